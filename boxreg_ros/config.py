@@ -131,9 +131,9 @@ class SolverConfig:
     """L-BFGS, and the rounds of correspondence and weighting around it."""
 
     rounds: int = setting(
-        15, 'most rounds; each renews the outermost points and the weights', '', 1, 100
+        10, 'most rounds; each renews the outermost points and the weights', '', 1, 100
     )
-    iterations: int = setting(1, 'most L-BFGS iterations per round', '', 1, 10000)
+    iterations: int = setting(2, 'most L-BFGS iterations per round', '', 1, 10000)
     threads: int = setting(
         0, 'threads that share the windows of a batch; 0: one per core', '', 0, 256
     )

@@ -4,7 +4,7 @@ import shutil
 
 from paths import ROOT
 
-KERNELS = ROOT / 'boxreg_ros' / 'core' / 'kernels'
+KERNELS = ROOT / 'boxreg_ros' / 'core' / 'method'
 
 
 def copy_compiled(kernels):

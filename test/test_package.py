@@ -125,7 +125,7 @@ def test_wheel_runs_in_another_environment(distributions, tmp_path):
     pip = [sys.executable, '-m', 'pip', '--python', programs / 'python', 'install', '--no-deps']
     run([*pip, '--no-index', '--ignore-installed', '--quiet', wheel], cwd=tmp_path)
     packages = sysconfig.get_path('purelib', vars={'base': str(tmp_path / 'environment')})
-    copy_compiled(Path(packages) / 'boxreg_ros' / 'core' / 'kernels')
+    copy_compiled(Path(packages) / 'boxreg_ros' / 'core' / 'method')
     code = 'import boxreg_ros; print(boxreg_ros.__path__[0])'
     assert str(tmp_path) in run([programs / 'python', '-c', code], cwd=tmp_path)
     assert 'openlabel' in run([programs / 'boxreg', 'formats'], cwd=tmp_path)

@@ -10,9 +10,10 @@ from typing import Any
 
 from boxreg_ros.config import Config, FaceConfig, KINDS
 from boxreg_ros.core.input_noise import set_noise
-from boxreg_ros.core.method.arrays import INPUTS, TERMS
-from boxreg_ros.core.method.constants import CONSTANTS, Constants
+from boxreg_ros.core.method import constants
+from boxreg_ros.core.method.arrays import INPUTS
 from boxreg_ros.core.method.faces import observe_faces
+from boxreg_ros.core.method.residuals import TERMS
 from boxreg_ros.core.population import set_population
 from boxreg_ros.core.problem import Problem
 from boxreg_ros.core.threads import run
@@ -61,23 +62,26 @@ class InputModel:
     ----------
     config : FaceConfig
         Expected insets, and whether margins are estimated.
+
+    Attributes
+    ----------
     constants : Constants
-        Numbers of the method, for all that use the model.
+        The numbers of the method, for all that use the model.
 
     """
 
-    def __init__(self, config: FaceConfig, constants: Constants = CONSTANTS) -> None:
-        self.constants = constants
+    def __init__(self, config: FaceConfig) -> None:
+        self.constants = constants.CONSTANTS
         self._estimates_margins = config.learn
         self._occlusion_insets = (config.inset_ends, config.inset_sides, 0.0, 0.0)
         # Of each track of each kind: sums over its face observations, see `_add`; its last input
         # residuals; its extent evidence.
-        unknown = np.full((constants.max_fits, 9), np.nan)
-        self._faces = [TrackRows(np.zeros((3, 3, 6)), constants.max_tracks) for _ in KINDS]
+        unknown = np.full((self.constants.max_fits, 9), np.nan)
+        self._faces = [TrackRows(np.zeros((3, 3, 6)), self.constants.max_tracks) for _ in KINDS]
         # What follows from the present sums, see `_margins_of`.
         self._margins: list[tuple[Floats, ...] | None] = [None] * len(KINDS)
-        self._residuals = [TrackRows(unknown, constants.max_tracks) for _ in KINDS]
-        self._evidence = [TrackRows(np.zeros((3, 3)), constants.max_tracks) for _ in KINDS]
+        self._residuals = [TrackRows(unknown, self.constants.max_tracks) for _ in KINDS]
+        self._evidence = [TrackRows(np.zeros((3, 3)), self.constants.max_tracks) for _ in KINDS]
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what was observed; margins that follow from it are computed again."""
@@ -115,23 +119,23 @@ class InputModel:
     ) -> None:
         """Add face observations, of records `TERMS` (B, N), that were made with `inputs`."""
         kinds = problem.kind
-        constants = self.constants
+        numbers = self.constants
         distance, weight = terms['distance'], terms['visibility']
         occluded, distant = np.moveaxis(terms['inset_shares'], 2, 0)
         gap_correction, occlusion_inset, range_inset = (
             inputs[name][kinds][:, None] for name in MARGIN_FIELDS[:3]
         )
         occluded = occluded * (occlusion_inset > 0)  # the bottom is observed by the road
-        is_visible = occluded < constants.min_share / 2
-        is_distant = distant > constants.min_share
-        has_points = (terms['num_points'] >= constants.min_box_points)[..., None]
+        is_visible = occluded < numbers.min_share / 2
+        is_distant = distant > numbers.min_share
+        has_points = (terms['num_points'] >= numbers.min_box_points)[..., None]
         # Three quantities: gap, occlusion inset, range inset; all (3, B, N, 6).
         counts = np.stack([
             has_points & is_visible & ~is_distant,
-            has_points & (occluded > constants.min_share),
+            has_points & (occluded > numbers.min_share),
             is_visible & is_distant,
         ])  # fmt: skip
-        counts &= (weight > 0) & (np.abs(distance) < constants.max_gap)
+        counts &= (weight > 0) & (np.abs(distance) < numbers.max_gap)
         counts &= problem.valid[..., None]
         values = np.stack([
             0 * occluded, occluded * occlusion_inset, distant * range_inset

@@ -53,42 +53,6 @@ NO_PRIOR = (
 """State, step, information and extents of a prior without information."""
 
 
-CLASS_SETTINGS = np.dtype(
-    [
-        ('acceleration', float, 6),
-        ('slip', float, 2),
-        ('drift', float),
-        ('pose', float, 6),
-        ('extent', float),
-        ('gap_spread', float),
-        ('sideslip', float),
-        ('roughness', float),
-        ('gaps', float, 6),
-        ('pivot', float),
-    ],
-    align=True,
-)
-"""
-Settings of the class of one window.
-
-acceleration
-    Deviations of the accelerations along the axes of the body, (6,).
-slip
-    Of the velocity of the pivot along the y and z axes, (2,) [m/s].
-drift
-    Of the step of a parked box [m].
-pose, extent
-    Of the input poses, (6,) [m, rad], and of the input extents, as part of each.
-gap_spread, sideslip
-    Of labelling margins [m], and of the angle from heading to path [rad].
-roughness
-    How far the surface is from rigid [m]: setting `shape`.
-gaps
-    Expected labelling margins, (6,) [m].
-pivot
-    Distance of the pivot behind the centre, as part of the length.
-"""
-ClassSettings = NDArray[np.void]
 SETTINGS_OF = {
     'acceleration': ('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning'),
     'slip': ('slip', 'climb'),
@@ -101,7 +65,34 @@ SETTINGS_OF = {
     'gaps': ('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom'),
     'pivot': ('pivot',),
 }
-"""The settings of `ClassConfig` that make each field."""
+"""
+Fields of `CLASS_SETTINGS`, and the settings of `ClassConfig` that make each.
+
+acceleration
+    Deviations of the accelerations along the axes of the body, (6,).
+slip
+    Of the velocity of the pivot along the y and z axes, (2,) [m/s].
+drift
+    Of the step of a parked box [m].
+pose, extent
+    Of the input poses, (6,) [m, rad], and of the input extents, as part of each.
+gap_spread, sideslip
+    Of labelling margins [m], and of the angle from heading to path [rad].
+roughness
+    How far the surface is from rigid [m].
+gaps
+    Expected labelling margins, (6,) [m].
+pivot
+    Distance of the pivot behind the centre, as part of the length.
+"""
+CLASS_SETTINGS = np.dtype(
+    [
+        (field, float, len(names)) if len(names) > 1 else (field, float)
+        for field, names in SETTINGS_OF.items()
+    ],
+    align=True,
+)
+"""Settings of the class of one window, a record."""
 
 
 class Problem(NamedTuple):
@@ -161,7 +152,7 @@ class Problem(NamedTuple):
     prior_information: Floats
     marginalised_extents: Floats
     kind: Ints
-    of_class: ClassSettings
+    of_class: NDArray[np.void]
 
     @property
     def errors(self) -> Floats:
@@ -205,8 +196,8 @@ class Problem(NamedTuple):
 
         """
         lengths = np.array(list(map(len, columns)))
-        valid: NDArray[np.bool_] = np.arange(lengths.max()) < lengths[:, None]
-        column = np.repeat([[of_window[-1]] for of_window in columns], valid.shape[1], axis=1)
+        column = np.repeat([[of_window[-1]] for of_window in columns], lengths.max(), axis=1)
+        valid: NDArray[np.bool_] = np.indices(column.shape)[1] < lengths[:, None]
         column[valid] = list(chain.from_iterable(columns))
         rows = np.array(windows)
         row = rows[:, None]
@@ -461,7 +452,7 @@ def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, 
     return minimum, np.asarray((half_turns % 2 == 0).all(1))
 
 
-def _of_classes(windows: Sequence[Window], config: Config) -> tuple[Ints, ClassSettings]:
+def _of_classes(windows: Sequence[Window], config: Config) -> tuple[Ints, NDArray[np.void]]:
     """Return kind (B,) and settings of the class of each window."""
     kinds = {name: config.kind(name) for name in {window.class_name for window in windows}}
     kind = np.array([KINDS.index(kinds[window.class_name]) for window in windows])

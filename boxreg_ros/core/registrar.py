@@ -13,7 +13,6 @@ from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
-from boxreg_ros.core.method.constants import CONSTANTS, Constants
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.pending import BoxToObserve, ObservedTrack, PendingArray, PendingBox
 from boxreg_ros.core.problem import SETTINGS_OF
@@ -61,8 +60,6 @@ class BoxRegistrar:
     budget : callable, optional
         Called once for each box array with `estimate` 'early' or 'final'; limits the windows that
         are solved for it. Default: all are.
-    constants : Constants, optional
-        Numbers of the method.
 
     Attributes
     ----------
@@ -107,24 +104,19 @@ class BoxRegistrar:
     """
 
     def __init__(
-        self,
-        config: Config,
-        submit: Submit | None = None,
-        budget: Budget | None = None,
-        constants: Constants = CONSTANTS,
+        self, config: Config, submit: Submit | None = None, budget: Budget | None = None
     ) -> None:
         self.config = config
         self.counts: Counter[str] = Counter()
         self._submit = submit
         self._budget = budget
-        self._constants = constants
         self.reset()
 
     def reset(self) -> None:
         """Discard tracks and box arrays that are held; keep the counts."""
         config = self.config
         self._matcher = StampMatcher(config, self.counts)
-        self._input_model = InputModel(config.faces, self._constants)
+        self._input_model = InputModel(config.faces)
         self.box_time = BoxTimeEvidence()
         self._pending = deque[PendingArray]()
         self._newest_ns = -inf
@@ -165,9 +157,11 @@ class BoxRegistrar:
 
     def margins(self) -> Floats:
         """Return the labelling margin of each face, of each of `KINDS`, (K, 6) [m]."""
+        names = SETTINGS_OF['gaps']
         kinds = [getattr(self.config, kind) for kind in KINDS]
-        of_settings = np.array([[getattr(kind, name) for name in SETTINGS_OF['gaps']] for kind in kinds])
-        margins: Floats = of_settings + self._input_model.inputs(self.config, with_noise=False)['gap_correction']
+        of_settings = np.array([[getattr(kind, name) for name in names] for kind in kinds])
+        inputs = self._input_model.inputs(self.config, with_noise=False)
+        margins: Floats = of_settings + inputs['gap_correction']
         return margins
 
     def _process(self, pairs: list[Pair]) -> Iterator[RefinedBoxes]:

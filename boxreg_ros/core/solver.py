@@ -197,8 +197,9 @@ def run_round(
     )  # fmt: skip
     search, objective = config.solver, Objective(rows, free, sums)
     found = minimize(
-        objective, torch.from_numpy(x), search.iterations, HISTORY, search.tolerance,
-        objective.metric, (torch.from_numpy(value), torch.from_numpy(gradient)),
+        objective.value_and_gradient, torch.from_numpy(x), search.iterations, HISTORY,
+        search.tolerance, objective.metric,
+        (torch.from_numpy(value), torch.from_numpy(gradient)),
     )  # fmt: skip
     is_done = np.empty(b, bool)
     run(
@@ -224,7 +225,7 @@ class Objective(NamedTuple):
     free: Floats
     sums: method.Sums
 
-    def __call__(self, x: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+    def value_and_gradient(self, x: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
         """Return values (p,) and gradients (p, D) of the windows `rows[part]` at x (p, D)."""
         value, gradient = torch.empty(len(x), dtype=x.dtype), torch.empty_like(x)
         run(

@@ -89,10 +89,7 @@ class BoxregNode(Node):
         self._opened = ExitStack()
 
     def configure(self) -> None:
-        """
-        Load or compile kernels, time a window, and make a registrar without any track.
-
-        """
+        """Load or compile kernels, time a window, and make a registrar without any track."""
         config, options = self._settings
         warm_up(config)
         cdr.walker()

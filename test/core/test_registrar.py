@@ -5,12 +5,12 @@ from itertools import pairwise
 
 from boxreg_ros import Config, refine
 from boxreg_ros.config import Ingredients
-from boxreg_ros.core import population, registration
+from boxreg_ros.core import registration
 from boxreg_ros.core.geometry import face_distances
 from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.core.problem import stack_windows
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.core.registration import register, solve
-from boxreg_ros.core.window import stack_windows
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest
@@ -406,9 +406,9 @@ def test_short_tracks_are_kept_and_boxes_without_points_refined(stream, estimate
 
 
 @pytest.fixture
-def no_extent_law(monkeypatch):
+def no_extent_law(set_constants):
     """Turn off the population prior on extents, which is estimated from all tracks."""
-    monkeypatch.setattr(population, 'SLOPE_DEVIATION', 1e-9)
+    set_constants(slope_deviation=1e-9)
 
 
 @each_estimate

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 import json
 import os
 from pathlib import Path
@@ -21,9 +20,7 @@ from boxreg_ros.config import Config
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `boxreg bench speed`."""
     parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument(
-        '-o', '--out', type=Path, help='folder for the picture of the scaling'
-    )
+    parser.add_argument('-o', '--out', type=Path, help='folder for the picture of the scaling')
     parser.add_argument('--quick', action='store_true', help='fewer and smaller cases')
     parser.add_argument(
         '--references', type=int, default=24, metavar='N',

@@ -158,7 +158,7 @@ def _minimum(fit: _Fit) -> Floats:
     )
 
     def closure() -> Tensor:
-        value, gradient = fit.objective((begin + scale * y).detach(), row)
+        value, gradient = fit.objective.value_and_gradient((begin + scale * y).detach(), row)
         y.grad = scale * gradient
         return value[0]
 

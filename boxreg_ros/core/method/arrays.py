@@ -2,8 +2,8 @@
 What the functions of a round pass to each other: records, and named tuples of arrays.
 
 Letters of the shapes: B windows, N observations of a window, K kinds of objects. The terms of a
-batch are an array (B, N) of records `TERMS`, and (B,) of `COMMON`. Only the first `lengths`
-observations of a window are read; the others are padding.
+batch are an array (B, N) of records `residuals.TERMS`, and (B,) of `COMMON`. Only the first
+`lengths` observations of a window are read; the others are padding.
 
 """
 
@@ -19,8 +19,6 @@ EXTENT, BIAS, GAP, PIVOT, ANCHOR, SIDESLIP, SHARED = 0, 3, 9, 15, 16, 22, 23
 labelling margins (6), pivot, anchor of the rigid shape (6), sideslip."""
 PRIOR = 2 * POSE + SHARED
 """Variables of the marginalisation prior: two poses and the shared ones."""
-NUM_RESIDUALS = 5
-"""Number of `residuals.RESIDUALS`."""
 BOTTOM = 5
 """The face that is observed by the road, not by points of the object."""
 SPAN = 3 * POSE
@@ -28,52 +26,6 @@ SPAN = 3 * POSE
 BOX_POSE = (0, 1, 2, 6, 7, 8)
 """Places of the pose in a box x y z length width height roll pitch yaw."""
 
-
-TERMS = np.dtype(
-    [
-        ('time', float),
-        ('given', float, POSE),
-        ('start', float, POSE),
-        ('axes', float, (3, 3)),
-        ('num_points', float),
-        ('distance', float, 6),
-        ('visibility', float, 6),
-        ('inset', float, 6),
-        ('inset_shares', float, (2, 6)),
-        ('W_faces', float, (6, 4, 4)),
-        ('wanted', float, POSE),
-        ('root', float, (POSE, POSE)),
-        ('W', float, (NUM_RESIDUALS, POSE)),
-    ],
-    align=True,
-)
-"""
-Data and weights of the residuals of one observation in one round.
-
-time
-    Of the observation [s].
-given, start
-    Input pose, and pose at the start of the round, (6,) [m, rad].
-axes
-    Axes of the box at the start of the round, (3, 3).
-num_points
-    Points in and near the box.
-distance
-    Mean signed distance of the outermost points of each face from where they are expected,
-    positive outside, (6,) [m].
-visibility
-    1 for a visible face, less for an occluded or distant one, 0 without points, (6,).
-inset, inset_shares
-    How far further inside than the labelling margin the points are expected, (6,) [m]; multiples
-    of occlusion inset and range inset in that, (2, 6).
-W_faces
-    Faces (M2): mean of (q, 1)(q, 1)' over the outermost points q of each face, from the centre of
-    the input box [m], times the weight of the face, (6, 4, 4).
-wanted, root
-    Rigid shape (M4): wanted step (6,), and a root of its information (6, 6).
-W
-    Weights of the `RESIDUALS` that begin here, 0 where they are left out, (n, 6).
-"""
 
 COMMON = np.dtype(
     [

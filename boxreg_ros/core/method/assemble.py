@@ -290,7 +290,7 @@ def weigh(b, problem, poses, shared, constants, at, out, terms, common):
     weigh_shared(length, shared, terms, common, face_weight, constants)
     window = Weighing(
         length, common.pose_deviation, common.widened_deviation, problem.pinned[b], pin_factor,
-        parked, of_class.acceleration, of_class.slip, of_class.drift,
+        parked, of_class,
     )  # fmt: skip
     weigh_each(poses, shared, terms, window, constants, at, out)
 

@@ -9,10 +9,10 @@ from data; all others are *chosen*, and `make results` halves and doubles each o
 from math import inf
 from typing import Any, NamedTuple
 
+from boxreg_ros.core.method.residuals import RESIDUALS
 import numpy as np
 
-RESIDUAL_NAMES = ('input', 'rigid shape', 'acceleration', 'zero motion', 'slip')
-"""Names of `residuals.RESIDUALS`, in their order."""
+RESIDUAL_NAMES = tuple(row.name for row in RESIDUALS)
 
 
 class Constants(NamedTuple):
@@ -173,7 +173,7 @@ class Constants(NamedTuple):
     """Deviation of one observation of each face [m]: `faces.ends` and so on."""
     uses_shape: bool = True
     """Whether the observations of a window are tied by the rigid shape of their track."""
-    residuals: tuple[bool, ...] = (True,) * 5
+    residuals: tuple[bool, ...] = (True,) * len(RESIDUALS)
     """Which of `RESIDUALS` are used; `boxreg bench ablation` leaves some out."""
 
     def with_settings(self, config: Any) -> 'Constants':
@@ -200,7 +200,7 @@ class Constants(NamedTuple):
             for is_used, name in zip(self.residuals, RESIDUAL_NAMES, strict=True)
         )
         is_robust = self.is_robust and is_smooth
-        return self._replace(uses_shape=residuals[1], residuals=residuals, is_robust=is_robust)
+        return self._replace(uses_shape=uses_shape, residuals=residuals, is_robust=is_robust)
 
     def record(self) -> np.void:
         """Return these numbers as one record, which kernels take by reference."""

@@ -99,7 +99,7 @@ def fill_face_distances(boxes, poses, shared, expected, terms, R, distances):
 
 
 @kernel
-def remove_means(length, terms, distances, min_weight, work):
+def remove_means(length, terms, distances, work):
     """Write the residuals of a window less their weighted mean, and the sums of its weights."""
     for face in range(FACES):
         total, count, mean = 0.0, 0, 0.0
@@ -107,7 +107,7 @@ def remove_means(length, terms, distances, min_weight, work):
             total += terms[n].visibility[face]
             count += terms[n].visibility[face] > 0.0
             mean += terms[n].visibility[face] * distances[n, face]
-        mean /= max(total, min_weight)
+        mean /= max(total, MIN_WEIGHT)
         for n in range(length):
             work.off_mean[n, face] = distances[n, face] - mean
         work.total[face] = total
@@ -238,7 +238,7 @@ def fill_posterior(
     for face in range(FACES):
         work.claimed[face] = face_deviation(face, shape, constants) ** 2
     fill_face_distances(problem.boxes[b], poses, shared, common.shared, terms, work.R, distances)
-    remove_means(length, terms, distances, MIN_WEIGHT, work)
+    remove_means(length, terms, distances, work)
     fill_underrated_information(deviation, error, common.W_shared, free_shared, work.underrated)
     fill_information_of_faces(
         length, problem.marginalised_extents[b, 3], terms, deviation[GAP:], constants, work

@@ -244,6 +244,53 @@ RESIDUALS = (
 """All residuals of observations but those of the faces, which `assemble.add_plane` sums."""
 
 
+TERMS = np.dtype(
+    [
+        ('time', float),
+        ('given', float, POSE),
+        ('start', float, POSE),
+        ('axes', float, (3, 3)),
+        ('num_points', float),
+        ('distance', float, 6),
+        ('visibility', float, 6),
+        ('inset', float, 6),
+        ('inset_shares', float, (2, 6)),
+        ('W_faces', float, (6, 4, 4)),
+        ('wanted', float, POSE),
+        ('root', float, (POSE, POSE)),
+        ('W', float, (len(RESIDUALS), POSE)),
+    ],
+    align=True,
+)
+"""
+Data and weights of the residuals of one observation in one round.
+
+time
+    Of the observation [s].
+given, start
+    Input pose, and pose at the start of the round, (6,) [m, rad].
+axes
+    Axes of the box at the start of the round, (3, 3).
+num_points
+    Points in and near the box.
+distance
+    Mean signed distance of the outermost points of each face from where they are expected,
+    positive outside, (6,) [m].
+visibility
+    1 for a visible face, less for an occluded or distant one, 0 without points, (6,).
+inset, inset_shares
+    How far further inside than the labelling margin the points are expected, (6,) [m]; multiples
+    of occlusion inset and range inset in that, (2, 6).
+W_faces
+    Faces (M2): mean of (q, 1)(q, 1)' over the outermost points q of each face, from the centre of
+    the input box [m], times the weight of the face, (6, 4, 4).
+wanted, root
+    Rigid shape (M4): wanted step (6,), and a root of its information (6, 6).
+W
+    Weights of the `RESIDUALS` that begin here, 0 where they are left out, (n, 6).
+"""
+
+
 @kernel
 def fill_axes(poses, first, last, at):
     """Write the axes of the poses `first` to `last`."""

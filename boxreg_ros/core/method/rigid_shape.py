@@ -3,8 +3,8 @@ One rigid shape per track (M4): all its points in the frame of its box, as small
 
 The points of a whole track, transformed into its box, fall into cells. Each cell that holds a
 piece of surface gives a plane and the thickness to which the observations smear it. Distances from
-these planes are linear in a small step of the pose: their sums of squares are all that is kept, as in
-point-to-plane ICP.
+these planes are linear in a small step of the pose: their sums of squares are all that is kept, as
+in point-to-plane ICP.
 
 """
 

@@ -19,7 +19,6 @@ from boxreg_ros.core.method.arrays import (
     SHARED,
     SIDESLIP,
     SPAN,
-    TERMS,
 )
 from boxreg_ros.core.method.arrowhead import invert_corner, invert_poses, solve
 from boxreg_ros.core.method.assemble import (
@@ -34,7 +33,7 @@ from boxreg_ros.core.method.compile import kernel
 from boxreg_ros.core.method.covariance import empty_covariance_work, fill_posterior, Inverse
 from boxreg_ros.core.method.expectation import empty_expectation_work, expect, fill_evidence
 from boxreg_ros.core.method.faces import empty_face_work, observe_window
-from boxreg_ros.core.method.residuals import empty_linearised
+from boxreg_ros.core.method.residuals import empty_linearised, TERMS
 from boxreg_ros.core.method.rigid_shape import agree, empty_shape_work
 import numpy as np
 

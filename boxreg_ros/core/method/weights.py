@@ -31,10 +31,8 @@ class Weighing(NamedTuple):
         Factor on the weights of the other boxes of a window with pinned ones (M21a); else 1.
     parked : array, shape (N,)
         Whether the object is parked from each box to the next (M25).
-    acceleration, slip : array, shapes (6,) and (2,)
-        Deviations of the settings.
-    drift : float
-        The same.
+    of_class : record `CLASS_SETTINGS`
+        Settings of its class.
 
     """
 
@@ -44,9 +42,7 @@ class Weighing(NamedTuple):
     pinned: Any
     pin_factor: Any
     parked: Any
-    acceleration: Any
-    slip: Any
-    drift: float
+    of_class: Any
 
 
 @kernel
@@ -69,14 +65,14 @@ def rigid_shape_weight(n, r, window, constants, w):
 def acceleration_weight(n, r, window, constants, w):
     """Write the weight of an acceleration along the axes of the body (M23)."""
     for k in range(POSE):
-        w[k] = 1 / window.acceleration[k] ** 2
+        w[k] = 1 / window.of_class.acceleration[k] ** 2
 
 
 @kernel
 def zero_motion_weight(n, r, window, constants, w):
     """Write the weight of the step of a parked object; zero where it drives (M25)."""
     for k in range(POSE):
-        deviation = window.drift * constants.drift_ratios[k]
+        deviation = window.of_class.drift * constants.drift_ratios[k]
         w[k] = 1 / deviation**2 if window.parked[n] else 0.0
 
 
@@ -84,7 +80,7 @@ def zero_motion_weight(n, r, window, constants, w):
 def slip_weight(n, r, window, constants, w):
     """Write the weight of the velocity of the pivot across the path and upward (M7)."""
     for k in range(2):
-        w[k] = 1 / window.slip[k] ** 2
+        w[k] = 1 / window.of_class.slip[k] ** 2
 
 
 @kernel

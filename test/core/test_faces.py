@@ -1,24 +1,33 @@
 """Face observations of boxes whose points are placed by hand."""
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.batch import State
-from boxreg_ros.core.face_support import (
-    FaceOffsets,
-    inset_shares,
-    observe_faces,
-    visibility,
-)
+from boxreg_ros.core.method.arrays import BOX_POSE
+from boxreg_ros.core.method.constants import CONSTANTS
+from boxreg_ros.core.method.faces import fill_insets, fill_visibility, observe_faces
+from boxreg_ros.core.method.residuals import TERMS
 import numpy as np
 import pytest
-from scenes import problem_of, shared_of
-import torch
+from scenes import no_inputs, problem_of, shared_of
 
-D = torch.float64
 CONFIG = Config()
 
 
-def tensor(values):
-    return torch.tensor(values, dtype=D)
+def visibility(problem):
+    """Return the visibility of each face of the first box, (6,)."""
+    tangent = np.empty(6)
+    fill_visibility(
+        problem.boxes[0, 0], problem.origins[0, 0], problem.points, np.empty((3, 3)), np.empty(3),
+        tangent,
+    )  # fmt: skip
+    return tangent
+
+
+def inset_shares(origins, tangent):
+    """Return the multiples of occlusion inset and range inset, (2, 6)."""
+    shares, inset, weight = np.empty((2, 6)), np.empty(6), np.empty(6)
+    record = CONSTANTS.with_settings(CONFIG).record()
+    fill_insets(origins, tangent, np.zeros(6), np.zeros(6), record, shares, inset, weight)
+    return shares
 
 
 def seen_from(origin, points=((0.0, 0, 0),), yaw=0.0, **changes):
@@ -31,7 +40,7 @@ def test_visibility_by_hand():
     # From 12 m ahead and 5 m to the left of a 4 x 2 m box: 10 m before the plane of the front,
     # 4 m to the side of its edge; 4 m before the left plane, 10 m ahead of its edge. It is 14 m
     # on the inner side of the back plane, and 6 m of the right one.
-    known = [[[10 / 4, -14 / 4, 4 / 10, -6 / 10, 9, -9]]]
+    known = [10 / 4, -14 / 4, 4 / 10, -6 / 10, 9, -9]
     np.testing.assert_allclose(visibility(seen_from([12.0, 5.0, 1.0])), known)
 
 
@@ -42,14 +51,14 @@ def test_visibility_turns_with_the_box():
 
 def test_without_a_sensor_faces_toward_the_centre_of_mass_are_visible():
     found = visibility(seen_from([np.nan] * 3, [[-1.5, 0.5, 0.3], [-1.9, 0.8, 0.1]]))
-    assert (found[0, 0, :4] > 0).tolist() == [False, True, True, False]
+    assert (found[:4] > 0).tolist() == [False, True, True, False]
 
 
 def test_occlusion_inset_grows_as_a_face_turns_away():
-    open_ = torch.linspace(-50, 50, 201, dtype=D)[None, :, None].expand(-1, -1, 6)
-    problem = problem_of([[[0, 0, 0, 4, 2, 2, 0, 0, 0]] * 201])
-    hidden, distant = inset_shares(problem, open_, CONFIG)[0].unbind(1)
-    assert (hidden.diff(dim=0) <= 0).all()
+    unknown = np.full((1, 3), np.nan)
+    tangents = np.linspace(-50, 50, 201)
+    hidden, distant = np.stack([inset_shares(unknown, np.full(6, t)) for t in tangents], 1)
+    assert (np.diff(hidden, axis=0) <= 0).all()
     np.testing.assert_allclose(hidden[0], 1, atol=1e-4)
     np.testing.assert_allclose(hidden[-1], 0, atol=1e-4)
     assert not distant.any()  # no sensor is known
@@ -62,7 +71,7 @@ def test_range_inset_grows_with_range(away, share):
     # From 20 m on the share grows by 1 in another 50 m, to 1.5 at most; the range is horizontal.
     # Front and roof are visible; back and bottom are occluded and have the occlusion inset only.
     problem = seen_from([0.6 * away, 0.8 * away, 5.0])
-    hidden, distant = inset_shares(problem, visibility(problem), CONFIG)[0, 0]
+    hidden, distant = inset_shares(problem.origins[0, 0], visibility(problem))
     np.testing.assert_allclose(distant, share * (1 - hidden))
     assert (hidden[[0, 2, 4]] < 0.2).all()
     assert (hidden[[1, 3, 5]] > 0.8).all()
@@ -74,10 +83,10 @@ def test_range_inset_lowers_the_weight_of_a_face():
     problem = seen_from([42.0, 56.0, 2.0], on_faces(0.15, faces=(4,)))
     for distant, weight in ((0.0, 1.0), (0.1, 0.5), (0.2, 0.2)):
         found = supported(problem, distant=distant)
-        assert found.weight[0, 0, 4].item() == pytest.approx(weight, rel=0.01)
-        assert found.distance[0, 0, 4].item() == pytest.approx(distant - 0.15, abs=1e-3)
-        assert found.inset[0, 0, 4].item() == pytest.approx(distant, abs=1e-3)
-        assert found.inset[0, 0, 5].item() == pytest.approx(0, abs=1e-3)  # the road
+        assert found['visibility'][0, 0, 4] == pytest.approx(weight, rel=0.01)
+        assert found['distance'][0, 0, 4] == pytest.approx(distant - 0.15, abs=1e-3)
+        assert found['inset'][0, 0, 4] == pytest.approx(distant, abs=1e-3)
+        assert found['inset'][0, 0, 5] == pytest.approx(0, abs=1e-3)  # the road
 
 
 def on_faces(inside, n=40, faces=(0, 2, 4)):
@@ -93,19 +102,24 @@ def on_faces(inside, n=40, faces=(0, 2, 4)):
 
 
 def supported(problem, gap=0.0, outermost=0.05, depths=0.0, distant=0.0):
-    state = State(problem.pose, shared_of(GAP=[gap] * 6))
-    offsets = FaceOffsets(*(torch.full((6,), value, dtype=D) for value in (0.0, depths, distant)))
     config = CONFIG.updated({'faces.outermost': outermost})
-    return observe_faces(problem, state, offsets, config)
+    terms = np.zeros(problem.counts.shape, TERMS)
+    B = len(problem.boxes)
+    observe_faces(
+        0, B, problem, np.ascontiguousarray(problem.boxes[..., BOX_POSE]),
+        shared_of(B=B, GAP=[gap] * 6), no_inputs(occlusion_inset=depths, range_inset=distant),
+        CONSTANTS.with_settings(config).record(), terms,
+    )  # fmt: skip
+    return terms
 
 
 @pytest.mark.parametrize('gap', [0.0, 0.04])
 def test_distance_of_points_is_counted_from_the_labelling_margin(gap):
     # The points are 0.1 m inside, `gap` of which is expected: the distance is gap - 0.1.
     found = supported(seen_from([30.0, 30.0, 2.0], on_faces(0.1)), gap)
-    assert found.weight[0, 0].tolist()[:5:2] == [1, 1, 1]
-    np.testing.assert_allclose(found.distance[0, 0, [0, 2, 4]], gap - 0.1, atol=1e-6)
-    assert found.num_points.item() == 120
+    assert found['visibility'][0, 0].tolist()[:5:2] == [1, 1, 1]
+    np.testing.assert_allclose(found['distance'][0, 0, [0, 2, 4]], gap - 0.1, atol=1e-6)
+    assert found['num_points'][0, 0] == 120
 
 
 def test_outermost_points_of_each_strip_by_hand():
@@ -117,9 +131,11 @@ def test_outermost_points_of_each_strip_by_hand():
     strips = [points[(points[:, 1] > y) & (points[:, 1] < y + 2 / 3)] for y in (-1, -1 / 3, 1 / 3)]
     outer = np.concatenate([strip[np.argsort(-strip[:, 0])[:4]] for strip in strips])
     homogeneous = np.c_[outer, np.ones(12)]
-    np.testing.assert_allclose(found.moments[0, 0, 0], homogeneous.T @ homogeneous / 12, rtol=1e-6)
-    assert found.distance[0, 0, 0].item() == pytest.approx(outer[:, 0].mean() - 2, abs=1e-4)
-    assert found.weight[0, 0, 0] == 1
+    np.testing.assert_allclose(
+        found['W_faces'][0, 0, 0], homogeneous.T @ homogeneous / 12, rtol=1e-6
+    )
+    assert found['distance'][0, 0, 0] == pytest.approx(outer[:, 0].mean() - 2, abs=1e-4)
+    assert found['visibility'][0, 0, 0] == 1
 
 
 @pytest.mark.parametrize(('behind', 'used'), [(0.15, 9), (0.25, 6)])
@@ -130,49 +146,49 @@ def test_a_strip_far_behind_the_others_is_left_out(behind, used):
     points = np.c_[np.where(y > 0.5, 1.9 - behind, 1.9), y, np.tile(np.linspace(-0.8, 0.8, 20), 3)]
     found = supported(seen_from([30.0, 0.0, 0.0], points))
     mean = 1.9 - (behind / 3 if used == 9 else 0.0)
-    assert found.distance[0, 0, 0].item() == pytest.approx(mean - 2, abs=1e-4)
-    side = found.moments[0, 0, 0][1, 3]  # mean y
-    assert side.item() == pytest.approx(0.0 if used == 9 else -0.35, abs=1e-6)
+    assert found['distance'][0, 0, 0] == pytest.approx(mean - 2, abs=1e-4)
+    side = found['W_faces'][0, 0, 0][1, 3]  # mean y
+    assert side == pytest.approx(0.0 if used == 9 else -0.35, abs=1e-6)
 
 
 def test_strips_without_points_are_left_out():
     # Two points in one strip, two in the next, none in the last: the mean of four.
     points = np.array([[1.9, -0.7, 0.1], [1.8, -0.6, 0.2], [1.9, 0.0, 0.3], [1.8, 0.1, 0.4]])
     found = supported(seen_from([30.0, 0.0, 0.0], points))
-    assert found.distance[0, 0, 0].item() == pytest.approx(-0.15, abs=1e-4)
-    np.testing.assert_allclose(found.moments[0, 0, 0][3, :3], points.mean(0), atol=1e-6)
+    assert found['distance'][0, 0, 0] == pytest.approx(-0.15, abs=1e-4)
+    np.testing.assert_allclose(found['W_faces'][0, 0, 0][3, :3], points.mean(0), atol=1e-6)
 
 
 def test_occluded_faces_have_less_weight():
     # Points on front and back, seen from the front.
     points = on_faces(0.05, faces=(0, 1, 2))
     found = supported(seen_from([30.0, 0.0, 0.0], points))
-    assert found.weight[0, 0, 0] == 1
-    assert found.weight[0, 0, 1] < 1
+    assert found['visibility'][0, 0, 0] == 1
+    assert found['visibility'][0, 0, 1] < 1
 
 
 def test_a_face_without_points_has_no_weight():
     # Two points are fewer than the minimum.
     found = supported(seen_from([30.0, 0.0, 0.0], on_faces(0.05, n=2, faces=(0,))))
-    assert found.weight[0, 0, 0] == 0
-    assert found.distance.isfinite().all()
-    assert found.moments.isfinite().all()
+    assert found['visibility'][0, 0, 0] == 0
+    assert np.isfinite(found['distance']).all()
+    assert np.isfinite(found['W_faces']).all()
 
 
 def test_points_beyond_the_margin_are_left_out():
     # 1 m ahead of the front is beyond the margin of 0.35 m.
     found = supported(seen_from([30.0, 0.0, 0.0], on_faces(-1.0, faces=(0,))))
-    assert found.weight[0, 0, 0] == 0
-    assert found.num_points.item() == 0
+    assert found['visibility'][0, 0, 0] == 0
+    assert found['num_points'][0, 0] == 0
 
 
 def test_the_road_is_the_observation_of_the_bottom():
     # The road is 1.2 m below the centre of a box whose bottom is 1 m below it: 0.2 m too high.
     problem = seen_from([30.0, 0.0, 0.0], on_faces(0.0), ground=[[-1.2]])
     found = supported(problem)
-    assert found.weight[0, 0, 5] == 1
-    assert found.distance[0, 0, 5].item() == pytest.approx(0.2)
-    assert supported(seen_from([30.0, 0.0, 0.0], on_faces(0.0))).weight[0, 0, 5] == 0
+    assert found['visibility'][0, 0, 5] == 1
+    assert found['distance'][0, 0, 5] == pytest.approx(0.2)
+    assert supported(seen_from([30.0, 0.0, 0.0], on_faces(0.0)))['visibility'][0, 0, 5] == 0
 
 
 def test_order_and_padding_of_points_do_not_matter():
@@ -182,12 +198,7 @@ def test_order_and_padding_of_points_do_not_matter():
     boxes = [[[0, 0, 0, 4, 2, 2, 0, 0, 0]] * 2]
     order = rng.permutation(120)
     known, found = (
-        observe_faces(
-            problem,
-            State(problem.pose, shared_of()),
-            FaceOffsets(*torch.ones(3, 6)),
-            CONFIG.updated({'faces.outermost': 0.2}),
-        )
+        supported(problem, 0.0, 0.2, 1.0, 1.0)
         for problem in (
             problem_of(boxes, points=points, mask=mask, origins=[[[9.0, 9.0, 9.0]] * 2]),
             problem_of(
@@ -198,8 +209,8 @@ def test_order_and_padding_of_points_do_not_matter():
             ),
         )
     )
-    for a, b in zip(found, known, strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-12)
+    for name in ('W_faces', 'distance', 'visibility', 'num_points'):
+        np.testing.assert_allclose(found[name], known[name], atol=1e-7)
 
 
 def test_points_are_motion_compensated_to_the_stamp():
@@ -210,9 +221,9 @@ def test_points_are_motion_compensated_to_the_stamp():
     origins = np.array([[[30.0, 0, 0]] * 4])
     late = problem_of(boxes, points=points, origins=origins, delays=np.full((1, 4, 40), -0.05))
     found = supported(late)
-    np.testing.assert_allclose(found.distance[..., 0], 0, atol=1e-6)
+    np.testing.assert_allclose(found['distance'][..., 0], 0, atol=1e-6)
     still = problem_of(boxes, points=points, origins=origins)
-    assert (supported(still).distance[..., 0] < -0.4).all()
+    assert (supported(still)['distance'][..., 0] < -0.4).all()
 
 
 def test_motion_compensation_does_not_depend_on_padding():
@@ -227,7 +238,7 @@ def test_motion_compensation_does_not_depend_on_padding():
         boxes[:, :2], points=points[:, :2], delays=np.full((1, 2, 40), -0.05),
         origins=np.full((1, 2, 3), 30.0),
     )  # fmt: skip
-    found, known = supported(whole).distance[:, :2], supported(alone).distance
+    found, known = supported(whole)['distance'][:, :2], supported(alone)['distance']
     np.testing.assert_allclose(known[..., 0], 0, atol=1e-6)
     np.testing.assert_allclose(found, known)
 
@@ -235,4 +246,4 @@ def test_motion_compensation_does_not_depend_on_padding():
 def test_a_single_observation_has_no_velocity():
     points = on_faces(0.0, faces=(0,))
     once = seen_from([30.0, 0.0, 0.0], points, delays=np.full((1, 1, 40), -0.05))
-    assert supported(once).distance[0, 0, 0].item() == pytest.approx(0, abs=1e-6)
+    assert supported(once)['distance'][0, 0, 0] == pytest.approx(0, abs=1e-6)

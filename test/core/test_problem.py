@@ -1,20 +1,27 @@
-"""Windows of observations, and batches of windows as padded tensors."""
+"""Windows of observations, and batches of windows as padded arrays."""
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.batch import PRIOR_SIZE, Problem
-from boxreg_ros.core.track_window import MarginalisationPrior
-from boxreg_ros.core.window import (
+from boxreg_ros.core.method.arrays import PRIOR as PRIOR_SIZE
+from boxreg_ros.core.method.constants import CONSTANTS
+from boxreg_ros.core.problem import (
     group_windows,
-    PRIOR_DECAY,
+    Problem,
     resolve_headings,
-    stack_windows,
 )
+from boxreg_ros.core.problem import (
+    stack_windows as stack,
+)
+from boxreg_ros.core.track_window import MarginalisationPrior
 from boxreg_ros.structures import POSE, ROLL, YAW
 import numpy as np
 import pytest
 from scenes import changed, drive, track_of, window_of
 
 CONFIG = Config()
+
+
+def stack_windows(windows, config):
+    return stack(windows, config, CONSTANTS.prior_decay)
 
 
 def windows(lengths):
@@ -55,17 +62,22 @@ def test_windows_are_padded():
     problem, base = stack_windows(many, CONFIG)
     assert problem.valid.sum(1).tolist() == lengths
     np.testing.assert_allclose(problem.boxes[:, 0, :3], 0)
-    assert (problem.times.diff(dim=1) > 0).all()
+    assert (np.diff(problem.times) > 0).all()
     for b, (one, n) in enumerate(zip(many, lengths, strict=True)):
-        centers = problem.boxes[b, :n, :3].numpy() + base[b]
+        centers = problem.boxes[b, :n, :3] + base[b]
         np.testing.assert_allclose(centers, given(one)[:, :3])
         np.testing.assert_allclose(problem.times[b, :n], 0.1 * np.arange(n), atol=1e-12)
         for i, observation in enumerate(one.observations):
-            mask = problem.mask[b, i]
-            np.testing.assert_array_equal(problem.points[b, i][mask], observation.points)
+            np.testing.assert_array_equal(points_of(problem, b, i), observation.points)
             np.testing.assert_array_equal(problem.origins[b, i], observation.origins)
-        assert not problem.mask[b, n:].any()
-    assert problem.of_class('position')[:, 0].tolist() == [CONFIG.vehicle.position] * 4
+        assert not problem.counts[b, n:].any()
+    assert problem.of_class['pose'][:, 0].tolist() == [CONFIG.vehicle.position] * 4
+
+
+def points_of(problem, b, i):
+    """Return the points of one observation."""
+    first = problem.first[b, i]
+    return problem.points[first : first + problem.counts[b, i]]
 
 
 def seconds(boxes):
@@ -159,7 +171,9 @@ def test_priors_are_stacked():
     np.testing.assert_array_equal(base, [prior.base, given(other)[0, :3]])
     np.testing.assert_allclose(problem.boxes[:, 0, :3], [[1, 0, 0], [0, 0, 0]])
     np.testing.assert_allclose(problem.prior_mean[0], prior.state + prior.step, atol=1e-12)
-    np.testing.assert_allclose(problem.prior_information[0], PRIOR_DECAY * prior.information)
+    np.testing.assert_allclose(
+        problem.prior_information[0], CONSTANTS.prior_decay * prior.information
+    )
     np.testing.assert_array_equal(problem.marginalised_extents, [[4, 2, 1, 1], [0, 0, 0, 0]])
     np.testing.assert_array_equal(problem.prior_mean[1], 0)
     np.testing.assert_array_equal(problem.prior_information[1], 0)
@@ -173,7 +187,7 @@ def test_whole_turns_between_prior_and_start_are_removed(turns):
     known, _ = stack_windows([with_prior(window)], CONFIG)
     found, _ = stack_windows([with_prior(window, turns)], CONFIG)
     for name in Problem._fields:
-        if name != 'returns':
+        if name != 'of_class':
             np.testing.assert_allclose(getattr(found, name), getattr(known, name), atol=1e-9)
 
 
@@ -183,7 +197,7 @@ def test_a_prior_of_the_opposite_heading_is_dropped():
     for one in (flipped(with_prior(window)), with_prior(window, np.pi)):
         problem, _ = stack_windows([one], CONFIG)
         np.testing.assert_array_equal(problem.prior_information, 0)
-        assert problem.prior_mean.isfinite().all()
+        assert np.isfinite(problem.prior_mean).all()
         np.testing.assert_array_equal(problem.marginalised_extents, [[4, 2, 1, 1]])
     kept, _ = stack_windows([flipped(with_prior(window, np.pi))], CONFIG)
     assert (kept.prior_information[0].diagonal() > 0).all()
@@ -214,8 +228,8 @@ def test_a_part_of_a_problem_has_the_observations_asked_for():
         whole = getattr(problem, name)
         np.testing.assert_array_equal(getattr(part, name)[0, 0], whole[1, 2])
         np.testing.assert_array_equal(getattr(part, name)[1], whole[0, [1, 3]])
-    assert (part.times.diff(dim=1) > 0).all()
-    np.testing.assert_array_equal(part.points[0, 0], problem.points[1, 2])
+    assert (np.diff(part.times) > 0).all()
+    np.testing.assert_array_equal(points_of(part, 0, 0), points_of(problem, 1, 2))
     for name in ('prior_mean', 'prior_information', 'marginalised_extents'):
         values = getattr(part, name)
         assert values.shape == getattr(problem, name).shape and not values.any()
@@ -232,6 +246,6 @@ def test_groups_are_bounded_and_either_warm_or_cold(monkeypatch):
     many = windows([5, 6, 7, 8])
     many[1] = many[1]._replace(num_new=1, start=given(many[1])[:5])
     monkeypatch.setattr(
-        'boxreg_ros.core.window.MAX_BATCH_VALUES', 2 * 8 * CONFIG.sampling.points * 18
+        'boxreg_ros.core.problem.MAX_BATCH_VALUES', 2 * 8 * CONFIG.sampling.points * 18
     )
     assert group_windows(many, CONFIG) == [[0, 2], [3], [1]]
