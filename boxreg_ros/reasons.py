@@ -5,7 +5,8 @@ from typing import Self
 
 REDUCE_LOAD = (
     'compare the latencies in `/diagnostics`; lower `window`, `solver.rounds` or '
-    '`sampling.points`, publish fewer boxes, or use more CPU cores (`solver.threads`)'
+    '`sampling.points`, publish fewer boxes, use more CPU cores (`solver.threads`), or give the '
+    'node cores of its own, see "Priority and cores"'
 )
 REDUCE_RECORDING = (
     'record to a faster disk, fewer `record_formats`, or without clouds (`record_points:=false`)'
@@ -89,6 +90,13 @@ class Reason(StrEnum):
         'not written beside the labels: the recorder, or its disk, is slower than the data',
         REDUCE_RECORDING,
     )
+    RECORDER_RESTARTED = (
+        'recorder_restarted',
+        'restart',
+        'the recorder of labels was ended from outside, for want of memory for example, and '
+        'started again; its segment was completed, box arrays under way to it may be lost',
+        'give the machine more memory, or record fewer `record_formats`',
+    )
     STATIC_UNCHANGED = (
         'static_unchanged',
         'cloud',
@@ -161,6 +169,11 @@ class Reason(StrEnum):
         'a person rejected the refined box or its track in `boxreg review`',
         '',
     )
+    DELETED = (
+        'deleted',
+        'box',
+        'rejected: a person deleted the box or its track in `boxreg review`',
+    )
     NO_SWEEP = (
         'no_sweep',
         'box',
@@ -218,9 +231,9 @@ class Reason(StrEnum):
     INVALID_BOX = (
         'invalid_box',
         'box',
-        'contains NaN or infinity, an extent that is not positive or above 1 km, or a position '
-        'beyond 30,000 km',
-        'check the detector, and its units',
+        'contains NaN or infinity, an extent that is not positive or above 1 km, a position '
+        'beyond 30,000 km, or a quaternion that is not of unit length, such as one of zeros',
+        'check the detector, and its units; without rotation a quaternion is x=0 y=0 z=0 w=1',
     )
     NOT_FINITE = (
         'not_finite',
@@ -232,7 +245,8 @@ class Reason(StrEnum):
         'budget',
         'box',
         'not solved before `deadline`: other tracks came first; its track is solved at a later '
-        'stamp, which refines the final box too if that is within `lag`',
+        'stamp, which refines the final box too if that is within `lag`. More than 1 % of the '
+        'final boxes are a WARN',
     )
     COAST_UNCONFIRMED = (
         'coast_unconfirmed',

@@ -191,3 +191,9 @@ def test_names_of_a_group_may_be_in_any_case():
     config = Config().updated({'pedestrian.names': ['Fussgaenger']})
     for name in ('FUSSGAENGER', 'fussgaenger', 'human-Fussgaenger'):
         assert config.class_config(name) is config.pedestrian
+
+
+def test_a_lag_is_less_than_the_window():
+    assert Config(window=8, lag=7).lag == 7
+    with pytest.raises(ConfigError, match=r'^lag: expected less than window \(8\), got 8'):
+        Config(window=8, lag=8)

@@ -59,12 +59,42 @@ def test_rosdep_keys_cover_the_imports():
     manifest = ElementTree.parse(ROOT / 'package.xml')
     keys = {item.text for item in manifest.iter('exec_depend')}
     # mcap has no rosdep key; the README describes its installation. It installs the other two.
-    names = imported_distributions() - {'mcap', 'lz4', 'zstandard'}
+    # Starlette has none either; `boxreg review` imports its server when it is asked to.
+    server = {'anyio', 'starlette', 'uvicorn'}
+    names = imported_distributions() - {'mcap', 'lz4', 'zstandard'} - server
     other_keys = {'torch': 'python3-pytorch-pip', 'rosbags': 'python3-rosbags-pip'}
     wanted = {other_keys.get(name, name) for name in names}
     assert len(wanted) > 5
     missing = [name for name in wanted if not {name, f'python3-{name}'} & keys]
     assert missing == []
+
+
+INSTALLATIONS = (
+    'README.md',
+    'docs/getting-started.md',
+    '.github/workflows/test.yaml',
+    'Dockerfile',
+)
+
+
+@pytest.mark.parametrize('file', INSTALLATIONS)
+def test_installations_leave_nothing_of_pip_to_rosdep(file):
+    index = yaml.safe_load((ROOT / 'test' / 'rosdep_noble.yaml').read_text(encoding='utf-8'))
+    manifest = ElementTree.parse(ROOT / 'package.xml')
+    keys = {item.text for item in manifest.iter() if item.tag.endswith('depend')}
+    assert keys - set(index['ros']) - set(index['apt']) <= set(index['pip'])
+    text = (ROOT / file).read_text(encoding='utf-8').replace('\\\n', ' ')
+    (line,) = re.findall(r'rosdep install .*?--skip-keys "(.*?)"', text)
+    assert keys & set(index['pip']) <= set(line.split())
+    by_pip = set(re.findall(r'[a-z]+', ' '.join(re.findall(r'pip install (.*)', text)).lower()))
+    names = {index['pip'].get(key, key.removeprefix('python3-')) for key in line.split()}
+    assert {*names, 'mcap'} <= by_pip
+
+
+def test_a_robot_needs_nothing_with_a_window():
+    manifest = ElementTree.parse(ROOT / 'package.xml')
+    needed = {item.text for item in manifest.iter('exec_depend')}
+    assert not needed & {'rviz2', 'python3-matplotlib', 'python3-jinja2'}
 
 
 def run(command, **options):

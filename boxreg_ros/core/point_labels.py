@@ -36,9 +36,13 @@ UNCERTAIN_BAND = 0.5
 ROAD_CLEARANCE = 0.06
 """Points less than this above the road are of the road [m]: above its noise, below a bumper."""
 MOVING_SPEED = 0.3
-"""Least speed of an object that moves [m/s]: four times the error over `MOTION_SECONDS`."""
-MOTION_SECONDS = 0.5
-"""The speed is that of the boxes within this time [s]."""
+"""Least speed of an object that moves [m/s]: slower than a pedestrian."""
+MOVING_DISTANCE = 0.35
+"""Least distance that an object moves within the boxes that state its speed [m]: 3 deviations."""
+MOVING_DEVIATIONS = 5.0
+"""Least speed in standard errors: boxes that jump once, as estimates that settle, do not move."""
+MOTION_SECONDS = 1.0
+"""The speed is that of the boxes within a span of this time [s]."""
 MIN_MOTION_SECONDS = 0.25
 """Shorter tracks have no known motion [s]."""
 CERTAIN_GAP = 0.6
@@ -136,8 +140,7 @@ class PointLabels(NamedTuple):
     @property
     def is_dynamic(self) -> Mask:
         """Return which points are on an object that moves now or later, or may be, (M,)."""
-        is_dynamic: Mask = (self.motion == MOVING) | (self.motion == STOOD)
-        is_dynamic |= (self.track == UNKNOWN) & (self.motion != PARKED)
+        is_dynamic: Mask = (self.track != BACKGROUND) & (self.motion != PARKED)
         return is_dynamic
 
 
@@ -155,6 +158,8 @@ class PointLabeller:
         `max_gap`, `reach`, `tolerance`, and the time that boxes are of, `sampling.box_time`.
     margins : array, shape (T, 6)
         Labelling margin of each face of each track: front, rear, left, right, top, bottom [m].
+    coast : float
+        How long an object goes on after its last box, for tracks that have not ended [s].
 
     """
 
@@ -164,6 +169,7 @@ class PointLabeller:
         array_stamps_ns: Ints,
         config: Config,
         margins: Floats,
+        coast: float = 0.0,
     ) -> None:
         self.tracks = list(tracks)
         self._config = config
@@ -174,6 +180,7 @@ class PointLabeller:
         self._first_ns = np.array([track.stamps_ns[0] for track in tracks], np.int64)
         self._last_ns = np.array([track.stamps_ns[-1] for track in tracks], np.int64)
         self._reach_ns = round(max(config.reach, config.tolerance) * 1e9)
+        self._coast_ns = max(self._reach_ns, round(coast * 1e9))
         self._gap_ns = round(config.max_gap * 1e9)
 
     def label(self, sweep: Sweep) -> PointLabels:
@@ -217,7 +224,7 @@ class PointLabeller:
     def objects_at(self, stamp_ns: int) -> Objects:
         """Return the objects of a stamp: their boxes, or those between the nearest two."""
         is_near = (self._first_ns <= stamp_ns + self._reach_ns) & (
-            self._last_ns >= stamp_ns - self._reach_ns
+            self._last_ns >= stamp_ns - self._coast_ns
         )
         found = [self._object_at(int(t), stamp_ns) for t in np.flatnonzero(is_near)]
         present = [one for one in found if one is not None]
@@ -332,28 +339,43 @@ def _track_motion(track: ObjectTrack) -> _TrackMotion:
         return _TrackMotion(np.zeros((n, 3)), np.zeros(n), np.zeros(n, np.uint8))
     yaws = np.unwrap(track.boxes[:, YAW], period=np.pi)
     values = np.column_stack([track.boxes[:, X : Z + 1], yaws])
-    speed = np.linalg.norm(_slopes(seconds, values, MOTION_SECONDS)[:, :2], axis=1)
-    moves = speed > MOVING_SPEED
+    slopes, errors, span = _slopes(seconds, values, MOTION_SECONDS)
+    speed = np.linalg.norm(slopes[:, :2], axis=1)
+    moves = speed > np.maximum(MOVING_SPEED, MOVING_DISTANCE / span)
+    moves &= speed > MOVING_DEVIATIONS * np.linalg.norm(errors[:, :2], axis=1)
     motion = np.where(moves, MOVING, STOOD if moves.any() else PARKED).astype(np.uint8)
-    slopes = np.where(moves[:, None], _slopes(seconds, values, MOTION_SECONDS / 2), 0.0)
+    near, _, _ = _slopes(seconds, values, MOTION_SECONDS / 2)  # less smooth, for the place
+    slopes = np.where(moves[:, None], near, 0.0)
     return _TrackMotion(slopes[:, :3], slopes[:, 3], motion)
 
 
-def _slopes(seconds: Floats, values: Floats, reach: float) -> Floats:
-    """Return the slope of values (n, c) at each of n times, by those within `reach` [s]."""
-    first = np.searchsorted(seconds, seconds - reach - 1e-6)
-    last = np.searchsorted(seconds, seconds + reach + 1e-6)
-    first = np.minimum(first, np.maximum(np.arange(len(seconds)) - 1, 0))  # two boxes at least
-    last = np.maximum(last, np.minimum(np.arange(len(seconds)) + 2, len(seconds)))
+def _slopes(seconds: Floats, values: Floats, span: float) -> tuple[Floats, Floats, Floats]:
+    """
+    Return the slope of values (n, c) at n times, its standard error, and the time it spans [s].
+
+    The boxes of a window of length `span` are used, in the middle of which the time is; at an end
+    of the track all of it is on one side.
+
+    """
+    n = len(seconds)
+    begin = np.clip(seconds - span / 2, seconds[0], max(seconds[0], seconds[-1] - span)) - 1e-6
+    first = np.searchsorted(seconds, begin)
+    last = np.searchsorted(seconds, begin + span + 2e-6)
+    first = np.minimum(first, np.maximum(np.arange(n) - 1, 0))  # two boxes at least
+    last = np.maximum(last, np.minimum(np.arange(n) + 2, n))
     t = seconds[:, None]
     values = values - values[0]
-    columns = np.hstack([np.ones_like(t), t, t * t, values, t * values])
+    columns = np.hstack([np.ones_like(t), t, t * t, values, t * values, values * values])
     sums = np.vstack([np.zeros(columns.shape[1]), np.cumsum(columns, axis=0)])
     sums = sums[last] - sums[first]
     c = values.shape[1]
-    n, s, ss = sums[:, :1], sums[:, 1:2], sums[:, 2:3]
-    slopes: Floats = (n * sums[:, 3 + c :] - s * sums[:, 3 : 3 + c]) / (n * ss - s * s)
-    return slopes
+    count, total, squares = sums[:, :1], sums[:, 1:2], sums[:, 2:3]
+    of_values, products, of_squares = np.split(sums[:, 3:], [c, 2 * c], axis=1)
+    spread = squares - total * total / count
+    slopes: Floats = (products - total * of_values / count) / spread
+    residuals = of_squares - of_values * of_values / count - slopes * slopes * spread
+    errors = np.sqrt((residuals / np.maximum(count - 2, 1) / spread).clip(0))
+    return slopes, errors, seconds[last - 1] - seconds[first]
 
 
 def _turned(vectors: Floats, angles: Floats) -> Floats:

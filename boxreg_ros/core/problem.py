@@ -197,7 +197,8 @@ class Problem(NamedTuple):
         """
         lengths = np.array(list(map(len, columns)))
         column = np.repeat([[of_window[-1]] for of_window in columns], lengths.max(), axis=1)
-        valid: NDArray[np.bool_] = np.indices(column.shape)[1] < lengths[:, None]
+        is_there = np.indices(column.shape)[1] < lengths[:, None]
+        valid: NDArray[np.bool_] = np.asarray(is_there, bool)
         column[valid] = list(chain.from_iterable(columns))
         rows = np.array(windows)
         row = rows[:, None]

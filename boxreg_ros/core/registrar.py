@@ -6,7 +6,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import accumulate, chain
-from math import inf
+from math import ceil, inf
 from typing import NamedTuple
 
 from boxreg_ros.config import Config, KINDS
@@ -27,8 +27,13 @@ GetEstimates = Callable[[], list[Estimate | None]]
 """Waits for the estimates of submitted windows, None for windows that are too short."""
 Submit = Callable[[list[Window], Config, InputModel], GetEstimates]
 """Starts `register` with the same arguments, perhaps in another process."""
-Budget = Callable[[], int]
-"""Returns how many windows may be solved for the box array at hand."""
+Budget = Callable[[int], int]
+"""
+Returns how many windows may be solved for the box array at hand.
+
+Its argument is the number that refines every final box: one of each track in `lag` + 1 arrays.
+
+"""
 
 VELOCITY_OBSERVATIONS = 4
 """Observations that the input velocity is estimated from; chosen: 0.3 s at 10 Hz."""
@@ -99,7 +104,8 @@ class BoxRegistrar:
 
     With a **budget**, the tracks that have waited longest are solved first, then those whose
     newest estimate is least certain, then the nearest. The boxes of the others are kept for now,
-    with the reason ``budget``; their observations join the next window that is solved.
+    with the reason ``budget``; their observations join the next window that is solved. After the
+    early boxes are published, `catch_up` solves tracks that wait, for their final boxes.
 
     """
 
@@ -154,6 +160,26 @@ class BoxRegistrar:
         for array in self._pending:
             array.num_unsettled = 0
         return [*ready, *self._pop_settled()]
+
+    def catch_up(self, limit: int) -> list[RefinedBoxes]:
+        """
+        Solve tracks that the budget made wait, which refines boxes that are not final yet.
+
+        Parameters
+        ----------
+        limit : int
+            Most windows to solve; the tracks that have waited longest come first.
+
+        """
+        waiting = [track for track in self._tracks.values() if track.num_carried]
+        if waiting:
+            self._solve(_by_urgency(waiting)[:limit])
+        return list(self._pop_settled())
+
+    @property
+    def num_waiting(self) -> int:
+        """Return the number of tracks whose newest observation is in no window yet."""
+        return sum(track.num_carried > 0 for track in self._tracks.values())
 
     def margins(self) -> Floats:
         """Return the labelling margin of each face, of each of `KINDS`, (K, 6) [m]."""
@@ -284,10 +310,14 @@ class BoxRegistrar:
 
     def _settle_after_lag(self) -> None:
         """Settle the arrays that have `lag` younger ones, which are in their windows."""
-        lag = min(self.config.lag, self.config.window - 1)
         observed = [array for array in self._pending if array.is_observed]
-        for array in observed[: max(0, len(observed) - lag)]:
+        for array in observed[: max(0, len(observed) - self._lag)]:
             array.num_unsettled = 0
+
+    @property
+    def _lag(self) -> int:
+        """Return the number of later arrays that a final box waits for."""
+        return min(self.config.lag, self.config.window - 1)
 
     def _solve_full_windows(self) -> None:
         """Solve when a window is full, together with tracks that fill more than half of one."""
@@ -304,17 +334,21 @@ class BoxRegistrar:
         if self._budget is None:
             return tracks
         ready = [t for t in tracks if len(t.entries) >= self.config.min_observations]
-        limit = self._budget()
-        self._settle_ended_tracks_beyond(max(0, limit - len(ready)))
-        if len(ready) <= limit:
+        # An ended track that waits has its last chance; the others have an estimate.
+        self._ended_tracks.sort(key=lambda track: -track.num_carried)
+        num_ended = sum(track.num_carried > 0 for track in self._ended_tracks)
+        limit = self._budget(num_ended + ceil(len(ready) / (self._lag + 1)))
+        self._settle_ended_tracks_beyond(max(limit - len(ready), min(limit, num_ended)))
+        if len(ready) + len(self._ended_tracks) <= limit:
             return tracks
+        limit -= len(self._ended_tracks)
         ready = _by_urgency(ready)
         for track in ready[limit:]:
             track.carry(self._num_overlapping)
         return ready[:limit]
 
     def _settle_ended_tracks_beyond(self, limit: int) -> None:
-        """Settle ended tracks but the first ones: each has an estimate, and none can wait."""
+        """Settle ended tracks but the first ones: none can wait."""
         for track in self._ended_tracks[limit:]:
             for entry in track.entries:
                 entry.settle()

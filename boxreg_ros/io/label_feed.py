@@ -11,13 +11,17 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 import json
+import re
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.errors import ConfigError
 from boxreg_ros.structures import Floats, RefinedBoxes, Sweep
 
 PROGRAM = 'boxreg_ros.recorder.main'
 """Module that the node runs; it is named here because the node does not import it."""
+UNITS = {'s': 1.0, 'min': 60.0, 'h': 3600.0, 'MB': 1e6, 'GB': 1e9}
+SIZE_UNITS = ('MB', 'GB')
 
 
 class RecorderSettings(NamedTuple):
@@ -111,6 +115,8 @@ class RecorderStatus:
         Room on the disk [bytes].
     recovered : int
         Segments recovered from the journals of earlier recordings.
+    damaged : int
+        Segments of earlier recordings whose journal cannot be read; their folder is kept.
     without_cloud : int
         Frames without a cloud, where clouds are written.
     left_out : int
@@ -129,6 +135,7 @@ class RecorderStatus:
     rate: float = 0.0
     free: int = 0
     recovered: int = 0
+    damaged: int = 0
     without_cloud: int = 0
     left_out: int = 0
     error: str = ''
@@ -141,3 +148,22 @@ class RecorderStatus:
     def seconds_left(self) -> float | None:
         """Return for how long the disk has room at this rate [s]; None while it is unknown."""
         return self.free / self.rate if self.rate > 0 else None
+
+
+def segment_limit(text: str) -> tuple[float, bool]:
+    """
+    Return the length of a segment [s or bytes], and whether it is in bytes.
+
+    Raises
+    ------
+    ConfigError
+        If the text is not a positive number with a unit of `UNITS`.
+
+    """
+    found = re.fullmatch(r'\s*(\d+(?:\.\d+)?)\s*([a-zA-Z]+)\s*', text)
+    if found is None or found[2] not in UNITS or float(found[1]) <= 0:
+        raise ConfigError(
+            f'record_segment: expected a positive number with one of the units '
+            f'{", ".join(UNITS)}, got {text!r}; write for example 60 s or 2 GB'
+        )
+    return float(found[1]) * UNITS[found[2]], found[2] in SIZE_UNITS

@@ -23,7 +23,7 @@ from boxreg_ros.io.recorded_type import RecordedType
 from boxreg_ros.io.resync import MessageOrder
 from boxreg_ros.io.storage.files import is_ros1, part_of
 from boxreg_ros.io.storage.reader import Reader
-from boxreg_ros.io.storage.record import Bytes, Damage, Record
+from boxreg_ros.io.storage.record import Damage, Record
 from boxreg_ros.io.topics import ODOMETRY_TYPE, Topics
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Floats, Sweep
@@ -248,7 +248,7 @@ class Recording:
             if topic in self.data_topics and self._decoded_topics.isdisjoint(alike):
                 raise UnsupportedMessage(f'no message on {topic!r} can be read; first: {first}')
 
-    def box_message(self, data: Bytes) -> tuple[Any, BoxArray]:
+    def box_message(self, data: bytes) -> tuple[Any, BoxArray]:
         """
         Return a message of the boxes' topic from its bytes, and its boxes.
 
@@ -271,7 +271,7 @@ class Recording:
         encode = store.serialize_cdr if self._reader.is2 else store.serialize_ros1
         return bytes(encode(replaced, kind))
 
-    def cloud_message(self, topic: str, data: Bytes) -> Any:
+    def cloud_message(self, topic: str, data: bytes) -> Any:
         """
         Return a message of a topic of clouds from its bytes.
 
@@ -290,7 +290,7 @@ class Recording:
         encode = store.serialize_cdr if self._reader.is2 else store.serialize_ros1
         return bytes(encode(message, clouds.POINTS_TYPE))
 
-    def received_ns(self, topic: str, received_ns: int, data: Bytes) -> int:
+    def received_ns(self, topic: str, received_ns: int, data: bytes) -> int:
         """Return the receive time that a message on a topic of `apart` gets: its cloud's [ns]."""
         (connection, *_) = self._topics.connections({topic})
         return self._timeline.received_ns(connection, received_ns, data)
@@ -454,7 +454,7 @@ class Recording:
         is_boxes = record.connection.topic == self.boxes_topic
         if self._array_adapter is None or not is_boxes or record.data[:2] != CDR_BEGIN:
             return None
-        boxes = self._array_adapter.read_flawless(bytes(record.data))
+        boxes = self._array_adapter.read_flawless(record.data)
         if boxes is None or self._convention.is_standard:
             return boxes
         return self._convention.to_centers(boxes)
@@ -467,7 +467,7 @@ class Recording:
             boxes: BoxArray = self._adapter.from_msg(message)
         return boxes
 
-    def _stamp_of(self, connection: Connection, data: Bytes) -> int | None:
+    def _stamp_of(self, connection: Connection, data: bytes) -> int | None:
         """Return the stamp of clouds, boxes and motion [ns]; None if there is none."""
         if connection.topic in self._topics.static_transforms:
             return None

@@ -16,7 +16,7 @@ from heapq import merge
 from itertools import islice
 
 from boxreg_ros.io.storage.reader import Reader
-from boxreg_ros.io.storage.record import Bytes, Record
+from boxreg_ros.io.storage.record import Record
 from rosbags.interfaces import Connection
 
 APART_NS = 10**9
@@ -27,7 +27,7 @@ A live detector is slower than its clouds by 0.1 to 0.5 s; that order is the ord
 
 """
 
-StampOf = Callable[[Connection, Bytes], int | None]
+StampOf = Callable[[Connection, bytes], int | None]
 
 
 class MessageOrder:
@@ -90,7 +90,7 @@ class MessageOrder:
         streams += [self._by_stamp(c, start_ns, end_ns) for c in apart]
         return merge(*streams, key=lambda record: record.received_ns)
 
-    def received_ns(self, connection: Connection, received_ns: int, data: Bytes) -> int:
+    def received_ns(self, connection: Connection, received_ns: int, data: bytes) -> int:
         """Return the receive time that a message on one of the topics `apart` gets [ns]."""
         due_ns = self._due_ns(self._stamp_of(connection, data))
         if due_ns is None or abs(received_ns - due_ns) < APART_NS:

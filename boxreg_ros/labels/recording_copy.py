@@ -8,12 +8,12 @@ from copy import copy
 from dataclasses import asdict
 from heapq import merge
 from pathlib import Path
-from typing import Any, cast, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.files import opened
 from boxreg_ros.io.storage.mcap import McapFile
-from boxreg_ros.io.storage.record import Bytes, Definition
+from boxreg_ros.io.storage.record import Definition
 from boxreg_ros.labels.protocol import Provenance
 from mcap.records import Attachment
 from mcap.writer import Writer as McapWriter
@@ -37,7 +37,7 @@ class RawMessage(NamedTuple):
     log_time: int
     publish_time: int
     sequence: int
-    data: Bytes
+    data: bytes
 
 
 class RecordingCopy:
@@ -93,9 +93,8 @@ class RecordingCopy:
             self._channels[key] = self._writer.register_channel(
                 raw.topic, raw.encoding, schema_id, dict(raw.metadata)
             )
-        data = cast(bytes, raw.data)  # the writer takes views, too
         self._writer.add_message(
-            self._channels[key], raw.log_time, data, raw.publish_time, raw.sequence
+            self._channels[key], raw.log_time, raw.data, raw.publish_time, raw.sequence
         )
 
     def _schema_id(self, schema: tuple[str, str, bytes] | None) -> int:

@@ -62,6 +62,13 @@ class BoxesTypeSearch:
             return [TopicProblem(DiagnosticStatus.WARN, f'{self._name}: {text}')]
         if errors and not readable:
             return [TopicProblem(DiagnosticStatus.ERROR, f'{self._name}: {errors[0]}')]
+        refiners = self._topics.refiners('boxes')
+        if refiners and not types:
+            text = (
+                f'has nothing but the refined boxes of {refiners}; remap boxes to their input, or '
+                f'set boxes_type if they are meant'
+            )
+            return [TopicProblem(DiagnosticStatus.WARN, f'{self._name}: {text}')]
         if not types and time.monotonic() >= self._since + PATIENCE:
             return [self._topics.unpublished('boxes', set(ADAPTERS))]
         return []

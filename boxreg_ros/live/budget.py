@@ -48,6 +48,10 @@ class TickBudget:
     longest of `RECENT` ones, the reserve is the second largest overrun of `OVERRUNS` ticks: a
     single interruption of the process is ignored.
 
+    Final boxes are given up last. In a tick that is late with any plan, and after the early boxes
+    of any other, the windows that they need are solved, as long as these take no longer than what
+    a batch costs in any case (`BATCH_OVERHEAD`): else clouds would be dropped.
+
     Parameters
     ----------
     deadline : float
@@ -72,6 +76,7 @@ class TickBudget:
         self._publishing_times = deque[float](maxlen=RECENT)  # [s]
         self._overruns = deque[float](maxlen=OVERRUNS)  # of the planned end [s]
         self._times = deque[float](maxlen=RECENT)  # per window [s]
+        self._owed = 0
         self._arrivals = deque[float](maxlen=RECENT)
 
     def add_arrival(self, received: float) -> None:
@@ -85,6 +90,7 @@ class TickBudget:
         self._since = since
         self._solved_at = 0.0
         self._planned_end = inf
+        self._owed = 0
 
     def end(self) -> None:
         """End a tick, unless it has ended: its early boxes are published."""
@@ -94,17 +100,49 @@ class TickBudget:
             self._overruns.append(now - self._planned_end)
             self._solved_at = 0.0
 
-    def windows(self) -> int:
-        """Return how many windows may be solved; at least one, so that its time is measured."""
-        if not self._times:
-            return 1
-        reserve = max(0.0, min(LARGEST_RESERVE * self.seconds, _second_longest(self._overruns)))
-        planned_end = self._since + self.seconds - reserve
-        time_left = planned_end - _second_longest(self._publishing_times) - self._clock()
-        number = int(time_left / _second_longest(self._times)) - BATCH_OVERHEAD
-        if number > 0:  # else the tick is late with any plan
+    def windows(self, needed: int) -> int:
+        """
+        Return how many windows may be solved before the early boxes are published.
+
+        Parameters
+        ----------
+        needed : int
+            Windows per box array that refine every final box.
+
+        Returns
+        -------
+        limit : int
+            At least one, so that its time is measured.
+
+        """
+        self._owed = min(needed, BATCH_OVERHEAD)
+        number = 0
+        if self._times:
+            reserve = max(
+                0.0, min(LARGEST_RESERVE * self.seconds, _second_longest(self._overruns))
+            )
+            planned_end = self._since + self.seconds - reserve
+            time_left = planned_end - _second_longest(self._publishing_times) - self._clock()
+            number = int(time_left / _second_longest(self._times)) - BATCH_OVERHEAD
+        if number > 0:
             self._planned_end = planned_end
-        return max(1, number)
+            limit = number
+        else:  # the tick is late with any plan, or the first
+            limit = max(1, self._owed)
+        self._owed = max(0, self._owed - limit)
+        return limit
+
+    @property
+    def owed(self) -> int:
+        """Return how many windows to solve once the early boxes are published."""
+        return self._owed
+
+    def spare_windows(self) -> int:
+        """Return how many windows fit into the part of the period that no deadline covers."""
+        if not self._times:
+            return 0
+        spare = (1.0 - PART_OF_PERIOD) * self._period
+        return int(spare / _second_longest(self._times)) - BATCH_OVERHEAD
 
     def submit(self, windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
         """Return a function that calls `register` with these arguments, and times it."""
@@ -113,12 +151,14 @@ class TickBudget:
     @property
     def seconds(self) -> float:
         """Return the present deadline [s]."""
-        if self.deadline >= 0:
-            return self.deadline
-        period = FIRST_PERIOD
-        if len(self._arrivals) > 1:
-            period = (self._arrivals[-1] - self._arrivals[0]) / (len(self._arrivals) - 1)
-        return PART_OF_PERIOD * period
+        return self.deadline if self.deadline >= 0 else PART_OF_PERIOD * self._period
+
+    @property
+    def _period(self) -> float:
+        """Return the measured period of the boxes [s]."""
+        if len(self._arrivals) < 2:
+            return FIRST_PERIOD
+        return (self._arrivals[-1] - self._arrivals[0]) / (len(self._arrivals) - 1)
 
     def _timed(
         self, windows: list[Window], config: Config, model: InputModel

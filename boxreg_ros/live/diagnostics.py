@@ -8,7 +8,7 @@ from threading import Lock
 import time
 import traceback
 
-from boxreg_ros.reasons import FAULTS, Reason
+from boxreg_ros.reasons import FAULTS, Reason, REDUCE_LOAD
 from boxreg_ros.structures import REFINED
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -21,6 +21,8 @@ REASONS_WITHOUT_CLOUDS = (Reason.NO_TRANSFORM, Reason.NO_SWEEP)
 """Reasons that boxes get when no cloud arrives at all."""
 RATES = ('points_received', 'boxes_received', 'early_published', 'final_published')
 """Counters that are also reported as a rate."""
+LEAST_SHARE = 0.01
+"""Part of the final boxes without time that is worth a warning; chosen: fewer are a hiccup."""
 LATENCY_QUANTILES = (('median', 0.5), ('p99', 0.99), ('most', 1.0))
 
 
@@ -144,6 +146,9 @@ class Health:
         values |= _latency_values('static_points CPU', sorted(cpu for _, cpu in static))
         values |= {key: str(value) for key, value in facts.items()}
         values |= {key: str(number) for key, number in sorted(counts.items())}
+        late = _budget_text(recent)
+        if late and self.is_due(Reason.BUDGET):
+            self._logger.warning(late)
         level, message = _level_and_message(recent)
         return DiagnosticStatus(
             level=level, name=name, message=message,
@@ -189,12 +194,23 @@ def _level_and_message(recent: Counter[str]) -> tuple[bytes, str]:
     missing = [name for name in ('points', 'boxes') if not recent[f'{name}_received']]
     if missing:
         return DiagnosticStatus.WARN, f'nothing received on {" and ".join(missing)}'
+    late = _budget_text(recent)
+    if late:
+        return DiagnosticStatus.WARN, late
     if recent['kept'] and not recent['refined']:
         box_reasons = [reason for reason in Reason if reason.unit == 'box']
         why = max(box_reasons, key=lambda name: recent[name])
         text = f'no box was refined; most often {why}: {why.meaning}'
         return DiagnosticStatus.WARN, text
     return DiagnosticStatus.OK, 'refining'
+
+
+def _budget_text(recent: Counter[str]) -> str:
+    """Return the warning of final boxes without time, with their share; '' for few or none."""
+    share = recent[Reason.BUDGET] / max(1, recent['refined'] + recent['kept'])
+    if share < LEAST_SHARE:
+        return ''
+    return f'{Reason.BUDGET}: no time to refine {share:.0%} of the final boxes; {REDUCE_LOAD}'
 
 
 def _level_and_message_of(worst: Reason, recent: Counter[str]) -> tuple[bytes, str]:

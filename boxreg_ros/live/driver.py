@@ -408,6 +408,15 @@ class LiveRegistrar:
         ready = self._register(self._session.unmerged())
         return ready + self._outgoing(self._registrar.flush())
 
+    @property
+    def num_waiting(self) -> int:
+        """Return the number of tracks that wait for a window, see `BoxRegistrar.catch_up`."""
+        return self._registrar.num_waiting
+
+    def catch_up(self, limit: int) -> list[Outgoing]:
+        """Solve up to `limit` tracks that wait, for their final boxes."""
+        return self._outgoing(self._registrar.catch_up(limit))
+
     def reset(self) -> list[Outgoing]:
         """Forget everything but the transforms; return everything that is held."""
         ready = self.flush()

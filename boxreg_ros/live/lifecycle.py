@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from queue import Queue
 from threading import Event
 
 from boxreg_ros.errors import BoxregError
+from boxreg_ros.live.bond import Bond
 from boxreg_ros.live.node import BoxregNode
 from boxreg_ros.live.recording import RECORDING_TIME
 from boxreg_ros.live.worker import Worker
+from lifecycle_msgs.srv import ChangeState
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+
+AnswerChange = Callable[[ChangeState.Request, ChangeState.Response], ChangeState.Response]
 
 
 class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
@@ -19,13 +25,17 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
 
     ``configure`` takes the values of the parameters and warms up, ``activate`` creates topics and
     services, ``deactivate`` publishes the boxes held and destroys them, ``cleanup`` forgets tracks
-    and transforms. A transition that an error prevents is refused and logged in one line.
+    and transforms. A transition that an error prevents, or that the present state does not have,
+    is refused and logged in one line. While the node is active it keeps its end of a bond.
 
     """
 
     def __init__(self) -> None:
         BoxregNode.__init__(self)
         LifecycleNodeMixin.__init__(self)
+        service = self._service_change_state
+        service.callback = partial(self._answer_change, service.callback)
+        self._bond: Bond | None = None
         self._activated = Queue[Worker | None]()
         self._drained = Event()
         self._is_active = False
@@ -41,6 +51,7 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
         if self._is_active:
             self._drained.clear()
             self._activated.put(self.worker)
+            self._bond = Bond.offered_by(self)
         else:
             self.close_topics()
         return result
@@ -48,6 +59,8 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Publish the boxes held, then end topics and services."""
         self._is_active = False
+        if self._bond is not None:
+            self._bond.end()
         self.worker.stop()
         self._drained.wait()
         self.recording.wait(RECORDING_TIME)
@@ -79,6 +92,19 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
         if self._is_active:
             self.worker.stop()
         self._activated.put(None)
+
+    def _answer_change(
+        self, change: AnswerChange, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response:
+        """Answer a request; rclpy raises for a transition that the present state does not have."""
+        try:
+            return change(request, response)
+        except rclpy_implementation.RCLError:
+            _, state = self._state_machine.current_state
+            name = request.transition.label or request.transition.id
+            self.get_logger().warning(f'the state {state!r} has no transition {name!r}: refused')
+            response.success = False
+            return response
 
     def _tried(self, step: Callable[[], None]) -> TransitionCallbackReturn:
         """Return whether a step succeeds; log its error."""

@@ -10,6 +10,7 @@ import time
 from typing import Any
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
+from boxreg_ros.io.compilation import announced_compilation
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.warm_up import warm_up
 from boxreg_ros.io.whole_files import written_whole
@@ -19,6 +20,7 @@ from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.params import changed, declare, parameters_yaml, reals_from_integers
+from boxreg_ros.live.recorder_process import check_recording
 from boxreg_ros.live.recording import LabelRecording
 from boxreg_ros.live.topics import import_message, NodeTopics
 from boxreg_ros.live.worker import Worker
@@ -43,6 +45,8 @@ STATUS_PERIOD = 1.0
 """Time between two messages on /diagnostics [s]."""
 ODOMETRY_DEPTH = 50
 """Queue size of `odom`: a second at the rate of common odometry sources."""
+CHECKED_BY_RECORDER = ('record_formats', 'record_camera')
+"""Parameters whose values are known to the recorder alone."""
 FINALS_MARGIN = 10
 """Queue size of the boxes beyond what may be published at once at the end."""
 
@@ -91,8 +95,9 @@ class BoxregNode(Node):
     def configure(self) -> None:
         """Load or compile kernels, time a window, and make a registrar without any track."""
         config, options = self._settings
-        warm_up(config)
-        cdr.walker()
+        with announced_compilation(self.get_logger().info):
+            warm_up(config)
+            cdr.walker()
         self._budget = TickBudget(options.deadline)
         warm_up(config, self._budget.submit)  # once more, timed without imports and compilation
         self._live = LiveRegistrar(
@@ -116,6 +121,7 @@ class BoxregNode(Node):
 
         """
         _, options = self._settings
+        self._refuse_loop()
         self._topics = NodeTopics(self, self._health)
         self._opened.callback(self._topics.close)
         self._markers = self._topics.publish(
@@ -169,6 +175,16 @@ class BoxregNode(Node):
 
     # ------------------------------------------------------------ topics
 
+    def _refuse_loop(self) -> None:
+        """Raise ConfigError if the node would take its own output for its input."""
+        name = self.resolve_topic_name('boxes')
+        for output in ('refined_boxes', 'refined_boxes_final'):
+            if self.resolve_topic_name(output) == name:
+                raise ConfigError(
+                    f'boxes: expected the topic of a tracker, got {name!r}, where this node '
+                    f'publishes {output}; correct the remap'
+                )
+
     def _open_static_points(self, points_type: str) -> None:
         """Publish clouds without moving objects."""
         if canonical(points_type) != POINTS_TYPE:
@@ -199,17 +215,10 @@ class BoxregNode(Node):
         """Subscribe to odometry and transforms."""
         qos = QoSProfile(depth=ODOMETRY_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._topics.subscribe('nav_msgs/msg/Odometry', 'odom', self._on_odometry, qos)
-        try:
-            from tf2_ros import TransformListener
-        except ImportError:
-            self._subscribe_to_transforms()
-        else:
-            self._listener = TransformListener(_TransformsToInbox(self._inbox), self)
-            self._opened.callback(self._listener.unregister)
-            self.get_logger().debug('transforms are received by tf2_ros')
+        self._subscribe_to_transforms()
 
     def _subscribe_to_transforms(self) -> None:
-        """Subscribe to /tf and /tf_static with the QoS of tf2_ros, where it is not installed."""
+        """Subscribe to /tf and /tf_static with the QoS of tf2_ros."""
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         try:
             for topic, qos in (('/tf', QoSProfile(depth=100)), ('/tf_static', latched)):
@@ -291,7 +300,9 @@ class BoxregNode(Node):
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
-            changed(*self._settings, parameters)
+            _, options = changed(*self._settings, parameters)
+            if {parameter.name for parameter in parameters} & set(CHECKED_BY_RECORDER):
+                check_recording(options.record_camera, options.record_formats)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -340,16 +351,3 @@ class BoxregNode(Node):
         self._diagnostics.publish(message)
         if self._markers.get_subscription_count() and self.worker.cloud_frame:
             self.recording.show(self._markers, self.worker.cloud_frame)
-
-
-class _TransformsToInbox:
-    """The part of a tf2 buffer that `tf2_ros.TransformListener` writes to."""
-
-    def __init__(self, inbox: Inbox) -> None:
-        self._inbox = inbox
-
-    def set_transform(self, transform: Any, authority: str) -> None:
-        self._inbox.put_event('/tf', [transform])
-
-    def set_transform_static(self, transform: Any, authority: str) -> None:
-        self._inbox.put_event('/tf_static', [transform])

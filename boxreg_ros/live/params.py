@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config, Setting, settings
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.label_feed import segment_limit
 from boxreg_ros.io.lidars import Lidars
 from msg_adapters import CLOUD_TYPES, POINTS_TYPE
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS
@@ -393,6 +394,8 @@ def _checked(item: Setting, value: Any) -> Any:
         raise ConfigError(f'{item.name}: expected one of {", ".join(item.choices)}, got {value!r}')
     if item.low is not None and item.high is not None and not item.low <= value <= item.high:
         raise ConfigError(f'{item.name}: expected {_bounds_of(item)}, got {value!r}')
+    if item.name == 'record_segment':
+        segment_limit(value)
     if item.name == 'deadline' and value == 0:
         raise ConfigError(
             'deadline: expected more than 0 s, or a negative number for most of the measured '

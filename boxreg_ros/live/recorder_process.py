@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 import json
 import pickle
 import subprocess
 import sys
 from threading import Condition, Event, Thread
+import time
 from typing import Any, IO, NamedTuple
 
-from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.label_feed import (
     FinalBoxes,
     LabelCloud,
@@ -22,7 +24,7 @@ from boxreg_ros.io.label_feed import (
     Tick,
 )
 from boxreg_ros.live.diagnostics import Health
-from boxreg_ros.reasons import REASONS
+from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.structures import Floats, Sweep
 from msg_adapters import clouds, pointcloud
 import numpy as np
@@ -37,6 +39,44 @@ that, and are the labels themselves: 100 s.
 """
 TICK_PERIOD = 1.0
 """Longest time between two items sent, so that the status stays up to date [s]."""
+RESTARTS = 3
+"""Times that a recorder that died is started again within `RESTART_PERIOD`; chosen."""
+RESTART_PERIOD = 60.0
+"""A recorder that dies more often has a lasting reason [s]; chosen."""
+TOTALS = (
+    'segments',
+    'frames',
+    'boxes',
+    'clouds',
+    'size',
+    'recovered',
+    'without_cloud',
+    'left_out',
+)
+"""Counters of `RecorderStatus` since the start."""
+
+
+CHECK_TIME = 10.0
+"""Longest wait for the check of parameters [s]; chosen: one takes a second."""
+
+
+def check_recording(camera: str, formats: Sequence[str]) -> None:
+    """
+    Let a recorder check parameters: the node does not import the label formats.
+
+    Raises
+    ------
+    ConfigError
+        For a format that cannot be recorded, or a calibration file that cannot be read.
+
+    """
+    command = [sys.executable, '-m', PROGRAM, camera, *formats]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=CHECK_TIME)
+    except subprocess.TimeoutExpired:
+        return  # a busy machine; the recorder checks again when it starts
+    if done.returncode:
+        raise ConfigError(done.stdout.strip() or done.stderr.strip())
 
 
 class RawCloud(NamedTuple):
@@ -61,6 +101,9 @@ class RawCloud(NamedTuple):
 class RecorderProcess:
     """
     Start the recorder and send it the items put. Thread-safe; `put` never waits.
+
+    A recorder that dies, for want of memory for example, is started again: it then completes the
+    segment that was open, and goes on with the items that wait.
 
     Parameters
     ----------
@@ -99,11 +142,16 @@ class RecorderProcess:
         self.status = RecorderStatus()
         self.has_ended = Event()
         self._health = health
-        self._on_begin = on_begin
+        self._on_begin: Callable[[], None] | None = on_begin
         self._on_end = on_end
         self._is_finishing = False
+        self._has_begun = False  # the present recorder has sent its first status
+        self._has_stopped = False  # it sends no more
         self._changed = Condition()
-        self._waiting: deque[Any] = deque([settings])
+        self._waiting: deque[Any] = deque()
+        self._before = RecorderStatus()  # the totals of recorders that died
+        self._arrays_sent = 0  # to the present one
+        self._died_at = deque[float](maxlen=RESTARTS)
         self._sizes = dict.fromkeys(CAPACITY, 0)
         Thread(target=self._run, args=(predecessor,), daemon=True).start()
 
@@ -139,52 +187,19 @@ class RecorderProcess:
         return {f'{kind} waiting': self._sizes[kind] for kind in CAPACITY}
 
     def _run(self, predecessor: RecorderProcess | None) -> None:
-        """Start the recorder and send it the items put."""
+        """Run the recorder, and again where it dies, until it has ended."""
         if predecessor is not None:
             predecessor.has_ended.wait()
-        process = subprocess.Popen(
-            [sys.executable, '-m', PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            process_group=0,  # the SIGINT of a terminal would end it before it ignores signals
-        )  # fmt: skip
-        assert process.stdin is not None
-        Thread(target=self._read_all, args=(process,), daemon=True).start()
-        self._send_all(process.stdin)
-
-    def _send_all(self, target: IO[bytes]) -> None:
-        """Send the items put, until `finish` or the end of the recorder."""
-        try:
-            with target:
-                while True:
-                    item = self._next()
-                    if item is None:
-                        return
-                    pickle.dump(_decoded(item), target, protocol=pickle.HIGHEST_PROTOCOL)
-                    target.flush()
-        except BrokenPipeError:
-            return  # the recorder has ended; its last status states why
-
-    def _next(self) -> Any:
-        """Return the next item, a `Tick` where there is none for a while, or None at the end."""
-        with self._changed:
-            if not self._waiting and not self._is_finishing:
-                self._changed.wait(TICK_PERIOD)
-            if not self._waiting:
-                return None if self._is_finishing else Tick()
-            item = self._waiting.popleft()
-            kind = _kind(item)
-            if kind in self._sizes:
-                self._sizes[kind] -= 1
-            return item
-
-    def _read_all(self, process: subprocess.Popen[bytes]) -> None:
-        """Read the status of the recorder until it ends."""
-        assert process.stdout is not None
-        lines = iter(process.stdout)
-        self._take_status(next(lines, b''))
-        self._on_begin()
-        for line in lines:
-            self._take_status(line)
-        exit_status = process.wait()
+        exit_status = self._run_once()
+        while self._is_to_start_again(exit_status):
+            lost = self._arrays_sent - (self.status.frames - self._before.frames)
+            self._health.report(
+                Reason.RECORDER_RESTARTED,
+                f'the recorder ended with exit status {exit_status} and is started again, which '
+                f'completes its segment; up to {lost} box arrays under way to it may be lost',
+            )
+            self._before = self.status
+            exit_status = self._run_once()
         error = self.status.error
         if not error and (exit_status or not self._is_finishing):
             error = (
@@ -196,10 +211,101 @@ class RecorderProcess:
             self.has_ended.set()
             self._waiting.clear()
         self._on_end(error)
+        self._announce()
+
+    def _run_once(self) -> int:
+        """Start the recorder, send it the items put, and return its exit status."""
+        self._arrays_sent = 0
+        self._has_begun = False
+        self._has_stopped = False
+        process = subprocess.Popen(
+            [sys.executable, '-m', PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            process_group=0,  # the SIGINT of a terminal would end it before it ignores signals
+        )  # fmt: skip
+        assert process.stdin is not None and process.stdout is not None
+        reader = Thread(target=self._read_all, args=(process.stdout,), daemon=True)
+        reader.start()
+        self._send_all(process.stdin)
+        reader.join()
+        return process.wait()
+
+    def _is_to_start_again(self, exit_status: int) -> bool:
+        """Return whether the recorder died without a reason of its own, and not too often."""
+        if not exit_status or self.status.error or not self._has_begun:
+            return False
+        now = time.monotonic()
+        if len(self._died_at) == RESTARTS and now < self._died_at[0] + RESTART_PERIOD:
+            return False
+        self._died_at.append(now)
+        return True
+
+    def _send_all(self, target: IO[bytes]) -> None:
+        """Send the settings and the items put, until `finish` or the end of the recorder."""
+        item: Any = None
+        try:
+            with target:
+                _send(self.settings, target)
+                while True:
+                    item = self._next()
+                    if item is None:
+                        return
+                    _send(_decoded(item), target)
+                    self._arrays_sent += isinstance(item, FinalBoxes)
+        except BrokenPipeError:  # the recorder has ended; its last status may state why
+            if item is not None:
+                self._put_back(item)
+
+    def _put_back(self, item: Any) -> None:
+        """Return an item that could not be sent to the head of the queue."""
+        with self._changed:
+            self._waiting.appendleft(item)
+            kind = _kind(item)
+            self._sizes[kind] = self._sizes.get(kind, 0) + 1
+
+    def _next(self) -> Any:
+        """Return the next item, a `Tick` where there is none for a while, or None at the end."""
+        with self._changed:
+            if not (self._waiting or self._is_finishing or self._has_stopped):
+                self._changed.wait(TICK_PERIOD)
+            if self._has_stopped:
+                return None
+            if not self._waiting:
+                return None if self._is_finishing else Tick()
+            item = self._waiting.popleft()
+            kind = _kind(item)
+            if kind in self._sizes:
+                self._sizes[kind] -= 1
+            return item
+
+    def _read_all(self, source: IO[bytes]) -> None:
+        """Read the status of the recorder until it ends."""
+        for line in source:
+            self._take_status(line)
+            self._has_begun = True
+            if not self.status.error:
+                self._announce()
+        with self._changed:
+            self._has_stopped = True
+            self._changed.notify()
+
+    def _announce(self) -> None:
+        """Call `on_begin`, once."""
+        on_begin, self._on_begin = self._on_begin, None
+        if on_begin is not None:
+            on_begin()
 
     def _take_status(self, line: bytes) -> None:
         if line:
-            self.status = RecorderStatus(**json.loads(line))
+            status = RecorderStatus(**json.loads(line))
+            totals: dict[str, Any] = {
+                name: getattr(status, name) + getattr(self._before, name) for name in TOTALS
+            }
+            self.status = replace(status, **totals)
+
+
+def _send(item: Any, target: IO[bytes]) -> None:
+    pickle.dump(item, target, protocol=pickle.HIGHEST_PROTOCOL)
+    target.flush()
 
 
 def _kind(item: Any) -> str:

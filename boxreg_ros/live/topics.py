@@ -220,8 +220,14 @@ class NodeTopics:
         return f'subscribed to {"; ".join(subscribed)}. Publishing {"; ".join(published)}'
 
     def types_published(self, topic: str) -> set[str]:
-        """Return the message types that other nodes publish on a topic."""
-        return {info.topic_type for info in self._node.get_publishers_info_by_topic(topic)}
+        """Return the message types that are published on a topic, but for refined boxes."""
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        return {p.topic_type for p in publishers if not self._refines(*_node_of(p))}
+
+    def refiners(self, topic: str) -> str:
+        """Return the names of the nodes of this kind that publish on a topic; '' for none."""
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        return _nodes([p for p in publishers if self._refines(*_node_of(p))])
 
     def problems(self) -> list[TopicProblem]:
         """Return the reasons why messages do not arrive now, on any topic of the node."""
@@ -333,12 +339,21 @@ class NodeTopics:
                 f'are sent, and shared memory and network in between',
             )
 
+    def _refines(self, name: str, namespace: str) -> bool:
+        """Return whether a node is of this kind, by its services: topics may be remapped."""
+        try:
+            services = self._node.get_service_names_and_types_by_node(name, namespace)
+        except RuntimeError:  # it has ended in the meantime
+            return False
+        offered = {service for service, _ in services}
+        prefix = f'{namespace.rstrip("/")}/{name}'
+        return {f'{prefix}/save_config', f'{prefix}/start_recording'} <= offered
+
     def _published_topics(self, type_names: set[str]) -> list[str]:
-        """Return the topics of given types that nodes publish, without those of this node."""
-        own = (self._node.get_name(), self._node.get_namespace())
+        """Return the topics of given types that nodes publish, those of refined boxes excluded."""
         found = set()
         for node in self._node.get_node_names_and_namespaces():
-            if node == own:
+            if self._refines(*node):
                 continue
             try:
                 topics = self._node.get_publisher_names_and_types_by_node(*node)
@@ -448,6 +463,11 @@ def _type_problem(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> TopicPr
         f'{endpoint.name}: expected messages of type {endpoint.type_name}, got {types} from '
         f'{_nodes(peers)}; {remedy}',
     )
+
+
+def _node_of(peer: TopicEndpointInfo) -> tuple[str, str]:
+    """Return name and namespace of the node that an endpoint belongs to."""
+    return peer.node_name, peer.node_namespace
 
 
 def _nodes(peers: list[TopicEndpointInfo]) -> str:

@@ -251,11 +251,15 @@ class Worker:
             self._publish(self._guarded(self._live.flush))
         if self._board.is_showing and self._live.has_ceased(now):
             self._markers.publish(self._board.clear())
+        self._waited = 0.0
+        spare = self._budget.spare_windows()
+        if spare > 0 and self._live.num_waiting:
+            self._catch_up(spare)
+            return
         period = HELD_PERIOD if self._live.is_holding else IDLE_PERIOD
         if self._live.static_points is not None:
             period = min(period, self._live.static_points.due(now))
         self._inbox.wake_up.wait(period)
-        self._waited = 0.0
 
     def _release_boxes_without_cloud(self, item: ReceivedMessage | None) -> None:
         """Release boxes that have waited too long for a cloud, unless one is at hand."""
@@ -310,10 +314,16 @@ class Worker:
             self.fixed_frame = self._live.fixed_frame
             self._logger.info(f'fixed frame is {self.fixed_frame!r}')
         self._publish(ready)
+        self._catch_up(self._budget.owed)
         if is_placeholder(item.content) and self._board.is_showing:
             self._markers.publish(self._board.clear())
         if isinstance(item.content, BoxArray):
             self._collect_garbage()
+
+    def _catch_up(self, limit: int) -> None:
+        """Solve up to `limit` tracks that wait, after the early boxes are published."""
+        if limit > 0:
+            self._publish(self._guarded(partial(self._live.catch_up, limit)))
 
     def _collect_garbage(self) -> None:
         """Free objects in cycles after a tick, so that no collection interrupts the next one."""

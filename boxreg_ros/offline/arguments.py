@@ -192,12 +192,9 @@ def config_from(args: argparse.Namespace) -> Config:
     return Settings(**values_of(args, Settings)).effective()
 
 
-def request_from(args: argparse.Namespace) -> Request:
-    """Return the request that the arguments describe."""
-    return Request(tuple(args.recordings), config=config_from(args), **values_of(args, Request))
-
-
-def topics_from(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the values of `TOPICS`, as `source_of` takes them."""
+def request_from(args: argparse.Namespace, *recordings: Path) -> Request:
+    """Return the request of the arguments; options that a command lacks have their defaults."""
+    paths = recordings or tuple(args.recordings)
+    command = () if recordings else tuple(getattr(args, 'arguments', ()))
     values = values_of(args, Request)
-    return {name: values[name] for name in ('lidars', 'boxes', 'odometry', 'convention')}
+    return Request(paths, config=config_from(args), command=command, **values)

@@ -28,15 +28,14 @@ from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.arguments import (
     add_options,
     add_recordings,
-    config_from,
+    request_from,
     Settings,
     TOPICS,
-    topics_from,
 )
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import spare_file
-from boxreg_ros.offline.sources import source_of, true_boxes
+from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.structures import Floats, is_valid_box, POSE, ROLL
 import numpy as np
 import yaml
@@ -276,11 +275,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Estimate, print a table, and write the settings."""
-    config = config_from(args)
+    request = request_from(args)
+    config = request.config
     if args.output:
         _check_output(args)
     truth = true_boxes(args.truth)
-    recording = source_of(args.recordings, **topics_from(args))
+    recording = request.recording()
     recording.has_boxes = not args.no_boxes
     drive = Drive.of(recording, truth, config.tolerance, config)
     if drive.left_out:

@@ -14,7 +14,7 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance, COVARIANCES, read_covariances
 from boxreg_ros.io.times import time_range
-from boxreg_ros.offline.arguments import add_options, TOPICS, topics_from, words_of
+from boxreg_ros.offline.arguments import add_options, request_from, TOPICS, words_of
 from boxreg_ros.offline.box_scores import (
     by_overlap,
     groups,
@@ -147,9 +147,8 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
         found = _table_in_frame(BoxTable.read_frames(source), frame_id)
         return found.rows(np.array([status != REJECTED for status in found.status], bool))
     from boxreg_ros.io.fixed_frame import input_boxes  # slow to import: it reads bags
-    from boxreg_ros.offline.sources import source_of
 
-    recording = source_of([source], **topics_from(args))
+    recording = request_from(args, source).recording()
     arrays, others = input_boxes(recording, args.fixed_frame)
     if others:
         _warn(others)

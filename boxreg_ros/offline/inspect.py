@@ -25,10 +25,11 @@ from boxreg_ros.errors import BoxregError
 from boxreg_ros.offline.arguments import (
     add_options,
     add_recordings,
+    request_from,
     TOPICS,
-    topics_from,
     words_of,
 )
+from boxreg_ros.offline.notes import sparse_boxes
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import spare_file
 from boxreg_ros.offline.timeline import check_plotly, merged_spans, write_timeline
@@ -94,17 +95,17 @@ def inspect(args: argparse.Namespace) -> dict[str, Any]:
         If nothing in it can be read.
 
     """
-    from boxreg_ros.offline.sources import scene_address, source_of
+    from boxreg_ros.offline.sources import scene_address
 
-    topics = topics_from(args)
-    source = source_of(args.recordings, **topics)
+    request = request_from(args)
+    source = request.recording()
     if scene_address(args.recordings) is None:
         facts = _contents(args.recordings)
     else:
         facts = _scene_contents(args.recordings)
     try:
         with source as recording:
-            facts |= _sampled(recording, topics['convention'])
+            facts |= _sampled(recording, request.convention)
             facts['damage'] = [damage._asdict() for damage in recording.damages]
     except BoxregError as error:
         facts['problems'].append(str(error))
@@ -345,7 +346,11 @@ def _warnings(sample: _Sample, finding: str, recording: ItemSource) -> Iterator[
     if recording.unreadable:
         first = next(iter(recording.first_errors.values()))
         yield f'{recording.unreadable.total()} messages cannot be read; first: {first}'
-    offset = _summary(sample)['stamp_offset_s']
+    facts = _summary(sample)
+    periods = facts['boxes_period_s'], facts['sweep_period_s']
+    if all(periods):
+        yield from sparse_boxes(*(1 / period for period in periods))
+    offset = facts['stamp_offset_s']
     if offset is not None and offset > DEFAULTS.reach:
         yield (
             f'boxes are up to {offset:.3f} s away from the nearest cloud; those beyond reach '

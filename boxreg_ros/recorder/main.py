@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 import os
 from pathlib import Path
 import pickle
-import re
 import shutil
 import signal
 import sys
@@ -23,14 +22,16 @@ from boxreg_ros.io.label_feed import (
     LabelCloud,
     RecorderSettings,
     RecorderStatus,
+    segment_limit,
     Split,
 )
 from boxreg_ros.io.transforms import TIME_JUMP
 from boxreg_ros.io.whole_files import DISK_ERRORS
 from boxreg_ros.labels import LabelFrame, module_of
+from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.cloud_spool import FOLDER as CLOUDS
 from boxreg_ros.labels.cloud_spool import Spool
-from boxreg_ros.recorder.folder import locked, recover_all
+from boxreg_ros.recorder.folder import lock_of, recover_all, Recovery
 from boxreg_ros.recorder.segment import (
     journal_settings,
     next_number,
@@ -39,8 +40,6 @@ from boxreg_ros.recorder.segment import (
     SegmentFiles,
 )
 
-UNITS = {'s': 1.0, 'min': 60.0, 'h': 3600.0, 'MB': 1e6, 'GB': 1e9}
-SIZE_UNITS = ('MB', 'GB')
 STATUS_PERIOD = 1.0
 """Time between two lines of status [s]; that of /diagnostics."""
 RATE_PERIODS = 10
@@ -85,7 +84,7 @@ class Recorder:
         if settings.with_points:
             self._spool = Spool(self._folder, settings.config)
         self._thread = ThreadPoolExecutor(1)
-        self._recovery: Future[int] | None = self._thread.submit(recover_all, cut_off)
+        self._recovery: Future[Recovery] | None = self._thread.submit(recover_all, cut_off)
         self._completions: deque[tuple[Segment, Future[None]]] = deque()
         self._written: Counter[str] = Counter()  # by field of `RecorderStatus`
         self._growth = Growth()
@@ -119,7 +118,7 @@ class Recorder:
 
     def status(self) -> RecorderStatus:
         """
-        Return the present state, and end a segment that has reached its size.
+        Return the present state; store the open segment, and end one that has reached its size.
 
         Raises
         ------
@@ -129,8 +128,10 @@ class Recorder:
         """
         self._collect()
         segment = self._segment
-        if segment is not None and segment.is_deleted:
-            raise _deleted(self._folder)
+        if segment is not None:
+            if segment.is_deleted:
+                raise _deleted(self._folder)
+            segment.sync()
         open_bytes = 0 if segment is None else self._growth.measure(segment.files)
         size = self._written['size'] + open_bytes
         if segment is not None and self._limits_bytes and open_bytes >= self._limit:
@@ -191,7 +192,9 @@ class Recorder:
     def _collect(self) -> None:
         """Count completed segments; raise the error of one that could not be completed."""
         if self._recovery is not None and self._recovery.done():
-            self._written['recovered'] = self._recovery.result()
+            recovery = self._recovery.result()
+            self._written['recovered'] = recovery.recovered
+            self._written['damaged'] = len(recovery.damaged)
             self._recovery = None
         while self._completions and self._completions[0][1].done():
             segment, completion = self._completions[0]
@@ -228,25 +231,6 @@ class Growth:
         return max(after - before, 0) / (now - since) if now > since else 0.0
 
 
-def segment_limit(text: str) -> tuple[float, bool]:
-    """
-    Return the length of a segment [s or bytes], and whether it is in bytes.
-
-    Raises
-    ------
-    ConfigError
-        If the text is not a positive number with a unit of `UNITS`.
-
-    """
-    found = re.fullmatch(r'\s*(\d+(?:\.\d+)?)\s*([a-zA-Z]+)\s*', text)
-    if found is None or found[2] not in UNITS or float(found[1]) <= 0:
-        raise ConfigError(
-            f'record_segment: expected a positive number with one of the units '
-            f'{", ".join(UNITS)}, got {text!r}; write for example 60 s or 2 GB'
-        )
-    return float(found[1]) * UNITS[found[2]], found[2] in SIZE_UNITS
-
-
 def check_formats(settings: RecorderSettings) -> None:
     """
     Refuse formats that do not exist, lack a package or an option, or need a recording.
@@ -257,12 +241,8 @@ def check_formats(settings: RecorderSettings) -> None:
         By name of the parameter.
 
     """
+    check_each(settings.formats, settings.camera)
     for name in settings.formats:
-        if name in NOT_LIVE:
-            raise ConfigError(
-                f'record_formats: expected formats of labels alone, got {name!r}, which copies a '
-                f'recording; leave it out, and record the topics with ros2 bag record'
-            )
         if 'camera' in options_of(name) and not settings.camera:
             raise ConfigError(
                 f'record_camera: expected a calibration file for the format {name!r}, got none; '
@@ -275,6 +255,30 @@ def check_formats(settings: RecorderSettings) -> None:
                 f'record_points: expected a format with clouds in record_formats, got '
                 f'{", ".join(settings.formats)}; add one, see boxreg formats'
             )
+
+
+def check_each(formats: Sequence[str], camera: str) -> None:
+    """
+    Refuse what is wrong by itself: a format, or a calibration file.
+
+    Raises
+    ------
+    ConfigError
+        By name of the parameter.
+
+    """
+    for name in formats:
+        if name in NOT_LIVE:
+            raise ConfigError(
+                f'record_formats: expected formats of labels alone, got {name!r}, which copies a '
+                f'recording; leave it out, and record the topics with ros2 bag record'
+            )
+        options_of(name)
+    if camera:
+        try:
+            Camera.read(Path(camera).expanduser())
+        except ConfigError as error:
+            raise ConfigError(f'record_camera: {error}') from None
 
 
 def options_of(name: str) -> tuple[str, ...]:
@@ -297,7 +301,7 @@ def serve(source: IO[bytes], report: Callable[[RecorderStatus], None]) -> None:
     recorder: Recorder | None = None
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with locked(folder):
+        with lock_of(folder):
             recorder = Recorder(settings)
             report(recorder.status())
             _record(recorder, source, report)
@@ -361,7 +365,14 @@ def _deleted(folder: Path) -> RecordingError:
 
 
 def main() -> int:
-    """Record from standard input; exit with 1 after an error, which the last status has."""
+    """
+    Record from standard input; exit with 1 after an error, which the last status has.
+
+    With arguments, a calibration file or '' and formats, check these instead.
+
+    """
+    if sys.argv[1:]:
+        return _check(*sys.argv[1:])
     for number in (signal.SIGINT, signal.SIGTERM):  # the end of the input is the signal to end
         signal.signal(number, signal.SIG_IGN)
     os.nice(NICENESS)
@@ -370,6 +381,16 @@ def main() -> int:
     except BoxregError as error:
         _print(RecorderStatus(error=' '.join(str(error).split())))
         os._exit(1)  # the files that cannot be written would raise again when they are closed
+    return 0
+
+
+def _check(camera: str, *formats: str) -> int:
+    """Print what is wrong with parameters in one line; return 1 if something is."""
+    try:
+        check_each(formats, camera)
+    except BoxregError as error:
+        print(' '.join(str(error).split()))
+        return 1
     return 0
 
 

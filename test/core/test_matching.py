@@ -5,6 +5,7 @@ from itertools import permutations
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.matching import StampMatcher
+from boxreg_ros.core.pending import PendingArray
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
@@ -213,3 +214,12 @@ def test_boxes_of_another_frame_than_their_sweep_are_refused():
     matcher = StampMatcher(Config(), Counter())
     matcher.add_sweep(Sweep(100, '', np.zeros((0, 3))))
     assert len(list(matcher.add_boxes(boxes(100)))) == 1
+
+
+def test_an_invalid_box_does_not_take_the_id_of_a_valid_one():
+    values = np.tile([0, 0, 0, 4, 2, 1.5, 0, 0, 0.0], (4, 1))
+    values[0, 3] = np.nan
+    ids = ('a', 'a', 'a', '')
+    array = PendingArray(BoxArray(0, 'odom', ids, ('car',) * 4, np.ones(4), values))
+    array.set_reasons('no_sweep')
+    assert array.reasons == ['invalid_box', 'no_sweep', 'duplicate_track_id', 'no_track_id']

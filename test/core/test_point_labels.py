@@ -128,3 +128,13 @@ def test_clouds_without_times_are_labelled_at_their_stamp():
     found = labelled([moving(20.0)], [[11.9, 0, 1], [7.5, 0, 1]])
     assert found.track.tolist() == [0, BACKGROUND]
     assert len(labelled([moving(20.0)], np.zeros((0, 3))).track) == 0
+
+
+def test_an_object_that_was_missed_goes_on_for_a_while():
+    late = STAMPS[-1] + 2 * SECOND // 10
+    arrays = np.append(STAMPS, late)
+    labeller = PointLabeller([moving(20.0)], arrays, AT_STAMP, np.zeros((1, 6)), coast=0.5)
+    front = np.array([[20.0 + 4.0 + 1.9, 0, 1]])
+    assert labeller.label(Sweep(int(late), 'odom', front)).track.tolist() == [0]
+    found = labelled([moving(20.0)], front, late, arrays=arrays)
+    assert found.track.tolist() == [BACKGROUND]

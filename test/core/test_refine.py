@@ -403,19 +403,6 @@ def test_an_outlier_box_does_not_affect_the_others(far):
         assert after.mean() > before.mean()
 
 
-def test_an_outlier_box_is_corrected_when_it_is_the_newest():
-    # 3 m to the side it overlaps with nothing. The boxes before it predict the position of the
-    # object, and its points correct it; without neighbours the IoU is about a third.
-    found = []
-    for seed in range(4):
-        track, truth = a_track(seed, truth=drive(20))
-        boxes = track.boxes.copy()
-        boxes[[8, 15], 1] += 3.0
-        refined = only(replace(track, boxes=boxes), Config(estimate='early'))
-        found.append(iou_3d(refined.boxes, truth)[[8, 15]])
-    assert np.mean(found) > 0.7
-
-
 # --- marginalisation prior -----------------------------------------------------------------------
 
 

@@ -1,12 +1,13 @@
 """Files of a few bytes that claim or hold any number: refused soon, in bounded memory."""
 
-from contextlib import closing
+from contextlib import closing, contextmanager
 import json
 import resource
 import sqlite3
 import struct
 import subprocess
 import sys
+import time
 
 from boxreg_ros.errors import TransferError
 from boxreg_ros.io.storage.files import Files, opened, part_of
@@ -91,6 +92,26 @@ def database(folder, change):
     return file
 
 
+def many_messages(count):
+    """Return the statements that make a table of messages without content, and no index."""
+    return (
+        'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data);'
+        f'WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < {count}) '
+        'INSERT INTO messages SELECT i, (SELECT min(id) FROM topics), i, NULL FROM n'
+    )
+
+
+@contextmanager
+def limited(kind, soft):
+    """Limit a resource of this process in a block."""
+    before = resource.getrlimit(kind)
+    resource.setrlimit(kind, (soft, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(kind, before)
+
+
 def test_bombs_are_refused_in_bounded_time_and_memory(tmp_path, whole):
     zeros = bytes(2**27)
     files = {
@@ -151,15 +172,16 @@ def test_a_full_disk_of_temporary_files_is_named(tmp_path, whole, monkeypatch):
     packed = zstandard.ZstdCompressor().compress(whole.read_bytes())
     (folder / 'b.mcap.zstd').write_bytes(packed)
     monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
-    try:
-        with pytest.raises(TransferError) as caught:
-            Files(part_of(folder))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with limited(resource.RLIMIT_FSIZE, 2000), pytest.raises(TransferError) as caught:
+        Files(part_of(folder))
     assert str(caught.value).startswith(f'temporary files in {tmp_path}: expected room')
     assert 'TMPDIR' in str(caught.value)
+
+
+def test_no_room_for_sorting_a_database_is_no_damage(tmp_path):
+    path = database(tmp_path / 'drive', many_messages(200_000))
+    with limited(resource.RLIMIT_FSIZE, 2000), pytest.raises(TransferError, match='TMPDIR'):
+        opened(path)
 
 
 def test_a_file_that_cannot_be_opened_is_no_damage(tmp_path, whole):
@@ -169,11 +191,20 @@ def test_a_file_that_cannot_be_opened_is_no_damage(tmp_path, whole):
     for name in ('a', 'b'):
         (folder / f'{name}.mcap').write_bytes(whole.read_bytes())
     part = part_of(folder)
-    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     with open('/dev/null') as newest:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (newest.fileno() + 2, limits[1]))
-        try:
-            with pytest.raises(TransferError, match='raise the limit of open files'):
-                Files(part)
-        finally:
-            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+        next_number = newest.fileno() + 1
+        with (
+            limited(resource.RLIMIT_NOFILE, next_number + 1),
+            pytest.raises(TransferError, match='raise the limit of open files'),
+        ):
+            Files(part)
+
+
+def test_many_damages_take_time_in_proportion(tmp_path):
+    count = 30_000
+    path = database(tmp_path / 'drive', many_messages(count))
+    begin = time.process_time()
+    with closing(opened(path)) as file:
+        assert not list(file.messages(file.connections, None, None))
+        assert len(file.damages) == count
+    assert time.process_time() - begin < 5  # comparing each with all takes minutes

@@ -12,6 +12,7 @@ from boxreg_ros.errors import BoxregError, RecordingError
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage import chunks
 from boxreg_ros.io.storage.files import opened
+from boxreg_ros.io.storage.record import Record
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Sweep
 from mcap.reader import make_reader
@@ -116,10 +117,58 @@ def test_a_damaged_chunk_is_left_out(tmp_path, drive, whole, where, has_index):
 
 def test_a_summary_with_a_wrong_checksum_is_not_trusted(tmp_path, drive, whole):
     data = bytearray(whole.read_bytes())
-    data[-100] ^= 0xFF
+    with whole.open('rb') as file:
+        index = make_reader(file).get_summary().chunk_indexes[12]
+    times = struct.pack('<QQ', index.message_start_time, index.message_end_time)
+    at = data.rindex(times)
+    data[at : at + 16] = bytes(16)  # as if its messages were before all others
     path = tmp_path / 'summary.mcap'
     path.write_bytes(data)
+    sweeps, boxes, damages = read(path, start=0.45, end=1.0)
+    assert (sweeps, boxes, damages) == (drive.stamps[5:10], drive.stamps[5:10], [])
+
+
+def test_an_index_of_places_beyond_the_file_is_not_used(tmp_path, drive, whole):
+    path = rewritten(whole, tmp_path / 'places.mcap', enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    first, length = chunk_places(path)[5]
+    at = data.rindex(struct.pack('<QQ', first, length))
+    data[at : at + 8] = struct.pack('<Q', len(data))
+    path.write_bytes(data)
     assert read(path) == (drive.stamps, drive.stamps, [])
+
+
+@pytest.mark.parametrize('has_index', [True, False])
+def test_a_chunk_that_claims_too_much_is_left_out(tmp_path, drive, whole, has_index):
+    path = rewritten(whole, tmp_path / 'flat.mcap', compression=CompressionType.NONE)
+    data = bytearray(path.read_bytes())
+    first, _ = chunk_places(path)[5]
+    at = first + 9 + 16  # opcode and length; first and last time
+    data[at : at + 8] = struct.pack('<Q', chunks.MAX_CHUNK_BYTES + 1)
+    path.write_bytes(data if has_index else data[:-300])
+    sweeps, boxes, damages = read(path)
+    assert 24 - 3 <= len(sweeps) + len(boxes) < 24
+    assert damages[0].first_byte == first
+    assert 'size of 1073741825 bytes' in damages[0].reason
+
+
+def test_messages_are_held_up_to_a_limit():
+    # Four chunks that all cover the whole time, so that all of them are needed at once.
+    times = {k: range(k, 40, 4) for k in range(4)}
+    sources = [chunks.Chunk(k, k + 1, k, 36 + k, {0: 10}) for k in range(4)]
+    loaded = []
+
+    def load(chunk):
+        loaded.append(chunk.first_byte)
+        return [Record(None, time, bytes(100), time) for time in times[chunk.first_byte]]
+
+    of_a_chunk = 10 * (100 + chunks.RECORD_BYTES)
+    for limit, most_loads in ((4 * of_a_chunk, 4), (2.5 * of_a_chunk, 40)):
+        loaded.clear()
+        found = [record.received_ns for record in chunks._merged(sources, load, limit)]
+        assert found == list(range(40))
+        assert 4 <= len(loaded) <= most_loads
+        assert (len(loaded) == 4) == (limit == 4 * of_a_chunk)
 
 
 @pytest.mark.parametrize('buffer_bytes', [1, 2**28])
@@ -308,6 +357,18 @@ def test_a_damaged_bag(tmp_path, bag, damage):
     assert set(sweeps + boxes) <= set(drive.stamps)
     assert damages[0].first_byte > 0
     assert damages[0].start_ns is not None
+
+
+def test_a_chunk_of_a_bag_that_claims_too_much_is_left_out(tmp_path, bag):
+    _, path = bag
+    data = bytearray(path.read_bytes())
+    mark = data.index(b'op=\x05', len(data) // 3)
+    at = data.index(b'size=', mark - 60) + len(b'size=')
+    data[at : at + 4] = struct.pack('<I', chunks.MAX_CHUNK_BYTES + 1)
+    path.write_bytes(data)
+    sweeps, boxes, damages = read(path)
+    assert 40 < len(sweeps) + len(boxes) < 80
+    assert [damage.reason for damage in damages] == ['damaged chunk (size of 1073741825 bytes)']
 
 
 # Fuzzing ---------------------------------------------------------------------------------------

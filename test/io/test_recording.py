@@ -1,15 +1,17 @@
 """Recordings of every storage: items, definitions, motion, parts and errors."""
 
+from contextlib import closing
 import sqlite3
 
 from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.storage.files import part_of
+from boxreg_ros.io.storage.files import opened, part_of
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Sweep
 from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
+from mcap_files import rewritten
 import numpy as np
 import pytest
 from ros_messages import Drive, Messages, SECOND, START, write_recording
@@ -250,6 +252,23 @@ def test_start_and_end_select_a_part(tmp_path):
     text = error_of(path, start=5.0)
     assert '1.9 s' in text
     assert 'got 5 to the end' in text
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3', 'rosbag1'])
+def test_a_part_of_a_file_has_its_first_time_but_not_its_last(tmp_path, storage):
+    drive = Drive(sweeps=12, ros1=storage == 'rosbag1')
+    path = write_recording(
+        tmp_path / 'drive', drive.items, storage, drive.messages, chunk_bytes=2_000
+    )
+    if storage == 'mcap':  # one message per chunk
+        path = rewritten(path, tmp_path / 'chunks.mcap', chunk_size=1)
+    received = sorted(time_ns for _, time_ns, _ in drive.items)
+    start, stop = received[8], received[-8]
+    with closing(opened(path if path.is_file() else next(path.glob('*.db3')))) as file:
+        records = list(file.messages(file.connections, start, stop))
+    times = [record.received_ns for record in records]
+    assert times == [time_ns for time_ns in received if start <= time_ns < stop]
+    assert start in times and stop in received and stop not in times
 
 
 # Errors ----------------------------------------------------------------------------------------

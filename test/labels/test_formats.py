@@ -35,7 +35,6 @@ from boxreg_ros.labels import (
     can_read,
     FORMATS,
     frames_of,
-    is_written,
     LabelFrame,
     module_of,
     Options,
@@ -258,6 +257,23 @@ def test_nuscenes(tmp_path, name, version):
     (pose,) = json.loads((folder / version / 'ego_pose.json').read_text())
     assert pose['translation'] == [10.0, 2.0, 1.0]
     np.testing.assert_allclose(pose['rotation'], [sqrt(0.5), 0, 0, sqrt(0.5)], atol=1e-9)
+
+
+def test_two_boxes_of_one_track_in_a_sample_of_nuscenes_are_two_instances(tmp_path):
+    frames = [frame_of([IN_FIXED] * len(ids), ids, STAMP + i) for i, ids in enumerate(['aa', 'a'])]
+    _, folder = written('nuscenes', tmp_path, frames)
+    tables = folder / 'v1.0-boxreg'
+    rows = json.loads((tables / 'sample_annotation.json').read_text())
+    samples = {}
+    for row in rows:
+        samples.setdefault(row['instance_token'], []).append(row['sample_token'])
+    assert sorted(len(found) for found in samples.values()) == [1, 2]
+    assert all(len(set(found)) == len(found) for found in samples.values())
+    counts = {
+        row['token']: row['nbr_annotations']
+        for row in json.loads((tables / 'instance.json').read_text())
+    }
+    assert counts == {token: len(found) for token, found in samples.items()}
 
 
 def test_argoverse2(tmp_path):
@@ -488,16 +504,6 @@ def test_boxes_without_track_id_are_not_merged(tmp_path, name):
 def test_empty_drive_round_trips(tmp_path, name):
     _, folder = written(name, tmp_path, [])
     assert list(frames_of(name, folder)) == []
-
-
-@pytest.mark.parametrize('name', READABLE_FORMATS)
-def test_is_written_detects_missing_files(tmp_path, name):
-    _, folder = written(name, tmp_path)
-    assert is_written(name, tmp_path)
-    for path in folder.rglob('*'):
-        if (path.is_file() and path.parent != tmp_path) or path.name == 'boxes.csv':
-            path.unlink()
-    assert not is_written(name, tmp_path)
 
 
 @pytest.mark.parametrize('name', READABLE_FORMATS)

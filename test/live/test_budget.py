@@ -29,16 +29,16 @@ def solved(deadline):
     return budget, clock
 
 
-def windows(budget, since):
+def windows(budget, since, needed=1):
     """Return the number of windows of a tick, with those that a batch costs in any case."""
     budget.begin(since)
-    return budget.windows() + BATCH_OVERHEAD
+    return budget.windows(needed) + BATCH_OVERHEAD
 
 
 def tick(budget, clock, solving=0.0, publishing=0.0):
     """Run a tick whose solving and publishing take a time [s]."""
     budget.begin(clock.now)
-    budget.windows()
+    budget.windows(1)
     clock.now += solving
     budget.submit([], Config(), InputModel(Config().faces))()
     clock.now += publishing
@@ -47,7 +47,8 @@ def tick(budget, clock, solving=0.0, publishing=0.0):
 
 def test_one_window_is_solved_while_no_time_is_known():
     budget = TickBudget(3600.0)
-    assert budget.windows() == 1
+    assert budget.windows(1) == 1
+    assert budget.spare_windows() == 0
 
 
 def test_the_number_of_windows_follows_the_time_left():
@@ -55,6 +56,31 @@ def test_the_number_of_windows_follows_the_time_left():
     assert windows(budget, clock.now) == pytest.approx(100, abs=1)
     assert windows(budget, clock.now - 0.05) == pytest.approx(50, abs=1)
     assert windows(budget, clock.now - 0.1) == 1 + BATCH_OVERHEAD
+
+
+def test_final_boxes_are_given_up_last():
+    budget, clock = solved(0.1)
+    overdue = clock.now - 0.1
+    assert windows(budget, overdue, needed=7) == 7 + BATCH_OVERHEAD
+    assert budget.owed == 0
+    # More than a batch costs in any case would make the next tick late, too.
+    assert windows(budget, overdue, needed=100) == 2 * BATCH_OVERHEAD
+    # A tick that can be in time is, and the rest follows.
+    in_time = clock.now - 0.1 + 1e-3 * (BATCH_OVERHEAD + 3.5)
+    assert windows(budget, in_time, needed=7) == 3 + BATCH_OVERHEAD
+    assert budget.owed == 4
+    assert windows(budget, clock.now, needed=7) > 7 + BATCH_OVERHEAD
+    assert budget.owed == 0
+
+
+def test_spare_windows_fit_into_the_rest_of_the_period():
+    budget, _ = solved(0.1)
+    for received in (5.0, 5.2, 5.4):
+        budget.add_arrival(received)
+    assert budget.spare_windows() + BATCH_OVERHEAD == pytest.approx(40, abs=1)
+    for received in (50.0, 50.1, 50.2):
+        budget.add_arrival(received)
+    assert budget.spare_windows() < 0
 
 
 def test_time_for_publishing_is_left():

@@ -64,6 +64,31 @@ def test_message_names_the_most_frequent_reason_if_no_box_was_refined():
     assert 'no box was refined' in status.message and 'no_gain' in status.message
 
 
+def test_the_share_of_final_boxes_without_time_is_a_warning():
+    log = Log()
+    health = Health(log)
+    for name in ('points_received', 'boxes_received'):
+        health.count(name)
+    health.set_core_counts({'budget': 3, 'kept': 4, 'refined': 1})
+    status = health.status('node', {})
+    assert status.level == DiagnosticStatus.WARN
+    assert 'budget: no time to refine 60% of the final boxes' in status.message
+    assert [text for _, text in log.entries] == [status.message]
+    for name in ('points_received', 'boxes_received'):
+        health.count(name)
+    health.set_core_counts({'budget': 4, 'kept': 5, 'refined': 200})  # one of 200: a hiccup
+    assert health.status('node', {}).level == DiagnosticStatus.OK
+
+
+def test_quaternions_of_zeros_are_named():
+    log = Log()
+    health = Health(log)
+    health.count('invalid_box', 2)
+    health.log_counts()
+    ((_, text),) = log.entries
+    assert 'quaternion' in text and 'zeros' in text and 'w=1' in text
+
+
 def test_each_reason_is_logged_once_per_period():
     log = Log()
     health = Health(log)

@@ -503,3 +503,29 @@ def test_a_lidar_that_tf_does_not_know_holds_back_the_others_only_once():
     reasons = [reason for reason, _, _ in live.reports]
     assert reasons.count('sweep_without_transform') == 6
     assert "from 'rear'" in live.reports[0][1]
+
+
+def test_a_concatenated_cloud_waits_for_its_info_while_there_are_infos():
+    drive = LidarDrive(3, 'info')
+    live = Live('odom', lidars=Lidars(info='/points_info'))
+    for topic, _, message in drive.items:
+        if topic in ('/tf', '/tf_static'):
+            live.tree.add_transforms(message.transforms, topic == '/tf_static')
+    infos = items_of(drive, '/points_info')
+    clouds = [
+        ReceivedMessage(message, live.placement.sweep_of(message, '/points'), 0.0)
+        for message in items_of(drive, '/points')
+    ]
+
+    def are_ready(now=0.5):
+        return [live.is_ready(cloud, now) for cloud in clouds]
+
+    assert are_ready() == [False, False, False]
+    live.placement.add_info(infos[1])
+    assert are_ready() == [False, True, False]
+    assert are_ready(now=1.0) == [True, True, True]  # the timeout
+    live.process(clouds[0])  # without its info: later ones do not wait
+    assert live.reports[-1][0] == 'cloud_without_info'
+    assert are_ready() == [True, True, True]
+    live.placement.add_info(infos[2])  # there are infos again
+    assert are_ready() == [False, True, True]

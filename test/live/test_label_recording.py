@@ -3,6 +3,7 @@
 import csv
 from importlib.util import find_spec
 import os
+import signal
 import time
 
 from boxreg_ros.cli import main
@@ -69,11 +70,11 @@ class Robot:
         return self._request(Trigger, name, Trigger.Request())
 
     def set_parameter(self, name, value):
-        """Set a parameter of the node."""
+        """Set a parameter of the node; return the reason if it is refused."""
         parameters = [Parameter(name, value=value).to_parameter_msg()]
         request = SetParameters.Request(parameters=parameters)
         (result,) = self._request(SetParameters, 'set_parameters', request).results
-        assert result.successful, result.reason
+        return '' if result.successful else result.reason
 
     def _request(self, kind, name, request):
         client = self.graph.node.create_client(kind, f'/boxreg_node/{name}')
@@ -212,6 +213,16 @@ def test_services_start_split_and_stop_a_recording(tmp_path):
             assert not answer.success
             assert error in answer.message
         (tmp_path / 'file').write_text('')
+        for parameter, value, words in (
+            ('record_segment', '1 week', ('record_segment', '1 week', '60 s')),
+            ('record_formats', ['kitty'], ('kitty', 'kitti')),
+            ('record_formats', ['csv', 'mcap'], ('record_formats', 'mcap', 'ros2 bag record')),
+            ('record_camera', str(tmp_path / 'missing'), ('record_camera', 'missing')),
+            ('record_camera', str(tmp_path / 'file'), ('record_camera', 'file')),
+        ):
+            reason = robot.set_parameter(parameter, value)
+            assert [word for word in words if word not in reason] == [], reason
+        assert robot.set_parameter('record_formats', ['csv', 'openlabel']) == ''
         robot.set_parameter('record_to', str(tmp_path / 'file'))
         answer = robot.call('start_recording')
         assert not answer.success
@@ -248,6 +259,29 @@ def test_services_start_split_and_stop_a_recording(tmp_path):
         rows = list(csv.DictReader(file))
     assert len(rows) == 30
     assert {row['track_id'] for row in rows} == {'1', '2'}
+
+
+def test_a_recorder_that_died_is_started_again(tmp_path):
+    """Its segment is completed, the next begins, and stopping answers as ever."""
+    path = Drive(sweeps=20).write(tmp_path / 'drive')
+    folder = tmp_path / 'labels'
+    with graph_in(tmp_path) as graph:
+        robot = Robot(graph, path, record_to=folder)
+        per_sweep = 3  # transform, cloud, boxes
+        robot.play(robot.records[: 1 + 10 * per_sweep])
+        graph.wait(lambda: robot.state()[2].get('frames') == '7', 'final boxes')  # lag 3
+        os.kill(int((folder / '.lock').read_text()), signal.SIGKILL)
+        graph.wait(lambda: 'recorder_restarted' in robot.node.output(), 'a warning')
+        robot.play(robot.records[1 + 10 * per_sweep :])
+        answer = robot.call('stop_recording')
+        assert answer.success, answer.message
+        assert robot.state()[0] == DiagnosticStatus.OK
+        robot.stop()
+    assert 'exit status -9' in robot.node.output()
+    assert 'ERROR' not in robot.node.output()
+    assert len(robot.early) == 20
+    rows = sorted(index_of(folder), key=lambda row: row['segment'])
+    assert [(row['frames'], row['recovered']) for row in rows] == [('7', '1'), ('13', '0')]
 
 
 def test_two_nodes_another_clock_and_a_killed_node(tmp_path):

@@ -6,12 +6,15 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import time
 
+from lifecycle_msgs.msg import Transition
 from paths import ROOT, SHARE, TEST
 import pytest
 from ros_domain import next_domain
-from ros_graph import graph_in, numbers_changed, play, publishers_for, records_of
-from ros_messages import DETECTIONS, Drive
+from ros_graph import graph_in, numbers_changed, PATIENCE, play, publishers_for, records_of
+from ros_messages import DETECTIONS, Drive, MARKERS
+from test_lifecycle import Manager
 import yaml
 
 pytest.importorskip('launch_ros', reason='launch_ros is not installed')
@@ -46,11 +49,12 @@ def environment(tmp_path):
     (prefix / 'share' / 'boxreg_ros').symlink_to(SHARE)
     programs = prefix / 'lib' / 'boxreg_ros'
     programs.mkdir(parents=True)
-    program = (
-        f'#!{sys.executable}\nfrom boxreg_ros.live.main import main\nraise SystemExit(main())\n'
-    )
-    (programs / 'boxreg_node').write_text(program)
-    (programs / 'boxreg_node').chmod(0o755)
+    for name, function in (('boxreg_node', 'main'), ('boxreg_lifecycle_node', 'lifecycle')):
+        (programs / name).write_text(
+            f'#!{sys.executable}\nfrom boxreg_ros.live.main import {function}\n'
+            f'raise SystemExit({function}())\n'
+        )
+        (programs / name).chmod(0o755)
     paths = [str(prefix), os.environ['AMENT_PREFIX_PATH']]
     return {
         **os.environ, 'AMENT_PREFIX_PATH': os.pathsep.join(paths),
@@ -133,11 +137,45 @@ def test_launch_testing_sees_refined_boxes_and_exit_codes(environment, tmp_path)
     assert log.read_text().count('Ran ') == 2  # while the node runs, and after its end
 
 
+def wait_for(text, log):
+    """Wait until a log has a text."""
+    deadline = time.monotonic() + PATIENCE
+    while not (log.exists() and text in log.read_text()):
+        assert time.monotonic() < deadline, log.read_text()
+        time.sleep(0.1)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'kind'), [((), MARKERS), ((f'boxes_type:={DETECTIONS}',), DETECTIONS)]
+)
+def test_the_parameter_file_wins_over_defaults_and_not_over_arguments(
+    environment, tmp_path, arguments, kind
+):
+    write_params(tmp_path / 'robot.yaml', boxes_type=MARKERS)
+    log = tmp_path / 'launch.log'
+    with launched(environment, log, 'params:=robot.yaml', *arguments):
+        wait_for(f'boxes are {kind}', log)
+
+
+def test_the_lifecycle_node_waits_for_its_manager(environment, tmp_path):
+    write_params(tmp_path / 'robot.yaml', boxes_type=DETECTIONS, use_sim_time=True)
+    log = tmp_path / 'launch.log'
+    with graph_in(tmp_path) as graph:
+        environment['ROS_DOMAIN_ID'] = str(graph.domain)
+        with launched(environment, log, 'params:=robot.yaml', 'lifecycle:=true'):
+            manager = Manager(graph)
+            assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
+            assert manager.change(Transition.TRANSITION_ACTIVATE) == (True, 'active')
+            wait_for(f'boxes are {DETECTIONS}', log)
+            graph.wait(lambda: graph.node.count_subscribers('/clock') == 1, 'use_sim_time')
+
+
 @pytest.mark.parametrize(
     ('argument', 'words'),
     [
         ('use_sim_time:=maybe', ('use_sim_time', 'maybe', 'true', 'false')),
         ('log_level:=loud', ('log_level', 'loud', 'debug', 'fatal')),
+        ('lifecycle:=on', ('lifecycle', 'on', 'true')),
         ('respawn:=yes', ('respawn', 'yes', 'true')),
         ('rviz:=1', ('rviz', "'true', 'false'")),
         ('params:=missing.yaml', ('params file', 'missing.yaml', 'Error opening')),

@@ -104,6 +104,43 @@ def test_each_activation_records_its_own_segments(graph, tmp_path):
     assert [row.frames for row in read_index(folder)] == [6, 6]
 
 
+def test_a_transition_that_the_state_does_not_have_is_refused(graph):
+    node = graph.start(command=COMMAND)
+    manager = Manager(graph)
+    assert manager.change(Transition.TRANSITION_ACTIVATE) == (False, 'unconfigured')
+    assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
+    assert manager.change(Transition.TRANSITION_CONFIGURE) == (False, 'inactive')
+    assert manager.change(200) == (False, 'inactive')
+    assert manager.change(Transition.TRANSITION_INACTIVE_SHUTDOWN) == (True, 'finalized')
+    assert manager.change(Transition.TRANSITION_CONFIGURE) == (False, 'finalized')
+    refused = [line for line in node.output().splitlines() if 'has no transition' in line]
+    assert len(refused) == 4
+    assert ended_cleanly(node)
+
+
+def test_an_active_node_keeps_its_end_of_a_bond(graph):
+    """As bondcpp of a Nav2 lifecycle manager reads it: an id, a heartbeat, and the end."""
+    heartbeats = graph.collect('bond/msg/Status', '/bond')
+    node = graph.start(command=COMMAND)
+    manager = Manager(graph)
+    assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
+    assert not heartbeats
+    for _ in range(2):
+        assert manager.change(Transition.TRANSITION_ACTIVATE) == (True, 'active')
+        graph.wait(lambda: len(heartbeats) > 5, 'heartbeats')
+        assert manager.change(Transition.TRANSITION_DEACTIVATE) == (True, 'inactive')
+        graph.wait(lambda: not heartbeats[-1].active, 'the end of the bond')
+        assert all(status.active for status in heartbeats[:-1])
+        (instance,) = {(status.id, status.instance_id) for status in heartbeats}
+        assert instance[0] == 'boxreg_node'
+        begun, ended = (heartbeats[row].header.stamp for row in (0, -1))
+        seconds = ended.sec - begun.sec + 1e-9 * (ended.nanosec - begun.nanosec)
+        assert (len(heartbeats) - 2) * 0.1 < seconds + 0.1  # no more often than promised
+        assert heartbeats[0].heartbeat_period == pytest.approx(0.1)
+        heartbeats.clear()
+    assert ended_cleanly(node)
+
+
 def test_an_activation_that_fails_leaves_the_node_inactive(graph):
     node = graph.start('-p', 'boxes_type:=std_msgs/msg/String', command=COMMAND)
     manager = Manager(graph)

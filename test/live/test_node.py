@@ -2,7 +2,6 @@
 
 from contextlib import ExitStack
 from dataclasses import replace
-from importlib.util import find_spec
 import signal
 import subprocess
 import sys
@@ -38,11 +37,11 @@ from ros_graph import (
 )
 from ros_messages import DETECTIONS, Drive, MARKERS, START
 
-WITHOUT_TF2_MSGS, WITHOUT_TF2_ROS, WITHOUT_NUMBA = (
+WITHOUT_TF2_MSGS, WITHOUT_NUMBA = (
     f'import sys; sys.modules["{package}"] = None\n'
     'from boxreg_ros.live.main import main\n'
     'sys.exit(main())'
-    for package in ('tf2_msgs', 'tf2_ros', 'numba')
+    for package in ('tf2_msgs', 'numba')
 )
 
 
@@ -135,27 +134,6 @@ def test_late_transforms_are_awaited_and_invalid_boxes_are_unchanged(graph, tmp_
         ego = np.array([0.5 * drive.stamps.index(array.stamp_ns), 0, 2.0])
         error = array.boxes[:, :3] + ego - drive.truth[array.stamp_ns][:, :3]
         assert np.nanmax(np.abs(error)) < 0.4
-
-
-@pytest.mark.parametrize('package', ['tf2_ros', 'none'])
-def test_transforms_are_received_with_and_without_tf2_ros(graph, tmp_path, package):
-    if package == 'tf2_ros' and find_spec('tf2_ros') is None:
-        pytest.skip('tf2_ros is not installed')
-    records = records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    command = ('-m', 'boxreg_ros.live.main') if package == 'tf2_ros' else ('-c', WITHOUT_TF2_ROS)
-    options = ('-p', 'transform_timeout:=20.0', '--log-level', 'boxreg_node:=debug')
-    node = graph.start(*RELIABLE, *QUICK, *options, command=command)
-    graph.wait_until_connected()
-    play(graph, records, early)
-    graph.wait(lambda: values_of(diagnostics).get('early_published') == '6', 'diagnostics')
-    values = values_of(diagnostics)
-    assert (values['fixed_frame'], values.get('no_transform')) == ('odom', None)
-    assert int(values['refined']) > 0
-    assert ended_cleanly(node)
-    assert ('transforms are received by tf2_ros' in node.output()) == (package == 'tf2_ros')
 
 
 def test_boxes_without_a_fixed_frame_are_published_unchanged(graph, tmp_path):
@@ -465,13 +443,14 @@ def refused(tmp_path_factory):
         'range': ['--ros-args', '-p', 'window:=2'],
         'boxes': ['--ros-args', '-p', 'boxes_type:=std_msgs/msg/String'],
         'type': ['--ros-args', '-p', 'boxes_type:=Detection3DArray'],
-        'device': ['--ros-args', '-p', 'device:=abacus'],
         'file': ['--ros-args', '--params-file', 'missing.yaml'],
         'qos': ['--ros-args', '-p', 'qos_overrides./points.subscription.depth:=deep'],
         'depth': ['--ros-args', '-p', 'qos_overrides./refined_markers.publisher.depth:=0'],
         'policy': ['--ros-args', '-p', 'qos_overrides./odom.subscription.reliability:=yes'],
         'deadline': ['--ros-args', '-p', 'deadline:=0'],
         'list': ['--ros-args', '-p', 'vehicle.names:=[]'],
+        'loop': ['--ros-args', '-r', 'boxes:=refined_boxes'],
+        'segment': ['--ros-args', '-p', 'record_segment:=1 week'],
     }
     folder = tmp_path_factory.mktemp('refused')
     started = {
@@ -488,13 +467,14 @@ def refused(tmp_path_factory):
         ('range', 2, ('window', '3', 'got 2')),
         ('boxes', 1, ('std_msgs/msg/String', 'Detection3DArray')),
         ('type', 1, ("'Detection3DArray'", 'vision_msgs/msg/Detection3DArray')),
-        ('device', 2, ('device', 'abacus', 'cpu')),
         ('file', 2, ('missing.yaml',)),
         ('qos', 2, ('./points.subscription.depth: expected a whole number', "got 'deep'")),
         ('depth', 2, ('qos_overrides./refined_markers.publisher.depth', 'from 1 to', 'got 0')),
         ('policy', 2, ('qos_overrides./odom.subscription.reliability', 'best_effort', 'got True')),
         ('deadline', 2, ('deadline', 'more than 0 s', 'got 0')),
         ('list', 2, ('vehicle.names', "['']")),
+        ('loop', 2, ('boxes', "'/refined_boxes'", 'correct the remap')),
+        ('segment', 2, ('record_segment', "'1 week'", '60 s')),
     ],
 )
 def test_invalid_arguments_are_reported_in_one_line(refused, case, status, words):

@@ -81,19 +81,26 @@ def test_launch_file_starts_the_node_with_its_arguments():
     arguments = {item.get('name'): item for item in launch.iter('arg')}
     assert all(item.get('description') for item in arguments.values())
     node = next(item for item in launch.iter('node') if item.get('pkg') == 'boxreg_ros')
-    assert node.get('exec') == arguments['name'].get('default') == 'boxreg_node'
+    programs = [(i.get('value'), i.get('if')) for i in launch.iter('let')][:2]
+    assert node.get('exec') == '$(var boxreg_program)'
+    assert programs == [('boxreg_node', None), ('boxreg_lifecycle_node', '$(var lifecycle)')]
+    assert arguments['name'].get('default') == 'boxreg_node'
     for argument in ('name', 'namespace', 'respawn'):
         assert node.get(argument) == f'$(var {argument})'
     # As a parameter of launch, a file that does not exist would be a mere warning.
-    assert node.get('ros_args') == '--log-level $(var log_level) --params-file $(var params)'
+    words = ' '.join(node.get('ros_args').split())
+    assert words.startswith('--log-level $(var log_level) --params-file $(var params) $(if ')
     assert {item.get('from') for item in node.iter('remap')} == {'points', 'boxes', 'odom'}
-    given = [item.get('from') or item.get('name') for item in node.iter('param')]
-    assert given == ['boxes_type', 'use_sim_time']  # they override the file
-    for name in ('use_sim_time', 'respawn', 'rviz'):
+    for name in ('boxes_type', 'use_sim_time'):  # after the file: they win where they are given
+        assert arguments[name].get('default') == ''
+        assert f'{name}:=$(var {name})' in words
+    assert not list(node.iter('param'))
+    for name in ('use_sim_time', 'lifecycle', 'respawn', 'rviz'):
         choices = [item.get('value') for item in arguments[name].iter('choice')]
-        assert choices == ['true', 'false']
+        assert choices[-2:] == ['true', 'false']
     text = (SHARE / 'boxreg.launch.xml').read_text(encoding='utf-8')
-    assert set(re.findall(r'\$\(var (\w+)\)', text)) == set(arguments)
+    variables = {item.get('name') for item in launch.iter('let')}
+    assert set(re.findall(r'\$\(var (\w+)\)', text)) == {*arguments, *variables}
     for file in re.findall(r'find-pkg-share boxreg_ros\)/([\w.]+)', text):
         assert (SHARE / file).is_file()
 

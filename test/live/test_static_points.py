@@ -72,9 +72,12 @@ def test_static_points(graph: Graph, tmp_path):
         own = owners[[rows[tuple(point)] for point in points.tolist()]]
         if sweep.stamp_ns < scene.sweeps[4].stamp_ns:
             continue  # the motion of the objects is not known yet
-        speeds = [np.ptp(actor.motion.poses[:, :2], axis=0).max() for actor in scene.actors]
-        is_moving = np.append(np.array(speeds) > 0.5, False)
-        is_parked = np.append(np.array(speeds) == 0, False)
+        seconds = (sweep.stamp_ns - scene.sweeps[0].stamp_ns) * 1e-9
+        ends = np.array([seconds - 0.05, seconds + 0.05])
+        steps = [np.diff(actor.motion.at(ends)[:, :2], axis=0) for actor in scene.actors]
+        paths = [np.ptp(actor.motion.poses[:, :2], axis=0).max() for actor in scene.actors]
+        is_moving = np.append([np.linalg.norm(step) > 0.03 for step in steps], False)
+        is_parked = np.append(np.array(paths) == 0, False)
         moving_left += is_moving[own].sum()
         moving += is_moving[owners].sum()
         parked_left += is_parked[own].sum()

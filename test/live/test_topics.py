@@ -125,6 +125,23 @@ def test_mistyped_remaps_are_reported_with_the_existing_topics(graph):
     assert ended_cleanly(node)
 
 
+def test_outputs_of_another_node_are_not_taken_for_inputs(graph):
+    graph.publisher(DETECTIONS, '/tracks')
+    diagnostics = graph.collect(DIAGNOSTICS, '/third/diagnostics')
+    first = graph.start('-p', f'boxes_type:={DETECTIONS}')
+    graph.wait(lambda: graph.node.count_publishers('/refined_boxes') == 1, 'the first node')
+    mistyped = ('-r', '__ns:=/second', '-r', 'boxes:=/track', '-p', f'boxes_type:={DETECTIONS}')
+    second = graph.start(*mistyped)
+    chained = ('-r', '__ns:=/third', '-r', 'boxes:=/refined_boxes')
+    third = graph.start(*chained, '-r', '/diagnostics:=/third/diagnostics')
+    parts = ('/refined_boxes', 'refined boxes of /boxreg_node', 'set boxes_type')
+    assert '[WARN]' in reported(graph, third, diagnostics, *parts)
+    graph.wait(lambda: '/track: nobody publishes it' in second.output(), 'a proposal')
+    assert 'a fitting type: /tracks;' in second.output()
+    assert 'boxes are' not in third.output()
+    assert all(ended_cleanly(node) for node in (first, second, third))
+
+
 def test_silent_publishers_are_reported_until_they_publish(graph):
     publisher = graph.publisher(POINTS, '/points')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
@@ -143,9 +160,20 @@ def test_silent_publishers_are_reported_until_they_publish(graph):
     assert ended_cleanly(node)
 
 
+WITH_TF2_ROS = """
+import sys
+from types import SimpleNamespace
+listener = SimpleNamespace(unregister=lambda: None)
+sys.modules['tf2_ros'] = SimpleNamespace(TransformListener=lambda buffer, node: listener)
+from boxreg_ros.live.main import main
+sys.exit(main())
+"""
+"""The node beside another package that could subscribe to /tf in its place."""
+
+
 def test_start_up_line_names_resolved_topics_with_type_and_qos(graph):
     remaps = ('-r', '__ns:=/front', '-r', 'points:=/lidar/points', '-r', '__node:=refiner')
-    node = graph.start(*remaps, '-p', f'boxes_type:={DETECTIONS}')
+    node = graph.start(*remaps, '-p', f'boxes_type:={DETECTIONS}', command=('-c', WITH_TF2_ROS))
     graph.wait(lambda: 'boxes are' in node.output(), 'the start-up line')
     # The outputs exist before anything is published.
     for topic in ('refined_boxes', 'refined_boxes_final', 'refined_markers'):
@@ -157,6 +185,8 @@ def test_start_up_line_names_resolved_topics_with_type_and_qos(graph):
         f'/lidar/points [{POINTS}] best_effort volatile keep_last 40',
         f'/front/boxes [{DETECTIONS}] best_available volatile keep_last',
         '/front/odom [nav_msgs/msg/Odometry] best_effort',
+        '/tf [tf2_msgs/msg/TFMessage] reliable volatile',
+        '/tf_static [tf2_msgs/msg/TFMessage] reliable transient_local',
         f'/front/refined_boxes [{DETECTIONS}] reliable volatile',
         f'/front/refined_boxes_final [{DETECTIONS}] reliable volatile',
         f'/front/refined_markers [{MARKERS}] reliable volatile keep_last 10',

@@ -15,6 +15,7 @@ MEASUREMENTS = {
     'tracks': 'broken tracks before and after each completing step',
     'sensitivity': 'accuracy with each setting halved and doubled',
     'highway': 'accuracy at 5 and at 30 m/s, with boxes of either time',
+    'points': 'labels of points against those of a simulation',
     'lidars': 'accuracy on a truck with LiDARs at its corners',
     'covariance': 'covariances against errors, by estimate and class',
     'review': 'how early the review list shows the bad tracks',

@@ -9,16 +9,17 @@ may overlap in time, or lie in any order. At most `BUFFER_BYTES` of them are buf
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from heapq import heapify, heappop, heappush
+from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.io.storage.record import (
-    Bytes,
     Damage,
-    note,
+    Damages,
     one_line,
     Record,
     shown,
@@ -81,7 +82,7 @@ class StoredMessage(NamedTuple):
 
     connection_id: int
     received_ns: int
-    data: Bytes
+    data: bytes | memoryview
     published_ns: int
     sequence: int
 
@@ -105,7 +106,7 @@ class ChunkedFile(ABC):
         self._file = byte_source_of(path)
         self.size = self._file.size
         self.connections: list[Connection] = []
-        self.damages: list[Damage] = []
+        self.damages: Damages = {}
         self._chunks: list[Chunk] = []
         try:
             self._open()
@@ -127,15 +128,14 @@ class ChunkedFile(ABC):
 
         def load(chunk: Chunk) -> list[Record]:
             read_ahead(chunk)
-            records = [
+            return [
                 Record(
-                    wanted[message.connection_id], message.received_ns, message.data,
+                    wanted[message.connection_id], message.received_ns, bytes(message.data),
                     message.published_ns, message.sequence,
                 )
                 for message in self._messages_of(chunk)
                 if message.connection_id in wanted and _is_within(message.received_ns, start, stop)
             ]  # fmt: skip
-            return _without_chunk(records)
 
         chunks = [
             chunk
@@ -179,7 +179,8 @@ class ChunkedFile(ABC):
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> None:
-        note(self.damages, Damage(self.name, reason, first_byte, end_byte, start_ns, end_ns))
+        damage = Damage(self.name, reason, first_byte, end_byte, start_ns, end_ns)
+        self.damages[damage] = None
 
     def _bytes(self, first_byte: int, end_byte: int) -> bytes:
         """Return a part of the file; fewer bytes at its end."""
@@ -194,16 +195,22 @@ class ChunkedFile(ABC):
 
     def _locate_damages(self) -> None:
         """Give damages found by a scan the times of the chunks before and behind them."""
-        for i, damage in enumerate(self.damages):
+        begins = [chunk.first_byte for chunk in self._chunks]  # ascending: the order of the scan
+        ends = [chunk.end_byte for chunk in self._chunks]
+        latest = list(accumulate((chunk.last_ns for chunk in self._chunks), max))
+        earliest = list(accumulate((chunk.start_ns for chunk in reversed(self._chunks)), min))
+
+        def located(damage: Damage) -> Damage:
             if damage.start_ns is not None or damage.first_byte is None:
-                continue
-            first, end = damage.first_byte, damage.end_byte or damage.first_byte
-            before = [c.last_ns for c in self._chunks if c.end_byte <= first]
-            behind = [c.start_ns for c in self._chunks if c.first_byte >= end]
+                return damage
+            before = bisect_right(ends, damage.first_byte)
+            behind = bisect_left(begins, damage.end_byte or damage.first_byte)
             # Behind the last chunk the end is unknown: the recording was interrupted there.
-            start_ns = max(before, default=None)
-            end_ns = min(behind, default=start_ns)
-            self.damages[i] = damage._replace(start_ns=start_ns, end_ns=end_ns)
+            start_ns = latest[before - 1] if before else None
+            end_ns = earliest[-1 - behind] if behind < len(begins) else start_ns
+            return damage._replace(start_ns=start_ns, end_ns=end_ns)
+
+        self.damages = {located(damage): None for damage in self.damages}
 
 
 class _ReadAhead:
@@ -267,14 +274,6 @@ def _merged(
             heappush(waiting, (held[i][positions[i]].received_ns, i))
         else:
             del held[i], sizes[i]
-
-
-def _without_chunk(records: list[Record]) -> list[Record]:
-    """Return messages whose memory is theirs: as copies, where views would hold much beside."""
-    views = [record.data for record in records if isinstance(record.data, memoryview)]
-    if not views or 2 * sum(map(len, views)) > views[0].obj.__sizeof__():
-        return records
-    return [record._replace(data=bytes(record.data)) for record in records]
 
 
 def _is_within(time_ns: int, start: int | None, stop: int | None) -> bool:

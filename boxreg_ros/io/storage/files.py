@@ -143,7 +143,7 @@ def _opened_compressed(file: Path, folder: Path, opener: Opener, origin: Path) -
     damage = _unpack(file, plain, origin)
     unpacked = opener(plain, origin)
     if damage is not None:
-        unpacked.damages.insert(0, damage)
+        unpacked.damages = {damage: None, **unpacked.damages}
     return unpacked
 
 

@@ -11,7 +11,7 @@ from boxreg_ros.errors import BoxregError, RecordingError, UnsupportedMessage
 from boxreg_ros.io.foxglove import decoder_of, FOXGLOVE_ENCODINGS, ros_type
 from boxreg_ros.io.storage.chunks import MAX_CHUNK_BYTES
 from boxreg_ros.io.storage.files import Files, merged_streams, Part
-from boxreg_ros.io.storage.record import Bytes, Damage, one_line, Record
+from boxreg_ros.io.storage.record import Damage, one_line, Record
 from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
 from rosbags.serde import SerdeError
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
@@ -113,7 +113,7 @@ class Reader:
         with readable(self._origin):  # no code of ours runs in the streams
             yield from merged_streams(streams)
 
-    def deserialize(self, data: Bytes, msgtype: str) -> Any:
+    def deserialize(self, data: bytes, msgtype: str) -> Any:
         """
         Return a message; its first byte shows the encoding.
 
@@ -124,7 +124,7 @@ class Reader:
 
         """
         if msgtype in self._decoders and data[:1] != b'\0':
-            return self._decoders[msgtype](bytes(data))
+            return self._decoders[msgtype](data)
         if data[:4] == ZSTD_MAGIC:
             data = _decompressed(data)
         if msgtype not in self.typestore.fielddefs:
@@ -199,7 +199,7 @@ def _types_of(definition: MessageDefinition, name: str) -> Any:
     return types
 
 
-def _decompressed(data: Bytes) -> bytes:
+def _decompressed(data: bytes) -> bytes:
     """Return a message that was compressed by itself."""
     try:
         size = zstandard.frame_content_size(data)

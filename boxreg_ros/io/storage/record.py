@@ -8,8 +8,6 @@ from typing import NamedTuple, Protocol
 
 from rosbags.interfaces import Connection
 
-Bytes = bytes | memoryview
-"""An encoded message; a view keeps the chunk that it is a part of."""
 NO_MESSAGES_NS = (2**63 - 1, 0)
 """Begin and end of a file without messages, as in rosbags [ns]."""
 
@@ -24,7 +22,7 @@ class Record(NamedTuple):
         Topic and type; its `owner` is the file.
     received_ns : int
         When it was received [ns].
-    data : bytes or memoryview
+    data : bytes
         Encoded message.
     published_ns, sequence : int
         Of MCAP files; equal to `received_ns`, and 0, for other files.
@@ -33,7 +31,7 @@ class Record(NamedTuple):
 
     connection: Connection
     received_ns: int
-    data: Bytes
+    data: bytes
     published_ns: int = 0
     sequence: int = 0
 
@@ -72,6 +70,10 @@ class Damage(NamedTuple):
         return f'{self.file}: {", ".join(parts)}'
 
 
+Damages = dict[Damage, None]
+"""In the order in which they were found; each once, however often the part was read."""
+
+
 class StorageFile(Protocol):
     """
     One open file of a recording, or several that belong together.
@@ -82,7 +84,7 @@ class StorageFile(Protocol):
         Topics with types and numbers of messages.
     start_time, end_time : int
         Receive times of the first message and behind the last [ns].
-    damages : list of Damage
+    damages : Damages
         Known so far: some are found while messages are read.
 
     """
@@ -90,7 +92,7 @@ class StorageFile(Protocol):
     connections: list[Connection]
     start_time: int
     end_time: int
-    damages: list[Damage]
+    damages: Damages
 
     def messages(
         self, connections: Collection[Connection], start: int | None, stop: int | None
@@ -110,12 +112,6 @@ class Definition(NamedTuple):
     schema: tuple[str, str, bytes] | None
     encoding: str
     metadata: tuple[tuple[str, str], ...]
-
-
-def note(damages: list[Damage], damage: Damage) -> None:
-    """Add a damage once: a part of a file may be read several times."""
-    if damage not in damages:
-        damages.append(damage)
 
 
 def span_ns(spans: Collection[tuple[int, int]]) -> tuple[int, int]:

@@ -18,7 +18,7 @@ from typing import Any
 from urllib.parse import quote
 
 from boxreg_ros.errors import RecordingError, TransferError
-from boxreg_ros.io.storage.record import Damage, NO_MESSAGES_NS, note, one_line, Record, shown
+from boxreg_ros.io.storage.record import Damage, Damages, NO_MESSAGES_NS, one_line, Record, shown
 from boxreg_ros.io.whole_files import temporary_folder
 from rosbags.interfaces import (
     Connection,
@@ -71,7 +71,7 @@ class SqliteFile:
 
     def __init__(self, path: Path, origin: Path | None = None) -> None:
         self.name = shown(path, origin)
-        self.damages: list[Damage] = []
+        self.damages: Damages = {}
         self.connections: list[Connection] = []
         self._surviving: list[tuple[int, int, int]] | None = None
         self._size = path.stat().st_size
@@ -263,7 +263,7 @@ class SqliteFile:
         return None
 
     def _note(self, reason: str, start_ns: int | None = None, end_ns: int | None = None) -> None:
-        note(self.damages, Damage(self.name, reason, None, None, start_ns, end_ns))
+        self.damages[Damage(self.name, reason, None, None, start_ns, end_ns)] = None
 
     def _raise_transfer_error(self, error: Exception) -> None:
         """Raise TransferError for an error that is not about the content of the file."""
@@ -283,7 +283,7 @@ class SqliteFile:
         size = path.stat().st_size
         if size < expected:
             reason = 'the end of the database is missing'
-            note(self.damages, Damage(self.name, reason, size, expected))
+            self.damages[Damage(self.name, reason, size, expected)] = None
 
 
 def _opened(path: Path, name: str) -> sqlite3.Connection:

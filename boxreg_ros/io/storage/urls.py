@@ -10,7 +10,7 @@ length that was asked for; requests that fail are repeated, and then raise `Tran
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from functools import partial
@@ -18,7 +18,7 @@ import os
 from pathlib import Path
 import re
 import time
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.errors import RecordingError, TransferError, unreadable
 
@@ -43,6 +43,8 @@ PASSING_STATUS = (408, 429)
 """Answers of HTTP below 500 that are worth another request: too slow, too many requests."""
 MISSING_STATUS = (None, 404, 410)
 """Status behind a FileNotFoundError of a file that does not exist; HTTP raises it for any."""
+UPLOAD = '.upload'
+"""File in a folder that is being uploaded, or whose upload was interrupted."""
 
 _T = TypeVar('_T')
 
@@ -55,23 +57,8 @@ class Entry(NamedTuple):
     version: str
 
 
-class ByteSource(Protocol):
-    """A file that is read by ranges; `size` in bytes."""
-
-    size: int
-
-    def read(self, first: int, end: int) -> bytes:
-        """Return a part of the file; fewer bytes at its end."""
-
-    def prefetch(self, ranges: Sequence[tuple[int, int]]) -> None:
-        """Begin to read ranges that are needed next."""
-
-    def close(self) -> None:
-        """Close the file."""
-
-
 class LocalFile:
-    """A file of this machine; see `ByteSource`."""
+    """A file of this machine that is read by ranges; `size` in bytes."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open('rb')
@@ -97,10 +84,12 @@ class LocalFile:
 
 class RemoteFile:
     """
-    A file behind a URL; see `ByteSource`.
+    A file behind a URL that is read by ranges.
 
     Attributes
     ----------
+    size : int
+        Size of the file [bytes].
     bytes_read : int
         Number of bytes that were requested so far.
 
@@ -168,6 +157,9 @@ class RemoteFile:
         return _answer_of(self._path, content)
 
 
+ByteSource = LocalFile | RemoteFile
+
+
 class _WholeFile(TransferError):
     """A server sends the whole file in place of a range."""
 
@@ -178,7 +170,7 @@ def url_of(path: Path) -> str | None:
     return f'{match[1]}://{match[2]}' if match else None
 
 
-def byte_source_of(path: Path) -> LocalFile | RemoteFile:
+def byte_source_of(path: Path) -> ByteSource:
     """Return an open file."""
     return LocalFile(path) if url_of(path) is None else RemoteFile(path)
 
@@ -261,21 +253,28 @@ def write_bytes(path: Path, content: bytes) -> None:
     _answer_of(path, lambda: system.pipe_file(name, content))
 
 
-def delete_files(path: Path) -> None:
-    """Delete all files below a folder behind a URL."""
+def delete_files(path: Path, names: Iterable[str]) -> None:
+    """Delete some files of a folder behind a URL."""
     system, name = _system_of(path)
-    for one in names_of(path):
+    for one in names:
         _answer_of(path, partial(system.rm_file, f'{name}/{one}'))
 
 
 def names_of(path: Path) -> list[str]:
     """Return the names of all files below a folder behind a URL; none if it does not exist."""
+    return list(sizes_of(path))
+
+
+def sizes_of(path: Path) -> dict[str, int]:
+    """Return names and sizes [bytes] of all files below a folder behind a URL."""
     system, name = _system_of(path)
-    found = _answer_of(path, lambda: system.find(name, **_limit(system)))
-    return [str(one).removeprefix(name).lstrip('/') for one in found]
+    found = _answer_of(path, lambda: system.find(name, detail=True, **_limit(system)))
+    return {
+        str(one).removeprefix(name).lstrip('/'): int(about['size']) for one, about in found.items()
+    }
 
 
-def upload(folder: Path, target: Path, last: str) -> None:
+def upload(folder: Path, target: Path, last: str, advanced: Callable[[], None]) -> None:
     """
     Replace a folder behind a URL by one of this machine.
 
@@ -285,16 +284,21 @@ def upload(folder: Path, target: Path, last: str) -> None:
         Source and URL.
     last : str
         File that marks a whole result: it is deleted first, and written when all others are.
+        `UPLOAD` is there from before the first change until then.
+    advanced : callable
+        Called after each file.
 
     """
     system, name = _system_of(target)
     files = {str(file.relative_to(folder)) for file in folder.rglob('*') if file.is_file()}
+    write_bytes(target / UPLOAD, b'')
     old = names_of(target)
     first_deleted = [last] if last in old else []
-    for file in (*first_deleted, *sorted(set(old) - files - {last})):
-        _answer_of(target, partial(system.rm_file, f'{name}/{file}'))
+    delete_files(target, [*first_deleted, *sorted(set(old) - files - {last, UPLOAD})])
     for file in sorted(files, key=lambda file: (file == last, file)):
         _answer_of(target, partial(system.put_file, str(folder / file), f'{name}/{file}'))
+        advanced()
+    delete_files(target, [UPLOAD])
 
 
 def _limit(system: Any) -> dict[str, float]:

@@ -1,0 +1,94 @@
+"""`boxreg compile`, and the Dockerfile that runs it, as far as that goes without docker."""
+
+import json
+import os
+from pathlib import Path
+import re
+import shlex
+import subprocess
+import sys
+
+from compiled import fill_cache
+from paths import ROOT
+import pytest
+from ros_graph import ended_cleanly, graph_in
+
+pytest.importorskip('numba')
+pytest.importorskip('rclpy')
+
+COMPILED = r'compiled (\d+) functions in \d+ s; kept in '
+
+
+def instructions():
+    """Return the instructions of the Dockerfile as pairs of keyword and arguments."""
+    text = (ROOT / 'Dockerfile').read_text(encoding='utf-8')
+    lines = [line for line in text.splitlines() if not line.startswith('#')]
+    whole = re.sub(r'\\\n\s*', '', '\n'.join(lines))
+    return [tuple(line.split(maxsplit=1)) for line in whole.splitlines() if line]
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """Return a folder for compiled functions that lacks a single one."""
+    folder = tmp_path / 'kernels'
+    folder.mkdir()
+    fill_cache(folder)
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(folder))
+    return folder
+
+
+def test_the_image_compiles_once_for_every_user_and_cpu(cache, tmp_path):
+    found = instructions()
+    assert [word for word, _ in found][:2] == ['FROM', 'SHELL']
+    assert json.loads(dict(found)['SHELL']) == ['/bin/bash', '-c']
+    assert json.loads(dict(found)['ENTRYPOINT'])[-2].endswith('exec "$@"')
+    values = dict(
+        word.split('=', 1) for kind, text in found if kind == 'ENV' for word in shlex.split(text)
+    )
+    assert values['NUMBA_CPU_FEATURES'] == ''
+    assert values['NUMBA_CPU_NAME'] == '${CPU}'
+    assert 'CPU=generic' in [text for kind, text in found if kind == 'ARG']
+    (line,) = (text for kind, text in found if kind == 'RUN' and 'boxreg compile' in text)
+    assert '"${NUMBA_CACHE_DIR}"' in line and values['NUMBA_CACHE_DIR']
+    (tmp_path / 'install').mkdir()
+    (tmp_path / 'install' / 'setup.bash').touch()  # that of colcon; `boxreg` is on the path here
+    environment = {**os.environ, 'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'}
+
+    def run_line():
+        done = subprocess.run(
+            ['bash', '-c', line], cwd=tmp_path, env=environment, capture_output=True, text=True,
+            timeout=300,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done
+
+    first = run_line()
+    assert re.match(COMPILED + re.escape(str(cache)), first.stdout), first.stdout
+    assert 'compiling the solver' in first.stderr
+    second = run_line()
+    assert second.stdout == f'nothing to compile; kept in {cache}\n'
+    assert second.stderr == ''
+    assert all(path.stat().st_mode & 0o006 == 0o006 for path in cache.rglob('*'))
+
+
+def test_the_first_start_of_a_node_says_that_it_compiles(cache, tmp_path):
+    with graph_in(tmp_path) as graph:
+        node = graph.start(command=('-m', 'boxreg_ros.live.main'))
+        graph.wait(lambda: 'waiting for the type of' in node.output(), 'the start')
+        assert ended_cleanly(node)
+    lines = [line for line in node.output().splitlines() if 'compiling the solver' in line]
+    assert lines and '[INFO]' in lines[0]
+
+
+def test_compile_fails_where_nothing_can_be_kept(tmp_path):
+    (tmp_path / 'file').touch()
+    code = (
+        'import sys; sys.modules["numba"] = None\n'
+        'from boxreg_ros.cli import main\n'
+        'sys.exit(main(["compile"]))'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 1
+    assert 'numba' in done.stderr and 'Traceback' not in done.stderr
