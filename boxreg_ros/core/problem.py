@@ -197,8 +197,7 @@ class Problem(NamedTuple):
         """
         lengths = np.array(list(map(len, columns)))
         column = np.repeat([[of_window[-1]] for of_window in columns], lengths.max(), axis=1)
-        is_there = np.indices(column.shape)[1] < lengths[:, None]
-        valid: NDArray[np.bool_] = np.asarray(is_there, bool)
+        valid = np.indices(column.shape)[1] < lengths[:, None]
         column[valid] = list(chain.from_iterable(columns))
         rows = np.array(windows)
         row = rows[:, None]
@@ -233,7 +232,7 @@ class Problem(NamedTuple):
         Of windows with pinned boxes the mean extents of these.
 
         """
-        has_pin = self.pinned.any(1)[:, None]
+        has_pin = self.pinned.any(1, keepdims=True)
         counted = np.where(has_pin, self.pinned, self.valid)[..., None]
         marginalised = np.where(has_pin, 0.0, self.marginalised_extents)
         total = (self.boxes[..., 3:6] * counted).sum(1) + marginalised[:, :3]

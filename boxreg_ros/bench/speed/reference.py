@@ -95,7 +95,7 @@ class _Fit:
     def __init__(self, problem: Problem, config: Config) -> None:
         model = InputModel(config.faces)
         plan = SolverPlan.choose(config, False, CONSTANTS.coarse_points)
-        constants = CONSTANTS.with_settings(config).in_round(False, True)
+        constants = CONSTANTS.with_settings(config).in_round(uses_shape=False, is_smooth=False)
         self.constants = constants.record()
         self.inputs = model.inputs(config)
         self.batch: Batch = start(problem, config, plan, self.inputs)
