@@ -20,7 +20,7 @@ setup(
         (f'share/{NAME}', ['package.xml', *sorted(glob(f'{NAME}/share/*'))]),
     ],
     # Read by the node and `relabel --report`, without an installation too.
-    package_data={NAME: ['py.typed', 'share/*'], 'msg_adapters': ['py.typed']},
+    package_data={NAME: ['py.typed', 'share/*', 'review/page/*'], 'msg_adapters': ['py.typed']},
     entry_points={
         'console_scripts': [
             f'boxreg = {NAME}.cli:command',
@@ -60,7 +60,7 @@ setup(
         # MCAP files whose boxes are protobuf.
         'foxglove': ['mcap-protobuf-support'],
         # The page of `boxreg relabel --report` and `boxreg review`.
-        'report': ['jinja2', 'plotly>=6'],
+        'report': ['jinja2', 'plotly>=6', 'starlette>=0.31', 'uvicorn>=0.27'],
         # HOTA and IDF1 of `boxreg evaluate`.
         'tracking': ['trackeval>=1.3,<2'],
         # The engine `--engine ray` of `boxreg batch`.
@@ -115,7 +115,9 @@ setup(
             's3fs',
             'shapely',
             'small-gicp',
+            'starlette>=0.31',
             'trackeval>=1.3,<2',
+            'uvicorn>=0.27',
             'ziamath',
         ],
         # What test/build_interfaces.py builds message types with.

@@ -14,6 +14,7 @@ from boxreg_ros.errors import (
 )
 
 if TYPE_CHECKING:
+    from boxreg_ros.core.follow import follow, FollowedTrack
     from boxreg_ros.core.refine import refine, RefinedTrack, Track
     from boxreg_ros.core.registrar import BoxRegistrar
     from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
@@ -26,6 +27,7 @@ __all__ = [
     'BoxregError',
     'Config',
     'ConfigError',
+    'FollowedTrack',
     'RecordingError',
     'RefinedBoxes',
     'RefinedTrack',
@@ -34,6 +36,7 @@ __all__ = [
     'Track',
     'TransformUnavailable',
     'UnsupportedMessage',
+    'follow',
     'refine',
 ]
 
@@ -41,10 +44,12 @@ __all__ = [
 _MODULES = {
     'BoxArray': 'boxreg_ros.structures',
     'BoxRegistrar': 'boxreg_ros.core.registrar',
+    'FollowedTrack': 'boxreg_ros.core.follow',
     'RefinedBoxes': 'boxreg_ros.structures',
     'RefinedTrack': 'boxreg_ros.core.refine',
     'Sweep': 'boxreg_ros.structures',
     'Track': 'boxreg_ros.core.refine',
+    'follow': 'boxreg_ros.core.follow',
     'refine': 'boxreg_ros.core.refine',
 }
 

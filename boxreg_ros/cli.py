@@ -32,6 +32,9 @@ COMMANDS = {
     'relabel': Command(
         'offline.relabel_command', 'refine the boxes of recordings and write label files'
     ),
+    'follow': Command(
+        'offline.follow_command', 'follow objects from one box or a few of each to whole tracks'
+    ),
     'inspect': Command(
         'offline.inspect', 'show what is in a recording, and the relabel command to run'
     ),
@@ -241,6 +244,7 @@ def _run(arguments: list[str]) -> int:
         options = re.findall(r'--[a-z-]+', args.subparser.format_usage())
         proposal = _proposal(unknown, options)
         args.subparser.error(f'unrecognized arguments: {" ".join(unknown)}{proposal}')
+    args.arguments = arguments
     keep_freed_memory()
     collect_rarely()
     return int(_module(args.command).run(args))

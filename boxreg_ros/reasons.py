@@ -169,6 +169,11 @@ class Reason(StrEnum):
         'a person rejected the refined box or its track in `boxreg review`',
         '',
     )
+    DELETED = (
+        'deleted',
+        'box',
+        'rejected: a person deleted the box or its track in `boxreg review`',
+    )
     NO_SWEEP = (
         'no_sweep',
         'box',

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import csv
 from dataclasses import dataclass
 from functools import lru_cache
@@ -24,6 +24,7 @@ COLUMNS = (
 UTF_16_MARKS = BOM_UTF16_LE, BOM_UTF16_BE
 EXPORTS = {'\0': 'UTF-16', ';': 'semicolons', '\t': 'tabs'}
 """What a header has that a spreadsheet has exported in another form, and the name of the form."""
+csv.field_size_limit(2**31 - 1)  # ids may be as long as messages
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,14 +197,20 @@ class BoxTable:
         """Write all rows as CSV, in the columns of ``boxes.csv``."""
         quaternions = quaternion_from_rpy(self.boxes[:, ROLL:])
         with open(path, 'w', newline='', encoding='utf-8') as file:
-            table = csv.writer(file, lineterminator='\n')
-            table.writerow(COLUMNS)
+            file.write(csv_row(COLUMNS))
             for i, box in enumerate(self.boxes):
                 numbers = (self.scores[i], *box[:3], *quaternions[i], *box[BOX_EXTENT])
-                table.writerow([
+                file.write(csv_row([
                     self.stamps_ns[i], self.frame_id, self.track_ids[i], self.class_names[i],
                     *(f'{number:.9f}' for number in numbers), self.status[i], self.num_points[i],
-                ])  # fmt: skip
+                ]))  # fmt: skip
+
+
+def csv_row(cells: Iterable[object]) -> str:
+    """Return one row of CSV with its end; texts with a carriage return are quoted, too."""
+    row = StringIO(newline='')
+    csv.writer(row, lineterminator='\r\n').writerow(cells)
+    return row.getvalue()[:-2] + '\n'
 
 
 def _exported(path: str | Path, found: str) -> RecordingError:
@@ -217,6 +224,4 @@ def _exported(path: str | Path, found: str) -> RecordingError:
 @lru_cache(1024)
 def cell(text: str) -> str:
     """Return a text as one of several cells of a row of CSV: in quotes where it needs them."""
-    row = StringIO()
-    csv.writer(row, lineterminator='\n').writerow(('', text))
-    return row.getvalue()[1:-1]
+    return csv_row(('', text))[1:-1]

@@ -115,6 +115,8 @@ class RecorderStatus:
         Room on the disk [bytes].
     recovered : int
         Segments recovered from the journals of earlier recordings.
+    damaged : int
+        Segments of earlier recordings whose journal cannot be read; their folder is kept.
     without_cloud : int
         Frames without a cloud, where clouds are written.
     left_out : int
@@ -133,6 +135,7 @@ class RecorderStatus:
     rate: float = 0.0
     free: int = 0
     recovered: int = 0
+    damaged: int = 0
     without_cloud: int = 0
     left_out: int = 0
     error: str = ''

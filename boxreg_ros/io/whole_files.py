@@ -21,7 +21,12 @@ DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[TextIO]:
-    """Yield a file that replaces `path`, also a URL, on success and is deleted on failure."""
+    """
+    Yield a file that replaces `path`, also a URL, on success and is deleted on failure.
+
+    On success it is on the disk itself: a power cut leaves it, or the one before.
+
+    """
     if url_of(path) is not None:
         text = StringIO()
         yield text
@@ -31,7 +36,9 @@ def written_whole(path: Path) -> Iterator[TextIO]:
     try:
         with partial.open('w', encoding='utf-8', newline='') as file:
             yield file
+        store([partial])
         os.replace(partial, path)
+        store([path.parent])
     finally:
         partial.unlink(missing_ok=True)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import csv
 from pathlib import Path
 
-from boxreg_ros.io.box_table import BoxTable, cell, COLUMNS
+from boxreg_ros.io.box_table import BoxTable, cell, COLUMNS, csv_row
 from boxreg_ros.io.covariance_table import COVARIANCES, CovarianceWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import refined_boxes
@@ -84,7 +84,7 @@ class Writer:
             header, *rows = csv.reader(file)
         rows.sort(key=lambda row: int(row[0]))
         with self._path.open('w', newline='', encoding='utf-8') as file:
-            csv.writer(file, lineterminator='\n').writerows([header, *rows])
+            file.writelines(map(csv_row, [header, *rows]))
 
 
 def _texts(numbers: Floats) -> Iterator[str]:

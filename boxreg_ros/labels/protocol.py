@@ -47,7 +47,7 @@ class Format:
         Parameters of the orientation, and the angles that are lost.
     files : str
         Files and folders that the writer creates, separated by commas. ``STAMP`` in the first
-        stands for one file per frame. `registry.is_written` looks for the first.
+        stands for one file per frame.
     packages : tuple of str
         Packages of pip that are needed beyond those of boxreg_ros itself.
     options : tuple of str

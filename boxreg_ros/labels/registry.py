@@ -138,14 +138,6 @@ def writer_for(
     return module.Writer(folder, provenance, options or Options())
 
 
-def is_written(name: str, out: Path) -> bool:
-    """Return whether the first file of a format, or a folder with content, exists in `out`."""
-    first = _folder_of(name, out) / module_of(name).FORMAT.files.split(',')[0]
-    if 'STAMP' in first.name:  # one file per frame
-        first = first.parent
-    return first.is_file() or (first.is_dir() and any(first.iterdir()))
-
-
 def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterator[LabelFrame]:
     """
     Yield the frames of a label file or folder, or of all segments of a recording of labels.

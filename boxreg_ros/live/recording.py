@@ -216,6 +216,7 @@ def _values_of(recorder: RecorderProcess) -> dict[str, object]:
         'segment': status.segment or 'none',
         'segments': status.segments,
         'segments recovered': status.recovered,
+        'segments that cannot be read': status.damaged,
         'frames': status.frames,
         'boxes': status.boxes,
         'clouds': status.clouds,

@@ -195,4 +195,6 @@ def config_from(args: argparse.Namespace) -> Config:
 def request_from(args: argparse.Namespace, *recordings: Path) -> Request:
     """Return the request of the arguments; options that a command lacks have their defaults."""
     paths = recordings or tuple(args.recordings)
-    return Request(paths, config=config_from(args), **values_of(args, Request))
+    command = () if recordings else tuple(getattr(args, 'arguments', ()))
+    values = values_of(args, Request)
+    return Request(paths, config=config_from(args), command=command, **values)

@@ -10,8 +10,9 @@ without Ray do one shard each.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed, ThreadPoolExecutor
+from contextlib import contextmanager, ExitStack
 from dataclasses import fields, replace
 from pathlib import Path
 import sys
@@ -19,6 +20,7 @@ from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.lock import locked
 from boxreg_ros.io.storage.urls import url_of
 from boxreg_ros.offline.arguments import (
     add_options,
@@ -27,16 +29,24 @@ from boxreg_ros.offline.arguments import (
     values_of,
     words_of,
 )
-from boxreg_ros.offline.batch_results import row_of, rows_of_shards, write_results
-from boxreg_ros.offline.job import Job, JOB_FAILED, jobs_of, UP_TO_DATE
-from boxreg_ros.offline.job_process import JobRunner
+from boxreg_ros.offline.batch_results import (
+    FAILED,
+    Result,
+    rows_of_shards,
+    UP_TO_DATE,
+    write_results,
+)
+from boxreg_ros.offline.job import Job, jobs_of
+from boxreg_ros.offline.job_process import JobRunner, read_states
 from boxreg_ros.offline.relabel_command import Demands
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import writing
 
-DONE = 0
-FAILED = 1
 ENGINES = ('local', 'ray')
+TIMEOUT = 1800.0
+"""Chosen: the longest step, the last windows of a drive of an hour, takes some minutes [s]."""
+MEMORY = 2.0
+"""Three times the memory measured for 150,000 points (docs/results/speed.md#scale) [GB]."""
 DRIVE_SETTINGS = tuple(one.name for one in fields(Settings) if one.name != 'workers')
 """Options of `Settings` that a drive takes; ``--workers`` is the number of drives here."""
 REQUESTS = 16
@@ -79,8 +89,13 @@ def _add_machine_arguments(parser: argparse.ArgumentParser) -> None:
         help='Ray cluster (default: the one that this machine belongs to, else a new local one)',
     )  # fmt: skip
     parser.add_argument(
-        '--timeout', type=float, metavar='S', help='longest time for one drive [s] (default: none)'
-    )
+        '--timeout', type=float, default=TIMEOUT, metavar='S',
+        help='longest time of a drive without progress [s] (default: %(default)g)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--memory', type=float, default=MEMORY, metavar='GB',
+        help='largest memory of a drive [GB] (default: %(default)g)',
+    )  # fmt: skip
     parser.add_argument(
         '--retries', type=int, default=1, metavar='N',
         help='how often a drive whose process was killed is tried again (default: %(default)s)',
@@ -89,20 +104,35 @@ def _add_machine_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Relabel all drives that are not done; return 1 if one has failed."""
-    if args.merge:
-        rows = rows_of_shards(args.out)
-        write_results(args.out, rows)
-        return _ended(args.out, rows)
-    _check(args)
     index, count = args.shard
-    jobs = jobs_of(args.recordings)[index - 1 :: count]
+    part = '' if count == 1 or args.merge else f'.{index}-of-{count}'
     with writing(args.out):
-        if url_of(args.out) is None:
-            args.out.mkdir(parents=True, exist_ok=True)
-        _run_all(jobs, args)
-        rows = [row_of(job) for job in jobs]
-        write_results(args.out, rows, '' if count == 1 else f'.{index}-of-{count}')
-    return _ended(args.out, rows)
+        jobs: list[Job] = []
+        rows: list[dict[str, Any]] = []
+        if args.merge:
+            rows = rows_of_shards(args.out)
+        else:
+            _check(args)
+            known = {name: one['recordings'] for name, one in read_states(args.out).items()}
+            jobs = jobs_of(args.recordings, known)[index - 1 :: count]
+        with _alone(args.out, part):
+            rows += [vars(result) for result in _results(jobs, args)]
+            write_results(args.out, rows, part)
+    done = sum(row['status'] != FAILED for row in rows)
+    skipped = sum(row['status'] == UP_TO_DATE for row in rows)
+    print(f'{args.out}: {done:,} of {len(rows):,} drives done, {skipped:,} of them earlier')
+    return 0 if done == len(rows) else 1
+
+
+@contextmanager
+def _alone(out: Path, part: str) -> Iterator[None]:
+    """Keep other runs from the index, the summary and the report of an output."""
+    if url_of(out) is not None:
+        yield
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out / f'.index{part}.lock', f'output {str(out)!r}'):
+        yield
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -112,6 +142,10 @@ def _check(args: argparse.Namespace) -> None:
     if args.workers < 1 or args.retries < 0:
         raise ConfigError(
             f'workers and retries: expected 1 and 0 or more, got {args.workers} and {args.retries}'
+        )
+    if not (args.timeout > 0 and args.memory > 0):
+        raise ConfigError(
+            f'timeout and memory: expected more than 0, got {args.timeout:g} and {args.memory:g}'
         )
     if args.address is not None and args.engine != 'ray':
         raise ConfigError(
@@ -126,58 +160,57 @@ def _config(args: argparse.Namespace) -> Config:
     return replace(Settings(**values_of(args, Settings)), workers=None).effective()
 
 
-def _run_all(jobs: list[Job], args: argparse.Namespace) -> None:
-    """Run all jobs, and show the progress and the jobs that fail."""
+def _results(jobs: Sequence[Job], args: argparse.Namespace) -> list[Result]:
+    """Run all jobs, show the progress and the jobs that fail, and return their results."""
     from tqdm import tqdm
 
-    waiting = [job for job in jobs if job.status != JOB_FAILED]
+    if not jobs:
+        return []
     with ThreadPoolExecutor(REQUESTS) as pool:
-        list(pool.map(Job.measure, waiting))
-    jobs = sorted(jobs, key=lambda job: -job.size)  # no large one is left to the end
-    options = tuple(options_of_drives(args))
-    runner = JobRunner(args.out, options, str(_config(args)), args.retries, args.timeout)
-    total = sum(job.size for job in waiting)
-    is_hidden = not sys.stderr.isatty()
+        sizes = dict(zip(jobs, pool.map(Job.size, jobs), strict=True))
+    by_size = sorted(jobs, key=lambda job: -sizes[job])  # no large one is left to the end
+    runner = JobRunner(
+        args.out if url_of(args.out) else args.out.absolute(),
+        tuple(options_of_drives(args)),
+        str(_config(args)),
+        args.retries,
+        args.timeout,
+        round(args.memory * 1e9),
+    )
+    results = {}
     failed = 0
-    with tqdm(total=total, unit='B', unit_scale=True, disable=is_hidden, leave=False) as bar:
-        for job in _ended_jobs(jobs, runner, args):
-            if job.status == JOB_FAILED:
+    is_hidden = not sys.stderr.isatty()
+    with tqdm(total=len(jobs), unit='drive', disable=is_hidden, leave=False) as bar:
+        for job, result in _ended(by_size, runner, args):
+            results[job] = result
+            if not result.is_done:
                 failed += 1
-                bar.write(f'boxreg: {job.name}: {job.last_line}', file=sys.stderr)
-            else:
-                bar.update(job.size)
+                bar.write(f'boxreg: {job.name}: {result.last_line}', file=sys.stderr)
+            bar.update()
             bar.set_postfix_str(f'{failed} failed')
+    return [results[job] for job in jobs]
 
 
-def _ended_jobs(jobs: list[Job], runner: JobRunner, args: argparse.Namespace) -> Iterator[Job]:
-    """Yield each job when it has ended; in `jobs` it has its results."""
-    if args.engine == 'ray':
-        from boxreg_ros.offline.ray_engine import run_on_ray
+def _ended(
+    jobs: Sequence[Job], runner: JobRunner, args: argparse.Namespace
+) -> Iterator[tuple[Job, Result]]:
+    """Run jobs, several at a time, and yield each with its result when it has ended."""
+    start: Callable[[Job], Result] = runner
+    workers, end = args.workers, runner.end
+    with ExitStack() as cluster:
+        if args.engine == 'ray':
+            from boxreg_ros.offline.ray_engine import ray_engine
 
-        yield from run_on_ray(jobs, runner, args.address)
-    else:
-        yield from _run_locally(jobs, runner, args.workers)
-
-
-def _run_locally(jobs: list[Job], runner: JobRunner, workers: int) -> Iterator[Job]:
-    """Run the jobs, `workers` at a time."""
-    with ThreadPoolExecutor(workers) as pool:
-        futures = [pool.submit(runner, job) for job in jobs]
+            start, workers, end = cluster.enter_context(ray_engine(runner, args.address))
+        pool = cluster.enter_context(ThreadPoolExecutor(workers))
+        futures = {pool.submit(start, job): job for job in jobs}
         try:
             for future in as_completed(futures):
-                yield future.result()
+                yield futures[future], future.result()
         except BaseException:  # a signal to this process, too
             pool.shutdown(wait=False, cancel_futures=True)
-            runner.end()
+            end()
             raise
-
-
-def _ended(out: Path, rows: Sequence[dict[str, Any]]) -> int:
-    """Print how many drives are done, and return the exit status."""
-    done = sum(row['status'] != JOB_FAILED for row in rows)
-    skipped = sum(row['status'] == UP_TO_DATE for row in rows)
-    print(f'{out}: {done:,} of {len(rows):,} drives done, {skipped:,} of them earlier')
-    return DONE if done == len(rows) else FAILED
 
 
 def options_of_drives(args: argparse.Namespace) -> list[str]:

@@ -1,49 +1,99 @@
-"""The results over all drives of `boxreg batch`: index, summary and report, of shards or all."""
+"""The results over all drives of `boxreg batch`: index, summary and page, of shards or all."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 import csv
+from dataclasses import dataclass, fields
+from html import escape
 from io import StringIO
 import json
 from pathlib import Path
 import re
 from typing import Any
+from urllib.parse import quote
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.storage.urls import names_of, read_text, url_of
 from boxreg_ros.io.whole_files import written_whole
-from boxreg_ros.offline.batch_report import write_batch_report
-from boxreg_ros.offline.job import Job, JOB_FAILED
 from boxreg_ros.offline.result_folder import SUMMARY
 
+FAILED = 'failed'
+DONE = 'done'
+UP_TO_DATE = 'up to date'
 COUNTS = ('sweeps', 'boxes_in', 'refined', 'kept', 'damages')
-INDEX_COLUMNS = (
-    'drive', 'status', 'exit_status', 'attempts', 'seconds', 'peak_mb', *COUNTS, 'last_line',
-    'key',
-)  # fmt: skip
+REVIEW = 'review.csv'
+RISK = 'risk_m'
+MAX_LISTED_TRACKS = 100
+"""Tracks in the report; a page of more is not read."""
+UNLISTED = ('key', 'exit_status')
+"""Columns of the index that the report leaves out."""
+PAGE_STYLE = (
+    'body{font-family:sans-serif;margin:2em}table{border-collapse:collapse}'
+    'td,th{border:1px solid #ccc;padding:.2em .5em;text-align:left}.failed{background:#fdd}'
+)
 SHARD_INDEX = re.compile(r'index\.(\d+)-of-(\d+)\.csv')
 
 
-def row_of(job: Job) -> dict[str, Any]:
-    """Return the row of a job in the index."""
-    status = job.summary.get('status', {})
-    return {
-        'drive': job.name,
-        'status': job.status,
-        'exit_status': '' if job.exit_status is None else job.exit_status,
-        'attempts': job.attempts,
-        'seconds': round(job.seconds, 1),
-        'peak_mb': round(job.peak_bytes / 1e6),
-        'sweeps': job.summary.get('sweeps', 0),
-        'boxes_in': job.summary.get('boxes_in', 0),
-        'refined': status.get('refined', 0),
-        'kept': status.get('kept', 0),
-        'damages': len(job.summary.get('damage', ())),
-        'last_line': job.last_line,
-        'key': job.key,
-    }
+@dataclass
+class Result:
+    """
+    Result of a job: a row of the index.
+
+    Attributes
+    ----------
+    drive : str
+        Name of the result folder.
+    status : str
+        ``done``, ``up to date`` or ``failed``.
+    exit_status : int or None
+        Of its last process; negative for the signal that ended it.
+    attempts : int
+        Processes that were started.
+    seconds : float
+        Time of all attempts [s].
+    peak_mb : int
+        Largest memory of a process and its workers, shared pages divided among them [MB].
+    sweeps, boxes_in, refined, kept, damages : int
+        Of its ``summary.json``.
+    last_line : str
+        Last line that its process printed, or why it failed.
+    key : str
+        Hash of the content of its files, the options and the version.
+
+    """
+
+    drive: str
+    status: str = FAILED
+    exit_status: int | None = None
+    attempts: int = 0
+    seconds: float = 0.0
+    peak_mb: int = 0
+    sweeps: int = 0
+    boxes_in: int = 0
+    refined: int = 0
+    kept: int = 0
+    damages: int = 0
+    last_line: str = ''
+    key: str = ''
+
+    @property
+    def is_done(self) -> bool:
+        """Return whether the drive has its result."""
+        return self.status != FAILED
+
+    def count(self, summary: dict[str, Any]) -> None:
+        """Take the counts of a ``summary.json``."""
+        status = summary.get('status', {})
+        self.sweeps = summary.get('sweeps', 0)
+        self.boxes_in = summary.get('boxes_in', 0)
+        self.refined = status.get('refined', 0)
+        self.kept = status.get('kept', 0)
+        self.damages = len(summary.get('damage', ()))
+
+
+INDEX_COLUMNS = tuple(column.name for column in fields(Result))
 
 
 def write_results(out: Path, rows: Sequence[dict[str, Any]], shard: str = '') -> None:
@@ -55,7 +105,7 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], shard: str = '') ->
     out : Path
         Folder with the result folders.
     rows : sequence of dict
-        As of `row_of`.
+        With the columns of `Result`.
     shard : str
         Part of the file names, as in ``.1-of-8``; empty for all drives.
 
@@ -66,18 +116,18 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], shard: str = '') ->
         writer.writerows(rows)
     merged = {
         'drives': len(rows),
-        'done': sum(row['status'] != JOB_FAILED for row in rows),
+        'done': sum(row['status'] != FAILED for row in rows),
         **{name: sum(int(row[name]) for row in rows) for name in COUNTS},
         'seconds': round(sum(float(row['seconds']) for row in rows), 1),
         'peak_mb': max((int(row['peak_mb']) for row in rows), default=0),
         'version': __version__,
-        'failed': {row['drive']: row['last_line'] for row in rows if row['status'] == JOB_FAILED},
+        'failed': {row['drive']: row['last_line'] for row in rows if row['status'] == FAILED},
     }
     stem, suffix = SUMMARY.split('.')
     with written_whole(out / f'{stem}{shard}.{suffix}') as file:
         file.write(json.dumps(merged, indent=2) + '\n')
     with written_whole(out / f'report{shard}.html') as file:
-        write_batch_report(file, out, rows)
+        file.write(_page(rows, _riskiest(out, [row['drive'] for row in rows])))
 
 
 def rows_of_shards(out: Path) -> list[dict[str, Any]]:
@@ -116,3 +166,45 @@ def rows_of_shards(out: Path) -> list[dict[str, Any]]:
 
 def _listed(numbers: Iterable[int]) -> str:
     return ', '.join(map(str, sorted(numbers))) or 'none'
+
+
+def _riskiest(out: Path, drives: Iterable[str]) -> list[dict[str, Any]]:
+    """Return the rows of all reviews with the largest risk, those first."""
+    found: list[tuple[float, dict[str, Any]]] = []
+    for drive in drives:
+        try:
+            text = read_text(out / drive / REVIEW)
+        except OSError:  # the drive has failed
+            continue
+        for row in csv.DictReader(text.splitlines()):
+            try:
+                found.append((float(row[RISK]), {'drive': drive, **row}))
+            except (KeyError, TypeError, ValueError):
+                continue  # a review without this column has no order
+    found.sort(key=lambda item: -item[0])
+    return [row for _, row in found[:MAX_LISTED_TRACKS]]
+
+
+def _page(drives: Sequence[dict[str, Any]], tracks: Sequence[dict[str, Any]]) -> str:
+    """Return the report: the tracks to look at first, then all drives."""
+    shown = [{name: row[name] for name in row if name not in UNLISTED} for row in drives]
+    first = f'<h2>Tracks to look at first</h2>{_table(tracks)}' if tracks else ''
+    return (
+        f'<!doctype html><meta charset="utf-8"><title>boxreg</title><style>{PAGE_STYLE}</style>'
+        f'<h1>{len(drives):,} drives</h1>{first}<h2>Drives</h2>{_table(shown)}'
+    )
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> str:
+    """Return rows as a table of HTML; those of drives that have failed are coloured."""
+    names = list(rows[0]) if rows else []
+    lines = [''.join(f'<th>{escape(str(name))}' for name in names)]
+    lines += [''.join(f'<td>{_cell(name, row.get(name))}' for name in names) for row in rows]
+    kinds = ['', *(row.get('status') for row in rows)]
+    body = ''.join(f'<tr class="{k}">{line}' for k, line in zip(kinds, lines, strict=True))
+    return f'<table>{body}</table>'
+
+
+def _cell(name: str, value: Any) -> str:
+    text = escape('' if value is None else str(value))
+    return f'<a href="{quote(str(value))}/">{text}</a>' if name == 'drive' else text

@@ -12,6 +12,8 @@ from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.observation import crop
 from boxreg_ros.core.registrar import BoxRegistrar, Submit
 from boxreg_ros.io.session import hand_to_registrar
+from boxreg_ros.io.stamp_order import kept
+from boxreg_ros.offline.every_sweep import Arrivals
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
     BoxArray,
@@ -101,23 +103,29 @@ class FirstPass(NamedTuple):
     given, results, num_points : list of lists
         Box arrays, their registration, and the points above the road in each box: one list for
         each part of the recording between two time jumps.
+    parts : list of Arrivals
+        Of these parts.
 
     """
 
     given: list[list[BoxArray]]
     results: list[list[RefinedBoxes]]
     num_points: list[list[Ints]]
+    parts: list[Arrivals]
 
     def plan(self, fixed_frame: str, config: Config) -> CompletionPlan:
         """Return what completes the tracks in the fixed frame; each part on its own."""
         whole = CompletionPlan([], [])
-        for part in zip(self.given, self.results, self.num_points, strict=True):
+        for part in zip(*self[:3], strict=True):
             whole.append(complete(*part, fixed_frame, config))
         return whole
 
 
 def first_pass(
-    items: Iterable[tuple[Moved, bool]], config: Config, submit: Submit | None = None
+    items: Iterable[tuple[Moved, bool]],
+    config: Config,
+    submit: Submit | None = None,
+    fixed_frame: str | None = None,
 ) -> FirstPass:
     """
     Register a recording, and count the points in its boxes.
@@ -130,11 +138,14 @@ def first_pass(
         Settings.
     submit : callable, optional
         As of `BoxRegistrar`.
+    fixed_frame : str, optional
+        With it, sweeps without boxes get an empty array, see `Arrivals`.
 
     """
     registrar = BoxRegistrar(config, submit)
     counter = PointCounter(config)
-    parts: list[list[BoxArray]] = [[]]
+    parts = [Arrivals()]
+    count = 0
     results: dict[object, RefinedBoxes] = {}
     is_early = config.estimate == 'early'
 
@@ -147,19 +158,28 @@ def first_pass(
         if restarts:
             counter.finish()
             counter.restart()
-            parts.append([])
+            parts.append(Arrivals())
         moved = item
         if isinstance(moved, BoxArray):
-            moved = replace(moved, ticket=sum(map(len, parts)))
-            parts[-1].append(moved)
+            moved = replace(moved, ticket=count)
+            count += 1
+        if moved is not None:
+            parts[-1].add(moved)
         counter.add(moved)
         keep(hand_to_registrar(registrar, moved, restarts))
     keep(registrar.flush())
     counter.finish()
+    arrays = [
+        part.arrays if fixed_frame is None else part.completed(fixed_frame) for part in parts
+    ]
     return FirstPass(
+        arrays,
+        [
+            [results[a.ticket] if a.ticket is not None else kept(a, '') for a in given]
+            for given in arrays
+        ],
+        [[counter.of(array) for array in given] for given in arrays],
         parts,
-        [[results[array.ticket] for array in given] for given in parts],
-        [[counter.of(array) for array in given] for given in parts],
     )
 
 

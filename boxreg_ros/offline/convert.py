@@ -6,7 +6,6 @@ import argparse
 from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-import json
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline.arguments import add_options, values_of
 from boxreg_ros.offline.labelled_recording import label_frame_of
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import SUMMARY, whole_folder
+from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
 from boxreg_ros.structures import BoxArray, Sweep
 
 
@@ -71,7 +70,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
     provenance = Provenance.of(request.recordings or (source,))
     counts: Counter[str] = Counter()
     unused = _Unused()
-    with whole_folder(out, request.inputs()) as folder:
+    with claimed(out), whole_folder(out, request.inputs()) as folder:
         writers = {
             name: writer_for(name, folder, provenance, request.options) for name in request.formats
         }
@@ -97,7 +96,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             'versions': {'boxreg_ros': __version__},
             'fingerprint': request.fingerprint(),
         }
-        (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
+        write_summary(folder, summary)
     return summary
 
 

@@ -29,6 +29,7 @@ from boxreg_ros.offline.arguments import (
     TOPICS,
     words_of,
 )
+from boxreg_ros.offline.notes import sparse_boxes
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import spare_file
 from boxreg_ros.offline.timeline import check_plotly, merged_spans, write_timeline
@@ -345,7 +346,11 @@ def _warnings(sample: _Sample, finding: str, recording: ItemSource) -> Iterator[
     if recording.unreadable:
         first = next(iter(recording.first_errors.values()))
         yield f'{recording.unreadable.total()} messages cannot be read; first: {first}'
-    offset = _summary(sample)['stamp_offset_s']
+    facts = _summary(sample)
+    periods = facts['boxes_period_s'], facts['sweep_period_s']
+    if all(periods):
+        yield from sparse_boxes(*(1 / period for period in periods))
+    offset = facts['stamp_offset_s']
     if offset is not None and offset > DEFAULTS.reach:
         yield (
             f'boxes are up to {offset:.3f} s away from the nearest cloud; those beyond reach '

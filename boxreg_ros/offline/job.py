@@ -1,10 +1,11 @@
-"""The jobs of `boxreg batch`: one per drive, with a key of its content, options and version."""
+"""The jobs of `boxreg batch`: one per drive, with a name of its own."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from glob import glob
 import hashlib
 import os
@@ -12,21 +13,26 @@ from pathlib import Path
 import re
 import shlex
 from typing import Any
+from urllib.parse import urlsplit
 
-from boxreg_ros import __version__
 from boxreg_ros.datasets import address_of, all_scenes, resolved, scene_files
-from boxreg_ros.errors import BoxregError, RecordingError
+from boxreg_ros.errors import BoxregError, ConfigError, RecordingError
 from boxreg_ros.io.storage.urls import entries_of, Entry, url_of
 
 MANIFESTS = ('.txt', '.lst')
 COMMENT = re.compile(r'(^|\s)#.*')
 """A comment of a manifest; within a word, ``#`` begins the name of a scene."""
-JOB_FAILED = 'failed'
-JOB_DONE = 'done'
-UP_TO_DATE = 'up to date'
+SUFFIX = re.compile(r'(?<=.)\.(mcap|db3|bag|active)(\.zstd?)?$')
+"""Suffixes of recordings; other dots belong to the name, as those of dates."""
+JOBS = 'jobs'
+"""Folder with the key and the log of each job."""
+RESERVED = frozenset({JOBS, 'index.csv', 'summary.json', 'report.html'})
+"""Names in the output that no drive may have."""
+BLOCK_BYTES = 2**24
+"""Bytes that are read for the hash of a file until progress is noted; chosen."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Job:
     """
     One drive.
@@ -36,41 +42,49 @@ class Job:
     name : str
         Name of its result folder.
     recordings : tuple of Path
-        Files or folders, merged by time.
-    size : int
-        Size of all files [bytes]; 0 where it is unknown.
-    key : str
-        Hash of the content of its files, the options and the version.
-    status : str
-        ``waiting``, ``done``, ``up to date`` or ``failed``.
-    exit_status : int or None
-        Of its last process; negative for the signal that ended it.
-    attempts : int
-        Processes that were started.
-    seconds : float
-        Time of all attempts [s].
-    peak_bytes : int
-        Largest memory of a process and its workers, shared pages divided among them.
-    last_line : str
-        Last line that its process printed, or why it failed.
-    summary : dict
-        Content of its ``summary.json``.
+        Files or folders, merged by time; absolute, so that they are the same on each machine.
+    problem : str
+        Why it cannot be done; empty if it can.
 
     """
 
     name: str
     recordings: tuple[Path, ...]
-    size: int = 0
-    key: str = ''
-    status: str = 'waiting'
-    exit_status: int | None = None
-    attempts: int = 0
-    seconds: float = 0.0
-    peak_bytes: int = 0
-    last_line: str = ''
-    summary: dict[str, Any] = field(default_factory=dict)
+    problem: str = ''
 
-    def files(self) -> Iterator[Path]:
+    def size(self) -> int:
+        """Return the size of all files [bytes]; 0 where they cannot be found."""
+        with suppress(OSError, RecordingError):
+            local = sum(file.stat().st_size for file in self._files())
+            return local + sum(entry.size for entry in self._entries())
+        return 0
+
+    def hashes(
+        self, earlier: Sequence[Sequence[Any]], advanced: Callable[[], None]
+    ) -> list[list[Any]]:
+        """
+        Return path, size, times and hash of each file; of a URL the tag or time of its server.
+
+        Parameters
+        ----------
+        earlier : sequence
+            Return value of an earlier run: unchanged files are not read again.
+        advanced : callable
+            Called while files are read.
+
+        """
+        known = {tuple(found[:-1]): found[-1] for found in earlier}
+        hashes = []
+        for file in self._files():
+            about = file.stat()
+            # A copy may keep the time of its content; that of its inode is its own.
+            times = about.st_mtime_ns, about.st_ctime_ns
+            place = str(file.resolve()), about.st_size, *times
+            hashes.append([*place, known.get(place) or _hash(file, advanced)])
+        hashes += [[str(one.path), one.size, 0, 0, one.version] for one in self._entries()]
+        return hashes
+
+    def _files(self) -> Iterator[Path]:
         """Yield all files of the recordings on this machine."""
         for path in self.recordings:
             address = address_of(path)
@@ -82,56 +96,34 @@ class Job:
             inner = sorted(path.iterdir()) if path.is_dir() else [path]
             yield from (file for file in inner if file.is_file())
 
-    def measure(self) -> None:
-        """Set `size`; a job whose files cannot be found reports it when it runs."""
-        with suppress(OSError, RecordingError):
-            local = sum(file.stat().st_size for file in self.files())
-            self.size = local + sum(entry.size for entry in self.entries())
-
-    def entries(self) -> Iterator[Entry]:
+    def _entries(self) -> Iterator[Entry]:
         """Yield all files of the recordings behind URLs."""
         for path in self.recordings:
             if url_of(path) is not None and address_of(path) is None:
                 yield from entries_of(path)
 
-    def fail(self, reason: str) -> None:
-        """Note why the job cannot be done."""
-        self.status = JOB_FAILED
-        self.last_line = reason
 
-    def hashes(self, earlier: Sequence[Sequence[Any]]) -> list[list[Any]]:
-        """
-        Return path, size, time and hash of each file; of a URL the tag or time of its server.
-
-        Parameters
-        ----------
-        earlier : sequence
-            Return value of an earlier run: unchanged files are not read again.
-
-        """
-        known = {tuple(found[:3]): found[3] for found in earlier}
-        hashes = []
-        for file in self.files():
-            about = file.stat()
-            place = str(file.resolve()), about.st_size, about.st_mtime_ns
-            hashes.append([*place, known.get(place) or _hash(file)])
-        hashes += [[str(one.path), one.size, 0, one.version] for one in self.entries()]
-        return hashes
-
-    def set_key(self, hashes: Sequence[Sequence[Any]], settings: Sequence[str]) -> None:
-        """Set the key from the hashes of the files and the settings."""
-        content = repr((__version__, list(settings), [found[-1] for found in hashes]))
-        self.key = hashlib.sha256(content.encode()).hexdigest()
-
-
-def jobs_of(arguments: Sequence[Path]) -> list[Job]:
+def jobs_of(
+    arguments: Sequence[Path], known: Mapping[str, Sequence[str]] | None = None
+) -> list[Job]:
     """
     Return one job per drive of recordings, patterns, manifests and data sets.
 
     A manifest is a text file with one drive per line: its recordings, merged by time. Relative
     paths begin at the manifest; ``#`` begins a comment. A data set without the name of a scene
-    is one drive per scene. A drive that does not exist, or is named a second time, has failed
-    already.
+    is one drive per scene. A drive that does not exist, or is named a second time, has a problem.
+
+    Parameters
+    ----------
+    arguments : sequence of Path
+        As on the command line.
+    known : mapping of str to sequence of str, optional
+        Recordings of the drives that are done, by name: these keep it.
+
+    Raises
+    ------
+    ConfigError
+        If two drives cannot be told apart by name.
 
     """
     drives: list[tuple[Path, ...]] = []
@@ -145,15 +137,92 @@ def jobs_of(arguments: Sequence[Path]) -> list[Job]:
         else:
             drives.append((argument,))
     seen: set[Path] = set()
-    problems = [_problem(drive, seen) for drive in drives]
-    names = iter(_names([d for d, problem in zip(drives, problems, strict=True) if not problem]))
-    jobs = []
-    for drive, problem in zip(drives, problems, strict=True):
-        job = Job(str(drive[0]) if problem else next(names), drive)
-        if problem:
-            job.fail(problem)
-        jobs.append(job)
-    return jobs
+    jobs = [Job(str(drive[0]), _absolute(drive), _problem(drive, seen)) for drive in drives]
+    names = names_of([job.recordings for job in jobs if not job.problem], known or {})
+    return [job if job.problem else Job(names[job.recordings], job.recordings) for job in jobs]
+
+
+def names_of(
+    drives: Collection[tuple[Path, ...]], known: Mapping[str, Sequence[str]]
+) -> dict[tuple[Path, ...], str]:
+    """
+    Return a name for each drive: that of its first recording, with folders where it needs them.
+
+    The order of the drives does not matter.
+
+    Parameters
+    ----------
+    drives : collection of tuple of Path
+        Recordings of each drive.
+    known : mapping of str to sequence of str
+        As of `jobs_of`.
+
+    Raises
+    ------
+    ConfigError
+        If two drives have the same name with all their folders.
+
+    """
+    earlier = {tuple(map(Path, paths)): name for name, paths in known.items()}
+    names = {drive: earlier[drive] for drive in drives if drive in earlier}
+    taken = RESERVED | set(names.values())
+    taken |= {name for name, paths in known.items() if all(map(_is_there, paths))}
+    parts = {drive: _parts(drive[0]) for drive in drives if drive not in names}
+    plain = Counter((*part[:-1], _plain(part[-1])) for part in parts.values())
+    for drive, (*folders, last) in parts.items():
+        if plain[*folders, _plain(last)] == 1:  # else its suffix tells it from its neighbour
+            parts[drive] = (*folders, _plain(last))
+    depths = dict.fromkeys(parts, 1)
+    while True:
+        found = {drive: '_'.join(parts[drive][-depth:]) for drive, depth in depths.items()}
+        uses = Counter(found.values())
+        same = [drive for drive, name in found.items() if uses[name] > 1 or name in taken]
+        if not same:
+            return names | found
+        if all(depths[drive] >= len(parts[drive]) for drive in same):
+            raise ConfigError(
+                f'drives: expected each to have a name of its own, got {str(same[0][0])!r} and '
+                f'another that are both {found[same[0]]!r} in the output; rename one'
+            )
+        for drive in same:
+            depths[drive] += 1
+
+
+def _parts(path: Path) -> tuple[str, ...]:
+    """Return the folders and the name of a recording, or of a data set and its scene."""
+    address = address_of(path)
+    if address is not None:
+        return (*address.root.parts[1:], resolved(address).scene)
+    url = url_of(path)
+    if url is None:
+        return path.parts[1:] or ('root',)
+    split = urlsplit(url)
+    path_of_url = split.path if split.scheme.startswith('http') else url.partition('//')[2]
+    return tuple(part for part in (split.netloc, *path_of_url.split('/')) if part)
+
+
+def _is_there(recording: str) -> bool:
+    """Return whether a recording exists; one behind a URL is expected to."""
+    path = Path(recording)
+    return url_of(path) is not None or path.exists()
+
+
+def _plain(name: str) -> str:
+    """Return the name of a recording without the suffix of its storage."""
+    return SUFFIX.sub('', name)
+
+
+def _absolute(drive: tuple[Path, ...]) -> tuple[Path, ...]:
+    """Return the recordings of a drive with paths that do not depend on the current folder."""
+    paths = []
+    for path in drive:
+        address = address_of(path)
+        if address is not None:
+            path = Path(str(address._replace(root=Path(os.path.abspath(address.root)))))
+        elif url_of(path) is None:
+            path = Path(os.path.abspath(path))
+        paths.append(path)
+    return tuple(paths)
 
 
 def _manifest(path: Path) -> Iterator[tuple[Path, ...]]:
@@ -187,22 +256,11 @@ def _problem(drive: tuple[Path, ...], seen: set[Path]) -> str:
     return ''
 
 
-def _names(drives: Sequence[tuple[Path, ...]]) -> list[str]:
-    """Return a name for each drive: the stem of its first path, with its folders if needed."""
-    stems = [_stem(drive[0]) for drive in drives]
-    if len(set(stems)) == len(stems):
-        return stems
-    paths = [str(drive[0].resolve().with_suffix('')) for drive in drives]
-    common = os.path.commonpath(paths)
-    return [os.path.relpath(path, common).replace(os.sep, '_') for path in paths]
-
-
-def _stem(path: Path) -> str:
-    """Return the name of a recording without its suffix, or that of a scene."""
-    address = address_of(path)
-    return path.stem if address is None else resolved(address).scene
-
-
-def _hash(path: Path) -> str:
+def _hash(path: Path, advanced: Callable[[], None]) -> str:
+    """Return the SHA-256 of a file."""
+    digest = hashlib.sha256()
     with path.open('rb') as file:
-        return hashlib.file_digest(file, 'sha256').hexdigest()
+        while block := file.read(BLOCK_BYTES):
+            digest.update(block)
+            advanced()
+    return digest.hexdigest()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 import ctypes
 from dataclasses import dataclass, field
 from functools import partial
+import hashlib
 import json
+from math import inf
 import os
 from pathlib import Path
 import signal
@@ -17,19 +19,23 @@ from tempfile import TemporaryFile
 import time
 from typing import Any, BinaryIO
 
+from boxreg_ros import __version__
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.lock import locked
 from boxreg_ros.io.storage.urls import names_of, read_text, url_of, write_text
 from boxreg_ros.io.whole_files import written_whole
-from boxreg_ros.offline.job import Job, JOB_DONE, JOB_FAILED, UP_TO_DATE
-from boxreg_ros.offline.result_folder import delete_remains, earlier_summary
-from boxreg_ros.offline.time_limit import within
+from boxreg_ros.offline.batch_results import DONE, Result, UP_TO_DATE
+from boxreg_ros.offline.job import Job, JOBS
+from boxreg_ros.offline.progress import PIPE
+from boxreg_ros.offline.result_folder import claimed, earlier_summary, whole_summary
+from boxreg_ros.offline.time_limit import Watch, watched
 
-JOBS = 'jobs'
-"""Folder with the key and the log of each job."""
 END_SECONDS = 10.0
 """Time that a job has to remove its files after SIGTERM [s]; then it is killed."""
 MEMORY_PERIOD = 0.5
 """Time between two measurements of the memory [s]; a run of a drive takes some seconds."""
+PIPE_BYTES = 2**16
+"""Capacity of a pipe in Linux [bytes]."""
 PR_SET_PDEATHSIG = 1
 """Of Linux: option of prctl for the signal at the end of the parent."""
 
@@ -44,15 +50,17 @@ class JobRunner:
     Attributes
     ----------
     out : Path
-        Folder with one result folder per drive.
+        Folder with one result folder per drive; absolute.
     options : tuple of str
         Options of `boxreg relabel`.
     config : str
         The effective settings, for the key.
     retries : int
         How often a job whose process was killed is tried again.
-    timeout : float or None
-        Longest time to read the files for the key, and of one attempt [s].
+    timeout : float
+        Longest time without progress [s].
+    memory : float
+        Largest memory of one job [bytes].
     running : set
         Processes that run now, to end them.
 
@@ -62,107 +70,157 @@ class JobRunner:
     options: tuple[str, ...]
     config: str
     retries: int = 1
-    timeout: float | None = None
+    timeout: float = inf
+    memory: float = inf
     running: set[Process] = field(default_factory=set)
 
-    def __call__(self, job: Job) -> Job:
-        """Relabel a drive if it is not done; return the job with its status."""
-        if job.status == JOB_FAILED:
-            return job
-        folder = self.out / JOBS
-        state = folder / f'{job.name}.json'
-        earlier = _read_state(state)
+    def __call__(self, job: Job) -> Result:
+        """Relabel a drive if it is not done."""
+        result = Result(job.name, last_line=job.problem)
+        if job.problem:
+            return result
         try:
-            hashes = within(self.timeout, partial(job.hashes, earlier.get('files', [])))
-            if url_of(folder) is None:
-                folder.mkdir(parents=True, exist_ok=True)
-            job.set_key(hashes, [*self.options, self.config])
-            self._relabel(job, earlier)
-            job.summary = earlier_summary(self.out / job.name) or {}
-            if job.status != JOB_FAILED:
-                with written_whole(state) as file:
-                    known = {'key': job.key, 'files': hashes, 'peak_bytes': job.peak_bytes}
-                    file.write(json.dumps(known, indent=2))
+            with self._alone(job):
+                self._settle(job, result)
         except RecordingError as error:
-            job.fail(str(error))
+            result.last_line = str(error)
         except TimeoutError:
-            job.fail(
-                f'its files were not read after {self.timeout:g} s: check their disk or network '
+            result.last_line = (
+                f'its files were not read for {self.timeout:g} s: check their disk or network '
                 f'mount, or raise --timeout'
             )
         except OSError as error:
-            job.fail(f'{error}; free some space, or make the file accessible, and run it again')
-        return job
+            result.last_line = (
+                f'{error}; free some space, or make the file accessible, and run it again'
+            )
+        return result
 
     def end(self) -> None:
         """End all processes that run."""
         for process in list(self.running):
             process.terminate()
 
-    def measured_bytes(self) -> int:
-        """Return the largest memory of the jobs that are done; 0 before the first."""
+    def _alone(self, job: Job) -> AbstractContextManager[object]:
+        """Keep other runs from the state, the log and the result of a job."""
         folder = self.out / JOBS
-        names: list[str] = []
         if url_of(folder) is not None:
-            names = names_of(folder)
-        elif folder.is_dir():
-            names = os.listdir(folder)
-        states = [_read_state(folder / name) for name in names if name.endswith('.json')]
-        return max((int(state.get('peak_bytes', 0)) for state in states), default=0)
+            return nullcontext()
+        folder.mkdir(parents=True, exist_ok=True)
+        # The process of a run that was killed takes a moment to end.
+        return locked(folder / f'{job.name}.lock', f'drive {job.name}', END_SECONDS)
 
-    def _relabel(self, job: Job, earlier: dict[str, Any]) -> None:
-        if earlier.get('key') == job.key and earlier_summary(self.out / job.name) is not None:
-            job.status, job.exit_status = UP_TO_DATE, 0
-            job.peak_bytes = int(earlier.get('peak_bytes', 0))
-            return
+    def _settle(self, job: Job, result: Result) -> None:
+        """Relabel a drive if it is not done, and store that it is."""
+        path = self.out / JOBS / f'{job.name}.json'
+        state = _read_state(path)
+        watch = Watch(self.timeout)
+        files = watched(watch, partial(job.hashes, state.get('files', []), watch.advanced))
+        result.key = self._key(files)
+        self._refuse_other_drive(job, state, files)
+        summary = whole_summary(self.out / job.name) if state.get('key') == result.key else None
+        if summary is None:
+            self._relabel(job, result)
+            summary = earlier_summary(self.out / job.name)
+        else:
+            result.status, result.exit_status, result.peak_mb = UP_TO_DATE, 0, state['peak_mb']
+        result.count(summary or {})
+        if result.is_done:
+            state = {'key': result.key, 'recordings': [str(path) for path in job.recordings]}
+            state |= {'files': files, 'peak_mb': result.peak_mb}
+            with written_whole(path) as file:
+                file.write(json.dumps(state, indent=2))
+
+    def _key(self, files: Sequence[Sequence[Any]]) -> str:
+        """Return the hash of the content of files, the options and the version."""
+        settings = [*self.options, self.config]
+        content = repr((__version__, settings, _contents(files)))
+        return hashlib.sha256(content.encode()).hexdigest()
+
+    def _refuse_other_drive(
+        self, job: Job, state: dict[str, Any], files: Sequence[Sequence[Any]]
+    ) -> None:
+        """Raise RecordingError if the result of a drive would replace that of another one."""
+        earlier = state.get('recordings', [str(path) for path in job.recordings])
+        is_other = earlier != [str(path) for path in job.recordings]
+        if is_other and _contents(state['files']) != _contents(files):
+            raise RecordingError(
+                f'expected a name of its own, got that of {", ".join(earlier)}, whose result is '
+                f'in {self.out / job.name}: choose another output with -o, or delete that one and '
+                f'{JOBS}/{job.name}.json'
+            )
+
+    def _relabel(self, job: Job, result: Result) -> None:
+        """Run the process of a job, again if it was killed."""
         begun = time.monotonic()
-        while job.attempts <= self.retries and not self._attempt(job):
+        while result.attempts <= self.retries and not self._attempt(job, result):
             pass
-        job.seconds = time.monotonic() - begun
-        job.status = JOB_DONE if job.exit_status == 0 else JOB_FAILED
+        result.seconds = round(time.monotonic() - begun, 1)
+        if result.exit_status == 0:
+            result.status = DONE
+            return
+        with suppress(RecordingError), claimed(self.out / job.name):
+            pass  # deletes what a process that was killed has left
 
-    def _attempt(self, job: Job) -> bool:
+    def _attempt(self, job: Job, result: Result) -> bool:
         """Run the process of a job once; return whether another attempt would end the same."""
         command = [sys.executable, '-m', 'boxreg_ros.cli', 'relabel', *map(str, job.recordings)]
         command += ['-o', str(self.out / job.name), '--resume', *self.options]
-        delete_remains(self.out / job.name)
-        job.attempts += 1
-        log = self.out / JOBS / f'{job.name}.log'
-        with _log_file(log) as file:
+        result.attempts += 1
+        with _log_file(self.out / JOBS / f'{job.name}.log') as log, _pipe() as (steps, step):
             process = subprocess.Popen(
-                command, stdout=file, stderr=subprocess.STDOUT, preexec_fn=_end_with_parent()
-            )
+                command, stdout=log, stderr=subprocess.STDOUT, preexec_fn=_end_with_parent(),
+                pass_fds=[step], env={**os.environ, PIPE: str(step)},
+            )  # fmt: skip
             self.running.add(process)
-            is_late = self._wait(process, job)
+            problem = self._wait(process, steps, result)
             self.running.discard(process)
-            file.seek(0)
-            last_line = _last_line(file.read())
-        job.exit_status = process.returncode
-        job.last_line = last_line or f'ended with status {process.returncode}'
-        if is_late:
-            job.last_line = f'not done after {self.timeout:g} s: raise --timeout'
-        elif process.returncode < 0:
-            job.last_line = (
+            log.seek(0)
+            last_line = _last_line(log.read())
+        result.exit_status = process.returncode
+        if not problem and (process.returncode or 0) < 0:
+            result.last_line = (
                 f'its process was killed by signal {-process.returncode}; the most frequent cause '
-                f'is too little memory (it took {job.peak_bytes / 1e6:,.0f} MB): use fewer '
-                f'--workers'
+                f'is too little memory (it took {result.peak_mb:,} MB): use fewer --workers'
             )
-        return is_late or process.returncode >= 0
-
-    def _wait(self, process: Process, job: Job) -> bool:
-        """Wait for a process and measure its memory; end a late one, and return whether it was."""
-        deadline = time.monotonic() + (self.timeout or float('inf'))
-        while process.poll() is None and time.monotonic() < deadline:
-            job.peak_bytes = max(job.peak_bytes, memory_bytes(process.pid))
-            left = deadline - time.monotonic()
-            _wait_for(process, max(min(MEMORY_PERIOD, left), 0.0))
-        if process.poll() is not None:
             return False
-        process.terminate()
-        _wait_for(process, END_SECONDS)
-        process.kill()
-        _wait_for(process, END_SECONDS)  # one that reads from a dead mount does not end
+        result.last_line = problem or last_line or f'ended with status {process.returncode}'
         return True
+
+    def _wait(self, process: Process, steps: int, result: Result) -> str:
+        """Wait for a process; end one that stands still or takes too much, and return why."""
+        watch = Watch(self.timeout)
+        while True:
+            _wait_for(process, min(MEMORY_PERIOD, watch.left))
+            if process.poll() is not None:
+                return ''
+            memory = memory_bytes(process.pid)
+            result.peak_mb = max(result.peak_mb, round(memory / 1e6))
+            with suppress(BlockingIOError):
+                os.read(steps, PIPE_BYTES)
+                watch.advanced()
+            if memory > self.memory:
+                problem = f'it took more than {self.memory / 1e9:g} GB of memory: raise --memory'
+            elif not watch.left:
+                problem = f'no progress for {self.timeout:g} s: raise --timeout'
+            else:
+                continue
+            process.terminate()
+            _wait_for(process, END_SECONDS)
+            process.kill()
+            _wait_for(process, END_SECONDS)  # one that reads from a dead mount does not end
+            return problem
+
+
+def read_states(out: Path) -> dict[str, dict[str, Any]]:
+    """Return what is stored of the jobs that are done, by name."""
+    folder = out / JOBS
+    names: list[str] = []
+    if url_of(folder) is not None:
+        names = names_of(folder)
+    elif folder.is_dir():
+        names = os.listdir(folder)
+    states = {name[:-5]: _read_state(folder / name) for name in names if name.endswith('.json')}
+    return {name: state for name, state in states.items() if state}
 
 
 def memory_bytes(pid: int) -> int:
@@ -179,16 +237,27 @@ def memory_bytes(pid: int) -> int:
 
 
 def _wait_for(process: Process, seconds: float) -> None:
-    try:
+    with suppress(subprocess.TimeoutExpired):
         process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        return
 
 
 def _end_with_parent() -> Callable[[], None]:
     """Return a function for a new process: it ends with this one, even if this one is killed."""
     prctl = ctypes.CDLL(None).prctl  # loaded here: between fork and exec little is allowed
     return partial(prctl, PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+@contextmanager
+def _pipe() -> Iterator[tuple[int, int]]:
+    """Yield both ends of a pipe that nobody waits for."""
+    ends = os.pipe()
+    try:
+        for end in ends:
+            os.set_blocking(end, False)
+        yield ends
+    finally:
+        for end in ends:
+            os.close(end)
 
 
 @contextmanager
@@ -209,9 +278,15 @@ def _last_line(log: bytes) -> str:
     return lines[-1].removeprefix('boxreg: ') if lines else ''
 
 
+def _contents(files: Sequence[Sequence[Any]]) -> list[Any]:
+    """Return the hashes of files, as of `Job.hashes`."""
+    return [found[-1] for found in files]
+
+
 def _read_state(path: Path) -> dict[str, Any]:
+    """Return the state of a job; empty if it was never done."""
     try:
         state = json.loads(read_text(path))
     except (OSError, ValueError):
         return {}
-    return state if isinstance(state, dict) else {}
+    return state if isinstance(state, dict) and 'key' in state else {}

@@ -24,6 +24,9 @@ from boxreg_ros.structures import (
 
 MAX_NAMED = 5
 """Most tracks that a warning names; chosen."""
+FEW_BOXES = 3
+"""Boxes at fewer stamps than one in so many sweeps are keyframes; chosen: a detector that drops
+every second cloud is none."""
 FEW_REFINED = 0.5
 """Refined part of the boxes below which a run prints its most frequent reason. Chosen."""
 
@@ -47,6 +50,9 @@ def closing_line(summary: Summary, out: Path) -> str:
         f'{out}: {", ".join(parts)} from {summary.sweeps:,} sweeps in '
         f'{summary.seconds["total"]:.1f} s, fixed frame {summary.fixed_frame}'
     )
+    before, after = summary.sweeps_with_boxes.values()
+    if after != before:
+        line += f'; boxes at {before:,} stamps before, {after:,} after'
     if summary.recorded_apart:
         apart = [f'{topic} ({late:+,.1f} s)' for topic, late in summary.recorded_apart.items()]
         line += f'; merged by stamp: {", ".join(apart)}'
@@ -60,6 +66,7 @@ def notes(summary: Summary) -> Iterator[str]:
     yield from _input_notes(summary)
     yield from _lidar_notes(summary)
     yield from _label_notes(summary)
+    yield from _keyframe_notes(summary)
     if summary.unknown_classes:
         names = ', '.join(repr(name) for name in summary.unknown_classes)
         boxes = sum(summary.unknown_classes.values())
@@ -109,6 +116,28 @@ def _label_notes(summary: Summary) -> Iterator[str]:
         yield (
             f'{summary.frames_without_cloud:,} of {summary.box_arrays:,} box arrays have no '
             f'cloud to write beside them'
+        )
+
+
+def _keyframe_notes(summary: Summary) -> Iterator[str]:
+    """Yield keyframes that could not be used; and that boxes come at few of the sweeps."""
+    problems = [problem for seed in summary.seeds for problem in seed['problems']]
+    yield from problems[:MAX_NAMED]
+    if len(problems) > MAX_NAMED:
+        yield f'{len(problems) - MAX_NAMED:,} more keyframes; {SUMMARY} lists all under "seeds"'
+    first_ns, last_ns = summary.time_ranges.get('clouds', (0, 0))
+    if last_ns > first_ns:
+        rates = [n / (last_ns - first_ns) * 1e9 for n in (summary.box_arrays, summary.sweeps)]
+        is_filled = summary.sweeps_with_boxes['after'] * FEW_BOXES > summary.sweeps
+        yield from () if is_filled else sparse_boxes(*rates)
+
+
+def sparse_boxes(boxes: float, clouds: float) -> Iterator[str]:
+    """Yield what to do where the rate of boxes is far below that of clouds [Hz]."""
+    if 0 < FEW_BOXES * boxes <= clouds:
+        yield (
+            f'boxes at {boxes:.2g} Hz, clouds at {clouds:.2g} Hz: for a box at every cloud use '
+            f'--keyframes, where a person has made them, or --complete'
         )
 
 

@@ -16,7 +16,7 @@ from boxreg_ros.offline.reader import ReadItem, Source, uses_one_core
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.reasons import Reason
-from boxreg_ros.review.decisions import Corrections, read_decisions
+from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.structures import (
     ADDED,
     BoxArray,
@@ -54,11 +54,15 @@ class Sink:
         The recording.
     clock : Stopwatch
         The time spent on files is added to its stage ``write``.
+    corrections : Corrections
+        The decisions of a person.
 
     Attributes
     ----------
     boxes_in, boxes_out : int
         Boxes of the input, and boxes written, added ones included.
+    arrays_in, arrays_out : int
+        Box arrays of the input, and those written, that have any box.
     status, reasons : Counter
         Of the boxes written.
     heading_flips : int
@@ -72,7 +76,7 @@ class Sink:
     changes : Changes
         Boxes before and after, for the report and the tables of tracks.
     corrections : Corrections
-        Rejected tracks and pinned boxes.
+        The decisions of a person.
     array_stamps_ns : list of int
         Stamps of all box arrays [ns].
     points : PointCollector or None
@@ -80,10 +84,18 @@ class Sink:
 
     """
 
-    def __init__(self, folder: Path, request: Request, source: Source, clock: Stopwatch) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        request: Request,
+        source: Source,
+        clock: Stopwatch,
+        corrections: Corrections,
+    ) -> None:
         self._fixed_frame = source.fixed_frame
         self._sensor_frame = source.sensor_frame
         self._writes_early = request.config.estimate == 'early'
+        self._has_keyframes = request.keyframes
         self._clock = clock
         self._config = request.config
         self.time_ranges: dict[str, tuple[int, int]] = {}
@@ -96,9 +108,7 @@ class Sink:
         bags = recording if isinstance(recording, Recording) else None
         options = replace(request.options, recording=bags)
         self._output = LabelOutput(folder, request.box_formats, provenance, options)
-        self.corrections = Corrections(
-            read_decisions(request.decisions) if request.decisions is not None else ()
-        )
+        self.corrections = corrections
         # These import numba, after the fork of the reader.
         from boxreg_ros.review.changes import Changes
         from boxreg_ros.review.track_points import PointCollector
@@ -114,6 +124,8 @@ class Sink:
         self.array_stamps_ns: list[int] = []
         self.boxes_in = 0
         self.boxes_out = 0
+        self.arrays_in = 0
+        self.arrays_out = 0
         self.status: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
         self.heading_flips = 0
@@ -144,12 +156,14 @@ class Sink:
         """Take results of the registrar; write arrays up to the first one without a result."""
         for refined in ready:
             ticket = refined.boxes.ticket
-            if not (refined.is_final or self._writes_early):
-                self._early[ticket] = refined
-                continue
             slot = self._order.waiting_for(ticket)
-            if slot is not None:  # otherwise its early result has been taken
-                self._order.take(ticket, self.corrections.apply(slot.boxes, refined))
+            if slot is None:  # its early result has been taken
+                continue
+            result = self.corrections.apply(slot.boxes, refined)
+            if refined.is_final or self._writes_early:
+                self._order.take(ticket, result)
+            else:
+                self._early[ticket] = result
         for slot, result in self._order.ready():
             early = self._early.pop(result.boxes.ticket, None)
             self._background(self._put, result, slot, early)
@@ -192,24 +206,32 @@ class Sink:
         """Reserve a place; boxes that could not be transformed have their result at once."""
         count = len(given.track_ids)
         self.boxes_in += count
+        self.arrays_in += count > 0
         self.array_stamps_ns.append(given.stamp_ns)
         for name, boxes in Counter(given.class_names).items():
             if not self._config.knows_class(name):
                 self.unknown_classes[name] += boxes
-        if isinstance(item.moved, BoxArray):
-            slot = Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
+        moved = item.moved
+        if isinstance(moved, BoxArray):
+            if self._has_keyframes:  # soft: evidence may move those that files call pinned
+                moved = replace(moved, pinned=None)
             self._last_ticket += 1
+            slot = Slot(moved, item.T_fixed_sensor, item.T_fixed_given)
             self._order.expect(slot, self._last_ticket)
-            moved = replace(self.corrections.pinned(item.moved), ticket=self._last_ticket)
+            moved = replace(self.corrections.to_register(moved), ticket=self._last_ticket)
+            if self._has_keyframes:
+                moved = replace(moved, pinned=np.ones(len(moved.track_ids), bool))
             item = item._replace(moved=moved)
         elif count:
-            result = kept(given, Reason.NO_TRANSFORM)
+            left = kept(self.corrections.to_register(given, with_pins=False), Reason.NO_TRANSFORM)
+            result = self.corrections.apply(given, left)
             self._order.expect(Slot(given, item.T_fixed_sensor, item.T_fixed_given, result))
         return item
 
     def _put(self, refined: RefinedBoxes, slot: Slot, early: RefinedBoxes | None) -> None:
         """Count the boxes of one array and write them in all formats; in the thread."""
         self.boxes_out += len(refined.status)
+        self.arrays_out += len(refined.status) > 0
         self.status.update(refined.status)
         self.reasons.update(filter(None, refined.reasons))
         self.heading_flips += _heading_flips(slot.boxes, refined)

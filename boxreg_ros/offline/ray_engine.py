@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import logging
-from pathlib import Path
 import signal
 import socket
 from typing import Any
 
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.io.storage.urls import url_of
+from boxreg_ros.offline.batch_results import Result
 from boxreg_ros.offline.job import Job
 from boxreg_ros.offline.job_process import JobRunner
 
-DEFAULT_JOB_BYTES = 10**9
-"""
-Memory that a job declares before one was measured [bytes].
-
-Twice the memory that was measured for a sweep of 150,000 points (docs/results/speed.md#scale).
-
-"""
-MEMORY_RESERVE = 1.2
-"""Declared by measured memory; chosen: drives of one fleet differ by their number of objects."""
 JOBS_AHEAD = 2
 """Jobs that are submitted per core of the cluster: one runs, one waits."""
 CLUSTER_SECONDS = 5.0
@@ -32,9 +22,12 @@ NODE_LOSSES = 10
 """How often Ray starts a job again whose node or worker was lost; spot nodes are lost hourly."""
 
 
-def run_on_ray(jobs: Sequence[Job], runner: JobRunner, address: str | None) -> Iterator[Job]:
+@contextmanager
+def ray_engine(
+    runner: JobRunner, address: str | None
+) -> Iterator[tuple[Callable[[Job], Result], int, Callable[[], None]]]:
     """
-    Run jobs on a Ray cluster; yield each when it has ended, its results in the job given.
+    Yield a function that runs a job on a cluster, how many to run at a time, and one to end them.
 
     A job whose worker or node is lost is started again and goes on from its journal, as the
     output is on storage that all nodes share. So does a job of a driver that was killed, when the
@@ -42,10 +35,9 @@ def run_on_ray(jobs: Sequence[Job], runner: JobRunner, address: str | None) -> I
 
     Parameters
     ----------
-    jobs : sequence of Job
-        Jobs to run.
     runner : JobRunner
-        Runs one job on a node; its paths must exist there.
+        Runs one job on a node; its paths must exist there. Each job asks for one core and the
+        memory of the runner.
     address : str or None
         Of the cluster; None for the one of this machine, or a new local one.
 
@@ -58,26 +50,29 @@ def run_on_ray(jobs: Sequence[Job], runner: JobRunner, address: str | None) -> I
 
     """
     ray = _connected(address)
-    measured = runner.measured_bytes()
-    memory = round(measured * MEMORY_RESERVE) or DEFAULT_JOB_BYTES
-    options = {'num_cpus': 1, 'memory': memory, 'max_retries': NODE_LOSSES}
-    start = ray.remote(**options)(_run_job)
-    shared = ray.put(_absolute(runner))
-    most = max(JOBS_AHEAD * int(ray.cluster_resources().get('CPU', 1)), 1)
-    waiting = list(reversed(jobs))
-    pending: dict[Any, Job] = {}
-    try:
-        while waiting or pending:
-            while waiting and len(pending) < most:
-                job = waiting.pop()
-                pending[start.remote(shared, _absolute_job(job))] = job
-            (ended,), _ = ray.wait(list(pending), num_returns=1)
-            job = pending.pop(ended)
-            _take_result(ray, ended, job)
-            yield job
-    finally:
-        for reference in pending:
+    start = ray.remote(num_cpus=1, memory=runner.memory, max_retries=NODE_LOSSES)(_run_job)
+    shared = ray.put(runner)
+    pending: set[Any] = set()
+
+    def run(job: Job) -> Result:
+        reference = start.remote(shared, job)
+        pending.add(reference)
+        try:
+            result: Result = ray.get(reference)
+        except ray.exceptions.RayError as error:
+            reason = ' '.join(str(error).split())[:200]
+            lost = f'its worker was lost {NODE_LOSSES + 1} times, last: {reason}'
+            result = Result(job.name, last_line=f'{lost}; check the cluster')
+        pending.discard(reference)
+        return result
+
+    def end() -> None:
+        for reference in list(pending):
             ray.cancel(reference, force=True)
+
+    try:
+        yield run, max(JOBS_AHEAD * int(ray.cluster_resources().get('CPU', 1)), 1), end
+    finally:
         ray.shutdown()
 
 
@@ -109,33 +104,6 @@ def _check_answers(address: str | None) -> None:
         socket.create_connection((host, int(port)), CLUSTER_SECONDS).close()
 
 
-def _run_job(runner: JobRunner, job: Job) -> Job:
+def _run_job(runner: JobRunner, job: Job) -> Result:
     """Run a job on a node of the cluster."""
     return runner(job)
-
-
-def _take_result(ray: Any, reference: Any, job: Job) -> None:
-    """Copy the result of a job on the cluster to the job here."""
-    try:
-        found = ray.get(reference)
-    except ray.exceptions.RayError as error:
-        reason = ' '.join(str(error).split())[:200]
-        job.fail(f'its worker was lost {NODE_LOSSES + 1} times, last: {reason}; check the cluster')
-        return
-    recordings = job.recordings
-    for name, value in vars(found).items():
-        setattr(job, name, value)
-    job.recordings = recordings
-
-
-def _absolute(runner: JobRunner) -> JobRunner:
-    """Return a runner with paths that do not depend on the current folder."""
-    return replace(runner, out=_absolute_path(runner.out), running=set())
-
-
-def _absolute_job(job: Job) -> Job:
-    return replace(job, recordings=tuple(map(_absolute_path, job.recordings)))
-
-
-def _absolute_path(path: Path) -> Path:
-    return path if url_of(path) else path.resolve()

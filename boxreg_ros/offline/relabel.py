@@ -9,14 +9,14 @@ step of `Config.complete`, the recording is read twice and its tracks are comple
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, ExitStack
+from contextlib import ExitStack
 from dataclasses import asdict
-import json
 from pathlib import Path
 from shutil import copyfile
-from typing import TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.io.session import hand_to_registrar
+from boxreg_ros.offline.every_sweep import Arrivals, with_empty_arrays
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.products import (
     checked,
@@ -27,17 +27,18 @@ from boxreg_ros.offline.products import (
 from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.reader import ReadAhead, reader, ReadItem
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import CONFIG, delete_remains, SUMMARY, whole_folder, writing
+from boxreg_ros.offline.result_folder import claimed, CONFIG, whole_folder, write_summary
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.summary import Summary
-from boxreg_ros.review.decisions import DECISIONS
+from boxreg_ros.review.corrections import Corrections
+from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 import yaml
 
 if TYPE_CHECKING:
     from boxreg_ros.core.registrar import BoxRegistrar, Submit
-    from boxreg_ros.offline.completion import Completion
-    from boxreg_ros.offline.journal import EstimateJournal
+    from boxreg_ros.offline.completion import Completion, Moved
+    from boxreg_ros.offline.resume import EstimateJournal
     from boxreg_ros.tracks.complete import CompletionPlan
 
 
@@ -76,27 +77,30 @@ def relabel(
     clock = Stopwatch()
     progress = progress or Progress()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
-    shown = _Passes(progress, 1 + bool(request.config.complete.steps))
-    with writing(out), ExitStack() as workers:
+    shown = _Passes(progress, 1 + request.completes)
+    with claimed(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
-        plan, completion = _survey(request, clock, shown, journal)
+        corrections = _corrections(request)
+        survey = _survey(request, clock, shown, journal, corrections)
         receive = workers.enter_context(reader(request))
         # The recording is opened while this process imports numba, which takes half a second.
         from boxreg_ros.core.registrar import BoxRegistrar
         from boxreg_ros.offline.registration_worker import registration_worker
 
         recording = ReadAhead(receive)
-        if plan is None:
+        if survey is None:
             clock.begun('start')
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.announce)
         )
         registrar = BoxRegistrar(request.config, _journaled(submit, journal))
         with whole_folder(out, request.inputs()) as folder:
-            with Sink(folder, request, recording.source, clock) as sink:
-                _register(recording, registrar, completion, sink, clock, shown)
+            with Sink(folder, request, recording.source, clock, corrections) as sink:
+                _register(recording, registrar, survey, sink, clock, shown)
+            plan = None if survey is None else survey.plan
             summary = Summary.of(request, recording, registrar, sink)
             summary.complete = completed_counts(plan)
+            summary.seeds = [] if survey is None else survey.ends
             for stage, seconds in recording.findings.seconds.items():
                 clock.add(stage, seconds)
             summary.fingerprint = fingerprint
@@ -121,20 +125,15 @@ def relabel(
                 copyfile(request.decisions, folder / DECISIONS)  # a review goes on from there
             settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
             (folder / CONFIG).write_text(settings, encoding='utf-8')
-            (folder / SUMMARY).write_text(
-                json.dumps(summary.as_json(), indent=2) + '\n', encoding='utf-8'
-            )
+            write_summary(folder, summary.as_json())
     return summary
 
 
-@contextmanager
-def _journal(out: Path, fingerprint: str) -> Iterator[EstimateJournal]:
-    """Yield the journal of a run; while it is locked, other partial results are remains."""
-    from boxreg_ros.offline.journal import EstimateJournal, journal_path
+def _journal(out: Path, fingerprint: str) -> EstimateJournal:
+    """Return the journal of a run, not yet open."""
+    from boxreg_ros.offline.resume import EstimateJournal, journal_path
 
-    with EstimateJournal(journal_path(out), fingerprint) as journal:
-        delete_remains(out)
-        yield journal
+    return EstimateJournal(journal_path(out), fingerprint)
 
 
 def _journaled(submit: Submit | None, journal: EstimateJournal | None) -> Submit | None:
@@ -161,39 +160,77 @@ class _Passes:
         self._done += 1
 
 
+class _Survey(NamedTuple):
+    """The first pass over a recording: what completes its tracks, and where keyframes end."""
+
+    plan: CompletionPlan
+    completion: Completion
+    parts: list[Arrivals]
+    ends: list[dict[str, Any]]
+
+
+def _corrections(request: Request) -> Corrections:
+    """Return the decisions of a person; none without a file of them."""
+    return Corrections(() if request.decisions is None else read_decisions(request.decisions))
+
+
 def _survey(
-    request: Request, clock: Stopwatch, progress: _Passes, journal: EstimateJournal | None
-) -> tuple[CompletionPlan | None, Completion | None]:
-    """Register the recording a first time and plan its whole tracks; None without steps."""
-    if not request.config.complete.steps:
-        return None, None
+    request: Request,
+    clock: Stopwatch,
+    progress: _Passes,
+    journal: EstimateJournal | None,
+    corrections: Corrections,
+) -> _Survey | None:
+    """Read the recording a first time and plan its whole tracks; None where none is completed."""
+    if not request.completes:
+        return None
     with ExitStack() as workers:
         receive = workers.enter_context(reader(request))
         from boxreg_ros.offline.completion import Completion, first_pass
-        from boxreg_ros.offline.registration_worker import registration_worker
 
         recording = ReadAhead(receive)
         clock.begun('start')
+        fixed_frame = recording.source.fixed_frame
+        items = (
+            (_corrected(item.moved, corrections), item.restarts)
+            for item in progress.each(recording)
+        )
+        if request.keyframes:
+            from boxreg_ros.offline.keyframes import ends_of, keyframes
+
+            with clock('follow'):
+                plan, parts, tracks = keyframes(items, fixed_frame, request.config)
+            return _Survey(plan, Completion(plan, request.config), parts, ends_of(tracks))
+        from boxreg_ros.offline.registration_worker import registration_worker
+
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.progress.announce)
         )
-        items = ((item.moved, item.restarts) for item in progress.each(recording))
-        submit = _journaled(submit, journal)
-        first = first_pass(items, request.config, submit)
-        plan = first.plan(recording.source.fixed_frame, request.config)
-        return plan, Completion(plan, request.config)
+        first = first_pass(items, request.config, _journaled(submit, journal), fixed_frame)
+        plan = first.plan(fixed_frame, request.config)
+        return _Survey(plan, Completion(plan, request.config), first.parts, [])
+
+
+def _corrected(item: Moved, corrections: Corrections) -> Moved:
+    """Return boxes as they are to be registered; sweeps as they are."""
+    return corrections.to_register(item) if isinstance(item, BoxArray) else item
 
 
 def _register(
     recording: ReadAhead,
     registrar: BoxRegistrar,
-    completion: Completion | None,
+    survey: _Survey | None,
     sink: Sink,
     clock: Stopwatch,
     progress: _Passes,
 ) -> None:
-    """Read the recording, register its boxes, with those of `completion`, and write them."""
-    for item in progress.each(recording):
+    """Read the recording, register its boxes, with those of the survey, and write them."""
+    items = progress.each(recording)
+    completion = None
+    if survey is not None:
+        completion = survey.completion
+        items = with_empty_arrays(items, survey.parts, recording.source.fixed_frame)
+    for item in items:
         with_ticket = sink.expect(item)
         moved = with_ticket.moved
         with clock('registrar'):

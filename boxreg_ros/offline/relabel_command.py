@@ -6,7 +6,7 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 import sys
-from typing import Any, Self, TYPE_CHECKING
+from typing import Self, TYPE_CHECKING
 
 from boxreg_ros.offline.arguments import (
     add_options,
@@ -15,9 +15,9 @@ from boxreg_ros.offline.arguments import (
     Settings,
     values_of,
 )
-from boxreg_ros.offline.progress import Progress
+from boxreg_ros.offline.progress import advanced, Progress
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import CONFIG, earlier_summary, spare, SUMMARY
+from boxreg_ros.offline.result_folder import CONFIG, spare, SUMMARY, whole_summary
 from boxreg_ros.options import option
 
 if TYPE_CHECKING:
@@ -58,11 +58,17 @@ class Demands:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `boxreg relabel`."""
     add_recordings(parser)
+    add_run_arguments(parser)
+
+
+def add_run_arguments(parser: argparse.ArgumentParser, out: Path | None = None) -> None:
+    """Add the options of a run; `out` is the default of its result folder."""
     add_options(parser, Request)
     add_options(parser, Settings)
+    shown = '' if out is None else ' (default: %(default)s)'
     parser.add_argument(
-        '-o', '--out', type=Path, required=True,
-        help='result folder; it is written completely or not at all',
+        '-o', '--out', type=Path, required=out is None, default=out,
+        help=f'result folder; it is written completely or not at all{shown}',
     )  # fmt: skip
     parser.add_argument(
         '--resume', action='store_true',
@@ -85,8 +91,8 @@ def run(args: argparse.Namespace) -> int:
 
     request = request_from(args)
     demands = Demands(**values_of(args, Demands))
-    earlier = earlier_summary(args.out)
-    if args.resume and earlier and _is_complete(earlier, request, args.out):
+    earlier = whole_summary(args.out) if args.resume else None
+    if earlier and earlier['fingerprint'] == request.fingerprint():
         print(f'{args.out}: up to date, made from the same files with the same settings')
         return _status(Summary.from_json(earlier), demands)
     if args.config != args.out / CONFIG:  # this one is written again with the same content
@@ -116,21 +122,6 @@ def _status(summary: Summary, demands: Demands) -> int:
     return FAILED if summary.has_failed else DONE
 
 
-def _is_complete(earlier: dict[str, Any], request: Request, out: Path) -> bool:
-    """Return whether `out` holds the result of the same request, with all its files."""
-    from boxreg_ros.io.storage.urls import url_of
-    from boxreg_ros.labels import is_written
-    from boxreg_ros.review.report import REPORT
-
-    if earlier['fingerprint'] != request.fingerprint():
-        return False
-    if url_of(out) is not None:
-        return True  # its summary is written last
-    if request.report and not (out / REPORT).exists():
-        return False
-    return all(is_written(name, out) for name in request.all_formats)
-
-
 class ProgressBar(Progress):
     """A bar on stderr, where that is a terminal; use as a context manager."""
 
@@ -139,6 +130,7 @@ class ProgressBar(Progress):
         from tqdm import tqdm
 
         is_hidden = not sys.stderr.isatty()
+        self._done = 0.0
         self._bar = tqdm(total=1.0, unit='s', disable=is_hidden, leave=False, bar_format=BAR)
         return self
 
@@ -150,8 +142,12 @@ class ProgressBar(Progress):
         """Show the progress of a run [s of the recording]."""
         self._bar.set_description_str('', refresh=False)
         self._bar.total = total
-        self._bar.update(max(0.0, done - self._bar.n))
+        if done > self._done:
+            self._bar.update(done - self._done)
+            self._done = done
+            advanced()
 
     def announce(self, activity: str) -> None:
         """Show the activity that the run waits for beside the bar."""
         self._bar.set_description_str(f'({activity})')
+        advanced()

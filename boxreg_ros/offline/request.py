@@ -57,6 +57,8 @@ class Request:
         Settings of the core.
     options : Options
         Settings of the label formats.
+    command : tuple of str
+        Arguments of `boxreg` that describe the request; empty if it was made in another way.
     others
         As their options state; None for the default named there.
 
@@ -86,6 +88,12 @@ class Request:
         parse=_labels,
         text=lambda labels: ':'.join(map(str, labels)),
     )
+    keyframes: bool = option(
+        False,
+        "the boxes are a person's, at some sweeps only: none is rejected or renamed, and each "
+        'object gets a box at every sweep, beyond its first and last keyframe as long as points '
+        'support it',
+    )
     fixed_frame: str | None = option(
         None,
         'frame to refine in (default: topmost frame that the frame of the clouds moves in)',
@@ -106,7 +114,8 @@ class Request:
     config: Config = field(default_factory=Config)
     decisions: Path | None = option(
         None,
-        'decisions.csv of boxreg review: keep rejected tracks as input, hold pinned boxes',
+        'decisions.csv of boxreg review: split, join, rename and delete tracks, keep rejected '
+        'ones as input, hold pinned boxes',
         metavar='FILE',
         parse=Path,
     )
@@ -152,11 +161,19 @@ class Request:
         parse=Path,
     )
 
+    command: tuple[str, ...] = field(default=(), repr=False, compare=False)
+
     def __post_init__(self) -> None:
         """Check the options."""
         self._check_recordings()
         self._check_boxes()
         self._check_part()
+        if self.keyframes and self.config.complete.steps:
+            raise ConfigError(
+                f'keyframes: expected without steps of --complete, got '
+                f'{", ".join(self.config.complete.steps)}; leave them out: keyframes are neither '
+                f'joined nor rejected, and missing boxes are followed through the points'
+            )
         check_options(self.box_formats, self.options)
         if self.report:
             from boxreg_ros.review.report import check_packages  # imports torch
@@ -246,6 +263,11 @@ class Request:
     def needs_point_labels(self) -> bool:
         """Return whether the recording is read again, to label its points."""
         return bool(self.point_formats or self.clouds or self.undistort or self.label_points)
+
+    @property
+    def completes(self) -> bool:
+        """Return whether boxes are added: the recording is read twice."""
+        return self.keyframes or bool(self.config.complete.steps)
 
     def inputs(self) -> tuple[Path, ...]:
         """Return the input files and folders."""

@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 import errno
-from glob import escape
+import hashlib
 import json
 import os
 from pathlib import Path
 import shutil
 from typing import Any
-from uuid import uuid4
 
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.io.storage.urls import names_of, read_text, upload, url_of
-from boxreg_ros.io.whole_files import DISK_ERRORS, temporary_folder
+from boxreg_ros.io.lock import locked
+from boxreg_ros.io.storage.urls import names_of, read_text, sizes_of, UPLOAD, upload, url_of
+from boxreg_ros.io.whole_files import DISK_ERRORS, store, temporary_folder
+from boxreg_ros.offline.progress import advanced
 
 REFUSED_ERRORS = (
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.ENOENT,
@@ -23,6 +24,8 @@ REFUSED_ERRORS = (
 """No permission, read-only file system, a file in place of a folder, no folders as in /proc."""
 SUMMARY = 'summary.json'
 CONFIG = 'config.yaml'
+FILES = 'files'
+"""Field of the summary: size and SHA-256 of each other file, by name."""
 
 
 def earlier_summary(out: Path) -> dict[str, Any] | None:
@@ -32,6 +35,31 @@ def earlier_summary(out: Path) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     return summary if isinstance(summary, dict) and 'fingerprint' in summary else None
+
+
+def whole_summary(out: Path) -> dict[str, Any] | None:
+    """
+    Return the summary of an earlier run; None without one, or if a file is missing or empty.
+
+    Files that someone has changed since count as whole.
+
+    """
+    summary = earlier_summary(out)
+    if summary is None:
+        return None
+    found = _sizes(out) if url_of(out) is None else sizes_of(out)
+    listed = summary.get(FILES, {}).items()
+    lost = any(about['size'] and not found.get(name) for name, about in listed)
+    return None if lost else summary
+
+
+def write_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """Add all files of a result to its summary, and write this last file."""
+    summary[FILES] = {
+        name: {'size': size, 'sha256': _digest(folder / name)}
+        for name, size in sorted(_sizes(folder).items())
+    }
+    (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
 
 
 def spare(out: Path, inputs: Iterable[Path | None]) -> None:
@@ -73,9 +101,39 @@ def spare_file(out: Path, inputs: Iterable[Path]) -> None:
 
 
 @contextmanager
+def claimed(out: Path) -> Iterator[None]:
+    """
+    Keep other runs from an output, and settle what a run that was killed has left of it.
+
+    Object stores have no locks: of a URL, a second run is not noticed.
+
+    Raises
+    ------
+    RecordingError
+        If another run writes to it, or it cannot be written.
+
+    """
+    with writing(out):
+        if url_of(out) is not None:
+            yield
+            return
+        whole = out.resolve()
+        whole.parent.mkdir(parents=True, exist_ok=True)
+        with locked(_beside(whole, 'lock'), f'output {str(out)!r}'):
+            partial, earlier = _beside(whole, 'partial'), _beside(whole, 'earlier')
+            if earlier.exists() and not whole.exists():  # killed between the two renames
+                os.replace(earlier, whole)
+            for remains in (partial, earlier):
+                shutil.rmtree(remains, ignore_errors=True)
+            yield
+
+
+@contextmanager
 def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path]:
     """
     Yield a temporary folder that replaces `out` on success and is deleted on failure.
+
+    On success all of it is on the disk itself. The caller has `claimed` the output.
 
     Raises
     ------
@@ -92,16 +150,16 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
     spare(out, inputs)
     _check_replaceable(out)
     out = out.resolve()
-    unique = f'.{out.name}.{uuid4().hex[:8]}'
-    partial = out.with_name(f'{unique}.partial')
-    earlier = out.with_name(f'{unique}.earlier')
+    partial, earlier = _beside(out, 'partial'), _beside(out, 'earlier')
     try:
         with writing(out):
             partial.mkdir(parents=True)
             yield partial
+            store([*partial.rglob('*'), partial])
             if out.exists():
                 os.replace(out, earlier)
             os.replace(partial, out)
+            store([out.parent])
     finally:
         if earlier.exists() and not out.exists():
             os.replace(earlier, out)
@@ -112,11 +170,13 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
 @contextmanager
 def _uploaded_folder(out: Path) -> Iterator[Path]:
     """Yield a folder of this machine that is uploaded to the URL `out` on success."""
-    if earlier_summary(out) is None and names_of(out):
-        raise _other_files(out)
+    if earlier_summary(out) is None:
+        names = names_of(out)
+        if names and UPLOAD not in names:
+            raise _other_files(out)
     with temporary_folder() as folder:
         yield folder
-        upload(folder, out, SUMMARY)
+        upload(folder, out, SUMMARY, advanced)
 
 
 @contextmanager
@@ -148,15 +208,6 @@ def writing(out: Path) -> Iterator[None]:
         raise
 
 
-def delete_remains(out: Path) -> None:
-    """Delete the partial results of runs that were killed; none may be running."""
-    if url_of(out) is not None:
-        return
-    whole = out.resolve()
-    for remains in whole.parent.glob(f'.{escape(whole.name)}.*.partial'):
-        shutil.rmtree(remains, ignore_errors=True)
-
-
 def _check_replaceable(out: Path) -> None:
     """Refuse a folder that is not the unchanged result of an earlier run."""
     if out.exists() and earlier_summary(out) is None and not _is_empty(out):
@@ -165,7 +216,7 @@ def _check_replaceable(out: Path) -> None:
     if changed is not None:
         raise RecordingError(
             f'output {str(out)!r}: expected an unchanged earlier result, got one with '
-            f'{str(changed)!r} changed or added since, which would be lost; choose another with '
+            f'{changed!r} changed or added since, which would be lost; choose another with '
             f'-o, or delete this one'
         )
 
@@ -177,16 +228,30 @@ def _other_files(out: Path) -> RecordingError:
     )
 
 
-def _changed_since(out: Path) -> Path | None:
-    """Return a file in a result that is younger than its summary, which is written last."""
-    summary = out / SUMMARY
-    if not summary.is_file():
-        return None
-    made_ns = summary.stat().st_mtime_ns
-    for file in out.rglob('*'):
-        if file.is_file() and file.stat().st_mtime_ns > made_ns:
-            return file.relative_to(out)
+def _changed_since(out: Path) -> str | None:
+    """Return the name of a file in a result whose content is not what the summary states."""
+    listed = (earlier_summary(out) or {}).get(FILES, {})
+    for name, size in _sizes(out).items():
+        if size and listed.get(name) != {'size': size, 'sha256': _digest(out / name)}:
+            return name
     return None
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    """Return names and sizes [bytes] of all files of a result but its summary."""
+    files = {str(file.relative_to(folder)): file for file in folder.rglob('*') if file.is_file()}
+    return {name: file.stat().st_size for name, file in files.items() if name != SUMMARY}
+
+
+def _digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open('rb') as file:
+        return hashlib.file_digest(file, 'sha256').hexdigest()
+
+
+def _beside(out: Path, suffix: str) -> Path:
+    """Return the hidden path beside an output for its lock or its parts."""
+    return out.with_name(f'.{out.name}.{suffix}')
 
 
 def _is_near(path: Path, out: Path) -> bool:
@@ -194,7 +259,7 @@ def _is_near(path: Path, out: Path) -> bool:
     whole = out.resolve()
     if whole.is_relative_to(path.resolve()):
         return True
-    hidden = str(whole.with_name(f'.{whole.name}.'))
+    hidden = str(_beside(whole, ''))
     return str(path.resolve()).startswith(hidden)
 
 

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import version
+from pathlib import Path
 import platform
 from typing import Any, Self, TYPE_CHECKING
 
@@ -34,6 +35,9 @@ class Summary:
     ----------
     recordings : list of str
         Paths.
+    command, folder : list of str, and str
+        Arguments of `boxreg` that made the result, and the folder they were given in; no
+        arguments for a run from Python.
     topics : dict
         Topics of points, boxes and odometry; None where there is none.
     labels : dict or None
@@ -79,6 +83,11 @@ class Summary:
         Of everything that can change the results.
     complete : dict
         Tracks and boxes that each step of completion changed; empty without steps.
+    seeds : list of dict
+        Where each track of keyframes ends in both directions and why, and keyframes that could
+        not be used; empty without keyframes.
+    sweeps_with_boxes : dict
+        Sweeps with a box ``before`` and ``after`` the run.
     fingerprint : str
         Of the request and its files.
     seconds : dict
@@ -91,6 +100,8 @@ class Summary:
     """
 
     recordings: list[str]
+    command: list[str]
+    folder: str
     topics: dict[str, str | None]
     labels: dict[str, Any] | None
     fixed_frame: str
@@ -123,6 +134,8 @@ class Summary:
     versions: dict[str, str]
     associated_tracks: int | None = None
     complete: dict[str, int] = field(default_factory=dict)
+    seeds: list[dict[str, Any]] = field(default_factory=list)
+    sweeps_with_boxes: dict[str, int] = field(default_factory=dict)
     fingerprint: str = ''
     seconds: dict[str, float] = field(default_factory=dict)
     rules: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -150,6 +163,8 @@ class Summary:
         findings = recording.findings
         return cls(
             recordings=[str(path) for path in request.recordings],
+            command=list(request.command),
+            folder=str(Path.cwd()),
             topics=source.topics,
             labels=_labels(request, findings.outside),
             fixed_frame=source.fixed_frame,
@@ -158,6 +173,7 @@ class Summary:
             box_arrays=findings.counts['box_arrays'],
             boxes_in=sink.boxes_in,
             boxes_out=sink.boxes_out,
+            sweeps_with_boxes={'before': sink.arrays_in, 'after': sink.arrays_out},
             status=dict(sink.status),
             reasons=dict(sink.reasons.most_common()),
             time_jumps=findings.counts[Reason.TIME_JUMP],

@@ -9,24 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 import gc
 import os
 import pickle
 import signal
 import socket
-import struct
 from traceback import format_exc
 from typing import Any
 
 from boxreg_ros.errors import BoxregError
-import numpy as np
 
 Receive = Callable[[], Any]
 Send = Callable[[Any], None]
 Serve = Callable[[Receive, Send], None]
 
-LARGE_BYTES = 2**16
-"""Arrays of at least this size are sent without a copy into the pickled message [bytes]."""
+ENDED = (EOFError, OSError, pickle.UnpicklingError)
+"""Errors of a connection whose other end was closed, also within an item."""
 
 
 class WorkerProcess:
@@ -43,7 +42,7 @@ class WorkerProcess:
     """
 
     def __init__(self, connection: socket.socket, purpose: str) -> None:
-        self._connection = connection
+        self._receive, self._send = _ends(connection)
         self._purpose = purpose
 
     def send(self, item: Any) -> None:
@@ -57,7 +56,7 @@ class WorkerProcess:
 
         """
         with self._report_end():
-            _send(self._connection, item)
+            self._send(item)
 
     def receive(self) -> Any:
         """
@@ -72,7 +71,7 @@ class WorkerProcess:
 
         """
         with self._report_end():
-            item = _receive(self._connection)
+            item = self._receive()
         if isinstance(item, Exception):
             raise item
         return item
@@ -82,7 +81,7 @@ class WorkerProcess:
         """Turn a closed connection into an error that names the process."""
         try:
             yield
-        except (EOFError, OSError):
+        except ENDED:
             raise BoxregError(
                 f'the process that {self._purpose}: expected it to run until all is done, but it '
                 f'has ended; the most frequent cause is too little memory: choose a smaller '
@@ -133,13 +132,8 @@ def _run(serve: Serve, connection: socket.socket) -> None:
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the parent handles them and ends the worker
 
-    def receive() -> Any:
-        return _receive(connection)
-
-    def send(item: Any) -> None:
-        _send(connection, item)
-
-    with suppress(EOFError, OSError):  # the parent has closed the connection
+    receive, send = _ends(connection)
+    with suppress(*ENDED):  # the parent has closed the connection
         try:
             serve(receive, send)
         except Exception as error:
@@ -147,45 +141,18 @@ def _run(serve: Serve, connection: socket.socket) -> None:
             send(error)
 
 
-def _send(connection: socket.socket, item: Any) -> None:
+def _ends(connection: socket.socket) -> tuple[Receive, Send]:
     """
-    Send the pickled item without its large arrays, and each large array as it lies in memory.
+    Return functions that receive and send pickled items.
 
-    `multiprocessing.Connection` is not used: it would copy each array once more on either side,
-    and place tensors in shared memory.
+    `multiprocessing.Connection` is not used: it would copy each array once more on either side.
 
     """
-    large: list[memoryview] = []
+    reader = connection.makefile('rb')
+    writer = connection.makefile('wb')
 
-    def keep_in_message(buffer: pickle.PickleBuffer) -> bool:
-        if buffer.raw().nbytes < LARGE_BYTES:
-            return True
-        large.append(buffer.raw())
-        return False
+    def send(item: Any) -> None:
+        pickle.dump(item, writer, pickle.HIGHEST_PROTOCOL)
+        writer.flush()
 
-    message = pickle.dumps(item, pickle.HIGHEST_PROTOCOL, buffer_callback=keep_in_message)
-    sizes = [len(message), *(buffer.nbytes for buffer in large)]
-    connection.sendall(struct.pack(f'<Q{len(sizes)}Q', len(sizes), *sizes))
-    connection.sendall(message)
-    for buffer in large:
-        connection.sendall(buffer)
-
-
-def _receive(connection: socket.socket) -> Any:
-    """Return the next item that `_send` sent."""
-    (count,) = struct.unpack('<Q', _received(connection, 8))
-    sizes = struct.unpack(f'<{count}Q', _received(connection, 8 * count))
-    message, *buffers = (_received(connection, size) for size in sizes)
-    return pickle.loads(message, buffers=buffers)
-
-
-def _received(connection: socket.socket, size: int) -> memoryview:
-    """Return the next `size` bytes."""
-    buffer = np.empty(size, np.uint8).data  # not zeroed, as a bytearray would be
-    rest = buffer
-    while len(rest):
-        received = connection.recv_into(rest, 0, socket.MSG_WAITALL)
-        if not received:
-            raise EOFError('the other end of the connection is closed')
-        rest = rest[received:]
-    return buffer
+    return partial(pickle.load, reader), send

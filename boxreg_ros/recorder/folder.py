@@ -2,71 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-import fcntl
-import os
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import IO
+from typing import NamedTuple
 
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.lock import locked
 from boxreg_ros.recorder.segment import recover
 
 LOCK = '.lock'
+DAMAGED = '.damaged'
+"""Suffix of the folder of a segment whose journal cannot be read."""
 
 
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """
-    Keep other recordings out of a folder.
+class Recovery(NamedTuple):
+    """Segments made from journals, and the folders of those that cannot be read."""
 
-    The kernel releases the lock when the process ends, in whichever way.
-
-    Raises
-    ------
-    RecordingError
-        If the folder cannot be written to, or another process records into it.
-
-    """
-    try:
-        file = (folder / LOCK).open('a+')
-    except OSError as error:
-        raise RecordingError(
-            f'record_to {str(folder)!r}: expected a folder that can be written to, got: '
-            f'{error.strerror}; choose another, or change its owner or mode'
-        ) from None
-    with file:
-        _lock(file, folder)
-        file.truncate(0)
-        file.write(f'{os.getpid()}\n')
-        file.flush()
-        yield
+    recovered: int
+    damaged: tuple[Path, ...]
 
 
-def recover_all(opened: Sequence[Path]) -> int:
+def lock_of(folder: Path) -> AbstractContextManager[None]:
+    """Return a context that keeps other recordings out of a folder; see `locked`."""
+    return locked(folder / LOCK, f'record_to {str(folder)!r}')
+
+
+def recover_all(opened: Sequence[Path]) -> Recovery:
     """
     Complete the segments of a locked folder that were cut off.
+
+    One that cannot be read gets another name, so that it neither is lost nor stops a recording.
 
     Parameters
     ----------
     opened : sequence of Path
         From `open_segments`, before a further segment was opened.
 
-    Returns
-    -------
-    recovered : int
-        Number of segments made: one whose journal has no frame is deleted only.
-
     """
-    return sum(recover(path) > 0 for path in opened)
-
-
-def _lock(file: IO[str], folder: Path) -> None:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        file.seek(0)
-        raise RecordingError(
-            f'record_to {str(folder)!r}: expected a folder that nobody records into, got one in '
-            f'use by process {file.read().strip()}; choose another, or stop that recording'
-        ) from None
+    recovered = 0
+    damaged = []
+    for path in opened:
+        try:
+            recovered += recover(path) > 0
+        except RecordingError:
+            damaged.append(path.rename(path.with_suffix(DAMAGED)))
+    return Recovery(recovered, tuple(damaged))

@@ -31,7 +31,7 @@ from boxreg_ros.labels import LabelFrame, module_of
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.cloud_spool import FOLDER as CLOUDS
 from boxreg_ros.labels.cloud_spool import Spool
-from boxreg_ros.recorder.folder import locked, recover_all
+from boxreg_ros.recorder.folder import lock_of, recover_all, Recovery
 from boxreg_ros.recorder.segment import (
     journal_settings,
     next_number,
@@ -84,7 +84,7 @@ class Recorder:
         if settings.with_points:
             self._spool = Spool(self._folder, settings.config)
         self._thread = ThreadPoolExecutor(1)
-        self._recovery: Future[int] | None = self._thread.submit(recover_all, cut_off)
+        self._recovery: Future[Recovery] | None = self._thread.submit(recover_all, cut_off)
         self._completions: deque[tuple[Segment, Future[None]]] = deque()
         self._written: Counter[str] = Counter()  # by field of `RecorderStatus`
         self._growth = Growth()
@@ -118,7 +118,7 @@ class Recorder:
 
     def status(self) -> RecorderStatus:
         """
-        Return the present state, and end a segment that has reached its size.
+        Return the present state; store the open segment, and end one that has reached its size.
 
         Raises
         ------
@@ -128,8 +128,10 @@ class Recorder:
         """
         self._collect()
         segment = self._segment
-        if segment is not None and segment.is_deleted:
-            raise _deleted(self._folder)
+        if segment is not None:
+            if segment.is_deleted:
+                raise _deleted(self._folder)
+            segment.sync()
         open_bytes = 0 if segment is None else self._growth.measure(segment.files)
         size = self._written['size'] + open_bytes
         if segment is not None and self._limits_bytes and open_bytes >= self._limit:
@@ -190,7 +192,9 @@ class Recorder:
     def _collect(self) -> None:
         """Count completed segments; raise the error of one that could not be completed."""
         if self._recovery is not None and self._recovery.done():
-            self._written['recovered'] = self._recovery.result()
+            recovery = self._recovery.result()
+            self._written['recovered'] = recovery.recovered
+            self._written['damaged'] = len(recovery.damaged)
             self._recovery = None
         while self._completions and self._completions[0][1].done():
             segment, completion = self._completions[0]
@@ -297,7 +301,7 @@ def serve(source: IO[bytes], report: Callable[[RecorderStatus], None]) -> None:
     recorder: Recorder | None = None
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with locked(folder):
+        with lock_of(folder):
             recorder = Recorder(settings)
             report(recorder.status())
             _record(recorder, source, report)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict, replace
 import os
 from pathlib import Path
@@ -11,20 +10,22 @@ import re
 import shutil
 
 from boxreg_ros.config import Config
+from boxreg_ros.io.journal import Journal
 from boxreg_ros.io.label_feed import RecorderSettings
 from boxreg_ros.io.whole_files import store
 from boxreg_ros.labels import LabelFrame, LabelOutput, Options, Provenance
 from boxreg_ros.labels.output import with_csv
 from boxreg_ros.labels.protocol import absolute
 from boxreg_ros.labels.segments import INDEX, IndexRow, read_index, write_index
-from boxreg_ros.recorder.journal import FrameJournal, JOURNAL, read_journal
 import yaml
 
+JOURNAL = 'journal.sqlite'
+"""In the folder of an open segment: its settings, then every frame before it is written."""
 LABEL_FILES = 'labels'
 """Folder of the label files inside that of an open segment."""
 CONFIG = 'config.yaml'
 OPEN_NAME = re.compile(r'\.(segment_\d{6})\.open')
-SEGMENT_NAME = re.compile(r'\.?segment_(\d{6})(\.open)?')
+SEGMENT_NAME = re.compile(r'\.?segment_(\d{6})(\.open|\.damaged)?')
 
 
 class SegmentFiles:
@@ -137,12 +138,17 @@ class Segment:
         self._open.mkdir()
         self.files = SegmentFiles(self._open, target, settings)
         # Last: a folder without a journal was never in use.
-        self._journal = FrameJournal(self._open / JOURNAL, settings)
+        self._journal = Journal(self._open / JOURNAL)
+        self._journal.append(dict(settings))
 
     def write(self, frame: LabelFrame) -> None:
         """Write a frame to the journal, then to the label files."""
-        self._journal.add(frame)
+        self._journal.append(frame)
         self.files.write(frame)
+
+    def sync(self) -> None:
+        """Wait until the journal is on the disk itself, where it survives a power cut."""
+        self._journal.sync()
 
     @property
     def is_deleted(self) -> bool:
@@ -151,19 +157,18 @@ class Segment:
 
     def complete(self) -> None:
         """Complete the label files and delete the journal."""
-        self._journal.close()
         self.files.complete(recovered=False)
+        self._journal.delete()
         shutil.rmtree(self._open)
 
     def abandon(self) -> None:
         """Delete the incomplete label files; the journal stays, so `recover` can write them."""
-        with suppress(OSError):  # the disk is full
-            self._journal.close()
+        self._journal.close()
         shutil.rmtree(self.files.folder, ignore_errors=True)
 
 
 def journal_settings(settings: RecorderSettings) -> dict[str, str]:
-    """Return the metadata of a journal: all that the label writers need beside the frames."""
+    """Return the first object of a journal: what the label writers need beside the frames."""
     return {
         'formats': ','.join(with_csv(settings.formats)),
         'with_points': str(settings.with_points).lower(),
@@ -209,7 +214,7 @@ def recover(opened: Path) -> int:
     Raises
     ------
     RecordingError
-        If the journal is no journal.
+        If the journal cannot be read; nothing is deleted then.
 
     """
     found = OPEN_NAME.fullmatch(opened.name)
@@ -225,13 +230,20 @@ def recover(opened: Path) -> int:
 
 def _rebuild(opened: Path, target: Path) -> int:
     """Write the frames of a journal as a segment; return their number."""
-    # `target` exists where the end came between its name and the index.
-    for incomplete in (opened / LABEL_FILES, target):
-        shutil.rmtree(incomplete, ignore_errors=True)
-    settings, frames = read_journal(opened / JOURNAL)
-    files = SegmentFiles(opened, target, settings)
-    for frame in frames:
-        files.write(frame)
-    if files.frames:
-        files.complete(recovered=True)
-    return files.frames
+    journal = Journal(opened / JOURNAL)
+    try:
+        records = journal.records()
+        settings = next(records, None)
+        if settings is None:  # cut off before its first frame
+            return 0
+        # `target` exists where the end came between its name and the index.
+        for incomplete in (opened / LABEL_FILES, target):
+            shutil.rmtree(incomplete, ignore_errors=True)
+        files = SegmentFiles(opened, target, settings)
+        for frame in records:
+            files.write(frame)
+        if files.frames:
+            files.complete(recovered=True)
+        return files.frames
+    finally:
+        journal.close()

@@ -1,71 +1,89 @@
 """
 ``decisions.csv``: what a person decided about tracks and boxes, one row per decision.
 
-Rows are only appended, so a crash loses at most the row that is being written. Of several rows
-for the same track and stamp the last one holds; ``none`` takes a decision back.
+Rows are only appended, so a crash loses at most the rows that are being written. Of several rows
+of one topic about the same boxes the last one holds. Several programs may append to one file.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import csv
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+import fcntl
 import io
 import os
 from pathlib import Path
 from typing import Any
 
 from boxreg_ros.errors import RecordingError, unreadable
-from boxreg_ros.reasons import Reason
+from boxreg_ros.io.box_table import csv_row
+from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.rotations import quaternion_from_rpy, rpy_from_quaternion
-from boxreg_ros.structures import (
-    BOX_EXTENT,
-    BoxArray,
-    Floats,
-    HUMAN,
-    is_valid_box,
-    KEPT,
-    RefinedBoxes,
-    ROLL,
-    Z,
-)
+from boxreg_ros.structures import BOX_EXTENT, Floats, is_valid_box, ROLL, Z
 import numpy as np
 from numpy.typing import NDArray
 
 DECISIONS = 'decisions.csv'
-DECISION_KINDS = ('accept', 'reject', 'unsure', 'pin', 'none')
+VERSION = 2
+VERSION_LINE = '# boxreg decisions '
+"""Begins the first line, before the version. Files of version 1 do not have it."""
+KINDS_OF_TOPIC: Mapping[str, tuple[str, ...]] = {
+    'judgement': ('accept', 'reject', 'unsure', 'pin', 'none'),
+    'deletion': ('delete', 'restore'),
+    'id': ('rename',),
+    'class': ('reclass',),
+}
+"""Kinds of decisions by topic: a decision replaces those of its topic about the same boxes."""
+TOPIC_OF = {kind: topic for topic, kinds in KINDS_OF_TOPIC.items() for kind in kinds}
 PINNED_BOX_COLUMNS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height')
-DECISION_COLUMNS = ('track_id', 'stamp_ns', 'decision', 'comment', 'frame_id', *PINNED_BOX_COLUMNS)
+FIRST_COLUMNS = ('track_id', 'stamp_ns', 'decision', 'comment', 'frame_id', *PINNED_BOX_COLUMNS)
+"""Those of version 1."""
+DECISION_COLUMNS = (*FIRST_COLUMNS, 'end_ns', 'value', 'who', 'when')
+MAX_STAMP_NS = 2**63 - 1
 MAX_COMMENT = 2000
 """Longest comment [characters]; chosen: a row fits a page of memory, which is written at once."""
+FORMULA_STARTS = ('=', '+', '-', '@', '\t', '\r', "'")
+"""Spreadsheets run cells that begin so as formulas, or hide the first character."""
+
+Scope = tuple[str, int | None, int | None]
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
     """
-    One decision about a track, or about one of its boxes.
+    One decision about a track, or about some of its boxes.
 
     Attributes
     ----------
     track_id : str
-        The track.
+        The track in the input of the run.
     stamp_ns : int or None
-        Stamp of the box [ns]; None for the whole track.
+        Stamp of the box, or the first one of a range [ns]; None for the whole track.
     kind : str
-        ``accept``, ``reject`` (keep the input), ``unsure``, ``pin`` (the box is right as given)
-        or ``none`` (no decision any more).
+        ``accept``, ``reject`` (keep the input), ``unsure``, ``pin`` (the box is right as given),
+        ``none`` (no judgement any more); ``delete``, ``restore``; ``rename`` and ``reclass``
+        (their `value` is the new id or class; empty for that of the input).
     comment : str
         Free text in one line.
     frame_id : str
         Frame of `box`; empty without one.
     box : array, shape (9,), or None
         The pinned box [m, rad].
+    end_ns : int or None
+        Last stamp of a range [ns]; None for one box, or the whole track.
+    value : str
+        New id or class.
+    who, when : str
+        The person, and the time in UTC (ISO 8601).
 
     Raises
     ------
     RecordingError
-        If the kind is unknown, or a pin has no stamp or no valid box.
+        If the kind is unknown, stamps are no range of 64-bit numbers, or a pin has no stamp or no
+        valid box.
 
     """
 
@@ -75,27 +93,69 @@ class Decision:
     comment: str = ''
     frame_id: str = ''
     box: Floats | None = None
+    end_ns: int | None = None
+    value: str = ''
+    who: str = ''
+    when: str = ''
 
     def __post_init__(self) -> None:
         """Check the decision."""
-        if self.kind not in DECISION_KINDS:
+        if self.kind not in TOPIC_OF:
             raise RecordingError(
-                f'decision: expected one of {", ".join(DECISION_KINDS)}, got {self.kind!r}; '
-                f'decide again, or remove the row'
+                f'decision: expected one of {", ".join(TOPIC_OF)}, got {self.kind!r}; decide '
+                f'again, or remove the row'
             )
-        if self.kind != 'pin':
-            return
-        if self.stamp_ns is None:
+        self._check_stamps()
+        if self.kind == 'pin':
+            self._check_pin()
+
+    def _check_stamps(self) -> None:
+        stamps = [stamp for stamp in (self.stamp_ns, self.end_ns) if stamp is not None]
+        is_range = stamps == sorted(stamps) and (self.end_ns is None or self.stamp_ns is not None)
+        if not is_range or any(abs(stamp) > MAX_STAMP_NS for stamp in stamps):
             raise RecordingError(
-                f'pin of track {self.track_id!r}: expected the stamp of a box, got none; pin one '
-                f'box'
+                f'decision on track {self.track_id!r:.80}: expected stamps of 64 bits, the last '
+                f'one not before the first, got {self.stamp_ns} and {self.end_ns}; decide again, '
+                f'or remove the row'
+            )
+
+    def _check_pin(self) -> None:
+        if self.stamp_ns is None or self.end_ns is not None:
+            got = 'none' if self.stamp_ns is None else 'a range'
+            raise RecordingError(
+                f'pin of track {self.track_id!r:.80}: expected the stamp of a box, got {got}; pin '
+                f'one box'
             )
         if self.box is None or not is_valid_box(self.box):
             got = 'none' if self.box is None else np.array2string(self.box, precision=3)
             raise RecordingError(
-                f'pinned box of track {self.track_id!r} at {self.stamp_ns}: expected finite '
+                f'pinned box of track {self.track_id!r:.80} at {self.stamp_ns}: expected finite '
                 f'numbers and positive extents, got {got}; pin the box again, or remove the row'
             )
+
+    @property
+    def topic(self) -> str:
+        """Return the topic of the decision, one of `KINDS_OF_TOPIC`."""
+        return TOPIC_OF[self.kind]
+
+    @property
+    def scope(self) -> Scope:
+        """Return the boxes that the decision is about: track, first and last stamp."""
+        return self.track_id, self.stamp_ns, self.end_ns
+
+    @property
+    def is_taken_back(self) -> bool:
+        """Return whether there is no decision any more."""
+        if self.kind in ('rename', 'reclass'):
+            return not self.value
+        return self.kind in ('none', 'restore')
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Return whether a box of the track at a stamp is one of those decided about."""
+        if self.stamp_ns is None:
+            return True
+        last_ns = self.stamp_ns if self.end_ns is None else self.end_ns
+        return self.stamp_ns <= stamp_ns <= last_ns
 
     def row(self) -> list[str]:
         """Return the columns of the file."""
@@ -104,19 +164,46 @@ class Decision:
             quaternion = quaternion_from_rpy(self.box[None, ROLL:])[0]
             values = [*self.box[: Z + 1], *quaternion, *self.box[BOX_EXTENT]]
             numbers = [f'{value:.9f}' for value in values]
-        stamp = '' if self.stamp_ns is None else str(self.stamp_ns)
+        stamp, end = ('' if one is None else str(one) for one in (self.stamp_ns, self.end_ns))
         comment = ' '.join(self.comment.split())[:MAX_COMMENT]
-        return [self.track_id, stamp, self.kind, comment, self.frame_id, *numbers]
+        return [
+            protected(self.track_id), stamp, self.kind, protected(comment),
+            protected(self.frame_id), *numbers, end, protected(self.value), protected(self.who),
+            self.when,
+        ]  # fmt: skip
 
     def as_json(self) -> dict[str, Any]:
         """Return the decision as the page sends and receives it."""
         return {
             'track_id': self.track_id,
             'stamp_ns': '' if self.stamp_ns is None else str(self.stamp_ns),
+            'end_ns': '' if self.end_ns is None else str(self.end_ns),
             'decision': self.kind,
             'comment': self.comment,
+            'value': self.value,
             'box': None if self.box is None else self.box.tolist(),
+            'who': self.who,
+            'when': self.when,
         }
+
+
+def protected(text: str) -> str:
+    """Return a text as a cell that no spreadsheet takes for a formula."""
+    return f"'{text}" if text.startswith(FORMULA_STARTS) else text
+
+
+def unprotected(cell: str) -> str:
+    """Return the text of a cell that `protected` has made."""
+    return cell.removeprefix("'")
+
+
+def held(decisions: Iterable[Decision]) -> list[Decision]:
+    """Return the decisions that hold: the last ones of their topic and scope, in their order."""
+    last: dict[tuple[str, Scope], Decision] = {}
+    for one in decisions:
+        last.pop((one.topic, one.scope), None)
+        last[one.topic, one.scope] = one
+    return [one for one in last.values() if not one.is_taken_back or one.comment]
 
 
 def read_decisions(path: Path) -> list[Decision]:
@@ -126,20 +213,31 @@ def read_decisions(path: Path) -> list[Decision]:
     Raises
     ------
     RecordingError
-        If the file cannot be read, a column is missing, or a row is no decision.
+        If the file cannot be read, is of a later version, lacks a column, or a row is no decision.
 
     """
     try:
-        text = path.read_text(encoding='utf-8-sig')
+        text = path.read_bytes().decode('utf-8-sig')
     except OSError as error:
         raise RecordingError(unreadable(path, error)) from None
     except UnicodeDecodeError as error:
         raise RecordingError(
             f'{path}: expected decisions of boxreg review, got no text: {error}; give their file'
         ) from None
-    whole = text[: text.rfind('\n') + 1]
-    reader = csv.DictReader(io.StringIO(whole, newline=''))
-    missing = [name for name in DECISION_COLUMNS if name not in (reader.fieldnames or ())]
+    whole = text[: _end_of_rows(text)]
+    if not whole:
+        return []
+    version = _version_of(whole)
+    if version not in (1, VERSION):
+        raise RecordingError(
+            f'{path}: expected decisions of version 1 or {VERSION}, got '
+            f'{whole.splitlines()[0]!r}; update boxreg_ros'
+        )
+    stream = io.StringIO(whole, newline='')
+    lines_before = int(version > 1 and bool(stream.readline()))
+    reader = csv.DictReader(stream)
+    columns = FIRST_COLUMNS if version == 1 else DECISION_COLUMNS
+    missing = [name for name in columns if name not in (reader.fieldnames or ())]
     if missing:
         raise RecordingError(
             f'{path}: expected decisions of boxreg review, got a file without the columns '
@@ -147,26 +245,32 @@ def read_decisions(path: Path) -> list[Decision]:
         )
     decisions = []
     for row in reader:
+        line = reader.line_num + lines_before
         try:
-            decisions.append(_parsed(row))
+            decisions.append(_parsed(row, version))
         except RecordingError as error:
-            raise RecordingError(f'{path}: line {reader.line_num}: {error}') from None
-        except ValueError as error:
+            raise RecordingError(f'{path}: line {line}: {error}') from None
+        except (ValueError, TypeError, AttributeError) as error:
             raise RecordingError(
-                f'{path}: line {reader.line_num}: expected numbers, got: {error}; correct the '
-                f'line, or remove it'
+                f'{path}: line {line}: expected numbers, got: {error}; correct the line, or '
+                f'remove it'
             ) from None
     return decisions
 
 
 class DecisionLog:
     """
-    Append decisions to a file; each is on disk when `append` returns.
+    Append decisions to a file that other programs may append to; each is on disk at once.
 
     Parameters
     ----------
     path : Path
         The file; it is made with the first decision.
+
+    Attributes
+    ----------
+    decisions : list of Decision
+        All rows, as of the last `refresh` or `append`.
 
     Raises
     ------
@@ -177,156 +281,135 @@ class DecisionLog:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.decisions = read_decisions(path) if path.exists() else []
+        self._state: tuple[int, ...] = ()
+        self.decisions: list[Decision] = []
+        self.refresh()
 
-    def append(self, decision: Decision) -> None:
-        """Write one decision at the end of the file."""
-        is_new = not self._path.exists()
-        text = io.StringIO(newline='')
-        writer = csv.writer(text, lineterminator='\n')
-        if is_new:
-            writer.writerow(DECISION_COLUMNS)
-        writer.writerow(decision.row())
-        with open(self._path, 'r+b' if not is_new else 'wb') as file:
-            file.seek(0 if is_new else self._end_of_last_row())
-            file.truncate()  # the part of a row that a crash has left
-            file.write(text.getvalue().encode())
+    def refresh(self) -> None:
+        """Read what others have appended."""
+        if self._state != _state_of(self._path):
+            with self._locked():
+                self._read()
+
+    def append(self, new: Sequence[Decision]) -> None:
+        """Write decisions at the end of the file: all of them, or none."""
+        with self._locked():
+            self.append_locked(new)
+
+    def append_locked(self, new: Sequence[Decision]) -> None:
+        """Write decisions at the end of the file that this log has locked."""
+        self._read()
+        rows = _encoded(new)
+        text = self._path.read_bytes().decode('utf-8-sig') if self._path.exists() else ''
+        end = _end_of_rows(text)
+        if not end or _version_of(text) < VERSION:
+            self._write_new(_encoded(self.decisions) + rows)
+        else:
+            self._write_at(len(text[:end].encode()) + self._bom(), rows)
+        self.decisions = [*self.decisions, *new]
+        self._state = _state_of(self._path)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the file, as it is now: no other program appends to it inside the block."""
+        with self._locked():
+            self._read()
+            yield
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Lock the folder: the file may be replaced by one of a newer version."""
+        folder = os.open(self._path.parent, os.O_RDONLY)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(folder)
+
+    def _read(self) -> None:
+        state = _state_of(self._path)
+        if state != self._state:
+            self.decisions = read_decisions(self._path) if state else []
+            self._state = state
+
+    def _bom(self) -> int:
+        return 3 * self._path.read_bytes().startswith(b'\xef\xbb\xbf')
+
+    def _write_new(self, rows: bytes) -> None:
+        with written_whole(self._path) as file:
+            file.write(f'{VERSION_LINE}{VERSION}\n' + csv_row(DECISION_COLUMNS) + rows.decode())
             file.flush()
             os.fsync(file.fileno())
-        self.decisions.append(decision)
 
-    def _end_of_last_row(self) -> int:
-        return self._path.read_bytes().rfind(b'\n') + 1
-
-
-class Corrections:
-    """
-    Rejected tracks and pinned boxes, as a run applies them; boxes can be pinned already.
-
-    Parameters
-    ----------
-    decisions : iterable of Decision
-        In the order they were made.
-
-    """
-
-    def __init__(self, decisions: Iterable[Decision] = ()) -> None:
-        last = {(one.track_id, one.stamp_ns): one for one in decisions}
-        made = {key: one for key, one in last.items() if one.kind in ('reject', 'pin')}
-        self._made = made
-        self._unused = set(made)
-        self._extents = _extents_of_pins(made.values())
-
-    def unused(self) -> list[str]:
-        """Return the tracks and boxes with a decision that the recording does not have."""
-        names = []
-        for track_id, stamp_ns in sorted(self._unused, key=str):
-            names.append(f'{track_id!r}' if stamp_ns is None else f'{track_id!r} at {stamp_ns}')
-        return names
-
-    def pinned(self, given: BoxArray) -> BoxArray:
-        """
-        Return input boxes with pinned boxes in the place of theirs.
-
-        A pin shows the extents of the object: the other boxes of its track have them too, in
-        windows without a pin as well.
-
-        Raises
-        ------
-        RecordingError
-            If a box is pinned in another frame.
-
-        """
-        if not self._made:
-            return given
-        is_pinned = _is_pinned(given)
-        boxes = given.boxes.copy()
-        for row, track_id in enumerate(given.track_ids):
-            if not is_pinned[row]:
-                boxes[row, BOX_EXTENT] = self._extents.get(track_id, boxes[row, BOX_EXTENT])
-            found = self._of(track_id, given.stamp_ns)
-            if found is None:
-                continue
-            if found.kind != 'pin' or found.box is None:
-                is_pinned[row] = False
-                continue
-            if found.frame_id != given.frame_id:
-                raise RecordingError(
-                    f'pinned box of track {track_id!r} at {given.stamp_ns}: expected frame '
-                    f'{given.frame_id!r}, got {found.frame_id!r}; relabel with --fixed-frame '
-                    f'{found.frame_id}'
-                )
-            boxes[row] = found.box
-            is_pinned[row] = True
-        return replace(given, boxes=boxes, pinned=is_pinned)
-
-    def apply(self, given: BoxArray, refined: RefinedBoxes) -> RefinedBoxes:
-        """Return the result with rejected boxes as in the input, and pinned boxes as pinned."""
-        is_pinned = _is_pinned(given)
-        if not (self._made or is_pinned.any()):
-            return refined
-        boxes = refined.boxes.boxes.copy()
-        status = list(refined.status)
-        reasons = list(refined.reasons)
-        covariances = refined.covariances.copy()
-        for row, track_id in enumerate(given.track_ids):
-            if status[row] == KEPT:
-                boxes[row] = given.boxes[row]  # without the extents of a pin
-            found = self._of(track_id, given.stamp_ns)
-            if found is None:
-                if is_pinned[row]:
-                    boxes[row] = given.boxes[row]
-                    status[row], reasons[row] = HUMAN, ''
-            elif found.kind == 'pin' and found.box is not None:
-                boxes[row] = found.box
-                status[row], reasons[row] = HUMAN, ''
-            elif found.kind == 'reject':
-                boxes[row] = given.boxes[row]
-                status[row], reasons[row] = KEPT, str(Reason.REJECTED)
-                covariances[row] = np.eye(6)
-        return replace(
-            refined,
-            boxes=replace(refined.boxes, boxes=boxes, pinned=None),
-            status=tuple(status),
-            reasons=tuple(reasons),
-            covariances=covariances,
-        )
-
-    def _of(self, track_id: str, stamp_ns: int) -> Decision | None:
-        """Return the decision on a box: its own, else that of its track."""
-        found = None
-        for key in ((track_id, stamp_ns), (track_id, None)):
-            if key in self._made:
-                self._unused.discard(key)
-                found = found or self._made[key]
-        return found
+    def _write_at(self, end: int, rows: bytes) -> None:
+        with open(self._path, 'r+b') as file:
+            file.truncate(end)  # without the part of a row that a crash has left
+            file.seek(end)
+            try:
+                file.write(rows)
+                file.flush()
+                os.fsync(file.fileno())
+            except OSError:  # as of a full disk
+                os.truncate(self._path, end)
+                raise
 
 
-def _is_pinned(boxes: BoxArray) -> NDArray[np.bool_]:
-    """Return which boxes of an array (n,) are pinned, as a copy."""
-    if boxes.pinned is None:
-        return np.zeros(len(boxes.track_ids), bool)
-    return boxes.pinned.copy()
+def _encoded(decisions: Iterable[Decision]) -> bytes:
+    """Return the rows of decisions; nothing is written for texts that cannot be."""
+    try:
+        return ''.join(csv_row(one.row()) for one in decisions).encode()
+    except UnicodeEncodeError as error:
+        raise RecordingError(
+            f'decision: expected text of Unicode, got half a character: {error}; write it again'
+        ) from None
 
 
-def _extents_of_pins(decisions: Iterable[Decision]) -> dict[str, Floats]:
-    """Return the mean extents (3,) of the pinned boxes of each track that has any."""
-    by_track: dict[str, list[Floats]] = {}
-    for decision in decisions:
-        if decision.kind == 'pin' and decision.box is not None:
-            by_track.setdefault(decision.track_id, []).append(decision.box[BOX_EXTENT])
-    return {track_id: np.mean(extents, axis=0) for track_id, extents in by_track.items()}
+def _state_of(path: Path) -> tuple[int, ...]:
+    """Return what changes when a file is written; empty if there is none."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return ()
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def _parsed(row: dict[str, str]) -> Decision:
+def _version_of(text: str) -> int:
+    """Return the version of a file; 0 if its line cannot be read."""
+    if not text.startswith(VERSION_LINE):
+        return 1
+    word = text.partition('\n')[0].removeprefix(VERSION_LINE).strip(' ,\r')
+    return int(word) if word.isdecimal() else 0
+
+
+def _end_of_rows(text: str) -> int:
+    """Return the end of the last whole row: a line feed that is not in quotes."""
+    end = text.rfind('\n') + 1
+    while text.count('"', 0, end) % 2:
+        end = text.rfind('\n', 0, end - 1) + 1
+    return end
+
+
+def _parsed(row: dict[str, str], version: int) -> Decision:
     """Return the decision of a row; raises ValueError for text that is no number."""
     box = None
     if any(row[name] for name in PINNED_BOX_COLUMNS):
         numbers = np.array([float(row[name] or 'nan') for name in PINNED_BOX_COLUMNS])
         box = _box_of(numbers)
     stamp_ns = int(row['stamp_ns']) if row['stamp_ns'] else None
+    if version == 1:
+        names = row['track_id'], stamp_ns, row['decision'], row['comment'], row['frame_id']
+        return Decision(*names, box)
     return Decision(
-        row['track_id'], stamp_ns, row['decision'], row['comment'], row['frame_id'], box
+        unprotected(row['track_id']),
+        stamp_ns,
+        row['decision'],
+        unprotected(row['comment']),
+        unprotected(row['frame_id']),
+        box,
+        int(row['end_ns']) if row['end_ns'] else None,
+        unprotected(row['value']),
+        unprotected(row['who']),
+        row['when'],
     )
 
 

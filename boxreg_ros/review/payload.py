@@ -14,7 +14,22 @@ from boxreg_ros.review.changes import median, TrackChanges
 from boxreg_ros.review.quality import ious, quality
 from boxreg_ros.review.tables import TrackRow
 from boxreg_ros.review.track_points import PointCollector, to_millimetres
-from boxreg_ros.structures import ADDED, BOX_EXTENT, Floats, X, Y, Z
+from boxreg_ros.structures import (
+    ADDED,
+    BOX_EXTENT,
+    COASTED,
+    EXTENDED,
+    Floats,
+    HUMAN,
+    INTERPOLATED,
+    Ints,
+    KEPT,
+    REFINED,
+    REJECTED,
+    X,
+    Y,
+    Z,
+)
 import numpy as np
 import orjson
 
@@ -28,6 +43,8 @@ DECIMALS = 4
 """Decimals of metres and radians: a tenth of a millimetre."""
 RISK_DECIMALS = 3
 """Decimals of risks [m], as in ``review.csv``."""
+STATES = (REFINED, KEPT, HUMAN, INTERPOLATED, EXTENDED, COASTED, REJECTED)
+"""Status of boxes by their letter in a row of the list, from a on."""
 COMPRESSION = 3
 """Level of zlib; measured: level 6 saves 9 % of the file and takes twice as long."""
 
@@ -116,9 +133,10 @@ class TrackPart:
         self.before = quality(track, track.given, self._points, truth.iou_before)
         self.after = quality(track, track.boxes, self._points, truth.iou_after)
 
-    def row(self, begin_ns: int) -> dict[str, Any]:
-        """Return the row of the list."""
+    def row(self, stamps_ns: Ints) -> dict[str, Any]:
+        """Return the row of the list; `stamps_ns` are those of the drive, sorted."""
         track = self._track
+        inputs, owners = _inputs_of(track)
         status = Counter(track.status.tolist())
         is_input = ~np.isin(track.status, ADDED)
         boxes = int(is_input.sum())
@@ -130,7 +148,11 @@ class TrackPart:
             'class': track.class_name,
             'boxes': boxes,
             'interpolated': sum(status[word] for word in ADDED),
-            'begin': (int(track.stamps_ns[0]) - begin_ns) * 1e-9,
+            'at': np.searchsorted(stamps_ns, track.stamps_ns),
+            'states': ''.join(chr(ord('a') + STATES.index(word)) for word in track.status),
+            'inputs': inputs,
+            'owners': owners,
+            'begin': int(track.stamps_ns[0] - stamps_ns[0]) * 1e-9,
             'seconds': float(track.stamps_ns[-1] - track.stamps_ns[0]) * 1e-9,
             'points': median(track.num_points),
             'refined': float(track.is_refined.sum() / boxes) if boxes else None,
@@ -181,6 +203,22 @@ class TrackPart:
             'counts': [len(points) for points in shown],
             'points': b64encode(every.astype('<i2').tobytes()).decode('ascii'),
         }
+
+
+def _inputs_of(track: TrackChanges) -> tuple[list[str], list[int] | None]:
+    """
+    Return the ids that a track has in the input, and the index of that of each box.
+
+    None where there is one id. Added boxes have that of the box before them.
+
+    """
+    ids = list(track.input_ids)
+    known = next(filter(None, ids), track.track_id)
+    for row, name in enumerate(ids):
+        known = name or known
+        ids[row] = known
+    inputs = list(dict.fromkeys(ids))
+    return inputs, [inputs.index(name) for name in ids] if len(inputs) > 1 else None
 
 
 def _moved(boxes: Floats, origin: Floats) -> Floats:

@@ -22,7 +22,14 @@ from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.review.changes import mean, TrackChanges
-from boxreg_ros.review.payload import as_json, compressed, points_per_box, TrackPart, true_boxes
+from boxreg_ros.review.payload import (
+    as_json,
+    compressed,
+    points_per_box,
+    STATES,
+    TrackPart,
+    true_boxes,
+)
 from boxreg_ros.review.quality import CELL, Quality
 from boxreg_ros.review.rules import RULES
 from boxreg_ros.review.rules.protocol import Rule, Violation
@@ -32,17 +39,24 @@ from boxreg_ros.structures import HUMAN, REFINED
 import numpy as np
 
 REPORT = 'report.html'
+PAGE_VERSION = 2
+"""Of the data and the requests of the page: `boxreg review` serves this one alone."""
 PACKAGES = ('jinja2', 'plotly')
-SHARE = Path(__file__).parents[1] / 'share'
+PAGE = Path(__file__).parent / 'page'
 TEMPLATE = 'report.html.j2'
-ASSETS = ('report.css', 'report.js')
+STYLE = 'report.css'
+SCRIPTS = (
+    'base', 'geometry', 'log', 'tracks', 'list', 'overview', 'timeline', 'views', 'charts', 'edit',
+    'decide', 'keys', 'main',
+)  # fmt: skip
+"""Parts of the script, in the order that they are joined in."""
 MAX_MAP_SENSOR = 2000
 """Positions of the sensor on the map; chosen."""
 
 
-def check_packages() -> None:
+def check_packages(what: str = '--report', packages: Sequence[str] = PACKAGES) -> None:
     """
-    Check that the packages of the report are installed.
+    Check that the packages of the report, or of something else, are installed.
 
     Raises
     ------
@@ -50,13 +64,11 @@ def check_packages() -> None:
         If one is not.
 
     """
-    for package in PACKAGES:
+    for package in packages:
         try:
             import_module(package)
         except ImportError as error:
-            raise ConfigError(
-                f'--report needs {package}: pip install {package} ({error})'
-            ) from None
+            raise ConfigError(f'{what} needs {package}: pip install {package} ({error})') from None
 
 
 def write_report(
@@ -93,7 +105,8 @@ def write_report(
 
     """
     tracks = [row.track for row in found]
-    begin_ns = min((int(track.stamps_ns[0]) for track in tracks), default=0)
+    stamps_ns = np.unique(np.concatenate([np.zeros(0, np.int64), *(t.stamps_ns for t in tracks)]))
+    begin_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
     max_points = points_per_box(sum(len(track.stamps_ns) for track in tracks))
     violations = _by_track(violated)
     rows = []
@@ -101,7 +114,7 @@ def write_report(
     qualities = []
     for row, true in zip(found, true_boxes(tracks, truth), strict=True):
         part = TrackPart(row, points, true)
-        rows.append(part.row(begin_ns) | {'rules': violations.get(row.track.track_id, [])})
+        rows.append(part.row(stamps_ns) | {'rules': violations.get(row.track.track_id, [])})
         parts.append(compressed(as_json(part.part(begin_ns, max_points))))
         qualities.append((part.before, part.after))
     stride = 1 + len(points.origins) // MAX_MAP_SENSOR
@@ -109,6 +122,9 @@ def write_report(
         'begin_ns': str(begin_ns),
         'frame': summary['fixed_frame'],
         'cell': CELL,
+        'stamps': [str(stamp) for stamp in stamps_ns.tolist()],
+        'times': np.round((stamps_ns - begin_ns) * 1e-9, 3),
+        'states': STATES,
         'has_truth': truth is not None,
         'tracks': rows,
         'sensor': np.round(points.origins[::stride, :2], 2),
@@ -131,13 +147,21 @@ def _page(**content: Any) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
-        loader=FileSystemLoader(SHARE), autoescape=True, undefined=StrictUndefined,
+        loader=FileSystemLoader(PAGE), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.filters['code'] = _code
-    css, script = (_as_markup((SHARE / name).read_text(encoding='utf-8')) for name in ASSETS)
+    css = _as_markup((PAGE / STYLE).read_text(encoding='utf-8'))
+    parts = [(PAGE / f'{name}.js').read_text(encoding='utf-8') for name in SCRIPTS]
+    script = _as_markup('\n'.join(parts))
     template = environment.get_template(TEMPLATE)
-    return template.render(css=css, script=script, plotly=compressed(_plotly_script()), **content)
+    return template.render(
+        css=css,
+        script=script,
+        plotly=compressed(_plotly_script()),
+        version=PAGE_VERSION,
+        **content,
+    )
 
 
 def _of_summary(summary: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-import csv
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from boxreg_ros.io.box_table import csv_row
 from boxreg_ros.review.changes import median, TrackChanges
+from boxreg_ros.review.decisions import protected
 from boxreg_ros.review.risk import assess, reasons_of, Risk, typical_parts, Usual
 from boxreg_ros.structures import ADDED, BOX_EXTENT, INTERPOLATED, KEPT, REFINED
 import numpy as np
@@ -111,12 +112,13 @@ def _review_row(rank: int, row: TrackRow) -> list[Any]:
 def _write(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Write a table; metres have three decimals, numbers that are not finite are empty cells."""
     with path.open('w', newline='', encoding='utf-8', errors='backslashreplace') as file:
-        table = csv.writer(file, lineterminator='\n')
-        table.writerow(header)
-        table.writerows([_cell(value) for value in row] for row in rows)
+        file.write(csv_row(header))
+        file.writelines(csv_row(map(_cell, row)) for row in rows)
 
 
 def _cell(value: Any) -> Any:
+    if isinstance(value, str):
+        return protected(value)
     if not isinstance(value, float):
         return value
     return f'{value:.3f}' if np.isfinite(value) else ''

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True)
-class _AddedBox:
+class AddedBox:
     """A box to add to an array; `extension` is the index of its extension in the plan, or -1."""
 
     track_id: str
@@ -70,7 +70,7 @@ class PlannedArray:
     track_ids: list[str]
     class_names: list[str]
     rejected: dict[int, str] = field(default_factory=dict)
-    added: list[_AddedBox] = field(default_factory=list)
+    added: list[AddedBox] = field(default_factory=list)
 
     def to_register(self, given: BoxArray) -> BoxArray:
         """Return the boxes of an array without rejected ones, and with the added ones."""
@@ -291,7 +291,7 @@ def _add(
     """Add boxes of a track to the arrays of their stamps."""
     for i, stamp_ns in enumerate(boxes.stamps_ns.tolist()):
         plan.arrays[array_of[stamp_ns]].added.append(
-            _AddedBox(
+            AddedBox(
                 track.track_id,
                 track.class_name,
                 boxes.status,
@@ -387,7 +387,7 @@ def _finished(
 
 
 def _covariance_of_added(
-    added: _AddedBox, registered: RefinedBoxes, row: int, num_points: int
+    added: AddedBox, registered: RefinedBoxes, row: int, num_points: int
 ) -> Floats:
     """Return that of the registration, or of the motion model where no points were registered."""
     if num_points and registered.status[row] != KEPT:

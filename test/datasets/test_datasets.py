@@ -488,7 +488,7 @@ def test_a_manifest_names_scenes(tmp_path):
     manifest = tmp_path / 'drives.txt'
     manifest.write_text(f'nuscenes:{tmp_path / "data"}#scene-0061  # a comment\n')
     (job,) = jobs_of([manifest])
-    assert (job.name, job.status) == ('scene-0061', 'waiting')
+    assert (job.name, job.problem) == ('scene-0061', '')
     assert [job.name for job in jobs_of([Path(f'nuscenes:{tmp_path / "data"}')])] == [
         'scene-0061',
         'scene-0103',

@@ -162,12 +162,13 @@ def test_messages_are_held_up_to_a_limit():
         loaded.append(chunk.first_byte)
         return [Record(None, time, bytes(100), time) for time in times[chunk.first_byte]]
 
-    for limit, most_loads in ((4000, 4), (2500, 40)):
+    of_a_chunk = 10 * (100 + chunks.RECORD_BYTES)
+    for limit, most_loads in ((4 * of_a_chunk, 4), (2.5 * of_a_chunk, 40)):
         loaded.clear()
         found = [record.received_ns for record in chunks._merged(sources, load, limit)]
         assert found == list(range(40))
         assert 4 <= len(loaded) <= most_loads
-        assert (len(loaded) == 4) == (limit == 4000)
+        assert (len(loaded) == 4) == (limit == 4 * of_a_chunk)
 
 
 @pytest.mark.parametrize('buffer_bytes', [1, 2**28])

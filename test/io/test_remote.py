@@ -5,16 +5,18 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import json
 from pathlib import Path
 import socket
+import subprocess
+import sys
 from threading import Thread
 
 from boxreg_ros.cli import main
 from boxreg_ros.errors import RecordingError, TransferError
+from boxreg_ros.io.journal import Journal, ObjectJournal
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage import urls
 from boxreg_ros.io.storage.files import part_of
 from boxreg_ros.io.storage.urls import RemoteFile, url_of
 from boxreg_ros.io.transforms import TransformTree
-from boxreg_ros.offline.journal import EstimateJournal
 from mcap.reader import make_reader
 from mcap_files import rewritten
 import numpy as np
@@ -202,6 +204,22 @@ def test_bytes_that_a_server_does_not_send_are_no_damage(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_file_that_is_replaced_while_it_is_read_is_no_damage(tmp_path, whole, capsys):
+    out = tmp_path / 'out'
+    data = whole.read_bytes()
+
+    def fault_of(first, _):
+        if 0 < first < len(data) // 2:  # behind the index, which is read first
+            whole.write_bytes(data[::-1] + b'longer')
+
+    with http_server(tmp_path) as (server, url):
+        server.fault_of = fault_of
+        assert main(['relabel', f'{url}/whole.mcap', '-o', str(out), *QUICK]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'expected the file as it was at the start, got another version' in line
+    assert not out.exists()
+
+
 @pytest.mark.parametrize('has_ranges', [True, False])
 def test_a_copy_of_a_file_is_whole(tmp_path, large, has_ranges, impatient):
     """A file that is copied first, from servers with and without ranges."""
@@ -312,10 +330,12 @@ def test_an_interrupted_run_goes_on_from_the_journal_in_the_store(tmp_path, stor
     recording = Drive(sweeps=60).write(tmp_path / 'drive')
     command = ['relabel', str(recording), '--set=track_window=16', *QUICK, '--resume', '-o']
     local = tmp_path / 'local'
-    append = EstimateJournal._append
+    originals = {kind: kind.append for kind in (Journal, ObjectJournal)}
     appended = []
 
-    def append_until(limit):
+    def append_until(limit, kind=ObjectJournal):
+        append = originals[kind]
+
         def limited(journal, content):
             append(journal, content)
             appended.append(content)
@@ -323,9 +343,9 @@ def test_an_interrupted_run_goes_on_from_the_journal_in_the_store(tmp_path, stor
                 raise KeyboardInterrupt
 
         appended.clear()
-        monkeypatch.setattr(EstimateJournal, '_append', limited)
+        monkeypatch.setattr(kind, 'append', limited)
 
-    append_until(None)
+    append_until(None, Journal)
     assert main([*command, str(local)]) == 0
     records = len(appended)
     assert records > 3
@@ -340,6 +360,33 @@ def test_an_interrupted_run_goes_on_from_the_journal_in_the_store(tmp_path, stor
     assert len(appended) == records - 3
     assert store.cat('drives/interrupted/one/boxes.csv') == boxes(local)
     assert not any('.journal' in name for name in store.find('drives/interrupted'))
+
+
+def test_an_upload_that_is_killed_goes_on_at_the_next_run(tmp_path, whole, store, capsys):
+    out = 's3://drives/results/one'
+    command = ['relabel', str(whole), '-o', out, '--resume', QUICK[0], '--formats=sustechpoints']
+    command += ['--end=1']
+    process = subprocess.Popen([sys.executable, '-m', 'boxreg_ros.cli', *command])
+    names = set()
+    while len(names) < 3:
+        assert process.poll() is None
+        store.invalidate_cache()
+        names = {name.removeprefix('drives/results/one/') for name in store.find(out)}
+    process.kill()
+    process.wait()
+    assert 'summary.json' not in names
+    assert main(command) == 0
+    assert '20 boxes in' in capsys.readouterr().out
+    store.invalidate_cache()
+    summary = json.loads(store.cat(f'{out}/summary.json'))
+    found = {name.removeprefix('drives/results/one/') for name in store.find(out)}
+    assert found == {'summary.json', *summary['files']}
+    assert store.find('drives/results/.one.journal') == []
+    # What says done is checked.
+    store.rm_file(f'{out}/boxes.csv')
+    assert main(command) == 0
+    assert main(command) == 0
+    assert capsys.readouterr().out.count('20 boxes in') == 1
 
 
 def test_batch_with_an_object_store(tmp_path, whole, store, capsys):

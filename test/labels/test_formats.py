@@ -35,7 +35,6 @@ from boxreg_ros.labels import (
     can_read,
     FORMATS,
     frames_of,
-    is_written,
     LabelFrame,
     module_of,
     Options,
@@ -505,16 +504,6 @@ def test_boxes_without_track_id_are_not_merged(tmp_path, name):
 def test_empty_drive_round_trips(tmp_path, name):
     _, folder = written(name, tmp_path, [])
     assert list(frames_of(name, folder)) == []
-
-
-@pytest.mark.parametrize('name', READABLE_FORMATS)
-def test_is_written_detects_missing_files(tmp_path, name):
-    _, folder = written(name, tmp_path)
-    assert is_written(name, tmp_path)
-    for path in folder.rglob('*'):
-        if (path.is_file() and path.parent != tmp_path) or path.name == 'boxes.csv':
-            path.unlink()
-    assert not is_written(name, tmp_path)
 
 
 @pytest.mark.parametrize('name', READABLE_FORMATS)

@@ -25,7 +25,8 @@ from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.offline.consistency import CONSISTENCY_VARIABLES
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.review.changes import Changes, median, TrackChanges
-from boxreg_ros.review.decisions import Corrections, Decision
+from boxreg_ros.review.corrections import Corrections
+from boxreg_ros.review.decisions import Decision
 from boxreg_ros.review.risk import assess, Usual
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Sweep, X, YAW, Z
@@ -193,7 +194,7 @@ def with_pins(drive: Drive, pins: Mapping[str, int]) -> Drive:
         for key in pins.items()
         if key in true_boxes
     )
-    return replace(drive, boxes=tuple(map(corrections.pinned, drive.boxes)))
+    return replace(drive, boxes=tuple(map(corrections.to_register, drive.boxes)))
 
 
 def planted(drive: Drive) -> Drive:

@@ -25,7 +25,7 @@ from typing import Any
 
 from boxreg_ros.bench.common import add_json_argument, BOXREG
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.offline.job import JOB_FAILED, jobs_of
+from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.offline.job_process import JobRunner
 from boxreg_ros.structures import Floats
 from mcap.reader import make_reader
@@ -219,21 +219,21 @@ def _measured(recording: Path, folder: Path) -> dict[str, float]:
     facts = json.loads(shown.stdout)
     (job,) = jobs_of([recording])
     before = _children_seconds()
-    JobRunner(folder / 'jobs', OPTIONS, '')(job)
+    result = JobRunner(folder / 'jobs', OPTIONS, '')(job)
     cpu_s = _children_seconds() - before
-    if job.status == JOB_FAILED:
-        raise RecordingError(f'{recording}: {job.last_line}')
+    if not result.is_done:
+        raise RecordingError(f'{recording}: {result.last_line}')
     return {
         'gb': recording.stat().st_size / 1e9,
         'recording_s': facts['seconds'],
-        'sweeps': job.summary['sweeps'],
+        'sweeps': result.sweeps,
         'points_per_sweep': facts['sample']['points_per_sweep'],
-        'boxes': job.summary['boxes_in'],
+        'boxes': result.boxes_in,
         'inspect_s': inspect_s,
-        'seconds': job.seconds,
+        'seconds': result.seconds,
         'cpu_s': cpu_s,
         'hours_per_core_hour': facts['seconds'] / cpu_s,
-        'peak_mb': job.peak_bytes / 1e6,
+        'peak_mb': result.peak_mb,
     }
 
 

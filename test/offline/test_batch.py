@@ -1,6 +1,7 @@
 """`boxreg batch`: each drive once, failures isolated, a second run skips done drives."""
 
 import csv
+from functools import partial
 import json
 import os
 from pathlib import Path
@@ -10,10 +11,11 @@ import sys
 import time
 
 from boxreg_ros.cli import main
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.offline.job_process import JobRunner, memory_bytes
 from boxreg_ros.offline.result_folder import whole_folder
+from boxreg_ros.offline.time_limit import Watch, watched
 from paths import ROOT
 import pytest
 from ros_messages import Drive
@@ -49,6 +51,7 @@ def test_failures_are_isolated_and_a_second_run_skips_done_drives(tmp_path, caps
     paths[0].touch()
     Drive(sweeps=7).write(tmp_path / 'other').replace(paths[1])
     (out / 'one' / 'review.csv').write_text('rank,track_id,risk_m\n1,7,0.25\n1,8,0.75\n')
+    (out / 'two' / 'boxes.csv').touch()  # as a copy without times
     assert main([*command[:-3], '--workers=1', *QUICK]) == 1
     rows = index_of(out)
     # `--workers` is no setting: it changes no result.
@@ -60,29 +63,22 @@ def test_failures_are_isolated_and_a_second_run_skips_done_drives(tmp_path, caps
     assert page.index('0.75') < page.index('0.25')
 
 
-def test_a_drive_that_takes_too_long_is_ended_and_leaves_nothing(tmp_path, capsys):
-    path = Drive(sweeps=6).write(tmp_path / 'one')
-    out = tmp_path / 'out'
-    assert main(['batch', str(path), '-o', str(out), '--timeout=0.2', *QUICK]) == 1
-    assert 'not done after 0.2 s' in capsys.readouterr().err
-    assert {item.name for item in out.iterdir()} == {
-        'jobs', 'index.csv', 'summary.json', 'report.html',
-    }  # fmt: skip
+def test_a_call_without_progress_is_left(tmp_path):
+    """As the read from a network mount that no longer answers: here from an empty pipe."""
+    ends = os.pipe()
+    with pytest.raises(TimeoutError):
+        watched(Watch(0.2), partial(os.read, ends[0], 1))
+    watch = Watch(0.3)
 
+    def slow():
+        for _ in range(5):
+            time.sleep(0.1)
+            watch.advanced()
+        return 'done'
 
-def test_a_drive_whose_files_take_too_long_to_read_fails(tmp_path):
-    endless = tmp_path / 'endless.mcap'
-    endless.touch()
-    os.truncate(endless, 10**12)  # without blocks on the disk; to hash it takes half an hour
-    command = ['batch', str(endless), '-o', str(tmp_path / 'out'), '--timeout=0.2']
-    # The thread that reads ends with the process.
-    batch = [sys.executable, '-m', 'boxreg_ros.cli', *command]
-    done = subprocess.run(batch, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert done.stderr == (
-        'boxreg: endless: its files were not read after 0.2 s: check their disk or network mount, '
-        'or raise --timeout\n'
-    )
+    assert watched(watch, slow) == 'done'
+    for end in ends:
+        os.close(end)
 
 
 def test_manifests_patterns_and_their_errors(tmp_path):
@@ -93,14 +89,101 @@ def test_manifests_patterns_and_their_errors(tmp_path):
     manifest = tmp_path / 'drives.txt'
     manifest.write_text('# two files of one drive\na.mcap b.mcap\n\nx/a.mcap  # another\n')
     jobs = jobs_of([manifest, tmp_path / '[c]*.mcap'])
-    assert [job.name for job in jobs] == ['a', 'x_a', 'c']
+    assert [job.name for job in jobs] == [f'{tmp_path.name}_a', 'x_a', 'c']
     assert jobs[0].recordings == (tmp_path / 'a.mcap', tmp_path / 'b.mcap')
     manifest.write_text('a.mcap\nmissing.mcap\n../' + tmp_path.name + '/a.mcap\n')
     first, missing, again = jobs_of([manifest])
-    assert (first.name, first.status) == ('a', 'waiting')
-    assert missing.status == again.status == 'failed'
-    assert 'got no such file; correct its path' in missing.last_line
-    assert 'got it a second time; leave one out' in again.last_line
+    assert (first.name, first.problem) == ('a', '')
+    assert 'got no such file; correct its path' in missing.problem
+    assert 'got it a second time; leave one out' in again.problem
+
+
+NAMES = [
+    ('rec/one.mcap', 'one.mcap'),  # the suffix tells it from its neighbour
+    ('rec/one.db3', 'one.db3'),
+    ('rec/x.mcap', 'rec_x'),
+    ('a_b/c.mcap', 'a_b_c'),
+    ('a/b_c.mcap', 'b_c'),
+    ('x/c.mcap', 'x_c'),
+    ('y/x.mcap.zstd', 'y_x'),
+    ('dated/2024-01-01-10.30.00', '2024-01-01-10.30.00'),
+    ('dated/2024-01-01-10.30.05', '2024-01-01-10.30.05'),
+    ('drive.001', 'drive.001'),
+    ('drive.002', 'drive.002'),
+    ('z/jobs', 'z_jobs'),  # that of the logs
+]
+
+
+def test_each_drive_has_a_name_of_its_own_in_any_order(tmp_path):
+    for path, _ in NAMES:
+        (tmp_path / path).parent.mkdir(exist_ok=True, parents=True)
+        (tmp_path / path).touch()
+    expected = {(tmp_path / path,): name for path, name in NAMES}
+    for order in (NAMES, NAMES[::-1]):
+        jobs = jobs_of([tmp_path / path for path, _ in order])
+        assert {job.recordings: job.name for job in jobs} == expected
+    # A part of the drives keeps the names that they have; another drive does not take one.
+    known = {name: [str(tmp_path / path)] for path, name in NAMES}
+    (tmp_path / 'v').mkdir()
+    (tmp_path / 'v' / 'b_c.mcap').touch()
+    (c, x, other) = jobs_of(
+        [tmp_path / p for p in ('x/c.mcap', 'y/x.mcap.zstd', 'v/b_c.mcap')], known
+    )
+    assert (c.name, x.name, other.name) == ('x_c', 'y_x', 'v_b_c')
+    # Where the names are the same with all folders, nothing is begun.
+    paths = [tmp_path / path for path in ('a_b/c.mcap', 'a/b_c.mcap', 'x/c.mcap', 'v/b_c.mcap')]
+    with pytest.raises(ConfigError, match='expected each to have a name of its own'):
+        jobs_of(paths)
+
+
+def test_the_result_of_another_drive_is_not_replaced(tmp_path, capsys):
+    out = tmp_path / 'out'
+    first = Drive(sweeps=6).write(tmp_path / 'a' / 'drive')
+    assert main(['batch', str(first), '-o', str(out), *QUICK]) == 0
+    boxes = (out / 'drive' / 'boxes.csv').read_bytes()
+    copy = tmp_path / 'b' / 'drive'
+    copy.parent.mkdir()
+    first.rename(copy)  # moved: it is the same drive
+    assert main(['batch', str(copy), '-o', str(out), *QUICK]) == 0
+    assert '1 of them earlier' in capsys.readouterr().out
+    copy.unlink()
+    other = Drive(sweeps=7).write(tmp_path / 'c' / 'drive')
+    assert main(['batch', str(other), '-o', str(out), *QUICK]) == 1
+    assert f'got that of {copy}, whose result is in {out / "drive"}' in capsys.readouterr().err
+    assert (out / 'drive' / 'boxes.csv').read_bytes() == boxes
+
+
+def test_a_second_run_leaves_the_first_and_its_files_alone(tmp_path, capsys):
+    paths = [Drive(sweeps=n).write(tmp_path / str(n)) for n in (6, 60)]
+    out = tmp_path / 'out'
+    command = ['batch', *map(str, paths), '-o', str(out), *QUICK]
+    with subprocess.Popen([sys.executable, '-m', 'boxreg_ros.cli', *command]) as first:
+        while not list(out.glob('.60.partial')):
+            assert first.poll() is None
+            time.sleep(0.02)
+        assert main(['batch', str(paths[0]), '-o', str(out), *QUICK]) == 1
+        assert main(['relabel', str(paths[1]), '-o', str(out / '60'), *QUICK]) == 1
+        batch, relabel = capsys.readouterr().err.splitlines()
+    assert f"output '{out}': expected an output that no other process writes to" in batch
+    assert f'in use by process {first.pid} on ' in batch
+    assert f"output '{out / '60'}': expected an output that no other process" in relabel
+    assert first.returncode == 0
+    assert {row['status'] for row in index_of(out).values()} == {'done'}
+    assert sorted(path.name for path in out.iterdir()) == [
+        '6', '60', 'index.csv', 'jobs', 'report.html', 'summary.json',
+    ]  # fmt: skip
+
+
+def test_a_drive_without_progress_or_with_too_much_memory_is_ended(tmp_path, capsys):
+    path = Drive(sweeps=6).write(tmp_path / 'one')
+    out = tmp_path / 'out'
+    assert main(['batch', str(path), '-o', str(out), '--timeout=0.2', *QUICK]) == 1
+    assert 'no progress for 0.2 s: raise --timeout' in capsys.readouterr().err
+    assert main(['batch', str(path), '-o', str(out), '--memory=0.01', *QUICK]) == 1
+    assert 'it took more than 0.01 GB of memory: raise --memory' in capsys.readouterr().err
+    assert {item.name for item in out.iterdir()} == {
+        'jobs', 'index.csv', 'summary.json', 'report.html',
+    }  # fmt: skip
 
 
 def test_missing_and_repeated_drives_fail_and_the_others_go_on(tmp_path, capsys):
@@ -174,9 +257,28 @@ def test_a_killed_process_is_tried_again_and_named(tmp_path, monkeypatch):
     script.chmod(0o755)
     monkeypatch.setattr('sys.executable', str(script))
     (job,) = jobs_of([path])
-    JobRunner(tmp_path / 'out', (), '', retries=2)(job)
-    assert (job.status, job.exit_status, job.attempts) == ('failed', -9, 3)
-    assert 'killed by signal 9; the most frequent cause is too little memory' in job.last_line
+    result = JobRunner(tmp_path / 'out', (), '', retries=2)(job)
+    assert (result.status, result.exit_status, result.attempts) == ('failed', -9, 3)
+    assert 'killed by signal 9; the most frequent cause is too little memory' in result.last_line
+
+
+def test_a_drive_that_goes_on_has_no_limit_of_time(tmp_path, monkeypatch):
+    path = Drive(sweeps=6).write(tmp_path / 'one')
+    reader, writer = os.pipe()
+    monkeypatch.setenv('BOXREG_PROGRESS', str(writer))
+    assert main(['relabel', str(path), '-o', str(tmp_path / 'alone'), *QUICK]) == 0
+    assert len(os.read(reader, 100)) >= 5  # for each sweep behind the first
+    script = tmp_path / 'python'
+    steps = 'os.write(int(os.environ["BOXREG_PROGRESS"]), b"."), time.sleep(0.2)'
+    script.write_text(f'#!{sys.executable}\nimport os, time\nfor _ in range(20): {steps}\n')
+    script.chmod(0o755)
+    monkeypatch.setattr('sys.executable', str(script))
+    (job,) = jobs_of([path])
+    result = JobRunner(tmp_path / 'out', (), '', timeout=2.0)(job)
+    assert (result.exit_status, result.status) == (0, 'done')
+    assert result.seconds > 2.0
+    for end in (reader, writer):
+        os.close(end)
 
 
 def test_a_batch_that_is_killed_takes_its_processes_with_it(tmp_path):

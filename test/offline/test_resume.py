@@ -5,19 +5,22 @@ from itertools import product
 import json
 import os
 from pathlib import Path
-import pickle
 import random
 import resource
+import shutil
 import subprocess
 import sys
 
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.offline.journal import EstimateJournal, journal_path
+from boxreg_ros.io.journal import Journal
+from boxreg_ros.offline.job import jobs_of
+from boxreg_ros.offline.job_process import JobRunner
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import whole_folder
+from boxreg_ros.offline.result_folder import claimed, whole_folder, whole_summary
+from boxreg_ros.offline.resume import EstimateJournal, journal_path
 from preloaded import BOXREG, PreloadedProcess
 import pytest
 from ros_messages import Drive
@@ -61,7 +64,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(
     tmp_path, request_of_drive, uninterrupted, monkeypatch
 ):
     out = tmp_path / 'out'
-    append = EstimateJournal._append
+    append = Journal.append
     solved = []
 
     def append_until(limit):
@@ -75,16 +78,16 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(
 
     for limit in (3, 2, 1):  # the first record has the fingerprint
         solved.clear()
-        monkeypatch.setattr(EstimateJournal, '_append', append_until(limit))
+        monkeypatch.setattr(Journal, 'append', append_until(limit))
         with pytest.raises(Interruption):
             relabel(request_of_drive, out, resume=True)
         assert [path.name for path in tmp_path.iterdir()] == ['.out.journal']
     # A record that was cut off is solved again; the remains of a killed run are deleted.
     journal = journal_path(out)
-    journal.write_bytes(journal.read_bytes()[:-1])
-    (tmp_path / '.out.0123.partial').mkdir()
+    os.truncate(journal, journal.stat().st_size // 2)
+    (tmp_path / '.out.partial').mkdir()
     solved.clear()
-    monkeypatch.setattr(EstimateJournal, '_append', append_until(0))
+    monkeypatch.setattr(Journal, 'append', append_until(0))
     relabel(request_of_drive, out, resume=True)
     assert content_of(out) == uninterrupted
     assert solved
@@ -132,33 +135,93 @@ def test_other_estimates_and_both_passes_are_resumed(tmp_path, options, monkeypa
         raise Interruption
 
     with monkeypatch.context() as patched:
-        patched.setattr('boxreg_ros.offline.relabel._write_tables', fail)
+        patched.setattr('boxreg_ros.offline.relabel.write_track_tables', fail)
         with pytest.raises(Interruption):
             relabel(request, out, resume=True)
     appended = []
-    monkeypatch.setattr(EstimateJournal, '_append', lambda _, content: appended.append(content))
+    monkeypatch.setattr(Journal, 'append', lambda _, content: appended.append(content))
     relabel(request, out, resume=True)
     assert content_of(out) == content_of(tmp_path / 'whole')
     assert not appended
 
 
-def test_journals_of_others_are_not_used(tmp_path):
+def test_a_journal_of_another_request_is_not_used(tmp_path):
     path = tmp_path / '.out.journal'
-    code = (
-        'import pathlib, sys; from boxreg_ros.offline.journal import EstimateJournal; '
-        'EstimateJournal(pathlib.Path(sys.argv[1]), "one").__enter__()'
-    )
-    with EstimateJournal(path, 'one'):
-        ran = subprocess.run([sys.executable, '-c', code, path], capture_output=True, text=True)
-        assert 'expected no other run with the same output' in ran.stderr
-    with EstimateJournal(path, 'one') as journal, pytest.raises(Interruption):
+    with pytest.raises(Interruption), EstimateJournal(path, 'one') as journal:
+        journal._store((0, [], {}))
         raise Interruption
-    with EstimateJournal(path, 'two') as journal:  # another request
+    with pytest.raises(Interruption), EstimateJournal(path, 'one'):
+        raise Interruption  # refused, before anything was recalled
+    with pytest.raises(Interruption), EstimateJournal(path, 'one') as journal:
+        assert journal._recalled(0) == ([], {})
+        raise Interruption
+    with EstimateJournal(path, 'two') as journal:
         assert journal._recalled(0) is None
-    with EstimateJournal(path, 'one') as journal:
-        journal._earlier = iter([pickle.dumps((0, [], {'x': print}))])
-        with pytest.raises(RecordingError, match=r'got builtins\.print'):
-            journal.journaled(None)([], None, None)
+    assert not path.exists()
+
+
+def test_a_result_is_judged_by_its_content_and_not_by_its_times(tmp_path):
+    recording = Drive(sweeps=6).write(tmp_path / 'drive')
+    request = Request((recording,), formats=('csv',), config=Config(**SETTINGS))
+    relabel(request, tmp_path / 'first')
+    out = tmp_path / 'copy'
+    shutil.copytree(tmp_path / 'first', out, copy_function=shutil.copyfile)  # newer files
+    os.utime(out / 'summary.json', (0, 0))  # the clock has stepped back
+    relabel(request, out)
+    assert content_of(out) == content_of(tmp_path / 'first')
+    # A file that a power cut has emptied is made again; one that was edited is kept.
+    os.truncate(out / 'boxes.csv', 0)
+    assert whole_summary(out) is None
+    relabel(request, out)
+    assert whole_summary(out) is not None
+    boxes = (out / 'boxes.csv').read_text()
+    (out / 'boxes.csv').write_text(boxes.replace('car', 'bus'))
+    os.utime(out / 'boxes.csv', (0, 0))
+    with pytest.raises(RecordingError, match=r"one with 'boxes\.csv' changed or added since"):
+        relabel(request, out)
+    assert 'bus' in (out / 'boxes.csv').read_text()
+    # Killed between the two renames of a replacement: the earlier result has its name again.
+    (out / 'boxes.csv').write_text(boxes)
+    out.rename(tmp_path / '.copy.earlier')
+    with claimed(out):
+        assert (out / 'boxes.csv').read_text() == boxes
+    relabel(request, out)
+    assert not [path.name for path in tmp_path.iterdir() if path.name.startswith('.')]
+
+
+def test_a_result_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    """After a power cut the folder is whole or not there: all of it is synced, then renamed."""
+    events = []
+
+    def noted(name, call, place):
+        def note(*arguments):
+            result = call(*arguments)
+            events.append((name, place(*arguments)))
+            return result
+
+        return note
+
+    def place_of(descriptor, *_):
+        return Path(f'/proc/self/fd/{descriptor}').resolve()
+
+    monkeypatch.setattr('os.fsync', noted('sync', os.fsync, place_of))
+    monkeypatch.setattr('os.replace', noted('rename', os.replace, lambda _, new: Path(new)))
+    recording = Drive(sweeps=6).write(tmp_path / 'drive')
+    out = tmp_path / 'results' / 'one'
+    (job,) = jobs_of([recording])
+    config = [f'--set={name}={value}' for name, value in SETTINGS.items()]
+    relabel(Request((recording,), formats=('csv', 'openlabel'), config=Config(**SETTINGS)), out)
+    renamed = events.index(('rename', out))
+    synced = {path for name, path in events[:renamed] if name == 'sync'}
+    partial = out.with_name('.one.partial')
+    assert synced >= {partial, *(partial / path.relative_to(out) for path in out.rglob('*'))}
+    assert ('sync', out.parent) in events[renamed:]
+    # Likewise the key that says that a drive is done.
+    state = out.parent / 'jobs' / 'drive.json'
+    assert JobRunner(out.parent, tuple(config), '')(job).is_done
+    renamed = events.index(('rename', state))
+    assert events[renamed - 1][1].name.startswith('.drive.json.')
+    assert events[renamed + 1] == ('sync', state.parent)
 
 
 def test_file_size_limit_is_an_error_and_leaves_nothing(tmp_path, request_of_drive):

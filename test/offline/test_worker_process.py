@@ -17,7 +17,7 @@ from boxreg_ros.offline import registration_worker as registration
 from boxreg_ros.offline.registration_worker import registration_worker
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.stopwatch import Stopwatch
-from boxreg_ros.offline.worker_process import LARGE_BYTES, run_in_worker
+from boxreg_ros.offline.worker_process import run_in_worker
 import numpy as np
 from paths import ROOT
 import pytest
@@ -101,12 +101,12 @@ def echo(receive, send):
 
 def flood(receive, send):
     while True:
-        send(np.zeros(LARGE_BYTES))
+        send(np.zeros(2**16))
 
 
 def test_items_survive_the_round_trip():
     rng = np.random.default_rng(0)
-    size = LARGE_BYTES // 4
+    size = 2**14
     with run_in_worker(echo, 'echoes') as process:
         for item in (
             None,
@@ -146,7 +146,7 @@ def test_leaving_the_block_does_not_wait_for_the_worker():
         run_in_worker(lambda receive, send: time.sleep(60), 'sleeps'),
         run_in_worker(echo, 'waits'),
         run_in_worker(
-            lambda receive, send: [send(np.zeros(LARGE_BYTES)) for _ in range(99)], 'pushes'
+            lambda receive, send: [send(np.zeros(2**16)) for _ in range(99)], 'pushes'
         ) as process,
     ):
         process.receive()

@@ -10,7 +10,7 @@ length that was asked for; requests that fail are repeated, and then raise `Tran
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from functools import partial
@@ -43,6 +43,8 @@ PASSING_STATUS = (408, 429)
 """Answers of HTTP below 500 that are worth another request: too slow, too many requests."""
 MISSING_STATUS = (None, 404, 410)
 """Status behind a FileNotFoundError of a file that does not exist; HTTP raises it for any."""
+UPLOAD = '.upload'
+"""File in a folder that is being uploaded, or whose upload was interrupted."""
 
 _T = TypeVar('_T')
 
@@ -75,6 +77,9 @@ class LocalFile:
     def prefetch(self, ranges: Sequence[tuple[int, int]]) -> None:
         """Leave it to the system, which reads ahead itself."""
 
+    def check_unchanged(self) -> None:
+        """Do nothing: a file that is being recorded is read as far as it goes."""
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()
@@ -96,7 +101,8 @@ class RemoteFile:
     def __init__(self, path: Path) -> None:
         self._system, self._name = _system_of(path)
         self._path = path
-        self.size = entry_of(path).size
+        self._entry = entry_of(path)
+        self.size = self._entry.size
         self.bytes_read = 0
         self._pool = ThreadPoolExecutor(READERS)
         self._ranges: OrderedDict[tuple[int, int], Future[bytes]] = OrderedDict()
@@ -122,6 +128,15 @@ class RemoteFile:
             whole = first, min(end, self.size)
             if first < self.size and whole not in self._ranges:
                 self._fetch(*whole)
+
+    def check_unchanged(self) -> None:
+        """Raise TransferError if the file is another one than at the start."""
+        self._system.invalidate_cache()
+        if entry_of(self._path) != self._entry:
+            raise TransferError(
+                f'{url_of(self._path)}: expected the file as it was at the start, got another '
+                f'version; run again when it is no longer written'
+            )
 
     def close(self) -> None:
         """Cancel the open requests."""
@@ -251,21 +266,28 @@ def write_bytes(path: Path, content: bytes) -> None:
     _answer_of(path, lambda: system.pipe_file(name, content))
 
 
-def delete_files(path: Path) -> None:
-    """Delete all files below a folder behind a URL."""
+def delete_files(path: Path, names: Iterable[str]) -> None:
+    """Delete some files of a folder behind a URL."""
     system, name = _system_of(path)
-    for one in names_of(path):
+    for one in names:
         _answer_of(path, partial(system.rm_file, f'{name}/{one}'))
 
 
 def names_of(path: Path) -> list[str]:
     """Return the names of all files below a folder behind a URL; none if it does not exist."""
+    return list(sizes_of(path))
+
+
+def sizes_of(path: Path) -> dict[str, int]:
+    """Return names and sizes [bytes] of all files below a folder behind a URL."""
     system, name = _system_of(path)
-    found = _answer_of(path, lambda: system.find(name, **_limit(system)))
-    return [str(one).removeprefix(name).lstrip('/') for one in found]
+    found = _answer_of(path, lambda: system.find(name, detail=True, **_limit(system)))
+    return {
+        str(one).removeprefix(name).lstrip('/'): int(about['size']) for one, about in found.items()
+    }
 
 
-def upload(folder: Path, target: Path, last: str) -> None:
+def upload(folder: Path, target: Path, last: str, advanced: Callable[[], None]) -> None:
     """
     Replace a folder behind a URL by one of this machine.
 
@@ -275,16 +297,21 @@ def upload(folder: Path, target: Path, last: str) -> None:
         Source and URL.
     last : str
         File that marks a whole result: it is deleted first, and written when all others are.
+        `UPLOAD` is there from before the first change until then.
+    advanced : callable
+        Called after each file.
 
     """
     system, name = _system_of(target)
     files = {str(file.relative_to(folder)) for file in folder.rglob('*') if file.is_file()}
+    write_bytes(target / UPLOAD, b'')
     old = names_of(target)
     first_deleted = [last] if last in old else []
-    for file in (*first_deleted, *sorted(set(old) - files - {last})):
-        _answer_of(target, partial(system.rm_file, f'{name}/{file}'))
+    delete_files(target, [*first_deleted, *sorted(set(old) - files - {last, UPLOAD})])
     for file in sorted(files, key=lambda file: (file == last, file)):
         _answer_of(target, partial(system.put_file, str(folder / file), f'{name}/{file}'))
+        advanced()
+    delete_files(target, [UPLOAD])
 
 
 def _limit(system: Any) -> dict[str, float]:

@@ -1,0 +1,339 @@
+"""Follow objects through point clouds from a few boxes of a person: arrays in, arrays out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.following.between import between
+from boxreg_ros.core.following.tracker import (
+    ARRIVED,
+    END_OF_SWEEPS,
+    Follower,
+    Owned,
+    Points,
+    POSE4,
+    Seeds,
+    Sweeps,
+    Way,
+)
+from boxreg_ros.core.refine import refine, Track
+from boxreg_ros.errors import ShapeError
+from boxreg_ros.rotations import wrap_angle
+from boxreg_ros.structures import (
+    BOX_EXTENT,
+    BoxArray,
+    checked,
+    EXTENDED,
+    Floats,
+    HUMAN,
+    INTERPOLATED,
+    Ints,
+    is_valid_box,
+    LENGTH,
+    WIDTH,
+    YAW,
+)
+import numpy as np
+from numpy.typing import NDArray
+
+MIN_SEED_POINTS = 5
+"""A seed with fewer points in its box is not followed; chosen."""
+NEARBY = 1.0
+"""Points so far outside of a box are passed to the solver [m]; as the margin of the baselines."""
+
+
+class End(NamedTuple):
+    """Where a track ends: the last stamp with a box [ns], and why, see `following.tracker`."""
+
+    stamp_ns: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FollowedTrack:
+    """
+    One object over time.
+
+    Attributes
+    ----------
+    track_id, class_name : str
+        As of its seeds.
+    rows : array, shape (N,)
+        Rows of the sweeps with a box, ascending.
+    stamps_ns : array, shape (N,)
+        Their stamps [ns].
+    boxes : array, shape (N, 9)
+        In the frame of the points [m, rad].
+    status : tuple of N str
+        ``human`` (a seed), ``interpolated`` (between two seeds) or ``extended`` (beyond them).
+    ends : tuple of End
+        Before the first seed and after the last.
+    problems : tuple of str
+        Seeds that could not be used and why, one line each; without any left, N is 0.
+
+    """
+
+    track_id: str
+    class_name: str
+    rows: Ints
+    stamps_ns: Ints
+    boxes: Floats
+    status: tuple[str, ...]
+    ends: tuple[End, ...]
+    problems: tuple[str, ...]
+
+
+def follow(
+    stamps_ns: Ints,
+    points: Sequence[NDArray[np.floating]],
+    seeds: Sequence[BoxArray],
+    config: Config | None = None,
+    sensor_origins: Floats | None = None,
+) -> list[FollowedTrack]:
+    """
+    Follow each object of `seeds` through all sweeps, and refine its whole track.
+
+    Parameters
+    ----------
+    stamps_ns : array, shape (S,)
+        Strictly increasing stamps of the sweeps [ns].
+    points : sequence of S arrays, shape (M_i, 3)
+        Points of each sweep in the fixed frame [m].
+    seeds : sequence of BoxArray
+        Boxes of a person in the fixed frame, one or more of each track id.
+    config : Config, optional
+        Settings of the solve.
+    sensor_origins : array, shape (S, 3), optional
+        Positions of the sensor [m].
+
+    Returns
+    -------
+    tracks : list of FollowedTrack
+        In the order of the first seeds.
+
+    Raises
+    ------
+    ShapeError
+        For arrays of other shapes, stamps that do not increase, or boxes without a track id.
+
+    Notes
+    -----
+    An object is followed both ways until the evidence ends: it is lost where too few points fit
+    what has been seen of it, where its pose is uncertain along its heading or in yaw, or where it
+    would have to jump. A box in doubt is not returned.
+
+    """
+    config = config or Config()
+    stamps = np.asarray(stamps_ns)
+    if stamps.ndim != 1 or stamps.dtype.kind not in 'iu' or (np.diff(stamps) <= 0).any():
+        raise ShapeError(
+            f'stamps_ns: expected (S,) whole numbers, strictly increasing [ns], got '
+            f'{stamps.dtype} of shape {stamps.shape}; sort them and remove repeated stamps'
+        )
+    if len(points) != len(stamps):
+        raise ShapeError(f'points: expected {len(stamps)} arrays, got {len(points)}')
+    if sensor_origins is not None:
+        sensor_origins = checked('sensor_origins', sensor_origins, (len(stamps), 3), 'x y z')
+    ordered = [ascending(checked(f'points[{i}]', p, (None, 3))) for i, p in enumerate(points)]
+    tracks = follow_points(stamps.astype(np.int64), ordered, seeds, config)
+    return _solved(tracks, ordered, config, sensor_origins)
+
+
+def ascending(points: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return finite points (M, 3), ascending by x."""
+    points = points[np.isfinite(points).all(1)]
+    return np.ascontiguousarray(points[np.argsort(points[:, 0], kind='stable')])
+
+
+def follow_points(
+    stamps_ns: Ints,
+    points: Points,
+    seeds: Sequence[BoxArray],
+    config: Config,
+) -> list[FollowedTrack]:
+    """Follow as `follow` does, without the solve; `points` are those of `ascending`."""
+    times = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
+    sweeps = Sweeps(times, points)
+    objects = [_placed(name, rows, stamps_ns) for name, rows in _by_track(seeds).items()]
+    owned = Owned()
+    followers = [
+        Follower(sweeps, one.seeds, config.kind(one.class_name), owned) if len(one.seeds.rows)
+        else None
+        for one in objects
+    ]  # fmt: skip
+    found: dict[int, FollowedTrack] = {}
+    counts = [0 if one is None else one.num_points for one in followers]
+    for index in np.argsort(-np.array(counts, int), kind='stable').tolist():
+        track = _followed(objects[index], followers[index], stamps_ns, times)
+        owned.add(track.rows, track.boxes)
+        found[index] = track
+    return [found[index] for index in range(len(objects))]
+
+
+class _Object(NamedTuple):
+    """An object: its seeds in sweeps, and those that could not be placed."""
+
+    track_id: str
+    class_name: str
+    seeds: Seeds
+    problems: tuple[str, ...]
+
+
+class _Seed(NamedTuple):
+    stamp_ns: int
+    class_name: str
+    box: Floats
+
+
+def _by_track(arrays: Sequence[BoxArray]) -> dict[str, list[_Seed]]:
+    """Return the seeds of each track, ascending by stamp."""
+    found: dict[str, list[_Seed]] = {}
+    for array in sorted(arrays, key=lambda array: array.stamp_ns):
+        for i, name in enumerate(array.track_ids):
+            if not name:
+                raise ShapeError('seeds: expected a track id for each box, got an empty one')
+            seed = _Seed(array.stamp_ns, array.class_names[i], array.boxes[i])
+            found.setdefault(name, []).append(seed)
+    return found
+
+
+def _placed(track_id: str, given: Sequence[_Seed], stamps_ns: Ints) -> _Object:
+    """Return an object with each seed in the sweep nearest in time, and name the others."""
+    boxes: dict[int, Floats] = {}
+    problems = []
+    for seed in given:
+        row, away, period = _nearest(stamps_ns, seed.stamp_ns)
+        name = f'seed of track {track_id!r} at {seed.stamp_ns}'
+        if not is_valid_box(seed.box):
+            problems.append(f'{name}: expected finite numbers and positive extents')
+        elif away > period / 2:
+            problems.append(
+                f'{name}: expected the stamp of a sweep, the nearest is {away * 1e-9:.3f} s away'
+            )
+        elif row in boxes:
+            problems.append(f'{name}: expected one box at a stamp; the first is used')
+        else:
+            boxes[row] = seed.box
+    rows = np.array(list(boxes), np.int64)
+    seeds = Seeds(rows, np.array(list(boxes.values())).reshape(-1, 9))
+    return _Object(track_id, given[0].class_name, seeds, tuple(problems))
+
+
+def _nearest(stamps_ns: Ints, stamp_ns: int) -> tuple[int, int, float]:
+    """Return the row of the nearest stamp, its distance, and the period there [ns]."""
+    if not len(stamps_ns):
+        return 0, 1, 0.0
+    away = np.abs(stamps_ns - stamp_ns)
+    row = int(away.argmin())
+    steps = np.diff(stamps_ns[max(0, row - 1) : row + 2])
+    return row, int(away[row]), float(steps.max(initial=0)) or 1e8
+
+
+def _followed(
+    one: _Object, follower: Follower | None, stamps_ns: Ints, times: Floats
+) -> FollowedTrack:
+    """Return the track of an object: before its first seed, between all of them, and after."""
+    if follower is None:
+        nothing = np.zeros(0, np.int64)
+        return FollowedTrack(
+            one.track_id, one.class_name, nothing, nothing, np.zeros((0, 9)), (), (), one.problems
+        )
+    problems = one.problems
+    seeds = one.seeds
+    poses = {int(row): box[POSE4] for row, box in zip(seeds.rows, seeds.boxes, strict=True)}
+    status = dict.fromkeys(poses, HUMAN)
+    for first in range(len(seeds.rows) - 1):
+        rows, found = between(follower, times, seeds, first)
+        poses |= dict(zip(rows.tolist(), found, strict=True))
+        status |= dict.fromkeys(rows.tolist(), INTERPOLATED)
+    ends = []
+    if follower.num_points < MIN_SEED_POINTS:
+        problems = (*problems, _without_points(one, follower.num_points))
+    for seed, sign, stop in ((0, -1, 0), (len(seeds.rows) - 1, 1, len(times) - 1)):
+        last = int(seeds.rows[seed])
+        reason = 'few_points'
+        if follower.num_points >= MIN_SEED_POINTS:
+            way = follower.way(seed, sign, stop)
+            reason = END_OF_SWEEPS if way.reason == ARRIVED else way.reason
+            for row in _supported(way):
+                poses[row] = way.poses[row]
+                status[row] = EXTENDED
+                last = row
+        ends.append(End(int(stamps_ns[last]), reason))
+    rows = np.array(sorted(poses), np.int64)
+    boxes = _boxes(rows, np.array([poses[row] for row in rows.tolist()]), seeds)
+    words = tuple(status[row] for row in rows.tolist())
+    return FollowedTrack(
+        one.track_id, one.class_name, rows, stamps_ns[rows], boxes, words, tuple(ends), problems
+    )
+
+
+def _without_points(one: _Object, count: int) -> str:
+    return (
+        f'seeds of track {one.track_id!r}: expected points in their boxes, got {count}; it is not '
+        f'followed: correct the boxes, or their frame'
+    )
+
+
+def _supported(way: Way) -> Iterator[int]:
+    """Yield the rows of a way, outwards, up to the last that points support."""
+    waiting: list[int] = []
+    for row in way.poses:  # in the order they were followed
+        waiting.append(row)
+        if row in way.seen:
+            yield from waiting
+            waiting = []
+
+
+def _boxes(rows: Ints, poses: Floats, seeds: Seeds) -> Floats:
+    """Return boxes (N, 9) of poses (N, 4), with roll and pitch of the nearest seed."""
+    nearest = np.abs(rows[:, None] - seeds.rows).argmin(1)
+    boxes: Floats = seeds.boxes[nearest].copy()
+    boxes[:, BOX_EXTENT] = seeds.boxes[:, BOX_EXTENT].mean(0)
+    boxes[:, POSE4] = poses
+    boxes[:, YAW] = wrap_angle(boxes[:, YAW])
+    return boxes
+
+
+def _solved(
+    tracks: Sequence[FollowedTrack],
+    points: Sequence[NDArray[np.floating]],
+    config: Config,
+    origins: Floats | None,
+) -> list[FollowedTrack]:
+    """Return the tracks refined, the seeds as boxes of a person that evidence may move."""
+    given = [
+        Track(
+            track.track_id,
+            track.class_name,
+            track.stamps_ns,
+            track.boxes,
+            [_nearby(points[row], box) for row, box in zip(track.rows, track.boxes, strict=True)],
+            None if origins is None else origins[track.rows],
+            pinned=np.array([word == HUMAN for word in track.status], bool),
+        )
+        for track in tracks
+        if len(track.rows)
+    ]
+    refined = {track.track_id: track.boxes for track in refine(given, config)}
+    return [
+        FollowedTrack(
+            track.track_id, track.class_name, track.rows, track.stamps_ns,
+            refined.get(track.track_id, track.boxes), track.status, track.ends, track.problems,
+        )
+        for track in tracks
+    ]  # fmt: skip
+
+
+def _nearby(points: NDArray[np.floating], box: Floats) -> NDArray[np.floating]:
+    """Return the points, which ascend by x, within `NEARBY` of a box."""
+    reach = np.hypot(box[LENGTH], box[WIDTH]) / 2 + NEARBY
+    first, last = np.searchsorted(points[:, 0], [box[0] - reach, box[0] + reach])
+    part: NDArray[np.floating] = points[first:last]
+    near = (np.abs(part[:, 1] - box[1]) < reach) & (
+        np.abs(part[:, 2] - box[2]) < box[5] / 2 + NEARBY
+    )
+    return np.asarray(part[near])

@@ -1,0 +1,1 @@
+"""Following one object through sweeps, from boxes of a person."""

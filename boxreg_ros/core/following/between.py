@@ -1,0 +1,100 @@
+"""Poses between two boxes of a person: lines and splines in time, and ways that have arrived."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from boxreg_ros.core.following.tracker import (
+    ARRIVED,
+    Follower,
+    MAX_GAP,
+    MAX_GAP_YAW,
+    POSE4,
+    Seeds,
+    Way,
+)
+from boxreg_ros.rotations import wrap_angle
+from boxreg_ros.structures import Floats, Ints
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
+
+MIN_CURVED_TRAVEL = 1.0
+"""Boxes nearer to each other are joined by a line: their headings are no tangents [m]."""
+
+
+def between(follower: Follower, times: Floats, seeds: Seeds, first: int) -> tuple[Ints, Floats]:
+    """
+    Return rows (n,) and poses (n, 4) between the seeds `first` and `first + 1`.
+
+    The object is followed from both. A way that arrives is closed onto the seed; both are blended
+    by the time to their seeds. Where none arrives, the spline that fits the points best is taken.
+
+    """
+    start, stop = seeds.rows[first : first + 2].tolist()
+    rows = np.arange(start + 1, stop)
+    if not len(rows):
+        return rows, np.zeros((0, 4))
+    part = (times[rows] - times[start]) / (times[stop] - times[start])
+    poses = seeds.boxes[:, POSE4]
+    forwards = _closed(follower.way(first, 1, stop), rows, part, poses[first + 1])
+    backwards = _closed(
+        follower.way(first + 1, -1, start), rows[::-1], 1 - part[::-1], poses[first]
+    )
+    if backwards is not None:
+        backwards = backwards[::-1]
+    lines = list(_lines(times, seeds, first, rows))
+    if forwards is not None and backwards is not None:
+        blended = _blended(forwards, backwards, part)
+        if (_distances(forwards, backwards) < MAX_GAP).all():
+            return rows, blended
+        lines.append(blended)
+    lines += [way for way in (forwards, backwards) if way is not None]
+    scores = [follower.fit_of(rows, line) for line in lines]
+    return rows, lines[int(np.argmax(scores))]
+
+
+def _closed(way: Way, rows: Ints, part: Floats, target: Floats) -> Floats | None:
+    """Return the poses (n, 4) of a way moved so that it ends at `target`; None where it is far."""
+    if way.reason != ARRIVED or not len(rows):
+        return None
+    gap = target - list(way.poses.values())[-1]
+    gap[3] = wrap_angle(gap[3])
+    if np.linalg.norm(gap[:3]) > MAX_GAP or abs(gap[3]) > MAX_GAP_YAW:
+        return None
+    poses = np.array([way.poses[row] for row in rows.tolist()])
+    return poses + part[:, None] * gap
+
+
+def _blended(a: Floats, b: Floats, part: Floats) -> Floats:
+    """Return poses (n, 4) from `a` to `b`, at `part` (n,) of the way."""
+    step = b - a
+    step[:, 3] = wrap_angle(step[:, 3])
+    return a + part[:, None] * step
+
+
+def _distances(a: Floats, b: Floats) -> Floats:
+    distances: Floats = np.linalg.norm(a[:, :3] - b[:, :3], axis=1)
+    return distances
+
+
+def _lines(times: Floats, seeds: Seeds, first: int, rows: Ints) -> Iterator[Floats]:
+    """Yield candidates (n, 4): a line, a spline by the headings, a spline of all seeds."""
+    poses = seeds.boxes[:, POSE4].copy()
+    poses[:, 3] = np.unwrap(poses[:, 3])
+    ends = poses[first : first + 2]
+    at = times[seeds.rows]
+    wanted = times[rows]
+    part = (wanted - at[first]) / (at[first + 1] - at[first])
+    yield ends[0] + part[:, None] * (ends[1] - ends[0])
+    travel = ends[1, :2] - ends[0, :2]
+    if np.linalg.norm(travel) < MIN_CURVED_TRAVEL:
+        return
+    if len(at) > 2:
+        yield CubicSpline(at, poses)(wanted)
+    seconds = at[first + 1] - at[first]
+    middle = ends[:, 3].mean()
+    speed = travel @ [np.cos(middle), np.sin(middle)] / seconds
+    tangents = np.zeros((2, 4))
+    tangents[:, :2] = speed * np.column_stack([np.cos(ends[:, 3]), np.sin(ends[:, 3])])
+    tangents[:, 2:] = (ends[1, 2:] - ends[0, 2:]) / seconds
+    yield CubicHermiteSpline(at[first : first + 2], ends, tangents)(wanted)

@@ -1,0 +1,139 @@
+"""
+The surface of one object in its box frame: cells with the moments of their points.
+
+A map is a tuple of arrays. `slots` (nx, ny, nz) holds the number of the cell at a place plus one,
+or 0; `moments` (S, 10) the count, the sums of x y z and of xx xy xz yy yz zz of its points;
+`normals` (S, 3) the direction of least spread around it; `used` (1,) the number of cells.
+
+"""
+
+from boxreg_ros.core.kernels.compile import kernel
+import numpy as np
+
+SURFACE_CELL = 0.15
+"""Side of a cell [m]."""
+FULL = 60
+"""A cell takes no more points than this."""
+RIM = 0.6
+"""A map reaches this far outside of the box [m]."""
+LINE = 0.02
+"""A neighbourhood with less spread in its second direction is a line [m]."""
+FLAT = 0.05
+"""Spread of a cell across its surface that is still a surface [m]."""
+
+
+@kernel
+def cell_of(x, y, z, slots):
+    """Return the indices of the cell at a place of the box frame; i = -1 outside of the map."""
+    nx, ny, nz = slots.shape
+    i = int(np.floor(x / SURFACE_CELL)) + nx // 2
+    j = int(np.floor(y / SURFACE_CELL)) + ny // 2
+    k = int(np.floor(z / SURFACE_CELL)) + nz // 2
+    if i < 1 or j < 1 or k < 1 or i >= nx - 1 or j >= ny - 1 or k >= nz - 1:
+        return -1, -1, -1
+    return i, j, k
+
+
+@kernel
+def insert(points, half, slots, moments, normals, used):
+    """Add points (n, 3) of the box frame to a map; update the normals of their cells."""
+    touched = np.zeros(len(moments), np.bool_)
+    for n in range(len(points)):
+        x, y, z = points[n]
+        i, j, k = cell_of(x, y, z, slots)
+        if i < 0:
+            continue
+        slot = slots[i, j, k] - 1
+        if slot < 0:
+            if used[0] >= len(moments):
+                continue
+            slot = used[0]
+            used[0] += 1
+            slots[i, j, k] = slot + 1
+        if moments[slot, 0] >= FULL:
+            continue
+        touched[slot] = True
+        moments[slot] += np.array([1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z])
+    for slot in range(used[0]):
+        if touched[slot]:
+            mean = moments[slot, 1:4] / moments[slot, 0]
+            normals[slot] = normal_at(mean, half, slots, moments)
+
+
+@kernel
+def normal_at(mean, half, slots, moments):
+    """
+    Return the normal of the points in the 27 cells around a place (3,); zeros for too few.
+
+    Where they form a line, as those of one ring, the normal is the horizontal one across it.
+
+    """
+    none = np.zeros(3)
+    if half[0] - abs(mean[0]) < half[1] - abs(mean[1]):
+        none[0] = np.sign(mean[0])
+    else:
+        none[1] = np.sign(mean[1])
+    i, j, k = cell_of(mean[0], mean[1], mean[2], slots)
+    total = np.zeros(10)
+    for a in range(i - 1, i + 2):
+        for b in range(j - 1, j + 2):
+            for c in range(k - 1, k + 2):
+                slot = slots[a, b, c] - 1
+                if slot >= 0:
+                    total += moments[slot]
+    n = total[0]
+    if n < 4:
+        return none
+    m = total[1:4] / n
+    C = np.empty((3, 3))
+    C[0, 0] = total[4] / n - m[0] * m[0]
+    C[0, 1] = total[5] / n - m[0] * m[1]
+    C[0, 2] = total[6] / n - m[0] * m[2]
+    C[1, 1] = total[7] / n - m[1] * m[1]
+    C[1, 2] = total[8] / n - m[1] * m[2]
+    C[2, 2] = total[9] / n - m[2] * m[2]
+    C[1, 0], C[2, 0], C[2, 1] = C[0, 1], C[0, 2], C[1, 2]
+    values, vectors = np.linalg.eigh(C)
+    if values[1] < LINE**2 or values[1] < 3 * values[0]:
+        along = vectors[:, 2]
+        length = np.hypot(along[0], along[1])
+        if length < 0.5:
+            return none
+        return np.array([-along[1] / length, along[0] / length, 0.0])
+    return vectors[:, 0].copy()
+
+
+@kernel
+def nearest(x, y, z, slots, moments, limit):
+    """Return the cell with the nearest mean to a place, or -1 beyond `limit` [m]."""
+    i, j, k = cell_of(x, y, z, slots)
+    if i < 0:
+        return -1
+    best = limit * limit
+    found = -1
+    for a in range(i - 1, i + 2):
+        for b in range(j - 1, j + 2):
+            for c in range(k - 1, k + 2):
+                slot = slots[a, b, c] - 1
+                if slot < 0:
+                    continue
+                n = moments[slot, 0]
+                dx = moments[slot, 1] / n - x
+                dy = moments[slot, 2] / n - y
+                dz = moments[slot, 3] / n - z
+                squared = dx * dx + dy * dy + dz * dz
+                if squared < best:
+                    best = squared
+                    found = slot
+    return found
+
+
+def empty(half, cells):
+    """Return a map without points for a box with `half` extents (3,)."""
+    sides = (2 * np.ceil((half + RIM) / SURFACE_CELL) + 2).astype(np.int64)
+    return (
+        np.zeros(sides, np.int32),
+        np.zeros((cells, 10)),
+        np.zeros((cells, 3)),
+        np.zeros(1, np.int64),
+    )

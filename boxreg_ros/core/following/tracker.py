@@ -1,0 +1,461 @@
+"""
+Follow one object through sweeps, from boxes of a person: predict, register, update.
+
+A way starts at a seed and takes one sweep after the other, in either direction in time. Between
+two seeds there are two ways; each is tested where it arrives at the other seed.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple, Protocol, Self
+
+from boxreg_ros.core.following.kernels import motion, registration, surface
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
+import numpy as np
+from numpy.typing import NDArray
+
+POSE4 = [0, 1, 2, YAW]
+"""Columns of a box that are followed; roll and pitch are those of the seed."""
+PLANAR = np.ix_([0, 1, 3], [0, 1, 3])
+"""x y yaw of the covariance of a followed pose."""
+
+SEED_DEVIATIONS = np.array([0.03, 0.03, 0.03, 0.02])
+"""Of x y z [m] and yaw [rad] of a box that a person has drawn."""
+ROAD_DEVIATION = 0.07
+"""Of the height of the road beside a box [m]; swept: 0.05 and 0.1 are as good, 0.2 drifts."""
+CLIMB = 0.1
+"""The height of a box changes by this in a second, as a random walk [m]; chosen."""
+STOPPED = 0.3
+"""Slower objects count as parked where they are held through an occlusion [m/s]."""
+REAR_AXLE = 0.25
+"""Distance of the rear axle of a vehicle behind its centre, as part of the length."""
+
+# A pose is accepted if all of these hold.
+MIN_POINTS = 5
+"""Points that fit the surface."""
+MIN_FIT = 0.5
+"""Part of the points near the surface that fit it."""
+MIN_SEEN = 0.3
+"""Part of the points in the box that are near the surface."""
+MAX_DEVIATION = 0.35
+"""Deviation along the heading [m]."""
+MAX_YAW_DEVIATION = 0.12
+"""[rad]."""
+MAX_JUMP = 16.0
+"""Squared Mahalanobis distance from the prediction."""
+MIN_FIT_TO_LEARN = 0.7
+"""Points of a sweep with a smaller part that fits are not added to the surface."""
+MIN_FIT_AGAIN = 0.6
+"""Part of the points that fit, to find an object again after a loss."""
+
+MIN_SCORE_AGAIN = 0.5
+"""And of their score before the loss, as a running mean."""
+
+HOLD, HOLD_PARKED = 2.0, 5.0
+"""An object that is not found for so long is lost [s]."""
+YOUNG = 1.0
+"""A way of this duration does not yet know its speed well [s]."""
+SPEED_AFTER_LOSS = 2.0
+"""Deviation of the speed of a young way after a loss [m/s]."""
+SEARCH_STEP = 0.4
+"""Distance of the starts of a search along the heading [m]."""
+
+MAX_GAP = 0.3
+"""A way has arrived at a seed if it is nearer than this [m]; swept in findings: 0.2 to 0.5."""
+MAX_GAP_YAW = 0.15
+"""And if its heading differs by less [rad]."""
+
+NEAR_SEEDS = 1.5
+"""Seeds nearer in time give the speed [s]; chosen: acceleration changes it by less than 3 m/s."""
+SEARCH_SWEEPS = 5
+"""Sweeps in each direction that a start speed is tested with."""
+SPEEDS_TESTED = 8
+"""Most likely speeds by the first sweeps that are tested with `SEARCH_SWEEPS`."""
+START_INFORMATION = np.diag(np.array([0.5, 0.5, 0.1, 0.05]) ** -2.0)
+"""Of the starts of a search for the speed: x y z [m] and yaw [rad]."""
+MARGIN_LEARNT = 0.1
+"""Points so far outside of the box are part of its surface [m]."""
+MAX_SWEEP_POINTS = 400
+"""A sweep with more points around a box is thinned; swept: the poses are as good."""
+MAX_CELLS = 20_000
+"""Of a surface: those of a bus of 12 m at 0.15 m."""
+
+ARRIVED, END_OF_SWEEPS = 'arrived', 'end_of_sweeps'
+
+
+class KindOfMotion(NamedTuple):
+    """Motion of a kind of object: densities of `motion.predict`, speed [m/s], road [m]."""
+
+    noise: Floats
+    max_speed: float
+    clearance: float
+
+
+MOTIONS = {
+    'vehicle': KindOfMotion(np.array([1.0, 0.1, 0.004, 1e-4]), 40.0, 0.25),
+    'cyclist': KindOfMotion(np.array([1.0, 0.4, 0.01, 1e-3]), 12.0, 0.2),
+    'pedestrian': KindOfMotion(np.array([0.6, 0.4, 0.02, 5e-3]), 3.0, 0.2),
+}
+
+
+class Points(Protocol):
+    """The points (M, 3) of each sweep, ascending by x."""
+
+    def __getitem__(self, row: int, /) -> NDArray[np.floating]:
+        """Return the points of a sweep."""
+
+
+class Sweeps(NamedTuple):
+    """Times (S,) of sweeps [s], and their points, all in one frame."""
+
+    times: Floats
+    points: Points
+
+
+class Seeds(NamedTuple):
+    """Boxes (N, 9) of a person in the sweeps `rows` (N,), ascending."""
+
+    rows: Ints
+    boxes: Floats
+
+
+class Way(NamedTuple):
+    """
+    Poses from a seed outwards.
+
+    Attributes
+    ----------
+    poses : dict
+        Pose (4,) by row of the sweep, without that of the seed.
+    seen : set of int
+        Rows where points support the pose; it is predicted in the others.
+    reason : str
+        Why it ends: `ARRIVED`, `END_OF_SWEEPS`, or `_reason`.
+
+    """
+
+    poses: dict[int, Floats]
+    seen: set[int]
+    reason: str
+
+
+class _Found(NamedTuple):
+    """A registered pose, its covariance (4, 4), its fit, and why it is not accepted."""
+
+    pose: Floats
+    covariance: Floats
+    fit: Floats
+    reason: str
+
+    @property
+    def score(self) -> float:
+        return _score(self.fit)
+
+    @property
+    def part(self) -> float:
+        """Part of the points near the surface that fit it."""
+        return float(self.fit[1] / max(self.fit[5], 1.0))
+
+
+class _State(NamedTuple):
+    """State and covariance of `motion`, height and its variance, and the time of the sweep."""
+
+    planar: Floats
+    covariance: Floats
+    z: float
+    z_variance: float
+
+    @classmethod
+    def at_seed(cls, pose: Floats, speed: float) -> Self:
+        deviations = [*SEED_DEVIATIONS[[0, 1, 3]], 1.0, 0.1]
+        planar = np.array([pose[0], pose[1], pose[3], speed, 0.0])
+        return cls(planar, np.diag(np.square(deviations)), pose[2], SEED_DEVIATIONS[2] ** 2)
+
+    @property
+    def pose(self) -> Floats:
+        return np.array([self.planar[0], self.planar[1], self.z, self.planar[2]])
+
+    @property
+    def information(self) -> Floats:
+        full = np.zeros((4, 4))
+        full[PLANAR] = self.covariance[:3, :3]
+        full[2, 2] = self.z_variance
+        return np.asarray(np.linalg.inv(full), np.float64)
+
+    @property
+    def is_parked(self) -> bool:
+        return bool(abs(self.planar[3]) < STOPPED)
+
+
+class Owned:
+    """Boxes of objects that are followed already: their points are of no other object."""
+
+    def __init__(self) -> None:
+        self._boxes: dict[int, list[Floats]] = {}  # by row of the sweep
+
+    def add(self, rows: Ints, boxes: Floats) -> None:
+        """Add the boxes (N, 9) of an object in the sweeps `rows` (N,)."""
+        for row, box in zip(rows.tolist(), boxes, strict=True):
+            self._boxes.setdefault(row, []).append(box)
+
+    def others(self, row: int, pose: Floats, half: Floats) -> Iterator[Floats]:
+        """Yield boxes near a pose (4,); not one whose centre is in it: that is the same object."""
+        boxes = self._boxes.get(row)
+        if not boxes:
+            return
+        reach = np.hypot(half[0], half[1])
+        for box in boxes:
+            away = np.hypot(box[0] - pose[0], box[1] - pose[1])
+            if half[1] < away < reach + np.hypot(box[LENGTH], box[WIDTH]) / 2 + 1.0:
+                yield box
+
+
+class Follower:
+    """
+    Follow one object.
+
+    Parameters
+    ----------
+    sweeps : Sweeps
+        All of a drive.
+    seeds : Seeds
+        Of the object, one or more.
+    kind : str
+        One of `MOTIONS`.
+    owned : Owned
+        Boxes of other objects.
+
+    """
+
+    def __init__(self, sweeps: Sweeps, seeds: Seeds, kind: str, owned: Owned) -> None:
+        self._sweeps = sweeps
+        self._seeds = seeds
+        self._kind = MOTIONS[kind]
+        self._owned = owned
+        self._half = seeds.boxes[:, BOX_EXTENT].mean(0) / 2
+        self._tilt = matrix_from_rpy(np.append(seeds.boxes[0, [ROLL, PITCH]], 0.0))
+        self._pivot = REAR_AXLE * 2 * self._half[0] if kind == 'vehicle' else 0.0
+        self._surface = surface.empty(self._half, MAX_CELLS)
+        self._road = np.nan
+        self.num_points = 0
+        for row, pose in zip(seeds.rows.tolist(), seeds.boxes[:, POSE4], strict=True):
+            points = self._near(row, pose)
+            self.num_points += self._learn(points, pose)
+            if np.isnan(self._road):
+                self._road = self._road_below(points, pose)
+
+    def way(self, seed: int, sign: int, stop: int) -> Way:
+        """Follow the object from a seed to the row `stop`, forwards or backwards."""
+        row = int(self._seeds.rows[seed])
+        pose = self._seeds.boxes[seed, POSE4]
+        state = _State.at_seed(pose, self._start_speed(seed))
+        times = self._sweeps.times
+        way = Way({}, set(), ARRIVED)
+        lost = ''
+        first = last_seen = times[row]
+        usual = _score(self._fit(self._near(row, pose), pose))
+        while row != stop:
+            row += sign
+            state = self._predicted(state, times[row] - times[row - sign])
+            is_lost = abs(times[row - sign] - last_seen) > 0
+            found = self._find(row, state, is_lost)
+            if is_lost and not found.reason and found.score < MIN_SCORE_AGAIN * usual:
+                found = found._replace(reason='no_fit')
+            if found.reason:
+                if not is_lost and abs(last_seen - first) < YOUNG:
+                    state.covariance[3, 3] += SPEED_AFTER_LOSS**2
+                hold = HOLD_PARKED if state.is_parked else HOLD
+                if abs(times[row] - last_seen) > hold:
+                    return way._replace(reason=found.reason)
+                way.poses[row] = state.pose
+                lost = found.reason
+                continue
+            lost = ''
+            planar, covariance = motion.update(
+                state.planar, state.covariance, found.pose[[0, 1, 3]], found.covariance[PLANAR]
+            )
+            state = _State(planar, covariance, found.pose[2], found.covariance[2, 2])
+            way.poses[row] = found.pose
+            way.seen.add(row)
+            last_seen = times[row]
+            usual += (found.score - usual) / 5
+            if found.part > MIN_FIT_TO_LEARN:
+                points = self._near(row, found.pose)
+                self._learn(points, found.pose)
+                if np.isnan(self._road):
+                    self._road = self._road_below(points, found.pose)
+        return way._replace(reason=lost or ARRIVED)
+
+    def fit_of(self, rows: Ints, poses: Floats) -> float:
+        """Return the mean score of poses (n, 4) in sweeps `rows` (n,)."""
+        scores = [
+            _score(self._fit(self._near(row, pose), pose))
+            for row, pose in zip(rows.tolist(), poses, strict=True)
+        ]
+        return float(np.mean(scores)) if scores else 0.0
+
+    def _find(self, row: int, state: _State, is_lost: bool) -> _Found:
+        """Return the pose in a sweep, from several starts after a loss."""
+        prior, information = state.pose, state.information
+        points = self._near(row, prior, 0.5)
+        height = self._road_below(points, prior) - self._road
+        if np.isfinite(height):
+            weight = ROAD_DEVIATION**-2
+            prior[2] += height * weight / (information[2, 2] + weight)
+            information[2, 2] += weight
+        best = self._registered(points, prior, prior, information)
+        if not is_lost:
+            return best
+        reach = 2.5 * np.sqrt(state.covariance[0, 0] + state.covariance[1, 1])
+        count = min(int(reach / SEARCH_STEP), 10)
+        for shift in SEARCH_STEP * np.arange(-count, count + 1):
+            start = prior + shift * np.array([np.cos(prior[3]), np.sin(prior[3]), 0.0, 0.0])
+            near = self._near(row, start, 0.5)
+            found = self._registered(near, start, prior, information)
+            if found.score > best.score + 0.02:
+                best = found
+        if not best.reason and best.part < MIN_FIT_AGAIN:
+            return best._replace(reason='no_fit')
+        return best
+
+    def _registered(
+        self, points: Floats, start: Floats, prior: Floats, information: Floats, steps: int = 12
+    ) -> _Found:
+        thinned = np.ascontiguousarray(points[:: 1 + len(points) // MAX_SWEEP_POINTS])
+        pose, of_points, fit = registration.register(
+            thinned, start, prior, information, self._tilt, self._half, self._kind.clearance,
+            self._surface, steps,
+        )  # fmt: skip
+        covariance = np.linalg.inv(of_points + information)
+        difference = pose - prior
+        jump = difference @ information @ difference
+        return _Found(pose, covariance, fit, _reason(pose, covariance, fit, jump))
+
+    def _start_speed(self, seed: int) -> float:
+        """Return the speed at a seed [m/s]: by its neighbours in time, or searched."""
+        rows = self._seeds.rows
+        times = self._sweeps.times
+        near = [i for i in (seed - 1, seed + 1) if 0 <= i < len(rows)]
+        near = [i for i in near if abs(times[rows[i]] - times[rows[seed]]) < NEAR_SEEDS]
+        if not near:
+            return self._searched_speed(seed)
+        first, last = min(*near, seed), max(*near, seed)
+        travel = self._seeds.boxes[last, :2] - self._seeds.boxes[first, :2]
+        yaw = self._seeds.boxes[seed, YAW]
+        forward = travel @ [np.cos(yaw), np.sin(yaw)]
+        return float(forward / (times[rows[last]] - times[rows[first]]))
+
+    def _searched_speed(self, seed: int) -> float:
+        """Return the speed at a seed by which the sweeps around it fit best [m/s]."""
+        row = int(self._seeds.rows[seed])
+        pose = self._seeds.boxes[seed, POSE4]
+        times = self._sweeps.times
+        around = [other for other in (row - 1, row + 1) if 0 <= other < len(times)]
+        if not around:
+            return 0.0
+        period = max(abs(times[other] - times[row]) for other in around)
+        step = min(3.0, 0.35 / max(period, 1e-3))
+        count = int(self._kind.max_speed / step)
+        speeds = step * np.arange(-count // 3, count + 1)
+        forward = np.array([np.cos(pose[3]), np.sin(pose[3]), 0.0, 0.0])
+        scores = np.zeros(len(speeds))
+        for i, speed in enumerate(speeds):
+            for other in around:
+                start = pose + speed * (times[other] - times[row]) * forward
+                points = self._near(other, start)
+                if len(points) >= MIN_POINTS:
+                    scores[i] += self._registered(points, start, start, START_INFORMATION, 6).score
+            scores[i] = scores[i] / len(around) - _cost(speed)
+        likely = speeds[np.argsort(-scores, kind='stable')[:SPEEDS_TESTED]]
+        tested = [self._tested_speed(row, pose, speed) for speed in likely]
+        return max(tested)[1]
+
+    def _tested_speed(self, row: int, pose: Floats, speed: float) -> tuple[float, float]:
+        """Return the score of a start speed over several sweeps, and the mean speed by them."""
+        times = self._sweeps.times
+        total, weights = 0.0, 1e-9
+        found_speeds = []
+        for sign in (1, -1):
+            state = _State.at_seed(pose, speed)
+            for count in range(1, SEARCH_SWEEPS + 1):
+                other = row + sign * count
+                if not 0 <= other < len(times):
+                    break
+                state = self._predicted(state, times[other] - times[other - sign])
+                prior, information = state.pose, state.information
+                found = self._registered(self._near(other, prior), prior, prior, information, 8)
+                step = found.pose - prior
+                jump = float(step @ information @ step)
+                total += (found.score - 0.02 * min(jump, 10.0)) / count
+                weights += 1 / count
+                planar, covariance = motion.update(
+                    state.planar, state.covariance, found.pose[[0, 1, 3]], found.covariance[PLANAR]
+                )
+                state = state._replace(planar=planar, covariance=covariance)
+            found_speeds.append(state.planar[3])
+        return total / weights - _cost(speed), float(np.mean(found_speeds))
+
+    def _predicted(self, state: _State, seconds: float) -> _State:
+        planar, covariance = motion.predict(
+            state.planar, state.covariance, seconds, self._kind.noise, self._pivot
+        )
+        return _State(planar, covariance, state.z, state.z_variance + CLIMB**2 * abs(seconds))
+
+    def _near(self, row: int, pose: Floats, margin: float = 0.0) -> Floats:
+        """Return the points (n, 3) around a pose that are not in the box of another object."""
+        reach = np.hypot(self._half[0], self._half[1]) + 0.7 + margin
+        box = np.array([reach, reach, self._half[2] + 0.6])
+        points = registration.near(self._sweeps.points[row], pose[:3], box)
+        for other in self._owned.others(row, pose, self._half):
+            tilt = matrix_from_rpy(np.append(other[[ROLL, PITCH]], 0.0))
+            points = registration.outside(points, other[POSE4], tilt, other[BOX_EXTENT] / 2)
+        near: Floats = points
+        return near
+
+    def _learn(self, points: Floats, pose: Floats) -> int:
+        """Add the points in the box to the surface; return their number."""
+        inside = registration.in_box(
+            points, pose, self._tilt, self._half, self._kind.clearance, MARGIN_LEARNT
+        )
+        surface.insert(inside, self._half, *self._surface)
+        return len(inside)
+
+    def _road_below(self, points: Floats, pose: Floats) -> float:
+        return float(registration.road_below(points, pose, self._tilt, self._half))
+
+    def _fit(self, points: Floats, pose: Floats) -> Floats:
+        fit: Floats = registration.fit(
+            points, pose, self._tilt, self._half, self._kind.clearance, self._surface
+        )
+        return fit
+
+
+def _cost(speed: float) -> float:
+    """Return how much better the score of a speed has to be than that of a parked object."""
+    return 0.03 * (abs(speed) > 0.7) + 0.1 * (speed < -0.7) + 0.002 * abs(speed)
+
+
+def _score(fit: Floats) -> float:
+    """Return the harmonic mean of the parts of the points that fit, and of the surface hit."""
+    inside, fitting, _, hit, beside, _ = fit
+    if inside < 3:
+        return 0.0
+    part = fitting / (inside + beside)
+    return float(2 * part * hit / max(part + hit, 1e-9))
+
+
+def _reason(pose: Floats, covariance: Floats, fit: Floats, jump: float) -> str:
+    """Return why a pose is not accepted; empty if it is."""
+    inside, fitting, _, _, _, matched = fit
+    if fitting < MIN_POINTS:
+        return 'few_points'
+    if fitting < MIN_FIT * matched or matched < MIN_SEEN * inside:
+        return 'no_fit'
+    forward = np.array([np.cos(pose[3]), np.sin(pose[3])])
+    along = forward @ covariance[:2, :2] @ forward
+    if along > MAX_DEVIATION**2 or covariance[3, 3] > MAX_YAW_DEVIATION**2:
+        return 'uncertain'
+    return 'jump' if jump > MAX_JUMP else ''

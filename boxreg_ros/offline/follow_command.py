@@ -1,0 +1,43 @@
+"""
+`boxreg follow`: whole tracks from a few boxes of each object.
+
+It is `boxreg relabel --keyframes` with the boxes of a file.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from boxreg_ros.errors import ConfigError
+from boxreg_ros.offline import relabel_command
+from boxreg_ros.offline.arguments import RECORDINGS
+
+DEFAULT_OUT = Path('followed')
+"""Result folder unless another is given."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `boxreg follow`."""
+    parser.add_argument('recording', type=Path, metavar='RECORDING', help=RECORDINGS)
+    parser.add_argument(
+        'seeds', type=Path, nargs='?', metavar='SEEDS',
+        help='boxes to follow, one or more of each object: CSV with the columns of boxes.csv; '
+        'those of other label formats by --labels',
+    )  # fmt: skip
+    relabel_command.add_run_arguments(parser, DEFAULT_OUT)
+    parser.set_defaults(keyframes=True)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Follow the seeds, print one closing line, and return the exit status."""
+    if (args.seeds is None) == (args.labels is None):
+        got = 'neither' if args.seeds is None else f'{args.seeds} and --labels'
+        raise ConfigError(
+            f'SEEDS: expected a table of boxes or --labels FORMAT:PATH, got {got}; give one'
+        )
+    args.recordings = [args.recording]
+    if args.seeds is not None:
+        args.labels = ('csv', args.seeds)
+    return relabel_command.run(args)

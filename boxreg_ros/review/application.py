@@ -1,0 +1,338 @@
+"""The web application of `boxreg review`: the page, decisions, solving again, label files."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping
+from datetime import datetime, UTC
+from pathlib import Path
+import re
+import secrets
+import sys
+from threading import Lock, Thread
+from typing import Any
+
+import anyio
+from boxreg_ros.errors import BoxregError, RecordingError
+from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
+from boxreg_ros.review.report import PAGE_VERSION, REPORT
+from boxreg_ros.review.solve import ReportParts
+import numpy as np
+import orjson
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+MAX_BODY = 2**23
+"""Longest request [bytes]: one decision about a track whose id has 1 MB, several times over."""
+MAX_ROWS = 10_000
+"""Most decisions of a request: a track that is made of as many parts; chosen."""
+BODY_SECONDS = 20.0
+POLL_SECONDS = 0.25
+"""Another program may append to the file: the time until its decisions are seen; chosen."""
+STAMP = re.compile(r'-?[0-9]{1,19}')
+MARK = f'<html lang="en" data-page="{PAGE_VERSION}"'.encode()
+"""Begins a page of this version, which offers decisions where ``data-review`` follows."""
+MARK_WITHIN = 1000
+"""Bytes of the page that have it."""
+HEADERS = {
+    'Cache-Control': 'no-store',
+    'X-Content-Type-Options': 'nosniff',
+    'X-Frame-Options': 'DENY',
+    'Referrer-Policy': 'no-referrer',
+}
+POLICY = (
+    "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'unsafe-inline'; "
+    "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'"
+)
+
+
+def review_application(
+    out: Path, port: int, who: str, is_ending: Callable[[], bool]
+) -> tuple[ASGIApp, str, Path]:
+    """
+    Return the application for a result folder.
+
+    Parameters
+    ----------
+    out : Path
+        Result folder with a report.
+    port : int
+        Port on loopback that it is served at: requests under another name are refused.
+    who : str
+        Name of the person, where the page sends none.
+    is_ending : callable
+        Whether the server ends: streams of events end then.
+
+    Returns
+    -------
+    application : ASGI application
+    token : str
+        Requests need it, in the address of the first one or in the cookie that this one sets.
+    log_path : Path
+        File of the decisions.
+
+    Raises
+    ------
+    RecordingError
+        If decisions or summary cannot be read.
+
+    """
+    review = _Review(out, who, is_ending)
+    token = secrets.token_urlsafe(16)
+    application = Starlette(
+        routes=[
+            Route('/', review.page),
+            Route('/decisions', review.decisions, methods=['GET']),
+            Route('/decisions', review.decide, methods=['POST']),
+            Route('/events', review.events),
+            Route('/solve', review.solve, methods=['POST']),
+            Route('/save', review.save, methods=['POST']),
+        ],
+        exception_handlers={BoxregError: _refused, OSError: _failed},
+    )
+    return _Guard(application, port, token), token, out / DECISIONS
+
+
+class _Guard:
+    """
+    Refuse requests under another name, of other pages, or without the token.
+
+    A page of the network may know the port, and a name that leads to this machine.
+
+    """
+
+    def __init__(self, application: ASGIApp, port: int, token: str) -> None:
+        self._application = application
+        self._hosts = [f'{name}:{port}' for name in ('127.0.0.1', 'localhost')]
+        self._token = token
+        self._cookie = f'boxreg_{port}'
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        request = Request(scope)
+        answer: ASGIApp = self._application
+        known = request.query_params.get('token') or request.cookies.get(self._cookie, '')
+        origin = request.headers.get('origin')
+        if request.headers.get('host') not in self._hosts or (
+            origin is not None and origin.removeprefix('http://') not in self._hosts
+        ):
+            answer = PlainTextResponse(f'expected the address http://{self._hosts[0]}/', 403)
+        elif not secrets.compare_digest(known.encode(), self._token.encode()):
+            answer = PlainTextResponse('expected the address that boxreg review has printed', 403)
+
+        async def send_with_headers(message: Any) -> None:
+            if message['type'] == 'http.response.start':
+                cookie = f'{self._cookie}={self._token}; HttpOnly; SameSite=Strict; Path=/'
+                found = dict(HEADERS)
+                if 'token' in request.query_params and message['status'] == 200:
+                    found['Set-Cookie'] = cookie
+                message['headers'] += [(k.lower().encode(), v.encode()) for k, v in found.items()]
+            await send(message)
+
+        await answer(scope, receive, send_with_headers)
+
+
+class _Review:
+    """The state of a review, and the answers to its requests."""
+
+    def __init__(self, out: Path, who: str, is_ending: Callable[[], bool]) -> None:
+        self._page = (out / REPORT).read_bytes()
+        if MARK not in self._page[:MARK_WITHIN]:
+            raise RecordingError(
+                f'{out / REPORT}: expected a report of this version, got one of another; run '
+                f'boxreg relabel RECORDING -o NEW --report with the same options'
+            )
+        self._parts = ReportParts(out, self._page)
+        self._summary = orjson.loads((out / 'summary.json').read_bytes())
+        self._frame_id: str = self._summary['fixed_frame']
+        self._out = out
+        self._who = who
+        self._log = DecisionLog(out / DECISIONS)
+        self._log_lock = Lock()
+        self._save_lock = asyncio.Lock()
+        self._is_ending = is_ending
+        Thread(target=self._parts.warm_up, daemon=True).start()
+
+    async def page(self, _: Request) -> Response:
+        """Return the page; its scripts alone may run."""
+        nonce = secrets.token_urlsafe(16)
+        page = self._page.replace(MARK, MARK + b' data-review', 1)
+        page = page.replace(b'\n<script>', f'\n<script nonce="{nonce}">'.encode())
+        policy = {'Content-Security-Policy': POLICY.format(nonce=nonce)}
+        return Response(page, media_type='text/html', headers=policy)
+
+    async def decisions(self, _: Request) -> Response:
+        """Return all decisions."""
+        await run_in_threadpool(self._refresh)
+        return JSONResponse({**self._since(0), 'who': self._who})
+
+    async def decide(self, request: Request) -> Response:
+        """Append decisions, unless others have decided about these tracks since."""
+        sent = await _json_of(request)
+        rows = sent.get('rows')
+        if not isinstance(rows, list) or not 0 < len(rows) <= MAX_ROWS:
+            raise RecordingError(f'rows: expected 1 to {MAX_ROWS} decisions in a list')
+        new = [self._decision(row) for row in rows]
+        return await run_in_threadpool(self._append, new, sent.get('seen'))
+
+    async def events(self, request: Request) -> Response:
+        """Stream decisions as they are made, by whomever."""
+        seen = request.headers.get('last-event-id') or request.query_params.get('seen', '')
+        if not seen.isdecimal():
+            raise RecordingError('seen: expected the number of known decisions')
+        return StreamingResponse(self._stream(int(seen)), media_type='text/event-stream')
+
+    async def solve(self, request: Request) -> Response:
+        """Return the boxes of a track, solved again with its pinned boxes."""
+        sent = await _json_of(request)
+        return Response(
+            await run_in_threadpool(self._parts.solved, sent), media_type='application/json'
+        )
+
+    async def save(self, request: Request) -> Response:
+        """Run the command of the result again with the decisions, into a folder beside it."""
+        await _json_of(request)
+        if self._save_lock.locked():
+            raise HTTPException(409, 'label files are being written already: wait for them')
+        async with self._save_lock:
+            return await self._relabel()
+
+    def _refresh(self) -> None:
+        with self._log_lock:
+            self._log.refresh()
+
+    def _append(self, new: list[Decision], seen: object) -> Response:
+        with self._log_lock, self._log.locked():
+            count = len(self._log.decisions)
+            first = seen if isinstance(seen, int) and 0 <= seen <= count else 0
+            tracks = {one.track_id for one in new}
+            missed = [one for one in self._log.decisions[first:] if one.track_id in tracks]
+            if missed:
+                last = missed[-1]
+                text = (
+                    f'{last.who or "another person"} has decided about track '
+                    f'{last.track_id!r:.80} meanwhile ({last.kind}): look, then decide again'
+                )
+                return JSONResponse({**self._since(first), 'message': text}, 409)
+            self._log.append_locked(new)
+        return JSONResponse(self._since(first))
+
+    def _since(self, first: int) -> dict[str, Any]:
+        """Return the decisions from `first` on, as the page receives them."""
+        rows = [one.as_json() for one in self._log.decisions[first:]]
+        return {'first': first, 'rows': rows}
+
+    async def _stream(self, seen: int) -> AsyncIterator[bytes]:
+        yield b'retry: 1000\n\n'
+        while not self._is_ending():
+            await run_in_threadpool(self._refresh)
+            if len(self._log.decisions) != seen:
+                first = seen if seen < len(self._log.decisions) else 0
+                seen = len(self._log.decisions)
+                data = orjson.dumps(self._since(first)).decode()
+                yield f'id: {seen}\ndata: {data}\n\n'.encode()
+            await anyio.sleep(POLL_SECONDS)
+
+    def _decision(self, sent: object) -> Decision:
+        """Return the decision that the page has sent."""
+        if not isinstance(sent, dict):
+            raise RecordingError('decision: expected an object')
+        box = _box_of(sent.get('box')) if sent.get('decision') == 'pin' else None
+        return Decision(
+            track_id=_text_of(sent, 'track_id'),
+            stamp_ns=_stamp_of(sent, 'stamp_ns'),
+            kind=_text_of(sent, 'decision'),
+            comment=_text_of(sent, 'comment'),
+            frame_id=self._frame_id if box is not None else '',
+            box=box,
+            end_ns=_stamp_of(sent, 'end_ns'),
+            value=_text_of(sent, 'value'),
+            who=_text_of(sent, 'who') or self._who,
+            when=datetime.now(UTC).isoformat(timespec='seconds'),
+        )
+
+    async def _relabel(self) -> Response:
+        command = self._summary.get('command') or []
+        decisions = (self._out / DECISIONS).resolve()
+        if not command:
+            raise RecordingError(
+                f'this result was not made by boxreg relabel: run boxreg relabel RECORDING -o NEW '
+                f'--decisions {decisions}'
+            )
+        out = self._out.resolve()
+        new = out.with_name(f'{out.name}.corrected')
+        more = ['-o', str(new), '--report']
+        if decisions.exists():
+            more += ['--decisions', str(decisions)]
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, '-m', 'boxreg_ros.cli', *command, *more,
+            cwd=self._summary['folder'],
+            stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+        )  # fmt: skip
+        try:
+            output, errors = await process.communicate()
+        finally:
+            if process.returncode is None:
+                process.terminate()  # it removes what it has begun
+        lines = [part.decode(errors='replace').splitlines() for part in (output, errors)]
+        if process.returncode:
+            raise RecordingError(lines[1][-1] if lines[1] else 'boxreg relabel failed')
+        return JSONResponse({'out': str(new), 'line': lines[0][-1], 'notes': lines[1]})
+
+
+async def _json_of(request: Request) -> Mapping[str, Any]:
+    """Return the object that a request has sent."""
+    if request.headers.get('content-type') != 'application/json':  # no form of another page
+        raise HTTPException(415, 'expected application/json')
+    body = bytearray()
+    try:
+        with anyio.fail_after(BODY_SECONDS):
+            async for part in request.stream():
+                body += part
+                if len(body) > MAX_BODY:
+                    raise HTTPException(413, f'expected at most {MAX_BODY:,} bytes')
+    except TimeoutError:
+        raise HTTPException(408, f'expected the request within {BODY_SECONDS:g} s') from None
+    try:
+        sent = orjson.loads(body)
+    except ValueError as error:
+        raise RecordingError(f'request: expected JSON, got: {error}') from None
+    if not isinstance(sent, dict):
+        raise RecordingError('request: expected an object')
+    return sent
+
+
+def _text_of(sent: Mapping[str, Any], name: str) -> str:
+    value = sent.get(name, '')
+    if not isinstance(value, str):
+        raise RecordingError(f'{name}: expected a text, got {value!r:.80}')
+    return value
+
+
+def _stamp_of(sent: Mapping[str, Any], name: str) -> int | None:
+    text = _text_of(sent, name)
+    if text and not STAMP.fullmatch(text):
+        raise RecordingError(f'{name}: expected nanoseconds, got {text!r:.80}')
+    return int(text) if text else None
+
+
+def _box_of(sent: object) -> Any:
+    if not isinstance(sent, list) or not all(type(one) in (int, float) for one in sent):
+        raise RecordingError(f'box: expected nine numbers, got {sent!r:.80}')
+    if len(sent) != 9:
+        raise RecordingError(f'box: expected nine numbers, got {len(sent)}')
+    return np.array(sent, np.float64)
+
+
+async def _refused(_: Request, error: Exception) -> Response:
+    return PlainTextResponse(str(error), 400)
+
+
+async def _failed(_: Request, error: Exception) -> Response:
+    return PlainTextResponse(f'expected a file that can be written, got: {error}', 500)

@@ -1,0 +1,259 @@
+"""The decisions of a person as a run applies them, before and after the registration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.stamp_order import kept
+from boxreg_ros.reasons import Reason
+from boxreg_ros.review.decisions import Decision, held, Scope
+from boxreg_ros.structures import (
+    BOX_EXTENT,
+    BoxArray,
+    Floats,
+    HUMAN,
+    KEPT,
+    RefinedBoxes,
+    REJECTED,
+)
+import numpy as np
+from numpy.typing import NDArray
+
+WITHOUT_EFFECT = ('accept', 'unsure', 'none')
+
+
+class Corrections:
+    """
+    The decisions of a person as a run applies them; boxes can be pinned already.
+
+    Deleted boxes are not registered; ids, classes and pinned boxes are those of the decisions
+    before any step of the run; rejected boxes are as in the input again after it.
+
+    Parameters
+    ----------
+    decisions : iterable of Decision
+        In the order they were made.
+
+    """
+
+    def __init__(self, decisions: Iterable[Decision] = ()) -> None:
+        self._of_track: dict[str, list[Decision]] = {}
+        for one in held(decisions):
+            self._of_track.setdefault(one.track_id, []).append(one)
+        self._unused = {
+            one.scope
+            for one in held(decisions)
+            if one.kind not in WITHOUT_EFFECT and not one.is_taken_back
+        }
+        self._extents = self._extents_of_pins()
+
+    def unused(self) -> list[str]:
+        """Return the tracks and boxes with a decision that the recording does not have."""
+        return [_text_of(scope) for scope in sorted(self._unused, key=str)]
+
+    def to_register(self, given: BoxArray, with_pins: bool = True) -> BoxArray:
+        """
+        Return input boxes as they are to be registered.
+
+        Without deleted boxes, with new ids and classes, and with pinned boxes in the place of
+        theirs. A pin shows the extents of the object: the other boxes of its track have them too,
+        in windows without a pin as well. Pins need the boxes in the fixed frame.
+
+        Raises
+        ------
+        RecordingError
+            If a box is pinned in another frame.
+
+        """
+        if not self._of_track:
+            return given
+        rows = self._left(given)
+        renamed = self._renamed(given).take(rows)
+        if not with_pins:
+            return renamed
+        boxes = renamed.boxes.copy()
+        pinned = _is_pinned(given)[rows]
+        for i, row in enumerate(rows):
+            if not pinned[i]:
+                boxes[i, BOX_EXTENT] = self._extents.get(
+                    renamed.track_ids[i], boxes[i, BOX_EXTENT]
+                )
+            found = self._judgement(given.track_ids[row], given.stamp_ns)
+            if found is None:
+                continue
+            if found.kind != 'pin' or found.box is None:
+                pinned[i] = pinned[i] and found.kind != 'reject'
+                continue
+            if found.frame_id != given.frame_id:
+                raise RecordingError(
+                    f'pinned box of track {found.track_id!r} at {given.stamp_ns}: expected frame '
+                    f'{given.frame_id!r}, got {found.frame_id!r}; relabel with --fixed-frame '
+                    f'{found.frame_id}'
+                )
+            boxes[i] = found.box
+            pinned[i] = True
+        return replace(renamed, boxes=boxes, pinned=pinned)
+
+    def apply(self, given: BoxArray, refined: RefinedBoxes) -> RefinedBoxes:
+        """
+        Return the result for all input boxes, in their order, and then for the added ones.
+
+        Parameters
+        ----------
+        given : BoxArray
+            The input.
+        refined : RefinedBoxes
+            The result for the boxes of `to_register`, in their order, and for added ones.
+
+        """
+        is_pinned = _is_pinned(given)
+        if not (self._of_track or is_pinned.any()):
+            return refined
+        refined = self._with_deleted(given, refined)
+        boxes = refined.boxes.boxes.copy()
+        status = list(refined.status)
+        reasons = list(refined.reasons)
+        covariances = refined.covariances.copy()
+        for row, track_id in enumerate(given.track_ids):
+            if status[row] == KEPT:
+                boxes[row] = given.boxes[row]  # without the extents of a pin
+            found = self._judgement(track_id, given.stamp_ns)
+            kind = found.kind if found is not None else 'none'
+            if reasons[row] == Reason.DELETED:
+                continue
+            if found is not None and kind == 'pin' and found.frame_id == given.frame_id:
+                boxes[row] = found.box
+                status[row], reasons[row] = HUMAN, ''
+            elif kind == 'reject':
+                boxes[row] = given.boxes[row]
+                status[row], reasons[row] = KEPT, str(Reason.REJECTED)
+                covariances[row] = np.eye(6)
+            elif is_pinned[row]:
+                boxes[row] = given.boxes[row]
+                status[row], reasons[row] = HUMAN, ''
+        return replace(
+            refined,
+            boxes=replace(refined.boxes, boxes=boxes, pinned=None),
+            status=tuple(status),
+            reasons=tuple(reasons),
+            covariances=covariances,
+        )
+
+    def _left(self, given: BoxArray) -> list[int]:
+        """Return the rows of the boxes that are not deleted."""
+        return [
+            row
+            for row, track_id in enumerate(given.track_ids)
+            if self._last('deletion', track_id, given.stamp_ns) is None
+        ]
+
+    def _renamed(self, given: BoxArray) -> BoxArray:
+        """Return input boxes with the ids and classes that were decided."""
+        track_ids = list(given.track_ids)
+        class_names = list(given.class_names)
+        for row, track_id in enumerate(given.track_ids):
+            renamed = self._last('id', track_id, given.stamp_ns)
+            track_ids[row] = renamed.value if renamed else track_id
+            reclassed = self._last('class', track_id, given.stamp_ns)
+            class_names[row] = reclassed.value if reclassed else class_names[row]
+        return replace(given, track_ids=tuple(track_ids), class_names=tuple(class_names))
+
+    def _with_deleted(self, given: BoxArray, refined: RefinedBoxes) -> RefinedBoxes:
+        """Return a result with the deleted boxes at their place, as rejected."""
+        n = len(given.track_ids)
+        left = self._left(given)
+        deleted = sorted(set(range(n)) - set(left))
+        if not deleted:
+            return refined
+        gone = kept(self._renamed(given).take(deleted), Reason.DELETED)
+        gone = replace(gone, status=(REJECTED,) * len(deleted))
+        order = np.empty(len(refined.status) + len(deleted), np.int64)
+        order[left] = np.arange(len(left))
+        order[deleted] = len(refined.status) + np.arange(len(deleted))
+        order[n:] = np.arange(len(left), len(refined.status))
+        return _joined(refined, gone).take(order.tolist())
+
+    def _judgement(self, track_id: str, stamp_ns: int) -> Decision | None:
+        """Return the judgement of a box: its own, else that of a range, else of its track."""
+        found = None
+        for one in self._covering('judgement', track_id, stamp_ns):
+            if found is None or _closeness(one) >= _closeness(found):
+                found = one
+        return found
+
+    def _last(self, topic: str, track_id: str, stamp_ns: int) -> Decision | None:
+        """Return the last decision of a topic about a box."""
+        return next(reversed(self._covering(topic, track_id, stamp_ns)), None)
+
+    def _covering(self, topic: str, track_id: str, stamp_ns: int) -> list[Decision]:
+        """Return the decisions of a topic about a box, in their order."""
+        found = [
+            one
+            for one in self._of_track.get(track_id, ())
+            if one.topic == topic and not one.is_taken_back and one.covers(stamp_ns)
+        ]
+        self._unused -= {one.scope for one in found}
+        return found
+
+    def _extents_of_pins(self) -> dict[str, Floats]:
+        """Return the mean extents (3,) of the pinned boxes of each track that has any, by id."""
+        by_track: dict[str, list[Floats]] = {}
+        for track_id, decisions in self._of_track.items():
+            for one in decisions:
+                if one.kind != 'pin' or one.box is None or one.stamp_ns is None:
+                    continue
+                renames = [d for d in decisions if d.kind == 'rename' and d.covers(one.stamp_ns)]
+                new_id = renames[-1].value if renames else track_id
+                by_track.setdefault(new_id, []).append(one.box[BOX_EXTENT])
+        return {track_id: np.mean(extents, axis=0) for track_id, extents in by_track.items()}
+
+
+def _is_pinned(boxes: BoxArray) -> NDArray[np.bool_]:
+    """Return which boxes of an array (n,) are pinned already, as those of label files."""
+    if boxes.pinned is None:
+        return np.zeros(len(boxes.track_ids), bool)
+    return boxes.pinned
+
+
+def _closeness(decision: Decision) -> int:
+    """Return how few boxes a decision is about: 2 for one, 1 for a range, 0 for a track."""
+    if decision.stamp_ns is None:
+        return 0
+    return 2 if decision.end_ns is None else 1
+
+
+def _text_of(scope: Scope) -> str:
+    track_id, stamp_ns, end_ns = scope
+    if stamp_ns is None:
+        return f'{track_id!r}'
+    return f'{track_id!r} at {stamp_ns}' + (f' to {end_ns}' if end_ns is not None else '')
+
+
+def _joined(first: RefinedBoxes, second: RefinedBoxes) -> RefinedBoxes:
+    """Return the boxes of two results of one stamp as one."""
+
+    def both(name: str, of: Sequence[Any] = (first, second)) -> Any:
+        return np.concatenate([getattr(one, name) for one in of])
+
+    boxes = first.boxes, second.boxes
+    return replace(
+        first,
+        boxes=replace(
+            first.boxes,
+            track_ids=(*boxes[0].track_ids, *boxes[1].track_ids),
+            class_names=(*boxes[0].class_names, *boxes[1].class_names),
+            scores=both('scores', boxes),
+            boxes=both('boxes', boxes),
+            pinned=None,
+        ),
+        status=(*first.status, *second.status),
+        reasons=(*first.reasons, *second.reasons),
+        num_points=both('num_points'),
+        covariances=both('covariances'),
+        extent_covariances=both('extent_covariances'),
+        face_distances=both('face_distances'),
+        near_points=both('near_points'),
+    )

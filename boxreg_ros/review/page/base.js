@@ -1,0 +1,55 @@
+'use strict';
+// The page of `boxreg relabel --report` and `boxreg review`. Its parts are joined in the order that
+// review/report.py lists. Boxes are x y z length width height roll pitch yaw [m, rad];
+// R = Rz(yaw) Ry(pitch) Rx(roll).
+
+const $ = id => document.getElementById(id);
+const NONCE = document.currentScript.nonce;
+const IS_REVIEW = document.documentElement.hasAttribute('data-review');
+let DATA;                          // the report: tracks of the run, largest risk first
+let TRACKS = [];                   // tracks as decided: split, joined, renamed
+// The line `track` is selected; `open` is the track whose `part` is shown.
+const view = { track: -1, open: null, part: null, row: 0, mark: null, sort: 'rank', descending: false, shown: [], place: 0,
+               space: false, charts: false, pending: false, edit: null, isMoved: false, playing: 0,
+               zoom: 1, center: [0, 0, 0], around: [], solved: null };
+
+const isKnown = value => value !== null && value !== undefined && Number.isFinite(value);
+const number = (value, digits = 2) => isKnown(value) ? value.toLocaleString('en', { minimumFractionDigits: digits, maximumFractionDigits: digits }) : '–';
+const colour = name => getComputedStyle(document.documentElement).getPropertyValue('--' + name).trim();
+
+function element(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith('on')) made[name] = value;
+    else if (value === true) made.setAttribute(name, '');
+    else if (value !== false && value !== null) made.setAttribute(name, value);
+  }
+  made.append(...children.filter(child => child !== null));
+  return made;
+}
+
+function fill(parent, ...children) { parent.replaceChildren(...children.filter(child => child !== null)); }
+
+async function inflate(base64) {
+  const bytes = Uint8Array.from(atob(base64), c => c.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('deflate'));
+  return new Response(stream).text();
+}
+
+// While the page is read, an element may be missing or incomplete: whole is one that another follows.
+async function textOf(id) {
+  if (!$(id)?.nextSibling && document.readyState === 'loading') {
+    await new Promise(done => document.addEventListener('DOMContentLoaded', done, { once: true }));
+  }
+  return $(id).textContent;
+}
+
+// The page as it is now has been painted.
+function painted() { return new Promise(done => requestAnimationFrame(() => setTimeout(done))); }
+
+function fail(text) {
+  $('failure').textContent = text;
+  $('failure').hidden = false;
+}
+
+function say(text) { $('notice').textContent = text; }

@@ -1,0 +1,103 @@
+// Keys -------------------------------------------------------------------------------------------
+
+const KEYS = {
+  ArrowLeft: ['←  →', 'step one box; with Shift ten', event => step(view.row - (event.shiftKey ? 10 : 1))],
+  ArrowRight: ['', '', event => step(view.row + (event.shiftKey ? 10 : 1))],
+  Home: ['Home  End', 'first and last box', () => step(0)],
+  End: ['', '', () => step(view.part.stamps.length - 1)],
+  ' ': ['Space', 'play or pause', () => play()],
+  ArrowDown: ['↓  ↑', 'next and previous track of the list', () => nextTrack(1)],
+  ArrowUp: ['', '', () => nextTrack(-1)],
+  g: ['g', 'go to the riskiest box of the track', () => step(nearestRow(current().riskiest))],
+  '+': ['+  −', 'zoom the views; the wheel zooms at the pointer, dragging moves them', () => zoomBy(ZOOM_STEP)],
+  '-': ['', '', () => zoomBy(1 / ZOOM_STEP)],
+  0: ['0', 'the whole box in the views again; a double click does too', () => resetViews()],
+  m: ['m', 'points of this sweep, or of all sweeps in the refined or input boxes', () => { const mode = $('mode'); mode.selectedIndex = (mode.selectedIndex + 1) % 3; drawViews(); }],
+  '/': ['/', 'search', () => $('f-text').focus()],
+  '?': ['?', 'show the keys', () => $('help').showModal()],
+};
+const REVIEW_KEYS = {
+  Enter: ['Enter', 'accept the track, and open the next one without a decision', () => acceptAndGoOn()],
+  a: ['a', 'accept the track; with Shift this box', event => judge('accept', event.shiftKey)],
+  r: ['r', 'reject the track: its input boxes are kept; with Shift this box', event => judge('reject', event.shiftKey)],
+  u: ['u', 'unsure about the track; with Shift about this box', event => judge('unsure', event.shiftKey)],
+  d: ['d', 'delete the track, or restore it; with Shift this box', event => remove(event.shiftKey)],
+  b: ['b', 'mark: decisions with Shift are about all boxes from here to the one shown then', () => mark()],
+  s: ['s', 'split: this box and all after it become a track of their own', () => split()],
+  j: ['j', 'join with a track that continues this one', () => join()],
+  n: ['n', 'change the id of the track', () => rename()],
+  k: ['k', 'change the class of the track, or of the marked boxes', () => reclass()],
+  c: ['c', 'comment on the track; with Shift on this box', event => $(event.shiftKey ? 'comment-box' : 'comment').focus()],
+  e: ['e', 'correct this box', () => edit()],
+  o: ['o', 'solve the track again with its pinned boxes', () => solve()],
+  z: ['z', 'undo the last decision', () => undo()],
+};
+const EDIT_KEYS = {
+  ArrowRight: ['←  →', 'move 2 cm along, as in the views; with Shift 10 cm', n => moveEdit(n * STEP, 0, 0)],
+  ArrowLeft: ['', '', n => moveEdit(-n * STEP, 0, 0)],
+  ArrowUp: ['↑  ↓', 'move across, as in the top view', n => moveEdit(0, n * STEP, 0)],
+  ArrowDown: ['', '', n => moveEdit(0, -n * STEP, 0)],
+  PageUp: ['PgUp  PgDn', 'move up and down', n => moveEdit(0, 0, n * STEP)],
+  PageDown: ['', '', n => moveEdit(0, 0, -n * STEP)],
+  '[': ['[  ]', 'turn by 0.5°', n => { view.edit[8] += n * TURN; redrawEdit(); }],
+  ']': ['', '', n => { view.edit[8] -= n * TURN; redrawEdit(); }],
+  f: ['f', 'flip the heading', () => { view.edit = flipped(view.edit); redrawEdit(); }],
+  l: ['l w h', 'lengthen, widen, heighten by 2 cm; with Shift shrink', n => resizeEdit(0, 1, n > 1 ? -STEP : STEP)],
+  w: ['', '', n => resizeEdit(1, 1, n > 1 ? -STEP : STEP)],
+  h: ['', '', n => resizeEdit(2, 1, n > 1 ? -STEP : STEP)],
+};
+const END_EDIT_KEYS = {
+  z: ['z', 'undo the last step of the correction', () => undoEdit()],
+  Enter: ['Enter', 'pin the box', () => pin()],
+  Escape: ['Escape', 'discard the correction', () => discard()],
+};
+
+function nextTrack(by) {
+  const at = view.shown.findIndex(track => track.index === view.track);
+  // A track that a filter has removed, as by its decision, leaves its place to the next one.
+  const wanted = at < 0 ? view.place + Math.min(by, 0) : at + by;
+  const next = view.shown[Math.max(0, Math.min(view.shown.length - 1, wanted))];
+  if (next) openTrack(next.index);
+}
+
+function onKey(event) {
+  if (document.querySelector('dialog[open]')) return;
+  if ((event.ctrlKey || event.metaKey) && !event.altKey && event.key.toLowerCase() === 's' && IS_REVIEW) {
+    event.preventDefault();
+    return void save();
+  }
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  const target = event.target;
+  if (target.matches('input:not([type=range], [type=checkbox]), textarea, select')) {
+    if (event.key === 'Escape' || event.key === 'Enter') target.blur();
+    return;
+  }
+  const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  const isTracks = !$('tracks').hidden && view.part;
+  if (name === 'Enter' && target.matches('button, a')) return;
+  if (name === ' ' && target.matches('button, a, input') && !isTracks) return;
+  if (!isTracks && event.key !== '?' && event.key !== '/') return;
+  const isView = ['+', '-', '0', ' '].includes(name);
+  if (view.edit && !isView) {
+    const key = EDIT_KEYS[name] ?? END_EDIT_KEYS[name];
+    if (!key) return;
+    event.preventDefault();
+    if (EDIT_KEYS[name]) rememberEdit();
+    return key[2](event.shiftKey ? 5 : 1);
+  }
+  const key = KEYS[name] ?? (IS_REVIEW ? REVIEW_KEYS[name] : undefined);
+  if (!key) return;
+  event.preventDefault();
+  key[2](event);
+}
+
+function setUpKeys() {
+  const groups = [KEYS, ...(IS_REVIEW ? [REVIEW_KEYS, { save: ['Ctrl s', 'write the label files with all decisions, beside the first result'] }] : [])];
+  const lines = group => Object.values(group).filter(([keys]) => keys).map(([keys, text]) => element('tr', {}, element('td', {}, element('kbd', {}, keys)), element('td', {}, text)));
+  const editing = IS_REVIEW ? [element('tr', {}, element('th', { colspan: 2 }, 'While correcting a box')), ...lines(EDIT_KEYS), ...lines(END_EDIT_KEYS)] : [];
+  fill($('keys'), ...groups.flatMap(lines), ...editing);
+  document.addEventListener('keydown', onKey);
+  $('ask-form').onsubmit = event => { event.preventDefault(); $('ask').close('=' + $('ask-text').value.trim()); };
+  $('ask-cancel').onclick = () => $('ask').close('');
+  $('help-button').onclick = () => $('help').showModal();
+}

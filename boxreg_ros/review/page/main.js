@@ -1,0 +1,204 @@
+// The page ---------------------------------------------------------------------------------------
+
+function hashOf(id, stamp) {
+  return '#' + new URLSearchParams({ track: id, ...(stamp ? { stamp } : {}) });
+}
+
+// A track that a link, or the history, opens has its address already.
+async function openTrack(index, stamp = null, row = null, isLinked = false) {
+  showTab('tracks');
+  const track = TRACKS[index];
+  if (track !== view.open) {
+    if (isCorrecting()) return;
+    view.track = index;
+    view.place = Math.max(0, view.shown.indexOf(track));
+    selectLine();
+    const part = await loadTrack(track);
+    if (TRACKS[view.track] !== track) return;
+    clearTimeout(view.hashTimer);
+    const isNew = view.open?.id !== track.id;
+    if (isNew && !isLinked) history.pushState(null, '', hashOf(track.id, stamp));
+    view.open = track;
+    view.part = part;
+    view.charts = false;
+    view.edit = view.solved = null;
+    if (isNew) {
+      view.mark = null;
+      view.limits = limitsOf(part);
+      view.zoom = 1;
+      view.center = [0, 0, 0];
+      view.around = [];
+    }
+    $('time').max = part.stamps.length - 1;
+    row ??= part.num_points.indexOf(Math.max(...part.num_points));  // the object is seen best there
+    drawTitle(track);
+    loadAround(track).then(found => {
+      if (view.open !== track) return;
+      view.around = found;
+      drawViews();
+    });
+  }
+  if (stamp) row = nearestRow(stamp);
+  if (view.part) step(row ?? view.row, true);
+  drawCharts();
+}
+
+function nearestRow(stamp) {
+  let best = 0n, row = 0;
+  view.part.stamps.forEach((own, k) => {
+    const off = BigInt(own) - BigInt(/^\d+$/.test(stamp) ? stamp : 0);
+    const away = off < 0n ? -off : off;
+    if (k === 0 || away < best) { best = away; row = k; }
+  });
+  return row;
+}
+
+function drawTitle(track) {
+  const facts = [`${track.boxes} boxes in ${number(track.seconds, 1)} s`, `${number(track.points, 0)} points (median)`,
+    `moved ${number(track.shift)} m`, `turned ${number(track.turn, 1)}°`, track.flips ? `${track.flips} heading ${track.flips === 1 ? 'flip' : 'flips'} corrected` : '',
+    `extents ${track.extents.map(e => e.map(v => number(v)).join(' × ')).join(' → ')} m`,
+    isKnown(track.after.iou) ? `3D IoU ${number(track.before.iou, 3)} → ${number(track.after.iou, 3)}` : '', sumOf(track.reasons)];
+  const violations = track.rules.map(([rule, stamp, text]) => element('a', { href: hashOf(track.id, stamp) }, `${rule}: ${text}`));
+  const origin = track.isWhole ? '' : `of ${[...new Set(track.pieces.map(({ s }) => DATA.tracks[s].id))].join(', ')}`;
+  fill($('title'), element('b', {}, track.id || 'no id'), element('span', {}, track.class), ...(origin ? [element('span', { class: 'grey' }, origin)] : []),
+    element('span', {}, `risk ${number(track.risk)} m: `, ...reasonsOf(track), ' · ', element('a', { href: hashOf(track.id, track.riskiest), title: 'key g' }, 'riskiest box')),
+    ...violations, element('span', { class: 'grey' }, facts.filter(Boolean).join(' · ')));
+}
+
+function step(row, isNew = false) {
+  const part = view.part;
+  row = Math.max(0, Math.min(part.stamps.length - 1, row));
+  if (row === view.row && !isNew) return;
+  if (row !== view.row && isCorrecting()) {
+    $('time').value = view.row;
+    return;
+  }
+  if (row !== view.row) view.edit = null;
+  view.row = row;
+  $('time').value = row;
+  const mine = IS_REVIEW ? heldOf(scopeOfBox(boxAt(row))) : null;
+  const facts = [`${row + 1}/${part.stamps.length}`, `${number(part.times[row], 2)} s`, part.status[row] + (part.reasons[row] ? ` (${part.reasons[row]})` : ''),
+    IS_REVIEW && isDeleted(...boxAt(row)) ? 'deleted' : '', mine ? (mine.decision === 'none' ? mine.comment : mine.decision) : '',
+    `${part.num_points[row]} points`, `risk ${number(part.risk[row])} m`,
+    isKnown(part.iou[1][row]) ? `IoU ${number(part.iou[0][row])} → ${number(part.iou[1][row])}` : ''];
+  $('clock').textContent = facts.filter(Boolean).join(' · ');
+  $('clock').title = `${$('clock').textContent} · stamp ${part.stamps[row]} ns`;
+  clearTimeout(view.hashTimer);  // browsers limit how often the address may change
+  view.hashTimer = setTimeout(() => history.replaceState(null, '', hashOf(current().id, view.part.stamps[view.row])), 200);
+  drawViews();
+  drawCursor();
+  if (IS_REVIEW) drawDecisions();
+}
+
+function play() {
+  if (!view.isPlaying && isCorrecting()) return;
+  cancelAnimationFrame(view.playing);
+  view.isPlaying = !view.isPlaying;
+  $('play').textContent = view.isPlaying ? 'Pause' : 'Play';
+  if (!view.isPlaying) return;
+  const last = view.part.stamps.length - 1;
+  if (view.row === last) step(0);
+  const from = performance.now() - 1000 * (view.part.times[view.row] - view.part.times[0]);
+  const next = now => {
+    const seconds = view.part.times[0] + (now - from) / 1000;
+    while (view.row < view.part.stamps.length - 1 && view.part.times[view.row + 1] <= seconds) step(view.row + 1);
+    if (view.row < view.part.stamps.length - 1) view.playing = requestAnimationFrame(next);
+    else play();
+  };
+  view.playing = requestAnimationFrame(next);
+}
+
+function showTab(name) {
+  for (const one of ['overview', 'tracks', 'run']) {
+    $(one).hidden = one !== name;
+    $('tab-' + one).setAttribute('aria-selected', String(one === name));
+  }
+  if (name === 'overview') drawTimeline();
+  if (name === 'overview' && !$('map').hasChildNodes()) setTimeout(() => { drawMap(); drawExample(); });
+  if (name === 'tracks') drawLines();
+}
+
+async function followHash() {
+  const hash = location.hash.slice(1);
+  if (['overview', 'run', 'tracks'].includes(hash)) return selectTab(hash);
+  const wanted = new URLSearchParams(hash);
+  if (wanted.has('rule')) {
+    clearFilters();
+    $('f-rule').value = wanted.get('rule');
+    drawList();
+    return openTrack((view.shown[0] ?? TRACKS[0]).index);
+  }
+  if (!wanted.has('track')) return showTab('overview');
+  const track = TRACKS.find(one => one.id === wanted.get('track'));
+  if (!track) {
+    showTab('overview');
+    return fail(`No track ${wanted.get('track')} in this report.`);
+  }
+  await openTrack(track.index, wanted.get('stamp'), null, true);
+}
+
+function selectTab(name) {
+  if (name === 'tracks') {
+    const index = view.track >= 0 ? view.track : view.shown[0]?.index;
+    if (index !== undefined) return openTrack(index);
+  }
+  history.replaceState(null, '', '#' + name);
+  showTab(name);
+}
+
+function redrawAll() {
+  view.space = view.charts = false;
+  $('map').replaceChildren();
+  if (!$('overview').hidden) { drawMap(); drawTimeline(); drawExample(); }
+  if (view.part && !$('tracks').hidden) { drawViews(); drawCharts(); }
+}
+
+function setUpPerson(who) {
+  log.who = localStorage.getItem('who') ?? who;
+  $('who').value = log.who;
+  $('who').onchange = event => {
+    log.who = event.target.value.trim();
+    localStorage.setItem('who', log.who);
+  };
+}
+
+async function main() {
+  await painted();  // title and figures, before the lists of many tracks are made
+  DATA = JSON.parse(await inflate($('data').textContent));
+  if (IS_REVIEW) {
+    if (location.search) history.replaceState(null, '', location.pathname + location.hash);  // the token
+    const found = await (await fetch('decisions')).json();
+    receive(found);
+    setUpPerson(found.who);
+    setUpNumbers();
+    $('decide').hidden = $('save-button').hidden = $('person').hidden = false;
+    $('save-button').onclick = save;
+    listen();
+  }
+  TRACKS = buildTracks();
+  setUpList();
+  drawOverview();
+  setUpTimeline();
+  setUpKeys();
+  for (const name of Object.keys(VIEWS)) setUpDragging($(name));
+  for (const one of ['overview', 'tracks', 'run']) $('tab-' + one).onclick = () => {
+    selectTab(one);
+    if (one === 'tracks') $('rows').focus({ preventScroll: true });
+  };
+  $('time').oninput = () => step(Number($('time').value));
+  $('mode').onchange = drawViews;
+  $('play').onclick = play;
+  addEventListener('hashchange', followHash);
+  addEventListener('beforeunload', event => { if (view.edit && view.isMoved) event.preventDefault(); });
+  addEventListener('resize', () => {
+    drawLines();
+    if (!$('overview').hidden) drawTimeline();
+    if (view.part && !$('tracks').hidden) { drawViews(); drawCursor(); }
+  });
+  matchMedia('(prefers-color-scheme: dark)').addEventListener('change', redrawAll);
+  await followHash();
+  document.documentElement.dataset.ready = '';
+}
+
+addEventListener('unhandledrejection', event => fail(`This page failed: ${event.reason?.message ?? event.reason}`));
+main();

@@ -1,0 +1,208 @@
+// The views of a box -----------------------------------------------------------------------------
+
+const FRAME = 12;                  // time for the 3D view at 60 frames per second [ms]
+const PAUSE = 120;                 // between two steps of one who stops to look [ms]
+const ZOOM_STEP = 1.25;            // of a key, or of a notch of the wheel
+const SLAB = 1.5;                  // around the object, of neighbours in the views from the side and the front [m]
+const CLOSE = 8;                   // of neighbours in the 3D view [m]
+const ZOOM = { least: 0.1, most: 20 };
+// The axes to the right and upwards, by view, and the corners of the outline that is seen.
+const VIEWS = { top: [0, 1, [4, 5, 6, 7]], side: [0, 2, [0, 1, 5, 4]], front: [1, 2, [0, 3, 7, 4]] };
+const NAMES = ['around', 'input', 'refined', 'truth', 'solved', 'human'];
+const DASHES = { input: [6, 4], truth: [2, 3] };
+
+function currentBoxes() {
+  const part = view.part, row = view.row;
+  const boxes = [['input', part.given[row]], ['refined', part.boxes[row]]];
+  if (DATA.has_truth) boxes.push(['truth', part.truth[row]]);
+  const solved = view.solved?.get(part.stamps[row]);
+  if (solved) boxes.push(['solved', moved(solved, part.origin, -1)]);
+  const pin = pinOf(view.row);
+  const human = view.edit ?? (pin ? moved(pin.box, part.origin, -1) : null);
+  if (human) boxes.push(['human', human]);
+  return boxes.filter(([, box]) => box && box[0] !== null);
+}
+
+const moved = (box, origin, sign) => box.map((v, k) => (k < 3 ? v + sign * origin[k] : v));
+
+// How far the views of a track reach from the centre of its boxes [m].
+function limitsOf(part) {
+  const limits = [1, 0.6, 0.6];
+  for (const box of [...part.usable, ...part.given]) {
+    if (box && box[0] !== null) [3, 4, 5].forEach((c, k) => { limits[k] = Math.max(limits[k], box[c] / 2 + 0.7); });
+  }
+  return limits;
+}
+
+function drawViews() {
+  const part = view.part;
+  if (!part.usable[view.row]) return drawNothing();
+  const mode = $('mode').value;
+  const cacheKey = mode === 'sweep' ? view.row : mode;
+  if (view.cacheKey !== cacheKey || view.cachePart !== part) {
+    view.local = localPoints(part, view.row, mode);
+    view.cacheKey = cacheKey;
+    view.cachePart = part;
+  }
+  const frame = frameBox(part, view.row, mode) ?? part.usable[view.row];
+  view.frame = frame;
+  view.R = rotation(frame);
+  const inFrame = point => toFrame(point, frame, view.R);
+  let boxes = currentBoxes();
+  if (mode === 'before') boxes = boxes.filter(([name]) => name !== 'refined');
+  if (mode === 'after') boxes = boxes.filter(([name]) => name !== 'input');
+  const near = mode === 'sweep' ? aroundAt(part.stamps[view.row], part.origin) : [];
+  view.far = near.flatMap(({ points }) => points.map(inFrame));
+  view.lines = [...near.map(({ box }) => ['around', box]), ...boxes]
+    .map(([name, box]) => ({ name, dash: DASHES[name] ?? [], corners: corners(box).map(inFrame) }));
+  for (const [name, axes] of Object.entries(VIEWS)) drawFlat($(name), ...axes);
+  drawSpace();
+  const labels = { around: 'neighbours', refined: part.status[view.row] === 'kept' ? 'kept' : 'refined', truth: 'true', solved: 'solved again' };
+  const shown = NAMES.filter(name => view.lines.some(line => line.name === name));
+  fill($('legend'), ...shown.map(name => element('span', {}, element('i', { style: `border-color: var(--${name}); border-top-style: ${{ input: 'dashed', truth: 'dotted' }[name] ?? 'solid'}` }), labels[name] ?? name)));
+}
+
+// A box with numbers that are not finite has no place.
+function drawNothing() {
+  view.local = view.far = view.lines = [];
+  view.cacheKey = null;
+  for (const [name, axes] of Object.entries(VIEWS)) drawFlat($(name), ...axes);
+  drawSpace();
+  fill($('legend'), 'no valid box at this stamp');
+}
+
+// One orthogonal view: its axes to the right and upwards, in the frame of the box.
+function drawFlat(canvas, right, up) {
+  const scale = devicePixelRatio, width = canvas.clientWidth, height = canvas.clientHeight;
+  if (canvas.width !== Math.round(width * scale)) canvas.width = Math.round(width * scale);
+  if (canvas.height !== Math.round(height * scale)) canvas.height = Math.round(height * scale);
+  const zoom = view.zoom * Math.min(width / (2 * view.limits[right]), height / (2 * view.limits[up]));
+  canvas.zoom = zoom;
+  const at = point => [width / 2 + zoom * (point[right] - view.center[right]), height / 2 - zoom * (point[up] - view.center[up])];
+  // Points are many small rectangles: the processor draws them sooner than a software GPU does.
+  const context = canvas.getContext('2d', { willReadFrequently: true });
+  context.setTransform(scale, 0, 0, scale, 0, 0);
+  context.clearRect(0, 0, width, height);
+  drawRuler(context, width, height, zoom, view.center[right]);
+  const isDense = view.local.length > 1500;
+  // Neighbours behind each other would hide the object in the views from the side and the front.
+  const depth = 3 - right - up, reach = view.frame ? view.frame[3 + depth] / 2 + SLAB : 0;
+  const isNear = point => depth === 2 || Math.abs(point[depth]) < reach;
+  drawPoints(context, (view.far ?? []).filter(isNear), at, 1.4, 0.4, 'around');
+  // Points near the lower face may be road: they would hide the object from above.
+  const shown = canvas.id === 'top' ? view.local.filter(point => point[2] >= -0.35 * view.frame[5]) : view.local;
+  drawPoints(context, shown, at, isDense ? 1.4 : 2.4, isDense ? 0.35 : 0.85, 'points');
+  const outline = right === 1 ? VIEWS.front[2] : up === 1 ? VIEWS.top[2] : VIEWS.side[2];
+  for (const { name, dash, corners: c } of view.lines) {
+    if (name === 'around' && !c.some(isNear)) continue;
+    context.strokeStyle = colour(name);
+    context.lineWidth = name === 'human' ? 2.5 : name === 'around' ? 1 : 1.8;
+    context.setLineDash(dash);
+    context.beginPath();
+    outline.forEach((k, i) => context[i ? 'lineTo' : 'moveTo'](...at(c[k])));
+    context.closePath();
+    if (right === 0) {
+      const nose = [0, 1, 2].map(k => (c[0][k] + c[3][k] + c[4][k] + c[7][k]) / 4);
+      const middle = [0, 1, 2].map(k => c.reduce((sum, corner) => sum + corner[k] / 8, 0));
+      context.moveTo(...at(nose));
+      context.lineTo(...at([0, 1, 2].map(k => nose[k] + 0.15 * (nose[k] - middle[k]))));
+    }
+    context.stroke();
+  }
+  context.setLineDash([]);
+}
+
+function drawRuler(context, width, height, zoom, center) {
+  context.strokeStyle = colour('line');
+  context.fillStyle = colour('grey');
+  context.lineWidth = 1;
+  context.font = '10px system-ui, sans-serif';
+  const pitch = [1, 2, 5, 10, 20].find(metres => zoom * metres > 25) ?? 50;
+  const [first, last] = [-1, 1].map(sign => center + sign * width / 2 / zoom);
+  for (let metre = Math.ceil(first / pitch) * pitch; metre <= last; metre += pitch) {
+    const x = width / 2 + zoom * (metre - center);
+    context.beginPath();
+    context.moveTo(x, height - 4);
+    context.lineTo(x, height);
+    context.stroke();
+    context.fillText(String(metre), x + 2, height - 3);
+  }
+}
+
+function drawPoints(context, points, at, size, alpha, name) {
+  context.globalAlpha = alpha;
+  context.fillStyle = colour(name);
+  for (const point of points) {
+    const [x, y] = at(point);
+    context.fillRect(x - size / 2, y - size / 2, size, size);
+  }
+  context.globalAlpha = 1;
+}
+
+// Zoom all views; the place under the pointer, in the frame of the box, stays there.
+function zoomBy(factor, canvas = null, event = null) {
+  const before = view.zoom;
+  view.zoom = Math.max(ZOOM.least, Math.min(ZOOM.most, view.zoom * factor));
+  if (canvas) {
+    const bounds = canvas.getBoundingClientRect(), [right, up] = VIEWS[canvas.id];
+    const part = (1 - before / view.zoom) / canvas.zoom;
+    view.center[right] += part * (event.clientX - bounds.left - bounds.width / 2);
+    view.center[up] -= part * (event.clientY - bounds.top - bounds.height / 2);
+  }
+  drawViews();
+}
+
+function resetViews() {
+  view.zoom = 1;
+  view.center = [0, 0, 0];
+  drawViews();
+}
+
+const EDGES = [0, 1, 2, 3, 0, 4, 5, 6, 7, 4, null, 1, 5, null, 2, 6, null, 3, 7];
+
+function spaceTraces() {
+  const every = view.local.length > 6000 ? Math.ceil(view.local.length / 6000) : 1;
+  const points = view.local.filter((_, k) => k % every === 0);
+  const columns = list => ({ x: list.map(p => p[0]), y: list.map(p => p[1]), z: list.map(p => p[2]) });
+  const cloud = (list, size, name) => ({ type: 'scatter3d', mode: 'markers', hoverinfo: 'skip', ...columns(list), marker: { size, color: colour(name) } });
+  const isClose = point => Math.hypot(...point) < CLOSE;
+  const traces = [cloud(points, every > 1 || points.length > 1500 ? 1.2 : 2.2, 'points'), cloud((view.far ?? []).filter(isClose), 1.2, 'around')];
+  for (const name of NAMES) {
+    const found = view.lines.filter(line => line.name === name && (name !== 'around' || line.corners.every(isClose)));
+    const gap = [null, null, null];
+    const way = found.flatMap(line => [...EDGES.map(k => (k === null ? gap : line.corners[k])), gap]);
+    traces.push({ type: 'scatter3d', mode: 'lines', hoverinfo: 'skip', ...columns(way.length ? way : [gap]),
+                  line: { color: colour(name), width: name === 'around' ? 2 : 4, dash: { input: 'dash', truth: 'dot' }[name] ?? 'solid' } });
+  }
+  return traces;
+}
+
+// One drawing is under way at most; the newest state follows it.
+async function drawSpace() {
+  view.wanted = true;
+  if (view.pending) return;
+  view.pending = true;
+  await withPlotly();
+  while (view.wanted && view.part) {
+    view.wanted = false;
+    // Where a drawing takes longer than a frame, it waits until the stepping pauses.
+    if (view.spaceCost > FRAME) {
+      await new Promise(done => setTimeout(done, PAUSE));
+      if (view.wanted) continue;
+    }
+    const begin = performance.now();
+    const traces = spaceTraces();
+    if (!view.space) {
+      const axis = { visible: false, showspikes: false };
+      await Plotly.newPlot('space', traces, { ...LAYOUT(), margin: { l: 0, r: 0, t: 0, b: 0 }, dragmode: 'orbit',
+        scene: { aspectmode: 'data', xaxis: axis, yaxis: axis, zaxis: axis, camera: { eye: { x: -1.3, y: -1.9, z: 1.1 } } } }, CONFIG);
+      view.space = true;
+    } else {
+      const data = name => traces.map(trace => trace[name]);
+      await Plotly.restyle('space', { x: data('x'), y: data('y'), z: data('z'), 'marker.size': traces.map(t => t.marker?.size ?? null) });
+    }
+    view.spaceCost = performance.now() - begin;
+    await new Promise(requestAnimationFrame);
+  }
+  view.pending = false;
+}
