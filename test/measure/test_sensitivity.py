@@ -118,6 +118,8 @@ def test_changed_constant_holds_within_the_context_only():
         module, name = item.place[0], item.name.rpartition('.')[2]
         if name not in vars(import_module(module)):
             continue  # the label of several elements
+        if vars(import_module(module))[name] != item.default:
+            continue  # a sign stands before the number
         before = dict(sys.modules)
         with changed_constant(item.place, item.value):
             changed = import_module(module)
@@ -143,7 +145,7 @@ def test_constants_of_the_method_change_the_result(drive):
     baseline = measure(drive, TRACK, None)
     assert 0.6 < baseline.iou_3d < 1
     of_faces = [item for item in variations_of_constants() if item.name.startswith('face_support')]
-    halved = [item for item in of_faces if item.factor == 0.5][:8]
+    halved = [item for item in of_faces if item.factor == 0.5][:3]
     outcomes = [measure(drive, TRACK, item) for item in halved]
     assert not [outcome.failure for outcome in outcomes if outcome.failure]
     assert max(abs(outcome.iou_3d - baseline.iou_3d) for outcome in outcomes) > 1e-4
