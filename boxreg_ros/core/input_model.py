@@ -186,6 +186,10 @@ class InputModel:
             rows, kept = _kept(self._evidence[k], track_ids, kinds == k)
             self._evidence[k].arrays[kept] = evidence[rows]
 
+    def gap_corrections(self) -> Floats:
+        """Return the labelling margins less those of the settings, (K, 6) [m]; without torch."""
+        return np.stack([self._margins_of(kind)[0] for kind in range(len(KINDS))])
+
     def offsets(self) -> FaceOffsets:
         """Return the labelling margins and insets to expect of each kind."""
         return self._margins()[0]

@@ -39,6 +39,8 @@ CPU = 'cpu'
 """The device that torch has everywhere: it is not imported to check that."""
 VELOCITY_OBSERVATIONS = 4
 """Observations that the input velocity is estimated from; chosen: 0.3 s at 10 Hz."""
+FACE_GAPS = ('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
+"""Settings with the labelling margin of each face."""
 UNKNOWN_COVARIANCE = np.full((6, 6), inf)
 """Covariance of a track without an estimate."""
 
@@ -191,11 +193,9 @@ class BoxRegistrar:
 
     def margins(self) -> Floats:
         """Return the labelling margin of each face, of each of `KINDS`, (K, 6) [m]."""
-        from boxreg_ros.core.batch import FACE_GAPS  # imports torch
-
         kinds = [getattr(self.config, kind) for kind in KINDS]
         of_settings = np.array([[getattr(kind, name) for name in FACE_GAPS] for kind in kinds])
-        margins: Floats = of_settings + self._input_model.offsets().gap_correction.numpy()
+        margins: Floats = of_settings + self._input_model.gap_corrections()
         return margins
 
     def _process(self, pairs: list[Pair]) -> Iterator[RefinedBoxes]:
