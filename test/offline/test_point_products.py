@@ -5,7 +5,7 @@ import json
 
 from boxreg_ros import cli
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.labels import check_options, Options
+from boxreg_ros.labels import check_options, LabelOutput, Options, Provenance
 from boxreg_ros.labels.semantickitti import class_of
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
@@ -262,6 +262,8 @@ def test_clouds_of_several_lidars_are_copied_each_on_its_topic(tmp_path):
 def test_formats_of_points_are_of_relabel_alone(tmp_path):
     with pytest.raises(ConfigError, match="format 'semantickitti' labels the points"):
         check_options(['semantickitti'], Options())
+    with pytest.raises(ConfigError, match="format 'lidarseg' labels the points"):
+        LabelOutput(tmp_path, ['lidarseg'], Provenance(), Options())
     request = Request((tmp_path,), formats=('csv', 'lidarseg'))
     assert (request.box_formats, request.point_formats) == (('csv',), ('lidarseg',))
     assert not Request((tmp_path,)).needs_point_labels
