@@ -211,10 +211,8 @@ def test_registrar_takes_input_while_windows_are_registered(stream):
     assert events == [*expected, 'wait', 'begin', 'wait']
 
 
-@pytest.mark.parametrize(
-    'changes', [{'estimate': 'final'}, {'device': 'meta'}, {'solver.threads': 1}]
-)
-def test_no_worker_for_sliding_windows_other_devices_or_one_core(changes):
+@pytest.mark.parametrize('changes', [{'estimate': 'final'}, {'solver.threads': 1}])
+def test_no_worker_for_sliding_windows_or_one_core(changes):
     with registration_worker(SHORT.updated(changes), Stopwatch(), print) as begin:
         assert begin is None
 

@@ -230,8 +230,10 @@ def test_ghosts_and_duplicates_are_found():
 
 def test_confirmed_tracks_are_never_rejected():
     car = path((0, 0), (8, 0), 30)
-    tracks = [tracklet('a', car), tracklet('b', car[:10], points=0)]
+    tracks = [tracklet('a', car), tracklet('b', car[:6], points=0)]
     assert duplicates(tracks, CONFIG) == ghosts(tracks) == set()
+    fewer = tracklet('c', car[:5], points=0)
+    assert duplicates([tracks[0], fewer], CONFIG) == ghosts([fewer]) == {'c'}
 
 
 def test_joined_tracks_have_the_majority_class_and_the_longest_id():
