@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.kernels import load
-from boxreg_ros.core.observation import crop, own_points, own_points_numpy
+from boxreg_ros.core.observation import crop, own_points
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL, Sweep, X, YAW, Z
 import numpy as np
@@ -323,8 +322,7 @@ class PointLabeller:
         excess = np.maximum(outside[0] - ends[owner], outside[1] - sides[owner])
         vertical = np.where(above > 0, top[owner], bottom[owner])
         np.maximum(excess, outside[2] - vertical, out=excess)
-        find = own_points if load() is not None else own_points_numpy
-        road = np.nan_to_num(find(sweep, boxes, self._config).road)
+        road = np.nan_to_num(own_points(sweep, boxes, self._config).road)
         lowest = road - half[:, 2] + ROAD_CLEARANCE
         is_near = np.flatnonzero((above > lowest[owner]) & (excess < UNCERTAIN_BAND))
         return row[is_near], owner[is_near], offset[:, is_near], excess[is_near]

@@ -3,7 +3,6 @@
 import json
 
 from boxreg_ros.bench.speed import report as speed_report
-from boxreg_ros.bench.speed import roofline
 from boxreg_ros.bench.speed.reference import compare
 from boxreg_ros.bench.speed.scaling import held_tracks
 from boxreg_ros.bench.speed.stages import crop, tick
@@ -23,7 +22,6 @@ def report():
         'held tracks': held_tracks(config, 3_000, 2),
         'crop': crop(config, 3, 3_000),
         'solver': compare(Config(estimate='final'), 2, 2),
-        'roofline': roofline.roofline(config, 2),
     }
 
 
@@ -42,13 +40,6 @@ def test_stages_of_a_tick_add_up(report):
     assert 0 < report['held tracks'] <= 2
 
 
-def test_no_stage_is_faster_than_its_limit(report):
-    found = report['roofline']
-    assert found['bandwidth'] > 0 and found['peak'] > 0
-    for stage in found['stages'].values():
-        assert 0 < stage['share'] < 1
-
-
 def test_results_are_shown_beside_earlier_ones_and_drawn(report, tmp_path):
     text = speed_report.text(report)
     assert f'one tick: {report["tick"]["total"]:.1f} ms' in text
@@ -59,6 +50,5 @@ def test_results_are_shown_beside_earlier_ones_and_drawn(report, tmp_path):
     earlier['cores']['2 cores'] = 2 * report['cores']['2 cores']
     lines = speed_report.beside(earlier, report).splitlines()
     assert [line.split()[-1] for line in lines if line.startswith('cores: 2 cores')] == ['2.00']
-    assert roofline.draw(report['roofline'], tmp_path / 'roofline.png').stat().st_size > 1000
     picture = speed_report.draw_scaling(report['scaling'], tmp_path / 'speed.png')
     assert picture.stat().st_size > 1000
