@@ -33,7 +33,7 @@ jazzy := $(VENV_JAZZY)/.done
 
 # Rooms without nodes, processes and pictures: the tests that depend on numpy, SciPy and numba, and
 # two that take a recording all the way.
-JAZZY_TESTS := $(addprefix --ignore test/core/,test_refine.py test_kernel_cache.py test_kernel_searches.py) \
+JAZZY_TESTS := $(addprefix --ignore test/core/,test_refine.py test_kernel_cache.py) \
     $(addprefix --ignore test/io/,test_damaged.py test_malformed.py test_remote.py) \
     test/test_config.py test/core test/io test/msg_adapters test/labels/test_labels.py \
     test/offline/test_evaluate.py test/live/test_driver.py test/bench/test_baselines.py \

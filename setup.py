@@ -1,18 +1,53 @@
 """Package for pip and, as ament_python, for colcon; pins that work together: constraints.txt."""
 
 from glob import glob
+import gzip
+import os
+from pathlib import Path
+import tarfile
 from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
+from setuptools.command.sdist import sdist
 
 NAME = 'boxreg_ros'
+PYTHONS = ('3.11', '3.12', '3.13', '3.14')
 manifest = ElementTree.parse('package.xml')
+
+
+class ReproducibleSdist(sdist):
+    """The sdist; with SOURCE_DATE_EPOCH the same sources make the same bytes, as in a wheel."""
+
+    def make_archive(self, base_name, format, root_dir=None, base_dir=None, **owner):
+        """Return the path of the archive of a folder."""
+        epoch = os.environ.get('SOURCE_DATE_EPOCH')
+        if epoch is None or format != 'gztar':
+            return super().make_archive(base_name, format, root_dir, base_dir, **owner)
+
+        def normalised(member):
+            member.mtime = int(epoch)
+            member.uid = member.gid = 0
+            member.uname = member.gname = ''
+            member.mode = 0o755 if member.isdir() or member.mode & 0o100 else 0o644
+            return member
+
+        path = f'{base_name}.tar.gz'
+        with (
+            gzip.GzipFile(path, 'wb', mtime=int(epoch)) as packed,
+            tarfile.open(fileobj=packed, mode='w', format=tarfile.PAX_FORMAT) as archive,
+        ):
+            archive.add(base_dir, filter=normalised)  # in the order of the names
+        return path
+
 
 setup(
     name=NAME,
     version=manifest.findtext('version'),
     description=' '.join(manifest.findtext('description', '').split()),
+    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
     author=manifest.findtext('maintainer'),
+    author_email=manifest.find('maintainer').get('email'),
     license=manifest.findtext('license'),
     packages=find_packages(include=[f'{NAME}*', 'msg_adapters']),
     data_files=[
@@ -34,19 +69,29 @@ setup(
         'develop': {'script_dir': f'$base/lib/{NAME}'},
     },
     zip_safe=False,
-    python_requires='>=3.11',
+    cmdclass={'sdist': ReproducibleSdist},
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        *(f'Programming Language :: Python :: {version}' for version in PYTHONS),
+        'Topic :: Scientific/Engineering',
+        'Typing :: Typed',
+    ],
+    # Tried with the versions of constraints.txt and of constraints-jazzy.txt.
+    python_requires='>=3.11,<3.15',
     install_requires=[
-        'lz4>=4',
+        'lz4>=4,<5',
         'mcap>=1.6,<2',
-        'numba>=0.59',
+        'numba>=0.59,<1',
         'numpy>=1.26,<3',
-        'orjson>=3.9',
-        'pyyaml>=6',
+        'orjson>=3.9,<4',
+        'pyyaml>=6,<7',
         'rosbags>=0.11.5,<0.12',  # whose .db3 files may be read in a thread of their own
-        'scipy>=1.11',
-        'torch>=2.3',
-        'tqdm>=4.60',
-        'zstandard>=0.21',
+        'scipy>=1.11,<2',
+        'torch>=2.3,<3',
+        'tqdm>=4.60,<5',
+        'zstandard>=0.21,<1',
     ],
     extras_require={
         # Point clouds that are compressed by Draco.

@@ -131,9 +131,9 @@ class SolverConfig:
     """L-BFGS, and the rounds of correspondence and weighting around it."""
 
     rounds: int = setting(
-        15, 'most rounds; each renews the outermost points and the weights', '', 1, 100
+        10, 'most rounds; each renews the outermost points and the weights', '', 1, 100
     )
-    iterations: int = setting(1, 'most L-BFGS iterations per round', '', 1, 10000)
+    iterations: int = setting(2, 'most L-BFGS iterations per round', '', 1, 10000)
     threads: int = setting(
         0, 'threads that share the windows of a batch; 0: one per core', '', 0, 256
     )
@@ -299,6 +299,8 @@ class Ingredients:
     """Motion residuals are down-weighted beyond three deviations."""
     robust_weights: bool = True
     """Input poses and labelling margins far from the expected ones are down-weighted."""
+    without: tuple[str, ...] = ()
+    """Names of `RESIDUALS` that are left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -378,7 +380,6 @@ class Config:
     queue: int = setting(
         20, 'maximum number of unpaired sweeps, and of box arrays, held', '', 1, 10000
     )
-    device: str = setting('cpu', "torch device of the solver: 'cpu', 'cuda', 'cuda:1', ...")
     sampling: SamplingConfig = SamplingConfig()
     faces: FaceConfig = FaceConfig()
     solver: SolverConfig = SolverConfig()

@@ -423,19 +423,32 @@ def _ingredients() -> str:
 
 
 def _ablation(results: Any) -> Iterable[str]:
-    """Yield for each recording what the figures lose without an ingredient, largest first."""
-    for ingredients in results.values():
-        whole, *others = ingredients.items()
-        best = whole[1]
-        header = ['without', 'BEV', '3D', 'R@0.8', 'BEV loss', '3D loss', 'R@0.8 loss']
+    """Yield for each recording the losses without an ingredient, the largest first."""
+    order = results.pop('greedy', [])
+    for found in results.values():
+        parts = ('3D', 'loss', 'R@0.8 loss')
+        titles = [f'{estimate}: {part}' for estimate in found for part in parts]
+        best = {estimate: rows['nothing'] for estimate, rows in found.items()}
+        names = sorted(
+            next(iter(found.values())),
+            key=lambda name: min(
+                rows[name]['iou_3d'] - best[e]['iou_3d'] for e, rows in found.items()
+            ),
+        )
         rows = []
-        ranked = sorted(others, key=lambda item: item[1]['iou_3d'])
-        for name, row in [whole, *ranked]:
-            values = [row['iou_bev'], row['iou_3d'], row['recall_3d'][-1]]
-            wholes = [best['iou_bev'], best['iou_3d'], best['recall_3d'][-1]]
-            losses = [_signed(a - b, 3) for a, b in zip(wholes, values, strict=True)]
-            rows.append([name, *map(_number, values), *losses])
-        yield _table(header, rows)
+        for name in ['nothing', *(name for name in names if name != 'nothing')]:
+            cells = []
+            for estimate, of in found.items():
+                own, whole = of[name], best[estimate]
+                cells += [
+                    _number(own['iou_3d']),
+                    _signed(whole['iou_3d'] - own['iou_3d'], 4),
+                    _signed(whole['recall_3d'][-1] - own['recall_3d'][-1], 3),
+                ]
+            rows.append([name, *cells])
+        yield _table(['without', *titles], rows)
+    if order:
+        yield _table(['without all of', 'largest loss'], [[a, _signed(b, 4)] for a, b in order])
 
 
 def _sensitivity(results: Any) -> Iterable[str]:

@@ -5,7 +5,7 @@ import shutil
 from paths import ROOT
 import pytest
 
-KERNELS = ROOT / 'boxreg_ros' / 'core' / 'kernels'
+KERNELS = ROOT / 'boxreg_ros' / 'core' / 'method'
 
 
 def copy_compiled(kernels):

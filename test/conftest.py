@@ -6,6 +6,7 @@ import signal
 import sys
 import tempfile
 
+from boxreg_ros.core.method import constants
 import pytest
 from ros_domain import next_domain
 import torch
@@ -37,3 +38,13 @@ def pytest_sessionstart():
     """Load the kernels in each process of a run in parallel."""
     if 'PYTEST_XDIST_WORKER' in os.environ:
         import warmed  # noqa: F401
+
+
+@pytest.fixture
+def set_constants(monkeypatch):
+    """Return a function that changes numbers of the method, until the end of the test."""
+
+    def set_to(**changes):
+        monkeypatch.setattr(constants, 'CONSTANTS', constants.CONSTANTS._replace(**changes))
+
+    return set_to

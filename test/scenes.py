@@ -1,24 +1,29 @@
 """Scenes with known truth: a car and the points of a stationary sensor; batches by hand."""
 
-from boxreg_ros.core import batch, terms
-from boxreg_ros.core.arrowhead import LINK
-from boxreg_ros.core.batch import (
-    CLASS_NUMBERS,
-    PADDING_POSITION,
-    PRIOR_SIZE,
-    Problem,
-    Returns,
+from boxreg_ros.config import KINDS
+from boxreg_ros.core.method.arrays import (
+    ANCHOR,
+    BIAS,
+    COMMON,
+    GAP,
+    INPUTS,
+    PIVOT,
+    POSE,
+    PRIOR,
     SHARED,
-    State,
+    SIDESLIP,
 )
-from boxreg_ros.core.geometry import rotation_from_rpy
+from boxreg_ros.core.method.arrays import (
+    EXTENT as LENGTH,
+)
+from boxreg_ros.core.method.residuals import RESIDUALS, TERMS
 from boxreg_ros.core.observation import Observation, Observations, observe
+from boxreg_ros.core.problem import CLASS_SETTINGS, Problem, SETTINGS_OF
 from boxreg_ros.core.refine import Track
 from boxreg_ros.core.track_window import Window
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 from scipy.spatial.transform import Rotation
-import torch
 
 EXTENT = np.array([4.4, 1.8, 1.5])
 PERIOD_NS = 10**8
@@ -132,69 +137,98 @@ def window_of(track, config):
     return Window(name, track.class_name, observations, n, np.zeros((0, 9)))
 
 
+PARTS = {
+    'EXTENT': slice(LENGTH, BIAS),
+    'BIAS': slice(BIAS, GAP),
+    'GAP': slice(GAP, PIVOT),
+    'PIVOT': PIVOT,
+    'ANCHOR': slice(ANCHOR, SIDESLIP),
+    'SIDESLIP': SIDESLIP,
+}
+
+
 def problem_of(boxes, **changes):
     """
     Return the problem of `boxes` (B, N, 9) with some fields changed.
 
-    At 10 Hz, without points or prior. `class_numbers` are given by name; the others are NaN.
+    At 10 Hz, without points or prior. Points are padded (B, N, M, 3), with a `mask` of those that
+    count. Fields of `CLASS_SETTINGS` are given by name in `of_class`; the others are NaN.
 
     """
-    boxes = torch.as_tensor(boxes, dtype=torch.float64)
+    boxes = np.asarray(boxes, float).copy()
     B, N = boxes.shape[:2]
-    points = torch.as_tensor(
-        changes.pop('points', np.full((B, N, 1, 3), PADDING_POSITION))
-    ).clone()
-    given = {
-        'boxes': boxes,
-        'start': boxes,
-        'valid': torch.ones(B, N, dtype=torch.bool),
-        'times': 0.1 * torch.arange(N, dtype=torch.float64).expand(B, N),
-        'origins': torch.full((B, N, 1, 3), torch.nan, dtype=torch.float64),
-        'ground': torch.full((B, N), torch.nan, dtype=torch.float64),
-        'prior_mean': torch.zeros(B, PRIOR_SIZE, dtype=torch.float64),
-        'prior_information': torch.zeros(B, PRIOR_SIZE, PRIOR_SIZE, dtype=torch.float64),
-        'marginalised_extents': torch.zeros(B, 4, dtype=torch.float64),
-        'class_numbers': torch.full((B, len(CLASS_NUMBERS)), torch.nan, dtype=torch.float64),
-        'pinned': torch.zeros(B, N, dtype=torch.bool),
-        'kind': torch.zeros(B, dtype=torch.int64),
-    }
-    for name, values in changes.pop('class_numbers', {}).items():
-        given['class_numbers'][:, CLASS_NUMBERS.index(name)] = torch.as_tensor(values)
-    mask = torch.as_tensor(changes.pop('mask', points[..., 0] != PADDING_POSITION))
-    delays = torch.as_tensor(changes.pop('delays', torch.zeros(mask.shape, dtype=torch.float64)))
+    points = np.asarray(changes.pop('points', np.zeros((B, N, 0, 3))))
+    mask = np.asarray(changes.pop('mask', np.ones(points.shape[:-1], bool)))
+    delays = np.asarray(changes.pop('delays', np.zeros(mask.shape)))
     if 'origins' in changes:  # (B, N, 3): of one sensor
         changes['origins'] = np.expand_dims(changes['origins'], -2)
-    more = {name: torch.as_tensor(np.asarray(value)) for name, value in changes.items()}
+    if 'valid' in changes:
+        changes['lengths'] = np.asarray(changes.pop('valid')).sum(1)
+    of_class = np.full(B, np.nan, CLASS_SETTINGS)
+    for name, value in changes.pop('of_class', {}).items():
+        of_class[name] = value
+    given = {
+        'boxes': boxes,
+        'start': boxes.copy(),
+        'lengths': np.full(B, N),
+        'times': np.tile(0.1 * np.arange(N), (B, 1)),
+        'origins': np.full((B, N, 1, 3), np.nan),
+        'ground': np.full((B, N), np.nan),
+        'stride': 1,
+        'pinned': np.zeros((B, N), bool),
+        'prior_mean': np.zeros((B, PRIOR)),
+        'prior_information': np.zeros((B, PRIOR, PRIOR)),
+        'marginalised_extents': np.zeros((B, 4)),
+        'kind': np.zeros(B, np.int64),
+        'of_class': of_class,
+    }
+    more = {name: np.array(value) for name, value in changes.items()}
     return Problem(**{**given, **more, **returns_of(points, mask, delays)})
 
 
 def returns_of(points, mask, delays=None):
     """Return the fields of a `Problem` for padded points (B, N, M, 3) with a mask (B, N, M)."""
-    delays = torch.zeros(mask.shape, dtype=torch.float64) if delays is None else delays
+    delays = np.zeros(mask.shape) if delays is None else delays
     counts = mask.sum(-1)
-    delays = delays[mask]
-    returns = Returns(points[mask], delays, bool(delays.any()), max(1, int(counts.max())))
+    delays = delays[mask].astype(np.float32)
     return {
-        'returns': returns,
-        'first': counts.flatten().cumsum(0).view(counts.shape) - counts,
+        'points': points[mask].astype(np.float32),
+        'delays': delays,
+        'is_moving': bool(delays.any()),
+        'first': counts.ravel().cumsum().reshape(counts.shape) - counts,
         'counts': counts,
     }
 
 
-def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):
-    """Return shared parameters (B, 23): `extent`, and parts by the names of their slices."""
-    shared = torch.zeros(B, SHARED, dtype=torch.float64)
-    shared[:, :3] = torch.tensor(extent)
+def settings_of(kind):
+    """Return the fields of `CLASS_SETTINGS` of one window with the settings of a kind."""
+    return {
+        field: [getattr(kind, name) for name in names] if len(names) > 1 else getattr(kind, *names)
+        for field, names in SETTINGS_OF.items()
+    }
+
+
+def no_inputs(**parts):
+    """Return records `INPUTS` (K,) without any evidence, with some fields changed."""
+    inputs = np.zeros(len(KINDS), INPUTS)
     for name, value in parts.items():
-        shared[:, getattr(batch, name)] = torch.as_tensor(value, dtype=torch.float64)
+        inputs[name] = value
+    return inputs
+
+
+def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):
+    """Return shared parameters (B, 23): `extent`, and parts by the names of `PARTS`."""
+    shared = np.zeros((B, SHARED))
+    shared[:, :3] = extent
+    for name, value in parts.items():
+        shared[:, PARTS[name]] = value
     return shared
 
 
 def boxes_at(*poses, extent=(4.0, 2.0, 2.0)):
     """Return boxes (1, N, 9) at poses (x, y, z, roll, pitch, yaw); missing values are 0."""
     full = [(*pose, *[0.0] * (6 - len(pose))) for pose in poses]
-    rows = [[*pose[:3], *extent, *pose[3:]] for pose in full]
-    return torch.tensor([rows], dtype=torch.float64)
+    return np.array([[[*pose[:3], *extent, *pose[3:]] for pose in full]])
 
 
 def random_problem(B=3, N=6, M=20, seed=0):
@@ -215,54 +249,41 @@ def random_problem(B=3, N=6, M=20, seed=0):
 
 def random_weights(rng, *shape):
     """Return random symmetric positive definite weights (*shape, shape[-1])."""
-    root = torch.from_numpy(rng.normal(size=(*shape, shape[-1])))
-    return root @ root.mT
+    root = rng.normal(size=(*shape, shape[-1]))
+    return root @ root.swapaxes(-1, -2)
 
 
-def terms_of(problem, seed=1):
-    """Return every term of a problem by name, with random weights and data."""
+def random_terms(N=6, seed=1):
+    """Return records `TERMS` (N,) and `COMMON` of one window, with random weights and data."""
     rng = np.random.default_rng(seed)
-    B, N = problem.valid.shape
-    inset = torch.from_numpy(rng.random((B, N, 6)))
-    expected = torch.from_numpy(rng.normal(size=(B, SHARED)))
-    axes = rotation_from_rpy(problem.pose[..., 3:] + 0.1)
-    wanted = torch.from_numpy(rng.normal(size=(B, N, 6)))
-    mean = torch.from_numpy(rng.normal(size=(B, 1, PRIOR_SIZE)))
-    shapes = {  # of the weights, and the data
-        terms.faces: ((N, 6, 4), (problem.pose, inset)),
-        terms.input_pose: ((N, 1, 6), (problem.pose, axes)),
-        terms.rigid_shape: ((N, 1, 6), (0.9 * problem.pose, wanted)),
-        terms.acceleration: ((N - 2, 1, 6), (problem.times,)),
-        terms.zero_motion: ((N - 1, 1, 6), ()),
-        terms.slip: ((N - 1, 1, 2), (problem.times,)),
-        terms.shared_prior: ((1, 1, SHARED), (expected,)),
-        terms.marginalisation_prior: ((1, 1, PRIOR_SIZE), (mean,)),
-    }
-    return {
-        function.__name__: terms.Term(function, random_weights(rng, B, *shape), data)
-        for function, (shape, data) in shapes.items()
-    }
+    terms, common = np.zeros(N, TERMS), np.zeros((), COMMON)[()]
+    terms['time'] = np.cumsum(rng.random(N) + 0.05)
+    for name in ('given', 'start', 'inset', 'wanted'):
+        terms[name] = rng.normal(size=(N, 6))
+    angles = rng.normal(size=(N, 3)) * [0.1, 0.1, 1.0]
+    terms['axes'] = Rotation.from_euler('ZYX', angles[:, ::-1]).as_matrix()
+    terms['W_faces'] = random_weights(rng, N, 6, 4)
+    terms['root'] = np.tril(rng.normal(size=(N, 6, 6)))
+    terms['W'] = rng.random((N, len(RESIDUALS), 6)) + 0.1
+    common['shared'], common['W_shared'] = rng.normal(size=SHARED), rng.random(SHARED) + 0.1
+    common['prior_mean'], common['W_prior'] = rng.normal(size=PRIOR), random_weights(rng, PRIOR)
+    return terms, common
 
 
-def random_variables(problem, seed=2):
-    """Return variables (B, 6 N + 22) about the input poses of a problem."""
+def random_variables(N=6, seed=2):
+    """Return variables (6 N + 23,) of one window."""
     rng = np.random.default_rng(seed)
-    B, N = problem.valid.shape
-    pose = problem.pose + 0.1 * torch.from_numpy(rng.normal(size=(B, N, 6)))
-    shared = 3 + torch.from_numpy(rng.normal(size=(B, SHARED)))
-    return State(pose, shared).pack()
+    return np.concatenate([rng.normal(size=6 * N), 3 + rng.normal(size=SHARED)])
 
 
-def dense(chain, N):
-    """Return the dense matrices (B, D, D) of a `Chain` of N links."""
-    B, D = len(chain.links), LINK * N + chain.corner.shape[1]
-    whole = chain.links.new_zeros(B, D, D)
-    whole[:, LINK * N :, LINK * N :] = chain.corner
-    for i in range(N):
-        own, rows = slice(LINK * i, LINK * (i + 1)), chain.links[:, i]
-        whole[:, own, LINK * N :] = rows[..., 5 * LINK :]
-        whole[:, LINK * N :, own] = rows[..., 5 * LINK :].mT
-        for k in range(max(0, 2 - i), min(5, 2 + N - i)):
-            first = LINK * (i + k - 2)
-            whole[:, own, first : first + LINK] = rows[..., LINK * k : LINK * (k + 1)]
-    return whole
+def dense(A, N):
+    """Return the dense matrix (D, D) of an `Arrowhead` with a chain of N poses."""
+    D = POSE * N + SHARED
+    whole = np.zeros((D, D))
+    for n in range(N):
+        rows, end = slice(POSE * n, POSE * (n + 1)), min(POSE * (n + 3), POSE * N)
+        whole[rows, POSE * n : end] = A.links[n][:, : end - POSE * n]
+        whole[rows, POSE * N :] = A.border[n]
+    whole[POSE * N :, POSE * N :] = A.corner
+    upper = np.triu(whole)
+    return upper + np.triu(upper, 1).T

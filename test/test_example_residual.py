@@ -1,71 +1,82 @@
-"""The residual of docs/tasks/add-a-residual.md: its Jacobian, and its kernel against torch."""
+"""The page docs/tasks/add-a-residual.md, followed to the letter in a copy of the package."""
 
-from importlib import import_module
-from types import SimpleNamespace
+import os
+import re
+import shutil
+import subprocess
+import sys
 
-from boxreg_ros.core.batch import State
-from boxreg_ros.core.terms import Term, value_and_gradient
-import numpy as np
 from paths import ROOT
 import pytest
-from scenes import boxes_at, problem_of, random_problem, random_variables, shared_of
-import torch
-
-arrowhead = pytest.importorskip('boxreg_ros.core.kernels.arrowhead')
 
 PAGE = ROOT / 'docs' / 'tasks' / 'add-a-residual.md'
-EXAMPLES = ROOT / 'docs' / 'examples'
-
-
-@pytest.fixture
-def example(monkeypatch):
-    monkeypatch.syspath_prepend(EXAMPLES)
-    return import_module('residual_example')
+EXAMPLE = ROOT / 'docs' / 'examples' / 'residual_example.py'
 
 
 def test_page_shows_the_example():
-    source = (EXAMPLES / 'residual_example.py').read_text(encoding='utf-8')
+    source = EXAMPLE.read_text(encoding='utf-8')
     assert f'```python\n{source}```\n' in PAGE.read_text(encoding='utf-8')
 
 
-def test_rise_by_hand(example):
-    # 0.1 m up in 0.2 s.
-    problem = problem_of(boxes_at([0, 0, 0, 0, 0, 0], [1, 2, 0.1, 0, 0, 0]), times=[[0.0, 0.2]])
-    found = example.rise(State(problem.pose, shared_of()), problem.times).residual
-    np.testing.assert_allclose(found, [[[[0.5]]]], atol=1e-12)
+@pytest.fixture
+def copy(tmp_path):
+    """Return a copy of the package in which the page has been followed."""
+    shutil.copytree(ROOT / 'boxreg_ros', tmp_path / 'boxreg_ros', ignore=ignored)
+    shutil.copytree(ROOT / 'msg_adapters', tmp_path / 'msg_adapters', ignore=ignored)
+    source = EXAMPLE.read_text(encoding='utf-8')
+    functions = source[source.index('@kernel') : source.index('ROW = ')]
+    residual, weight = functions.split('\n\n\n')[:2]
+    method = tmp_path / 'boxreg_ros' / 'core' / 'method'
+    insert(method / 'residuals.py', 'RESIDUALS = (', f'{residual}\n\n\n')
+    insert(method / 'weights.py', '@kernel\ndef robustify', f'{weight}\n\n\n')
+    insert(method / 'residuals.py', '    slip_weight,\n', '    rise_weight,\n')
+    row = re.search(r'`(Residual\(rise, .*\))`', PAGE.read_text(encoding='utf-8'))[1]
+    insert(method / 'residuals.py', '    Residual(slip, ', f'    {row},\n')
+    setting = re.search(r'```python\n(    rise: float = .*?)```', PAGE.read_text(), re.DOTALL)[1]
+    insert(tmp_path / 'boxreg_ros' / 'config.py', '    pivot: float = setting(', setting)
+    field = "    'rise': ('rise',),\n"
+    insert(tmp_path / 'boxreg_ros' / 'core' / 'problem.py', "    'drift': ('drift',),\n", field)
+    return tmp_path
 
 
-def upper_triangle(A, N):
-    """Return the blocks of the poses in a matrix as one upper triangle, (6 N, 6 N)."""
-    upper = np.zeros((6 * N, 6 * N + 12))
-    for n in range(N):
-        upper[6 * n : 6 * n + 6, 6 * n : 6 * n + 18] = A.links[n]
-    return upper[:, : 6 * N]
+def ignored(folder, names):
+    return [name for name in names if name == '__pycache__']
 
 
-def test_gradient_and_curvature_of_kernel_and_torch(example):
-    problem = random_problem()
-    x = random_variables(problem)
-    B, N = problem.valid.shape
-    weight = 1 + torch.rand(B, N - 1, generator=torch.Generator().manual_seed(3)).to(x)
-    term = Term(example.rise, weight[..., None, None, None], (problem.times,))
+def insert(path, before, text):
+    """Insert a text before the one place where another stands."""
+    source = path.read_text(encoding='utf-8')
+    assert source.count(before) == 1, (path, before)
+    path.write_text(source.replace(before, text + before), encoding='utf-8')
 
-    def residual(x):
-        return term.linearise(State.unpack(x, N)).residual[..., 0, 0]
 
-    values, gradients = value_and_gradient([term], x, N)
-    jacobians = torch.autograd.functional.jacobian(residual, x)  # (B, N - 1, B, 6 N + 22)
-    for b in range(B):
-        J = jacobians[b, :, b]
-        weighted = weight[b, :, None] * J
-        np.testing.assert_allclose(gradients[b], residual(x)[b] @ weighted, atol=1e-9)
-        data = SimpleNamespace(W_rise=weight[b].numpy(), times=problem.times[b].numpy())
-        poses = x[b, : 6 * N].numpy().reshape(N, 6)
-        gradient = np.zeros(x.shape[1])
-        A = arrowhead.empty_arrowhead(N)
-        arrowhead.clear(A)
-        value = sum(example.add_rise(n, poses, data, gradient, A) for n in range(N - 1))
-        np.testing.assert_allclose(value, values[b], rtol=1e-12)
-        np.testing.assert_allclose(gradient, gradients[b], atol=1e-9)
-        known = np.triu(J.mT @ weighted)[: 6 * N, : 6 * N]
-        np.testing.assert_allclose(upper_triangle(A, N), known, atol=1e-9)
+CHECK = """
+import numpy as np
+from boxreg_ros.core.method.assemble import accumulate, empty_axes, no_matrix
+from boxreg_ros.core.method.constants import RESIDUAL_NAMES
+from boxreg_ros.core.method.residuals import empty_linearised, RESIDUALS, TERMS
+from boxreg_ros.core.method.arrays import COMMON
+
+# 0.1 m up in 0.2 s, with the weight 7: r = .5, value 7 * .25 / 2, gradient 7 * .5 / .2.
+i = RESIDUAL_NAMES.index('rise')
+terms, common = np.zeros(2, TERMS), np.zeros((), COMMON)[()]
+terms['time'], terms['W'][0, i, 0] = [0.0, 0.2], 7.0
+x, gradient = np.zeros(35), np.empty(35)
+x[6:9] = 1.0, 2.0, 0.1
+value = accumulate(
+    x, 2, terms, common, empty_axes(2), empty_linearised(), gradient, no_matrix()
+)
+np.testing.assert_allclose(value, 7 * 0.25 / 2)
+known = np.zeros(35)
+known[2], known[8] = -17.5, 17.5
+np.testing.assert_allclose(gradient, known)
+from boxreg_ros import Config
+assert Config().vehicle.rise == 1.0
+"""
+
+
+def test_the_page_makes_a_residual(copy):
+    command = [sys.executable, '-c', CHECK]
+    done = subprocess.run(command, cwd=copy, env={**os.environ, 'PYTHONPATH': ''},
+                          capture_output=True, text=True, timeout=600)  # fmt: skip
+    assert done.returncode == 0, done.stderr

@@ -7,7 +7,7 @@ from paths import ROOT
 
 PROTOCOL = {'DATASET', 'FORMAT', 'REQUIRED_FIELDS', 'RULE', '__all__'}
 """Names that each label format, data set, message adapter or rule defines for itself."""
-KERNELS = ROOT / 'boxreg_ros' / 'core' / 'kernels'
+KERNELS = ROOT / 'boxreg_ros' / 'core' / 'method'
 """Kernels number the variables that their torch twins have as slices of the same names."""
 
 

@@ -28,8 +28,26 @@ def test_all_files_state_the_same_version():
     assert manifest.findtext('version') == boxreg_ros.__version__
     citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text(encoding='utf-8'))
     assert citation['version'] == boxreg_ros.__version__
-    newest = re.search(r'^## \[(\d.*?)\]', (ROOT / 'CHANGELOG.md').read_text(), re.MULTILINE)
-    assert newest[1] == boxreg_ros.__version__
+    released = re.search(
+        r'^## \[(\d.*?)\] - (\S+)$', (ROOT / 'CHANGELOG.md').read_text(), re.MULTILINE
+    )
+    assert released[1] == boxreg_ros.__version__
+    assert released[2] == str(citation['date-released'])
+
+
+def test_each_declared_python_is_tried():
+    text = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    declared = ast.literal_eval(re.search(r'^PYTHONS = (.*)$', text, re.MULTILINE)[1])
+    workflow = yaml.safe_load((ROOT / '.github/workflows/test.yaml').read_text(encoding='utf-8'))
+    assert workflow['jobs']['python']['strategy']['matrix']['python'] == list(declared)
+    assert workflow['permissions'] == {'contents': 'read'}
+    used = [
+        step['uses']
+        for job in workflow['jobs'].values()
+        for step in job['steps']
+        if 'uses' in step
+    ]
+    assert used and all(re.fullmatch(r'[\w/-]+@[0-9a-f]{40}', action) for action in used)
 
 
 def test_dependencies_are_pinned():
@@ -99,10 +117,10 @@ def test_a_robot_needs_nothing_with_a_window():
 
 def run(command, **options):
     """Run a command that must succeed, outside of the source tree; return its output."""
-    environment = {key: value for key, value in os.environ.items() if key != 'PYTHONPATH'}
+    environment = options.pop('env', os.environ)
     done = subprocess.run(
         [*map(str, command)],
-        env=environment,
+        env={key: value for key, value in environment.items() if key != 'PYTHONPATH'},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -119,25 +137,52 @@ def distributions(tmp_path_factory):
     pytest.importorskip('build', reason='build is not installed')
     folder = tmp_path_factory.mktemp('distributions')
     source = folder / 'source'
-    ignored = shutil.ignore_patterns('.*', 'out', 'build', 'log', 'install', '*.egg-info', 'bags')
-    shutil.copytree(ROOT, source, ignore=ignored)
-    run(
-        [sys.executable, '-m', 'build', '--no-isolation', '-o', folder / 'dist', source],
-        cwd=folder,
-    )
-    (sdist,) = (folder / 'dist').glob('*.tar.gz')
-    (wheel,) = (folder / 'dist').glob('*.whl')
+    ignored = ('.git', '.venv*', '.*_cache', 'out', 'build', 'log', 'install', '*.egg-info')
+    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(*ignored), symlinks=True)
+    return built(source, folder / 'dist')
+
+
+def built(source, folder):
+    """Build sdist and wheel into a folder; return their paths."""
+    epoch = {**os.environ, 'SOURCE_DATE_EPOCH': '1795651200'}
+    command = [sys.executable, '-m', 'build', '--no-isolation', '-o', folder, source]
+    run(command, cwd=source.parent, env=epoch)
+    (sdist,) = folder.glob('*.tar.gz')
+    (wheel,) = folder.glob('*.whl')
     return sdist, wheel
 
 
-def test_sdist_contains_all_files_of_a_build(distributions):
-    sdist, _ = distributions
-    with tarfile.open(sdist) as archive:
-        names = {name.partition('/')[2] for name in archive.getnames()}
-    needed = {'setup.py', 'package.xml', 'LICENSE', 'README.md', 'boxreg_ros/py.typed'}
-    needed |= {str(p.relative_to(ROOT)) for p in ROOT.glob('boxreg_ros/share/*')}
-    needed |= {str(p.relative_to(ROOT)) for p in ROOT.glob('boxreg_ros/**/*.py')}
-    assert sorted(needed - names) == []
+@pytest.fixture(scope='module')
+def unpacked(distributions, tmp_path_factory):
+    """Return the folder of the unpacked sdist."""
+    folder = tmp_path_factory.mktemp('unpacked')
+    with tarfile.open(distributions[0]) as archive:
+        archive.extractall(folder, filter='data')
+    (source,) = folder.iterdir()
+    return source
+
+
+def test_sdist_contains_every_file_of_the_sources(unpacked):
+    if not (ROOT / '.git').exists():
+        pytest.skip('not a clone: its files are unknown')
+    tracked = run(['git', '-C', ROOT, 'ls-files', '-z'], cwd=ROOT).split('\0')
+    missing = [
+        name for name in tracked if (ROOT / name).exists() and not (unpacked / name).exists()
+    ]
+    assert missing == []
+
+
+def test_tests_of_the_sdist_run_in_it(unpacked):
+    tests = ('test/test_config.py', 'test/test_rotations.py', 'test/core/test_metrics.py')
+    command = [sys.executable, '-B', '-m', 'pytest', '-q', '-n0', *tests]
+    assert ' passed' in run(command, cwd=unpacked)
+
+
+def test_distributions_are_reproducible(distributions, unpacked, tmp_path):
+    again = built(unpacked, tmp_path)
+    for first, second in zip(distributions, again, strict=True):
+        assert first.name == second.name
+        assert first.read_bytes() == second.read_bytes(), first.name
 
 
 def new_environment(folder):
@@ -155,7 +200,7 @@ def test_wheel_runs_in_another_environment(distributions, tmp_path):
     pip = [sys.executable, '-m', 'pip', '--python', programs / 'python', 'install', '--no-deps']
     run([*pip, '--no-index', '--ignore-installed', '--quiet', wheel], cwd=tmp_path)
     packages = sysconfig.get_path('purelib', vars={'base': str(tmp_path / 'environment')})
-    copy_compiled(Path(packages) / 'boxreg_ros' / 'core' / 'kernels')
+    copy_compiled(Path(packages) / 'boxreg_ros' / 'core' / 'method')
     code = 'import boxreg_ros; print(boxreg_ros.__path__[0])'
     assert str(tmp_path) in run([programs / 'python', '-c', code], cwd=tmp_path)
     assert 'openlabel' in run([programs / 'boxreg', 'formats'], cwd=tmp_path)
@@ -191,7 +236,7 @@ def prefix(request, tmp_path_factory):
     command += ['--symlink-install'] if request.param == 'symlink' else []
     done = subprocess.run(command, cwd=workspace, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
-    for kernels in (workspace / 'install').rglob('core/kernels'):
+    for kernels in (workspace / 'install').rglob('core/method'):
         copy_compiled(kernels)
     return workspace / 'install' / 'boxreg_ros'
 

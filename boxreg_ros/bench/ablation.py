@@ -1,7 +1,9 @@
 """
 `boxreg bench ablation`: accuracy with each ingredient of the method switched off.
 
-An ingredient is switched off by settings, or by one of `config.Ingredients`.
+An ingredient is switched off by settings, or by one of `config.Ingredients`: each of the
+residuals of `core.method.residuals` by its name. Both estimates are measured, since some
+ingredients are part of one only.
 
 """
 
@@ -14,7 +16,7 @@ import sys
 from typing import Any
 
 from boxreg_ros.bench.common import add_scope_arguments, in_scope, line, print_json
-from boxreg_ros.config import Config, KINDS
+from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import Scores, summarise
 from boxreg_ros.offline.drive import Drive
@@ -23,8 +25,7 @@ from tqdm import tqdm
 
 WHOLE = 'nothing'
 SCORES = ('BEV', '3D', 'R@0.8', 'flips')
-UNLIMITED = 1e3
-"""Highest bound of the deviations of motion: the residual has no weight."""
+ESTIMATES = ('final', 'track')
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +46,9 @@ class Ingredient:
     settings: Mapping[str, Any]
 
 
-def _every_kind(**values: float) -> dict[str, float]:
-    """Return settings of `ClassConfig`, the same for all kinds of objects."""
-    return {f'{kind}.{name}': value for kind in KINDS for name, value in values.items()}
+def _without(*names: str) -> dict[str, tuple[str, ...]]:
+    """Return the setting that leaves residuals out."""
+    return {'ingredients.without': names}
 
 
 def _off(*names: str) -> dict[str, bool]:
@@ -60,10 +61,10 @@ INGREDIENTS = {
     'points': Ingredient(
         'faces and rigid shape have no weight: motion and input alone',
         {f'faces.{name}': 10.0 for name in ('ends', 'sides', 'top', 'bottom')}
-        | _every_kind(shape=1.0),
+        | _without('rigid shape'),
     ),
     'rigid shape': Ingredient(
-        'points of a track are not tied to one rigid shape', _every_kind(shape=1.0)
+        'points of a track are not tied to one rigid shape', _without('rigid shape')
     ),
     'learnt margins': Ingredient(
         'labelling margins are those of the settings', {'faces.learn': False}
@@ -92,22 +93,12 @@ INGREDIENTS = {
         'boxes also use the points of their neighbours', _off('point_ownership')
     ),
     'road': Ingredient('the bottom face is never observed', _off('road')),
-    'smoothness': Ingredient(
-        'accelerations have no weight',
-        _every_kind(
-            acceleration=UNLIMITED,
-            cornering=UNLIMITED,
-            vertical=UNLIMITED,
-            turning=UNLIMITED,
-            tilting=UNLIMITED,
-        ),
-    ),
+    'smoothness': Ingredient('accelerations have no weight', _without('acceleration')),
     'robust motion': Ingredient('motion residuals are not robust', _off('robust_motion')),
     'slip and pivot': Ingredient(
-        'sideways and vertical velocities have no weight',
-        _every_kind(slip=UNLIMITED, climb=UNLIMITED),
+        'sideways and vertical velocities have no weight', _without('slip')
     ),
-    'zero motion': Ingredient('parked objects have no zero-motion prior', _every_kind(drift=1.0)),
+    'zero motion': Ingredient('parked objects have no zero-motion prior', _without('zero motion')),
     'heading sign': Ingredient('180° flips stay', _off('heading_sign')),
     'robust weights': Ingredient(
         'outliers have full weight', {'faces.outlier': 10.0} | _off('robust_weights')
@@ -123,54 +114,124 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='INGREDIENT', help=f'only some of {", ".join(list(INGREDIENTS)[1:])}',
     )  # fmt: skip
     parser.add_argument(
-        '--estimate', choices=('early', 'final', 'track'), default='track',
-        help='early (newest box), final (fixed lag) or track (full sequence); default: track',
+        '--estimate', nargs='+', choices=('early', *ESTIMATES), default=ESTIMATES,
+        help='early (newest box), final (fixed lag), track (full sequence); default: final track',
+    )  # fmt: skip
+    parser.add_argument(
+        '--greedy', type=float, metavar='LOSS',
+        help='also leave out the ingredient that costs least on average, then the next one beside '
+        'it, as long as the mean 3D IoU of an estimate falls by less than this',
     )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print one JSON object')
 
 
 def run(args: argparse.Namespace) -> int:
     """Print accuracy without each ingredient, for every recording and on average."""
-    report: dict[str, dict[str, Scores]] = {}
+    drives = {str(folder): Drive.read(folder) for folder in args.data}
     wanted = [WHOLE, *args.without]
     quiet = args.json or not sys.stderr.isatty()
-    with tqdm(total=len(args.data) * len(wanted), leave=False, disable=quiet) as bar:
-        for folder in args.data:
-            drive = Drive.read(folder)
-            report[str(folder)] = {}
-            for name in wanted:
-                found = without(INGREDIENTS[name], drive, args.estimate)
-                scores = summarise(in_scope(found, drive.truth, args))
-                report[str(folder)][name] = scores
-                bar.update()
+    report: dict[str, dict[str, dict[str, Scores]]] = {folder: {} for folder in drives}
+    total = len(drives) * len(args.estimate) * len(wanted)
+    with tqdm(total=total, leave=False, disable=quiet) as bar:
+        for folder, drive in drives.items():
+            for estimate in args.estimate:
+                report[folder][estimate] = {}
+                for name in wanted:
+                    found = without(INGREDIENTS[name].settings, drive, estimate)
+                    scores = summarise(in_scope(found, drive.truth, args))
+                    report[folder][estimate][name] = scores
+                    bar.update()
+    order = greedy(drives, report, args) if args.greedy is not None else []
     if args.json:
-        plain = {
-            folder: {name: asdict(scores) for name, scores in rows.items()}
-            for folder, rows in report.items()
+        plain: dict[str, Any] = {
+            folder: {
+                estimate: {name: asdict(scores) for name, scores in rows.items()}
+                for estimate, rows in found.items()
+            }
+            for folder, found in report.items()
         }
-        print_json(plain)
+        print_json(plain | {'greedy': order} if order else plain)
         return 0
-    for folder, rows in report.items():
-        print(f'{folder}: {rows[WHOLE].boxes} true boxes')
-        print('\n'.join(table({name: figures(scores) for name, scores in rows.items()})) + '\n')
-    if len(report) > 1:
-        means = {
-            name: np.mean([figures(rows[name]) for rows in report.values()], axis=0).tolist()
-            for name in wanted
-        }
-        print(f'mean of {len(report)} recordings')
-        print('\n'.join(table(means)) + '\n')
-    print(f'Estimate {args.estimate}; in brackets the loss. Without')
+    for estimate in args.estimate:
+        _print_estimate(estimate, {folder: found[estimate] for folder, found in report.items()})
+    for names, loss in order:
+        print(f'{loss:+.4f} without {names}')
+    print('In brackets the loss. Without')
     for name in args.without:
         print(f'  {name}: {INGREDIENTS[name].meaning}')
     return 0
 
 
-def without(ingredient: Ingredient, drive: Drive, estimate: str = 'track') -> BoxTable:
-    """Return the boxes of an estimate with an ingredient switched off."""
+def _print_estimate(estimate: str, report: Mapping[str, Mapping[str, Scores]]) -> None:
+    """Print the tables of one estimate: of each recording, and of their mean."""
+    for folder, rows in report.items():
+        print(f'{folder}, {estimate}: {rows[WHOLE].boxes} true boxes')
+        print('\n'.join(table({name: figures(scores) for name, scores in rows.items()})) + '\n')
+    if len(report) > 1:
+        means = {
+            name: np.mean([figures(rows[name]) for rows in report.values()], axis=0).tolist()
+            for name in next(iter(report.values()))
+        }
+        print(f'mean of {len(report)} recordings, {estimate}')
+        print('\n'.join(table(means)) + '\n')
+
+
+def greedy(
+    drives: Mapping[str, Drive],
+    report: Mapping[str, Mapping[str, Mapping[str, Scores]]],
+    args: argparse.Namespace,
+) -> list[tuple[str, float]]:
+    """
+    Leave out the ingredient that costs least, again and again, up to the loss ``--greedy``.
+
+    Returns
+    -------
+    order : list of pairs
+        Names of all that are out so far, and the largest loss of mean 3D IoU of an estimate.
+
+    """
+    whole = {
+        estimate: np.mean([found[estimate][WHOLE].iou_3d for found in report.values()])
+        for estimate in args.estimate
+    }
+
+    def loss(names: Sequence[str]) -> float:
+        settings = merged([INGREDIENTS[name].settings for name in names])
+        losses = []
+        for estimate in args.estimate:
+            scores = [
+                summarise(in_scope(without(settings, drive, estimate), drive.truth, args)).iou_3d
+                for drive in drives.values()
+            ]
+            losses.append(whole[estimate] - np.mean(scores))
+        return float(max(losses))
+
+    left, out = [*args.without], list[str]()
+    order = []
+    while left:
+        costs = {name: loss([*out, name]) for name in left}
+        cheapest = min(costs, key=lambda name: costs[name])
+        if costs[cheapest] > args.greedy:
+            break
+        left.remove(cheapest)
+        out.append(cheapest)
+        order.append((', '.join(out), costs[cheapest]))
+    return order
+
+
+def merged(settings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the settings that switch several ingredients off; residuals add up."""
+    found: dict[str, Any] = {}
+    for one in settings:
+        for name, value in one.items():
+            found[name] = (*found.get(name, ()), *value) if isinstance(value, tuple) else value
+    return found
+
+
+def without(settings: Mapping[str, Any], drive: Drive, estimate: str = 'track') -> BoxTable:
+    """Return the boxes of an estimate with the settings that switch an ingredient off."""
     run = 'track' if estimate == 'track' else 'final'  # one run gives final and early boxes
-    config = Config(estimate=run).updated(ingredient.settings)
-    return drive.registered(config)[estimate]
+    return drive.registered(Config(estimate=run).updated(settings))[estimate]
 
 
 def figures(scores: Scores) -> list[float]:

@@ -17,6 +17,7 @@ class SubCommand(NamedTuple):
 MEASUREMENTS = {
     'paper': SubCommand('paper', "the paper's experiment: its Table I and two figures"),
     'real': SubCommand('accuracy', 'accuracy on recordings with known truth'),
+    'follow': SubCommand('follow', 'whole tracks from one box or a few of each object'),
     'ablation': SubCommand('ablation', 'accuracy without each ingredient of the method'),
     'speed': SubCommand('speed.command', 'time per tick, per box and per window'),
 }

@@ -85,6 +85,7 @@ def minimize(
     history: int,
     tolerance: float,
     metric: Metric | None = None,
+    first: tuple[Tensor, Tensor] | None = None,
 ) -> Minimum:
     """
     Minimise one function per row.
@@ -103,6 +104,8 @@ def minimize(
     metric : callable, optional
         Maps vectors (b, D) and their rows to the inverse of an approximate Hessian times them.
         Without it the usual scaled identity is used.
+    first : pair of Tensor, optional
+        Values and gradients at the start, where they are known.
 
     Returns
     -------
@@ -118,7 +121,7 @@ def minimize(
 
     """
     rows = torch.arange(len(start), device=start.device)
-    value, gradient = function(start, rows)
+    value, gradient = function(start, rows) if first is None else first
     is_finite = value.isfinite() & gradient.isfinite().all(1)
     status = torch.where(is_finite, 0, int(Status.FAILED))
     best = Minimum(start.clone(), value.clone(), status, torch.zeros_like(rows))

@@ -2,26 +2,20 @@
 The paper's objective to the letter, Eq. 4 to 8, and its solver.
 
 Its terms are functions of boxes and points, differentiated automatically. The default objective
-is in `terms`; it shares no code with this one but the optimiser.
+is in `method`; it shares no code with this one but the optimiser.
 
 """
 
-from boxreg_ros.config import Config, PaperConfig
-from boxreg_ros.core.batch import (
-    EXTENT,
-    free_variables,
-    POSE_ERRORS,
-    Posterior,
-    Problem,
-    Solution,
-    State,
-)
-from boxreg_ros.core.expectation import expect, InputEstimates
-from boxreg_ros.core.face_support import FaceOffsets
+from typing import NamedTuple
+
+from boxreg_ros.config import Config, KINDS, PaperConfig
 from boxreg_ros.core.geometry import face_distances, rotation_from_rpy
-from boxreg_ros.core.lbfgs import HISTORY, minimize, select
+from boxreg_ros.core.lbfgs import HISTORY, minimize
+from boxreg_ros.core.method.arrays import INPUTS, Posterior, PRIOR, Solution
+from boxreg_ros.core.problem import Problem
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import POSE
+from boxreg_ros.structures import Floats, POSE
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -37,6 +31,37 @@ TOLERANCE = 1e-9
 """Relative decrease of the objective that ends the search of one multiplier round. Chosen."""
 FULL_STEP = 0.1
 """Step from which on its direction counts in full in Eq. 7 [m]. Chosen."""
+PADDING_POSITION = 1e6
+"""Coordinate of padding points [m]. Derived: near no box, and finite in float32."""
+
+
+class Observed(NamedTuple):
+    """
+    What the terms compare boxes with.
+
+    Attributes
+    ----------
+    points, mask : Tensor, shapes (B, N, M, 3) and (B, N, M)
+        Points in the frame of the boxes [m]; False for padding.
+    valid : Tensor, shape (B, N)
+        False for padding.
+
+    """
+
+    points: Tensor
+    mask: Tensor
+    valid: Tensor
+
+    @classmethod
+    def of(cls, problem: Problem) -> 'Observed':
+        """Return the points of a problem, padded."""
+        place = np.arange(problem.width)
+        mask = place < problem.counts[..., None]
+        index = (problem.first[..., None] + problem.stride * place)[mask]
+        points = np.full((*mask.shape, 3), PADDING_POSITION, np.float32)
+        points[mask] = problem.points[index]
+        centred = points + problem.boxes[..., None, :3]
+        return cls(*map(torch.from_numpy, (centred, mask, problem.valid)))
 
 
 def closeness(boxes: Tensor, points: Tensor, mask: Tensor, nearest: int) -> Tensor:
@@ -128,7 +153,7 @@ def alignment(boxes: Tensor, valid: Tensor, rounding: float = EPSILON) -> Tensor
 
 
 def total(
-    boxes: Tensor, problem: Problem, weights: PaperConfig, multipliers: Tensor, rounding: float
+    boxes: Tensor, seen: Observed, weights: PaperConfig, multipliers: Tensor, rounding: float
 ) -> tuple[Tensor, Tensor]:
     """
     Return the objective (B,) [Eq. 8] and the violation (B, 2) of its two constraints.
@@ -140,9 +165,8 @@ def total(
     with its weight w and its multiplier m, a column of `multipliers` (B, 2).
 
     """
-    points, mask, _ = problem.padded()
-    points = points + problem.boxes[..., None, :3]
-    constraints = [term(boxes, problem.valid, rounding) for term in (smoothness, alignment)]
+    points, mask, valid = seen
+    constraints = [term(boxes, valid, rounding) for term in (smoothness, alignment)]
     violation = torch.stack(constraints, -1)
     penalty = violation.new_tensor([weights.smoothness, weights.alignment])
     loss = weights.closeness * closeness(boxes, points, mask, weights.nearest)
@@ -166,11 +190,12 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
     """
     settings = config.paper
     length = problem.length
-    shared = expect(problem, InputEstimates(FaceOffsets(*torch.zeros(3, 6)))).shared
-    extent = shared[:, None, EXTENT].expand(-1, length, -1)
-    free = free_variables(problem, config)[:, : 6 * length]
-    x = problem.pose.flatten(1)
-    every = torch.arange(len(x), device=x.device)
+    mean = problem.mean_extents()
+    extent = torch.from_numpy(mean)[:, None].expand(-1, length, -1)
+    free = torch.from_numpy(problem.free_variables(config))[:, : 6 * length]
+    x = torch.from_numpy(problem.boxes[..., POSE]).flatten(1)
+    seen = Observed.of(problem)
+    every = torch.arange(len(x))
     penalty = x.new_tensor([settings.smoothness, settings.alignment])
     multipliers = penalty.repeat(len(x), 1)
 
@@ -189,21 +214,28 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
         ) -> tuple[Tensor, Tensor]:
             with torch.enable_grad():
                 x = x.detach().requires_grad_()
-                part = select(problem, rows)
+                part = Observed(*(of_all[rows] for of_all in seen))
                 loss, _ = total(boxes(x, rows), part, settings, multipliers[rows], rounding)
                 (gradient,) = torch.autograd.grad(loss.sum(), x)
             return loss.detach(), gradient * free[rows]
 
         x = minimize(function, x, settings.iterations, HISTORY, TOLERANCE).x
-        _, violation = total(boxes(x, every), problem, settings, multipliers, rounding)
+        _, violation = total(boxes(x, every), seen, settings, multipliers, rounding)
         multipliers = multipliers + violation * penalty
-    variance = problem.of_class(*POSE_ERRORS) ** 2
-    pose = x.unflatten(1, (length, 6))
-    found = Posterior.zeros(pose)
-    found.poses[:] = torch.diag_embed(variance)[:, None]
-    extent_deviation = shared[:, EXTENT] * problem.of_class('extent')
-    found.extents[:] = torch.diag_embed(extent_deviation**2)
-    return Solution(State(pose, shared), found)
+    B = len(mean)
+    shared = problem.expected_shared(np.zeros(len(KINDS), INPUTS))
+    of_poses, of_extents = np.zeros((B, length, 6, 6)), np.zeros((B, 3, 3))
+    of_poses[...] = _diagonal(problem.of_class['pose'] ** 2)[:, None]
+    of_extents[...] = _diagonal((mean * problem.of_class['extent'][:, None]) ** 2)
+    posterior = Posterior(of_poses, of_extents, np.zeros((B, length, 6)))
+    no_prior = np.zeros((0, PRIOR)), np.zeros((0, PRIOR)), np.zeros((0, PRIOR, PRIOR))
+    poses = x.numpy().reshape(B, length, 6)
+    return Solution(poses, shared, np.zeros((B, 3, 3)), posterior, *no_prior)
+
+
+def _diagonal(values: Floats) -> Floats:
+    """Return diagonal matrices (B, n, n) of `values` (B, n)."""
+    return values[..., None] * np.eye(values.shape[1])
 
 
 def _mean(values: Tensor, valid: Tensor) -> Tensor:

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.kernels import load
-from boxreg_ros.core.observation import crop, own_points, own_points_numpy
+from boxreg_ros.core.observation import crop, own_points
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL, Sweep, X, YAW, Z
 import numpy as np
@@ -42,6 +41,8 @@ MOVING_DISTANCE = 0.35
 """Least distance that an object moves within the boxes that state its speed [m]: 3 deviations."""
 MOVING_DEVIATIONS = 5.0
 """Least speed in standard errors: boxes that jump once, as estimates that settle, do not move."""
+LEAST_WAY = 1.0
+"""Between two rests an object moves at least so far [m]: farther than an estimate jumps."""
 MOTION_SECONDS = 1.0
 """The speed is that of the boxes within a span of this time [s]."""
 MIN_MOTION_SECONDS = 0.25
@@ -121,8 +122,8 @@ class PointLabels(NamedTuple):
         Rows of the points on an object, ascending.
     local : array, shape (L, 3)
         These points in the frame of their box at their own time [m].
-    at_stamp : array, shape (L, 3)
-        These points in the fixed frame, moved to the stamp with their object [m].
+    own_boxes : array, shape (L, 9)
+        The box of each of these points, at the stamp of the sweep.
     tracks : sequence of T ObjectTrack
         All objects of the drive.
     moves : array, shape (T,)
@@ -134,9 +135,15 @@ class PointLabels(NamedTuple):
     motion: Bytes
     rows: Ints
     local: Floats
-    at_stamp: Floats
+    own_boxes: Floats
     tracks: Sequence[ObjectTrack]
     moves: Mask
+
+    def at_stamp(self) -> Floats:
+        """Return the points on an object, moved with it to the stamp, (L, 3), fixed frame [m]."""
+        R = matrix_from_rpy(self.own_boxes[:, ROLL:])
+        turned: Floats = np.einsum('lij,lj->li', R, self.local)
+        return turned + self.own_boxes[:, X : Z + 1]
 
     @property
     def is_dynamic(self) -> Mask:
@@ -175,7 +182,7 @@ class PointLabeller:
         self.tracks = list(tracks)
         self._config = config
         self._array_stamps_ns = np.unique(array_stamps_ns)
-        self._limits = TOLERANCE - margins
+        self._limits = TOLERANCE - margins[:, [0, 2, 4, 5]]  # ends, sides, top, bottom
         self._motions = [_track_motion(track) for track in tracks]
         self._names = self.tracks, np.array([MOVING in one.motion for one in self._motions], bool)
         self._first_ns = np.array([track.stamps_ns[0] for track in tracks], np.int64)
@@ -191,9 +198,9 @@ class PointLabeller:
         motion = np.zeros(M, np.uint8)
         objects = self.objects_at(sweep.stamp_ns)
         if not len(objects.track) or not M:
-            none = np.zeros((0, 3))
-            return PointLabels(track, motion, np.zeros(0, np.int64), none, none, *self._names)
-        row, owner, local, excess = self._near(sweep, objects)
+            nothing = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 9))
+            return PointLabels(track, motion, *nothing, *self._names)
+        row, owner, offset, excess = self._near(sweep, objects)
         band = np.where(objects.is_certain, BAND, UNCERTAIN_BAND)
         is_unknown = (excess < band[owner]) & ((excess > 0) | objects.is_lost[owner])
         track[row[is_unknown]] = UNKNOWN
@@ -207,9 +214,10 @@ class PointLabeller:
         owners = owner[pairs]
         track[rows] = objects.track[owners]
         motion[rows] = objects.motion[owners]
+        boxes = objects.boxes[owners]
         R = matrix_from_rpy(objects.boxes[:, ROLL:])[owners]
-        at_stamp = np.einsum('lij,lj->li', R, local[pairs]) + objects.boxes[owners, X : Z + 1]
-        return PointLabels(track, motion, rows, local[pairs], at_stamp, *self._names)
+        local = np.einsum('lji,lj->li', R, offset[:, pairs].T)
+        return PointLabels(track, motion, rows, local, boxes, *self._names)
 
     def knows(self, stamp_ns: int) -> bool:
         """Return whether the boxes of the input say what is there at a stamp."""
@@ -279,40 +287,45 @@ class PointLabeller:
         -------
         row, owner : array, shape (P,)
             Of the point and of the object.
-        local : array, shape (P, 3)
-            The point in the frame of the box at its time [m].
+        offset : array, shape (3, P)
+            From the centre of the box to the point, moved back to the stamp with its object;
+            axes of the fixed frame [m].
         excess : array, shape (P,)
             How far it is outside of the surface and `TOLERANCE`, negative inside [m].
 
         """
         boxes = objects.boxes
-        has_times = sweep.times is not None and bool(objects.velocities.any())
-        shift = np.zeros((len(boxes), 3))
+        half = boxes[:, LENGTH:ROLL] / 2
+        R = matrix_from_rpy(boxes[:, ROLL:])
         searched = boxes
-        if has_times and sweep.times is not None:
-            ends = np.array([sweep.times.min(), sweep.times.max()])
+        shift = np.zeros((len(boxes), 3))
+        moves = np.asarray(objects.velocities.any(axis=1))
+        times = sweep.times if moves.any() else None
+        if times is not None:
+            ends = np.array([times.min(), times.max()])
             shift = objects.velocities * ends.mean()
             searched = boxes.copy()
             searched[:, X : Z + 1] += shift
             searched[:, LENGTH] += np.linalg.norm(objects.velocities, axis=1) * np.ptp(ends)
-        near = crop(sweep, searched, TOLERANCE + UNCERTAIN_BAND)
-        row, owner = near.row, near.owner
-        offset = near.offset.T + shift[owner]
-        if has_times and sweep.times is not None:
-            delays = self._delays(sweep.times[row], owner, len(boxes))
-            offset = offset - objects.velocities[owner] * delays[:, None]
-            offset = _turned(offset, -objects.turn_rates[owner] * delays)
-        R = matrix_from_rpy(boxes[:, ROLL:])
-        local = np.einsum('pji,pj->pi', R[owner], offset)
-        half = boxes[:, LENGTH:ROLL] / 2
-        limits = self._limits[objects.track].reshape(-1, 3, 2)  # (object, axis, positive side)
-        side = np.where(local > 0, limits[owner, :, 0], limits[owner, :, 1])
-        excess = (np.abs(local) - half[owner] - side).max(axis=1)
-        find = own_points if load() is not None else own_points_numpy
-        road = np.nan_to_num(find(sweep, boxes, self._config).road)
-        height = local[:, Z] + half[owner, Z]
-        is_above = height > road[owner] + ROAD_CLEARANCE
-        return row[is_above], owner[is_above], local[is_above], excess[is_above]
+        row, owner, offset, outside = crop(sweep, searched, TOLERANCE + UNCERTAIN_BAND)
+        if times is not None:
+            moved = np.flatnonzero(moves[owner])
+            own = owner[moved]
+            delays = self._delays(times[row[moved]], own, len(boxes))
+            there = offset[:, moved].T + shift[own] - objects.velocities[own] * delays[:, None]
+            there = _turned(there, -objects.turn_rates[own] * delays)
+            offset[:, moved] = there.T
+            outside[:, moved] = np.abs(np.einsum('pji,pj->ip', R[own], there)) - half[own].T
+        up = R[:, :, 2]
+        above = np.einsum('ip,pi->p', offset, up[owner])  # the centre, along z of the box
+        ends, sides, top, bottom = self._limits[objects.track].T
+        excess = np.maximum(outside[0] - ends[owner], outside[1] - sides[owner])
+        vertical = np.where(above > 0, top[owner], bottom[owner])
+        np.maximum(excess, outside[2] - vertical, out=excess)
+        road = np.nan_to_num(own_points(sweep, boxes, self._config).road)
+        lowest = road - half[:, 2] + ROAD_CLEARANCE
+        is_near = np.flatnonzero((above > lowest[owner]) & (excess < UNCERTAIN_BAND))
+        return row[is_near], owner[is_near], offset[:, is_near], excess[is_near]
 
     def _delays(self, times: Floats, owner: Ints, n: int) -> Floats:
         """Return the times of points (P,) relative to the time of their box [s]."""
@@ -345,10 +358,23 @@ def _track_motion(track: ObjectTrack) -> _TrackMotion:
     speed = np.linalg.norm(slopes[:, :2], axis=1)
     moves = speed > np.maximum(MOVING_SPEED, MOVING_DISTANCE / span)
     moves &= speed > MOVING_DEVIATIONS * np.linalg.norm(errors[:, :2], axis=1)
+    moves = _without_jumps(moves, track.boxes[:, X : Z + 1])
     motion = np.where(moves, MOVING, STOOD if moves.any() else PARKED).astype(np.uint8)
     near, _, _ = _slopes(seconds, values, MOTION_SECONDS / 2)  # less smooth, for the place
     slopes = np.where(moves[:, None], near, 0.0)
     return _TrackMotion(slopes[:, :3], slopes[:, 3], motion)
+
+
+def _without_jumps(moves: Mask, centres: Floats) -> Mask:
+    """Return which boxes (n,) move, without motions between two rests that lead nowhere."""
+    steps = np.diff(np.concatenate([[False], moves, [False]]).astype(int))
+    begins, ends = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
+    kept = moves.copy()
+    for begin, end in zip(begins, ends, strict=True):
+        is_inner = begin > 0 and end < len(moves)
+        if is_inner and np.linalg.norm(centres[end] - centres[begin - 1]) < LEAST_WAY:
+            kept[begin:end] = False
+    return kept
 
 
 def _slopes(seconds: Floats, values: Floats, span: float) -> tuple[Floats, Floats, Floats]:

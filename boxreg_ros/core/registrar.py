@@ -15,10 +15,10 @@ from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.pending import BoxToObserve, ObservedTrack, PendingArray, PendingBox
+from boxreg_ros.core.problem import SETTINGS_OF
 from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import column, joined
 from boxreg_ros.core.track_window import Estimate, Window
-from boxreg_ros.errors import ConfigError
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, RefinedBoxes, Sweep, X, Z
 import numpy as np
@@ -35,8 +35,6 @@ Its argument is the number that refines every final box: one of each track in `l
 
 """
 
-CPU = 'cpu'
-"""The device that torch has everywhere: it is not imported to check that."""
 VELOCITY_OBSERVATIONS = 4
 """Observations that the input velocity is estimated from; chosen: 0.3 s at 10 Hz."""
 UNKNOWN_COVARIANCE = np.full((6, 6), inf)
@@ -79,11 +77,6 @@ class BoxRegistrar:
     box_time : BoxTimeEvidence
         Evidence of the time that the input boxes are of.
 
-    Raises
-    ------
-    ConfigError
-        If torch cannot use `config.device`.
-
     Notes
     -----
     A **box array** passes through these states, in this order:
@@ -119,7 +112,6 @@ class BoxRegistrar:
     def __init__(
         self, config: Config, submit: Submit | None = None, budget: Budget | None = None
     ) -> None:
-        _check_device(config.device)
         self.config = config
         self.counts: Counter[str] = Counter()
         self._submit = submit
@@ -191,11 +183,11 @@ class BoxRegistrar:
 
     def margins(self) -> Floats:
         """Return the labelling margin of each face, of each of `KINDS`, (K, 6) [m]."""
-        from boxreg_ros.core.batch import FACE_GAPS  # imports torch
-
+        names = SETTINGS_OF['gaps']
         kinds = [getattr(self.config, kind) for kind in KINDS]
-        of_settings = np.array([[getattr(kind, name) for name in FACE_GAPS] for kind in kinds])
-        margins: Floats = of_settings + self._input_model.offsets().gap_correction.numpy()
+        of_settings = np.array([[getattr(kind, name) for name in names] for kind in kinds])
+        inputs = self._input_model.inputs(self.config, with_noise=False)
+        margins: Floats = of_settings + inputs['gap_correction']
         return margins
 
     def _process(self, pairs: list[Pair]) -> Iterator[RefinedBoxes]:
@@ -465,19 +457,3 @@ def submit_locally(windows: list[Window], config: Config, model: InputModel) -> 
     from boxreg_ros.core.registration import register
 
     return partial(register, windows, config, model)
-
-
-def _check_device(device: str) -> None:
-    """Raise ConfigError if torch cannot use `device`."""
-    if device == CPU:
-        return
-    import torch
-
-    try:
-        torch.zeros(1, device=device)
-    except (AssertionError, RuntimeError) as error:  # torch raises either
-        reason = str(error).splitlines()[0]
-        raise ConfigError(
-            f"device: expected one that torch can use here, such as 'cpu', got {device!r}: "
-            f'{reason}'
-        ) from None

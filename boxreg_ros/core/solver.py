@@ -1,48 +1,106 @@
 """
-The solver of the default objective: rounds of expectation, observation, weighting and L-BFGS.
+The solver of the default objective: rounds of expectation, face observations, weights and L-BFGS.
 
-As in ICP, correspondences and weights are renewed in every round and held while the sum is
+As in ICP, correspondences and weights are renewed in every round and held while the sum (M1) is
 minimised. How many rounds there are, and what they use, is a `SolverPlan`, chosen once per batch.
 
 """
 
-from functools import partial
+from dataclasses import dataclass, replace
 from math import inf
+from typing import NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.batch import (
-    EXTENT,
-    free_variables,
-    MarginalPrior,
-    Posterior,
-    Problem,
-    SHARED,
-    Solution,
-    State,
-)
-from boxreg_ros.core.expectation import InputEstimates, shared_without_population
-from boxreg_ros.core.face_support import FaceOffsets
-from boxreg_ros.core.input_model import InputModel
-from boxreg_ros.core.input_noise import InputNoise, normalised_residuals, UNKNOWN_NOISE
-from boxreg_ros.core.kernels import compiled
-from boxreg_ros.core.population import UNKNOWN_POPULATION
-from boxreg_ros.core.rounds import Round, run_round, SolverPlan
-from boxreg_ros.core.threads import mapped, num_workers, shared_between
-from boxreg_ros.structures import POSE
+from boxreg_ros.core.input_model import InputModel, Inputs
+from boxreg_ros.core.input_noise import normalised_residuals, set_noise
+from boxreg_ros.core.lbfgs import HISTORY, minimize
+from boxreg_ros.core.method import round as method
+from boxreg_ros.core.method.arrays import BIAS, EXTENT, Posterior, PRIOR, SHARED, Solution
+from boxreg_ros.core.method.constants import Constants
+from boxreg_ros.core.population import set_population
+from boxreg_ros.core.problem import Problem
+from boxreg_ros.core.threads import run, shared_between
+from boxreg_ros.structures import Floats, Ints, POSE
+import numpy as np
+from numpy.typing import NDArray
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
-# Constants whose origin is not stated are chosen; `boxreg bench sensitivity` halves and doubles
-# each of them.
 NOISE_ROUNDS = 2
-"""First rounds of a whole track whose residuals give the input noise. Later fits follow the
-input: the noise would be estimated smaller in every round."""
-OBSERVATIONS_PER_THREAD = 2500
-"""Observations that a thread solves at once: more save calls, fewer save memory traffic."""
+"""First rounds of a whole track whose residuals give the input noise. Chosen: later fits follow
+the input, and the noise would be estimated smaller in every round."""
 
 
-@torch.inference_mode()
+@dataclass(frozen=True, slots=True)
+class SolverPlan:
+    """
+    How a batch is solved.
+
+    Attributes
+    ----------
+    rounds : int
+        Most rounds.
+    coarse_points : float
+        Points per box until the boxes are settled; then all.
+    starts_from_fit : bool
+        Whether the start is the fit of the tick before: faces are judged by its extents, and its
+        motion is good enough for robust weights in the first round.
+    uses_rigid_shape : bool
+        Whether observations are tied by the rigid shape of their track, from the second round on.
+    estimates_noise : bool
+        Whether the noise of the input is estimated from this batch and not taken from the model.
+    marginalises : bool
+        Whether full windows leave a prior to the next ones.
+
+    """
+
+    rounds: int
+    coarse_points: float
+    starts_from_fit: bool = False
+    uses_rigid_shape: bool = False
+    estimates_noise: bool = False
+    marginalises: bool = False
+
+    @classmethod
+    def choose(cls, config: Config, is_warm: bool, coarse_points: int) -> 'SolverPlan':
+        """
+        Return the plan for windows that are warm: all but their newest box have been solved.
+
+        A warm window takes one round with all points, a cold one as many as it needs. For whole
+        tracks noise comes from the batch: the model has one residual a window of theirs, seconds
+        apart, from which no correlation can be estimated.
+
+        """
+        plan = cls(1, inf, starts_from_fit=True)
+        if not is_warm:
+            plan = cls(config.solver.rounds, coarse_points)
+        if config.estimate == 'track':
+            return replace(plan, uses_rigid_shape=True, estimates_noise=True)
+        return replace(plan, marginalises=True)
+
+
+class Batch(NamedTuple):
+    """
+    Windows that are being solved.
+
+    Attributes
+    ----------
+    problem : Problem
+    free : array, shape (B, 6 N + 23)
+        1 for variables that are estimated.
+    sums : Sums
+        The sums of residuals of the round.
+    solution : Solution
+        Where the round begins; the round writes its end.
+
+    """
+
+    problem: Problem
+    free: Floats
+    sums: method.Sums
+    solution: Solution
+
+
 def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) -> Solution:
     """
     Minimise the robust objective (M1) of a batch: rounds until every window is settled.
@@ -54,7 +112,7 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     config : Config
         Settings.
     model : InputModel
-        Labelling margins and noise of the input.
+        Labelling margins and noise of the input, and the constants of the method.
     is_warm : bool
         Whether all boxes but the newest start from an earlier fit.
 
@@ -69,62 +127,133 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     other: threads share them.
 
     """
-    plan = SolverPlan.choose(config, is_warm)
-    learns_noise = config.ingredients.noise_estimation
-    learns_extents = config.ingredients.population_extents
-    noise = model.noise() if learns_noise and not plan.estimates_noise else UNKNOWN_NOISE
-    population = model.population() if learns_extents else UNKNOWN_POPULATION
-    inputs = InputEstimates(model.offsets(), noise, population, model.gap_scatter())
-    free = free_variables(problem, config)
-    solution = start(problem, free, inputs.offsets, plan)
-    every = torch.arange(len(free), device=free.device)
+    constants = model.constants.with_settings(config)
+    plan = SolverPlan.choose(config, is_warm, constants.coarse_points)
+    inputs = model.inputs(config, with_noise=not plan.estimates_noise)
+    batch = start(problem, config, plan, inputs)
+    every = np.arange(len(batch.free))
     rows, turn, points = every, 0, plan.coarse_points
     with shared_between(config.solver.threads):
         while len(rows):
-            batch = Round(problem.thinned(points), solution, inputs, free)
-            work = partial(run_round, batch, plan, turn, config)
-            is_done = mapped(work, _split(rows, problem.length))
-            rows = rows[~torch.cat(is_done)]
+            is_done = run_round(batch, inputs, rows, points, plan, turn, config, constants)
+            rows = rows[~is_done]
             turn += 1
-            if plan.estimates_noise and learns_noise and turn <= NOISE_ROUNDS:
-                residuals = normalised_residuals(problem, solution.state)
-                noise = InputNoise.estimate_by_kind(residuals, problem.kind)
-                inputs = inputs._replace(noise=noise)
-            if plan.estimates_noise and learns_extents:
-                joined = population.joined(solution.extent_evidence, problem.kind)
-                inputs = inputs._replace(population=joined)
-            if not len(rows) and 2 * points <= problem.returns.width:
+            if plan.estimates_noise:
+                inputs = _from_batch(batch, inputs, model, turn, config)
+            if not len(rows) and 2 * points <= problem.width:
                 rows, points = every, inf  # settled on few points: once more with all
-    return solution
+    return batch.solution
 
 
-def start(problem: Problem, free: Tensor, offsets: FaceOffsets, plan: SolverPlan) -> Solution:
-    """Return the state that the first round starts from, without covariances and prior."""
-    pose = problem.start[..., POSE].contiguous()  # a copy
-    shared = shared_without_population(problem, offsets)
-    log_extent = shared[:, EXTENT].log()
+def start(problem: Problem, config: Config, plan: SolverPlan, inputs: Inputs) -> Batch:
+    """Return a batch where the first round starts, without covariances and prior."""
+    B, N = problem.counts.shape
+    free = problem.free_variables(config)
+    shared = problem.expected_shared(inputs)
+    evidence = np.zeros((B, 3, 3))
+    evidence[:, 0] = np.log(shared[:, EXTENT:BIAS])
     if plan.starts_from_fit:
-        shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], free[:, -SHARED:][:, EXTENT])
-    prior = extents = None
-    if plan.marginalises:
-        unknown = torch.full_like(problem.prior_mean, torch.nan)
-        information = torch.empty_like(problem.prior_information)  # without a step, of no use
-        prior = MarginalPrior(unknown, unknown.clone(), information)
-        first = pad(problem.boxes[:, 0, 3:6], (0, 1), value=1.0)
-        extents = problem.marginalised_extents + first
-    evidence = pad(log_extent[:, None], (0, 0, 0, 2))  # (B, 3, 3)
-    return Solution(State(pose, shared), Posterior.zeros(pose), prior, extents, evidence)
+        is_free = free[:, -SHARED:][:, EXTENT:BIAS]
+        shared[:, EXTENT:BIAS] += is_free * (problem.start[:, 0, 3:6] - shared[:, EXTENT:BIAS])
+    leaving = B if plan.marginalises and config.window == N else 0
+    solution = Solution(
+        problem.start[..., POSE].copy(), shared, evidence,
+        Posterior(np.zeros((B, N, 6, 6)), np.zeros((B, 3, 3)), np.zeros((B, N, 6))),
+        np.full((leaving, PRIOR), np.nan), np.full((leaving, PRIOR), np.nan),
+        np.full((leaving, PRIOR, PRIOR), np.nan),
+    )  # fmt: skip
+    prior = problem.prior_mean, problem.prior_information
+    return Batch(problem, free, method.empty_sums(B, N, *prior), solution)
 
 
-def _split(rows: Tensor, length: int) -> tuple[Tensor, ...]:
+@torch.inference_mode()
+def run_round(
+    batch: Batch,
+    inputs: Inputs,
+    rows: Ints,
+    points: float,
+    plan: SolverPlan,
+    turn: int,
+    config: Config,
+    constants: Constants,
+) -> NDArray[np.bool_]:
     """
-    Return parts of `rows` for threads, windows of `length` each.
+    Take one round with the windows `rows` (b,), and write its end to the solution of the batch.
 
-    One on a GPU, where the kernels share windows by themselves, and for few observations.
+    Returns which of these windows are done (b,): settled, or at the end of the last round. Only
+    those have covariances and, if they are full, a prior for the next window.
 
     """
-    size = OBSERVATIONS_PER_THREAD / length
-    if compiled(rows) is not None or not rows.is_cpu or len(rows) <= size:
-        return (rows,)
-    parts = num_workers() * int(1 + len(rows) / size / num_workers())
-    return rows.tensor_split(min(len(rows), parts))
+    _, free, sums, solution = batch
+    problem = batch.problem.thinned(points)
+    uses_shape = plan.uses_rigid_shape and turn > 0
+    is_smooth = turn > 0 or plan.starts_from_fit
+    record = constants.in_round(uses_shape, is_smooth).record()
+    b, D = len(rows), free.shape[1]
+    x, value, gradient = np.empty((b, D)), np.empty(b), np.empty((b, D))
+    run(
+        method.begin, b, rows, problem, problem.thinned(constants.shape_points), inputs, free,
+        record, solution.poses, solution.shared, sums, x, value, gradient,
+    )  # fmt: skip
+    search, objective = config.solver, Objective(rows, free, sums)
+    found = minimize(
+        objective.value_and_gradient, torch.from_numpy(x), search.iterations, HISTORY,
+        search.tolerance, objective.metric,
+        (torch.from_numpy(value), torch.from_numpy(gradient)),
+    )  # fmt: skip
+    is_done = np.empty(b, bool)
+    run(
+        method.end, b, rows, found.x.numpy(), problem, free, record, sums, solution,
+        turn + 1 >= plan.rounds, turn > 0, is_done,
+    )  # fmt: skip
+    return is_done
+
+
+class Objective(NamedTuple):
+    """
+    The sums of residuals of the windows `rows` (b,) of a batch, as `minimize` calls them.
+
+    Attributes
+    ----------
+    rows : array, shape (b,)
+    free, sums
+        As in `Batch`.
+
+    """
+
+    rows: Ints
+    free: Floats
+    sums: method.Sums
+
+    def value_and_gradient(self, x: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+        """Return values (p,) and gradients (p, D) of the windows `rows[part]` at x (p, D)."""
+        value, gradient = torch.empty(len(x), dtype=x.dtype), torch.empty_like(x)
+        run(
+            method.evaluate, len(x), self.rows[part.numpy()], x.contiguous().numpy(), self.free,
+            self.sums, value.numpy(), gradient.numpy(),
+        )  # fmt: skip
+        return value, gradient
+
+    def metric(self, vectors: Tensor, part: Tensor) -> Tensor:
+        """Return the inverse Gauss-Newton curvature times `vectors` (p, D)."""
+        found = vectors.clone()
+        run(method.precondition, len(found), self.rows[part.numpy()], self.sums.factor,
+            found.numpy())  # fmt: skip
+        return found
+
+
+def _from_batch(
+    batch: Batch, inputs: Inputs, model: InputModel, turn: int, config: Config
+) -> Inputs:
+    """Return the estimates of the input with those of the batch itself, after a round."""
+    problem, _, _, solution = batch
+    inputs = inputs.copy()
+    if config.ingredients.noise_estimation and turn <= NOISE_ROUNDS:
+        extents = solution.shared[:, EXTENT:BIAS]
+        residuals = normalised_residuals(problem, solution.poses, extents)
+        set_noise(inputs, residuals, problem.kind, model.constants)
+    if config.ingredients.population_extents:
+        evidence, kind = model.extent_evidence()
+        evidence = np.concatenate([evidence, solution.evidence])
+        set_population(inputs, evidence, np.concatenate([kind, problem.kind]), model.constants)
+    return inputs

@@ -20,20 +20,15 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
     Parameters
     ----------
     config : Config
-        Objective, estimate, mode and device are those of the stream to come.
+        Objective, estimate and mode are those of the stream to come.
     submit : callable, optional
         As for `BoxRegistrar`, which it is given to.
-
-    Raises
-    ------
-    ConfigError
-        If torch cannot use the device.
 
     """
     rng = np.random.default_rng(0)
     quick = Config(
-        objective=config.objective, mode=config.mode, device=config.device,
-        estimate=config.estimate, window=4, lag=3, solver=SolverConfig(rounds=2, iterations=2),
+        objective=config.objective, mode=config.mode, estimate=config.estimate,
+        window=4, lag=3, solver=SolverConfig(rounds=2, iterations=2),
         paper=PaperConfig(multiplier_rounds=1, iterations=2),
     )  # fmt: skip
     registrar = BoxRegistrar(quick, submit)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
-from boxreg_ros.labels.registry import writer_for
+from boxreg_ros.labels.registry import require_boxes, writer_for
 from boxreg_ros.structures import RefinedBoxes, REJECTED
 
 WITH_REJECTED = ('csv', 'mcap')
@@ -32,13 +32,14 @@ class LabelOutput:
     Raises
     ------
     ConfigError
-        As `writer_for`.
+        As `writer_for`, or if a format labels points.
 
     """
 
     def __init__(
         self, folder: Path, formats: Sequence[str], provenance: Provenance, options: Options
     ) -> None:
+        require_boxes(formats)
         self._writers = {
             name: writer_for(name, folder, provenance, options) for name in with_csv(formats)
         }

@@ -85,6 +85,15 @@ def labels_points(name: str) -> bool:
     return module_of(name).FORMAT.has_points
 
 
+def require_boxes(names: Sequence[str]) -> None:
+    """Raise ConfigError if one of the formats labels points."""
+    for name in filter(labels_points, names):
+        raise ConfigError(
+            f'format {name!r} labels the points of clouds: expected formats of boxes; write it '
+            f'by boxreg relabel --label-points'
+        )
+
+
 def check_options(names: Sequence[str], options: Options) -> None:
     """
     Refuse options that none of the formats `names` uses, and the lack of those that one needs.
@@ -97,11 +106,7 @@ def check_options(names: Sequence[str], options: Options) -> None:
         `module_of`.
 
     """
-    for name in filter(labels_points, names):
-        raise ConfigError(
-            f'format {name!r} labels the points of clouds: expected formats of boxes; write it '
-            f'by boxreg relabel --label-points'
-        )
+    require_boxes(names)
     used = {option for name in names for option in module_of(name).FORMAT.options}
     for option in COMMAND_LINE_OPTIONS:
         if getattr(options, option) and option not in used:

@@ -93,15 +93,7 @@ class BoxregNode(Node):
         self._opened = ExitStack()
 
     def configure(self) -> None:
-        """
-        Load or compile kernels, time a window, and make a registrar without any track.
-
-        Raises
-        ------
-        ConfigError
-            If torch cannot use the device.
-
-        """
+        """Load or compile kernels, time a window, and make a registrar without any track."""
         config, options = self._settings
         with announced_compilation(self.get_logger().info):
             warm_up(config)

@@ -16,19 +16,13 @@ import sys
 from typing import Any
 
 from boxreg_ros.config import Config, KINDS, Setting, settings
-from boxreg_ros.core.batch import EXTENT, State
-from boxreg_ros.core.expectation import expect, InputEstimates
-from boxreg_ros.core.face_support import FaceOffsets, observe_faces
-from boxreg_ros.core.input_model import FACE_GROUPS, InputModel, MAX_TRACKS
-from boxreg_ros.core.input_noise import (
-    input_residuals,
-    InputNoise,
-    MAD_TO_DEVIATION,
-    MIN_OBSERVATIONS_FOR_NOISE,
-)
+from boxreg_ros.core.input_model import FACE_GROUPS, InputModel
+from boxreg_ros.core.input_noise import noise_of, normalised_residuals
+from boxreg_ros.core.method.constants import CONSTANTS
+from boxreg_ros.core.method.noise import MAD_TO_DEVIATION
 from boxreg_ros.core.observation import Observation, Observations, observe
+from boxreg_ros.core.problem import group_windows, stack_windows
 from boxreg_ros.core.track_window import Window
-from boxreg_ros.core.window import group_windows, stack_windows
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.arguments import (
@@ -42,9 +36,8 @@ from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import spare_file
 from boxreg_ros.offline.sources import true_boxes
-from boxreg_ros.structures import Floats, is_valid_box
+from boxreg_ros.structures import Floats, is_valid_box, POSE, ROLL
 import numpy as np
-import torch
 import yaml
 
 GAPS = ('gap_ends', 'gap_sides', 'gap_top', 'gap_bottom')
@@ -121,8 +114,8 @@ def _means_of_tracks(
     insets: dict[str, list[Floats]] = {f'faces.{name}': [] for name in INSETS}
     for kind, windows in kinds.items():
         expected = [getattr(getattr(config, kind), name) for name in GAPS]
-        for first in range(0, len(windows), MAX_TRACKS):
-            model = _model_of(windows[first : first + MAX_TRACKS], config)
+        for first in range(0, len(windows), CONSTANTS.max_tracks):
+            model = _model_of(windows[first : first + CONSTANTS.max_tracks], config)
             for name, gap, faces in zip(GAPS, expected, FACE_GROUPS, strict=True):
                 gaps[f'{kind}.{name}'] += [gap + shift for shift in model.gaps_of_tracks(faces)]
             for name, faces in zip(INSETS, FACE_GROUPS, strict=False):
@@ -157,26 +150,27 @@ def _errors_of_kind(
     tracks: list[list[tuple[int, Floats, Floats]]], config: Config
 ) -> dict[str, Measured]:
     """Return the errors of tracks of (stamp, input box, true box) that are long enough."""
-    tracks = [track for track in tracks if len(track) >= MIN_OBSERVATIONS_FOR_NOISE]
+    tracks = [track for track in tracks if len(track) >= CONSTANTS.min_observations]
     found = dict.fromkeys(ERRORS, Measured(np.nan, np.nan, 0))
     if not tracks:
         return found
     given = [_bare([row[:2] for row in track]) for track in tracks]
     labelled = [_bare([row[::2] for row in track]) for track in tracks]
-    problem, base = stack_windows(given, config)
-    true, true_base = stack_windows(labelled, config)
-    problem = problem._replace(counts=problem.valid.long())  # as if all boxes had points
-    shift = torch.nn.functional.pad(torch.from_numpy(true_base - base), (0, 3))
-    pose = true.pose + shift[:, None]
+    decay = CONSTANTS.prior_decay
+    problem, base = stack_windows(given, config, decay)
+    true, true_base = stack_windows(labelled, config, decay)
+    problem = problem._replace(counts=problem.valid.astype(int))  # as if all boxes had points
+    poses = true.boxes[..., POSE]
+    poses[..., :3] += (true_base - base)[:, None]
     # The input may have the opposite heading, for a whole track: yaw is compared modulo 180°.
-    half_turns = torch.tensor([2.0, 2.0, 1.0]) * torch.pi
-    pose[..., 3:] += half_turns * ((problem.pose - pose)[..., 3:] / half_turns).round()
-    no_offsets = FaceOffsets(*torch.zeros(3, 6))
-    extent = expect(true, InputEstimates(no_offsets)).shared
-    residuals = input_residuals(problem, State(pose, extent))
+    half_turns = np.array([2.0, 2.0, 1.0]) * np.pi
+    off = problem.boxes[..., ROLL:] - poses[..., 3:]
+    poses[..., 3:] += half_turns * np.round(off / half_turns)
+    extent = true.mean_extents()
+    residuals = normalised_residuals(problem, poses, extent) * problem.errors[:, None]
     # Without tracks whose boxes only repeat the one before.
-    counts = residuals.isfinite().all(2).sum(1)
-    residuals = residuals[counts >= MIN_OBSERVATIONS_FOR_NOISE]
+    counts = np.isfinite(residuals).all(2).sum(1)
+    residuals = residuals[counts >= CONSTANTS.min_observations]
     if len(residuals):
         single = np.array([_deviations(residuals[b : b + 1]) for b in range(len(residuals))])
         spreads = [_deviation(column - np.median(column)) for column in single.T]
@@ -184,18 +178,16 @@ def _errors_of_kind(
         for name, value, spread in zip(ERRORS, values, spreads, strict=False):
             found[name] = Measured(float(value), spread, len(residuals))
     # A track has one extent: what counts is the error of its mean.
-    error = np.abs(
-        (expect(problem, InputEstimates(no_offsets)).shared / extent)[:, EXTENT].numpy() - 1
-    )
+    error = np.abs(problem.mean_extents() / extent - 1)
     by_track = MAD_TO_DEVIATION * np.median(error, axis=1)
     spread = _deviation(by_track - np.median(by_track))
     found['extent'] = Measured(MAD_TO_DEVIATION * float(np.median(error)), spread, len(tracks))
     return found
 
 
-def _deviations(residuals: torch.Tensor) -> Floats:
+def _deviations(residuals: Floats) -> Floats:
     """Return the deviations (5,) of all `ERRORS` but the extent, of residuals (B, N, 9)."""
-    noise = InputNoise.estimate(residuals)
+    noise = noise_of(residuals, CONSTANTS)
     lon, lat, z, roll, pitch, yaw = noise.deviation[:6].tolist()
     return np.array([lon, lat, z, np.hypot(roll, pitch) / np.sqrt(2), yaw])
 
@@ -355,14 +347,11 @@ def _true_windows(drive: Drive, config: Config) -> list[Window]:
 def _model_of(windows: Sequence[Window], config: Config) -> InputModel:
     """Return an input model with the face observations at the boxes of `windows`."""
     model = InputModel(config.faces)
-    offsets = model.offsets()
     for rows in group_windows(windows, config):
         part = [windows[i] for i in rows]
-        problem, _ = stack_windows(part, config)
-        state = State(problem.pose, expect(problem, InputEstimates(offsets)).shared)
-        observations = observe_faces(problem, state, offsets, config)
+        problem, _ = stack_windows(part, config, CONSTANTS.prior_decay)
         track_ids = [window.track_id for window in part]
-        model.add_face_observations(track_ids, problem.kind, observations, problem.valid, offsets)
+        model.observe_margins(track_ids, problem, problem.boxes[..., POSE], config)
     return model
 
 

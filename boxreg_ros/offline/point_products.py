@@ -300,7 +300,7 @@ class _Products:
             moves = labels.motion[labels.rows] == MOVING
             shift = np.zeros((len(codes), 3))
             moved = labels.rows[moves]
-            shift[moved] = labels.at_stamp[moves] - sweep.in_frame().points[moved]
+            shift[moved] = labels.at_stamp()[moves] - sweep.in_frame().points[moved]
             columns['shift'] = shift
         first = 0
         for part in item.items:

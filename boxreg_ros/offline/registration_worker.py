@@ -18,7 +18,7 @@ from typing import Any, cast
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.observation import Observation, Observations
-from boxreg_ros.core.registrar import CPU, GetEstimates, Submit, submit_locally
+from boxreg_ros.core.registrar import GetEstimates, Submit, submit_locally
 from boxreg_ros.core.tables import joined
 from boxreg_ros.core.track_window import Estimate, Window
 from boxreg_ros.io.compilation import announced_compilation
@@ -49,7 +49,7 @@ def registration_worker(
         Called with what is waited for where that takes long.
 
     """
-    if config.estimate != 'track' or config.device != CPU or uses_one_core(config):
+    if config.estimate != 'track' or uses_one_core(config):
         with announced_compilation(announce):
             yield None
         return

@@ -1,32 +1,23 @@
-"""A residual with its torch twin and its kernel: the vertical velocity in the fixed frame."""
+"""A residual, its weight and its row: the vertical velocity in the fixed frame."""
 
-from typing import Any
-
-from boxreg_ros.core.batch import State
-from boxreg_ros.core.kernels.normal_equations import is_wanted
-from boxreg_ros.core.terms import Linearised
-from torch import Tensor
+from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.residuals import Residual
 
 
-def rise(state: State, times: Tensor) -> Linearised:
-    """Return the vertical velocity of each box in the fixed frame (M31) [m/s]."""
-    rate = 1 / times.diff(dim=1)[..., None, None]  # (B, N - 1, 1, 1)
-    residual = state.pose[..., 2].diff(dim=1)[..., None, None] * rate
-    by_pose = rate.new_zeros(*rate.shape, 12)  # two poses of six numbers
-    by_pose[..., 2] = -rate
-    by_pose[..., 8] = rate
-    return Linearised(residual, by_pose, residual.new_zeros(1, 1, 0))
+@kernel
+def rise(n, poses, shared, terms, at, out):
+    """Write the vertical velocity of a box in the fixed frame (M31) [m/s]."""
+    rate = 1 / (terms[n + 1].time - terms[n].time)
+    out.r[0] = rate * (poses[n + 1, 2] - poses[n, 2])
+    out.J[0, 2] = -rate  # z of pose n
+    out.J[0, 8] = rate  # z of pose n + 1
+    return 1, 0  # rows, shared variables
 
 
-def add_rise(n: int, poses: Any, terms: Any, gradient: Any, A: Any) -> float:
-    """Add the vertical velocity from pose n to n + 1 (M31)."""
-    w = terms.W_rise[n]
-    rate = 1 / (terms.times[n + 1] - terms.times[n])
-    r = rate * (poses[n + 1, 2] - poses[n, 2])
-    gradient[6 * n + 2] -= w * rate * r
-    gradient[6 * n + 8] += w * rate * r
-    if is_wanted(A):
-        A.links[n, 2, 2] += w * rate**2
-        A.links[n, 2, 8] -= w * rate**2
-        A.links[n + 1, 2, 2] += w * rate**2
-    return float(0.5 * w * r**2)
+@kernel
+def rise_weight(n, r, window, constants, w):
+    """Write the weight of the vertical velocity (M31)."""
+    w[0] = 1 / window.of_class.rise**2
+
+
+ROW = Residual(rise, rise_weight, poses=2, is_robust=False, name='rise')

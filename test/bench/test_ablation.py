@@ -29,15 +29,17 @@ def drive(scene):
 
 @pytest.fixture(scope='module')
 def whole(drive):
-    return without(INGREDIENTS[WHOLE], drive)
+    return without({}, drive)
 
 
 @pytest.mark.parametrize('name', NAMES)
 def test_switching_off_an_ingredient_changes_boxes(drive, whole, name):
     if name == 'marginalisation':  # nothing leaves the window of a whole track
-        whole, found = (without(INGREDIENTS[key], drive, 'early') for key in (WHOLE, name))
+        whole, found = (
+            without(INGREDIENTS[key].settings, drive, 'early') for key in (WHOLE, name)
+        )
     else:
-        found = without(INGREDIENTS[name], drive)
+        found = without(INGREDIENTS[name].settings, drive)
     assert found.track_ids == whole.track_ids
     assert np.isfinite(found.boxes).all()
     assert np.abs(found.boxes - whole.boxes).max() > 1e-3
@@ -45,8 +47,8 @@ def test_switching_off_an_ingredient_changes_boxes(drive, whole, name):
 
 def test_ingredients_are_switched_by_their_run_alone(drive, whole):
     # The core is unchanged: a run with all of them after a run without one is as before.
-    without(INGREDIENTS['point ownership'], drive)
-    again = without(INGREDIENTS[WHOLE], drive)
+    without(INGREDIENTS['point ownership'].settings, drive)
+    again = without({}, drive)
     np.testing.assert_array_equal(again.boxes, whole.boxes)
 
 
@@ -70,16 +72,24 @@ def test_losses_are_printed(tmp_path, scene, capsys):
     folders = [str(tmp_path / name) for name in ('a', 'b')]
     assert cli.main(['bench', 'ablation', *folders, *options]) == 0
     text = capsys.readouterr().out
-    assert text.count('\none extent ') == 3  # both recordings, and their mean
-    assert 'mean of 2 recordings' in text
+    assert text.count('\none extent ') == 6  # both recordings and their mean, of two estimates
+    assert 'mean of 2 recordings, track' in text
     assert cli.main(['bench', 'ablation', folders[0], *options, '--json']) == 0
-    (rows,) = json.loads(capsys.readouterr().out)['results'].values()
-    assert set(rows) == {WHOLE, 'one extent'}
-    assert 0.5 < rows[WHOLE]['iou_3d'] < 1
+    (found,) = json.loads(capsys.readouterr().out)['results'].values()
+    assert set(found) == {'final', 'track'}
+    for rows in found.values():
+        assert set(rows) == {WHOLE, 'one extent'}
+        assert 0.5 < rows[WHOLE]['iou_3d'] < 1
+
+
+def test_ingredients_are_left_out_one_after_the_other():
+    settings = [INGREDIENTS[name].settings for name in ('rigid shape', 'road', 'slip and pivot')]
+    known = {'ingredients.without': ('rigid shape', 'slip'), 'ingredients.road': False}
+    assert bench_ablation.merged(settings) == known
 
 
 def test_estimates_differ(drive, whole):
-    newest, final = (without(INGREDIENTS[WHOLE], drive, name) for name in ('early', 'final'))
+    newest, final = (without({}, drive, name) for name in ('early', 'final'))
     for one, other in ((newest, final), (final, whole), (newest, whole)):
         assert len(one.boxes) == len(other.boxes)
         assert np.abs(one.boxes - other.boxes).max() > 1e-3

@@ -2,11 +2,12 @@
 
 from boxreg_ros.config import PaperConfig
 from boxreg_ros.core import paper
-from boxreg_ros.core.paper import EPSILON
+from boxreg_ros.core.paper import EPSILON, Observed
 from boxreg_ros.structures import POSE
 import numpy as np
 import pytest
-from scenes import boxes_at, problem_of, random_problem, returns_of
+from scenes import boxes_at as numpy_boxes
+from scenes import problem_of, random_problem
 import torch
 
 D = torch.float64
@@ -15,6 +16,10 @@ NIL = EPSILON**0.5  # the norm of a zero vector, with EPSILON inside its root
 
 def tensor(values):
     return torch.tensor(values, dtype=D)
+
+
+def boxes_at(*poses):
+    return torch.from_numpy(numpy_boxes(*poses))
 
 
 def all_valid(boxes):
@@ -163,13 +168,18 @@ def poses_of(boxes):
     return boxes[..., POSE].clone().requires_grad_()
 
 
+def seen_of(problem):
+    """Return boxes and `Observed` of a problem."""
+    return torch.from_numpy(problem.boxes), Observed.of(problem)
+
+
 def with_poses(boxes, pose):
     return torch.cat([pose[..., :3], boxes[..., 3:6], pose[..., 3:]], -1)
 
 
 PAPER = {
-    'closeness': lambda b, p: paper.closeness(b, p.points, p.mask, 5),
-    'enclosure': lambda b, p: paper.enclosure(b, p.points, p.mask),
+    'closeness': lambda b, p: paper.closeness(b, *p[:2], 5),
+    'enclosure': lambda b, p: paper.enclosure(b, *p[:2]),
     'smoothness': lambda b, p: paper.smoothness(b, p.valid),
     'alignment': lambda b, p: paper.alignment(b, p.valid),
     'total': lambda b, p: paper.total(b, p, PaperConfig(nearest=5), MULTIPLIERS, EPSILON)[0],
@@ -180,10 +190,9 @@ each_term = pytest.mark.parametrize('term', PAPER.values(), ids=PAPER)
 
 @each_term
 def test_gradients_of_the_paper(term):
-    problem = random_problem(M=8)
-    pose = poses_of(problem.boxes)
+    boxes, seen = seen_of(random_problem(M=8))
     assert torch.autograd.gradcheck(
-        lambda pose: term(with_poses(problem.boxes, pose), problem), pose, eps=1e-7, atol=1e-5
+        lambda pose: term(with_poses(boxes, pose), seen), poses_of(boxes), eps=1e-7, atol=1e-5
     )
 
 
@@ -194,9 +203,9 @@ def test_gradients_are_finite_at_kinks(term, moving):
     # lie on faces, on edges, at the centre and upon each other.
     boxes = boxes_at(*[(0.5 * i * moving, 0, 0) for i in range(6)])
     points = tensor([[2, 1, 1], [2, 0, 0], [0, 0, 0], [0, 0, 0]]).expand(1, 6, 4, 3)
-    problem = problem_of(boxes, points=points)
+    seen = seen_of(problem_of(boxes, points=points.numpy()))[1]
     pose = poses_of(boxes)
-    value = term(with_poses(boxes, pose), problem)
+    value = term(with_poses(boxes, pose), seen)
     value.sum().backward()
     assert value.isfinite().all()
     assert pose.grad.isfinite().all()
@@ -205,11 +214,11 @@ def test_gradients_are_finite_at_kinks(term, moving):
 @each_term
 def test_padding_alone_has_value_and_gradient_zero(term):
     problem = random_problem()
-    nothing = problem._replace(
-        counts=torch.zeros_like(problem.counts), valid=torch.zeros_like(problem.valid)
+    boxes, nothing = seen_of(
+        problem._replace(counts=0 * problem.counts, lengths=0 * problem.lengths)
     )
-    pose = poses_of(problem.boxes)
-    value = term(with_poses(problem.boxes, pose), nothing)
+    pose = poses_of(boxes)
+    value = term(with_poses(boxes, pose), nothing)
     value.sum().backward()
     np.testing.assert_array_equal(value.detach(), 0)
     np.testing.assert_array_equal(pose.grad, 0)
@@ -218,39 +227,37 @@ def test_padding_alone_has_value_and_gradient_zero(term):
 @each_term
 def test_padding_order_and_batch_do_not_matter(term):
     problem = random_problem()
-    known = term(problem.boxes, problem)
+    boxes, seen = seen_of(problem)
+    known = term(boxes, seen)
     # Other order of points.
-    order = torch.from_numpy(np.random.default_rng(1).permutation(problem.points.shape[2]))
-    points, mask = problem.points[:, :, order], problem.mask[:, :, order]
-    other = problem._replace(**returns_of(points, mask))
-    boxes = torch.where(problem.valid[..., None], problem.boxes, 77.0)
-    np.testing.assert_allclose(term(problem.boxes, other), known, rtol=1e-12)
-    if term is not PAPER['total']:  # whose points are relative to the boxes
-        np.testing.assert_allclose(term(boxes, other), known, rtol=1e-12)
+    order = torch.from_numpy(np.random.default_rng(1).permutation(seen.points.shape[2]))
+    other = Observed(seen.points[:, :, order], seen.mask[:, :, order], seen.valid)
+    np.testing.assert_allclose(term(boxes, other), known, rtol=1e-12)
+    padded = torch.where(seen.valid[..., None], boxes, 77.0)
+    np.testing.assert_allclose(term(padded, other), known, rtol=1e-12)
 
 
 @pytest.mark.parametrize('name', ['closeness', 'enclosure'])
 def test_duplicates_do_not_matter(name):
     # Every point three times, and three times the K: the same means.
-    problem = random_problem()
+    boxes, seen = seen_of(random_problem())
     term = getattr(paper, name)
     more = [5] if name == 'closeness' else []
-    known = term(problem.boxes, problem.points, problem.mask, *more)
-    points, mask = problem.points.repeat(1, 1, 3, 1), problem.mask.repeat(1, 1, 3)
-    found = term(problem.boxes, points, mask, *[3 * k for k in more])
+    known = term(boxes, *seen[:2], *more)
+    points, mask = seen.points.repeat(1, 1, 3, 1), seen.mask.repeat(1, 1, 3)
+    found = term(boxes, points, mask, *[3 * k for k in more])
     np.testing.assert_allclose(found, known, rtol=1e-12)
 
 
 def test_total_is_the_weighted_sum_with_multipliers():
     # Eq. 8 with c the two constraints: closeness and enclosure weighted, m c + w c^2 / 2.
-    problem = random_problem()
+    boxes, seen = seen_of(random_problem())
     weights = PaperConfig(closeness=2.0, enclosure=3.0, smoothness=0.5, alignment=0.7, nearest=5)
-    boxes = problem.boxes + 0.1
-    points = problem.points + problem.boxes[..., None, :3]
-    loss, violation = paper.total(boxes, problem, weights, MULTIPLIERS, EPSILON)
-    c = [paper.smoothness(boxes, problem.valid), paper.alignment(boxes, problem.valid)]
-    known = 2 * paper.closeness(boxes, points, problem.mask, 5)
-    known += 3 * paper.enclosure(boxes, points, problem.mask)
+    boxes = boxes + 0.1
+    loss, violation = paper.total(boxes, seen, weights, MULTIPLIERS, EPSILON)
+    c = [paper.smoothness(boxes, seen.valid), paper.alignment(boxes, seen.valid)]
+    known = 2 * paper.closeness(boxes, *seen[:2], 5)
+    known += 3 * paper.enclosure(boxes, *seen[:2])
     known += MULTIPLIERS[:, 0] * c[0] + 0.5 * c[0] ** 2 / 2
     known += MULTIPLIERS[:, 1] * c[1] + 0.7 * c[1] ** 2 / 2
     np.testing.assert_allclose(loss, known)

@@ -48,7 +48,7 @@ def test_points_belong_to_the_box_at_their_own_time():
     assert found.track.tolist() == [0, BACKGROUND, BACKGROUND, 0]
     assert found.motion.tolist() == [MOVING, UNKNOWN_MOTION, UNKNOWN_MOTION, MOVING]
     np.testing.assert_allclose(found.local[:, 0], [1.9, -1.5], atol=1e-6)
-    np.testing.assert_allclose(found.at_stamp[:, 0], [11.9, 8.5], atol=1e-6)
+    np.testing.assert_allclose(found.at_stamp()[:, 0], [11.9, 8.5], atol=1e-6)
     assert found.is_dynamic.tolist() == [True, False, False, True]
 
 
@@ -95,6 +95,15 @@ def test_motion_of_an_object(speeds, motion):
     track = track_of(np.column_stack([x, 0 * x]), stamps=stamps)
     first = [[x[0], 0, 1]]
     assert labelled([track], first, stamps[0], arrays=stamps).motion.tolist() == [motion]
+
+
+def test_an_estimate_that_jumps_does_not_move():
+    stamps = START + np.arange(41) * SECOND // 10
+    x = np.where(np.arange(41) < 18, 0.0, -0.6) + 0.02 * np.sin(np.arange(41))
+    x[18:22] = [-0.12, -0.24, -0.36, -0.48]  # as the boxes of a parked car that is seen anew
+    track = track_of(np.column_stack([x, 0 * x]), stamps=stamps)
+    found = [labelled([track], [[0, 0, 1]], stamp, arrays=stamps).motion[0] for stamp in stamps]
+    assert set(found) == {PARKED}
 
 
 def test_what_cannot_be_known_is_unknown():

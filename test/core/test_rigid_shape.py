@@ -1,13 +1,14 @@
 """One rigid shape per track: steps known by hand, and its effect on relative poses."""
 
 from boxreg_ros import Config, refine
-from boxreg_ros.core.batch import State
-from boxreg_ros.core.rigid_shape import agreement
+from boxreg_ros.core.method.arrays import BOX_POSE
+from boxreg_ros.core.method.constants import CONSTANTS
+from boxreg_ros.core.method.residuals import TERMS
+from boxreg_ros.core.method.rigid_shape import agree, empty_shape_work
 from boxreg_ros.simulation.simulate import simulate
 import numpy as np
 import pytest
-from scenes import problem_of, returns_of, shared_of
-import torch
+from scenes import problem_of
 
 BOX = [0.0, 0, 0, 4.0, 2.0, 2.0, 0, 0, 0]
 
@@ -27,14 +28,30 @@ def problem(poses, seed=0):
     boxes = np.tile(BOX, (len(poses), 1))
     boxes[:, :3], boxes[:, 6:] = np.array(poses)[:, :3], np.array(poses)[:, 3:]
     points = [corner(rng) - box[:3] for box in boxes]
-    class_numbers = {'shape': torch.tensor([0.03], dtype=torch.float64)}
-    return problem_of(boxes[None], points=np.array([points]), class_numbers=class_numbers)
+    return problem_of(boxes[None], points=np.array([points]), of_class={'roughness': 0.03})
+
+
+def agreement(seen, poses=None, b=0):
+    """Return information (N, 6, 6) and wanted steps (N, 6) of window `b`."""
+    poses = seen.boxes[b][:, BOX_POSE] if poses is None else poses
+    terms, record = np.zeros(len(poses), TERMS), CONSTANTS.record()
+    work = empty_shape_work(0, len(seen.boxes), seen, len(poses), record['cells'])
+    agree(b, seen, poses, np.array(BOX[3:6]), record, work, terms)
+    return terms['root'] @ terms['root'].swapaxes(1, 2), terms['wanted']
+
+
+def with_points(seen, is_kept):
+    """Return a window with some points (P,) of its observations alone."""
+    owner = np.repeat(np.arange(seen.counts.size), seen.counts.ravel())
+    counts = np.bincount(owner[is_kept], minlength=seen.counts.size).reshape(seen.counts.shape)
+    return seen._replace(
+        points=seen.points[is_kept], delays=seen.delays[is_kept], counts=counts,
+        first=counts.ravel().cumsum().reshape(counts.shape) - counts,
+    )  # fmt: skip
 
 
 def look(poses):
-    seen = problem(poses)
-    found = agreement(seen, State(seen.pose, shared_of(EXTENT=BOX[3:6])))
-    return [part[0].numpy() for part in found]
+    return agreement(problem(poses))
 
 
 def test_an_outlying_pose_is_moved_back():
@@ -59,10 +76,8 @@ def test_a_common_step_is_not_observable():
 
 def test_too_few_points_give_no_information():
     seen = problem(np.zeros((3, 6)))
-    mask = seen.mask
-    mask[..., 2:] = False
-    seen = seen._replace(**returns_of(seen.points, mask))
-    information, wanted = agreement(seen, State(seen.pose, shared_of(EXTENT=BOX[3:6])))
+    is_first = np.tile(np.arange(600) < 2, 3)
+    information, wanted = agreement(with_points(seen, is_first))
     np.testing.assert_array_equal(information, 0)
     np.testing.assert_array_equal(wanted, 0)
 
@@ -70,12 +85,10 @@ def test_too_few_points_give_no_information():
 def test_a_plane_gives_no_information_along_it():
     # Only the front is visible: steps to the left or up, and a roll about x, do not change it.
     seen = problem(np.zeros((5, 6)))
-    mask = seen.mask & (seen.points[..., 0] >= 1.99)
-    seen = seen._replace(**returns_of(seen.points, mask))
-    information, _ = agreement(seen, State(seen.pose, shared_of(EXTENT=BOX[3:6])))
-    pinned = information[0].diagonal(dim1=-2, dim2=-1)
+    information, _ = agreement(with_points(seen, seen.points[:, 0] >= 1.99))
+    pinned = information.diagonal(axis1=1, axis2=2)
     assert (pinned[:, [0, 4, 5]] > 100).all()
-    np.testing.assert_allclose(pinned[:, [1, 2, 3]], 0, atol=1e-6 * float(pinned.max()))
+    np.testing.assert_allclose(pinned[:, [1, 2, 3]], 0, atol=1e-6 * pinned.max())
 
 
 @pytest.mark.parametrize('seed', range(2))
@@ -90,7 +103,8 @@ def test_rigid_shape_improves_relative_poses(seed):
         return (refined.boxes - scene.truth.boxes)[:, :3].std(0).max()
 
     config = Config()
-    assert spread(config) < 0.75 * spread(config.updated({'vehicle.shape': 1.0}))
+    without = config.updated({'ingredients.without': ('rigid shape',)})
+    assert spread(config) < 0.75 * spread(without)
 
 
 def test_non_finite_values_do_not_affect_other_windows():
@@ -99,15 +113,12 @@ def test_non_finite_values_do_not_affect_other_windows():
     seen = problem_of(
         np.tile(BOX, (2, 6, 1)) + np.pad(poses[..., :3], ((0, 0), (0, 0), (0, 6))),
         points=np.tile(corner(np.random.default_rng(0)), (2, 6, 1, 1)) - poses[..., None, :3],
-        class_numbers={'shape': torch.tensor([0.03, 0.03], dtype=torch.float64)},
+        of_class={'roughness': 0.03},
     )
-    shared = shared_of(EXTENT=BOX[3:6]).expand(2, -1).clone()
-    expected = agreement(seen, State(seen.pose, shared))
-    broken = seen.pose.clone()
-    broken[1] = torch.nan
-    shared[1] = torch.nan
-    seen.points[1, 0, 0] = torch.inf
-    for part, whole in zip(agreement(seen, State(broken, shared)), expected, strict=True):
-        assert whole[0].abs().max() > 0.01
-        np.testing.assert_array_equal(part[0], whole[0])
-        np.testing.assert_array_equal(part[1], 0)
+    known = agreement(seen)
+    seen.points[seen.first[1, 0]] = np.inf
+    _, wanted = agreement(seen, np.full((6, 6), np.nan), b=1)
+    np.testing.assert_array_equal(wanted, 0)
+    for part, whole in zip(agreement(seen), known, strict=True):
+        assert np.abs(whole).max() > 0.01
+        np.testing.assert_array_equal(part, whole)

@@ -86,6 +86,21 @@ def test_ids_of_objects_that_disappear_and_return():
     assert tracker.count == 8
 
 
+def test_late_boxes_change_no_track():
+    trackers = Tracker(max_gap=1.0), Tracker(max_gap=1.0)
+    for k in range(8):
+        for tracker in trackers:
+            tracker.identify(array_of(START + k * SECOND // 10, (k, 0, CAR)))
+    late = array_of(START + SECOND // 2, (5.6, 0.5, CAR))
+    assert trackers[0].identify(late).track_ids == ('1',)
+    after = START + 7 * SECOND // 10 + SECOND  # max_gap later, and no more
+    places = [tracker._tracks[0].predicted(after) for tracker in trackers]
+    for one, other in zip(*places, strict=True):
+        np.testing.assert_array_equal(one, other)
+    for tracker in trackers:
+        assert tracker.identify(array_of(after, (17, 0, CAR))).track_ids == ('1',)
+
+
 def test_neighbours_are_not_swapped_when_one_is_missing():
     """Four cars are parked 2.4 m apart; one is not detected at four stamps."""
     tracker = Tracker(max_gap=1.0)

@@ -88,6 +88,15 @@ def test_a_lidar_that_is_a_second_late_is_counted_and_left_out():
     assert reasons.count('cloud_late') >= 29
 
 
+def test_a_second_cloud_of_the_last_stamp_is_late():
+    reports = []
+    merger = SweepMerger(('a', 'b'), 0.1, lambda *args: reports.append(args[0]))
+    (merged_sweep,) = [*merger.add(cloud('a', 1000)), *merger.add(cloud('b', 1000))]
+    assert len(merged_sweep.sweep.points) == 4
+    assert merger.add(cloud('b', 1000)) == [] == merger.flush()
+    assert reports == ['cloud_late']
+
+
 def test_a_missing_cloud_delays_its_sweep_by_one_period():
     merger = SweepMerger(NAMES, 0.1, ignore)
     for topic, stamp in periods(3, {'a': 0, 'b': 10, 'c': 20}, skip={('b', 1)}):

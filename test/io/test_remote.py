@@ -204,6 +204,22 @@ def test_bytes_that_a_server_does_not_send_are_no_damage(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_file_that_is_replaced_while_it_is_read_is_no_damage(tmp_path, whole, capsys):
+    out = tmp_path / 'out'
+    data = whole.read_bytes()
+
+    def fault_of(first, _):
+        if 0 < first < len(data) // 2:  # behind the index, which is read first
+            whole.write_bytes(data[::-1] + b'longer')
+
+    with http_server(tmp_path) as (server, url):
+        server.fault_of = fault_of
+        assert main(['relabel', f'{url}/whole.mcap', '-o', str(out), *QUICK]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'expected the file as it was at the start, got another version' in line
+    assert not out.exists()
+
+
 @pytest.mark.parametrize('has_ranges', [True, False])
 def test_a_copy_of_a_file_is_whole(tmp_path, large, has_ranges, impatient):
     """A file that is copied first, from servers with and without ranges."""

@@ -145,8 +145,9 @@ def test_a_late_item_can_be_released_without_another(jumps):
     assert jumps.release() == []
 
 
-def test_stamps_less_than_a_second_old_are_not_held(jumps):
+def test_stamps_more_than_a_second_old_are_held(jumps):
     assert jumps.add('item', boxes_at(99.1)) == (['item'], False)
+    assert jumps.add('item', boxes_at(98.9)) == ([], False)
 
 
 def test_an_array_without_boxes_stamp_and_frame_is_a_placeholder():

@@ -47,6 +47,7 @@ FIRST_MARKER = 8  # bytes before the first marker: the header and the length of 
 COMPLETION_TIME = 60.0  # for the last segment of recorded labels [s]
 RECORDING_TURNS = 2  # runs without and with recording
 SETTLED_AFTER = 60.0  # queues, pools of memory and the heap have their size by then [s]
+LAST_TIME = 30.0  # wait for the last messages, on a busy machine [s]
 SAMPLE_PERIOD = 1.0  # of memory, handles, threads and CPU time of the node [s]
 
 
@@ -164,6 +165,7 @@ def publish(args: argparse.Namespace) -> None:
     """Publish in real time; log stamp and time of publishing of every box array [ns]."""
     from nav_msgs.msg import Odometry
     import rclpy
+    from rclpy.duration import Duration
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import PointCloud2
@@ -177,7 +179,9 @@ def publish(args: argparse.Namespace) -> None:
     node = rclpy.create_node('bench_publisher')
     best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
     to_points = node.create_publisher(PointCloud2, 'points', best_effort)
-    to_boxes = node.create_publisher(MarkerArray, 'boxes', 10)
+    turns = round(args.seconds * args.rate)
+    # All are kept until they are received: a busy node is late, and misses none.
+    to_boxes = node.create_publisher(MarkerArray, 'boxes', turns)
     to_odom = node.create_publisher(Odometry, 'odom', 50)
     while not all(p.get_subscription_count() for p in (to_points, to_boxes, to_odom)):
         time.sleep(0.1)
@@ -186,7 +190,7 @@ def publish(args: argparse.Namespace) -> None:
     period_ns = 1e9 / args.rate
     begin_ns = time.time_ns()
     with args.log.open('w') as log:
-        for turn in range(round(args.seconds * args.rate)):
+        for turn in range(turns):
             stamp_ns = begin_ns + round(turn * period_ns)
             _sleep_until(stamp_ns)
             stamp = divmod(stamp_ns, 10**9)
@@ -202,7 +206,7 @@ def publish(args: argparse.Namespace) -> None:
             moment_ns = time.monotonic_ns()
             to_boxes.publish(message)
             log.write(f'{stamp_ns} {moment_ns}\n')
-    time.sleep(1.0)  # the last messages are still under way
+    to_boxes.wait_for_all_acked(Duration(seconds=LAST_TIME))
     node.destroy_node()
     rclpy.shutdown()
 
@@ -314,6 +318,7 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
             raise BoxregError(f'the publisher failed: {(folder / "sent.log").read_text()}')
         samples = samples or [vitals(node.pid)]
         sent = np.loadtxt(folder / 'sent', dtype=np.int64, ndmin=2)
+        _await_last(sent, arrivals)
         shutdown_time = _ended(node)
         log = (folder / 'node.log').read_text()
         recorded = recording(labels, args.record, sent) if args.record else {}
@@ -330,6 +335,16 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
         'counters': arrivals['counters'],
         **({'messages': _by_sweep(sent, arrivals, args.rate)} if keeps_messages else {}),
     }
+
+
+def _await_last(sent: Any, arrivals: dict[str, Any]) -> None:
+    """Wait until the last box array has arrived and is counted, but no longer than `LAST_TIME`."""
+    deadline = time.monotonic() + LAST_TIME
+    last_ns = int(sent[-1, 0])
+    while time.monotonic() < deadline and not (
+        last_ns in arrivals['early'] and arrivals['counters'].get('boxes_received') == len(sent)
+    ):
+        time.sleep(0.1)
 
 
 def _ended(node: subprocess.Popen[bytes]) -> float:

@@ -1,10 +1,8 @@
 """
 `measure sensitivity`: loss of accuracy when a setting or a constant is halved or doubled.
 
-Settings are the numbers of `Config`. Constants are the numbers that the modules of the core assign
-as ``NAME = number`` or ``NAME = number, number``. Both are discovered, so a new one is measured
-without an entry here. To change a constant the packages are imported again from a source in which
-this one number is replaced; everything derived from it follows.
+Settings are the numbers of `Config`, constants those of `boxreg_ros.core.method.constants`. Both
+are discovered, so a new one is measured without an entry here.
 
 A number without effect on any data set should be removed, one that must be exact should be
 estimated from the data.
@@ -14,21 +12,14 @@ estimated from the data.
 from __future__ import annotations
 
 import argparse
-import ast
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from fnmatch import fnmatch
 from functools import partial
-from importlib import import_module
-from importlib.machinery import ModuleSpec, SourceFileLoader
-from importlib.util import find_spec
 from multiprocessing import get_context
-from pathlib import Path
-import re
-import sys
 from typing import Any
 
 from boxreg_ros.bench.common import (
@@ -40,6 +31,7 @@ from boxreg_ros.bench.common import (
     progress_bar,
 )
 from boxreg_ros.config import Config, KINDS, Setting
+from boxreg_ros.core.method import constants
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.offline.box_scores import match, summarise
 from boxreg_ros.offline.drive import Drive
@@ -49,14 +41,14 @@ import numpy as np
 import torch
 
 FACTORS = (0.5, 2.0)
-CORE = 'boxreg_ros.core'
-PACKAGE = 'boxreg_ros'
-CONSTANT_NAME = re.compile(r'_?[A-Z][A-Z0-9_]*')
 PAPER = 'paper'
 """The objective of the paper, and the group of settings that it alone reads."""
 
-SourcePlace = tuple[str, int, int]
-"""Place of a number in a source: module, line and column."""
+UNLIKE = Config().updated(
+    {f'faces.{name}': 1.0 for name in ('outermost', 'ends', 'sides', 'top', 'bottom', 'outlier')}
+    | {f'ingredients.{name}': False for name in ('strips', 'robust_motion')}
+)
+"""A configuration that differs from the default one in all that `with_settings` fills."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +59,13 @@ class Variation:
     Attributes
     ----------
     name : str
-        Dotted name of a setting, or ``module.CONSTANT`` of a constant of the core.
+        Dotted name of a setting, or that of a constant.
     factor : float
         Factor that was asked for: one of `FACTORS`.
     default, value : int or float
         The number as it is and as it is for this run, within its bounds.
-    place : SourcePlace, optional
-        Place of a constant; None for settings.
+    place : pair of str and int, optional
+        Field of a constant, and its place in a tuple; None for settings.
 
     """
 
@@ -81,7 +73,7 @@ class Variation:
     factor: float
     default: float
     value: float
-    place: SourcePlace | None = None
+    place: tuple[str, int] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,199 +188,38 @@ def _scaled(value: float, factor: float) -> float:
     return value * factor
 
 
-def variations_of_constants(package: str = CORE) -> list[Variation]:
-    """
-    Return every numeric constant of a package halved and doubled.
-
-    A constant is a number, or one number of a tuple, that a module assigns to an upper-case name.
-    A constant that is computed from others follows them and is not varied itself. A whole number
-    inside an index expression, or from which another constant is computed, describes the layout
-    of arrays and is left out.
-
-    """
-    trees = {name: ast.parse(path.read_text(encoding='utf-8')) for name, path in _sources(package)}
-    layout = set[str]()
-    for tree in trees.values():
-        layout |= _layout_names(tree)
+def variations_of_constants() -> list[Variation]:
+    """Return every number of `Constants` that is no setting, halved and doubled."""
+    known = constants.CONSTANTS
+    of_settings = known.with_settings(UNLIKE)
     found = []
-    for module, tree in trees.items():
-        for names, label, number in _constants(tree):
-            is_layout = isinstance(number.value, int) and not layout.isdisjoint(names)
-            if is_layout:
-                continue
-            name = f'{module.rpartition(".")[2]}.{label}'
-            place = (module, number.lineno, number.col_offset)
-            default = number.value
-            assert isinstance(default, (int, float))
-            for factor in FACTORS:
-                value = _scaled(default, factor)
-                if value != default:
-                    found.append(Variation(name, factor, default, value, place))
-    return found
-
-
-def _sources(package: str) -> Iterator[tuple[str, Path]]:
-    """Yield name and path of every module that lies directly in a package."""
-    spec = find_spec(package)
-    for folder in spec.submodule_search_locations or () if spec else ():
-        for path in sorted(Path(folder).glob('*.py')):
-            if path.stem != '__init__':
-                yield f'{package}.{path.stem}', path
-
-
-def _constants(tree: ast.Module) -> Iterator[tuple[list[str], str, ast.Constant]]:
-    """Yield names, label and number of each constant: ``A = 1``, ``A = 1, 2``, ``A, B = 1, 2``."""
-    for node in tree.body:
-        if isinstance(node, ast.Assign):
-            targets, value = node.targets, node.value
-        elif isinstance(node, ast.AnnAssign) and node.value is not None:
-            targets, value = [node.target], node.value
-        else:
+    for name, default in known._asdict().items():
+        if getattr(of_settings, name) != default:
             continue
-        first = targets[0]
-        if isinstance(first, ast.Tuple) and isinstance(value, ast.Tuple):
-            pairs = [([a], b) for a, b in zip(first.elts, value.elts, strict=False)]
-        else:
-            pairs = [(targets, value)]
-        for aliases, expression in pairs:
-            names = [target.id for target in aliases if isinstance(target, ast.Name)]
-            if not names or not all(CONSTANT_NAME.fullmatch(name) for name in names):
+        numbers = default if isinstance(default, tuple) else (default,)
+        for place, number in enumerate(numbers):
+            if isinstance(number, bool):
                 continue
-            yield from _numbers(names, expression)
-
-
-def _numbers(names: list[str], value: ast.expr) -> Iterator[tuple[list[str], str, ast.Constant]]:
-    """Yield the number that a value is, or those of a tuple of numbers with their positions."""
-    label = ' = '.join(names)
-    if isinstance(value, ast.Tuple):
-        numbers = [_number(element) for element in value.elts]
-        if all(numbers):
-            for i, number in enumerate(numbers):
-                assert number is not None
-                yield names, f'{label}[{i}]', number
-        return
-    number = _number(value)
-    if number is not None:
-        yield names, label, number
-
-
-def _number(node: ast.expr) -> ast.Constant | None:
-    """Return the literal of a number, which may have a sign; None for anything else."""
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd)):
-        node = node.operand
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        return node
-    return None
-
-
-def _layout_names(tree: ast.Module) -> set[str]:
-    """Return upper-case names inside index expressions, or from which constants are computed."""
-    names = set[str]()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Subscript):
-            names |= _upper_names(node.slice)
-    for node in tree.body:
-        if isinstance(node, ast.Assign) and not isinstance(node.value, ast.Call):
-            names |= _upper_names(node.value)
-    return names
-
-
-def _upper_names(node: ast.expr) -> set[str]:
-    """Return upper-case names in an expression, calls in it left out."""
-    if isinstance(node, ast.Call):
-        return set()
-    if isinstance(node, ast.Name):
-        return {node.id} if CONSTANT_NAME.fullmatch(node.id) else set()
-    found = set[str]()
-    for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.expr):
-            found |= _upper_names(child)
+            label = f'{name}[{place}]' if isinstance(default, tuple) else name
+            for factor in FACTORS:
+                value = _scaled(number, factor)
+                if value != number:
+                    found.append(Variation(label, factor, number, value, (name, place)))
     return found
-
-
-# ------------------------------------------------------------------------ changed constants
-
-
-class _ReplaceNumber(ast.NodeTransformer):
-    """Puts a value in the place of the number at a line and a column."""
-
-    def __init__(self, place: SourcePlace, value: float) -> None:
-        self.place = place
-        self.value = value
-
-    def visit_Constant(self, node: ast.Constant) -> ast.Constant:
-        if (node.lineno, node.col_offset) == self.place[1:]:
-            return ast.copy_location(ast.Constant(self.value), node)
-        return node
-
-
-class _Loader(SourceFileLoader):
-    """Loads one module from its source with one number replaced."""
-
-    def __init__(self, name: str, path: str, place: SourcePlace, value: float) -> None:
-        super().__init__(name, path)
-        self.change = _ReplaceNumber(place, value)
-
-    def get_code(self, fullname: str) -> Any:
-        """Return the code of the changed source; stored byte code is not used."""
-        tree = ast.parse(Path(self.path).read_text(encoding='utf-8'))
-        changed = ast.fix_missing_locations(self.change.visit(tree))
-        return compile(changed, self.path, 'exec')
-
-
-class _Finder:
-    """Finds the one module of which a number is to be replaced."""
-
-    def __init__(self, place: SourcePlace, value: float) -> None:
-        self.place = place
-        self.value = value
-
-    def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        """Return how to load the module, None for all others."""
-        if name != self.place[0]:
-            return None
-        sys.meta_path.remove(self)
-        spec = find_spec(name)
-        sys.meta_path.insert(0, self)
-        if spec is not None and spec.origin is not None:
-            spec.loader = _Loader(name, spec.origin, self.place, self.value)
-        return spec
 
 
 @contextmanager
-def changed_constant(place: SourcePlace, value: float) -> Iterator[None]:
-    """
-    Import the packages of `boxreg_ros` again, with one number replaced, while a context lasts.
-
-    Modules imported before keep what they have and are back in `sys.modules` afterwards. The
-    modules in `boxreg_ros` itself (`structures`, `config`, ...) stay, so that their types do.
-    Nothing else may import modules of the package in other threads meanwhile.
-
-    """
-    package = import_module(PACKAGE)
-    before = {name: module for name, module in sys.modules.items() if _is_renewed(name)}
-    attributes = {name: value for name, value in vars(package).items() if name[:2] != '__'}
-    finder = _Finder(place, value)
-    for name in before:
-        del sys.modules[name]
-    sys.meta_path.insert(0, finder)
+def changed_constant(place: tuple[str, int], value: float) -> Iterator[None]:
+    """Replace one number of `Constants`, or one number of a tuple among them, for a context."""
+    before = constants.CONSTANTS
+    name, i = place
+    default = getattr(before, name)
+    changed = (*default[:i], value, *default[i + 1 :]) if isinstance(default, tuple) else value
+    constants.CONSTANTS = before._replace(**{name: changed})
     try:
         yield
     finally:
-        sys.meta_path.remove(finder)
-        for name in [name for name in sys.modules if _is_renewed(name)]:
-            del sys.modules[name]
-        sys.modules.update(before)
-        vars(package).update(attributes)
-
-
-def _is_renewed(name: str) -> bool:
-    """Return whether a module is in a package of `boxreg_ros`, other than this one."""
-    top, *inner = name.split('.')
-    if top != PACKAGE or not inner or inner[0] == 'bench':
-        return False
-    module = sys.modules[name]
-    return len(inner) > 1 or hasattr(module, '__path__')
+        constants.CONSTANTS = before
 
 
 # ----------------------------------------------------------------------------------- runs
@@ -418,10 +249,7 @@ def measure(drive: Drive, measurement: Measurement, variation: Variation | None)
             predicted = drive.registered(config)[estimate]
         else:
             with changed_constant(variation.place, variation.value):
-                # The class that the changed core is imported by, with the same content.
-                changed: Any = import_module(Drive.__module__).Drive
-                content = {item.name: getattr(drive, item.name) for item in fields(drive)}
-                predicted = changed(**content).registered(config)[estimate]
+                predicted = drive.registered(config)[estimate]
         scope = (measurement.min_points, measurement.classes)
         scores = summarise(match(predicted, drive.truth, *scope))
     except Exception as error:  # a number out of its range may fail anywhere in the core
@@ -506,7 +334,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--only', nargs='+', default=['*'], metavar='PATTERN',
-        help="only settings and constants of these names, as in 'faces.*' or 'lbfgs.*'",
+        help="only settings and constants of these names, as in 'faces.*' or 'parked_*'",
     )  # fmt: skip
     parser.add_argument(
         '--workers', type=int, default=2, metavar='N', help='runs at a time (default: 2)'

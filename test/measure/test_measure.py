@@ -38,13 +38,16 @@ def test_every_measurement_declares_options(name):
 
 def test_a_stored_measurement_is_renewed_by_its_command(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(renew, 'STORE', tmp_path)
-    stored = tmp_path / 'highway.json'
-    before = {'command': 'python test/measure highway --seeds=1 --sweeps=6 --json', 'results': {}}
-    stored.write_text(json.dumps(before), encoding='utf-8')
-    assert measure.main(['renew', str(tmp_path), '--only', 'highway*']) == 0
+    stored = tmp_path / 'street.json'
+    command = 'boxreg inspect bags/street.mcap --json'
+    stored.write_text(json.dumps({'command': command}), encoding='utf-8')
+    assert measure.main(['renew', str(tmp_path), '--only', 'str*']) == 0
     document = json.loads(stored.read_text(encoding='utf-8'))
-    assert document['command'] == before['command']
-    assert list(document['results']) == ['stamp', 'sight']
+    assert document['command'] == command
+    assert document['fixed_frame'] == 'odom'
+    assert renew.resolved('python test/measure tracks street')[1:] == [
+        measure.MEASURE[1], 'tracks', 'street',
+    ]  # fmt: skip
     failing = json.dumps({'command': 'boxreg bench real absent --json'})
     stored.write_text(failing, encoding='utf-8')
     assert measure.main(['renew', str(tmp_path)]) == 1

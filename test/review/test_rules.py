@@ -78,6 +78,38 @@ def test_each_rule_finds_its_fault_at_its_stamp(name):
     assert RULES[name].rule_id == name
 
 
+def timed(seconds, rows, column, value):
+    """Return the car with other times between its boxes [s], and with some values changed."""
+    found = changed(rows, column, value)
+    stamps = np.round(np.arange(N) * seconds * 1e9).astype(np.int64)
+    found.boxes[:, 0] = stamps * 1e-8
+    return LabelTrack.of('1', 'car', Config(), stamps, found.boxes, found.num_points)
+
+
+def pointed(numbers, n=N):
+    """Return the car with numbers of points, beside one that goes on to the end."""
+    found = track('b', y=9.0, n=n)
+    found.num_points[-len(numbers) :] = numbers
+    return [track('a'), found]
+
+
+@pytest.mark.parametrize(
+    ('name', 'below', 'beyond'),
+    [
+        ('jump', [timed(0.1, 8, 1, 0.24)], [timed(0.1, 8, 1, 0.26)]),  # 0.5 m off
+        ('jump', [timed(0.5, 8, 1, 3.6)], [timed(0.5, 8, 1, 3.9)]),  # 30 m/s^2
+        ('jump', [timed(2.0, 8, 1, 300.0)], [timed(0.9, 8, 1, 300.0)]),  # of steps up to 1 s
+        ('spin', [timed(0.1, 9, 8, 0.19)], [timed(0.1, 9, 8, 0.21)]),  # 2 rad/s
+        ('spin', [timed(0.02, 9, 8, 0.09)], [timed(0.02, 9, 8, 0.11)]),  # 0.1 rad
+        ('few-points', pointed([4] * (N // 2)), pointed([4] * (N // 2 + 1))),
+        ('ends-in-view', pointed([49], n=10), pointed([50], n=10)),
+    ],
+)
+def test_rules_have_limits(name, below, beyond):
+    assert name not in violations(below)
+    assert name in violations(beyond)
+
+
 def test_an_id_that_occurs_twice_at_a_stamp_is_a_duplicate():
     (first,) = violations([twice()])['duplicate']
     assert 'occurs twice' in first.text

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 import json
 import os
 from pathlib import Path
 from typing import Any
 
 from boxreg_ros.bench.common import print_json
-from boxreg_ros.bench.speed import roofline
 from boxreg_ros.bench.speed.recordings import relabel
 from boxreg_ros.bench.speed.reference import compare
 from boxreg_ros.bench.speed.report import beside, draw_scaling, text
@@ -22,10 +20,7 @@ from boxreg_ros.config import Config
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `boxreg bench speed`."""
     parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument(
-        '-o', '--out', type=Path, help='folder for the pictures of the scaling and of the roofline'
-    )
-    parser.add_argument('--device', default='cpu', help="'cpu' or 'cuda'")
+    parser.add_argument('-o', '--out', type=Path, help='folder for the picture of the scaling')
     parser.add_argument('--quick', action='store_true', help='fewer and smaller cases')
     parser.add_argument(
         '--references', type=int, default=24, metavar='N',
@@ -43,7 +38,6 @@ def run(args: argparse.Namespace) -> int:
     if args.out:
         args.out.mkdir(parents=True, exist_ok=True)
         report['plot'] = str(draw_scaling(report['scaling'], args.out / 'speed.png'))
-        report['roofline plot'] = str(roofline.draw(report['roofline'], args.out / 'roofline.png'))
     if args.json:
         print_json(report)
         return 0
@@ -56,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """Return the report, with the load of the machine when it began."""
-    config = replace(Config(estimate='final'), device=args.device)
+    config = Config(estimate='final')
     count, tracks, points = (8, 8, 20_000) if args.quick else (64, 64, 130_000)
     sizes, most_windows, most_tracks = [8, 64, 512], 512, 2048
     if args.quick:
@@ -64,7 +58,6 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     load = os.getloadavg()[0]
     first = tick(config, tracks, points)  # its first tick is that of the process
     return {
-        'device': args.device,
         'load': load,
         'windows': count,
         'most windows': most_windows,
@@ -75,6 +68,5 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         'solver': compare(config, count, 2 if args.quick else args.references),
         'scaling': scaling(config, args.quick),
         'cores': cores(config, most_windows),
-        'roofline': roofline.roofline(config, count),
         'relabel': relabel(tracks, points, 3.0 if args.quick else 20.0),
     }

@@ -1,31 +1,27 @@
 """
 The solver beside a plain `torch.optim.LBFGS` fit of one window.
 
-The reference minimises the same terms by automatic differentiation. It is a fair one: variables
+The reference minimises the same sum of residuals, with its gradient. It is a fair one: variables
 are scaled by their expected errors, the line search is strong Wolfe, and it stops by our rule.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from time import perf_counter
+from time import process_time
 
 from boxreg_ros.bench.speed.streams import make_windows, shortest
 from boxreg_ros.config import Config
-from boxreg_ros.core.batch import EXTENT, free_variables, POSE_ERRORS, Problem, Solution, State
-from boxreg_ros.core.expectation import expect, InputEstimates
-from boxreg_ros.core.face_support import observe_faces
 from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.method import round as method
+from boxreg_ros.core.method.arrays import BIAS, EXTENT, Solution
+from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.core.problem import Problem, stack_windows
 from boxreg_ros.core.refine import refine, Track
-from boxreg_ros.core.rounds import SETTLED_STEP
-from boxreg_ros.core.solver import solve
-from boxreg_ros.core.terms import Term
+from boxreg_ros.core.solver import Batch, Objective, solve, SolverPlan, start
 from boxreg_ros.core.track_window import Window
-from boxreg_ros.core.weights import weigh
-from boxreg_ros.core.window import stack_windows
 from boxreg_ros.structures import BOX_EXTENT, Floats, POSE
 import numpy as np
 import torch
@@ -53,12 +49,12 @@ def compare(config: Config, count: int, references: int) -> dict[str, float]:
 
     """
     windows, truth = make_windows(count, config.window, 128, config)
-    problem, base = stack_windows(windows, config)
+    problem, base = stack_windows(windows, config, CONSTANTS.prior_decay)
 
     def cold() -> Solution:
         return solve(problem, config, InputModel(config.faces), is_warm=False)
 
-    warm_problem = _warm(problem, cold().state, config)
+    warm_problem = _warm(problem, cold())
 
     def warm() -> Solution:
         return solve(warm_problem, config, InputModel(config.faces), is_warm=True)
@@ -72,46 +68,88 @@ def compare(config: Config, count: int, references: int) -> dict[str, float]:
         'warm': shortest(warm, config) / count,
     }
     result = {name: 1e3 * seconds for name, seconds in times.items()}
-    single = [stack_windows([window], config)[0] for window in windows[:references]]
+    decay = CONSTANTS.prior_decay
+    single = [stack_windows([window], config, decay)[0] for window in windows[:references]]
     reference_fit(single[0], config)  # imports and allocations of the first call
-    begin = perf_counter()
+    begin = process_time()
     fits = [reference_fit(problem, config) for problem in single]
-    result['reference'] = 1e3 * (perf_counter() - begin) / references
-    ours = [solve(one, config, InputModel(config.faces), is_warm=False).state for one in single]
+    result['reference'] = 1e3 * (process_time() - begin) / references
+    ours = [solve(one, config, InputModel(config.faces), is_warm=False) for one in single]
+    starts = [_Fit(one, config).batch.solution for one in single]
     iou = {}
-    for name, states in (('input', None), ('reference', fits), ('ours', ours)):
-        states = states or [_start(one, config) for one in single]
-        pairs = zip(single, states, strict=True)
-        result[f'value, {name}'] = float(np.mean([_value(p, s, config) for p, s in pairs]))
-        rows = zip(single, states, base, truth, strict=False)
-        iou[name] = np.array(
-            [_iou(p, None if name == 'input' else s, b, t) for p, s, b, t in rows]
-        )
+    for name, found in (('input', starts), ('reference', fits), ('ours', ours)):
+        pairs = zip(single, found, strict=True)
+        values = [_Fit(one, config).value(solution) for one, solution in pairs]
+        result[f'value, {name}'] = float(np.mean(values))
+        rows = zip(single, found, base, truth, strict=False)
+        iou[name] = np.array([_iou(p, s, b, t, name == 'input') for p, s, b, t in rows])
         result[f'IoU, {name}'] = float(iou[name].mean())
     # A window has several minima; in which of them a solver ends is chance.
     result['IoU, error'] = float((iou['ours'] - iou['reference']).std() / np.sqrt(references))
     return result
 
 
-def reference_fit(problem: Problem, config: Config) -> State:
+class _Fit:
+    """One window: the sum of its residuals, and where it starts."""
+
+    def __init__(self, problem: Problem, config: Config) -> None:
+        model = InputModel(config.faces)
+        plan = SolverPlan.choose(config, False, CONSTANTS.coarse_points)
+        constants = CONSTANTS.with_settings(config).in_round(uses_shape=False, is_smooth=False)
+        self.constants = constants.record()
+        self.inputs = model.inputs(config)
+        self.batch: Batch = start(problem, config, plan, self.inputs)
+        self.row = np.zeros(1, np.int64)
+        self.objective = Objective(self.row, self.batch.free, self.batch.sums)
+
+    def linearise(self) -> tuple[Tensor, float]:
+        """Renew the sum where the solution is; return its variables (1, D) and its value."""
+        problem, free, sums, solution = self.batch
+        x, value, gradient = np.empty_like(free), np.empty(1), np.empty_like(free)
+        method.begin(
+            0, 1, self.row, problem, problem, self.inputs, free, self.constants, solution.poses,
+            solution.shared, sums, x, value, gradient,
+        )  # fmt: skip
+        return torch.from_numpy(x), float(value[0])
+
+    def deviations(self) -> Tensor:
+        """Return the expected error of every variable, 0 for those held fixed; (1, D)."""
+        problem, free, sums, _ = self.batch
+        poses = np.tile(problem.of_class['pose'], problem.length)
+        errors = np.concatenate([poses, sums.common['deviation']], axis=1)
+        return torch.from_numpy(free * np.where(errors > 0, errors, 1.0))
+
+    def value(self, solution: Solution) -> float:
+        """Return the value of the sum renewed at a solution."""
+        self.batch.solution.poses[:] = solution.poses
+        self.batch.solution.shared[:] = solution.shared
+        return self.linearise()[1]
+
+
+def reference_fit(problem: Problem, config: Config) -> Solution:
     """Return the fit of one window by `torch.optim.LBFGS`."""
-    state = _start(problem, config)
-    free = free_variables(problem, config)
-    scale = free * _deviations(problem, config)
-    errors = problem.of_class(*POSE_ERRORS)[:, None]
+    fit = _Fit(problem, config)
+    solution = fit.batch.solution
     for _ in range(REFERENCE_ROUNDS):
-        terms = _terms(problem, state, config)
-        found = State.unpack(_minimum(terms, state.pack(), scale, problem.length), problem.length)
-        moved = ((found.pose - state.pose) / errors).square().mean(2).amax()
-        state = found
-        if moved <= SETTLED_STEP**2:
+        before = solution.poses.copy()
+        x = _minimum(fit)
+        width = before.size
+        solution.poses[:] = x[:, :width].reshape(before.shape)
+        solution.shared[:] = x[:, width:]
+        moved = (
+            (((solution.poses - before) / problem.of_class['pose'][:, None]) ** 2).mean(2).max()
+        )
+        if moved <= CONSTANTS.settled_step**2:
             break
-    return state
+    return solution
 
 
-def _minimum(terms: Sequence[Term], start: Tensor, scale: Tensor, length: int) -> Tensor:
-    """Return the minimum of the sum of `terms` over start + scale * y, beginning at y = 0."""
-    y = torch.zeros_like(start, requires_grad=True)
+def _minimum(fit: _Fit) -> Floats:
+    """Return the minimum of the sum over start + scale * y, beginning at y = 0, (1, D)."""
+    begin, _ = fit.linearise()
+    scale = fit.deviations()
+    row = torch.zeros(1, dtype=torch.int64)
+    y = torch.zeros_like(begin, requires_grad=True)
     search = torch.optim.LBFGS(
         [y],
         max_iter=REFERENCE_ITERATIONS,
@@ -120,63 +158,33 @@ def _minimum(terms: Sequence[Term], start: Tensor, scale: Tensor, length: int) -
     )
 
     def closure() -> Tensor:
-        search.zero_grad()
-        value = _total(terms, State.unpack(start + scale * y, length))
-        value.backward()
-        return value
+        value, gradient = fit.objective.value_and_gradient((begin + scale * y).detach(), row)
+        y.grad = scale * gradient
+        return value[0]
 
     search.step(closure)
-    return (start + scale * y).detach()
+    found: Floats = (begin + scale * y).detach().numpy()
+    return found
 
 
-def _deviations(problem: Problem, config: Config) -> Tensor:
-    """Return the expected error of every variable, 1 where none is known; (1, 6 N + 23)."""
-    expected = expect(problem, InputEstimates(InputModel(config.faces).offsets()))
-    pose = problem.of_class(*POSE_ERRORS).repeat(1, problem.length)
-    deviations = torch.cat([pose, expected.deviation], 1)
-    return torch.where(deviations > 0, deviations, 1.0)
-
-
-def _start(problem: Problem, config: Config) -> State:
-    """Return the input boxes with the expected shared variables."""
-    offsets = InputModel(config.faces).offsets()
-    return State(problem.pose.clone(), expect(problem, InputEstimates(offsets)).shared)
-
-
-def _terms(problem: Problem, state: State, config: Config) -> list[Term]:
-    """Return the weighted terms with correspondences at `state`."""
-    offsets = InputModel(config.faces).offsets()
-    observations = observe_faces(problem, state, offsets, config)
-    return weigh(problem, state, observations, expect(problem, InputEstimates(offsets)), config)
-
-
-def _value(problem: Problem, state: State, config: Config) -> float:
-    """Return the value of the terms renewed at `state`."""
-    return float(_total(_terms(problem, state, config), state))
-
-
-def _total(terms: Sequence[Term], state: State) -> Tensor:
-    residuals = [(term.linearise(state).residual, term.weight) for term in terms]
-    parts = [(r * (W @ r[..., None])[..., 0]).sum() / 2 for r, W in residuals]
-    return torch.stack(parts).sum()
-
-
-def _iou(problem: Problem, state: State | None, base: Floats, truth: Floats) -> float:
-    """Return the mean 3D IoU of a fit of one window, or of its input for None."""
-    boxes = problem.boxes[0].cpu().numpy().copy()
-    if state is not None:
-        boxes[:, POSE] = state.pose[0].cpu().numpy()
-        boxes[:, BOX_EXTENT] = state.shared[0, EXTENT].cpu().numpy()
+def _iou(
+    problem: Problem, solution: Solution, base: Floats, truth: Floats, is_input: bool
+) -> float:
+    """Return the mean 3D IoU of a fit of one window, or of its input."""
+    boxes = problem.boxes[0].copy()
+    if not is_input:
+        boxes[:, POSE] = solution.poses[0]
+        boxes[:, BOX_EXTENT] = solution.shared[0, EXTENT:BIAS]
     boxes[:, :3] += base
     return float(iou_3d(boxes, truth).mean())
 
 
-def _warm(problem: Problem, state: State, config: Config) -> Problem:
+def _warm(problem: Problem, solution: Solution) -> Problem:
     """Return the problem as in a stream: all but the newest box start from a fit."""
-    extent = state.shared[:, None, EXTENT].expand(-1, config.window, -1)
-    solved = torch.cat([state.pose[..., :3], extent, state.pose[..., 3:]], -1)
-    start = torch.cat([solved[:, :-1], problem.boxes[:, -1:]], 1)
-    return problem._replace(start=start)
+    start_boxes = problem.boxes.copy()
+    start_boxes[:, :-1, POSE] = solution.poses[:, :-1]
+    start_boxes[:, :-1, BOX_EXTENT] = solution.shared[:, None, EXTENT:BIAS]
+    return problem._replace(start=start_boxes)
 
 
 def _track(window: Window) -> Track:

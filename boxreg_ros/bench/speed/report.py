@@ -25,11 +25,10 @@ WANTED_TRACKS = 400
 def text(report: dict[str, Any]) -> str:
     """Return the report of `command.measure` as text."""
     return '\n'.join([
-        f'on {report["device"]}, load of the machine {report["load"]:.1f} when it began',
+        f'load of the machine {report["load"]:.1f} when it began',
         *_solver_lines(report['solver'], report['windows']),
         *_scaling_lines(report['scaling']),
         *_tick_lines(report),
-        *_roofline_lines(report['roofline']),
         _crop_line(report['crop']),
         *_relabel_lines(report['relabel']),
     ])  # fmt: skip
@@ -128,18 +127,6 @@ def _solver_lines(found: dict[str, float], count: int) -> list[str]:
         f'  IoU of ours less that of the reference: '
         f'{found["IoU, ours"] - found["IoU, reference"]:+.3f} +- {found["IoU, error"]:.3f}'
     )
-    return lines
-
-
-def _roofline_lines(found: dict[str, Any]) -> list[str]:
-    lines = [
-        f'limit of one core: {found["bandwidth"]:.1f} GB/s, {found["peak"]:.0f} Gflop/s (float64)'
-    ]
-    for name, stage in found['stages'].items():
-        lines.append(
-            f'  {name:28s} {stage["ms"]:8.2f} ms   {stage["MB"]:7.2f} MB   '
-            f'{stage["Mflop"]:7.2f} Mflop   {stage["share"]:.1%} of the limit'
-        )
     return lines
 
 

@@ -9,10 +9,10 @@ import sys
 from boxreg_ros.bench.speed.stages import tick
 from boxreg_ros.bench.speed.streams import make_windows, shortest, SWEEP_PERIOD
 from boxreg_ros.config import Config
-from boxreg_ros.core.batch import Problem
 from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.method.constants import CONSTANTS
+from boxreg_ros.core.problem import Problem, stack_windows
 from boxreg_ros.core.solver import solve
-from boxreg_ros.core.window import stack_windows
 
 BISECTIONS = 4
 """Steps of the search for the most tracks: it is found within 6 %. Chosen."""
@@ -23,8 +23,6 @@ PROBED_TICKS = 20
 def scaling(config: Config, quick: bool) -> dict[str, list[tuple[int, float]]]:
     """Return the time per window [ms] over number of windows, their length, and points per box."""
     counts, lengths, points = [1, 8, 64, 512], [5, 10, 20, 40, 80], [128, 512, 2048, 4096]
-    if config.device != 'cpu':
-        counts = [64, 1024, 16384]
     if quick:
         counts, lengths, points = [1, 8], [5, 10], [128, 512]
     cases = {
@@ -38,7 +36,7 @@ def scaling(config: Config, quick: bool) -> dict[str, list[tuple[int, float]]]:
         for x, count, length, most in rows:
             windows, _ = make_windows(min(count, 64), length, most, config)
             windows = (windows * -(-count // len(windows)))[:count]
-            problem, _ = stack_windows(windows, config)
+            problem, _ = stack_windows(windows, config, CONSTANTS.prior_decay)
 
             def once(problem: Problem = problem) -> object:
                 return solve(problem, config, InputModel(config.faces), is_warm=False)
@@ -68,7 +66,7 @@ def pinned(available: set[int], count: int) -> None:
     config = Config(estimate='final').updated({'solver.threads': len(available)})
     windows, _ = make_windows(min(count, 64), config.window, 128, config)
     windows = (windows * -(-count // len(windows)))[:count]
-    problem, _ = stack_windows(windows, config)
+    problem, _ = stack_windows(windows, config, CONSTANTS.prior_decay)
 
     def once() -> object:
         return solve(problem, config, InputModel(config.faces), is_warm=False)

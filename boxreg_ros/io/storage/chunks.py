@@ -167,6 +167,7 @@ class ChunkedFile(ABC):
         try:
             return self._unpack(chunk, stored)
         except Exception as error:  # of the format's library or of a decompressor
+            self._file.check_unchanged()
             reason = f'damaged chunk ({one_line(error)})'
             self._note(reason, chunk.first_byte, chunk.end_byte, chunk.start_ns, chunk.last_ns)
             return []

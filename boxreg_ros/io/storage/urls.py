@@ -77,6 +77,9 @@ class LocalFile:
     def prefetch(self, ranges: Sequence[tuple[int, int]]) -> None:
         """Leave it to the system, which reads ahead itself."""
 
+    def check_unchanged(self) -> None:
+        """Do nothing: a file that is being recorded is read as far as it goes."""
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()
@@ -98,7 +101,8 @@ class RemoteFile:
     def __init__(self, path: Path) -> None:
         self._system, self._name = _system_of(path)
         self._path = path
-        self.size = entry_of(path).size
+        self._entry = entry_of(path)
+        self.size = self._entry.size
         self.bytes_read = 0
         self._pool = ThreadPoolExecutor(READERS)
         self._ranges: OrderedDict[tuple[int, int], Future[bytes]] = OrderedDict()
@@ -124,6 +128,15 @@ class RemoteFile:
             whole = first, min(end, self.size)
             if first < self.size and whole not in self._ranges:
                 self._fetch(*whole)
+
+    def check_unchanged(self) -> None:
+        """Raise TransferError if the file is another one than at the start."""
+        self._system.invalidate_cache()
+        if entry_of(self._path) != self._entry:
+            raise TransferError(
+                f'{url_of(self._path)}: expected the file as it was at the start, got another '
+                f'version; run again when it is no longer written'
+            )
 
     def close(self) -> None:
         """Cancel the open requests."""

@@ -6,7 +6,7 @@ behind its centre, where it has no sideways velocity.
 
 """
 
-from boxreg_ros.core.kernels.compile import kernel
+from boxreg_ros.core.method.compile import kernel
 import numpy as np
 
 STATE = 5

@@ -1,7 +1,7 @@
 """Registration of the points of one sweep to the surface of one object."""
 
 from boxreg_ros.core.following.kernels.surface import nearest
-from boxreg_ros.core.kernels.compile import kernel
+from boxreg_ros.core.method.compile import kernel
 import numpy as np
 
 REACH = 0.3

@@ -7,7 +7,7 @@ or 0; `moments` (S, 10) the count, the sums of x y z and of xx xy xz yy yz zz of
 
 """
 
-from boxreg_ros.core.kernels.compile import kernel
+from boxreg_ros.core.method.compile import kernel
 import numpy as np
 
 SURFACE_CELL = 0.15

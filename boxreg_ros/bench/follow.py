@@ -1,0 +1,245 @@
+"""
+`boxreg bench follow`: whole tracks from a few boxes of each object, against interpolation.
+
+The boxes given are true ones with the error of a person. One box: the first with
+`MIN_SEED_RETURNS`, and every later box counts. Two: the first and the last with so many, and
+every tenth box: all between the first and the last that are given count.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
+from boxreg_ros.config import Config
+from boxreg_ros.core.follow import follow
+from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.completion import points_above_road
+from boxreg_ros.offline.drive import Drive
+from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
+from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, Ints, ROLL, YAW
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+MIN_SEED_RETURNS = 20
+"""Points in the boxes that are given; as published for single-object tracking."""
+MIN_COUNTED_RETURNS = 10
+"""`found` is the part of the true boxes with so many points that got a box."""
+HUMAN_POSITION, HUMAN_YAW, HUMAN_EXTENT = 0.03, np.radians(1.0), 0.03
+"""Deviations of a box of a person: centre [m], yaw [rad] and extents [m]; measured on labels."""
+CASES = ('one box', 'two boxes', 'every 10th')
+COLUMN_TITLES = ('true', 'found', '>.5', '3D', '3D all')
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """
+    A track and what is given of it.
+
+    Attributes
+    ----------
+    track_id, class_name : str
+        Of the track.
+    stamps_ns, truth, num_points : array, shape (N,), (N, 9) and (N,)
+        Its true boxes, and the points in them.
+    rows, boxes : array, shape (n,) and (n, 9)
+        Those given, with the error of a person.
+    counted : array, shape (m,)
+        Rows that are scored.
+
+    """
+
+    track_id: str
+    class_name: str
+    stamps_ns: Ints
+    truth: Floats
+    num_points: Ints
+    rows: Ints
+    boxes: Floats
+    counted: Ints
+
+    @property
+    def times(self) -> Floats:
+        """Seconds from the first true box, (N,)."""
+        return np.asarray((self.stamps_ns - self.stamps_ns[0]) * 1e-9, np.float64)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `boxreg bench follow`."""
+    parser.add_argument(
+        'data', type=Path, nargs='+', metavar='DATA', help='folder: one recording and truth.csv'
+    )
+    parser.add_argument(
+        '--seed', type=int, default=0, metavar='N', help='seed of the errors (default: 0)'
+    )
+    parser.add_argument(
+        '--exact', action='store_true', help='give the true boxes, without the error of a person'
+    )
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print one table per recording."""
+    report: dict[str, Any] = {}
+    with progress_bar(len(args.data) * len(CASES), args) as bar:
+        for folder in args.data:
+            drive = Drive.read(folder)
+            report[str(folder)] = rows = {}
+            if not args.json:
+                bar.clear()
+                print(f'{folder}: {len(drive.truth.boxes):,} true boxes')
+            for case in CASES:
+                given = list(_given(drive, case, args.seed, args.exact))
+                rows[case] = _scores(drive, case, given)
+                bar.update()
+                if not args.json:
+                    bar.clear()
+                    _print(case, rows[case])
+    if args.json:
+        print_json(report)
+    return 0
+
+
+def _print(case: str, scores: Mapping[str, Mapping[str, float]]) -> None:
+    print(line(case, COLUMN_TITLES))
+    for name, row in scores.items():
+        true, *others = row.values()
+        print(line(f'  {name}', (f'{true:,}', *others)))
+
+
+def _given(drive: Drive, case: str, seed: int, is_exact: bool) -> Iterator[Given]:
+    """Yield the tracks of a drive with what is given of each; those with nothing are left out."""
+    truth = drive.truth
+    rng = np.random.default_rng(seed)
+    ids = np.array(truth.track_ids)
+    counts = _num_points(drive, truth)
+    for name in dict.fromkeys(truth.track_ids):
+        rows = np.flatnonzero(ids == name)
+        rows = rows[np.argsort(truth.stamps_ns[rows], kind='stable')]
+        seen = np.flatnonzero(counts[rows] >= MIN_SEED_RETURNS)
+        if case == 'every 10th':
+            chosen = np.arange(0, len(rows), 10)
+        else:
+            chosen = np.unique(
+                seen[:1] if case == 'one box' else seen[[0, -1]] if len(seen) else seen
+            )
+        if not len(chosen):
+            continue
+        last = len(rows) if case == 'one box' else chosen[-1]
+        counted = np.setdiff1d(np.arange(chosen[0] + 1, last), chosen)
+        boxes = truth.boxes[rows[chosen]]
+        if not is_exact:
+            boxes = _of_a_person(boxes, rng)
+        yield Given(
+            name, truth.class_names[rows[0]], truth.stamps_ns[rows], truth.boxes[rows],
+            counts[rows], chosen, boxes, counted,
+        )  # fmt: skip
+
+
+def _num_points(drive: Drive, truth: BoxTable) -> Ints:
+    """Return the points in each true box, above the road."""
+    counts = np.zeros(len(truth.boxes), np.int64)
+    for stamp_ns in np.unique(truth.stamps_ns):
+        rows = np.flatnonzero(truth.stamps_ns == stamp_ns)
+        [sweep] = drive.sweeps_at(np.array([stamp_ns]))
+        counts[rows] = points_above_road(sweep, truth.boxes[rows])
+    return counts
+
+
+def _of_a_person(boxes: Floats, rng: np.random.Generator) -> Floats:
+    """Return boxes (n, 9) with the error of a person."""
+    noisy = boxes.copy()
+    shifts = rng.normal(0.0, HUMAN_POSITION, (len(boxes), 3, 1))
+    noisy[:, :3] += (matrix_from_rpy(boxes[:, ROLL:]) @ shifts)[..., 0]
+    noisy[:, YAW] += rng.normal(0.0, HUMAN_YAW, len(boxes))
+    noisy[:, BOX_EXTENT] += rng.normal(0.0, HUMAN_EXTENT, (len(boxes), 3))
+    return noisy
+
+
+def _scores(drive: Drive, case: str, given: list[Given]) -> dict[str, dict[str, float]]:
+    """Return the scores of each method."""
+    methods = {'constant velocity': _constant_velocity}
+    if case != 'one box':
+        methods = {'linear': _linear, 'spline': _spline}
+    scores = {
+        name: _score(given, {one.track_id: method(one) for one in given})
+        for name, method in methods.items()
+    }
+    return scores | {'follow': _score(given, _followed(drive, given))}
+
+
+def _score(given: list[Given], found: Mapping[str, Floats]) -> dict[str, float]:
+    """Return the scores of boxes (N, 9) of each track, NaN where there is none."""
+    boxes = np.concatenate([found[one.track_id][one.counted] for one in given])
+    truth = np.concatenate([one.truth[one.counted] for one in given])
+    counts = np.concatenate([one.num_points[one.counted] for one in given])
+    iou = iou_3d(boxes, truth)
+    is_found = np.isfinite(boxes).all(1)
+    is_counted = counts >= MIN_COUNTED_RETURNS
+    return {
+        'true': len(truth),
+        'found': float(is_found[is_counted].mean()) if is_counted.any() else np.nan,
+        'above_half': float((iou[is_found] > 0.5).mean()) if is_found.any() else np.nan,
+        'iou_found': float(iou[is_found].mean()) if is_found.any() else np.nan,
+        'iou_all': float(iou.mean()) if len(iou) else np.nan,
+    }
+
+
+def _constant_velocity(one: Given) -> Floats:
+    """Return the given box moved on by the velocity of the next true box."""
+    row = int(one.rows[0])
+    after = min(row + 1, len(one.truth) - 1)
+    seconds = one.times[after] - one.times[row]
+    velocity = (one.truth[after, :3] - one.truth[row, :3]) / (seconds or 1.0)
+    boxes = np.repeat(one.boxes[:1], len(one.truth), axis=0)
+    boxes[:, :3] += (one.times - one.times[row])[:, None] * velocity
+    return boxes
+
+
+def _linear(one: Given) -> Floats:
+    at = one.times[one.rows]
+    return np.stack([np.interp(one.times, at, column) for column in _unwrapped(one).T], axis=1)
+
+
+def _spline(one: Given) -> Floats:
+    if len(one.rows) < 3:
+        return _linear(one)
+    boxes: Floats = CubicSpline(one.times[one.rows], _unwrapped(one))(one.times)
+    boxes[:, BOX_EXTENT] = _linear(one)[:, BOX_EXTENT]
+    boxes[:, ROLL:] = wrap_angle(boxes[:, ROLL:])
+    return boxes
+
+
+def _unwrapped(one: Given) -> Floats:
+    boxes = one.boxes.copy()
+    boxes[:, ROLL:] = np.unwrap(boxes[:, ROLL:], axis=0)
+    return boxes
+
+
+def _followed(drive: Drive, given: list[Given]) -> dict[str, Floats]:
+    """Return the boxes (N, 9) of `follow` at the stamps of each track, NaN where it ended."""
+    seeds = [
+        BoxArray(
+            int(one.stamps_ns[row]), '', (one.track_id,), (one.class_name,), np.ones(1), box[None]
+        )
+        for one in given
+        for row, box in zip(one.rows, one.boxes, strict=True)
+    ]
+    stamps = np.array([sweep.stamp_ns for sweep in drive.sweeps], np.int64)
+    points = [sweep.in_frame().points for sweep in drive.sweeps]
+    origins = np.array([sweep.origin for sweep in drive.sweeps])
+    tracks = {t.track_id: t for t in follow(stamps, points, seeds, Config(), origins)}
+    found = {}
+    for one in given:
+        track = tracks[one.track_id]
+        boxes = np.full(one.truth.shape, np.nan)
+        _, here, there = np.intersect1d(one.stamps_ns, track.stamps_ns, return_indices=True)
+        boxes[here] = track.boxes[there]
+        found[one.track_id] = boxes
+    return found

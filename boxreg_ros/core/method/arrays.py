@@ -1,0 +1,170 @@
+"""
+What the functions of a round pass to each other: records, and named tuples of arrays.
+
+Letters of the shapes: B windows, N observations of a window, K kinds of objects. The terms of a
+batch are an array (B, N) of records `residuals.TERMS`, and (B,) of `COMMON`. Only the first
+`lengths` observations of a window are read; the others are padding.
+
+"""
+
+from typing import Any, NamedTuple
+
+from boxreg_ros.core.method.compile import kernel
+import numpy as np
+
+POSE = 6
+"""Variables of a pose: x y z roll pitch yaw."""
+EXTENT, BIAS, GAP, PIVOT, ANCHOR, SIDESLIP, SHARED = 0, 3, 9, 15, 16, 22, 23
+"""First of the shared variables of each kind, and their number: extent (3), input bias (6),
+labelling margins (6), pivot, anchor of the rigid shape (6), sideslip."""
+PRIOR = 2 * POSE + SHARED
+"""Variables of the marginalisation prior: two poses and the shared ones."""
+BOTTOM = 5
+"""The face that is observed by the road, not by points of the object."""
+SPAN = 3 * POSE
+"""Variables of the poses that a residual depends on at most."""
+BOX_POSE = (0, 1, 2, 6, 7, 8)
+"""Places of the pose in a box x y z length width height roll pitch yaw."""
+
+
+COMMON = np.dtype(
+    [
+        ('shared', float, SHARED),
+        ('deviation', float, SHARED),
+        ('pose_deviation', float, POSE),
+        ('widened_deviation', float, POSE),
+        ('unmodelled_bias', float, POSE),
+        ('error', float, PIVOT),
+        ('W_shared', float, SHARED),
+        ('prior_mean', float, PRIOR),
+        ('W_prior', float, (PRIOR, PRIOR)),
+    ],
+    align=True,
+)
+"""
+What the observations of a window have in common in one round.
+
+shared, deviation
+    Expected means and deviations of the shared variables before points are used (M15), (23,).
+pose_deviation, widened_deviation
+    Deviation of the input poses along the axes of their boxes, without their bias; the same,
+    widened for the correlation of the errors of neighbours, (6,) [m, rad].
+unmodelled_bias
+    Deviation of the bias of windows with a pinned box, where no bias is estimated; else 0, (6,).
+error
+    Deviations of the errors of mean input extents, bias and margins, as far as known (M28), (15,).
+W_shared
+    Weights of the shared variables (M8), (23,).
+prior_mean, W_prior
+    Marginalisation prior (M9): minimum and information, (35,) and (35, 35).
+"""
+
+INPUTS = np.dtype(
+    [
+        ('deviation', float, 9),
+        ('correlation', float, 9),
+        ('weight', float),
+        ('gap_correction', float, 6),
+        ('occlusion_inset', float, 6),
+        ('range_inset', float, 6),
+        ('median', float, 3),
+        ('slopes', float, (3, 3)),
+        ('gap_variance', float, 6),
+        ('gap_tracks', float, 6),
+        ('gap_noise', float, 6),
+    ],
+    align=True,
+)
+"""
+Estimated errors of the input of a stream, for one kind of objects.
+
+deviation, correlation
+    Of poses along the box axes and of extents (M14): deviation about the mean of a track, in units
+    of that of the settings; correlation from one observation to the next, (9,).
+weight
+    Of this noise against the settings: 0 without observations, near 1 after many.
+gap_correction, occlusion_inset, range_inset
+    Labelling margin of each face less the one of the settings; how much further inside the points
+    of an occluded face are, and those of an object 70 m away, (6,) [m].
+median, slopes
+    Of the population of extents (M16), (3,) and (3, 3); slopes are 0 where there is none.
+gap_variance, gap_tracks, gap_noise
+    Between the gaps of tracks (M18a): variance [m^2], number of tracks, and the share of the
+    variance of an observation in that of the mean of a track, (6,).
+"""
+
+
+class Arrowhead(NamedTuple):
+    """
+    A matrix as `arrowhead` keeps it, or its Cholesky factor.
+
+    Attributes
+    ----------
+    links : array, shape (B, N + 2, 6, 18)
+        Blocks of each pose: upper triangle of its own, and those with the two poses after it. Two
+        poses of padding, zero, end the chain.
+    border : array, shape (B, N + 2, 6, 23)
+        Blocks of each pose with the shared variables.
+    corner : array, shape (B, 23, 23)
+        Upper triangle of the block of the shared variables.
+
+    """
+
+    links: Any
+    border: Any
+    corner: Any
+
+
+@kernel
+def matrix_of_window(b, matrix):
+    """Return the matrix of window `b`."""
+    return Arrowhead(matrix.links[b], matrix.border[b], matrix.corner[b])
+
+
+class Posterior(NamedTuple):
+    """
+    Covariances of the estimate, and the residuals of its faces.
+
+    Attributes
+    ----------
+    poses : array, shape (B, N, 6, 6)
+        Covariances of x y z roll pitch yaw [m, rad].
+    extents : array, shape (B, 3, 3)
+        Covariances of length, width and height [m].
+    face_distances : array, shape (B, N, 6)
+        Signed distance of the outermost points of each face from where they are expected, by the
+        estimated extents and the margins of other tracks, positive outside [m]; 0 without points.
+
+    """
+
+    poses: Any
+    extents: Any
+    face_distances: Any
+
+
+class Solution(NamedTuple):
+    """
+    A batch that is being solved: the start of a round, then its end.
+
+    Attributes
+    ----------
+    poses, shared : array, shapes (B, N, 6) and (B, 23)
+        Boxes, and the variables that all observations of a window share.
+    evidence : array, shape (B, 3, 3)
+        Evidence of the points about the extents (M17): logarithms of the input extents;
+        corrections by the points alone; their weights.
+    posterior : Posterior
+        Of windows that are done.
+    prior_state, prior_step, prior_information : array, shapes (B, 35), (B, 35), (B, 35, 35)
+        What full windows leave to the next ones (M13): linearisation point, step from there to
+        the minimum, information; NaN for others, no rows if it is not wanted.
+
+    """
+
+    poses: Any
+    shared: Any
+    evidence: Any
+    posterior: Any
+    prior_state: Any
+    prior_step: Any
+    prior_information: Any

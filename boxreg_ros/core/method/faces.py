@@ -1,0 +1,439 @@
+"""
+The outermost points on each face of each box, as their second moments, (M10) to (M12).
+
+This is the correspondence search of every round.
+
+"""
+
+from math import ceil, inf, isfinite, isnan, sqrt
+from typing import Any, NamedTuple
+
+from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP
+from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.rotation import fill_rotation
+import numpy as np
+
+FACES = 5
+"""Front, back, left, right, top: the bottom is observed by the road."""
+STRIP_AXIS = (1, 1, 0, 0, 1)
+"""Box axis along which the strips of each of these lie side by side."""
+NOWHERE = 1e9
+"""Depth of points that are not on a face [m]."""
+ALWAYS_VISIBLE = 9.0
+"""Tangent of the roof; that of the bottom is its negative."""
+FAR_SENSOR = 1e6
+"""Distance of an unknown sensor, over that of the centre of the points."""
+MIN_ALONG = 0.5
+"""Least distance along a face in the tangent of its visibility [m]. Chosen."""
+
+
+@kernel
+def fill_candidates(depth, m, constants, index):
+    """
+    Write which of m points may be outermost on a face; return how many, and their largest depth.
+
+    Those further behind the outermost one than `max_depth` are on another surface.
+
+    """
+    limit = constants.deepest - constants.max_depth
+    for i in range(m):
+        limit = min(limit, depth[i])
+    limit += constants.max_depth
+    count = 0
+    for i in range(m):
+        index[count] = i
+        count += depth[i] <= limit
+    return count, limit
+
+
+@kernel
+def fill_depths(m, half, level, constants, work):
+    """
+    Write how far inside of the expected surface of each face each of m points is, (5, M) [m].
+
+    Points that are beside a face, or too deep to be on it, are at `NOWHERE`. Writes the strips
+    (2, M) too; returns how many points are in and near the box.
+
+    """
+    local, excess, strip, depth = work.local, work.excess, work.strip, work.depth
+    outside_margin, edge_margin, deepest = (
+        constants.outside_margin, constants.edge_margin, constants.deepest
+    )  # fmt: skip
+    strips = constants.strips
+    for k in range(3):
+        for i in range(m):
+            excess[k, i] = abs(local[k, i]) - half[k]
+    near = 0
+    for i in range(m):
+        near += (
+            (excess[0, i] < outside_margin)
+            & (excess[1, i] < outside_margin)
+            & (excess[2, i] < outside_margin)
+        )
+    for k in range(2):
+        scale = strips / 2 / half[k]
+        for i in range(m):
+            place = min(max((local[k, i] + half[k]) * scale, 0.0), strips - 1.0)
+            strip[k, i] = int(place)
+    for face in range(FACES):
+        axis = face // 2
+        one = 1 if axis == 0 else 0
+        other = 1 if axis == 2 else 2
+        sign = 1.0 - 2.0 * (face % 2)
+        surface = half[axis] - level[face]
+        for i in range(m):
+            d = surface - sign * local[axis, i]
+            counts = (excess[one, i] <= edge_margin) & (excess[other, i] <= edge_margin)
+            counts &= (d >= -outside_margin) & (d < deepest)
+            depth[face, i] = d if counts else NOWHERE
+    return near
+
+
+@kernel
+def outermost_points(m, wanted, constants, work, moments):
+    """
+    Find the outermost ones of m points on each of the five faces of one box.
+
+    Writes their second moments (5, 4, 4), how many stand for each face, and their mean depth.
+
+    """
+    points, candidates = work.moved, work.candidates
+    best_depth, best_index = work.best_depth, work.best_index
+    for face in range(FACES):
+        own_strip, depth = work.strip[STRIP_AXIS[face]], work.depth[face]
+        count, limit = fill_candidates(depth, m, constants, candidates)
+        best_depth[:, :wanted] = NOWHERE
+        for candidate in range(count):
+            i = candidates[candidate]
+            d, s = depth[i], own_strip[i]
+            place = wanted - 1
+            if d < best_depth[s, place]:
+                while place > 0 and d < best_depth[s, place - 1]:
+                    best_depth[s, place] = best_depth[s, place - 1]
+                    best_index[s, place] = best_index[s, place - 1]
+                    place -= 1
+                best_depth[s, place] = d
+                best_index[s, place] = i
+        number = 0
+        total = 0.0
+        moment = moments[face]
+        moment[:] = 0.0
+        for s in range(len(best_depth)):
+            for rank in range(wanted):
+                if not best_depth[s, rank] <= limit:
+                    break
+                number += 1
+                total += best_depth[s, rank]
+                i = best_index[s, rank]
+                for a in range(3):
+                    for b in range(a, 3):
+                        moment[a, b] += points[a, i] * points[b, i]
+                    moment[a, 3] += points[a, i]
+        if number:
+            share = 1 / number
+            for a in range(3):
+                for b in range(a, 4):
+                    moment[a, b] *= share
+                    moment[b, a] = moment[a, b]
+            moment[3, 3] = 1.0
+        work.number[face] = number
+        work.mean_depth[face] = total / max(number, 1)
+
+
+@kernel
+def returns_of(problem, values, b, n):
+    """Return the values of the points of one observation."""
+    first = problem.first[b, n]
+    return values[first : first + problem.counts[b, n] * problem.stride : problem.stride]
+
+
+@kernel
+def centre_of(points, centre):
+    """Write the mean of points (M, 3); zero without points."""
+    centre[:] = 0.0
+    for i in range(len(points)):
+        for k in range(3):
+            centre[k] += points[i, k]
+    for k in range(3):
+        centre[k] /= max(len(points), 1)
+
+
+@kernel
+def fill_visibility(box, origins, points, R, toward, tangent):
+    """Write the visibility of each face of one input box from its best sensor, (6,)."""
+    fill_rotation(box[6], box[7], box[8], R)
+    tangent[:4] = -inf
+    for sensor in range(len(origins)):
+        raise_visibility(box, origins[sensor], points, R, toward, tangent)
+    tangent[4] = ALWAYS_VISIBLE
+    tangent[5] = -ALWAYS_VISIBLE
+
+
+@kernel
+def raise_visibility(box, origin, points, R, toward, tangent):
+    """Raise the visibility of the upright faces to that from one sensor."""
+    if isfinite(origin[0]) and isfinite(origin[1]) and isfinite(origin[2]):
+        for k in range(3):
+            toward[k] = origin[k]
+    else:
+        centre_of(points, toward)
+        for k in range(3):
+            toward[k] *= FAR_SENSOR
+    for face in range(4):
+        axis = face // 2
+        sign = 1.0 - 2.0 * (face % 2)
+        outward = -box[3 + axis] / 2
+        along = 0.0
+        for k in range(3):
+            outward += sign * toward[k] * R[k, axis]
+            along += toward[k] * R[k, 1 - axis]
+        along = abs(along) - box[4 - axis] / 2
+        tangent[face] = max(tangent[face], outward / max(along, MIN_ALONG))
+
+
+@kernel
+def fill_insets(origins, tangent, occlusion_inset, range_inset, constants, shares, inset, weight):
+    """Write the shares (2, 6) of the two insets, their sum (6,), and the weights of faces (6,)."""
+    reach = sqrt(origins[0, 0] ** 2 + origins[0, 1] ** 2)
+    for sensor in range(1, len(origins)):
+        reach = min(reach, sqrt(origins[sensor, 0] ** 2 + origins[sensor, 1] ** 2))
+    beyond = 0.0 if isnan(reach) else (reach - constants.near_range) / constants.range_span
+    beyond = min(max(beyond, 0.0), constants.max_range_share)
+    for face in range(6):
+        u = tangent[face] + constants.edge_lead[face]
+        occluded = 0.5 - 0.5 * u / sqrt(u**2 + constants.visibility_softness)
+        shares[0, face] = occluded
+        shares[1, face] = (1.0 - occluded) * beyond
+        by_range = shares[1, face] * range_inset[face]
+        inset[face] = occluded * occlusion_inset[face] + by_range
+        seen = 1.0 if tangent[face] > 0.0 else constants.occluded_weight
+        weight[face] = seen / (1.0 + (by_range / constants.range_half_weight) ** 2)
+
+
+@kernel
+def fill_velocity(poses, times, n, length, velocity):
+    """Write the velocity (3,) of pose n: the mean over the steps before and after it."""
+    before = max(n - 1, 0)
+    after = min(n + 1, length - 1)
+    duration = max(times[after] - times[before], 1e-9)
+    for k in range(3):
+        velocity[k] = (poses[after, k] - poses[before, k]) / duration
+
+
+@kernel
+def fill_moved(b, n, problem, velocity, moved):
+    """Write the points of one observation at the stamp of its box (M12), (3, M) [m]."""
+    points = returns_of(problem, problem.points, b, n)
+    delays = returns_of(problem, problem.delays, b, n)
+    for i in range(len(points)):
+        for k in range(3):
+            moved[k, i] = points[i, k]
+    if problem.is_moving:
+        for k in range(3):
+            for i in range(len(points)):
+                moved[k, i] -= velocity[k] * delays[i]
+
+
+@kernel
+def to_box_axes(m, moved, shift, R, local):
+    """Write m points in box axes, (3, M) [m]; the box is `shift` (3,) from their origin."""
+    for i in range(m):
+        x = moved[0, i] - shift[0]
+        y = moved[1, i] - shift[1]
+        z = moved[2, i] - shift[2]
+        local[0, i] = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
+        local[1, i] = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
+        local[2, i] = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+
+
+@kernel
+def add_road(shift, ground, half_height, gap, moment, distance):
+    """Write the observation of the bottom: a point of the road under the centre of the box."""
+    road = ground if isfinite(ground) else 0.0
+    point = (shift[0], shift[1], road, 1.0)
+    for a in range(4):
+        for b in range(4):
+            moment[a, b] = point[a] * point[b]
+    distance[BOTTOM] = shift[2] - road - half_height + gap
+
+
+class FaceWork(NamedTuple):
+    """
+    Arrays to work in, for observations of at most M points.
+
+    Attributes
+    ----------
+    moved, local : array, shape (3, M)
+        Points at the stamp of their box, from the centre of the input box, and in box axes [m].
+    excess : array, shape (3, M)
+        How far outside of the box they are along its axes [m].
+    strip : array, shape (2, M)
+        Strip that each point lies in, along x and along y.
+    depth : array, shape (5, M)
+        See `fill_depths`.
+    candidates : array, shape (M + 1,)
+        Points that may be outermost on one face; the last place is for one that may not.
+    best_depth, best_index : array
+        The outermost points of each strip of one face.
+    number, mean_depth : array, shape (5,)
+        Of the outermost points of each face.
+
+    """
+
+    moved: Any
+    local: Any
+    excess: Any
+    strip: Any
+    depth: Any
+    candidates: Any
+    best_depth: Any
+    best_index: Any
+    number: Any
+    mean_depth: Any
+
+
+@kernel
+def empty_face_work(begin, end, problem, constants):
+    """Return arrays for the observations of the windows `begin` to `end`."""
+    M = max(1, problem.counts[begin:end].max()) if end > begin else 1
+    size = ceil(max(constants.min_face_points, constants.outermost / constants.strips * M)) + 1
+    return FaceWork(
+        np.empty((3, M)), np.empty((3, M)), np.empty((3, M)), np.empty((2, M), np.int32),
+        np.empty((FACES, M)), np.empty(M + 1, np.int32), np.empty((constants.strips, size)),
+        np.empty((constants.strips, size), np.int64), np.empty(FACES, np.int64), np.empty(FACES),
+    )  # fmt: skip
+
+
+@kernel
+def clear_padding(length, terms):
+    """Set the face observations of padding to zero."""
+    for n in range(length, len(terms)):
+        terms[n].W_faces[:] = 0.0
+        terms[n].distance[:] = 0.0
+        terms[n].visibility[:] = 0.0
+        terms[n].inset[:] = 0.0
+        terms[n].inset_shares[:] = 0.0
+        terms[n].num_points = 0.0
+
+
+@kernel
+def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
+    """
+    Write the face observations of window `b`.
+
+    Parameters
+    ----------
+    b : int
+        The window.
+    problem : Problem
+        Input of the batch.
+    poses, shared : array, shapes (N, 6) and (23,)
+        Boxes of the window in this round.
+    inputs : record `INPUTS`
+        With the insets of its kind.
+    constants : record of `Constants`
+    work : FaceWork
+        Arrays to work in.
+    terms : array of `TERMS`, shape (N,)
+        Of the window: its face observations are written, zero for padding.
+
+    Notes
+    -----
+    The paper takes the K points closest to a face that is visible by the points' centre of mass
+    [Eq. 4]. Here the outermost ones are taken: the closest points of a face that is given too far
+    inside may lie anywhere. On a face with a wrong yaw the outermost points are all at one end:
+    each strip has its own, so that the face is turned as well. Points far behind the outermost
+    one belong to another surface.
+
+    """
+    R = np.empty((3, 3))
+    half = np.empty(3)
+    shift = np.empty(3)
+    level = np.empty(6)
+    toward = np.empty(3)
+    tangent = np.empty(6)
+    velocity = np.zeros(3)
+    length = problem.lengths[b]
+    clear_padding(length, terms)
+    for k in range(3):
+        half[k] = shared[EXTENT + k] / 2
+    for n in range(length):
+        m = problem.counts[b, n]
+        box, pose, origins = problem.boxes[b, n], poses[n], problem.origins[b, n]
+        ground = problem.ground[b, n]
+        term = terms[n]
+        distance, weight, inset = term.distance, term.visibility, term.inset
+        points = returns_of(problem, problem.points, b, n)
+        fill_visibility(box, origins, points, R, toward, tangent)
+        fill_insets(
+            origins, tangent, inputs.occlusion_inset, inputs.range_inset, constants,
+            term.inset_shares, inset, weight,
+        )  # fmt: skip
+        for k in range(3):
+            shift[k] = pose[k] - box[k]
+        for face in range(6):
+            level[face] = shared[GAP + face] + inset[face]
+        if problem.is_moving:
+            fill_velocity(poses, problem.times[b], n, length, velocity)
+        fill_rotation(pose[3], pose[4], pose[5], R)
+        fill_moved(b, n, problem, velocity, work.moved)
+        to_box_axes(m, work.moved, shift, R, work.local)
+        near = fill_depths(m, half, level, constants, work)
+        share = constants.outermost / constants.strips
+        wanted = ceil(max(constants.min_face_points, share * near))
+        outermost_points(m, wanted, constants, work, term.W_faces)
+        for face in range(FACES):
+            distance[face] = -work.mean_depth[face]
+            if work.number[face] < constants.min_face_points:
+                weight[face] = 0.0
+        gap = shared[GAP + BOTTOM]
+        add_road(shift, ground, half[2], gap, term.W_faces[BOTTOM], distance)
+        weight[BOTTOM] = 1.0 if isfinite(ground) else 0.0
+        terms[n].num_points = near
+
+
+@kernel
+def observe_faces(first, last, problem, poses, shared, inputs, constants, terms):
+    """Write the face observations of windows `first` to `last` (B, N), see `observe_window`."""
+    work = empty_face_work(first, last, problem, constants)
+    for b in range(first, last):
+        kind = problem.kind[b]
+        observe_window(b, problem, poses[b], shared[b], inputs[kind], constants, work, terms[b])
+
+
+@kernel
+def count_held(begin, end, problem, poses, extents, margin, held):
+    """
+    Write how many points are in each box, or less than `margin` outside of it, (B, N).
+
+    Boxes at `poses` (B, N, 6) of `extents` (B, N, 3); windows `begin` to `end`.
+
+    """
+    M = max(1, problem.counts[begin:end].max()) if end > begin else 1
+    moved = np.empty((3, M))
+    local = np.empty((3, M))
+    R = np.empty((3, 3))
+    velocity = np.zeros(3)
+    shift = np.empty(3)
+    for b in range(begin, end):
+        for n in range(problem.lengths[b]):
+            m = problem.counts[b, n]
+            pose, extent, box = poses[b, n], extents[b, n], problem.boxes[b, n]
+            fill_rotation(pose[3], pose[4], pose[5], R)
+            if problem.is_moving:
+                fill_velocity(poses[b], problem.times[b], n, problem.lengths[b], velocity)
+            for k in range(3):
+                shift[k] = pose[k] - box[k]
+            fill_moved(b, n, problem, velocity, moved)
+            to_box_axes(m, moved, shift, R, local)
+            reach_x, reach_y, reach_z = (
+                extent[0] / 2 + margin, extent[1] / 2 + margin, extent[2] / 2 + margin
+            )  # fmt: skip
+            count = 0
+            for i in range(m):
+                count += (
+                    (abs(local[0, i]) < reach_x)
+                    & (abs(local[1, i]) < reach_y)
+                    & (abs(local[2, i]) < reach_z)
+                )
+            held[b, n] = count

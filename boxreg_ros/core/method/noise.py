@@ -1,0 +1,125 @@
+"""Noise of the input boxes of many tracks (M14)."""
+
+from math import sqrt
+
+from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.covariance import MIN_POWER
+from boxreg_ros.core.method.selection import lower_median
+import numpy as np
+
+MAD_TO_DEVIATION = 1.48
+"""Standard deviation over median absolute deviation. Derived: 1 / 0.6745 for a Gaussian."""
+CORRELATION_ITERATIONS = 5
+"""Alternating evaluations of the correlation and of the variance that track means remove.
+Derived: they change by less than 0.1 % then."""
+
+
+@kernel
+def are_finite(values):
+    """Return whether all values (n,) are finite."""
+    total = 0.0
+    for value in values:
+        total += 0.0 * value  # NaN for infinity and NaN
+    return total == 0.0
+
+
+@kernel
+def fill_valid(residuals, min_observations, valid):
+    """Write which residuals (B, N, 9) count: finite ones of tracks with enough of them."""
+    for b in range(len(residuals)):
+        count = 0
+        for n in range(residuals.shape[1]):
+            valid[b, n] = are_finite(residuals[b, n])
+            count += valid[b, n]
+        if count < min_observations:
+            valid[b] = False
+
+
+@kernel
+def fill_centred(residuals, valid, j, errors):
+    """Write variable `j` less the mean of its track, (B, N)."""
+    for b in range(len(residuals)):
+        total, count = 0.0, 0
+        for n in range(residuals.shape[1]):
+            if valid[b, n]:
+                total += residuals[b, n, j]
+                count += 1
+        if count == 0:
+            continue
+        for n in range(residuals.shape[1]):
+            errors[b, n] = residuals[b, n, j] - total / count
+
+
+@kernel
+def median_size(errors, valid, sizes):
+    """Return the median size of the valid `errors` (B, N)."""
+    count = 0
+    for b in range(len(errors)):
+        for n in range(errors.shape[1]):
+            if valid[b, n]:
+                sizes[count] = abs(errors[b, n])
+                count += 1
+    return lower_median(sizes[:count])
+
+
+@kernel
+def neighbour_sums(errors, valid, bound):
+    """Return power and sum of products of neighbouring errors, each within +-bound."""
+    power, products = 0.0, 0.0
+    for b in range(len(errors)):
+        for n in range(errors.shape[1] - 1):
+            if valid[b, n] and valid[b, n + 1]:
+                first = min(max(errors[b, n], -bound), bound)
+                second = min(max(errors[b, n + 1], -bound), bound)
+                power += (first**2 + second**2) / 2
+                products += first * second
+    return power, products
+
+
+@kernel
+def removed_by_means(c, n):
+    """
+    Return the loss of variance when the mean of `n` autoregressive errors is subtracted.
+
+    The second value is the loss of the mean product of neighbours; both are over the variance of
+    an error of the correlation `c`.
+
+    """
+    with_mean = (1 - c**n) / (n * (1 - c))  # covariance of the first or last error with the mean
+    of_mean = (1 + c) / (1 - c) / n - 2 * c * with_mean / (n * (1 - c))
+    inner = (n * of_mean - with_mean) / (n - 1)  # neighbours leave out one end each
+    return of_mean, 2 * inner - of_mean
+
+
+@kernel
+def estimate(residuals, constants, deviation, correlation):
+    """
+    Write deviation and correlation (9,) of residuals (B, N, 9); return how many of them count.
+
+    Nothing is written where no residual counts. A constant error, such as that of an extent that
+    a tracker holds, is fully correlated; with one or two tracks it cannot be distinguished from
+    the labelling margin.
+
+    """
+    B, N, J = residuals.shape
+    valid = np.empty((B, N), np.bool_)
+    fill_valid(residuals, constants.min_observations, valid)
+    total, tracks = 0, 0
+    for b in range(B):
+        total += valid[b].sum()
+        tracks += valid[b].any()
+    if total == 0:
+        return 0
+    errors, sizes = np.empty((B, N)), np.empty(total)
+    for j in range(J):
+        fill_centred(residuals, valid, j, errors)
+        scatter = MAD_TO_DEVIATION * median_size(errors, valid, sizes)
+        power, products = neighbour_sums(errors, valid, constants.gate * scatter)
+        ratio = products / max(power, MIN_POWER)
+        variance, removed = 0.0, 0.0
+        for _ in range(CORRELATION_ITERATIONS):
+            whole = ratio + (1 - ratio) * removed if power > MIN_POWER else 1 - 2 / tracks
+            correlation[j] = min(max(whole, 0.0), constants.max_correlation)
+            variance, removed = removed_by_means(correlation[j], total / tracks)
+        deviation[j] = scatter / sqrt(max(1 - variance, constants.min_left))
+    return total

@@ -1,0 +1,217 @@
+"""
+One round of many windows, in the order of the paper's figure.
+
+    expect -> observe faces -> weigh -> linearise -> [ L-BFGS ] -> settled? -> covariances
+
+The search between is `boxreg_ros.core.lbfgs`, for all windows at once; it calls `evaluate` and
+`precondition`.
+
+"""
+
+from typing import Any, NamedTuple
+
+from boxreg_ros.core.method.arrays import (
+    ANCHOR,
+    Arrowhead,
+    COMMON,
+    matrix_of_window,
+    POSE,
+    SHARED,
+    SIDESLIP,
+    SPAN,
+)
+from boxreg_ros.core.method.arrowhead import invert_corner, invert_poses, solve
+from boxreg_ros.core.method.assemble import (
+    accumulate,
+    empty_axes,
+    linearise,
+    marginalise,
+    no_matrix,
+    weigh,
+)
+from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.covariance import empty_covariance_work, fill_posterior, Inverse
+from boxreg_ros.core.method.expectation import empty_expectation_work, expect, fill_evidence
+from boxreg_ros.core.method.faces import empty_face_work, observe_window
+from boxreg_ros.core.method.residuals import empty_linearised, TERMS
+from boxreg_ros.core.method.rigid_shape import agree, empty_shape_work
+import numpy as np
+
+
+class Sums(NamedTuple):
+    """
+    The sums of the residuals of B windows in one round.
+
+    Attributes
+    ----------
+    terms, common : array of `TERMS` and `COMMON`, shapes (B, N) and (B,)
+        Data and weights.
+    factor : Arrowhead
+        Cholesky factor of the Gauss-Newton curvature at the start of the round; NaN where it is
+        not positive definite.
+
+    """
+
+    terms: Any
+    common: Any
+    factor: Any
+
+
+def empty_sums(B: int, N: int, prior_mean: Any, prior_information: Any) -> Sums:
+    """Return room for B windows of N observations with a prior (B, 35) and (B, 35, 35)."""
+    common = np.zeros(B, COMMON)
+    common['prior_mean'] = prior_mean
+    common['W_prior'] = prior_information
+    factor = Arrowhead(
+        np.zeros((B, N + 2, POSE, SPAN)), np.zeros((B, N + 2, POSE, SHARED)),
+        np.zeros((B, SHARED, SHARED)),
+    )  # fmt: skip
+    return Sums(np.zeros((B, N), TERMS), common, factor)
+
+
+@kernel
+def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, shared, sums,
+          x, value, gradient):  # fmt: skip
+    """
+    Begin a round of the windows `rows[first:last]`.
+
+    Parameters
+    ----------
+    first, last : int
+        First row, and the one after the last.
+    rows : array, shape (b,)
+        Windows of the batch that take part.
+    problem, thinned : Problem
+        Input of the batch, and the same with the points of the rigid shape.
+    inputs : array of `INPUTS`, shape (K,)
+        Noise, margins and population of the input, by kind.
+    free : array, shape (B, 6 N + 23)
+        1 for variables that are estimated, 0 for those held fixed.
+    constants : record of `Constants`
+    poses, shared : array, shapes (B, N, 6) and (B, 23)
+        Start of the round.
+    sums : Sums
+        Of the batch: written.
+    x, value, gradient : array, shapes (b, 6 N + 23), (b,) and (b, 6 N + 23)
+        Written: variables of the windows, and the sum of the residuals there.
+
+    """
+    N = poses.shape[1]
+    n = POSE * N
+    at, out = empty_axes(N), empty_linearised()
+    of_expectation = empty_expectation_work()
+    of_faces = empty_face_work(0, len(problem.counts), problem, constants)
+    of_shape = empty_shape_work(0, len(thinned.counts), thinned, N, constants.cells)
+    for row in range(first, last):
+        b = rows[row]
+        kind = problem.kind[b]
+        shared[b, ANCHOR:SIDESLIP] = 0.0
+        terms, common = sums.terms[b], sums.common[b]
+        expect(b, problem, inputs[kind], constants, of_expectation, common)
+        observe_window(b, problem, poses[b], shared[b], inputs[kind], constants, of_faces, terms)
+        if constants.uses_shape:
+            agree(b, thinned, poses[b], shared[b, :3], constants, of_shape, terms)
+        weigh(b, problem, poses[b], shared[b], constants, at, out, terms, common)
+        x[row, :n] = poses[b].ravel()
+        x[row, n:] = shared[b]
+        value[row] = linearise(
+            x[row], terms, common, free[b], at, out, gradient[row],
+            matrix_of_window(b, sums.factor),
+        )  # fmt: skip
+
+
+@kernel
+def evaluate(first, last, rows, x, free, sums, value, gradient):
+    """
+    Write value (b,) and gradient (b, 6 N + 23) of the windows `rows[first:last]` at `x`.
+
+    `free` and `sums` are as in `begin`.
+
+    """
+    D = x.shape[1]
+    N = (D - SHARED) // POSE
+    at, out = empty_axes(N), empty_linearised()
+    for row in range(first, last):
+        terms, common = sums.terms[rows[row]], sums.common[rows[row]]
+        value[row] = accumulate(x[row], N, terms, common, at, out, gradient[row], no_matrix())
+        for k in range(D):
+            gradient[row, k] *= free[rows[row], k]
+
+
+@kernel
+def precondition(first, last, rows, factor, vectors):
+    """Replace the `vectors` (b, 6 N + 23) of windows by the inverse curvature times them."""
+    for row in range(first, last):
+        solve(matrix_of_window(rows[row], factor), vectors[row])
+
+
+@kernel
+def has_settled(poses, start, errors, settled_step):
+    """Return whether no box of a window moves by more than `settled_step` errors of its input."""
+    for n in range(len(poses)):
+        moved = 0.0
+        for k in range(POSE):
+            moved += ((poses[n, k] - start[n, k]) / errors[k]) ** 2 / POSE
+        if not moved <= settled_step**2:
+            return False
+    return True
+
+
+@kernel
+def end(first, last, rows, x, problem, free, constants, sums, solution, is_last, may_settle,
+        is_done):  # fmt: skip
+    """
+    End the round of the windows `rows[first:last]`.
+
+    Those that are done, since they are settled or the round `is_last`, have covariances and, if
+    they are full, leave a prior to the next window.
+
+    Parameters
+    ----------
+    first, last, rows, problem, free, constants, sums
+        As in `begin`.
+    x : array, shape (b, 6 N + 23)
+        Minimum of each sum.
+    solution : Solution
+        Of the batch: written.
+    is_last, may_settle : bool
+        Whether all are done; whether those may be that hardly moved.
+    is_done : array, shape (b,)
+        Written.
+
+    """
+    N = solution.poses.shape[1]
+    n = POSE * N
+    at, out, gradient = empty_axes(N), empty_linearised(), np.empty(n + SHARED)
+    work = empty_covariance_work(N)
+    inverse = Inverse(
+        np.empty((N, POSE, POSE)), np.empty((N, POSE, SHARED)), np.empty((SHARED, SHARED))
+    )
+    for row in range(first, last):
+        b = rows[row]
+        terms, common = sums.terms[b], sums.common[b]
+        A = matrix_of_window(b, sums.factor)
+        found = x[row, :n].copy().reshape(N, POSE)
+        errors = problem.of_class[b].pose
+        is_settled = has_settled(found, solution.poses[b], errors, constants.settled_step)
+        is_done[row] = is_last or (may_settle and is_settled)
+        solution.poses[b] = found
+        solution.shared[b] = x[row, n:]
+        invert_corner(A.corner, inverse.corner)
+        fill_evidence(
+            common, solution.shared[b], inverse.corner, constants.min_extent_gain,
+            solution.evidence[b],
+        )  # fmt: skip
+        if not is_done[row]:
+            continue
+        invert_poses(A, inverse.corner, inverse.poses, inverse.border)
+        fill_posterior(
+            b, problem, found, solution.shared[b], terms, common, free[b], inverse, constants,
+            work, solution.posterior,
+        )  # fmt: skip
+        if len(solution.prior_state) and problem.lengths[b] == N:
+            accumulate(x[row], 1, terms, common, at, out, gradient, A)
+            marginalise(
+                x[row], gradient, A, solution.prior_state[b], solution.prior_step[b],
+                solution.prior_information[b],
+            )  # fmt: skip

@@ -1,0 +1,520 @@
+"""
+A batch of windows as padded arrays: what the method solves at once.
+
+The estimated variables of a window of N observations are x = (p_1, ..., p_N, s): poses p_i of six
+numbers each and the shared variables s of `method.arrays`, the same for all observations.
+
+"""
+
+from collections.abc import Sequence
+from dataclasses import fields
+from itertools import chain
+from operator import attrgetter
+from typing import NamedTuple
+
+from boxreg_ros.config import ClassConfig, Config, KINDS
+from boxreg_ros.core.method.arrays import BIAS, EXTENT, GAP, PIVOT, POSE, PRIOR, SHARED
+from boxreg_ros.core.observation import Observations
+from boxreg_ros.core.tables import joined
+from boxreg_ros.core.track_window import MarginalisationPrior, Window
+from boxreg_ros.structures import Floats, Ints, ROLL, YAW
+import numpy as np
+from numpy.typing import NDArray
+
+CLASS_NUMBERS = [item.name for item in fields(ClassConfig)[1:]]
+"""Names of the numbers of a `ClassConfig`."""
+numbers_of = attrgetter(*CLASS_NUMBERS)
+"""Returns the numbers of a `ClassConfig`, in this order."""
+PADDING_PERIOD = 0.1
+"""Time step of padding observations [s]. Derived: any positive number keeps times increasing."""
+MAX_REVERSE_SPEED = 6.0
+"""A faster object moves forward [m/s]; chosen: no road vehicle reverses at 22 km/h."""
+KNOWN_FLIP_SHARE = 0.75
+"""
+Share of contrary headings above which a known heading sign is changed; chosen.
+
+Without a known sign the majority decides: a share of 0.5.
+
+"""
+MAX_BATCH_VALUES = 3e7
+"""Most point coordinates, or entries of the Hessian, in a batch; derived: 240 MB as float64."""
+VALUES_PER_POINT = 18
+"""Values held per point while a batch is solved; estimated from the temporary arrays."""
+PRIOR_ANGLES = [3, 4, 5, 9, 10, 11]
+"""Angles among the variables of the marginalisation prior: of its two poses."""
+
+
+NO_PRIOR = (
+    np.full(PRIOR, np.nan),
+    np.zeros(PRIOR),
+    np.zeros((PRIOR, PRIOR)),
+    np.zeros(4),
+)
+"""State, step, information and extents of a prior without information."""
+
+
+SETTINGS_OF = {
+    'acceleration': ('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning'),
+    'slip': ('slip', 'climb'),
+    'drift': ('drift',),
+    'pose': ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading'),
+    'extent': ('extent',),
+    'gap_spread': ('gap_spread',),
+    'sideslip': ('sideslip',),
+    'roughness': ('shape',),
+    'gaps': ('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom'),
+    'pivot': ('pivot',),
+}
+"""
+Fields of `CLASS_SETTINGS`, and the settings of `ClassConfig` that make each.
+
+acceleration
+    Deviations of the accelerations along the axes of the body, (6,).
+slip
+    Of the velocity of the pivot along the y and z axes, (2,) [m/s].
+drift
+    Of the step of a parked box [m].
+pose, extent
+    Of the input poses, (6,) [m, rad], and of the input extents, as part of each.
+gap_spread, sideslip
+    Of labelling margins [m], and of the angle from heading to path [rad].
+roughness
+    How far the surface is from rigid [m].
+gaps
+    Expected labelling margins, (6,) [m].
+pivot
+    Distance of the pivot behind the centre, as part of the length.
+"""
+CLASS_SETTINGS = np.dtype(
+    [
+        (field, float, len(names)) if len(names) > 1 else (field, float)
+        for field, names in SETTINGS_OF.items()
+    ],
+    align=True,
+)
+"""Settings of the class of one window, a record."""
+
+
+class Problem(NamedTuple):
+    """
+    A batch of padded windows; centres are relative to one point per window.
+
+    Attributes
+    ----------
+    boxes : array, shape (B, N, 9)
+        Input boxes, yaw unwrapped along the window and 180° flips corrected [m, rad].
+    start : array, shape (B, N, 9)
+        Start of the search: the input, or the estimate of the window before.
+    lengths : array, shape (B,)
+        Observations of each window; the others are padding.
+    times : array, shape (B, N)
+        Time since the first observation, increasing over the padding too [s].
+    origins : array, shape (B, N, K, 3)
+        Each sensor that sees the object minus the centre of the input box [m]; NaN if unknown.
+    ground : array, shape (B, N)
+        Height of the road minus that of the input centre [m]; NaN if unknown.
+    points, delays : array, shapes (P, 3) and (P,)
+        Returns of all observations minus the centre of their input box [m], and their measurement
+        times relative to the stamp of the box [s].
+    first, counts : array, shape (B, N)
+        First of the returns of each observation, and their number.
+    stride : int
+        Every n-th return of an observation is used.
+    is_moving : bool
+        Whether any delay is not zero.
+    pinned : array, shape (B, N)
+        Whether a person has corrected a box.
+    prior_mean, prior_information : array, shapes (B, 35) and (B, 35, 35)
+        Marginalisation prior (M9) on the two oldest poses and the shared variables: the minimum
+        of its quadratic form, and its information matrix, 0 without a prior.
+    marginalised_extents : array, shape (B, 4)
+        Sum of the input extents of marginalised observations [m], and the number of these.
+    kind : array, shape (B,)
+        Index of the kind of each window's object among `KINDS`.
+    of_class : array of `CLASS_SETTINGS`, shape (B,)
+
+    """
+
+    boxes: Floats
+    start: Floats
+    lengths: Ints
+    times: Floats
+    origins: Floats
+    ground: Floats
+    points: NDArray[np.float32]
+    delays: NDArray[np.float32]
+    first: Ints
+    counts: Ints
+    stride: int
+    is_moving: bool
+    pinned: NDArray[np.bool_]
+    prior_mean: Floats
+    prior_information: Floats
+    marginalised_extents: Floats
+    kind: Ints
+    of_class: NDArray[np.void]
+
+    @property
+    def errors(self) -> Floats:
+        """Deviations of input poses and, as part of each, of extents, (B, 9)."""
+        extent = np.repeat(self.of_class['extent'][:, None], 3, axis=1)
+        return np.concatenate([self.of_class['pose'], extent], axis=1)
+
+    @property
+    def length(self) -> int:
+        """Observations per window, padding included: N."""
+        return int(self.boxes.shape[1])
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """True for observations, False for padding, (B, N)."""
+        valid: NDArray[np.bool_] = np.arange(self.length) < self.lengths[:, None]
+        return valid
+
+    @property
+    def width(self) -> int:
+        """Most returns of an observation, at least 1: M."""
+        return max(1, int(self.counts.max()))
+
+    def part(self, windows: Sequence[int], columns: Sequence[Sequence[int]]) -> 'Problem':
+        """
+        Return some windows with some of their observations only.
+
+        Marginalised observations are left out, with their prior and their extents.
+
+        Parameters
+        ----------
+        windows : sequence of b int
+            Rows of the windows.
+        columns : sequence of b sequences of int
+            Columns of the observations of each of them, ascending, at least one.
+
+        Returns
+        -------
+        part : Problem
+            Of b windows, padded to the most observations that one of them has.
+
+        """
+        lengths = np.array(list(map(len, columns)))
+        column = np.repeat([[of_window[-1]] for of_window in columns], lengths.max(), axis=1)
+        valid = np.indices(column.shape)[1] < lengths[:, None]
+        column[valid] = list(chain.from_iterable(columns))
+        rows = np.array(windows)
+        row = rows[:, None]
+        b = len(rows)
+        return self._replace(
+            boxes=self.boxes[row, column],
+            start=self.start[row, column],
+            lengths=lengths,
+            times=self.times[row, column] + PADDING_PERIOD * (~valid).cumsum(1),
+            origins=self.origins[row, column],
+            ground=self.ground[row, column],
+            first=self.first[row, column],
+            counts=self.counts[row, column],
+            pinned=self.pinned[row, column],
+            prior_mean=np.zeros((b, PRIOR)),
+            prior_information=np.zeros((b, PRIOR, PRIOR)),
+            marginalised_extents=np.zeros((b, 4)),
+            kind=self.kind[rows],
+            of_class=self.of_class[rows],
+        )
+
+    def thinned(self, points: float) -> 'Problem':
+        """Return the problem with every n-th point: at least `points` per box, if there are."""
+        stride = max(1, int(self.width // points))
+        counts = -(-self.counts // stride)
+        return self._replace(counts=counts, stride=stride * self.stride)
+
+    def mean_extents(self) -> Floats:
+        """
+        Return the mean extents of the input, marginalised observations included, (B, 3) [m].
+
+        Of windows with pinned boxes the mean extents of these.
+
+        """
+        has_pin = self.pinned.any(1, keepdims=True)
+        counted = np.where(has_pin, self.pinned, self.valid)[..., None]
+        marginalised = np.where(has_pin, 0.0, self.marginalised_extents)
+        total = (self.boxes[..., 3:6] * counted).sum(1) + marginalised[:, :3]
+        mean: Floats = total / (counted.sum(1) + marginalised[:, 3:])
+        return mean
+
+    def expected_shared(self, inputs: NDArray[np.void]) -> Floats:
+        """
+        Return the means of the shared variables without a population, (B, 23).
+
+        `inputs` (K,) are records `INPUTS`.
+
+        """
+        shared = np.zeros((len(self.boxes), SHARED))
+        shared[:, EXTENT:BIAS] = self.mean_extents()
+        shared[:, GAP:PIVOT] = self.of_class['gaps'] + inputs['gap_correction'][self.kind]
+        shared[:, PIVOT] = shared[:, EXTENT] * self.of_class['pivot']
+        return shared
+
+    def free_variables(self, config: Config) -> Floats:
+        """Return 1 for every variable (B, 6 N + 23) that is estimated, 0 for those held fixed."""
+        B, N = self.counts.shape
+        pose = np.repeat(self.valid[..., None].astype(np.float64), POSE, axis=2)
+        shared = np.ones((B, SHARED))
+        if config.mode == 'bev':
+            pose[..., [2, 3, 4]] = 0.0
+            shared[:, 2] = 0.0
+        if config.extent == 'fixed':
+            shared[:, EXTENT:BIAS] = 0.0
+        if not config.ingredients.input_bias:
+            shared[:, BIAS:GAP] = 0.0
+        return np.concatenate([pose.reshape(B, POSE * N), shared], axis=1)
+
+
+def group_windows(windows: Sequence[Window], config: Config) -> list[list[int]]:
+    """
+    Return groups of rows of `windows` to solve together.
+
+    A group is either all warm or all cold, of similar lengths, and within `MAX_BATCH_VALUES`.
+    Windows shorter than `min_observations` are in no group.
+
+    """
+    lengths = [len(window.observations) for window in windows]
+    rows = [row for row, length in enumerate(lengths) if length >= config.min_observations]
+    rows.sort(key=lambda row: (windows[row].is_warm, lengths[row], row))
+    groups: list[list[int]] = []
+    for row in rows:
+        length = lengths[row]
+        hessian = (6 * length + SHARED) ** 2
+        points = length * config.sampling.points * VALUES_PER_POINT
+        is_full = not groups or (len(groups[-1]) + 1) * max(hessian, points) > MAX_BATCH_VALUES
+        if is_full or windows[groups[-1][0]].is_warm != windows[row].is_warm:
+            groups.append([])
+        groups[-1].append(row)
+    return groups
+
+
+def stack_windows(
+    windows: Sequence[Window], config: Config, decay: float
+) -> tuple[Problem, Floats]:
+    """
+    Stack windows to padded arrays.
+
+    Parameters
+    ----------
+    windows : sequence of B Window
+        Each with at least one observation.
+    config : Config
+        Settings.
+    decay : float
+        Factor on the information of the marginalisation priors.
+
+    Returns
+    -------
+    problem : Problem
+        Positions are relative to `base`.
+    base : array, shape (B, 3)
+        One origin per window in the fixed frame [m].
+
+    """
+    lengths = np.array([len(window.observations) for window in windows])
+    valid = np.arange(lengths.max()) < lengths[:, None]  # (B, N)
+    tables, rows = joined([item for window in windows for item in window.observations])
+    seen = Observations.concatenated(tables)
+    if 2 * len(rows) < len(seen.boxes):  # of another group: their points are not held twice
+        seen, rows = seen.take(rows), np.arange(len(rows))
+    boxes, times, origins, ground = _stack_observations(seen, rows, valid)
+    priors = [w.prior or _no_prior(w.observations[0].box[:3]) for w in windows]
+    base, state, step, information, extents = (
+        np.array(part) for part in zip(*priors, strict=True)
+    )
+    pinned = np.zeros(valid.shape, bool)
+    pinned[valid] = seen.is_pinned[rows]
+    if config.ingredients.heading_sign:
+        boxes[..., ROLL:] = _resolved_angles(boxes, times, valid, pinned, state[:, 5])
+    else:
+        boxes[..., YAW] = np.unwrap(boxes[..., YAW])
+    start = _starting_boxes(windows, boxes)
+    boxes[..., :3] -= base[:, None]
+    start[..., :3] -= base[:, None]
+    minimum, is_usable = _prior_minimum(start, state, step)
+    information *= decay * is_usable[:, None, None]
+    first, counts = np.zeros((2, *valid.shape), np.int64)
+    first[valid] = seen.first[rows]
+    counts[valid] = seen.counts[rows]
+    if not config.ingredients.marginalisation:
+        information[:] = 0.0
+    kind, of_class = _of_classes(windows, config)
+    delays = _delays(seen, config)
+    problem = Problem(
+        boxes=boxes,
+        start=start,
+        lengths=lengths,
+        times=times,
+        origins=origins,
+        ground=ground,
+        points=seen.points,
+        delays=delays,
+        first=first,
+        counts=counts,
+        stride=1,
+        is_moving=bool(delays.any()),
+        pinned=pinned,
+        prior_mean=np.nan_to_num(minimum),
+        prior_information=information,
+        marginalised_extents=extents,
+        kind=kind,
+        of_class=of_class,
+    )
+    return problem, base
+
+
+def _no_prior(base: Floats) -> MarginalisationPrior:
+    """Return a prior without information, NaN as its linearisation point."""
+    return MarginalisationPrior(base, *NO_PRIOR)
+
+
+def _stack_observations(
+    seen: Observations, rows: Ints, valid: NDArray[np.bool_]
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """
+    Return input boxes, times, sensor origins and ground heights of `rows`, padded.
+
+    Shapes (B, N, 9), (B, N), (B, N, K, 3) and (B, N). Padding repeats the last box of a window, at
+    later times, and the last sensor of an observation.
+
+    """
+    B, N = valid.shape
+    lengths = valid.sum(1)
+    begin = np.cumsum(lengths) - lengths
+    column = np.arange(N)
+    last = lengths[:, None] - 1
+    padded = rows[begin[:, None] + np.minimum(column, last)]  # (B, N), the last row repeats
+    origins = np.zeros((B, N, *seen.origins.shape[1:]))
+    origins[valid] = seen.origins[rows]
+    ground = np.full((B, N), np.nan)
+    ground[valid] = seen.ground[rows]
+    stamps_ns = seen.stamps_ns[padded]
+    times = (stamps_ns - stamps_ns[:, :1]) * 1e-9 + PADDING_PERIOD * np.maximum(column - last, 0)
+    return seen.boxes[padded], times, origins, ground
+
+
+def _delays(seen: Observations, config: Config) -> NDArray[np.float32]:
+    """Return the delays of all returns relative to the time of their box [s]."""
+    if config.sampling.box_time == 'sight' and seen.sights.any():
+        return seen.delays - np.repeat(seen.sights.astype(np.float32), seen.counts)
+    return seen.delays
+
+
+def _resolved_angles(
+    boxes: Floats,
+    times: Floats,
+    valid: NDArray[np.bool_],
+    pinned: NDArray[np.bool_],
+    known_yaw: Floats,
+) -> Floats:
+    """
+    Return roll, pitch and yaw (B, N, 3) of `boxes` (B, N, 9) with 180° flips corrected.
+
+    A pinned box decides on the heading of its window.
+
+    """
+    yaw = resolve_headings(boxes, times, valid, known_yaw)
+    is_contrary = np.any(pinned & (np.cos(yaw - boxes[..., YAW]) < 0), axis=1, keepdims=True)
+    yaw = np.where(is_contrary, yaw + np.pi, yaw)
+    # A half turn about the z axis of the box changes the signs of roll and pitch.
+    is_same = np.sign(np.cos(yaw - boxes[..., YAW]))
+    tilt = boxes[..., ROLL:YAW] * is_same[..., None]
+    return np.concatenate([(tilt + np.pi) % (2 * np.pi) - np.pi, yaw[..., None]], axis=-1)
+
+
+def _starting_boxes(windows: Sequence[Window], boxes: Floats) -> Floats:
+    """Return where the search starts (B, N, 9): earlier estimates, else the input `boxes`."""
+    start = boxes.copy()
+    lengths = np.array([len(window.start) for window in windows])
+    is_known = np.arange(boxes.shape[1]) < lengths[:, None]
+    start[is_known] = np.concatenate([window.start for window in windows])
+    # Whole turns, and half turns of yaw: a kept box is returned with the heading of its input.
+    period = np.pi * np.array([2, 2, 1])
+    start[..., ROLL:] += period * np.round((boxes[..., ROLL:] - start[..., ROLL:]) / period)
+    return start
+
+
+def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """
+    Return the minimum of each prior (B, 35), and which priors fit the present headings (B,).
+
+    Angles are moved by half turns to those of `start` (B, N, 9). A prior that an odd number of
+    them is needed for holds for the other heading sign.
+
+    """
+    B, N = start.shape[:2]
+    angles = start[:, [0, 1 % N], ROLL:].reshape(B, len(PRIOR_ANGLES))
+    half_turns = np.rint((angles - state[:, PRIOR_ANGLES]) / np.pi)
+    minimum = state + step
+    minimum[:, PRIOR_ANGLES] += np.pi * half_turns
+    return minimum, np.asarray((half_turns % 2 == 0).all(1))
+
+
+def _of_classes(windows: Sequence[Window], config: Config) -> tuple[Ints, NDArray[np.void]]:
+    """Return kind (B,) and settings of the class of each window."""
+    kinds = {name: config.kind(name) for name in {window.class_name for window in windows}}
+    kind = np.array([KINDS.index(kinds[window.class_name]) for window in windows])
+    numbers = np.array([numbers_of(getattr(config, name)) for name in KINDS], dtype=np.float64)
+
+    found = np.zeros(len(kind), CLASS_SETTINGS)
+    for field, names in SETTINGS_OF.items():
+        columns = [CLASS_NUMBERS.index(name) for name in names]
+        found[field] = numbers[kind][:, columns].reshape(found[field].shape)
+    return kind, found
+
+
+def resolve_headings(
+    boxes: Floats, times: Floats, valid: NDArray[np.bool_], known_yaw: Floats
+) -> Floats:
+    """
+    Return unwrapped yaw angles with one heading sign per window, 180° flips corrected.
+
+    The majority of a window decides on the sign; against a known sign, three quarters. An object
+    faster than `MAX_REVERSE_SPEED` heads where it moves. A single heading that is off by a
+    quarter turn does not affect those after it.
+
+    Parameters
+    ----------
+    boxes : array, shape (B, N, 9)
+        Input boxes [m, rad].
+    times : array, shape (B, N)
+        Increasing [s].
+    valid : array, shape (B, N)
+        False for padding.
+    known_yaw : array, shape (B,)
+        Heading of the first box as estimated before [rad]; NaN where unknown.
+
+    Returns
+    -------
+    yaw : array, shape (B, N)
+        Each within a whole number of half turns of the input [rad].
+
+    """
+    input_yaw = boxes[..., YAW]
+    chain = input_yaw.copy()
+    if chain.shape[1] == 1:
+        return chain  # nothing contradicts a single heading
+    trend = boxes[:, 0, YAW]
+    for column in range(1, chain.shape[1]):
+        change = (chain[:, column] - trend + np.pi / 2) % np.pi - np.pi / 2
+        chain[:, column] = trend + change
+        trend = trend + change * 2 / 3  # an outlier of a quarter turn moves it by 60° only
+    is_contrary = (np.cos(input_yaw - chain) < 0) & valid
+    share = is_contrary.sum(1) / valid.sum(1)
+    limit = np.where(np.isnan(known_yaw), 0.5, KNOWN_FLIP_SHARE)
+    limit = np.where(np.cos(known_yaw - chain[:, 0]) < 0, 1 - KNOWN_FLIP_SHARE, limit)
+    speed = _median_forward_speed(boxes, times, valid, chain)
+    is_flipped = np.where(np.abs(speed) > MAX_REVERSE_SPEED, speed < 0, share > limit)
+    return np.where(is_flipped[:, None], chain + np.pi, chain)
+
+
+def _median_forward_speed(
+    boxes: Floats, times: Floats, valid: NDArray[np.bool_], yaw: Floats
+) -> Floats:
+    """Return the median speed of the centres along `yaw` (B, N), shape (B,) [m/s]."""
+    dx, dy = np.moveaxis(np.diff(boxes[..., :2], axis=1, prepend=boxes[:, :1, :2]), 2, 0)
+    along = (dx * np.cos(yaw) + dy * np.sin(yaw)) / np.diff(times, prepend=-1.0)
+    ascending = np.sort(np.where(valid, along, np.inf))
+    return np.asarray(ascending[np.arange(len(boxes)), (valid.sum(1) - 1) // 2])

@@ -1,0 +1,108 @@
+"""Following one object through sweeps from a few boxes of a person."""
+
+from boxreg_ros import follow, ShapeError
+from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.structures import BoxArray, HUMAN, INTERPOLATED
+import numpy as np
+import pytest
+from scenes import drive, returns, stamps
+
+N = 30
+ORIGIN = (0.0, 0.0, 1.5)
+
+
+def road(rng, count=4000):
+    flat = rng.uniform(-30, 60, (count, 2))
+    return np.column_stack([flat, rng.normal(0.0, 0.01, count)])
+
+
+def scene(truth, rng, hidden=()):
+    """Return the sweeps of an object and the road; without the object in `hidden` ones."""
+    sweeps = []
+    for row, box in enumerate(truth):
+        parts = [road(rng)]
+        if row not in hidden:
+            parts.append(returns(box, rng, 150, ORIGIN))
+        sweeps.append(np.concatenate(parts))
+    return sweeps
+
+
+def seed(truth, row, name='a', **changes):
+    box = truth[row] + np.array([0.02, -0.02, 0.01, 0, 0, 0, 0, 0, 0.01])
+    return BoxArray(
+        int(stamps(len(truth))[row]), '', (name,), ('car',), np.ones(1), box[None], **changes
+    )
+
+
+@pytest.mark.parametrize('start', [0, 15, N - 1])
+def test_one_box_is_followed_both_ways_along_a_curve(start):
+    rng = np.random.default_rng(1)
+    truth = drive(N, speed=8.0, turn=0.3)
+    [track] = follow(stamps(N), scene(truth, rng), [seed(truth, start)])
+    assert track.rows.tolist() == list(range(N))
+    assert [end.reason for end in track.ends] == ['end_of_sweeps'] * 2
+    assert track.status[start] == HUMAN
+    iou = iou_3d(track.boxes, truth)
+    assert iou.min() > 0.75
+    assert iou.mean() > 0.85
+
+
+def test_a_lost_object_gets_no_box_and_an_occluded_one_goes_on():
+    rng = np.random.default_rng(2)
+    truth = drive(N, speed=6.0, turn=0.0)
+    hidden = range(10, 15)
+    [track] = follow(stamps(N), scene(truth, rng, hidden), [seed(truth, 2)])
+    assert track.rows[-1] == N - 1
+    assert iou_3d(track.boxes, truth[track.rows])[15:].min() > 0.7
+    [track] = follow(stamps(N), scene(truth, rng, range(20, N)), [seed(truth, 2)])
+    assert track.rows[-1] == 19
+    assert track.ends[1].reason == 'few_points'
+    assert track.ends[1].stamp_ns == stamps(N)[19]
+
+
+def test_boxes_between_keyframes_are_better_than_a_line():
+    rng = np.random.default_rng(3)
+    truth = drive(N, speed=8.0, turn=0.6)
+    rows = [0, 10, 20, 29]
+    [track] = follow(stamps(N), scene(truth, rng), [seed(truth, row) for row in rows])
+    assert track.status.count(HUMAN) == 4
+    assert track.status.count(INTERPOLATED) == N - 4
+    at = stamps(N)
+    line = np.stack([np.interp(at, at[rows], column) for column in truth[rows].T], axis=1)
+    assert iou_3d(track.boxes, truth).mean() > iou_3d(line, truth).mean() + 0.05
+
+
+def test_neighbour_and_road_do_not_pull_a_parked_car():
+    rng = np.random.default_rng(4)
+    truth = drive(N, speed=0.0, turn=0.0)
+    beside = truth + np.array([0.0, 2.3, 0, 0, 0, 0, 0, 0, 0])
+    sweeps = [
+        np.concatenate([one, returns(box, rng, 150, ORIGIN)])
+        for one, box in zip(scene(truth, rng), beside, strict=True)
+    ]
+    [track] = follow(stamps(N), sweeps, [seed(truth, 0)])
+    assert iou_3d(track.boxes, truth[track.rows]).min() > 0.8
+
+
+def test_seeds_that_cannot_be_used_are_named_and_the_rest_is_done():
+    rng = np.random.default_rng(5)
+    truth = drive(N)
+    sweeps = scene(truth, rng)
+    good = seed(truth, 0)
+    empty = seed(truth + np.array([0, 30.0, 0, 0, 0, 0, 0, 0, 0]), 0, 'empty')
+    twice = seed(truth, 0)
+    late = BoxArray(10**18, '', ('late',), ('car',), np.ones(1), truth[:1])
+    jump = [seed(truth, 0, 'jump'), seed(truth + np.array([200.0, *[0] * 8]), 2, 'jump')]
+    tracks = follow(stamps(N), sweeps, [good, empty, twice, late, *jump])
+    by_name = {track.track_id: track for track in tracks}
+    assert len(by_name['a'].rows) == N
+    assert 'expected one box at a stamp' in by_name['a'].problems[0]
+    assert 'expected points in their boxes, got 0' in by_name['empty'].problems[0]
+    assert by_name['empty'].rows.tolist() == [0]
+    assert 'the nearest is' in by_name['late'].problems[0]
+    assert not len(by_name['late'].rows)
+    assert "one is inside that of track 'jump'" in by_name['a'].problems[1]
+    assert 'too far apart' in by_name['jump'].problems[-1]
+    assert follow(stamps(N), sweeps, []) == []
+    with pytest.raises(ShapeError, match='expected 30 arrays, got 29'):
+        follow(stamps(N), sweeps[1:], [good])

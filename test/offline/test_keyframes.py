@@ -1,0 +1,116 @@
+"""`boxreg follow` and `--keyframes`: boxes at every sweep from a few of a person."""
+
+import csv
+import json
+
+from boxreg_ros.cli import main
+from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.every_sweep import Arrivals, empty_array
+from boxreg_ros.structures import Sweep
+import numpy as np
+import pytest
+from relabel_results import rows_of
+
+SWEEPS = 13
+
+
+@pytest.fixture(scope='module')
+def street(tmp_path_factory):
+    """Return a folder with a recording, its truth, and keyframes at every fifth sweep."""
+    folder = tmp_path_factory.mktemp('street')
+    words = f'simulate -o {folder}/drive.mcap --truth {folder}/truth.csv --sweeps {SWEEPS}'
+    assert main(words.split()) == 0
+    with open(folder / 'truth.csv', newline='') as file:
+        rows = list(csv.DictReader(file))
+    stamps = sorted({int(row['stamp_ns']) for row in rows})
+    keys = [row for row in rows if int(row['stamp_ns']) in stamps[1:12:5]]
+    write(folder / 'keys.csv', keys)
+    write(folder / 'seeds.csv', [row for row in rows if int(row['stamp_ns']) == stamps[6]])
+    off = dict(keys[0], track_id='nothing', y='300')
+    late = dict(keys[0], track_id='late', stamp_ns=str(stamps[-1] + 10**10))
+    write(folder / 'bad.csv', [*keys, off, late])
+    return folder
+
+
+def write(path, rows):
+    with open(path, 'w', newline='') as file:
+        table = csv.DictWriter(file, rows[0])
+        table.writeheader()
+        table.writerows(rows)
+
+
+def scores(out, truth):
+    """Return the IoU (n,) of all written boxes that the truth has."""
+    found, true = BoxTable.read(out / 'boxes.csv'), BoxTable.read(truth)
+    at = dict(zip(zip(true.track_ids, true.stamps_ns, strict=True), true.boxes, strict=True))
+    keys = list(zip(found.track_ids, found.stamps_ns, strict=True))
+    rows = [row for row, key in enumerate(keys) if key in at]
+    return iou_3d(found.boxes[rows], np.array([at[keys[row]] for row in rows]))
+
+
+def test_keyframes_get_a_box_at_every_sweep(street, tmp_path, capsys):
+    out = tmp_path / 'out'
+    words = [
+        'relabel',
+        f'{street}/drive.mcap',
+        '--labels',
+        f'csv:{street}/bad.csv',
+        '-o',
+        str(out),
+    ]
+    assert main([*words, '--keyframes', '--formats', 'csv,openlabel']) == 0
+    printed = capsys.readouterr()
+    assert f'boxes at 4 stamps before, {SWEEPS + 1} after' in printed.out
+    assert "seeds of track 'nothing': expected points in their boxes" in printed.err
+    assert "track 'late'" in printed.err and 'the nearest is' in printed.err
+    rows = rows_of(out)
+    with open(street / 'keys.csv', newline='') as file:
+        given = list(csv.DictReader(file))
+    for track_id in {row['track_id'] for row in given}:
+        stamps = [int(row['stamp_ns']) for row in given if row['track_id'] == track_id]
+        of_track = [row for row in rows if row['track_id'] == track_id]
+        word = {int(row['stamp_ns']): row['status'] for row in of_track}
+        assert all(word[stamp] in ('refined', 'kept') for stamp in stamps)
+        between = [at for at in word if min(stamps) < at < max(stamps) and at not in stamps]
+        assert all(word[at] == 'interpolated' for at in between)
+        assert len(between) == 4 * (len(stamps) - 1) or len(stamps) < 3
+        beyond = [at for at in word if not min(stamps) <= at <= max(stamps)]
+        assert all(word[at] == 'extended' for at in beyond)
+    assert scores(out, street / 'truth.csv').mean() > 0.9
+    assert scores(out, street / 'keys.csv').mean() > 0.995
+    summary = json.loads((out / 'summary.json').read_text())
+    ends = {seed['track_id']: seed for seed in summary['seeds']}
+    assert ends['nothing']['after']['reason'] == 'few_points'
+    assert summary['sweeps_with_boxes'] == {'before': 4, 'after': SWEEPS + 1}
+
+
+def test_one_box_of_each_object_is_followed(street, tmp_path):
+    out = tmp_path / 'out'
+    words = ['follow', f'{street}/drive.mcap', f'{street}/seeds.csv', '-o', str(out)]
+    assert main([*words, '--formats', 'csv']) == 0
+    iou = scores(out, street / 'truth.csv')
+    with open(street / 'truth.csv', newline='') as file:
+        true = [row for row in csv.DictReader(file) if int(row['num_points']) >= 30]
+    assert len(iou) > 0.7 * len(true)
+    assert (iou > 0.5).mean() > 0.97
+    assert main(['follow', f'{street}/drive.mcap', '-o', str(out)]) == 2
+
+
+def test_few_boxes_are_said_and_completed(street, tmp_path, capsys):
+    words = ['relabel', f'{street}/drive.mcap', '--labels', f'csv:{street}/keys.csv']
+    words += ['--formats', 'csv', '-o', str(tmp_path / 'out')]
+    assert main(words) == 0
+    assert 'for a box at every cloud use --keyframes' in capsys.readouterr().err
+    assert main([*words, '--complete']) == 0
+    assert 'stamps before, 11 after' in capsys.readouterr().out
+    assert main([*words, '--complete', '--keyframes']) == 2
+
+
+def test_empty_arrays_stand_between_late_ones():
+    part = Arrivals()
+    for item in (0, 10, 20, empty_array(0, 'odom'), 30, empty_array(30, 'odom'), 40):
+        is_sweep = isinstance(item, int)
+        part.add(Sweep(item, 'odom', np.zeros((0, 3))) if is_sweep else item)
+    assert part.missing_ns() == [10, 20, 40]
+    assert [array.stamp_ns for array in part.completed('odom')] == [0, 10, 20, 30, 40]
