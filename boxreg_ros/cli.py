@@ -41,7 +41,9 @@ COMMANDS = {
     'batch': Command('offline.batch', 'relabel many recordings with several workers'),
     'convert': Command('offline.convert', 'convert label files to other formats'),
     'formats': Command('offline.formats', 'list the label formats and their conventions'),
-    'review': Command('review.server', 'look at a result in the browser, decide and correct'),
+    'review': Command(
+        'offline.review_command', 'look at a result in the browser, decide and correct'
+    ),
     'evaluate': Command('offline.evaluate', 'compare boxes with true boxes'),
     'check': Command('offline.check', 'check labels against rules'),
     'calibrate': Command(

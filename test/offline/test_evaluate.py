@@ -2,15 +2,17 @@
 
 import argparse
 import codecs
+import csv
 from dataclasses import replace
 import json
 import re
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable, COLUMNS
+from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline import evaluate as cli
 from boxreg_ros.offline.box_scores import evaluate, groups, has_word, match, summarise
-from boxreg_ros.structures import BoxArray
+from boxreg_ros.structures import BoxArray, KEPT, RefinedBoxes
 import numpy as np
 import pytest
 
@@ -281,3 +283,27 @@ def test_tables_with_invalid_predictions_only_are_explained(tmp_path, capsys):
     printed = capsys.readouterr()
     assert 'all 20 predicted boxes are invalid' in printed.err
     assert '10 true boxes, 10 missing' in printed.out
+
+
+def test_no_cell_of_a_table_is_a_formula_and_every_text_is_read_back(tmp_path):
+    ids = ('=1+1', '@x', '+a', '-b', '-1', "'=x", "'", 'a\rb', '\tq', 'a,"b"\nc', 'x' * 10**6)
+    truth = truth_table()
+    table = replace(rows(truth, np.arange(len(ids))), frame_id='=odom', track_ids=ids)
+    table.write(tmp_path / 'boxes.csv')
+    assert BoxTable.read(tmp_path / 'boxes.csv').track_ids == ids
+    with (tmp_path / 'boxes.csv').open(newline='') as file:
+        cells = [row['track_id'] for row in csv.DictReader(file)]
+    assert cells[:8] == ["'=1+1", "'@x", "'+a", "'-b", '-1', "''=x", "''", 'a\rb']
+    frame = LabelFrame(
+        RefinedBoxes(
+            BoxArray(5, '=odom', ids, ids, np.ones(len(ids)), table.boxes),
+            (KEPT,) * len(ids), ('',) * len(ids), table.num_points,
+            np.tile(np.eye(6), (len(ids), 1, 1)),
+        ),
+        '=odom', 'lidar',
+    )  # fmt: skip
+    writer = writer_for('csv', tmp_path, Provenance())
+    writer.write(frame)
+    writer.close()
+    again = BoxTable.read(tmp_path / 'boxes.csv')
+    assert (again.track_ids, again.class_names, again.frame_id) == (ids, ids, '=odom')
