@@ -167,7 +167,8 @@ def _with_new_directions(
         step=torch.where(search.has_moved, 1.0, search.step),
         tries=torch.where(search.has_moved, 0, search.tries) + 1,
     )
-    return select(search, (best.status[search.rows] == Status.RUNNING).nonzero()[:, 0])
+    running: _Search = select(search, (best.status[search.rows] == Status.RUNNING).nonzero()[:, 0])
+    return running
 
 
 def _after_trial(search: _Search, best: Minimum, function: Function, history: int) -> _Search:
