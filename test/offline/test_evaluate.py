@@ -118,6 +118,14 @@ def test_missing_and_unmatched_boxes_are_counted():
     assert evaluate(replace(predicted, boxes=broken), truth).missing == 4
 
 
+def test_least_numbers_of_points_belong_to_what_they_begin():
+    truth = replace(truth_table(3), num_points=np.array([99, 100, 101, 299, 300, 301]))
+    assert match(truth, truth, 100).num_points.tolist() == [100, 101, 299, 300, 301]
+    by_points = groups(match(truth, truth))['by_points']
+    low, high = (next(k for k in by_points if k.startswith(f'{n}-')) for n in (100, 300))
+    assert (by_points[low].boxes, by_points[high].boxes) == (3, 2)
+
+
 def test_scope_by_points_and_class():
     truth = truth_table()
     assert evaluate(truth, truth, min_points=100).boxes == 10
