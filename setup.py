@@ -18,11 +18,11 @@ manifest = ElementTree.parse('package.xml')
 class ReproducibleSdist(sdist):
     """The sdist; with SOURCE_DATE_EPOCH the same sources make the same bytes, as in a wheel."""
 
-    def make_archive(self, base_name, format, root_dir=None, base_dir=None, **owner):
+    def make_archive(self, base_name, kind, root_dir=None, base_dir=None, **owner):
         """Return the path of the archive of a folder."""
         epoch = os.environ.get('SOURCE_DATE_EPOCH')
-        if epoch is None or format != 'gztar':
-            return super().make_archive(base_name, format, root_dir, base_dir, **owner)
+        if epoch is None or kind != 'gztar':
+            return super().make_archive(base_name, kind, root_dir, base_dir, **owner)
 
         def normalised(member):
             member.mtime = int(epoch)

@@ -41,6 +41,7 @@ def population_slopes(evidence: Floats, constants: Constants) -> tuple[Floats, F
         corrections to these, over the square of their expected error; the weights of these, 0
         without enough evidence.
     constants : Constants
+        Of the method.
 
     Returns
     -------

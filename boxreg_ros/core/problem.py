@@ -167,7 +167,7 @@ class Problem(NamedTuple):
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """True for observations, False for padding, (B, N)."""
+        """Rows that are observations and not padding, (B, N)."""
         valid: NDArray[np.bool_] = np.arange(self.length) < self.lengths[:, None]
         return valid
 

@@ -156,9 +156,10 @@ class Settings:
     """The options that make a `Config`; a setting of its own wins over one that sets several."""
 
     config: Path | None = option(None, 'settings as a YAML file', metavar='FILE', parse=Path)
-    set: tuple[tuple[str, Any], ...] = option(
+    overrides: tuple[tuple[str, Any], ...] = option(
         (),
         'one setting, as in solver.rounds=2; overrides --config and --complete; can be repeated',
+        flag='--set',
         metavar='KEY=VALUE',
         parse=_key_value,
         text=_written,
@@ -184,7 +185,7 @@ class Settings:
             shorthands |= {f'complete.{step}': True for step in COMPLETE_STEPS}
         if self.workers is not None:
             shorthands['solver.threads'] = self.workers
-        return config.updated(shorthands).updated(dict(self.set))
+        return config.updated(shorthands).updated(dict(self.overrides))
 
 
 def config_from(args: argparse.Namespace) -> Config:

@@ -258,7 +258,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads."""
     add_recordings(parser)
     add_options(parser, Request, *TOPICS)
-    add_options(parser, Settings, 'config', 'set')
+    add_options(parser, Settings, 'config', 'overrides')
     parser.add_argument(
         '--truth', type=Path, required=True, metavar='TRUTH.csv',
         help='true boxes of some tracks, in the columns of boxes.csv',

@@ -454,7 +454,7 @@ class VoxelCloud:
             self.points()
 
     def points(self) -> Floats:
-        """Return the points (n, 3) [m]."""
+        """Return their positions, shape (n, 3) [m]."""
         every = np.concatenate([np.zeros((0, 3)), *self._parts])
         cells = np.floor(every / self._edge).astype(np.int64)
         cells -= cells.min(axis=0, initial=0)

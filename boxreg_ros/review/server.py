@@ -7,12 +7,8 @@ from getpass import getuser
 from pathlib import Path
 import signal
 import socket
-from typing import TYPE_CHECKING
 
 from boxreg_ros.errors import ConfigError, RecordingError
-
-if TYPE_CHECKING:
-    from uvicorn import Server
 
 HOST = '127.0.0.1'
 PORT = 8765
@@ -79,7 +75,7 @@ class ReviewServer:
             log_level='critical', server_header=False, date_header=False,
             timeout_graceful_shutdown=SHUTDOWN_SECONDS,
         )  # fmt: skip
-        self._server: Server = Server(config)
+        self._server = Server(config)
 
     def serve_forever(self) -> None:
         """Serve until `shutdown`."""

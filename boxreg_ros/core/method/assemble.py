@@ -265,6 +265,7 @@ def weigh(b, problem, poses, shared, constants, at, out, terms, common):
     poses, shared : array, shapes (N, 6) and (23,)
         Boxes and shared variables of the window.
     constants : record of `Constants`
+        Of the method, with the settings.
     at, out : Axes, Linearised
         To work in.
     terms, common : array of `TERMS`, shape (N,), and record `COMMON`

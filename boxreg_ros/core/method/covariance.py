@@ -226,6 +226,7 @@ def fill_posterior(
     inverse : Inverse
         Blocks of its inverse curvature.
     constants : record of `Constants`
+        Of the method, with the settings.
     work : CovarianceWork
         Arrays to work in.
     found : Posterior

@@ -251,6 +251,7 @@ def expect(b, problem, inputs, constants, work, common):
     inputs : record `INPUTS`
         Noise, margins and population of the input, of its kind.
     constants : record of `Constants`
+        Of the method, with the settings.
     work : ExpectationWork
         Arrays to work in.
     common : record `COMMON`

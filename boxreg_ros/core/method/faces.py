@@ -332,6 +332,7 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
     inputs : record `INPUTS`
         With the insets of its kind.
     constants : record of `Constants`
+        Of the method, with the settings.
     work : FaceWork
         Arrays to work in.
     terms : array of `TERMS`, shape (N,)

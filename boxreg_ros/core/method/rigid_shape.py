@@ -188,6 +188,7 @@ def agree(b, problem, poses, extents, constants, work, terms):
     poses, extents : array, shapes (N, 6) and (3,)
         Boxes of the window in this round [m, rad].
     constants : record of `Constants`
+        Of the method, with the settings.
     work : ShapeWork
         Arrays to work in.
     terms : array of `TERMS`, shape (N,)

@@ -88,6 +88,7 @@ def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, s
     free : array, shape (B, 6 N + 23)
         1 for variables that are estimated, 0 for those held fixed.
     constants : record of `Constants`
+        Of the method, with the settings.
     poses, shared : array, shapes (B, N, 6) and (B, 23)
         Start of the round.
     sums : Sums
