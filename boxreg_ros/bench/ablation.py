@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 WHOLE = 'nothing'
 SCORES = ('BEV', '3D', 'R@0.8', 'flips')
-ESTIMATES = ('final', 'track')
+ABLATED_ESTIMATES = ('final', 'track')
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +60,7 @@ INGREDIENTS = {
     WHOLE: Ingredient('every ingredient is on', {}),
     'points': Ingredient(
         'faces and rigid shape have no weight: motion and input alone',
-        {f'faces.{name}': 10.0 for name in ('ends', 'sides', 'top', 'bottom')}
-        | _without('rigid shape'),
+        {f'faces.{name}': 10.0 for name in ('ends', 'sides', 'bottom')} | _without('rigid shape'),
     ),
     'rigid shape': Ingredient(
         'points of a track are not tied to one rigid shape', _without('rigid shape')
@@ -114,7 +113,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='INGREDIENT', help=f'only some of {", ".join(list(INGREDIENTS)[1:])}',
     )  # fmt: skip
     parser.add_argument(
-        '--estimate', nargs='+', choices=('early', *ESTIMATES), default=ESTIMATES,
+        '--estimate', nargs='+', choices=('early', *ABLATED_ESTIMATES), default=ABLATED_ESTIMATES,
         help='early (newest box), final (fixed lag), track (full sequence); default: final track',
     )  # fmt: skip
     parser.add_argument(

@@ -54,8 +54,8 @@ NO_PRIOR = (
 
 
 SETTINGS_OF = {
-    'acceleration': ('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning'),
-    'slip': ('slip', 'climb'),
+    'acceleration': ('acceleration', 'cornering', 'acceleration', *(3 * ('turning',))),
+    'slip': ('slip', 'slip'),
     'drift': ('drift',),
     'pose': ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading'),
     'extent': ('extent',),

@@ -24,7 +24,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.lock import locked
 from boxreg_ros.io.storage.urls import names_of, read_text, url_of, write_text
 from boxreg_ros.io.whole_files import written_whole
-from boxreg_ros.offline.batch_results import DONE, Result, UP_TO_DATE
+from boxreg_ros.offline.batch_results import DRIVE_DONE, Result, UP_TO_DATE
 from boxreg_ros.offline.job import Job, JOBS
 from boxreg_ros.offline.progress import PIPE
 from boxreg_ros.offline.result_folder import claimed, earlier_summary, whole_summary
@@ -156,7 +156,7 @@ class JobRunner:
             pass
         result.seconds = round(time.monotonic() - begun, 1)
         if result.exit_status == 0:
-            result.status = DONE
+            result.status = DRIVE_DONE
             return
         with suppress(RecordingError), claimed(self.out / job.name):
             pass  # deletes what a process that was killed has left
