@@ -3,6 +3,7 @@
 from contextlib import suppress
 import ctypes
 import gc
+import os
 
 # Parameters of mallopt(3), from glibc's malloc.h.
 M_TRIM_THRESHOLD = -1
@@ -15,6 +16,17 @@ MAX_KEPT = 256 << 20
 YOUNG_OBJECTS = 100_000
 """New objects before a collection. Swept: 700 (of Python), 20,000 and 100,000 take 0.50, 0.17 and
 0.09 s of a run of 4.5 s, most of it while libraries are imported, with the same peak memory."""
+
+
+def start_no_threads() -> None:
+    """
+    Keep libraries from starting threads when they are imported: to be called before that.
+
+    `boxreg relabel` forks its workers, and a fork has none of the threads of its parent, nor the
+    locks that these would release. No matrix here is large enough for several threads.
+
+    """
+    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 
 def collect_rarely() -> None:

@@ -17,7 +17,7 @@ from types import FrameType, ModuleType
 from typing import Any, NamedTuple, NoReturn
 
 from boxreg_ros import __version__
-from boxreg_ros.allocation import collect_rarely, keep_freed_memory
+from boxreg_ros.allocation import collect_rarely, keep_freed_memory, start_no_threads
 from boxreg_ros.errors import BoxregError, ConfigError, remedy_of
 
 
@@ -41,7 +41,9 @@ COMMANDS = {
     'batch': Command('offline.batch', 'relabel many recordings with several workers'),
     'convert': Command('offline.convert', 'convert label files to other formats'),
     'formats': Command('offline.formats', 'list the label formats and their conventions'),
-    'review': Command('review.server', 'look at a result in the browser, decide and correct'),
+    'review': Command(
+        'offline.review_command', 'look at a result in the browser, decide and correct'
+    ),
     'evaluate': Command('offline.evaluate', 'compare boxes with true boxes'),
     'check': Command('offline.check', 'check labels against rules'),
     'calibrate': Command(
@@ -228,6 +230,7 @@ def _loses_exceptions(frame: FrameType | None) -> bool:
 
 def _run(arguments: list[str]) -> int:
     """Parse the arguments and run the subcommand."""
+    start_no_threads()
     command = next((item for item in arguments if not item.startswith('-')), None)
     if command == 'node' and arguments[0] == 'node':  # takes the arguments of a ROS node
         return int(_module('node').main(arguments[1:]) or DONE)

@@ -26,11 +26,11 @@ Ints = NDArray[np.int64]
 X, Y, Z, LENGTH, WIDTH, HEIGHT, ROLL, PITCH, YAW = range(9)
 POSE = [X, Y, Z, ROLL, PITCH, YAW]
 BOX_EXTENT = slice(LENGTH, HEIGHT + 1)
+"""Columns of the extents of a box."""
 LARGEST_EXTENT = 1e3
 """Objects are smaller [m]; chosen: twice the longest ship."""
 LARGEST_COORDINATE = 3e7
 """Centres are nearer to the origin [m]; maps have up to 20,037,509 m (Web Mercator)."""
-"""Columns of the extents of a box."""
 BOX_AXES = 'x y z length width height roll pitch yaw'
 
 REFINED, KEPT = 'refined', 'kept'

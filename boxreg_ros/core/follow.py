@@ -21,7 +21,7 @@ from boxreg_ros.core.following.tracker import (
 )
 from boxreg_ros.core.refine import refine, Track
 from boxreg_ros.errors import ShapeError
-from boxreg_ros.rotations import wrap_angle
+from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import (
     BOX_EXTENT,
     BoxArray,
@@ -33,6 +33,7 @@ from boxreg_ros.structures import (
     Ints,
     is_valid_box,
     LENGTH,
+    ROLL,
     WIDTH,
     YAW,
 )
@@ -158,6 +159,7 @@ def follow_points(
     times = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
     sweeps = Sweeps(times, points)
     objects = [_placed(name, rows, stamps_ns) for name, rows in _by_track(seeds).items()]
+    objects = _overlapping(objects)
     owned = Owned()
     followers = [
         Follower(sweeps, one.seeds, config.kind(one.class_name), owned) if len(one.seeds.rows)
@@ -246,6 +248,10 @@ def _followed(
     poses = {int(row): box[POSE4] for row, box in zip(seeds.rows, seeds.boxes, strict=True)}
     status = dict.fromkeys(poses, HUMAN)
     for first in range(len(seeds.rows) - 1):
+        if follower.jumps(first):
+            at = stamps_ns[seeds.rows[first : first + 2]].tolist()
+            problems = (*problems, _jump(one, at))
+            continue
         rows, found = between(follower, times, seeds, first)
         poses |= dict(zip(rows.tolist(), found, strict=True))
         status |= dict.fromkeys(rows.tolist(), INTERPOLATED)
@@ -269,6 +275,36 @@ def _followed(
     return FollowedTrack(
         one.track_id, one.class_name, rows, stamps_ns[rows], boxes, words, tuple(ends), problems
     )
+
+
+def _jump(one: _Object, stamps_ns: list[int]) -> str:
+    return (
+        f'seeds of track {one.track_id!r} at {stamps_ns[0]} and {stamps_ns[1]}: expected boxes of '
+        f'one object, got some too far apart for a {one.class_name!r}; no boxes are added between '
+        f'them: give each object an id of its own'
+    )
+
+
+def _overlapping(objects: Sequence[_Object]) -> list[_Object]:
+    """Return the objects; those with a seed whose centre is in that of another are named."""
+    by_row: dict[int, list[tuple[int, Floats]]] = {}
+    for index, one in enumerate(objects):
+        for row, box in zip(one.seeds.rows.tolist(), one.seeds.boxes, strict=True):
+            by_row.setdefault(row, []).append((index, box))
+    others: dict[int, str] = {}
+    for placed in by_row.values():
+        boxes = np.array([box for _, box in placed])
+        offsets = (boxes[:, :3] - boxes[:, None, :3]) @ matrix_from_rpy(boxes[:, ROLL:])
+        is_inside = (np.abs(offsets) < boxes[:, None, BOX_EXTENT] / 2).all(2)
+        np.fill_diagonal(is_inside, False)
+        for outer, inner in np.argwhere(is_inside).tolist():
+            others[placed[inner][0]] = objects[placed[outer][0]].track_id
+    found = list(objects)
+    for index, other in others.items():
+        one = objects[index]
+        line = f'seeds of track {one.track_id!r}: one is inside that of track {other!r}; both are'
+        found[index] = one._replace(problems=(*one.problems, f'{line} followed: delete one'))
+    return found
 
 
 def _without_points(one: _Object, count: int) -> str:

@@ -23,11 +23,8 @@ STEP_BOUNDS = (0.1, 0.5)
 Methods for Unconstrained Optimization, section 6.3.2."""
 MAX_BACKTRACKS = 12
 """Most trials of one direction. Chosen: the last step is 2^-11 of the first, or shorter."""
-SYNC_INTERVAL = 4
-"""Turns after which a GPU is asked for the number of running rows. Chosen: asking waits for it."""
 HISTORY = 6
-"""Curvature pairs that are kept. Literature: 3 to 20 (Nocedal & Wright, section 7.2). With one
-iteration in a round, as by default, none is used."""
+"""Curvature pairs that are kept. Literature: 3 to 20 (Nocedal and Wright, section 7.2)."""
 
 Function = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Metric = Callable[[Tensor, Tensor], Tensor]
@@ -117,7 +114,7 @@ def minimize(
     Two-loop recursion (Nocedal and Wright, algorithm 7.4), then backtracking from a full step by
     quadratic interpolation until Armijo's condition holds. Every turn evaluates one point per row:
     a row that accepts it goes on from there while its neighbour still shortens its step. Ended
-    rows leave the batch as soon as they are half of it.
+    rows leave the batch.
 
     """
     rows = torch.arange(len(start), device=start.device)
@@ -130,58 +127,51 @@ def minimize(
     search = _Search(
         rows, start, value, gradient, start, value, value, is_finite, zeros, list[CurvaturePair]()
     )
-    for turn in range(iterations * MAX_BACKTRACKS):
-        taken = best.iterations[search.rows]
+    for _ in range(iterations * MAX_BACKTRACKS):
         is_running = best.status[search.rows] == Status.RUNNING
-        running = is_running & ((taken < iterations) | ~search.has_moved)
-        if turn % (1 if rows.is_cpu else SYNC_INTERVAL) == 0:
-            count = int(running.sum())
-            if not count:
-                break
-            if count <= len(search.rows) // 2:
-                search = select(search, running.nonzero()[:, 0])
-                running = running[running]
-        search, running = _with_new_directions(search, running, best, metric, tolerance)
-        search = _after_trial(search, running, best, function, history)
+        is_over = search.has_moved & (best.iterations[search.rows] == iterations)
+        search = select(search, (is_running & ~is_over).nonzero()[:, 0])
+        search = _with_new_directions(search, best, metric, tolerance)
+        if not len(search.rows):
+            break
+        search = _after_trial(search, best, function, history)
     return best
 
 
 def _with_new_directions(
-    search: _Search, running: Tensor, best: Minimum, metric: Metric | None, tolerance: float
-) -> tuple[_Search, Tensor]:
+    search: _Search, best: Minimum, metric: Metric | None, tolerance: float
+) -> _Search:
     """
-    Give a new direction to the rows that have moved; return those that still run, too.
+    Give a new direction to the rows that have moved, or leave those out that have converged.
 
     Status and iterations of `best` are updated.
 
     """
-    fresh = running & search.has_moved
-    direction = -_two_loop(search.gradient, search.pairs, search.rows, metric)
-    slope = (search.gradient * direction).sum(1)
+    moved = search.has_moved.nonzero()[:, 0]
+    rows, _, value, gradient, *_, pairs = select(search, moved)
+    direction = -_two_loop(gradient, pairs, rows, metric)
+    slope = (gradient * direction).sum(1)
     is_uphill = ~(slope < 0)
-    direction = torch.where(is_uphill[:, None], -search.gradient, direction)
-    slope = torch.where(is_uphill, -search.gradient.square().sum(1), slope)
-    if metric is None and not search.pairs:  # the scale is unknown: a step of length 1 at most
-        size = search.gradient.abs().sum(1).clamp(min=1.0)
+    direction = torch.where(is_uphill[:, None], -gradient, direction)
+    slope = torch.where(is_uphill, -gradient.square().sum(1), slope)
+    if metric is None and not pairs:  # the scale is unknown: a step of length 1 at most
+        size = gradient.abs().sum(1).clamp(min=1.0)
         direction = direction / size[:, None]
         slope = slope / size
-    converged = fresh & (-slope <= tolerance * (1 + search.value.abs()))
-    best.status[search.rows] += int(Status.CONVERGED) * converged
-    running = running & ~converged
-    fresh = fresh & ~converged
-    best.iterations[search.rows] += fresh
+    has_converged = -slope <= tolerance * (1 + value.abs())
+    best.status[rows] = int(Status.CONVERGED) * has_converged
+    best.iterations[rows] += ~has_converged
     search = search._replace(
-        direction=torch.where(fresh[:, None], direction, search.direction),
-        slope=torch.where(fresh, slope, search.slope),
-        step=torch.where(fresh, 1.0, search.step),
-        tries=torch.where(fresh, 0, search.tries) + 1,
+        direction=search.direction.index_copy(0, moved, direction),
+        slope=search.slope.index_copy(0, moved, slope),
+        step=torch.where(search.has_moved, 1.0, search.step),
+        tries=torch.where(search.has_moved, 0, search.tries) + 1,
     )
-    return search, running
+    running: _Search = select(search, (best.status[search.rows] == Status.RUNNING).nonzero()[:, 0])
+    return running
 
 
-def _after_trial(
-    search: _Search, running: Tensor, best: Minimum, function: Function, history: int
-) -> _Search:
+def _after_trial(search: _Search, best: Minimum, function: Function, history: int) -> _Search:
     """
     Evaluate one point per row; accept it, or shorten the step.
 
@@ -191,8 +181,8 @@ def _after_trial(
     rows, value, slope, step = search.rows, search.value, search.slope, search.step
     trial, trial_gradient = function(search.x + step[:, None] * search.direction, rows)
     has_decreased = trial <= value + SUFFICIENT_DECREASE * step * slope
-    is_good = running & trial_gradient.isfinite().all(1) & has_decreased
-    is_stuck = running & ~is_good & (search.tries == MAX_BACKTRACKS)
+    is_good = trial_gradient.isfinite().all(1) & has_decreased
+    is_stuck = ~is_good & (search.tries == MAX_BACKTRACKS)
     best.status[rows] += int(Status.STUCK) * is_stuck
 
     s = torch.where(is_good, step, 0.0)[:, None] * search.direction
@@ -210,7 +200,7 @@ def _after_trial(
         value=torch.where(is_good, trial, value),
         gradient=search.gradient + y,
         step=shorter.clamp(least * step, most * step),
-        has_moved=is_good | (search.has_moved & ~running),
+        has_moved=is_good,
         pairs=[*search.pairs, pair][-history:],
     )
     best.x[rows] = search.x  # by Armijo's condition never worse than before

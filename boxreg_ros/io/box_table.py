@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 import csv
 from dataclasses import dataclass
 from functools import lru_cache
@@ -24,6 +25,8 @@ COLUMNS = (
 UTF_16_MARKS = BOM_UTF16_LE, BOM_UTF16_BE
 EXPORTS = {'\0': 'UTF-16', ';': 'semicolons', '\t': 'tabs'}
 """What a header has that a spreadsheet has exported in another form, and the name of the form."""
+FORMULA_STARTS = ('=', '+', '-', '@', '\t', '\r', "'")
+"""Spreadsheets run cells that begin so as formulas, or hide the first character."""
 csv.field_size_limit(2**31 - 1)  # ids may be as long as messages
 
 
@@ -135,7 +138,7 @@ class BoxTable:
             ) from None
         of_frame: dict[str, list[tuple[int, dict[str, str]]]] = {}
         for line, row in rows:
-            of_frame.setdefault(row['frame_id'], []).append((line, row))
+            of_frame.setdefault(unprotected(row['frame_id']), []).append((line, row))
         return {name: cls._parsed(path, name, part) for name, part in of_frame.items()}
 
     @classmethod
@@ -171,8 +174,8 @@ class BoxTable:
         return cls(
             stamps,
             frame_id,
-            tuple(row['track_id'] for row in rows),
-            tuple(row['class_name'] for row in rows),
+            tuple(unprotected(row['track_id']) for row in rows),
+            tuple(unprotected(row['class_name']) for row in rows),
             numbers[:, 0],
             boxes,
             tuple(row['status'] for row in rows),
@@ -201,7 +204,8 @@ class BoxTable:
             for i, box in enumerate(self.boxes):
                 numbers = (self.scores[i], *box[:3], *quaternions[i], *box[BOX_EXTENT])
                 file.write(csv_row([
-                    self.stamps_ns[i], self.frame_id, self.track_ids[i], self.class_names[i],
+                    self.stamps_ns[i],
+                    *map(protected, (self.frame_id, self.track_ids[i], self.class_names[i])),
                     *(f'{number:.9f}' for number in numbers), self.status[i], self.num_points[i],
                 ]))  # fmt: skip
 
@@ -224,4 +228,24 @@ def _exported(path: str | Path, found: str) -> RecordingError:
 @lru_cache(1024)
 def cell(text: str) -> str:
     """Return a text as one of several cells of a row of CSV: in quotes where it needs them."""
-    return csv_row(('', text))[1:-1]
+    return csv_row(('', protected(text)))[1:-1]
+
+
+def protected(text: str) -> str:
+    """
+    Return a text as a cell that no spreadsheet takes for a formula; `unprotected` reads it.
+
+    A number with a sign is none.
+
+    """
+    if not text.startswith(FORMULA_STARTS):
+        return text
+    with suppress(ValueError):
+        float(text)
+        return text
+    return f"'{text}"
+
+
+def unprotected(cell: str) -> str:
+    """Return the text of a cell that `protected` has made."""
+    return cell[1:] if cell.startswith("'") else cell

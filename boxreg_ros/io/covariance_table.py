@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.errors import RecordingError, unreadable
-from boxreg_ros.io.box_table import cell
+from boxreg_ros.io.box_table import cell, unprotected
 from boxreg_ros.structures import Floats, KEPT, RefinedBoxes, X, Y
 import numpy as np
 
@@ -113,7 +113,7 @@ def _rows(reader: csv.DictReader[str]) -> Iterator[tuple[tuple[int, str], BoxCov
         numbers = np.array([float(row[name]) for name in COVARIANCE_NUMBERS])
         pose = _symmetric(numbers[:NUM_POSE], 6)
         extent = _symmetric(numbers[NUM_POSE:], 3)
-        key = int(row['stamp_ns']), row['track_id']
+        key = int(row['stamp_ns']), unprotected(row['track_id'])
         yield key, BoxCovariance(float(row['range'] or 'nan'), pose, extent)
 
 

@@ -151,8 +151,13 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(
             '--address: expected with --engine ray, got it without; add --engine ray'
         )
+    _request(args)  # refuses options that cannot work together
+
+
+def _request(args: argparse.Namespace) -> Request:
+    """Return the request of all drives, without their recordings."""
     options = values_of(args, Request) | {'report': False}  # to check that imports torch
-    Request((), config=_config(args), **options)
+    return Request((), config=_config(args), **options)
 
 
 def _config(args: argparse.Namespace) -> Config:
@@ -173,6 +178,7 @@ def _results(jobs: Sequence[Job], args: argparse.Namespace) -> list[Result]:
         args.out if url_of(args.out) else args.out.absolute(),
         tuple(options_of_drives(args)),
         str(_config(args)),
+        _request(args).inputs(),
         args.retries,
         args.timeout,
         round(args.memory * 1e9),

@@ -15,6 +15,7 @@ from urllib.parse import quote
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.box_table import unprotected
 from boxreg_ros.io.storage.urls import names_of, read_text, url_of
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.result_folder import SUMMARY
@@ -178,9 +179,10 @@ def _riskiest(out: Path, drives: Iterable[str]) -> list[dict[str, Any]]:
             text = read_text(out / drive / REVIEW)
         except OSError:  # the drive has failed
             continue
-        for row in csv.DictReader(text.splitlines()):
+        for row in csv.DictReader(StringIO(text, newline='')):
             try:
-                found.append((float(row[RISK]), {'drive': drive, **row}))
+                shown = {name: unprotected(cell) for name, cell in row.items()}
+                found.append((float(row[RISK]), {'drive': drive, **shown}))
             except (KeyError, TypeError, ValueError):
                 continue  # a review without this column has no order
     found.sort(key=lambda item: -item[0])

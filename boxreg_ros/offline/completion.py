@@ -25,6 +25,7 @@ from boxreg_ros.structures import (
     Sweep,
 )
 from boxreg_ros.tracks.complete import complete, CompletionPlan
+from boxreg_ros.tracks.followed import closed_onto_exact
 from boxreg_ros.tracks.track_steps import TrackSteps
 import numpy as np
 
@@ -193,11 +194,14 @@ class Completion:
         From the first pass over the same items.
     config : Config
         Settings.
+    has_keyframes : bool
+        Whether the input is of a person.
 
     """
 
-    def __init__(self, plan: CompletionPlan, config: Config) -> None:
+    def __init__(self, plan: CompletionPlan, config: Config, has_keyframes: bool = False) -> None:
         self._plan = plan
+        self._has_keyframes = has_keyframes
         self._is_early = config.estimate == 'early'
         self._counter = PointCounter(config)
         self._given: list[BoxArray] = []
@@ -234,7 +238,8 @@ class Completion:
         self._counter.finish()
         points = [self._counter.of(array) for array in self._to_register]
         registered = [self._results[index] for index in range(len(self._given))]
-        return self._plan.finished(self._given, registered, points)
+        results = self._plan.finished(self._given, registered, points)
+        return closed_onto_exact(self._given, results) if self._has_keyframes else results
 
 
 def completed(

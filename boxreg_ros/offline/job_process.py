@@ -22,7 +22,7 @@ from typing import Any, BinaryIO
 from boxreg_ros import __version__
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.lock import locked
-from boxreg_ros.io.storage.urls import names_of, read_text, url_of, write_text
+from boxreg_ros.io.storage.urls import entries_of, names_of, read_text, url_of, write_text
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.batch_results import DRIVE_DONE, Result, UP_TO_DATE
 from boxreg_ros.offline.job import Job, JOBS
@@ -30,6 +30,10 @@ from boxreg_ros.offline.progress import PIPE
 from boxreg_ros.offline.result_folder import claimed, earlier_summary, whole_summary
 from boxreg_ros.offline.time_limit import Watch, watched
 
+DRIVE = '{drive}'
+"""Stands for the name of the drive in the options of a batch."""
+STATE = frozenset({'key', 'recordings', 'files', 'peak_mb'})
+"""Fields of the state of a job that is done; one without them, of another version, is none."""
 END_SECONDS = 10.0
 """Time that a job has to remove its files after SIGTERM [s]; then it is killed."""
 MEMORY_PERIOD = 0.5
@@ -52,9 +56,11 @@ class JobRunner:
     out : Path
         Folder with one result folder per drive; absolute.
     options : tuple of str
-        Options of `boxreg relabel`.
+        Options of `boxreg relabel`; `DRIVE` in them and in `inputs` is the name of the job.
     config : str
         The effective settings, for the key.
+    inputs : tuple of Path
+        Files and folders that the options name, for the key.
     retries : int
         How often a job whose process was killed is tried again.
     timeout : float
@@ -69,6 +75,7 @@ class JobRunner:
     out: Path
     options: tuple[str, ...]
     config: str
+    inputs: tuple[Path, ...] = ()
     retries: int = 1
     timeout: float = inf
     memory: float = inf
@@ -115,7 +122,7 @@ class JobRunner:
         state = _read_state(path)
         watch = Watch(self.timeout)
         files = watched(watch, partial(job.hashes, state.get('files', []), watch.advanced))
-        result.key = self._key(files)
+        result.key = self._key(job, files)
         self._refuse_other_drive(job, state, files)
         summary = whole_summary(self.out / job.name) if state.get('key') == result.key else None
         if summary is None:
@@ -130,9 +137,14 @@ class JobRunner:
             with written_whole(path) as file:
                 file.write(json.dumps(state, indent=2))
 
-    def _key(self, files: Sequence[Sequence[Any]]) -> str:
+    def _key(self, job: Job, files: Sequence[Sequence[Any]]) -> str:
         """Return the hash of the content of files, the options and the version."""
-        settings = [*self.options, self.config]
+        inputs = (Path(str(path).replace(DRIVE, job.name)) for path in self.inputs)
+        settings = [
+            *self.options,
+            self.config,
+            *(digest for p in inputs for digest in _digests(p)),
+        ]
         content = repr((__version__, settings, _contents(files)))
         return hashlib.sha256(content.encode()).hexdigest()
 
@@ -164,7 +176,8 @@ class JobRunner:
     def _attempt(self, job: Job, result: Result) -> bool:
         """Run the process of a job once; return whether another attempt would end the same."""
         command = [sys.executable, '-m', 'boxreg_ros.cli', 'relabel', *map(str, job.recordings)]
-        command += ['-o', str(self.out / job.name), '--resume', *self.options]
+        command += ['-o', str(self.out / job.name), '--resume']
+        command += [word.replace(DRIVE, job.name) for word in self.options]
         result.attempts += 1
         with _log_file(self.out / JOBS / f'{job.name}.log') as log, _pipe() as (steps, step):
             process = subprocess.Popen(
@@ -278,6 +291,17 @@ def _last_line(log: bytes) -> str:
     return lines[-1].removeprefix('boxreg: ') if lines else ''
 
 
+def _digests(path: Path) -> Iterator[str]:
+    """Yield the hashes of a file or of all files of a folder; none if there is none."""
+    if url_of(path) is not None:
+        yield from (f'{one.path} {one.version}' for one in entries_of(path))
+        return
+    for file in [path] if path.is_file() else sorted(path.rglob('*')):
+        if file.is_file():
+            with file.open('rb') as opened:
+                yield hashlib.file_digest(opened, 'sha256').hexdigest()
+
+
 def _contents(files: Sequence[Sequence[Any]]) -> list[Any]:
     """Return the hashes of files, as of `Job.hashes`."""
     return [found[-1] for found in files]
@@ -289,4 +313,4 @@ def _read_state(path: Path) -> dict[str, Any]:
         state = json.loads(read_text(path))
     except (OSError, ValueError):
         return {}
-    return state if isinstance(state, dict) and 'key' in state else {}
+    return state if isinstance(state, dict) and STATE.issubset(state) else {}

@@ -200,7 +200,8 @@ def _survey(
 
             with clock('follow'):
                 plan, parts, tracks = keyframes(items, fixed_frame, request.config)
-            return _Survey(plan, Completion(plan, request.config), parts, ends_of(tracks))
+            completion = Completion(plan, request.config, has_keyframes=True)
+            return _Survey(plan, completion, parts, ends_of(tracks))
         from boxreg_ros.offline.registration_worker import registration_worker
 
         submit = workers.enter_context(

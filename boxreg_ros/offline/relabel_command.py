@@ -129,6 +129,7 @@ class ProgressBar(Progress):
         """Show the bar."""
         from tqdm import tqdm
 
+        tqdm.monitor_interval = 0  # no thread beside this one, which forks
         is_hidden = not sys.stderr.isatty()
         self._done = 0.0
         self._bar = tqdm(total=1.0, unit='s', disable=is_hidden, leave=False, bar_format=BAR)

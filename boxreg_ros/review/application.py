@@ -258,11 +258,13 @@ class _Review:
         )
 
     async def _relabel(self) -> Response:
-        command = self._summary.get('command') or []
+        command = self._summary['command']
+        folder = Path(self._summary['folder'])
         decisions = (self._out / DECISIONS).resolve()
-        if not command:
+        if command[:1] != ['relabel'] or not folder.is_dir():
             raise RecordingError(
-                f'this result was not made by boxreg relabel: run boxreg relabel RECORDING -o NEW '
+                f'expected a result of boxreg relabel in {str(folder)!r}, got one of '
+                f'{command[:1]}, or the folder is gone; run boxreg relabel RECORDING -o NEW '
                 f'--decisions {decisions}'
             )
         out = self._out.resolve()
@@ -272,7 +274,7 @@ class _Review:
             more += ['--decisions', str(decisions)]
         process = await asyncio.create_subprocess_exec(
             sys.executable, '-m', 'boxreg_ros.cli', *command, *more,
-            cwd=self._summary['folder'],
+            cwd=folder,
             stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
         )  # fmt: skip
         try:

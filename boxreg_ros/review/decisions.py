@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.errors import RecordingError, unreadable
-from boxreg_ros.io.box_table import csv_row
+from boxreg_ros.io.box_table import csv_row, protected, unprotected
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.rotations import quaternion_from_rpy, rpy_from_quaternion
 from boxreg_ros.structures import BOX_EXTENT, Floats, is_valid_box, ROLL, Z
@@ -45,8 +45,6 @@ DECISION_COLUMNS = (*FIRST_COLUMNS, 'end_ns', 'value', 'who', 'when')
 MAX_STAMP_NS = 2**63 - 1
 MAX_COMMENT = 2000
 """Longest comment [characters]; chosen: a row fits a page of memory, which is written at once."""
-FORMULA_STARTS = ('=', '+', '-', '@', '\t', '\r', "'")
-"""Spreadsheets run cells that begin so as formulas, or hide the first character."""
 
 Scope = tuple[str, int | None, int | None]
 
@@ -185,16 +183,6 @@ class Decision:
             'who': self.who,
             'when': self.when,
         }
-
-
-def protected(text: str) -> str:
-    """Return a text as a cell that no spreadsheet takes for a formula."""
-    return f"'{text}" if text.startswith(FORMULA_STARTS) else text
-
-
-def unprotected(cell: str) -> str:
-    """Return the text of a cell that `protected` has made."""
-    return cell.removeprefix("'")
 
 
 def held(decisions: Iterable[Decision]) -> list[Decision]:
@@ -342,15 +330,16 @@ class DecisionLog:
             os.fsync(file.fileno())
 
     def _write_at(self, end: int, rows: bytes) -> None:
-        with open(self._path, 'r+b') as file:
+        with open(self._path, 'r+b', buffering=0) as file:
             file.truncate(end)  # without the part of a row that a crash has left
             file.seek(end)
+            left = memoryview(rows)
             try:
-                file.write(rows)
-                file.flush()
+                while left:
+                    left = left[file.write(left) :]
                 os.fsync(file.fileno())
             except OSError:  # as of a full disk
-                os.truncate(self._path, end)
+                file.truncate(end)
                 raise
 
 

@@ -1,4 +1,4 @@
-"""`boxreg review`: serve the report of a result on this machine, and write down decisions."""
+"""Serve the report of a result on this machine, and write down decisions."""
 
 from __future__ import annotations
 
@@ -22,9 +22,8 @@ SHUTDOWN_SECONDS = 1
 """Pages that listen for decisions are left after this time; chosen."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `boxreg review`."""
-    parser.add_argument('out', type=Path, metavar='OUT', help='result of boxreg relabel --report')
+def add_server_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the server."""
     parser.add_argument(
         '--port', type=int, default=PORT, metavar='N',
         help='port on this machine, 0 for any free one (default: %(default)s)',
@@ -35,9 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def run(args: argparse.Namespace) -> int:
+def serve(out: Path, port: int, who: str) -> int:
     """Serve until interrupted, or ended by a signal: each decision is saved already."""
-    server = review_server(args.out, args.port, args.who)
+    server = review_server(out, port, who)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
             signal.signal(number, lambda *_: server.shutdown())

@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from boxreg_ros.io.box_table import csv_row
+from boxreg_ros.io.box_table import csv_row, protected
 from boxreg_ros.review.changes import median, TrackChanges
-from boxreg_ros.review.decisions import protected
 from boxreg_ros.review.risk import assess, reasons_of, Risk, typical_parts, Usual
 from boxreg_ros.structures import ADDED, BOX_EXTENT, INTERPOLATED, KEPT, REFINED
 import numpy as np

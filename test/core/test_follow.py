@@ -92,7 +92,8 @@ def test_seeds_that_cannot_be_used_are_named_and_the_rest_is_done():
     empty = seed(truth + np.array([0, 30.0, 0, 0, 0, 0, 0, 0, 0]), 0, 'empty')
     twice = seed(truth, 0)
     late = BoxArray(10**18, '', ('late',), ('car',), np.ones(1), truth[:1])
-    tracks = follow(stamps(N), sweeps, [good, empty, twice, late])
+    jump = [seed(truth, 0, 'jump'), seed(truth + np.array([200.0, *[0] * 8]), 2, 'jump')]
+    tracks = follow(stamps(N), sweeps, [good, empty, twice, late, *jump])
     by_name = {track.track_id: track for track in tracks}
     assert len(by_name['a'].rows) == N
     assert 'expected one box at a stamp' in by_name['a'].problems[0]
@@ -100,6 +101,8 @@ def test_seeds_that_cannot_be_used_are_named_and_the_rest_is_done():
     assert by_name['empty'].rows.tolist() == [0]
     assert 'the nearest is' in by_name['late'].problems[0]
     assert not len(by_name['late'].rows)
+    assert "one is inside that of track 'jump'" in by_name['a'].problems[1]
+    assert 'too far apart' in by_name['jump'].problems[-1]
     assert follow(stamps(N), sweeps, []) == []
     with pytest.raises(ShapeError, match='expected 30 arrays, got 29'):
         follow(stamps(N), sweeps[1:], [good])

@@ -8,6 +8,7 @@ from boxreg_ros.errors import ConfigError, ShapeError
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.simulation.noise import detector_noise
 from boxreg_ros.simulation.simulate import simulate
+from boxreg_ros.structures import is_valid_box
 import numpy as np
 import pytest
 from scenes import drive, stamps, track_of
@@ -551,7 +552,8 @@ def random_track(rng):
         origins[rng.integers(n)] = rng.choice([np.nan, np.inf])
     steps = (10.0 ** rng.uniform(0, 10, n)).astype(np.int64)
     boxes[0] = np.where(np.isfinite(boxes[0]), boxes[0], 1.0)
-    boxes[0, 3:6] = np.abs(boxes[0, 3:6]) + 1e-3
+    boxes[0, :3] = boxes[0, :3].clip(-1e5, 1e5)
+    boxes[0, 3:6] = np.abs(boxes[0, 3:6]).clip(1e-3, 50.0)
     return Track(
         '1', str(rng.choice(['car', 'pedestrian', 'cyclist', ''])), np.cumsum(steps), boxes,
         points, None if rng.random() < 0.2 else origins,
@@ -573,7 +575,7 @@ def test_random_input_gives_finite_boxes(seed):
     )
     track = random_track(rng)
     refined = only(track, config)
-    valid = np.isfinite(track.boxes).all(1) & (track.boxes[:, 3:6] > 0).all(1)
+    valid = is_valid_box(track.boxes)
     assert [s == 'interpolated' for s in refined.status] == (~valid).tolist()
     assert (refined.boxes[:, 3:6] > 0).all()
 

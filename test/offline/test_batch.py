@@ -21,6 +21,8 @@ import pytest
 from ros_messages import Drive
 
 QUICK = ['--set=min_observations=3', '--set=window=5', '--set=lag=2']
+DECISIONS = 'track_id,stamp_ns,decision,comment,frame_id,x,y,z,qx,qy,qz,qw,length,width,height\n'
+"""Header of decisions."""
 
 
 def index_of(out):
@@ -29,34 +31,42 @@ def index_of(out):
 
 
 def test_failures_are_isolated_and_a_second_run_skips_done_drives(tmp_path, capsys):
-    paths = [Drive(sweeps=6).write(tmp_path / name) for name in ('one', 'two')]
+    names = ('one', 'two', 'three')
+    paths = [Drive(sweeps=6).write(tmp_path / name) for name in names]
     junk = tmp_path / 'junk.mcap'
     junk.write_text('no recording')
+    for name in (*names, 'junk'):
+        (tmp_path / f'{name}.csv').write_text(f'{DECISIONS}1,,accept,{name}{"," * 11}\n')
+    options = [f'--decisions={tmp_path}/{{drive}}.csv', *QUICK]
     out = tmp_path / 'out'
-    command = ['batch', *map(str, paths), str(junk), '-o', str(out), '--workers=2', *QUICK]
-    assert main(command) == 1
+    command = ['batch', *map(str, paths), str(junk), '-o', str(out), *options]
+    assert main([*command, '--workers=2']) == 1
     streams = capsys.readouterr()
-    assert f'{out}: 2 of 3 drives done, 0 of them earlier' in streams.out
+    assert f'{out}: 3 of 4 drives done, 0 of them earlier' in streams.out
     (line,) = streams.err.splitlines()
     assert line.startswith('boxreg: junk: ')
     assert 'no message can be read' in line
     rows = index_of(out)
-    assert [rows[name]['status'] for name in ('one', 'two', 'junk')] == ['done', 'done', 'failed']
+    assert [rows[name]['status'] for name in names] == ['done'] * 3
+    assert rows['junk']['status'] == 'failed'
+    assert ',two,' in (out / 'two' / 'decisions.csv').read_text()
     merged = json.loads((out / 'summary.json').read_text())
-    assert merged['boxes_in'] == 2 * 12
+    assert merged['boxes_in'] == 3 * 12
     assert list(merged['failed']) == ['junk']
 
-    # A drive stays done when its file is touched, but not when its content changes.
+    # A drive stays done when its file is touched, but not when its content changes, or that of
+    # a file of its options.
     before = {name: (out / name / 'boxes.csv').stat().st_mtime_ns for name in ('one', 'two')}
     paths[0].touch()
     Drive(sweeps=7).write(tmp_path / 'other').replace(paths[1])
     (out / 'one' / 'review.csv').write_text('rank,track_id,risk_m\n1,7,0.25\n1,8,0.75\n')
     (out / 'two' / 'boxes.csv').touch()  # as a copy without times
-    assert main([*command[:-3], '--workers=1', *QUICK]) == 1
+    (tmp_path / 'three.csv').write_text(f'{DECISIONS}1,,unsure,{"," * 11}\n')
+    assert main([*command, '--workers=1']) == 1
     rows = index_of(out)
     # `--workers` is no setting: it changes no result.
     assert rows['one']['status'] == 'up to date'
-    assert rows['two']['status'] == 'done'
+    assert rows['two']['status'] == rows['three']['status'] == 'done'
     assert (out / 'one' / 'boxes.csv').stat().st_mtime_ns == before['one']
     assert rows['two']['boxes_in'] == '14'
     page = (out / 'report.html').read_text()

@@ -2,15 +2,17 @@
 
 import argparse
 import codecs
+import csv
 from dataclasses import replace
 import json
 import re
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable, COLUMNS
+from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline import evaluate as cli
 from boxreg_ros.offline.box_scores import evaluate, groups, has_word, match, summarise
-from boxreg_ros.structures import BoxArray
+from boxreg_ros.structures import BoxArray, KEPT, RefinedBoxes
 import numpy as np
 import pytest
 
@@ -114,6 +116,14 @@ def test_missing_and_unmatched_boxes_are_counted():
     broken = predicted.boxes.copy()
     broken[5] = np.nan
     assert evaluate(replace(predicted, boxes=broken), truth).missing == 4
+
+
+def test_least_numbers_of_points_belong_to_what_they_begin():
+    truth = replace(truth_table(3), num_points=np.array([99, 100, 101, 299, 300, 301]))
+    assert match(truth, truth, 100).num_points.tolist() == [100, 101, 299, 300, 301]
+    by_points = groups(match(truth, truth))['by_points']
+    low, high = (next(k for k in by_points if k.startswith(f'{n}-')) for n in (100, 300))
+    assert (by_points[low].boxes, by_points[high].boxes) == (3, 2)
 
 
 def test_scope_by_points_and_class():
@@ -281,3 +291,27 @@ def test_tables_with_invalid_predictions_only_are_explained(tmp_path, capsys):
     printed = capsys.readouterr()
     assert 'all 20 predicted boxes are invalid' in printed.err
     assert '10 true boxes, 10 missing' in printed.out
+
+
+def test_no_cell_of_a_table_is_a_formula_and_every_text_is_read_back(tmp_path):
+    ids = ('=1+1', '@x', '+a', '-b', '-1', "'=x", "'", 'a\rb', '\tq', 'a,"b"\nc', 'x' * 10**6)
+    truth = truth_table()
+    table = replace(rows(truth, np.arange(len(ids))), frame_id='=odom', track_ids=ids)
+    table.write(tmp_path / 'boxes.csv')
+    assert BoxTable.read(tmp_path / 'boxes.csv').track_ids == ids
+    with (tmp_path / 'boxes.csv').open(newline='') as file:
+        cells = [row['track_id'] for row in csv.DictReader(file)]
+    assert cells[:8] == ["'=1+1", "'@x", "'+a", "'-b", '-1', "''=x", "''", 'a\rb']
+    frame = LabelFrame(
+        RefinedBoxes(
+            BoxArray(5, '=odom', ids, ids, np.ones(len(ids)), table.boxes),
+            (KEPT,) * len(ids), ('',) * len(ids), table.num_points,
+            np.tile(np.eye(6), (len(ids), 1, 1)),
+        ),
+        '=odom', 'lidar',
+    )  # fmt: skip
+    writer = writer_for('csv', tmp_path, Provenance())
+    writer.write(frame)
+    writer.close()
+    again = BoxTable.read(tmp_path / 'boxes.csv')
+    assert (again.track_ids, again.class_names, again.frame_id) == (ids, ids, '=odom')

@@ -78,6 +78,7 @@ def test_keyframes_get_a_box_at_every_sweep(street, tmp_path, capsys):
         beyond = [at for at in word if not min(stamps) <= at <= max(stamps)]
         assert all(word[at] == 'extended' for at in beyond)
     assert scores(out, street / 'truth.csv').mean() > 0.9
+    assert scores(out, street / 'keys.csv').mean() > 0.995
     summary = json.loads((out / 'summary.json').read_text())
     ends = {seed['track_id']: seed for seed in summary['seeds']}
     assert ends['nothing']['after']['reason'] == 'few_points'

@@ -14,10 +14,13 @@ from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.scene import FIXED_FRAME
 from boxreg_ros.simulation.simulate import simulate
 from consumers import consumer
+from mcap.reader import make_reader
 import numpy as np
 import pytest
 from relabel_results import QUICK
+from ros_messages import Drive
 from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_typestore, Stores
 
 SWEEPS = 12
 ALL_CLOUDS = ('static', 'background', 'object')
@@ -267,3 +270,69 @@ def test_formats_of_points_are_of_relabel_alone(tmp_path):
     request = Request((tmp_path,), formats=('csv', 'lidarseg'))
     assert (request.box_formats, request.point_formats) == (('csv',), ('lidarseg',))
     assert not Request((tmp_path,)).needs_point_labels
+
+
+@pytest.mark.parametrize('storage', ['sqlite3', 'rosbag1'])
+def test_copies_keep_what_they_do_not_edit(tmp_path, storage):
+    """ROS 1 and rosbag2; points that are not finite stay in the clouds, as unknown ones."""
+    drive = Drive(sweeps=6, ros1=storage == 'rosbag1')
+    with_nan = 3
+
+    def spoil(message):
+        step = message.point_step
+        message.data = message.data.copy()
+        message.data[:step].view('<f4')[0] = np.nan
+
+    drive.replace('/points', with_nan, spoil)
+    path = drive.write(tmp_path / 'drive', storage)
+    request = Request(
+        (path,), config=QUICK, formats=('csv', 'mcap'), clouds=('static',), label_points=True,
+    )  # fmt: skip
+    relabel(request, tmp_path / 'out')
+    before, first = all_of(path)
+    static, kept = copied(tmp_path / 'out' / 'clouds' / 'static.mcap', storage)
+    overlay, shown = copied(tmp_path / 'out' / 'overlay.mcap', storage)
+    assert [item for item in static if item[0] != '/points'] == [
+        item for item in before if item[0] != '/points'
+    ]
+    assert set(before) - set(overlay) <= {item for item in before if item[0] == '/points'}
+    assert len(first) == len(kept) == len(shown) == 6
+    for number, (given, fewer, more) in enumerate(zip(first, kept, shown, strict=True)):
+        assert str(given.header) == str(fewer.header) == str(more.header)
+        assert [f.name for f in fewer.fields] == [f.name for f in given.fields]
+        assert [f.name for f in more.fields[-3:]] == ['label', 'instance', 'moving']
+        assert more.width == given.width and more.point_step == given.point_step + 5
+        table = more.data.reshape(more.width, more.point_step)
+        np.testing.assert_array_equal(
+            table[:, : given.point_step], given.data.reshape(given.width, -1)
+        )
+        rows = fewer.data.reshape(fewer.width, -1)
+        assert 0 < fewer.width <= given.width
+        assert np.isnan(rows[:, :4].copy().view('<f4')).sum() == (number == with_nan)
+        if number == with_nan:
+            assert table[0, -5:].tolist() == [0, 0, 0, 0, 255]
+
+
+def all_of(path):
+    """Return topic, time and bytes of all messages of a recording, and its clouds."""
+    with closing(AnyReader([path])) as reader:
+        reader.open()
+        messages = list(reader.messages())
+        clouds = [
+            reader.deserialize(data, connection.msgtype)
+            for connection, _, data in messages
+            if connection.topic == '/points'
+        ]
+    return [(connection.topic, t, bytes(data)) for connection, t, data in messages], clouds
+
+
+def copied(path, storage):
+    """Return the same of a copy; rosbags reads no MCAP file with messages of ROS 1."""
+    if storage != 'rosbag1':
+        return all_of(path)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with path.open('rb') as file:
+        found = [(c.topic, m.log_time, m.data) for _, c, m in make_reader(file).iter_messages()]
+    kind = 'sensor_msgs/msg/PointCloud2'
+    clouds = [store.deserialize_ros1(data, kind) for topic, _, data in found if topic == '/points']
+    return found, clouds

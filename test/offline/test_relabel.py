@@ -133,6 +133,10 @@ def test_output_folder_contents(tmp_path):
     ]  # fmt: skip
     assert Config.from_yaml(out / 'config.yaml') == QUICK.updated({'solver.iterations': 2})
     content = json.loads((out / 'summary.json').read_text())
+    assert content.pop('files').keys() == {
+        'boxes.csv', 'config.yaml', 'covariances.csv', 'openlabel/labels.json', 'review.csv',
+        'tracks.csv',
+    }  # fmt: skip
     assert content == summary.as_json()
     assert Summary.from_json(content) == summary
     assert summary.topics == {'points': '/points', 'boxes': '/boxes', 'odometry': None}

@@ -326,3 +326,27 @@ def test_workers_end_when_the_parent_is_killed(tmp_path):
         time.sleep(0.05)
     assert len(left) == 2
     assert not any(path.exists() for path in left)
+
+
+FORKS = """
+import os, sys
+fork = os.fork
+def counted():
+    print('threads', len(os.listdir('/proc/self/task')))
+    return fork()
+os.fork = counted
+from boxreg_ros.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_relabel_forks_before_it_has_threads(tmp_path):
+    """Python 3.14 warns of the contrary, and locks of other threads are never released."""
+    path = Drive(sweeps=6).write(tmp_path / 'drive')
+    command = [sys.executable, '-c', FORKS, 'relabel', path, '-o', tmp_path / 'out']
+    environment = {key: text for key, text in os.environ.items() if 'THREADS' not in key}
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=True
+    )
+    forks = [line for line in done.stdout.splitlines() if line.startswith('threads')]
+    assert forks and set(forks) == {'threads 1'}

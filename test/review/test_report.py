@@ -26,6 +26,7 @@ from boxreg_ros.review.tables import assessed
 from boxreg_ros.review.track_points import PointCollector
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
+from browser import NEEDS_BROWSER, opened_page
 from msg_adapters.convention import Convention
 import numpy as np
 from paths import BAGS
@@ -292,6 +293,45 @@ def test_risks_and_violations_of_each_track_are_shown(tmp_path):
     part = page.part('7')
     np.testing.assert_allclose(part['risk'], found.risk.boxes, atol=1e-3)
     assert page.rows['7']['riskiest'] == part['stamps'][np.argmax(found.risk.boxes)]
+
+
+@NEEDS_BROWSER
+def test_a_thousand_tracks_are_listed_without_laying_out_all(tmp_path):
+    changes = Changes('odom')
+    names = tuple(map(str, range(1000)))
+    boxes = np.tile([0.0, 0, 0, 4, 2, 1.5, 0, 0, 0], (1000, 1))
+    boxes[:, 0] = 10.0 * np.arange(1000)
+    for k in range(20):
+        moved = boxes.copy()
+        moved[:, 0] += 0.1 * k
+        array = BoxArray(
+            START_NS + k * PERIOD_NS, 'odom', names, ('car',) * 1000, np.ones(1000), moved
+        )
+        covariances = np.tile(0.01 * np.eye(6), (1000, 1, 1))
+        counts = np.full(1000, 9)
+        changes.add(
+            array, RefinedBoxes(array, ('refined',) * 1000, ('',) * 1000, counts, covariances)
+        )
+    found = assessed(changes.tracks())
+    write_report(tmp_path, 'done', SUMMARY, Config(), found, {}, PointCollector(Config()))
+    with opened_page((tmp_path / 'report.html').as_uri() + '#tracks') as page:
+        lines = page.locator('#rows tr[data-track]')
+        assert page.inner_text('#f-count') == '1000 of 1000 tracks'
+        assert 10 < lines.count() < 100
+        assert page.evaluate("$('rows').scrollHeight") > 1000 * page.evaluate('LINE')
+        widths = page.evaluate(
+            "[...document.querySelectorAll('#rows th')].map(t => t.offsetWidth)"
+        )
+        page.evaluate('openTrack(998)')
+        page.wait_for_selector('tr[data-track="998"][aria-selected=true]')
+        page.keyboard.press('ArrowDown')
+        page.wait_for_selector('tr[data-track="999"][aria-selected=true]')
+        assert lines.count() < 100
+        again = page.evaluate("[...document.querySelectorAll('#rows th')].map(t => t.offsetWidth)")
+        assert again == widths  # the columns do not move
+        page.fill('#f-text', '123')
+        assert page.inner_text('#f-count') == '1 of 1000 tracks'
+        assert lines.count() == 1
 
 
 # Known values ------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from datetime import datetime
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import json
+import resource
 import shutil
 import signal
 import socket
@@ -125,6 +126,24 @@ def test_texts_of_any_kind_come_back(tmp_path):
     writer.write(LabelFrame(kept(replace(boxes, stamp_ns=5), 'no_gain'), 'odom', 'lidar'))
     writer.close()
     assert BoxTable.read(tmp_path / 'boxes.csv').track_ids == ('a\rb', 'a\rb')
+
+
+def test_a_full_disk_loses_no_earlier_row(tmp_path):
+    path = tmp_path / DECISIONS
+    log = DecisionLog(path)
+    log.append([Decision('1', None, 'accept')])
+    before = path.read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 20, limits[1]))
+    try:
+        with pytest.raises(OSError, match='File too large'):
+            log.append([Decision('2', None, 'reject', 'a comment longer than the room left')])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == before
+    log.append([Decision('3', None, 'accept')])
+    assert [one.track_id for one in read_decisions(path)] == ['1', '3']
+    assert [one.track_id for one in log.decisions] == ['1', '3']
 
 
 def test_decisions_of_earlier_versions_are_read_and_continued(tmp_path):

@@ -2,6 +2,9 @@
 
 from pathlib import Path
 import shutil
+import signal
+import subprocess
+import sys
 from threading import Thread
 
 from boxreg_ros import Config, refine, Track
@@ -20,6 +23,11 @@ QUICK = ['--set', 'solver.rounds=2', '--set', 'sampling.points=64']
 FORMATS = ['--formats', 'openlabel,sustechpoints']
 DO = '[data-do={}]'
 NUM_SWEEPS = 14
+LEAVING = """(() => {
+  const event = new Event('beforeunload', { cancelable: true });
+  dispatchEvent(event);
+  return event.defaultPrevented;
+})()"""
 
 pytestmark = NEEDS_BROWSER
 
@@ -69,11 +77,13 @@ def answer(page, text):
 def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
     with opened_page(server.address + '#track=1') as page:
         assert sorted(ids_of(page)) == ['1', '2']
+        lengths = 'TRACKS.map(track => track.path.length).sort((a, b) => a - b)'
         open_track(page, '1', 8)
         page.keyboard.press('s')
         page.wait_for_function('TRACKS.length === 3')
         assert sorted(ids_of(page)) == ['1', '1_2', '2']
         page.wait_for_function("current().id === '1_2'")
+        assert page.evaluate(lengths) == [6, 8, 14]
         assert page.evaluate('[view.row, view.part.stamps.length]') == [0, 6]
         page.click(DO.format('rename'))
         answer(page, 'new')
@@ -110,7 +120,8 @@ def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
         open_track(page, '1', 0)
         page.keyboard.press('j')
         page.wait_for_selector('#ask[open]')
-        assert page.locator('#ask-proposals button').first.inner_text().startswith('1_2 ')
+        proposed = page.locator('#ask-proposals button').first.inner_text()
+        assert proposed == '1_2 car: 0.1 s and 0.0 m apart'
         page.keyboard.press('Enter')
         page.wait_for_function('TRACKS.length === 2')
         page.keyboard.press('z')
@@ -247,6 +258,7 @@ def test_a_correction_shows_its_figures_is_typed_and_undone_in_steps(server):
         assert shown == pytest.approx(expected, abs=0.02)
         page.mouse.up()
         assert page.evaluate('numInside(pointsAt(view.part, view.row), view.edit)') < inside
+        assert page.evaluate(LEAVING)  # the browser asks before it is lost
         page.keyboard.press('l')
         page.fill('#n-width', '3')
         page.keyboard.press('Enter')
@@ -361,6 +373,24 @@ def test_axe_finds_nothing(server):
         page.keyboard.press('e')
         found = axe.run(page)
         assert found.violations_count == 0, found.generate_report()
+
+
+def test_a_review_begins_with_a_recording(made, tmp_path, capfd):
+    out = tmp_path / 'out'
+    command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', str(made / 'drive')]
+    assert main([*command[3:]]) == 1  # no result
+    assert 'expected a finished result' in capfd.readouterr().err
+    command += ['-o', str(out), '--port', '0', *FORMATS, *QUICK]
+    for word in ('boxes in', 'up to date'):
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            lines = [process.stdout.readline() for _ in range(2)]
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=60)
+        assert process.returncode == 0
+        assert word in lines[0]
+        assert lines[1].startswith('http://127.0.0.1:')
+    assert (out / 'report.html').is_file()
+    assert (out / 'sustechpoints').is_dir()
 
 
 def test_every_part_of_the_script_is_in_the_page():

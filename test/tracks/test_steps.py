@@ -119,6 +119,13 @@ def test_fragments_that_disagree_are_not_stitched(change):
     assert ids(found) == ['a', 'b']
 
 
+def test_fragments_of_other_kinds_are_not_stitched():
+    boxes = path((0, 0), (8, 0), 30)
+    for name, number in (('truck', 1), ('cyclist', 2)):  # a vehicle, and none
+        later = tracklet('b', boxes[15:], 15, class_name=name)
+        assert len(stitch([tracklet('a', boxes[:10]), later], CONFIG)[0]) == number
+
+
 def test_a_gap_longer_than_both_fragments_is_left():
     """Two short ghosts would fit each other anywhere."""
     boxes = path((0, 0), (5, 0), 40)

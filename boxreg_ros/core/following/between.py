@@ -27,7 +27,8 @@ def between(follower: Follower, times: Floats, seeds: Seeds, first: int) -> tupl
     Return rows (n,) and poses (n, 4) between the seeds `first` and `first + 1`.
 
     The object is followed from both. A way that arrives is closed onto the seed; both are blended
-    by the time to their seeds. Where none arrives, the spline that fits the points best is taken.
+    by the time to their seeds. Where they do not agree, the line, spline or way that fits the
+    points best is taken; among these, both ways up to their losses with a line between.
 
     """
     start, stop = seeds.rows[first : first + 2].tolist()
@@ -36,10 +37,10 @@ def between(follower: Follower, times: Floats, seeds: Seeds, first: int) -> tupl
         return rows, np.zeros((0, 4))
     part = (times[rows] - times[start]) / (times[stop] - times[start])
     poses = seeds.boxes[:, POSE4]
-    forwards = _closed(follower.way(first, 1, stop), rows, part, poses[first + 1])
-    backwards = _closed(
-        follower.way(first + 1, -1, start), rows[::-1], 1 - part[::-1], poses[first]
-    )
+    way_on = follower.way(first, 1, stop)
+    way_back = follower.way(first + 1, -1, start)
+    forwards = _closed(way_on, rows, part, poses[first + 1])
+    backwards = _closed(way_back, rows[::-1], 1 - part[::-1], poses[first])
     if backwards is not None:
         backwards = backwards[::-1]
     lines = list(_lines(times, seeds, first, rows))
@@ -49,6 +50,7 @@ def between(follower: Follower, times: Floats, seeds: Seeds, first: int) -> tupl
             return rows, blended
         lines.append(blended)
     lines += [way for way in (forwards, backwards) if way is not None]
+    lines += _bridged(way_on, way_back, times, seeds.rows[first : first + 2], poses[first:])
     scores = [follower.fit_of(rows, line) for line in lines]
     return rows, lines[int(np.argmax(scores))]
 
@@ -63,6 +65,24 @@ def _closed(way: Way, rows: Ints, part: Floats, target: Floats) -> Floats | None
         return None
     poses = np.array([way.poses[row] for row in rows.tolist()])
     return poses + part[:, None] * gap
+
+
+def _bridged(on: Way, back: Way, times: Floats, ends: Ints, poses: Floats) -> list[Floats]:
+    """Return one line (n, 4): both ways up to the last support, and straight between; or none."""
+    start, stop = ends.tolist()
+    known = {start: poses[0], stop: poses[1]}
+    last = max((row for row in on.seen if row < stop), default=start)
+    next_ = min((row for row in back.seen if row > start), default=stop)
+    if last >= next_:  # both went past each other, and disagree
+        return []
+    known |= {row: on.poses[row] for row in on.seen if row <= last}
+    known |= {row: back.poses[row] for row in back.seen if row >= next_}
+    rows = np.array(sorted(known))
+    values = np.array([known[row] for row in rows.tolist()])
+    values[:, 3] = np.unwrap(values[:, 3])
+    wanted = times[start + 1 : stop]
+    columns = [np.interp(wanted, times[rows], column) for column in values.T]
+    return [np.stack(columns, axis=1)]
 
 
 def _blended(a: Floats, b: Floats, part: Floats) -> Floats:

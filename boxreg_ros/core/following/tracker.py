@@ -289,6 +289,13 @@ class Follower:
                     self._road = self._road_below(points, found.pose)
         return way._replace(reason=lost or ARRIVED)
 
+    def jumps(self, seed: int) -> bool:
+        """Return whether the next seed is farther away than such an object can move."""
+        rows, boxes = self._seeds.rows[seed : seed + 2], self._seeds.boxes[seed : seed + 2]
+        seconds = self._sweeps.times[rows[1]] - self._sweeps.times[rows[0]]
+        distance = np.linalg.norm(boxes[1, :2] - boxes[0, :2])
+        return bool(distance > self._kind.max_speed * seconds + 1.0)
+
     def fit_of(self, rows: Ints, poses: Floats) -> float:
         """Return the mean score of poses (n, 4) in sweeps `rows` (n,)."""
         scores = [

@@ -52,4 +52,4 @@ function fail(text) {
   $('failure').hidden = false;
 }
 
-function say(text) { $('notice').textContent = text; }
+function say(text) { $('notice').textContent = $('notice').title = text; }

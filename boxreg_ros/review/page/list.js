@@ -51,7 +51,7 @@ function decidedOf(track) {
   const single = [...inputs].flatMap(input => log.ofInput.get(input) ?? []).filter(row => row.stamp_ns && TOPIC_OF[row.decision] === 'judgement');
   const boxes = single.length && (track.isWhole ? single : single.filter(row => track.members().some(([s, k]) => inputOf(s, k) === row.track_id && covers(row, stampOf(s, k))))).length;
   const gone = isGone(track) ? 'delete' : track.deleted ? `${track.deleted} deleted` : '';
-  const edits = [track.isWhole ? '' : 'id', track.pieces.some(({ s }) => DATA.tracks[s].class !== track.class) ? 'class' : ''];
+  const edits = [track.isWhole ? '' : track.pieces.some(({ s }) => DATA.tracks[s].id !== track.id) ? 'id' : 'split', track.pieces.some(({ s }) => DATA.tracks[s].class !== track.class) ? 'class' : ''];
   return [word, gone, ...edits, boxes ? `${boxes} ${boxes === 1 ? 'box' : 'boxes'}` : ''].filter(Boolean).join(', ');
 }
 
@@ -104,8 +104,9 @@ function drawList() {
 // The lines that are seen: a thousand need not be laid out.
 function drawLines() {
   const box = $('rows'), found = columns();
-  const first = Math.max(0, Math.floor(box.scrollTop / LINE) - SPARE_LINES);
-  const last = Math.min(view.shown.length, Math.ceil((box.scrollTop + box.clientHeight) / LINE) + SPARE_LINES);
+  const top = Math.min(box.scrollTop, Math.max(0, LINE * view.shown.length - box.clientHeight));  // a filter may have shortened the list
+  const first = Math.max(0, Math.floor(top / LINE) - SPARE_LINES);
+  const last = Math.min(view.shown.length, Math.ceil((top + box.clientHeight) / LINE) + SPARE_LINES);
   const space = lines => (lines > 0 ? [element('tr', { 'aria-hidden': 'true' }, element('td', { class: 'space', colspan: found.length, style: `height: ${LINE * lines}px` }))] : []);
   fill(box.querySelector('tbody'), ...space(first), ...view.shown.slice(first, last).map(track => lineOf(track, found)), ...space(view.shown.length - last));
   box.querySelector('table').setAttribute('aria-rowcount', view.shown.length);

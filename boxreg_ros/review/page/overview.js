@@ -88,17 +88,17 @@ function withPlotly() {
 async function drawMap() {
   await withPlotly();
   const lines = { x: [], y: [], customdata: [], text: [] };
-  const source = track => TRACKS.find(({ pieces }) => pieces.some(({ s }) => DATA.tracks[s] === track));
+  const shownAs = new Map(TRACKS.flatMap(({ pieces, index }) => pieces.map(({ s }) => [DATA.tracks[s], index])));
   for (const track of DATA.tracks) {
     for (const [k, [x, y]] of track.path.entries()) {
-      lines.x.push(x); lines.y.push(y); lines.customdata.push([source(track).index, track.rows[k]]); lines.text.push(escaped(`${track.id} ${track.class}`));
+      lines.x.push(x); lines.y.push(y); lines.customdata.push([shownAs.get(track), track.rows[k]]); lines.text.push(escaped(`${track.id} ${track.class}`));
     }
     lines.x.push(null); lines.y.push(null); lines.customdata.push([0, 0]); lines.text.push('');
   }
   const names = DATA.tracks.filter(t => t.path.length);
   const risky = names.filter(t => isKnown(t.risk));
   const middle = track => track.path[track.path.length >> 1];
-  const mark = track => [source(track).index, track.rows[track.rows.length >> 1]];
+  const mark = track => [shownAs.get(track), track.rows[track.rows.length >> 1]];
   await Plotly.newPlot('map', [
     { x: DATA.sensor.map(p => p[0]), y: DATA.sensor.map(p => p[1]), mode: 'lines', line: { color: colour('grey'), dash: 'dot', width: 1.5 }, hoverinfo: 'skip' },
     { ...lines, mode: 'lines+markers', line: { color: colour('refined'), width: 1.5 }, marker: { size: 4, color: colour('refined') }, hovertemplate: '%{text}<extra></extra>' },

@@ -52,10 +52,16 @@ function trackOf(id, pieces, index) {
   if (!track.isWhole) {
     const times = track.members().map(([s, k]) => DATA.times[DATA.tracks[s].at[k]]);
     Object.assign(track, { boxes: times.length, interpolated: 0, begin: times[0], seconds: times.at(-1) - times[0],
-                           path: sources.flatMap(source => source.path) });
+                           path: pieces.flatMap(pathOf) });
   }
   track.sharper = track.before.cells ? 100 * (track.after.cells / track.before.cells - 1) : null;
   return track;
+}
+
+// The places on the map of a part of a track of the report.
+function pathOf({ s, rows }) {
+  const { path, rows: picks } = DATA.tracks[s], own = new Set(rows ?? picks);
+  return path.filter((_, k) => own.has(picks[k]));
 }
 
 // The track that is open stays open, by the box that is shown.
