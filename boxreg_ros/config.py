@@ -180,11 +180,14 @@ class ClassConfig:
         4.0, 'standard deviation of the sideways acceleration', 'm/s^2', 1e-3, 1e3
     )
     turning: float = setting(
-        0.8, 'standard deviation of the yaw, roll and pitch acceleration', 'rad/s^2', 1e-3, 1e3
+        0.8, 'standard deviation of the yaw acceleration', 'rad/s^2', 1e-3, 1e3
+    )
+    tilting: float = setting(
+        0.2, 'standard deviation of the roll and pitch acceleration', 'rad/s^2', 1e-3, 1e3
     )
     slip: float = setting(
         0.15,
-        'standard deviation of the sideways and vertical velocity of the pivot',
+        'standard deviation of the sideways velocity of the pivot',
         'm/s',
         1e-3,
         1e3,
@@ -193,6 +196,9 @@ class ClassConfig:
         0.01, 'standard deviation of the constant angle from the heading of a track to its path',
         'rad', 1e-4, 1.0,
     )  # fmt: skip
+    climb: float = setting(
+        0.25, 'standard deviation of the velocity along the z axis of the box', 'm/s', 1e-3, 1e3
+    )
     pivot: float = setting(
         0.25, 'distance of the pivot (rear axle) behind the centre, as part of the length',
         '', 0.0, 0.5,

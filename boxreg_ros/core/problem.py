@@ -54,8 +54,8 @@ NO_PRIOR = (
 
 
 SETTINGS_OF = {
-    'acceleration': ('acceleration', 'cornering', 'acceleration', *(3 * ('turning',))),
-    'slip': ('slip', 'slip'),
+    'acceleration': ('acceleration', 'cornering', 'acceleration', 'tilting', 'tilting', 'turning'),
+    'slip': ('slip', 'climb'),
     'drift': ('drift',),
     'pose': ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading'),
     'extent': ('extent',),

@@ -70,4 +70,6 @@ def _filled(tracklet: Tracklet, row: int, stamps_ns: Ints, config: Config) -> Ad
 def accelerations(model: ClassConfig) -> Floats:
     """Return usual accelerations of x y z [m/s^2] and roll pitch yaw [rad/s^2], shape (6,)."""
     horizontal = max(model.acceleration, model.cornering)
-    return np.array([horizontal, horizontal, model.acceleration, *(3 * (model.turning,))])
+    return np.array(
+        [horizontal, horizontal, model.acceleration, model.tilting, model.tilting, model.turning]
+    )
