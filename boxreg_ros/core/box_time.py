@@ -14,21 +14,13 @@ from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.method.constants import CONSTANTS
-from boxreg_ros.core.observation import crop, NEARBY, Observation
+from boxreg_ros.core.observation import crop, FACE_TOLERANCE, NEARBY, Observation
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, LENGTH, ROLL, Sweep, X, Z
 import numpy as np
 from numpy.typing import NDArray
 
 # All of these are chosen.
-MIN_MOTION = 0.2
-"""
-Least motion between stamp and sight that is evidence [m].
-
-About the error of an input box. Of simulated boxes of known time with 0.2 to 0.3 m, 84 to 100 %
-vote for it; with 0.1 to 0.2 m some sets vote for the other.
-
-"""
 MIN_DIFFERENCE = 0.02
 """Least difference of the mean distance of the points from a face that is evidence [m]."""
 MIN_VOTES = 10
@@ -50,7 +42,7 @@ def motion_to_sight(sweep: Sweep, boxes: Floats, velocities: Floats) -> Floats:
         return motion
     latest = max(sweep.times.max(), -sweep.times.min())  # not abs: no copy of a million bytes
     most = latest * np.linalg.norm(velocities, axis=1)
-    moving = np.flatnonzero(most > MIN_MOTION)
+    moving = np.flatnonzero(most > FACE_TOLERANCE)
     if not len(moving):
         return motion
     near = crop(sweep, boxes[moving], NEARBY)
@@ -96,7 +88,7 @@ class BoxTimeEvidence:
             return
         rows = [observation.row for observation in seen]
         motions = velocities * seen[0].table.sights[rows, None]  # from the stamp [m]
-        for i in np.flatnonzero(np.linalg.norm(motions, axis=1) >= MIN_MOTION).tolist():
+        for i in np.flatnonzero(np.linalg.norm(motions, axis=1) >= FACE_TOLERANCE).tolist():
             self._vote(seen[i], velocities[i], motions[i])
 
     def _vote(self, seen: Observation, velocity: Floats, motion: Floats) -> None:

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 NEARBY = 1.0
 """How far beside a box its road, its time and its points are looked for [m]; chosen: a lane has
 about as much free."""
-ROAD_SIDE_GAP = 0.05
-"""Road points are at least so far beside a box [m]; chosen: excludes points on its sides."""
+SIDE_NOISE = 0.05
+"""Points up to so far outside of a box may be on its sides: it holds them, and they are not of the
+road beside it [m]; chosen."""
 ROAD_HEIGHT_RANGE = 0.6
 """Road points are less above or below the bottom of a box [m]; chosen: far above its noise."""
 ROAD_QUANTILES = (0.1, 0.3, 0.6)
@@ -30,7 +31,9 @@ MIN_SENSOR_PART = 0.1
 """Least part of the points of an object by a sensor that sees it; chosen: fewer are stray."""
 FACE_TOLERANCE = 0.2
 """Points this far outside of a face may be on it, and points of two boxes that are deeper in one
-by less are of both [m]; chosen: the error of an input or predicted box."""
+by less are of both; boxes that move less until they are seen have no time [m]. Chosen: the error
+of an input or predicted box. Of simulated boxes of known time that move by 0.2 to 0.3 m, 84 to
+100 % vote for it; with 0.1 to 0.2 m some sets vote for the other."""
 
 
 class Crop(NamedTuple):
@@ -328,7 +331,7 @@ def own_points(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
         clearance=GROUND_CLEARANCE,
         has_road=config.ingredients.road,
         road_width=NEARBY,
-        road_gap=ROAD_SIDE_GAP,
+        road_gap=SIDE_NOISE,
         road_range=ROAD_HEIGHT_RANGE,
         road_quantiles=ROAD_QUANTILES,
         road_flatness=ROAD_FLATNESS,

@@ -10,7 +10,8 @@ from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, ROLL
 import numpy as np
 
 MIN_HITS = 3
-"""Detections that confirm a track; literature: SORT."""
+"""Detections that confirm a track, and its face observations, and tracks, that a margin needs;
+literature: SORT."""
 SUPPORT_PART = 0.3
 """
 Least part of the points that the end of the track has, in a supported box.
