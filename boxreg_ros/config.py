@@ -105,10 +105,13 @@ class FaceConfig:
     )
     sides: float = setting(
         0.08,
-        'standard deviation of one observation of the left, right or top face',
+        'standard deviation of one observation of the left or right face',
         'm',
         1e-3,
         10.0,
+    )
+    top: float = setting(
+        0.08, 'standard deviation of one observation of the top face', 'm', 1e-3, 10.0
     )
     bottom: float = setting(
         0.05, 'standard deviation of one observation of the road under the box', 'm', 1e-3, 10.0

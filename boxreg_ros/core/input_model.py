@@ -134,7 +134,7 @@ class InputModel:
             has_points & (occluded > numbers.min_share),
             is_visible & is_distant,
         ])  # fmt: skip
-        counts &= (weight > 0) & (np.abs(distance) < numbers.outside_margin)
+        counts &= (weight > 0) & (np.abs(distance) < numbers.max_gap)
         counts &= problem.valid[..., None]
         values = np.stack([
             0 * occluded, occluded * occlusion_inset, distant * range_inset

@@ -45,7 +45,7 @@ PAPER = 'paper'
 """The objective of the paper, and the group of settings that it alone reads."""
 
 UNLIKE = Config().updated(
-    {f'faces.{name}': 1.0 for name in ('outermost', 'ends', 'sides', 'bottom', 'outlier')}
+    {f'faces.{name}': 1.0 for name in ('outermost', 'ends', 'sides', 'top', 'bottom', 'outlier')}
     | {f'ingredients.{name}': False for name in ('strips', 'robust_motion')}
 )
 """A configuration that differs from the default one in all that `with_settings` fills."""

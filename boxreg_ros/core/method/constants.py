@@ -25,9 +25,11 @@ class Constants(NamedTuple):
 
     # Face observations (M10) to (M12)
     outside_margin: float = 0.35
-    """Points up to this far outside of a face, or beside it, are of the object, and up to twice as
-    far inside of that face. Of those further from where they are expected no margin is estimated
-    [m]. Chosen."""
+    """Points up to this far outside of a face count as points of the object [m]. Chosen."""
+    edge_margin: float = 0.2
+    """The same beside the edges of the face [m]. Chosen."""
+    deepest: float = 0.7
+    """Points further inside of a face are on none of its surfaces [m]. Chosen."""
     max_depth: float = 0.2
     """Points further behind the outermost one are on another surface, such as a wheel [m].
     Chosen: without it .01 to .02 of 3D IoU are lost."""
@@ -43,19 +45,24 @@ class Constants(NamedTuple):
     """Up to this range points reach the outermost parts of a surface [m]. Chosen."""
     range_span: float = 50.0
     """The range inset is that of an object this much further away [m]. Chosen: at 70 m."""
+    max_range_share: float = 1.5
+    """Largest multiple of the range inset; 0 without range inset. Chosen."""
+    range_half_weight: float = 0.1
+    """A face whose points have this range inset has weight 1/2 [m]. Chosen."""
     occluded_weight: float = 0.25
     """Weight of a face that is turned away from the sensor. Chosen."""
     face_outlier: float = 0.15
-    """Distance at which the points of a face have weight 1/4, and range inset at which the face
-    has weight 1/2 [m]: setting `faces.outlier`."""
+    """Distance at which the points of a face have weight 1/4 [m]: setting `faces.outlier`."""
 
     # Weights (M21) to (M25)
+    outlier: float = 3.0
+    """Deviation at which an input pose has weight 1/2, a motion residual 1/4, in standard
+    deviations. Literature: the usual gate of three standard deviations."""
     gate: float = 3.0
     """Turn of a parked object, in errors of the input yaw, and bound of the gaps of tracks, in
-    their deviations. Literature: the usual gate of three standard deviations."""
-    outlier: float = gate
-    """Deviations at which an input pose and the prior of a labelling margin have weight 1/2, a
-    motion residual 1/4. Derived: the gate, or infinity without robust weights."""
+    their deviations. Literature: as `outlier`."""
+    gap_outlier: float = 2.0
+    """The same for the prior of a labelling margin, weight 1/2. Chosen."""
     is_robust: bool = True
     """Whether motion residuals are robust: not from a start that is as noisy as the input."""
     pin_deviations: tuple[float, ...] = (0.02, 0.02, 0.02, 0.005, 0.005, 0.005)
@@ -66,8 +73,11 @@ class Constants(NamedTuple):
     parked_distance: float = 0.7
     """Largest distance that a parked object moves [m]. Chosen."""
     driving_speed: float = 1.0
-    """An object drives where the medians of `min_observations` boxes before and after a step move
-    faster [m/s]; the steps between these boxes have no zero-motion prior. Chosen."""
+    """An object drives where the medians of boxes before and after a step move faster [m/s].
+    Chosen."""
+    driving_span: int = 5
+    """Boxes in these medians; steps before such a one, and after it, that have no zero-motion
+    prior either. Chosen."""
     drift_ratios: tuple[float, ...] = (1.0, 1.0, 0.5, 0.15, 0.15, 0.15)
     """Deviation of the steps of a parked box x y z [m] and roll pitch yaw [rad], over the setting
     `drift`. Chosen."""
@@ -102,8 +112,9 @@ class Constants(NamedTuple):
     correlation_interval: float = 0.1
     """Time over which the errors of biased input are correlated [s]. Chosen."""
     white_correlation: float = 0.15
-    """Input whose errors are correlated by less over that time has nearly no bias; with three
-    times as much the bias is as large as the error. Chosen."""
+    """Input whose errors are correlated by less over that time has nearly no bias. Chosen."""
+    correlation_span: float = 0.3
+    """Above `white_correlation` by this much, the bias is as large as the error. Chosen."""
     low_noise_ratio: float = 0.4
     """Input with less than this part of its usual error is low-noise input, such as human labels.
     Chosen."""
@@ -122,16 +133,19 @@ class Constants(NamedTuple):
 
     # Noise of the input (M14)
     min_observations: int = 5
-    """Fewest observations that noise, or whether an object drives, is estimated from. Chosen."""
+    """Fewest observations of a track that noise is estimated from. Chosen."""
     half_weight: float = 14.0
     """Observations with which an estimated noise has weight 1/2. Chosen."""
     max_correlation: float = 0.9
-    """Largest correlation of consecutive errors, and largest part of a variance that the mean of a
-    track takes away. Chosen."""
+    """Largest correlation of consecutive errors. Chosen."""
+    min_left: float = 0.3
+    """Least part of a variance that the mean of a track is taken to leave. Chosen."""
 
     # Labelling margins (M18)
     min_gap_deviation: float = 0.02
     """Added to the interquartile range of margins: few tracks may agree by chance [m]. Chosen."""
+    max_gap: float = 0.5
+    """No margin is estimated from points further from where they are expected [m]. Chosen."""
     min_box_points: int = 30
     """No margin is estimated from near boxes with fewer points. Chosen."""
     min_share: float = 0.5
@@ -165,15 +179,16 @@ class Constants(NamedTuple):
     def with_settings(self, config: Any) -> 'Constants':
         """Return these numbers with the settings of a `Config`."""
         faces, parts = config.faces, config.ingredients
-        of_faces = faces.ends, faces.ends, *(3 * (faces.sides,)), faces.bottom
+        of_faces = faces.ends, faces.ends, faces.sides, faces.sides, faces.top, faces.bottom
         return self._replace(
             outermost=faces.outermost,
             face_outlier=faces.outlier,
             face_deviations=of_faces,
             strips=self.strips if parts.strips else 1,
             occluded_weight=self.occluded_weight if parts.occluded_faces else 0.0,
-            near_range=self.near_range if parts.range_inset else inf,
-            outlier=self.gate if parts.robust_weights else inf,
+            max_range_share=self.max_range_share if parts.range_inset else 0.0,
+            outlier=self.outlier if parts.robust_weights else inf,
+            gap_outlier=self.gap_outlier if parts.robust_weights else inf,
             is_robust=parts.robust_motion,
             residuals=tuple(name not in parts.without for name in RESIDUAL_NAMES),
         )

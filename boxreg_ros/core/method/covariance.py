@@ -134,9 +134,7 @@ def variance_of_mean(length, terms, constants, work):
     for face in range(FACES):
         faces += work.count[face] > 0
     n = max(work.count.sum() / max(faces, 1), 1.0)
-    unbiased = (products / max(power, MIN_POWER) + 1 / n) / max(
-        1 - 4 / n, 1 - constants.max_correlation
-    )
+    unbiased = (products / max(power, MIN_POWER) + 1 / n) / max(1 - 4 / n, constants.min_left)
     usual = constants.residual_correlation
     correlation = usual + weight_of(n, constants.half_weight) * (unbiased - usual)
     correlation = clamp(correlation, 0.0, constants.max_correlation)
@@ -153,7 +151,7 @@ def fill_information_of_faces(length, marginalised, terms, spread, constants, wo
         for n in range(length):
             share = terms[n].visibility[face] / max(total, MIN_WEIGHT)
             scatter += share * work.off_mean[n, face] ** 2
-        scatter /= max(1 - of_mean / max(count, 1.0), 1 - constants.max_correlation)
+        scatter /= max(1 - of_mean / max(count, 1.0), constants.min_left)
         shown = weight_of(count, constants.half_weight)
         variance = of_mean * (claimed + shown * (scatter - claimed)) - claimed
         total *= (length + marginalised) / length

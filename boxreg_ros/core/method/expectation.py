@@ -102,7 +102,7 @@ def fill_ratios(b, problem, inputs, constants, work):
         correlation = typical + weight * (inputs.correlation[j] - typical)
         work.widening[j] = sqrt((1 + correlation) / (1 - correlation))
         later = correlation ** (constants.correlation_interval / interval)
-        slow = (later / constants.white_correlation - 1) / 2
+        slow = (later - constants.white_correlation) / constants.correlation_span
         work.slow[j] = clamp(slow, LEAST_PART, 1.0)
     for j in range(POSE):
         deviation = inputs.deviation[j]

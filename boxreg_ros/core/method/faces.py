@@ -35,7 +35,7 @@ def fill_candidates(depth, m, constants, index):
     Those further behind the outermost one than `max_depth` are on another surface.
 
     """
-    limit = 2 * constants.outside_margin - constants.max_depth
+    limit = constants.deepest - constants.max_depth
     for i in range(m):
         limit = min(limit, depth[i])
     limit += constants.max_depth
@@ -56,14 +56,20 @@ def fill_depths(m, half, level, constants, work):
 
     """
     local, excess, strip, depth = work.local, work.excess, work.strip, work.depth
-    margin = constants.outside_margin
+    outside_margin, edge_margin, deepest = (
+        constants.outside_margin, constants.edge_margin, constants.deepest
+    )  # fmt: skip
     strips = constants.strips
     for k in range(3):
         for i in range(m):
             excess[k, i] = abs(local[k, i]) - half[k]
     near = 0
     for i in range(m):
-        near += (excess[0, i] < margin) & (excess[1, i] < margin) & (excess[2, i] < margin)
+        near += (
+            (excess[0, i] < outside_margin)
+            & (excess[1, i] < outside_margin)
+            & (excess[2, i] < outside_margin)
+        )
     for k in range(2):
         scale = strips / 2 / half[k]
         for i in range(m):
@@ -77,8 +83,8 @@ def fill_depths(m, half, level, constants, work):
         surface = half[axis] - level[face]
         for i in range(m):
             d = surface - sign * local[axis, i]
-            counts = (excess[one, i] < margin) & (excess[other, i] < margin)
-            counts &= (d >= -margin) & (d < 2 * margin)
+            counts = (excess[one, i] <= edge_margin) & (excess[other, i] <= edge_margin)
+            counts &= (d >= -outside_margin) & (d < deepest)
             depth[face, i] = d if counts else NOWHERE
     return near
 
@@ -192,7 +198,7 @@ def fill_insets(origins, tangent, occlusion_inset, range_inset, constants, share
     for sensor in range(1, len(origins)):
         reach = min(reach, sqrt(origins[sensor, 0] ** 2 + origins[sensor, 1] ** 2))
     beyond = 0.0 if isnan(reach) else (reach - constants.near_range) / constants.range_span
-    beyond = max(beyond, 0.0)
+    beyond = min(max(beyond, 0.0), constants.max_range_share)
     for face in range(6):
         u = tangent[face] + constants.edge_lead[face]
         occluded = 0.5 - 0.5 * u / sqrt(u**2 + constants.visibility_softness)
@@ -201,7 +207,7 @@ def fill_insets(origins, tangent, occlusion_inset, range_inset, constants, share
         by_range = shares[1, face] * range_inset[face]
         inset[face] = occluded * occlusion_inset[face] + by_range
         seen = 1.0 if tangent[face] > 0.0 else constants.occluded_weight
-        weight[face] = seen / (1.0 + (by_range / constants.face_outlier) ** 2)
+        weight[face] = seen / (1.0 + (by_range / constants.range_half_weight) ** 2)
 
 
 @kernel

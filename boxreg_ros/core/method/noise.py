@@ -121,5 +121,5 @@ def estimate(residuals, constants, deviation, correlation):
             whole = ratio + (1 - ratio) * removed if power > MIN_POWER else 1 - 2 / tracks
             correlation[j] = min(max(whole, 0.0), constants.max_correlation)
             variance, removed = removed_by_means(correlation[j], total / tracks)
-        deviation[j] = scatter / sqrt(max(1 - variance, 1 - constants.max_correlation))
+        deviation[j] = scatter / sqrt(max(1 - variance, constants.min_left))
     return total

@@ -16,6 +16,8 @@ from boxreg_ros.core.method.faces import fill_moved, fill_velocity, to_box_axes
 from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
 
+SHAPE_MARGIN = 0.3
+"""Points up to this far outside of a box are part of the shape [m]. Chosen."""
 STEP_RIDGE = 1e-3
 """Information added to that of a step: without points none is wanted. Derived: that of a deviation
 of 30 m."""
@@ -105,7 +107,7 @@ def fill_sums(b, problem, poses, half, constants, work):
         to_box_axes(m, work.moved, shift, R, local)
         for i in range(m):
             x, y, z = local[0, i], local[1, i], local[2, i]
-            if not is_near(x, y, z, half, constants.outside_margin):
+            if not is_near(x, y, z, half, SHAPE_MARGIN):
                 continue
             moment = work.sums[cell_of(x, y, z, half, constants.cells)]
             p = (x, y, z, 1.0)
@@ -123,7 +125,7 @@ def fill_agreement(m, local, half, constants, work, total, wanted):
     used = 0
     for i in range(m):
         x, y, z = local[0, i], local[1, i], local[2, i]
-        if not is_near(x, y, z, half, constants.outside_margin):
+        if not is_near(x, y, z, half, SHAPE_MARGIN):
             continue
         cell = cell_of(x, y, z, half, constants.cells)
         if work.thickness[cell] == 0.0:

@@ -149,7 +149,7 @@ def median_place(boxes, times, first, last):
 def fill_parked(boxes, times, length, yaw_deviation, constants, parked):
     """Write whether the object is parked from each box to the next (M25), (N,)."""
     parked[:] = is_parked(boxes, times, length, yaw_deviation, constants)
-    span = constants.min_observations
+    span = constants.driving_span
     for step in range(span - 1, length - span):
         x0, y0, t0 = median_place(boxes, times, step + 1 - span, step + 1)
         x1, y1, t1 = median_place(boxes, times, step + 1, step + 1 + span)
@@ -218,4 +218,4 @@ def weigh_shared(length, shared, terms, common, face_weight, constants):
         of_points = (pull / max(total, 1e-9)) ** 2 / variance
         of_gap = (shared[GAP + face] - common.shared[GAP + face]) ** 2 / spread**2
         off = max(of_points, of_gap)
-        W[GAP + face] = 1 / (spread**2 * (1 + off / constants.outlier**2))
+        W[GAP + face] = 1 / (spread**2 * (1 + off / constants.gap_outlier**2))
