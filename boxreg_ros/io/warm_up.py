@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
+from boxreg_ros.core.follow import follow
 from boxreg_ros.core.observation import observe
 from boxreg_ros.core.registrar import BoxRegistrar, Submit
 from boxreg_ros.structures import BoxArray, Sweep
@@ -39,6 +40,22 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
         registrar.add_sweep(Sweep(stamp_ns, 'map', points.astype(np.float32)))
         registrar.add_boxes(BoxArray(stamp_ns, 'map', ('1',), ('car',), np.ones(1), box))
     registrar.flush()
+
+
+def warm_up_follower(config: Config) -> None:
+    """Follow a synthetic box through six sweeps, there and back: its kernels are loaded."""
+    rng = np.random.default_rng(0)
+    centres = 10.0 + 0.5 * np.arange(6)
+    sweeps = [rng.uniform(-1, 1, (64, 3)) * [2, 1, 0.7] + [x, 0, 0] for x in centres]
+    stamps_ns = np.arange(6) * 10**8
+    seeds = [
+        BoxArray(
+            int(stamps_ns[row]), 'map', ('1',), ('car',), np.ones(1),
+            np.array([[centres[row], 0, 0, 4, 2, 1.5, 0, 0, 0]]),
+        )
+        for row in (1, 4)
+    ]  # fmt: skip
+    follow(stamps_ns, sweeps, seeds, config)
 
 
 def warm_up_crop(config: Config) -> None:

@@ -12,7 +12,7 @@ import warnings
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.io.compilation import announced_compilation
-from boxreg_ros.io.warm_up import warm_up
+from boxreg_ros.io.warm_up import warm_up, warm_up_follower
 from msg_adapters import cdr
 
 COMPILED_ESTIMATES = ('final', 'track')
@@ -49,10 +49,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _compile() -> int:
-    """Register with each estimate and mode; return the number of functions compiled."""
+    """Register with each estimate and mode, and follow; return the functions compiled."""
     with announced_compilation(lambda text: print(text, file=sys.stderr)) as done:
         for estimate, mode in product(COMPILED_ESTIMATES, MODES):
             warm_up(Config.from_dict({'estimate': estimate, 'mode': mode}))
+        warm_up_follower(Config.from_dict({'estimate': 'track'}))
         cdr.walker()
     return done.functions
 
