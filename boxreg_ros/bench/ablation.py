@@ -60,7 +60,8 @@ INGREDIENTS = {
     WHOLE: Ingredient('every ingredient is on', {}),
     'points': Ingredient(
         'faces and rigid shape have no weight: motion and input alone',
-        {f'faces.{name}': 10.0 for name in ('ends', 'sides', 'top', 'bottom')} | _without('rigid shape'),
+        {f'faces.{name}': 10.0 for name in ('ends', 'sides', 'top', 'bottom')}
+        | _without('rigid shape'),
     ),
     'rigid shape': Ingredient(
         'points of a track are not tied to one rigid shape', _without('rigid shape')
