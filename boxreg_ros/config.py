@@ -104,7 +104,11 @@ class FaceConfig:
         0.12, 'standard deviation of one observation of the front or rear face', 'm', 1e-3, 10.0
     )
     sides: float = setting(
-        0.08, 'standard deviation of one observation of the left or right face', 'm', 1e-3, 10.0
+        0.08,
+        'standard deviation of one observation of the left or right face',
+        'm',
+        1e-3,
+        10.0,
     )
     top: float = setting(
         0.08, 'standard deviation of one observation of the top face', 'm', 1e-3, 10.0
@@ -173,13 +177,10 @@ class ClassConfig:
         (), 'class names of this kind: any of these words, in any case'
     )
     acceleration: float = setting(
-        1.5, 'standard deviation of the forward acceleration', 'm/s^2', 1e-3, 1e3
+        1.5, 'standard deviation of the forward and vertical acceleration', 'm/s^2', 1e-3, 1e3
     )
     cornering: float = setting(
         4.0, 'standard deviation of the sideways acceleration', 'm/s^2', 1e-3, 1e3
-    )
-    vertical: float = setting(
-        1.0, 'standard deviation of the vertical acceleration', 'm/s^2', 1e-3, 1e3
     )
     turning: float = setting(
         0.8, 'standard deviation of the yaw acceleration', 'rad/s^2', 1e-3, 1e3
@@ -188,7 +189,11 @@ class ClassConfig:
         0.2, 'standard deviation of the roll and pitch acceleration', 'rad/s^2', 1e-3, 1e3
     )
     slip: float = setting(
-        0.15, 'standard deviation of the sideways velocity of the pivot', 'm/s', 1e-3, 1e3
+        0.15,
+        'standard deviation of the sideways velocity of the pivot',
+        'm/s',
+        1e-3,
+        1e3,
     )
     sideslip: float = setting(
         0.01, 'standard deviation of the constant angle from the heading of a track to its path',
@@ -248,10 +253,10 @@ class CompleteConfig:
     prune: bool = setting(False, 'reject ghosts and duplicates')
     fill: bool = setting(False, 'add missing boxes between two boxes of a track')
     extend: bool = setting(False, 'add boxes before and after a track while points support them')
-    stitch_gap: float = setting(
-        2.0, 'longest time between two fragments of one object', 's', 0.0, 1e3
-    )
-    fill_gap: float = setting(2.0, 'longest gap of a moving object that is filled', 's', 0.0, 1e3)
+    fill_gap: float = setting(
+        2.0, 'longest gap between fragments of an object, and of a moving one that is filled',
+        's', 0.0, 1e3,
+    )  # fmt: skip
     extend_time: float = setting(
         1.0, 'longest extension of a moving object at each end', 's', 0.0, 1e3
     )

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 WHOLE = 'nothing'
 SCORES = ('BEV', '3D', 'R@0.8', 'flips')
-ESTIMATES = ('final', 'track')
+ABLATED_ESTIMATES = ('final', 'track')
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='INGREDIENT', help=f'only some of {", ".join(list(INGREDIENTS)[1:])}',
     )  # fmt: skip
     parser.add_argument(
-        '--estimate', nargs='+', choices=('early', *ESTIMATES), default=ESTIMATES,
+        '--estimate', nargs='+', choices=('early', *ABLATED_ESTIMATES), default=ABLATED_ESTIMATES,
         help='early (newest box), final (fixed lag), track (full sequence); default: final track',
     )  # fmt: skip
     parser.add_argument(

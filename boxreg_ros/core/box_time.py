@@ -13,31 +13,18 @@ from functools import lru_cache
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.observation import crop, Observation
+from boxreg_ros.core.method.constants import CONSTANTS
+from boxreg_ros.core.observation import crop, FACE_TOLERANCE, NEARBY, Observation
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, LENGTH, ROLL, Sweep, X, Z
 import numpy as np
 from numpy.typing import NDArray
 
 # All of these are chosen.
-SIGHT_MARGIN = 1.0
-"""Points up to this far outside a box give the time at which the sweep saw it [m]."""
-MIN_MOTION = 0.2
-"""
-Least motion between stamp and sight that is evidence [m].
-
-About the error of an input box. Of simulated boxes of known time with 0.2 to 0.3 m, 84 to 100 %
-vote for it; with 0.1 to 0.2 m some sets vote for the other.
-
-"""
-MIN_VOTE_POINTS = 10
-"""Fewest points of a box that is evidence."""
-MAX_FACE_DISTANCE = 0.5
-"""Points count as no further from the nearest face of a box than this [m]."""
 MIN_DIFFERENCE = 0.02
 """Least difference of the mean distance of the points from a face that is evidence [m]."""
 MIN_VOTES = 10
-"""Fewest boxes that decide; without them boxes are taken to be at the time of sight."""
+"""Fewest points of a box that votes, and fewest votes; without, boxes are at the time of sight."""
 MIN_MAJORITY = 0.6
 """Least part of these boxes that decides."""
 
@@ -55,11 +42,11 @@ def motion_to_sight(sweep: Sweep, boxes: Floats, velocities: Floats) -> Floats:
         return motion
     latest = max(sweep.times.max(), -sweep.times.min())  # not abs: no copy of a million bytes
     most = latest * np.linalg.norm(velocities, axis=1)
-    moving = np.flatnonzero(most > MIN_MOTION)
+    moving = np.flatnonzero(most > FACE_TOLERANCE)
     if not len(moving):
         return motion
-    near = crop(sweep, boxes[moving], SIGHT_MARGIN)
-    is_near = near.outside.max(0) < SIGHT_MARGIN
+    near = crop(sweep, boxes[moving], NEARBY)
+    is_near = near.outside.max(0) < NEARBY
     rows, owner = near.row[is_near], near.owner[is_near]
     for i, box in enumerate(moving):
         times = sweep.times[rows[owner == i]]
@@ -101,11 +88,11 @@ class BoxTimeEvidence:
             return
         rows = [observation.row for observation in seen]
         motions = velocities * seen[0].table.sights[rows, None]  # from the stamp [m]
-        for i in np.flatnonzero(np.linalg.norm(motions, axis=1) >= MIN_MOTION).tolist():
+        for i in np.flatnonzero(np.linalg.norm(motions, axis=1) >= FACE_TOLERANCE).tolist():
             self._vote(seen[i], velocities[i], motions[i])
 
     def _vote(self, seen: Observation, velocity: Floats, motion: Floats) -> None:
-        if len(seen.points) < MIN_VOTE_POINTS:
+        if len(seen.points) < MIN_VOTES:
             return
         points = seen.points - np.outer(seen.delays, velocity)  # at the stamp
         at_stamp = _distance_from_faces(seen.box, points)
@@ -144,4 +131,4 @@ def _distance_from_faces(box: Floats, points: NDArray[np.floating]) -> float:
     """Return the mean distance of points (M, 3) from the nearest face of a box [m]."""
     local = np.abs(points @ matrix_from_rpy(box[ROLL:]))
     outside = (local - box[LENGTH:ROLL] / 2).max(1)
-    return float(np.abs(outside).clip(max=MAX_FACE_DISTANCE).mean())
+    return float(np.abs(outside).clip(max=CONSTANTS.outside_margin).mean())

@@ -19,6 +19,7 @@ from boxreg_ros.core.following.tracker import (
     Sweeps,
     Way,
 )
+from boxreg_ros.core.observation import GOOD_POINTS, NEARBY
 from boxreg_ros.core.refine import refine, Track
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
@@ -39,11 +40,6 @@ from boxreg_ros.structures import (
 )
 import numpy as np
 from numpy.typing import NDArray
-
-MIN_SEED_POINTS = 5
-"""A seed with fewer points in its box is not followed; chosen."""
-NEARBY = 1.0
-"""Points so far outside of a box are passed to the solver [m]; as the margin of the baselines."""
 
 
 class End(NamedTuple):
@@ -256,12 +252,12 @@ def _followed(
         poses |= dict(zip(rows.tolist(), found, strict=True))
         status |= dict.fromkeys(rows.tolist(), INTERPOLATED)
     ends = []
-    if follower.num_points < MIN_SEED_POINTS:
+    if follower.num_points < GOOD_POINTS:
         problems = (*problems, _without_points(one, follower.num_points))
     for seed, sign, stop in ((0, -1, 0), (len(seeds.rows) - 1, 1, len(times) - 1)):
         last = int(seeds.rows[seed])
         reason = 'few_points'
-        if follower.num_points >= MIN_SEED_POINTS:
+        if follower.num_points >= GOOD_POINTS:
             way = follower.way(seed, sign, stop)
             reason = END_OF_SWEEPS if way.reason == ARRIVED else way.reason
             for row in _supported(way):

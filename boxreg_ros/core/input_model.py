@@ -16,6 +16,7 @@ from boxreg_ros.core.method.faces import observe_faces
 from boxreg_ros.core.method.residuals import TERMS
 from boxreg_ros.core.population import set_population
 from boxreg_ros.core.problem import Problem
+from boxreg_ros.core.support import MIN_HITS
 from boxreg_ros.core.threads import run
 from boxreg_ros.core.track_rows import TrackRows
 from boxreg_ros.structures import Floats, Ints
@@ -40,8 +41,6 @@ GAP_DEVIATIONS = {
     'pedestrian': (0.15, 0.15, 0.15, 0.15),
 }
 """Prior deviation of each margin from the one of the settings of its kind [m]. Chosen."""
-MIN_TRACK_OBSERVATIONS = 3
-"""Fewest face observations of a track, and tracks, that a margin is estimated from. Chosen."""
 
 
 class InputModel:
@@ -225,7 +224,7 @@ class InputModel:
         means = []
         for sums in _of_all_kinds(self._faces)[0]:
             total, count, share = sums[quantity][:, faces]
-            is_known = count >= MIN_TRACK_OBSERVATIONS
+            is_known = count >= MIN_HITS
             if is_known.any():
                 means.append(total[is_known] / share[is_known])
         return means
@@ -243,7 +242,7 @@ class InputModel:
     def _posterior_mean(self, means: Floats, prior: float, deviation: float) -> float:
         """Weigh the midmean of sorted `means` against a prior with its deviation (M18)."""
         n = len(means)
-        if n < MIN_TRACK_OBSERVATIONS:
+        if n < MIN_HITS:
             return prior
         middle, spread = _midmean(means)
         error = MIDMEAN_FACTOR * (spread + self.constants.min_gap_deviation)
@@ -270,7 +269,7 @@ def _means_of_groups(known: Floats) -> Means:
     found = []
     for faces in FACE_GROUPS:
         total, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)
-        is_known = count >= MIN_TRACK_OBSERVATIONS
+        is_known = count >= MIN_HITS
         means = total[is_known] / share[is_known]
         order = np.argsort(means)
         found.append((means[order], count[is_known][order]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from boxreg_ros.config import ClassConfig
+from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, Ints, X, Y, YAW, Z
 import numpy as np
@@ -22,8 +23,6 @@ UNKNOWN_SPEED_DEVIATION = 8.0
 """Standard deviation of the speed of an object with one box [m/s]; chosen: urban traffic."""
 TURN_RATE = 0.5
 """Standard deviation of an unknown turn rate [rad/s]; chosen: a bend of 20 m at 10 m/s."""
-MIN_TURN_SPEED = 1.0
-"""Slower objects are predicted straight ahead [m/s]; chosen: their heading is uncertain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +117,7 @@ def motion_at(stamps_ns: Ints, boxes: Floats, row: int, model: ClassConfig) -> E
     spread = np.square(offsets).sum()
     velocity = offsets @ near[:, X : Z + 1] / spread
     turn_rate = 0.0
-    if np.linalg.norm(velocity[:2]) > MIN_TURN_SPEED and len(near) > 3:
+    if np.linalg.norm(velocity[:2]) > CONSTANTS.driving_speed and len(near) > 3:
         turn_rate = float(offsets @ unflipped(near[:, YAW]) / spread)
         # The slope is the velocity in the middle of the boxes; its direction turns up to the end.
         turn = -turn_rate * seconds.mean()

@@ -27,7 +27,7 @@ INITIAL_ROUNDING = 0.3
 ROUNDING_DECAY = 0.01
 """Factor on the rounding from one multiplier round to the next. Chosen: it has reached `EPSILON`
 in the fifth."""
-TOLERANCE = 1e-9
+STATIONARITY = 1e-9
 """Relative decrease of the objective that ends the search of one multiplier round. Chosen."""
 FULL_STEP = 0.1
 """Step from which on its direction counts in full in Eq. 7 [m]. Chosen."""
@@ -219,7 +219,7 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
                 (gradient,) = torch.autograd.grad(loss.sum(), x)
             return loss.detach(), gradient * free[rows]
 
-        x = minimize(function, x, settings.iterations, HISTORY, TOLERANCE).x
+        x = minimize(function, x, settings.iterations, HISTORY, STATIONARITY).x
         _, violation = total(boxes(x, every), seen, settings, multipliers, rounding)
         multipliers = multipliers + violation * penalty
     B = len(mean)

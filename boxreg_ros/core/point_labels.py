@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.method.constants import CONSTANTS
+from boxreg_ros.core.motion import MOTION_SECONDS
 from boxreg_ros.core.observation import crop, own_points
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL, Sweep, X, YAW, Z
@@ -27,24 +29,20 @@ UNKNOWN_MOTION, PARKED, STOOD, MOVING = range(4)
 """Motion of an object: never seen to move, stands now but moves at another time, moves."""
 
 # All of these are chosen; `test/measure/points.py` draws what they change.
-TOLERANCE = 0.12
+SURFACE_TOLERANCE = 0.12
 """Points up to this far outside of the surface that the margins predict are of the object [m]."""
 BAND = 0.1
 """Points up to this far outside of that are unknown: of the object or beside it [m]."""
 UNCERTAIN_BAND = 0.5
 """The same of boxes that no points confirm: kept ones, and ones between those of a gap [m]."""
-ROAD_CLEARANCE = 0.06
+LABEL_CLEARANCE = 0.06
 """Points less than this above the road are of the road [m]: above its noise, below a bumper."""
-MOVING_SPEED = 0.3
-"""Least speed of an object that moves [m/s]: slower than a pedestrian."""
 MOVING_DISTANCE = 0.35
 """Least distance that an object moves within the boxes that state its speed [m]: 3 deviations."""
 MOVING_DEVIATIONS = 5.0
 """Least speed in standard errors: boxes that jump once, as estimates that settle, do not move."""
 LEAST_WAY = 1.0
 """Between two rests an object moves at least so far [m]: farther than an estimate jumps."""
-MOTION_SECONDS = 1.0
-"""The speed is that of the boxes within a span of this time [s]."""
 MIN_MOTION_SECONDS = 0.25
 """Shorter tracks have no known motion [s]."""
 CERTAIN_GAP = 0.6
@@ -182,7 +180,7 @@ class PointLabeller:
         self.tracks = list(tracks)
         self._config = config
         self._array_stamps_ns = np.unique(array_stamps_ns)
-        self._limits = TOLERANCE - margins[:, [0, 2, 4, 5]]  # ends, sides, top, bottom
+        self._limits = SURFACE_TOLERANCE - margins[:, [0, 2, 4, 5]]  # ends, sides, top, bottom
         self._motions = [_track_motion(track) for track in tracks]
         self._names = self.tracks, np.array([MOVING in one.motion for one in self._motions], bool)
         self._first_ns = np.array([track.stamps_ns[0] for track in tracks], np.int64)
@@ -291,7 +289,7 @@ class PointLabeller:
             From the centre of the box to the point, moved back to the stamp with its object;
             axes of the fixed frame [m].
         excess : array, shape (P,)
-            How far it is outside of the surface and `TOLERANCE`, negative inside [m].
+            How far it is outside of the surface and `SURFACE_TOLERANCE`, negative inside [m].
 
         """
         boxes = objects.boxes
@@ -307,7 +305,7 @@ class PointLabeller:
             searched = boxes.copy()
             searched[:, X : Z + 1] += shift
             searched[:, LENGTH] += np.linalg.norm(objects.velocities, axis=1) * np.ptp(ends)
-        row, owner, offset, outside = crop(sweep, searched, TOLERANCE + UNCERTAIN_BAND)
+        row, owner, offset, outside = crop(sweep, searched, SURFACE_TOLERANCE + UNCERTAIN_BAND)
         if times is not None:
             moved = np.flatnonzero(moves[owner])
             own = owner[moved]
@@ -323,7 +321,7 @@ class PointLabeller:
         vertical = np.where(above > 0, top[owner], bottom[owner])
         np.maximum(excess, outside[2] - vertical, out=excess)
         road = np.nan_to_num(own_points(sweep, boxes, self._config).road)
-        lowest = road - half[:, 2] + ROAD_CLEARANCE
+        lowest = road - half[:, 2] + LABEL_CLEARANCE
         is_near = np.flatnonzero((above > lowest[owner]) & (excess < UNCERTAIN_BAND))
         return row[is_near], owner[is_near], offset[:, is_near], excess[is_near]
 
@@ -356,7 +354,7 @@ def _track_motion(track: ObjectTrack) -> _TrackMotion:
     values = np.column_stack([track.boxes[:, X : Z + 1], yaws])
     slopes, errors, span = _slopes(seconds, values, MOTION_SECONDS)
     speed = np.linalg.norm(slopes[:, :2], axis=1)
-    moves = speed > np.maximum(MOVING_SPEED, MOVING_DISTANCE / span)
+    moves = speed > np.maximum(CONSTANTS.parked_speed, MOVING_DISTANCE / span)
     moves &= speed > MOVING_DEVIATIONS * np.linalg.norm(errors[:, :2], axis=1)
     moves = _without_jumps(moves, track.boxes[:, X : Z + 1])
     motion = np.where(moves, MOVING, STOOD if moves.any() else PARKED).astype(np.uint8)

@@ -19,7 +19,9 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import residuals_at
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, Solution
+from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.faces import count_held
+from boxreg_ros.core.observation import SIDE_NOISE
 from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.problem import group_windows, Problem, stack_windows
 from boxreg_ros.core.solver import solve
@@ -31,10 +33,6 @@ from boxreg_ros.structures import Floats, Ints, KEPT, POSE, REFINED, ROLL
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_LOST_POINTS = 3
-"""Points that a refined box may always hold less than its input box. Chosen."""
-HELD_MARGIN = 0.05
-"""Points up to this far outside a box count as held by it [m]. Chosen."""
 KEPT_REASONS = (Reason.NO_POINTS, Reason.NOT_FINITE, Reason.NO_GAIN)
 """Why a box is kept, in the order of `_failed_tests`."""
 
@@ -173,11 +171,11 @@ def _failed_tests(
     """
     before = problem.counts  # at most: counting those of the input boxes takes time
     is_blind = np.broadcast_to(before.sum(1, keepdims=True) == 0, before.shape)
-    least = (1 - max_lost_part) * before - MAX_LOST_POINTS
+    least = (1 - max_lost_part) * before - CONSTANTS.min_face_points
     if (held < least).any():
         extent = np.ascontiguousarray(problem.boxes[..., 3:6])
         before = _held(problem, problem.boxes[..., POSE], extent)
-        least = (1 - max_lost_part) * before - MAX_LOST_POINTS
+        least = (1 - max_lost_part) * before - CONSTANTS.min_face_points
     return np.stack([is_blind, ~is_finite, held < least])
 
 
@@ -185,7 +183,7 @@ def _held(problem: Problem, poses: Floats, extent: Floats) -> Ints:
     """Return how many points are in boxes at `poses` (B, N, 6) of `extent` (B, N, 3), (B, N)."""
     held = np.zeros(problem.counts.shape, np.int64)
     contiguous = np.ascontiguousarray(poses), np.ascontiguousarray(extent)
-    run(count_held, len(held), problem, *contiguous, HELD_MARGIN, held)
+    run(count_held, len(held), problem, *contiguous, SIDE_NOISE, held)
     return held
 
 

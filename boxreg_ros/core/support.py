@@ -2,18 +2,16 @@
 
 from collections.abc import Sequence
 
+from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.metrics import iou_3d
-from boxreg_ros.core.observation import Observation
+from boxreg_ros.core.observation import FACE_TOLERANCE, GOOD_POINTS, Observation
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, ROLL
 import numpy as np
 
 MIN_HITS = 3
-"""Detections that confirm a track; literature: SORT."""
-GOOD_POINTS = 5
-"""Points above the road that are evidence for an object; chosen: fewer are often of clutter."""
-SUPPORT_POINTS = 3
-"""Least points above the road in a supported box; chosen: one or two may be of clutter."""
+"""Detections that confirm a track, and its face observations, and tracks, that a margin needs;
+literature: SORT."""
 SUPPORT_PART = 0.3
 """
 Least part of the points that the end of the track has, in a supported box.
@@ -21,17 +19,13 @@ Least part of the points that the end of the track has, in a supported box.
 Chosen: within the longest extension the range, and so the number, changes less.
 
 """
-SUPPORT_BOXES = 5
-"""Boxes at the end of a track that give the number of points to expect; chosen."""
 OWNED = 0.1
 """3D IoU at which two boxes are of one object; chosen: objects do not overlap."""
-FACE_TOLERANCE = 0.2
-"""Points up to so far outside of a face count [m]; chosen: the error of a prediction."""
 
 
 def least_support(at_end: Ints) -> float:
     """Return the points that a supported box has, by those of boxes at the end of its track."""
-    return max(SUPPORT_POINTS, SUPPORT_PART * float(np.median(at_end)))
+    return max(CONSTANTS.min_face_points, SUPPORT_PART * float(np.median(at_end)))
 
 
 def is_owned(box: Floats, others: Floats) -> bool:
@@ -52,7 +46,7 @@ def points_to_confirm(detected: Sequence[Observation]) -> float:
     counts = points_inside(detected)
     if len(counts) < MIN_HITS or 2 * (counts >= GOOD_POINTS).sum() <= len(counts):
         return np.inf
-    return least_support(counts[-SUPPORT_BOXES:])
+    return least_support(counts[-CONSTANTS.min_observations :])
 
 
 def points_inside(observations: Sequence[Observation]) -> Ints:

@@ -18,10 +18,10 @@ from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.labels import frames_of, SceneFrames
 from boxreg_ros.labels.argoverse2 import (
-    ANNOTATIONS_FILE,
     CITY_FRAME,
     EGO_FRAME,
     EGO_POSES_FILE,
+    FEATHER_FILE,
     xyz_xyzw,
 )
 from boxreg_ros.labels.arrow import read_rows, read_table
@@ -53,7 +53,7 @@ def scene_names(root: Path) -> list[str]:
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
     """Return the files and folders of a log."""
     log = _logs(root)[name]
-    paths = [log / part for part in (ANNOTATIONS_FILE, EGO_POSES_FILE, SENSOR_POSES_FILE)]
+    paths = [log / part for part in (FEATHER_FILE, EGO_POSES_FILE, SENSOR_POSES_FILE)]
     return (log / 'sensors' / DATASET.lidar, *(path for path in paths if path.is_file()))
 
 
@@ -74,7 +74,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
         {str(stamp_ns): stamp_ns for stamp_ns in stamps_ns},
         *frame_names(log, CITY_FRAME, EGO_FRAME),
     )
-    annotations = log / ANNOTATIONS_FILE
+    annotations = log / FEATHER_FILE
     return Scene(
         frames,
         DATASET.lidar,

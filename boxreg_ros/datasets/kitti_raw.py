@@ -39,7 +39,7 @@ DATASET = Dataset(
     remedy='unpack its archives into one folder',
     lidar='velodyne_points',
 )
-SUFFIX = '_sync'
+DRIVE_SUFFIX = '_sync'
 RAW_DIGITS = 10
 IMU_CALIBRATION_FILE = 'calib_imu_to_velo.txt'
 
@@ -62,7 +62,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     drive = _drives(root)[name]
     exported = exported_poses(drive, 1)
     if exported is None:
-        stamps_ns = _stamps(drive / DATASET.lidar / STAMPS_FILE, f'{name}{SUFFIX}.zip')
+        stamps_ns = _stamps(drive / DATASET.lidar / STAMPS_FILE, f'{name}{DRIVE_SUFFIX}.zip')
         pose_stamps_ns, poses = _oxts(drive, name)
     else:
         pose_stamps_ns, poses = exported
@@ -84,7 +84,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
 
 def _oxts(drive: Path, name: str) -> tuple[Ints, Floats]:
     """Return stamps (n,) and poses (n, 7) of the LiDAR at the stamps of the GPS/IMU unit."""
-    archive = f'{name}{SUFFIX}.zip'
+    archive = f'{name}{DRIVE_SUFFIX}.zip'
     stamps_ns = np.array(_stamps(drive / 'oxts' / STAMPS_FILE, archive), np.int64)
     folder = require(drive / 'oxts' / 'data', 'the poses', f'unpack {archive}')
     rows = [oxts_rows(path) for path in sorted(folder.glob('*.txt'))]
@@ -117,6 +117,6 @@ def _stamps(path: Path, archive: str) -> list[int]:
 
 def _drives(root: Path) -> dict[str, Path]:
     """Return the folders of all drives by name: of all days, of one day, or one export."""
-    found = [*root.glob(f'*{SUFFIX}'), *root.glob(f'*/*{SUFFIX}')]
+    found = [*root.glob(f'*{DRIVE_SUFFIX}'), *root.glob(f'*/*{DRIVE_SUFFIX}')]
     found += [root.absolute()] if (root / DATASET.lidar).is_dir() else []
-    return {path.name.removesuffix(SUFFIX): path for path in found}
+    return {path.name.removesuffix(DRIVE_SUFFIX): path for path in found}

@@ -63,7 +63,7 @@ OPTIONAL_COLUMNS = {'track_uuid', 'num_interior_pts'}
 """Detections that are submitted lack these."""
 LOG_COLUMN = 'log_id'
 CITY_FRAME, EGO_FRAME = 'city', 'egovehicle'
-ANNOTATIONS_FILE = 'annotations.feather'
+FEATHER_FILE = 'annotations.feather'
 EGO_POSES_FILE = 'city_SE3_egovehicle.feather'
 LIDAR_NAME = 'up_lidar'
 
@@ -77,7 +77,7 @@ class Writer(FolderWriter):
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
         columns = ANNOTATION_COLUMNS | EVIDENCE_COLUMNS
-        self._annotations = Table(folder / ANNOTATIONS_FILE, columns, to_json(self.about))
+        self._annotations = Table(folder / FEATHER_FILE, columns, to_json(self.about))
         self._poses = Table(folder / EGO_POSES_FILE, {'timestamp_ns': 'int64'} | POSE_COLUMNS)
         path = folder / 'calibration' / 'egovehicle_SE3_sensor.feather'
         calibration = Table(path, {'sensor_name': 'string'} | POSE_COLUMNS)
@@ -120,7 +120,7 @@ class Writer(FolderWriter):
 def read(path: Path) -> Iterator[LabelFrame]:
     """Yield the annotated stamps of a log, with the poses of its pose file."""
     if path.is_dir():
-        path = path / ANNOTATIONS_FILE
+        path = path / FEATHER_FILE
     folder = path.parent
     pose_file = folder / EGO_POSES_FILE
     poses = read_rows(pose_file) if pose_file.exists() else []
@@ -145,7 +145,7 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
 
     """
     if path.is_dir():
-        path = path / ANNOTATIONS_FILE
+        path = path / FEATHER_FILE
     table = read_table(path)
     if LOG_COLUMN in table.column_names:
         logs = table.column(LOG_COLUMN)

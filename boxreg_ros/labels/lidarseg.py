@@ -57,7 +57,7 @@ CATEGORY_OF_WORDS = (
 )
 OTHER_CATEGORY = 'vehicle.car'
 """Other class names are those of vehicles, as everywhere in the package."""
-MAX_INSTANCE = 999
+MAX_PANOPTIC_INSTANCE = 999
 """Of the three digits below the category."""
 
 
@@ -99,7 +99,7 @@ class Writer(nuscenes.Writer):
                 name = category_of(track.class_name)
                 counts[name] += 1
                 categories.append(CATEGORIES.index(name))
-                instances.append(counts[name] if counts[name] <= MAX_INSTANCE else 0)
+                instances.append(counts[name] if counts[name] <= MAX_PANOPTIC_INSTANCE else 0)
             assert (UNKNOWN, BACKGROUND) == (-2, -1)  # the last two entries
             ends = [UNKNOWN_CATEGORY, BACKGROUND_CATEGORY]
             self._of_tracks = [*categories, *ends], [*instances, 0, 0]

@@ -30,7 +30,7 @@ FORMAT = Format(
     files='sequences/00/, with labels/, velodyne/, poses.txt',
     has_points=True,
 )
-SEQUENCE = 'sequences/00'
+SEQUENCE_FOLDER = 'sequences/00'
 UNLABELED, OTHER_OBJECT = 0, 99
 CLASSES = (
     # Words of class names; class of objects that never move, and of those that do.
@@ -52,14 +52,14 @@ MAX_INSTANCE = 2**16 - 1
 class Writer(FolderWriter):
     """Write a file of points and one of labels per sweep."""
 
-    folders = (f'{SEQUENCE}/labels', f'{SEQUENCE}/velodyne')
-    cloud_file = f'{SEQUENCE}/velodyne/{{number:06d}}.bin'
+    folders = (f'{SEQUENCE_FOLDER}/labels', f'{SEQUENCE_FOLDER}/velodyne')
+    cloud_file = f'{SEQUENCE_FOLDER}/velodyne/{{number:06d}}.bin'
     has_sidecar = True
     needs_pose = True
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
-        self._sequence = folder / SEQUENCE
+        self._sequence = folder / SEQUENCE_FOLDER
         identity = ' '.join(map(str, np.eye(4)[:3].ravel()))
         lines = [f'{name}: {identity}\n' for name in ('P0', 'P1', 'P2', 'P3', 'Tr')]
         (self._sequence / 'calib.txt').write_text(''.join(lines), encoding='utf-8')

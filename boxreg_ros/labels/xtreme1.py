@@ -30,7 +30,7 @@ FORMAT = cuboid_format(
     title='Xtreme1',
     files='scene_1/result/STAMP.json, scene_1/lidar_point_cloud_0/STAMP.pcd',
 )
-CLOUDS_FOLDER = 'lidar_point_cloud_0'
+LIDAR_FOLDER = 'lidar_point_cloud_0'
 RESULT_FOLDER = 'result'
 BOX_TYPE = '3D_BOX'
 
@@ -43,8 +43,8 @@ class Writer(CuboidWriter):
 
     """
 
-    folders = (f'scene_1/{RESULT_FOLDER}', f'scene_1/{CLOUDS_FOLDER}')
-    cloud_file = f'scene_1/{CLOUDS_FOLDER}/{{name}}.pcd'
+    folders = (f'scene_1/{RESULT_FOLDER}', f'scene_1/{LIDAR_FOLDER}')
+    cloud_file = f'scene_1/{LIDAR_FOLDER}/{{name}}.pcd'
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
@@ -66,12 +66,12 @@ def read(path: Path) -> Iterator[LabelFrame]:
     the ``result`` folder of the scene has one file per frame.
 
     """
-    scene, folder = single_part(path, 'scene', [RESULT_FOLDER, CLOUDS_FOLDER])
+    scene, folder = single_part(path, 'scene', [RESULT_FOLDER, LIDAR_FOLDER])
 
     def cuboids_by_name(name: str) -> list[ReadCuboid]:
         return _read_cuboids(scene / RESULT_FOLDER / f'{name}.json')
 
-    files = [*scene.glob(f'{RESULT_FOLDER}/*.json'), *scene.glob(f'{CLOUDS_FOLDER}/*.pcd')]
+    files = [*scene.glob(f'{RESULT_FOLDER}/*.json'), *scene.glob(f'{LIDAR_FOLDER}/*.pcd')]
     names = {file.stem for file in files}
     yield from read_frames(folder, sorted(names), cuboids_by_name)
 

@@ -14,7 +14,7 @@ TOPIC = 'bond'
 STATUS_TYPE = 'bond/msg/Status'
 PERIOD = 0.1
 """Time between two heartbeats [s]; that of the nodes of Nav2."""
-TIMEOUT = 4.0
+HEARTBEAT_TIMEOUT = 4.0
 """Silence after which the other end takes the bond for broken [s]; that of Nav2 by default."""
 DEPTH = 10
 """Queue size: a second of heartbeats."""
@@ -40,7 +40,7 @@ class Bond:
         self._node = node
         self._status = kind(
             id=node.get_name(), instance_id=str(uuid4()), active=True,
-            heartbeat_timeout=TIMEOUT, heartbeat_period=PERIOD,
+            heartbeat_timeout=HEARTBEAT_TIMEOUT, heartbeat_period=PERIOD,
         )  # fmt: skip
         self._publisher = node.create_publisher(kind, TOPIC, DEPTH)
         # A steady clock: the manager's timeout runs on while /clock stands still.

@@ -30,7 +30,7 @@ from boxreg_ros.offline.arguments import (
     words_of,
 )
 from boxreg_ros.offline.batch_results import (
-    FAILED,
+    DRIVE_FAILED,
     Result,
     rows_of_shards,
     UP_TO_DATE,
@@ -43,7 +43,7 @@ from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import writing
 
 ENGINES = ('local', 'ray')
-TIMEOUT = 1800.0
+DRIVE_TIMEOUT = 1800.0
 """Chosen: the longest step, the last windows of a drive of an hour, takes some minutes [s]."""
 MEMORY = 2.0
 """Three times the memory measured for 150,000 points (docs/results/speed.md#scale) [GB]."""
@@ -89,7 +89,7 @@ def _add_machine_arguments(parser: argparse.ArgumentParser) -> None:
         help='Ray cluster (default: the one that this machine belongs to, else a new local one)',
     )  # fmt: skip
     parser.add_argument(
-        '--timeout', type=float, default=TIMEOUT, metavar='S',
+        '--timeout', type=float, default=DRIVE_TIMEOUT, metavar='S',
         help='longest time of a drive without progress [s] (default: %(default)g)',
     )  # fmt: skip
     parser.add_argument(
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
         with _alone(args.out, part):
             rows += [vars(result) for result in _results(jobs, args)]
             write_results(args.out, rows, part)
-    done = sum(row['status'] != FAILED for row in rows)
+    done = sum(row['status'] != DRIVE_FAILED for row in rows)
     skipped = sum(row['status'] == UP_TO_DATE for row in rows)
     print(f'{args.out}: {done:,} of {len(rows):,} drives done, {skipped:,} of them earlier')
     return 0 if done == len(rows) else 1

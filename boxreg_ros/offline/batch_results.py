@@ -20,8 +20,8 @@ from boxreg_ros.io.storage.urls import names_of, read_text, url_of
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.result_folder import SUMMARY
 
-FAILED = 'failed'
-DONE = 'done'
+DRIVE_FAILED = 'failed'
+DRIVE_DONE = 'done'
 UP_TO_DATE = 'up to date'
 COUNTS = ('sweeps', 'boxes_in', 'refined', 'kept', 'damages')
 REVIEW = 'review.csv'
@@ -66,7 +66,7 @@ class Result:
     """
 
     drive: str
-    status: str = FAILED
+    status: str = DRIVE_FAILED
     exit_status: int | None = None
     attempts: int = 0
     seconds: float = 0.0
@@ -82,7 +82,7 @@ class Result:
     @property
     def is_done(self) -> bool:
         """Return whether the drive has its result."""
-        return self.status != FAILED
+        return self.status != DRIVE_FAILED
 
     def count(self, summary: dict[str, Any]) -> None:
         """Take the counts of a ``summary.json``."""
@@ -117,12 +117,14 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], shard: str = '') ->
         writer.writerows(rows)
     merged = {
         'drives': len(rows),
-        'done': sum(row['status'] != FAILED for row in rows),
+        'done': sum(row['status'] != DRIVE_FAILED for row in rows),
         **{name: sum(int(row[name]) for row in rows) for name in COUNTS},
         'seconds': round(sum(float(row['seconds']) for row in rows), 1),
         'peak_mb': max((int(row['peak_mb']) for row in rows), default=0),
         'version': __version__,
-        'failed': {row['drive']: row['last_line'] for row in rows if row['status'] == FAILED},
+        'failed': {
+            row['drive']: row['last_line'] for row in rows if row['status'] == DRIVE_FAILED
+        },
     }
     stem, suffix = SUMMARY.split('.')
     with written_whole(out / f'{stem}{shard}.{suffix}') as file:

@@ -28,7 +28,7 @@ JOBS = 'jobs'
 """Folder with the key and the log of each job."""
 RESERVED = frozenset({JOBS, 'index.csv', 'summary.json', 'report.html'})
 """Names in the output that no drive may have."""
-BLOCK_BYTES = 2**24
+READ_BYTES = 2**24
 """Bytes that are read for the hash of a file until progress is noted; chosen."""
 
 
@@ -260,7 +260,7 @@ def _hash(path: Path, advanced: Callable[[], None]) -> str:
     """Return the SHA-256 of a file."""
     digest = hashlib.sha256()
     with path.open('rb') as file:
-        while block := file.read(BLOCK_BYTES):
+        while block := file.read(READ_BYTES):
             digest.update(block)
             advanced()
     return digest.hexdigest()

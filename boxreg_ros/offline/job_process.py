@@ -24,7 +24,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.lock import locked
 from boxreg_ros.io.storage.urls import entries_of, names_of, read_text, url_of, write_text
 from boxreg_ros.io.whole_files import written_whole
-from boxreg_ros.offline.batch_results import DONE, Result, UP_TO_DATE
+from boxreg_ros.offline.batch_results import DRIVE_DONE, Result, UP_TO_DATE
 from boxreg_ros.offline.job import Job, JOBS
 from boxreg_ros.offline.progress import PIPE
 from boxreg_ros.offline.result_folder import claimed, earlier_summary, whole_summary
@@ -32,7 +32,7 @@ from boxreg_ros.offline.time_limit import Watch, watched
 
 DRIVE = '{drive}'
 """Stands for the name of the drive in the options of a batch."""
-STATE = frozenset({'key', 'recordings', 'files', 'peak_mb'})
+STATE_KEYS = frozenset({'key', 'recordings', 'files', 'peak_mb'})
 """Fields of the state of a job that is done; one without them, of another version, is none."""
 END_SECONDS = 10.0
 """Time that a job has to remove its files after SIGTERM [s]; then it is killed."""
@@ -168,7 +168,7 @@ class JobRunner:
             pass
         result.seconds = round(time.monotonic() - begun, 1)
         if result.exit_status == 0:
-            result.status = DONE
+            result.status = DRIVE_DONE
             return
         with suppress(RecordingError), claimed(self.out / job.name):
             pass  # deletes what a process that was killed has left
@@ -313,4 +313,4 @@ def _read_state(path: Path) -> dict[str, Any]:
         state = json.loads(read_text(path))
     except (OSError, ValueError):
         return {}
-    return state if isinstance(state, dict) and STATE.issubset(state) else {}
+    return state if isinstance(state, dict) and STATE_KEYS.issubset(state) else {}

@@ -90,7 +90,7 @@ TRAFFIC = (
     ActorPlan('pedestrian', 'pedestrian', (22, 7.2, np.pi), constant(1.3), zero),
     ActorPlan('pedestrian', 'pedestrian', (15, -6.9, 0), constant(1.5), lambda t: 0.1 * np.cos(t)),
 )  # fmt: skip
-PARKED = (
+PARKED_ROW = (
     ('car', 7, -4.6), ('van', 13.2, -4.7), ('suv', 19, -4.6), ('car', 24.7, -4.7),
     ('car', 41, -4.6), ('truck', 49, -4.9), ('suv', 57, -4.6), ('car', 11, 4.9),
     ('suv', 17, 4.9), ('van', 23.5, 5.0), ('car', 30, 4.8), ('car', 45.5, 4.9),
@@ -113,7 +113,7 @@ def street(rng: np.random.Generator, sweeps: int | None) -> SimulatedScene:
 def street_actors(rng: np.random.Generator, count: int) -> list[Actor]:
     """Return the parked rows and the traffic of the street for `count` sweeps."""
     plans = list(TRAFFIC)
-    for shape, x, y in PARKED:
+    for shape, x, y in PARKED_ROW:
         place = (
             x + rng.normal(0, 0.2),
             y + rng.normal(0, 0.1),

@@ -10,7 +10,8 @@ ends the extension.
 from __future__ import annotations
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.support import is_owned, least_support, SUPPORT_BOXES
+from boxreg_ros.core.method.constants import CONSTANTS
+from boxreg_ros.core.support import is_owned, least_support
 from boxreg_ros.structures import EXTENDED, Floats, Ints
 from boxreg_ros.tracks.added import AddedBoxes
 from boxreg_ros.tracks.fill import accelerations
@@ -84,8 +85,8 @@ def _candidates(tracklet: Tracklet, is_last: bool, stamps_ns: Ints, config: Conf
 
 def points_at_end(tracklet: Tracklet, is_last: bool) -> Ints:
     """Return the points in the boxes at one end of a track."""
-    points = tracklet.num_points
-    return points[-SUPPORT_BOXES:] if is_last else points[:SUPPORT_BOXES]
+    points, count = tracklet.num_points, CONSTANTS.min_observations
+    return points[-count:] if is_last else points[:count]
 
 
 def num_free(candidates: AddedBoxes, owned: dict[int, list[Floats]]) -> int:

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import iou_3d
-from boxreg_ros.core.support import GOOD_POINTS, MIN_HITS
+from boxreg_ros.core.observation import GOOD_POINTS
+from boxreg_ros.core.support import MIN_HITS
 from boxreg_ros.structures import BOX_EXTENT, Floats, X, Y
 from boxreg_ros.tracks.tracklet import Tracklet
 import numpy as np

@@ -41,7 +41,7 @@ def stitch(
     tracklets : list of Tracklet
         In the order of their start.
     config : Config
-        `complete.stitch_gap`, and the motion of each class.
+        `complete.fill_gap`, and the motion of each class.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def stitch(
             gap = (firsts[j].stamp_ns - lasts[i].stamp_ns) * 1e-9
             is_known = max(counts[i], counts[j]) >= MIN_KNOWN_MOTION
             # A motion is not predicted for longer than it was observed: two ghosts fit anything.
-            limit = min(config.complete.stitch_gap, spans[i] + spans[j])
+            limit = min(config.complete.fill_gap, spans[i] + spans[j])
             if is_known and 0 < gap <= limit and kinds[i] is kinds[j]:
                 costs[i, j] = _cost(lasts[i], firsts[j])
     links = best_links(costs)
@@ -83,7 +83,7 @@ def _cost(before: EndMotion, after: EndMotion) -> float:
     backward = _position_cost(after, before)
     distance, log_det = max(forward, backward)
     seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
-    up = HEIGHT_DEVIATION + before.model.vertical * seconds**2 / 2
+    up = HEIGHT_DEVIATION + before.model.acceleration * seconds**2 / 2
     distance += (after.box[Z] - before.box[Z]) ** 2 / up**2
     extents = slice(LENGTH, HEIGHT + 1)
     ratios = np.log(after.box[extents] / before.box[extents])

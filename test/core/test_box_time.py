@@ -5,7 +5,6 @@ from dataclasses import replace
 from boxreg_ros.config import Config
 from boxreg_ros.core.box_time import (
     BoxTimeEvidence,
-    MIN_VOTE_POINTS,
     MIN_VOTES,
     motion_to_sight,
     swept,
@@ -21,7 +20,7 @@ from scenes import observation
 BOX = np.array([20.0, 0, 0, 4, 2, 1.5, 0, 0, 0])
 
 
-def surface(n=MIN_VOTE_POINTS):
+def surface(n=MIN_VOTES):
     """Return points on the rear face of `BOX`, relative to its centre."""
     return np.stack([np.full(n, -2.0), np.linspace(-0.9, 0.9, n), np.zeros(n)], 1)
 
@@ -45,7 +44,7 @@ def test_motion_to_sight_is_that_of_the_points_of_the_box():
 
 def seen(known, velocity, delays):
     """Return an observation of `surface`, with delays [s], of a box of the `known` time."""
-    delays = np.broadcast_to(delays, MIN_VOTE_POINTS).astype(np.float32)
+    delays = np.broadcast_to(delays, MIN_VOTES).astype(np.float32)
     sight = float(np.median(delays))
     points = surface() + np.outer(delays - sight * (known == 'sight'), velocity)
     return observation(boxes=BOX, points=points, delays=delays, sights=sight)
@@ -82,7 +81,7 @@ def test_points_of_two_lidars_are_compared_at_their_own_times(known):
     # The second LiDAR sees the object 50 ms after the first.
     evidence = BoxTimeEvidence()
     velocity = np.array([10.0, 0, 0])
-    delays = np.repeat([0.0, 0.05], MIN_VOTE_POINTS // 2)
+    delays = np.repeat([0.0, 0.05], MIN_VOTES // 2)
     evidence.add([seen(known, velocity, delays)], velocity[None])
     assert evidence.votes == {known: 1}
 
