@@ -104,11 +104,7 @@ class FaceConfig:
         0.12, 'standard deviation of one observation of the front or rear face', 'm', 1e-3, 10.0
     )
     sides: float = setting(
-        0.08,
-        'standard deviation of one observation of the left or right face',
-        'm',
-        1e-3,
-        10.0,
+        0.08, 'standard deviation of one observation of the left or right face', 'm', 1e-3, 10.0
     )
     top: float = setting(
         0.08, 'standard deviation of one observation of the top face', 'm', 1e-3, 10.0
@@ -177,10 +173,13 @@ class ClassConfig:
         (), 'class names of this kind: any of these words, in any case'
     )
     acceleration: float = setting(
-        1.5, 'standard deviation of the forward and vertical acceleration', 'm/s^2', 1e-3, 1e3
+        1.5, 'standard deviation of the forward acceleration', 'm/s^2', 1e-3, 1e3
     )
     cornering: float = setting(
         4.0, 'standard deviation of the sideways acceleration', 'm/s^2', 1e-3, 1e3
+    )
+    vertical: float = setting(
+        1.0, 'standard deviation of the vertical acceleration', 'm/s^2', 1e-3, 1e3
     )
     turning: float = setting(
         0.8, 'standard deviation of the yaw acceleration', 'rad/s^2', 1e-3, 1e3
@@ -189,11 +188,7 @@ class ClassConfig:
         0.2, 'standard deviation of the roll and pitch acceleration', 'rad/s^2', 1e-3, 1e3
     )
     slip: float = setting(
-        0.15,
-        'standard deviation of the sideways velocity of the pivot',
-        'm/s',
-        1e-3,
-        1e3,
+        0.15, 'standard deviation of the sideways velocity of the pivot', 'm/s', 1e-3, 1e3
     )
     sideslip: float = setting(
         0.01, 'standard deviation of the constant angle from the heading of a track to its path',

@@ -54,7 +54,7 @@ NO_PRIOR = (
 
 
 SETTINGS_OF = {
-    'acceleration': ('acceleration', 'cornering', 'acceleration', 'tilting', 'tilting', 'turning'),
+    'acceleration': ('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning'),
     'slip': ('slip', 'climb'),
     'drift': ('drift',),
     'pose': ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading'),

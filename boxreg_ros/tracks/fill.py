@@ -71,5 +71,5 @@ def accelerations(model: ClassConfig) -> Floats:
     """Return usual accelerations of x y z [m/s^2] and roll pitch yaw [rad/s^2], shape (6,)."""
     horizontal = max(model.acceleration, model.cornering)
     return np.array(
-        [horizontal, horizontal, model.acceleration, model.tilting, model.tilting, model.turning]
+        [horizontal, horizontal, model.vertical, model.tilting, model.tilting, model.turning]
     )

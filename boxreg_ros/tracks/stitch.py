@@ -83,7 +83,7 @@ def _cost(before: EndMotion, after: EndMotion) -> float:
     backward = _position_cost(after, before)
     distance, log_det = max(forward, backward)
     seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
-    up = HEIGHT_DEVIATION + before.model.acceleration * seconds**2 / 2
+    up = HEIGHT_DEVIATION + before.model.vertical * seconds**2 / 2
     distance += (after.box[Z] - before.box[Z]) ** 2 / up**2
     extents = slice(LENGTH, HEIGHT + 1)
     ratios = np.log(after.box[extents] / before.box[extents])
