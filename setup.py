@@ -44,7 +44,7 @@ setup(
     name=NAME,
     version=manifest.findtext('version'),
     description=' '.join(manifest.findtext('description', '').split()),
-    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description=Path(__file__).resolve().with_name('README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     author=manifest.findtext('maintainer'),
     author_email=manifest.find('maintainer').get('email'),

@@ -25,7 +25,7 @@ from boxreg_ros.io.whole_files import store
 
 TRUSTED_PACKAGES = ('boxreg_ros', 'numpy')
 TRUSTED_NAMES = (
-    *('Estimate', 'Estimates', 'MarginalisationPrior', 'TrackRows'),
+    *('Constants', 'Estimate', 'Estimates', 'MarginalisationPrior', 'TrackRows'),
     *('LabelFrame', 'RefinedBoxes', 'BoxArray', 'Sweep'),
     *('ndarray', 'dtype', 'scalar', '_reconstruct', '_frombuffer'),
 )

@@ -39,11 +39,10 @@ from ros_graph import (
 )
 from ros_messages import DETECTIONS, Drive, MARKERS, START
 
-WITHOUT_TF2_MSGS, WITHOUT_NUMBA = (
-    f'import sys; sys.modules["{package}"] = None\n'
+WITHOUT_TF2_MSGS = (
+    'import sys; sys.modules["tf2_msgs"] = None\n'
     'from boxreg_ros.live.main import main\n'
     'sys.exit(main())'
-    for package in ('tf2_msgs', 'numba')
 )
 
 
@@ -493,18 +492,6 @@ def test_invalid_arguments_are_reported_in_one_line(refused, case, status, words
     assert len(ours) == 1, output
     for word in words:
         assert word in ours[0]
-
-
-def test_without_numba_boxes_are_read_by_rclpy_and_refined_by_torch(graph, tmp_path):
-    records = records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    node = graph.start(*RELIABLE, *QUICK, command=('-c', WITHOUT_NUMBA))
-    graph.wait_until_connected()
-    play(graph, records, early)
-    assert ended_cleanly(node)
-    assert numbers_changed(early, records)[3:] == [2] * 3
-    assert node.output().count('RuntimeWarning') == 1, node.output()
 
 
 def boxes_of(*track_ids, x=0.0):

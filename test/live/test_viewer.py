@@ -34,8 +34,8 @@ OUTPUTS = {
 TOPICS = {**INPUTS, **OUTPUTS}
 SWEEPS = 6
 LAG = 2
-ONE_TRACK = 'deadline:=0.001'
-"""A deadline with which one track is solved at each stamp, however fast the machine."""
+SHORT = 'deadline:=0.001'
+"""A deadline with which no machine solves all tracks at each stamp."""
 ADD, DELETE, DELETEALL = 0, 2, 3
 
 
@@ -58,7 +58,7 @@ def run(tmp_path_factory):
         for topic in OUTPUTS:
             record_topic(graph, topic, taken)
         graph.start(
-            *QUICK, '-p', ONE_TRACK, '-p', f'record_to:={folder / "labels"}',
+            *QUICK, '-p', SHORT, '-p', f'record_to:={folder / "labels"}',
             '-p', 'transform_timeout:=20.0', '-r', 'boxes:=detections',
             '-p', 'qos_overrides./points.subscription.reliability:=reliable',
         )  # fmt: skip
@@ -177,10 +177,12 @@ def test_colours_show_what_was_done(opened):
         colours[ns][tuple(round(value, 3) for value in marker['colour'])] += 1
     number = sum(colours['refined'].values())
     assert colours['input'] == {TRANSLUCENT_GREY: number}
-    assert colours['refined'] == {GREEN: 1, YELLOW: number - 1}
+    solved = colours['refined'][GREEN]
+    assert 0 < solved < number
+    assert colours['refined'] == {GREEN: solved, YELLOW: number - solved}
     assert colours['final'].keys() == {CYAN}
     discs = [m['scale'][0] for (ns, _), m in shown.items() if ns == 'covariance']
-    assert np.count_nonzero(np.array(discs) > 0.01) == 1  # only of the refined box
+    assert np.count_nonzero(np.array(discs) > 0.01) == solved  # only of refined boxes
     (state,) = (marker for (ns, _), marker in shown.items() if ns == 'recording')
     assert state['text'].startswith('recording segment_000001')
     assert max(map(len, state['text'].splitlines())) <= 30

@@ -32,14 +32,14 @@ QUICK = ['--set=solver.rounds=1', '--set=solver.iterations=3']
 
 
 def content_of(folder):
-    """Return the bytes of all files by name, without the times in the summary."""
+    """Return the bytes of all files by name, without times and command in the summary."""
     content = {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob('*'))
         if path.is_file()
     }
     summary = json.loads(content['summary.json'])
-    del summary['seconds']
+    del summary['seconds'], summary['command']
     return content | {'summary.json': summary}
 
 
