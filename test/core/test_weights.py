@@ -189,14 +189,7 @@ def test_weights_of_input_and_motion_by_hand():
     terms, _ = weighed(problem, common)
     W = {name: terms['W'][:, i] for i, name in enumerate(RESIDUAL_NAMES)}
     np.testing.assert_allclose(W['input'][:5], [common['widened_deviation'] ** -2.0] * 5)
-    motion = [
-        car.acceleration,
-        car.cornering,
-        car.acceleration,
-        car.tilting,
-        car.tilting,
-        car.turning,
-    ]
+    motion = [car.acceleration, car.cornering, car.vertical, car.tilting, car.tilting, car.turning]
     np.testing.assert_allclose(W['acceleration'][:3], [np.array(motion) ** -2.0] * 3)
     np.testing.assert_allclose(W['slip'][:4, :2], [[car.slip**-2, car.climb**-2]] * 4)
     assert not W['input'][5:].any() and not W['acceleration'][3:].any()

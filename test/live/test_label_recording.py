@@ -297,6 +297,7 @@ def test_two_nodes_another_clock_and_a_killed_node(tmp_path):
         graph.wait(lambda: 'writes to, got one in use' in second.output(), 'an error')
         assert second.output().count('ERROR') == 1
         robot.play()
+        graph.wait(lambda: robot.state()[2].get('frames') == '9', 'final boxes')  # lag 3
         robot.play(records_of(simulated))
         graph.wait(lambda: robot.state()[2].get('frames') == '17', 'final boxes')
         robot.node.kill()
