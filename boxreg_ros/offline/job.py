@@ -123,7 +123,7 @@ def jobs_of(
     Raises
     ------
     ConfigError
-        If two drives cannot be told apart by name.
+        If two drives have the same name.
 
     """
     drives: list[tuple[Path, ...]] = []
@@ -170,7 +170,7 @@ def names_of(
     parts = {drive: _parts(drive[0]) for drive in drives if drive not in names}
     plain = Counter((*part[:-1], _plain(part[-1])) for part in parts.values())
     for drive, (*folders, last) in parts.items():
-        if plain[*folders, _plain(last)] == 1:  # else its suffix tells it from its neighbour
+        if plain[*folders, _plain(last)] == 1:  # else the suffix distinguishes it
             parts[drive] = (*folders, _plain(last))
     depths = dict.fromkeys(parts, 1)
     while True:

@@ -109,7 +109,7 @@ def test_manifests_patterns_and_their_errors(tmp_path):
 
 
 NAMES = [
-    ('rec/one.mcap', 'one.mcap'),  # the suffix tells it from its neighbour
+    ('rec/one.mcap', 'one.mcap'),  # the suffix distinguishes them
     ('rec/one.db3', 'one.db3'),
     ('rec/x.mcap', 'rec_x'),
     ('a_b/c.mcap', 'a_b_c'),
