@@ -78,10 +78,13 @@ def test_margins_move_the_surface_that_points_are_expected_on():
     assert labelled([track_of([0, 0])], beside, margin=0.3).track.tolist() == [BACKGROUND]
 
 
-def test_points_of_the_road_are_background():
+def test_points_of_the_road_are_background_and_those_of_it_or_a_moving_object_unknown():
     ring = [[x, y, 0.02] for x in np.linspace(-2.6, 2.6, 14) for y in (-1.5, 1.5)]
-    found = labelled([track_of([0.0, 0.0])], [*ring, [0, 0.9, 0.03], [0, 0.9, 0.3]])
-    assert found.track[-2:].tolist() == [BACKGROUND, 0]
+    points = [[0, 0.9, 0.03], [0, 0.9, 0.3], [0, 1.3, 0.03], [0, 0.9, -0.1]]
+    for track, low in ((track_of([0.0, 0.0]), BACKGROUND), (moving(20.0), UNKNOWN)):
+        x = track.boxes[5, 0]
+        found = labelled([track], np.add([*ring, *points], [x, 0, 0])).track.tolist()
+        assert found == [BACKGROUND] * len(ring) + [low, 0, BACKGROUND, BACKGROUND]
 
 
 @pytest.mark.parametrize(
@@ -139,11 +142,16 @@ def test_clouds_without_times_are_labelled_at_their_stamp():
     assert len(labelled([moving(20.0)], np.zeros((0, 3))).track) == 0
 
 
-def test_an_object_that_was_missed_goes_on_for_a_while():
-    late = STAMPS[-1] + 2 * SECOND // 10
-    arrays = np.append(STAMPS, late)
-    labeller = PointLabeller([moving(20.0)], arrays, AT_STAMP, np.zeros((1, 6)), coast=0.5)
-    front = np.array([[20.0 + 4.0 + 1.9, 0, 1]])
-    assert labeller.label(Sweep(int(late), 'odom', front)).track.tolist() == [0]
-    found = labelled([moving(20.0)], front, late, arrays=arrays)
-    assert found.track.tolist() == [BACKGROUND]
+def test_before_and_after_its_boxes_a_moving_object_is_somewhere_near():
+    """It has not appeared there: its points are not background, nor known to be its own."""
+    times = [STAMPS[0] - 4 * SECOND // 10, STAMPS[-1] + 4 * SECOND // 10]
+    arrays = [*STAMPS, *times, STAMPS[-1] + SECOND]
+    parked = track_of([0.0, 6.0], 'b')
+    for stamp in times:
+        x = 20.0 * (stamp - START) / SECOND
+        points = [[x + 1.9, 0, 1], [x + 4, 0, 1], [0, 6, 1]]
+        found = labelled([moving(20.0), parked], points, stamp, arrays=arrays)
+        assert found.track.tolist() == [UNKNOWN, BACKGROUND, BACKGROUND]
+        assert found.is_dynamic.tolist() == [True, False, False]
+    late = labelled([moving(20.0)], [[40.0, 0, 1]], arrays[-1], arrays=arrays)
+    assert late.track.tolist() == [BACKGROUND]
