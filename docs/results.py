@@ -50,6 +50,7 @@ DATA = {
 PAGES = {
     **dict.fromkeys(('kinds', 'highway', 'lidars', 'paper'), 'scenes'),
     **dict.fromkeys(('covariance', 'review'), 'certainty'),
+    **dict.fromkeys(('ablation', 'sensitivity'), 'ablation'),
     **dict.fromkeys(('speed', 'scale', 'report'), 'speed'),
     **dict.fromkeys(('node', 'load', 'kills'), 'node'),
 }
