@@ -5,10 +5,10 @@ This is the correspondence search of every round.
 
 """
 
-from math import ceil, inf, isfinite, isnan, sqrt
+from math import ceil, inf, isfinite, sqrt
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP
+from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, TOP
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
@@ -192,22 +192,20 @@ def raise_visibility(box, origin, points, R, toward, tangent):
 
 
 @loop
-def fill_insets(origins, tangent, occlusion_inset, range_inset, constants, shares, inset, weight):
-    """Write the shares (2, 6) of the two insets, their sum (6,), and the weights of faces (6,)."""
-    reach = sqrt(origins[0, 0] ** 2 + origins[0, 1] ** 2)
-    for sensor in range(1, len(origins)):
-        reach = min(reach, sqrt(origins[sensor, 0] ** 2 + origins[sensor, 1] ** 2))
-    beyond = 0.0 if isnan(reach) else (reach - constants.near_range) / constants.range_span
-    beyond = min(max(beyond, 0.0), constants.max_range_share)
+def fill_insets(tangent, occlusion_inset, ring_height, constants, occluded, inset, weight):
+    """
+    Write how occluded the faces are, their insets, and their weights, (6,) each (M11).
+
+    The highest ring on an object is anywhere between its top and one ring below.
+
+    """
     for face in range(6):
         u = tangent[face] + constants.edge_lead[face]
-        occluded = 0.5 - 0.5 * u / sqrt(u**2 + constants.visibility_softness)
-        shares[0, face] = occluded
-        shares[1, face] = (1.0 - occluded) * beyond
-        by_range = shares[1, face] * range_inset[face]
-        inset[face] = occluded * occlusion_inset[face] + by_range
-        seen = 1.0 if tangent[face] > 0.0 else constants.occluded_weight
-        weight[face] = seen / (1.0 + (by_range / constants.range_half_weight) ** 2)
+        occluded[face] = 0.5 - 0.5 * u / sqrt(u**2 + constants.visibility_softness)
+        inset[face] = occluded[face] * occlusion_inset[face]
+        weight[face] = 1.0 if tangent[face] > 0.0 else constants.occluded_weight
+    inset[TOP] += ring_height / 2
+    weight[TOP] /= 1.0 + ring_height**2 / 12 / constants.face_deviations[TOP] ** 2
 
 
 @loop
@@ -312,7 +310,7 @@ def clear_padding(length, terms):
         terms[n].distance[:] = 0.0
         terms[n].visibility[:] = 0.0
         terms[n].inset[:] = 0.0
-        terms[n].inset_shares[:] = 0.0
+        terms[n].occluded[:] = 0.0
         terms[n].num_points = 0.0
 
 
@@ -367,8 +365,8 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
         points = returns_of(problem, problem.points, b, n)
         fill_visibility(box, origins, points, R, toward, tangent)
         fill_insets(
-            origins, tangent, inputs.occlusion_inset, inputs.range_inset, constants,
-            term.inset_shares, inset, weight,
+            tangent, inputs.occlusion_inset, problem.ring_heights[b, n], constants,
+            term.occluded, inset, weight,
         )  # fmt: skip
         for k in range(3):
             shift[k] = pose[k] - box[k]
