@@ -120,7 +120,7 @@ class InputModel:
         kinds = problem.kind
         numbers = self.constants
         distance, weight = terms['distance'], terms['visibility']
-        occluded, distant = terms['occluded'], 0 * terms['occluded']
+        occluded, distant = np.moveaxis(terms['inset_shares'], 2, 0)
         gap_correction, occlusion_inset, range_inset = (
             inputs[name][kinds][:, None] for name in MARGIN_FIELDS[:3]
         )

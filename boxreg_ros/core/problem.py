@@ -342,6 +342,8 @@ def stack_windows(
     first, counts = np.zeros((2, *valid.shape), np.int64)
     first[valid] = seen.first[rows]
     counts[valid] = seen.counts[rows]
+    if not config.ingredients.ring_inset:
+        ring_heights[:] = 0.0
     if not config.ingredients.marginalisation:
         information[:] = 0.0
     kind, of_class = _of_classes(windows, config)

@@ -30,6 +30,14 @@ def test_rings_without_returns_leave_the_height_as_it_is():
     assert heights_of(points, [-20, 0, 0]) == pytest.approx(0.2, abs=0.005)
 
 
+def test_a_roof_that_several_rings_meet_is_seen():
+    # From 1 m above a roof of 2 m, 10 m ahead, at the slopes -1/10 to -1/12, every 0.005.
+    down = np.arange(-0.1, -1 / 12, 0.005)
+    roof = np.array([(-1 / slope - 10, y, 0) for slope in down for y in (-0.5, 0.5)])
+    side = np.array([(0, y, 1 - 0.005 * k - 1) for k in range(1, 20) for y in (-0.5, 0.5)])
+    assert heights_of(np.concatenate([side, roof]), [-10, 0, 1]) == pytest.approx(0, abs=1e-6)
+
+
 def test_of_several_sensors_the_densest_rings_count():
     # Seen from 1 m higher the rings of the first one are no rings: their points have all slopes.
     points = wall(np.arange(-5, 3) * 0.01)

@@ -5,7 +5,7 @@ This is the correspondence search of every round.
 
 """
 
-from math import ceil, inf, isfinite, sqrt
+from math import ceil, inf, isfinite, isnan, sqrt
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, TOP
@@ -192,18 +192,28 @@ def raise_visibility(box, origin, points, R, toward, tangent):
 
 
 @loop
-def fill_insets(tangent, occlusion_inset, ring_height, constants, occluded, inset, weight):
+def fill_insets(origins, ring_height, tangent, inputs, constants, shares, inset, weight):
     """
-    Write how occluded the faces are, their insets, and their weights, (6,) each (M11).
+    Write the shares (2, 6) of occlusion and range inset, insets (6,) and weights (6,) of faces.
 
-    The highest ring on an object is anywhere between its top and one ring below.
+    The top is anywhere between the highest ring on an object and the next one, which misses it: h
+    apart, half of that further out on average, with the variance of a uniform distribution.
 
     """
+    reach = sqrt(origins[0, 0] ** 2 + origins[0, 1] ** 2)
+    for sensor in range(1, len(origins)):
+        reach = min(reach, sqrt(origins[sensor, 0] ** 2 + origins[sensor, 1] ** 2))
+    beyond = 0.0 if isnan(reach) else (reach - constants.near_range) / constants.range_span
+    beyond = min(max(beyond, 0.0), constants.max_range_share)
     for face in range(6):
         u = tangent[face] + constants.edge_lead[face]
-        occluded[face] = 0.5 - 0.5 * u / sqrt(u**2 + constants.visibility_softness)
-        inset[face] = occluded[face] * occlusion_inset[face]
-        weight[face] = 1.0 if tangent[face] > 0.0 else constants.occluded_weight
+        occluded = 0.5 - 0.5 * u / sqrt(u**2 + constants.visibility_softness)
+        shares[0, face] = occluded
+        shares[1, face] = (1.0 - occluded) * beyond
+        by_range = shares[1, face] * inputs.range_inset[face]
+        inset[face] = occluded * inputs.occlusion_inset[face] + by_range
+        seen = 1.0 if tangent[face] > 0.0 else constants.occluded_weight
+        weight[face] = seen / (1.0 + (by_range / constants.range_half_weight) ** 2)
     inset[TOP] += ring_height / 2
     weight[TOP] /= 1.0 + ring_height**2 / 12 / constants.face_deviations[TOP] ** 2
 
@@ -310,7 +320,7 @@ def clear_padding(length, terms):
         terms[n].distance[:] = 0.0
         terms[n].visibility[:] = 0.0
         terms[n].inset[:] = 0.0
-        terms[n].occluded[:] = 0.0
+        terms[n].inset_shares[:] = 0.0
         terms[n].num_points = 0.0
 
 
@@ -365,8 +375,8 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
         points = returns_of(problem, problem.points, b, n)
         fill_visibility(box, origins, points, R, toward, tangent)
         fill_insets(
-            tangent, inputs.occlusion_inset, problem.ring_heights[b, n], constants,
-            term.occluded, inset, weight,
+            origins, problem.ring_heights[b, n], tangent, inputs, constants, term.inset_shares,
+            inset, weight,
         )  # fmt: skip
         for k in range(3):
             shift[k] = pose[k] - box[k]

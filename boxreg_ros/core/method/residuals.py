@@ -254,7 +254,7 @@ TERMS = np.dtype(
         ('distance', float, 6),
         ('visibility', float, 6),
         ('inset', float, 6),
-        ('occluded', float, 6),
+        ('inset_shares', float, (2, 6)),
         ('W_faces', float, (6, 4, 4)),
         ('wanted', float, POSE),
         ('root', float, (POSE, POSE)),
@@ -278,9 +278,9 @@ distance
     positive outside, (6,) [m].
 visibility
     1 for a visible face, less for an occluded or distant one, 0 without points, (6,).
-inset, occluded
-    How far further inside than the labelling margin the points are expected, (6,) [m]; share of
-    the occlusion inset in that, (6,).
+inset, inset_shares
+    How far further inside than the labelling margin the points are expected, (6,) [m]; multiples
+    of occlusion inset and range inset in that, (2, 6).
 W_faces
     Faces (M2): mean of (q, 1)(q, 1)' over the outermost points q of each face, from the centre of
     the input box [m], times the weight of the face, (6, 4, 4).

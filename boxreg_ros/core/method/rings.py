@@ -1,4 +1,4 @@
-"""How far apart the rings of a LiDAR are at an object, seen from its own points."""
+"""How far apart the rings of a LiDAR are at the top of an object, from its own points (M11)."""
 
 from math import inf, isfinite, sqrt
 
@@ -9,7 +9,10 @@ import numpy as np
 @kernel
 def ring_heights(points, counts, origins):
     """
-    Return the height between two rings of the LiDAR at each of n objects, 0 if unknown [m].
+    Return the height between the two highest rings on each of n objects, 0 if unknown [m].
+
+    On a wall it is the angle between rings times the distance. Where several rings meet a roof it
+    is nearly 0: then the top itself is seen.
 
     Parameters
     ----------
@@ -23,27 +26,43 @@ def ring_heights(points, counts, origins):
     Returns
     -------
     heights : array, shape (n,)
-        With several sensors, whose rings lie between each other, that of the densest.
+        With several sensors, whose rings lie between each other, the least.
 
     """
     heights = np.zeros(len(counts))
-    slopes = np.empty(max(counts.max(), 1)) if len(counts) else np.empty(0)
+    most = max(counts.max(), 1) if len(counts) else 0
+    slopes, ordered = np.empty(most), np.empty(most)
     first = 0
     for i in range(len(counts)):
-        own, known = points[first : first + counts[i]], slopes[: counts[i]]
-        first += counts[i]
+        m = counts[i]
+        own, known = points[first : first + m], slopes[:m]
+        first += m
         height = inf
         for k in range(origins.shape[1]):
-            origin = origins[i, k]
-            if not isfinite(origin[0]):
-                continue
-            fill_slopes(own, origin, known)
-            known.sort()
-            distance = sqrt(origin[0] ** 2 + origin[1] ** 2)
-            height = min(height, distance * covering_gap(known))
+            if m > 1 and isfinite(origins[i, k, 0]):
+                fill_slopes(own, origins[i, k], known)
+                ordered[:m] = known
+                ordered[:m].sort()
+                ring = covering_gap(ordered[:m])
+                away = sqrt(origins[i, k, 0] ** 2 + origins[i, k, 1] ** 2)
+                height = min(height, away * ring, height_of_highest(own, known, ring))
         if isfinite(height):
             heights[i] = height
     return heights
+
+
+@loop
+def height_of_highest(points, slopes, ring):
+    """Return the height of the highest ring above the next, on points (M, 3) of some slopes."""
+    top = 0
+    for i in range(len(points)):
+        if points[i, 2] > points[top, 2]:
+            top = i
+    height = inf
+    for i in range(len(points)):
+        if abs(slopes[i] - slopes[top]) > ring / 2:
+            height = min(height, points[top, 2] - points[i, 2])
+    return height
 
 
 @loop
