@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 import csv
 from dataclasses import dataclass, fields
 from html import escape
@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.box_table import unprotected
+from boxreg_ros.io.box_table import csv_row, protected, unprotected
 from boxreg_ros.io.storage.urls import names_of, read_text, url_of
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.result_folder import SUMMARY
@@ -112,9 +112,9 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], shard: str = '') ->
 
     """
     with written_whole(out / f'index{shard}.csv') as file:
-        writer = csv.DictWriter(file, INDEX_COLUMNS, lineterminator='\n')
-        writer.writeheader()
-        writer.writerows(rows)
+        file.write(csv_row(INDEX_COLUMNS))
+        for row in rows:
+            file.write(csv_row(protected(str(row[name])) for name in INDEX_COLUMNS))
     merged = {
         'drives': len(rows),
         'done': sum(row['status'] != DRIVE_FAILED for row in rows),
@@ -163,8 +163,14 @@ def rows_of_shards(out: Path) -> list[dict[str, Any]]:
         )
     rows: list[dict[str, Any]] = []
     for path in found.values():
-        rows += csv.DictReader(StringIO(read_text(path)))
+        rows += _read_rows(read_text(path))
     return sorted(rows, key=lambda row: str(row['drive']))
+
+
+def _read_rows(text: str) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a table whose cells are no formulas."""
+    for row in csv.DictReader(StringIO(text, newline='')):
+        yield {name: unprotected(cell or '') for name, cell in row.items()}
 
 
 def _listed(numbers: Iterable[int]) -> str:
@@ -179,10 +185,9 @@ def _riskiest(out: Path, drives: Iterable[str]) -> list[dict[str, Any]]:
             text = read_text(out / drive / REVIEW)
         except OSError:  # the drive has failed
             continue
-        for row in csv.DictReader(StringIO(text, newline='')):
+        for row in _read_rows(text):
             try:
-                shown = {name: unprotected(cell) for name, cell in row.items()}
-                found.append((float(row[RISK]), {'drive': drive, **shown}))
+                found.append((float(row[RISK]), {'drive': drive, **row}))
             except (KeyError, TypeError, ValueError):
                 continue  # a review without this column has no order
     found.sort(key=lambda item: -item[0])

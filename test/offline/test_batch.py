@@ -214,7 +214,7 @@ def test_missing_and_repeated_drives_fail_and_the_others_go_on(tmp_path, capsys)
 
 
 def test_shards_of_the_recipe_for_slurm_are_merged_to_the_results_of_one_run(tmp_path, capsys):
-    paths = [str(Drive(sweeps=n).write(tmp_path / str(n))) for n in (5, 6)]
+    paths = [str(Drive(sweeps=n).write(tmp_path / name)) for n, name in ((5, '=5'), (6, '6'))]
     (tmp_path / 'drives.txt').write_text('\n'.join(paths))
     out = tmp_path / 'out'
     page = (ROOT / 'docs' / 'tasks' / 'many-recordings.md').read_text()
@@ -240,7 +240,9 @@ def test_shards_of_the_recipe_for_slurm_are_merged_to_the_results_of_one_run(tmp
     run_shard(2)
     assert main(['batch', '-o', str(out), '--merge']) == 0
     assert f'{out}: 2 of 2 drives done' in capsys.readouterr().out
-    assert [row['boxes_in'] for row in index_of(out).values()] == ['10', '12']
+    rows = index_of(out)
+    assert [rows[name]['boxes_in'] for name in ("'=5", '6')] == ['10', '12']  # no formula
+    assert 'href="%3D5/"' in (out / 'report.html').read_text()
     merged = json.loads((out / 'summary.json').read_text())
     # One run over all drives finds them done, and writes the same.
     assert main(['batch', *paths, '-o', str(out), *QUICK]) == 0
