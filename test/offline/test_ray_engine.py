@@ -77,6 +77,8 @@ def test_lost_workers_and_drivers_lose_no_drive(tmp_path, address, capfd):
     with (out / 'index.csv').open(newline='') as file:
         rows = list(csv.DictReader(file))
     assert sum(row['status'] == 'up to date' for row in rows) == len(done)
+    assert main([*arguments, '--memory=1e6']) == 2  # else it would wait for such a node for ever
+    assert '--memory: expected at most ' in capfd.readouterr().err
     for path in paths:
         relabel(Request((path,), formats=('csv',)), tmp_path / 'alone' / path.stem)
         alone = tmp_path / 'alone' / path.stem / 'boxes.csv'
