@@ -105,7 +105,7 @@ def _check_answers(address: str | None) -> None:
         socket.create_connection((host, int(port)), CLUSTER_SECONDS).close()
 
 
-def _check_memory(nodes: list[dict[str, Any]], memory: int) -> None:
+def _check_memory(nodes: list[dict[str, Any]], memory: float) -> None:
     """Refuse jobs that need more memory [bytes] than any node has: Ray would wait for ever."""
     sizes = [node['Resources'].get('memory', 0) for node in nodes if node['Alive']]
     largest = max(sizes, default=0)

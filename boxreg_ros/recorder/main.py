@@ -353,9 +353,9 @@ def _explained(error: OSError, folder: Path, has_begun: bool) -> RecordingError:
             f'{place}: expected room for labels, got: {error.strerror}; free some space and call '
             f'~/start_recording, which completes the segment that was open'
         )
-    if folder.is_file():
+    if os.path.isfile(folder):
         return RecordingError(f'{place}: expected a folder, got a file; choose another')
-    if folder.exists():
+    if os.path.exists(folder):  # False for a name that is too long
         return RecordingError(
             f'{place}: expected a folder that can be written to, got: {error.strerror} '
             f'({error.filename}); choose another, or change its owner or mode'

@@ -17,6 +17,8 @@ from ros_messages import Drive
 pytest.importorskip('ray')
 MEMORY = 100 * 2**20
 """Smallest object store that Ray accepts [bytes]; no objects are stored in it."""
+HANGING = 900
+"""A driver that takes longer for one of three small drives hangs [s]; on an idle machine: 20."""
 
 
 @pytest.fixture
@@ -33,11 +35,12 @@ def address():
     cluster.shutdown()
 
 
-def wait_until(condition, process=None):
-    deadline = time.monotonic() + 120
+def wait_until(condition, process):
+    """Wait as long as a process runs: how long it takes depends on what else the machine does."""
+    deadline = time.monotonic() + HANGING
     while not condition():
+        assert process.poll() is None
         assert time.monotonic() < deadline
-        assert process is None or process.poll() is None
         time.sleep(0.05)
 
 
@@ -68,7 +71,8 @@ def test_lost_workers_and_drivers_lose_no_drive(tmp_path, address, capfd):
     wait_until(lambda: list(states.glob('*.json')), driver)
     driver.kill()
     driver.wait()
-    wait_until(lambda: not relabel_processes(out))
+    while relabel_processes(out):  # those that Ray ends with their driver
+        time.sleep(0.05)
     done = {path: path.stat().st_mtime_ns for path in states.glob('*.json')}
     results = {path: path.stat().st_mtime_ns for path in out.glob('*/boxes.csv')}
     assert subprocess.run(command).returncode == 0
