@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol, TextIO, TypeVar
 
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import write_provenance
@@ -15,6 +15,13 @@ from boxreg_ros.reasons import Reason
 import numpy as np
 
 NO_POINTS = np.zeros((0, 3))
+
+
+class _Closable(Protocol):
+    def close(self) -> None: ...
+
+
+_T = TypeVar('_T', bound=_Closable)
 
 
 class FolderWriter:
@@ -63,14 +70,15 @@ class FolderWriter:
         self.name = ''
         self.about: dict[str, Any] = asdict(provenance)
         self._names = FrameNames()
+        self._to_close: list[_Closable] = []
         self._with_points = options.with_points and self.cloud_file != ''
         for name in self.folders:
             (folder / name).mkdir(parents=True)
         if self._with_points:
             (folder / self.cloud_file).parent.mkdir(parents=True, exist_ok=True)
         if self.has_sidecar:
-            self._stamps_file = (folder / STAMPS_FILE).open('w', encoding='utf-8')
-            self._poses_file = (folder / POSES_FILE).open('w', encoding='utf-8')
+            self._stamps_file = self.text_file(STAMPS_FILE)
+            self._poses_file = self.text_file(POSES_FILE)
 
     def write(self, frame: LabelFrame) -> None:
         """Add a frame."""
@@ -93,6 +101,15 @@ class FolderWriter:
             self._poses_file.write(' '.join(map(repr, values.ravel().tolist())) + '\n')
         self.number += 1
 
+    def opened(self, file: _T) -> _T:
+        """Return a file, which is closed at the end."""
+        self._to_close.append(file)
+        return file
+
+    def text_file(self, name: str) -> TextIO:
+        """Open a text file of the folder, which is closed at the end."""
+        return self.opened((self.folder / name).open('w', encoding='utf-8'))
+
     def add(self, frame: LabelFrame) -> None:
         """Write the labels of a frame; `number` and `name` are its own."""
         raise NotImplementedError
@@ -103,14 +120,13 @@ class FolderWriter:
         write_cloud(path, points, frame.intensities)
 
     def finish(self) -> None:
-        """Complete the label files."""
+        """Complete the labels, before their files are closed."""
 
     def close(self) -> None:
         """Complete the files."""
         self.finish()
-        if self.has_sidecar:
-            self._stamps_file.close()
-            self._poses_file.close()
+        for file in self._to_close:
+            file.close()
         write_provenance(self.folder, self.about)
 
 

@@ -22,12 +22,13 @@ HANGING = 900
 
 
 @pytest.fixture
-def address():
+def address(monkeypatch):
     """Yield the address of a cluster of two nodes with one core each."""
     from ray.cluster_utils import Cluster
 
     handler = signal.getsignal(signal.SIGTERM)
     node = {'num_cpus': 1, 'object_store_memory': MEMORY, 'include_dashboard': False}
+    monkeypatch.setenv('RAY_worker_niceness', '0')  # else other processes starve them
     cluster = Cluster(initialize_head=True, head_node_args=node)
     cluster.add_node(num_cpus=1, object_store_memory=MEMORY)
     signal.signal(signal.SIGTERM, handler)  # that of Ray would end the tests
