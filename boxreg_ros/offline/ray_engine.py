@@ -50,7 +50,6 @@ def ray_engine(
 
     """
     ray = _connected(address)
-    _check_memory(ray.nodes(), runner.memory)
     start = ray.remote(num_cpus=1, memory=runner.memory, max_retries=NODE_LOSSES)(_run_job)
     shared = ray.put(runner)
     pending: set[Any] = set()
@@ -72,6 +71,7 @@ def ray_engine(
             ray.cancel(reference, force=True)
 
     try:
+        _check_memory(ray.nodes(), runner.memory)
         yield run, max(JOBS_AHEAD * int(ray.cluster_resources().get('CPU', 1)), 1), end
     finally:
         ray.shutdown()
