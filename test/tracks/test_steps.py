@@ -193,6 +193,12 @@ def test_long_gaps_are_filled_for_parked_objects_only():
     parked = tracklet('b', path((0, 0), (0, 0), 65)[steps], steps=steps)
     (added,) = fill(parked, STAMPS, CONFIG)
     assert len(added.boxes) == 55
+    # A gap of exactly `fill_gap`, 2 s, is filled.
+    for first, number in ((24, 1), (25, 0)):
+        steps = [*range(5), *range(first, first + 5)]
+        moving = tracklet('c', path((0, 0), (3, 0), 30)[steps], steps=steps)
+        assert len(fill(moving, STAMPS, CONFIG)) == number
+    steps = [*range(5), *range(60, 65)]
     # A stamp at which the input has no boxes of any object is no gap.
     assert fill(parked, STAMPS[steps], CONFIG) == []
 
