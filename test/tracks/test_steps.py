@@ -119,6 +119,14 @@ def test_fragments_that_disagree_are_not_stitched(change):
     assert ids(found) == ['a', 'b']
 
 
+def test_the_motion_of_both_fragments_leads_to_the_other_one():
+    slow = tracklet('a', path((0, 0), (8, 0), 10))
+    start = path((0, 0), (8, 0), 16)[15, :2]
+    for speed, number in ((8, 1), (20, 2)):  # the second car comes from elsewhere
+        later = tracklet('b', path(start, (speed, 0), 12), 15)
+        assert len(stitch([slow, later], CONFIG)[0]) == number
+
+
 def test_fragments_of_other_kinds_are_not_stitched():
     boxes = path((0, 0), (8, 0), 30)
     for name, number in (('truck', 1), ('cyclist', 2)):  # a vehicle, and none
