@@ -175,6 +175,9 @@ def test_parked_tracks_with_a_pause_are_one():
         tracklet('other', path((12, 5), (0, 0), 8), 100),
     ]
     assert ids(join_static(parts, CONFIG)) == ['a', 'other']
+    # Of two tracks that begin there at a time one continues it, and the other one stays.
+    twins = [parts[0], parts[1], tracklet('c', place[:6], 100)]
+    assert ids(join_static(twins, CONFIG)) == ['a', 'c']
     # Another car stood there meanwhile.
     between_them = tracklet('x', path((7.5, 5), (0, 0), 5), 50)
     assert ids(join_static([parts[0], between_them, parts[1]], CONFIG)) == ['a', 'x', 'b']
