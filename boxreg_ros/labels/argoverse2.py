@@ -17,7 +17,7 @@ from typing import Any
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.transforms import matrix
-from boxreg_ros.labels.arrow import read_rows, read_table, Table
+from boxreg_ros.labels.arrow import read_rows, read_table
 from boxreg_ros.labels.files import frame_names, to_json
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance, SceneFrames
@@ -54,13 +54,14 @@ ANNOTATION_COLUMNS = {
     'num_interior_pts': 'int64',
 }
 POINT_COLUMNS = {'intensity': 'uint8', 'laser_number': 'uint8', 'offset_ns': 'int32'}
-REQUIRED_COLUMNS = sorted(ANNOTATION_COLUMNS.keys() - {'track_uuid', 'num_interior_pts'})
+NEEDED_COLUMNS = sorted(ANNOTATION_COLUMNS.keys() - {'track_uuid', 'num_interior_pts'})
 """Detections that are submitted lack the others."""
-STAMP = itemgetter('timestamp_ns')
+ROW_STAMP = itemgetter('timestamp_ns')
 LOG_COLUMN = 'log_id'
 CITY_FRAME, EGO_FRAME = 'city', 'egovehicle'
 FEATHER_FILE = 'annotations.feather'
 EGO_POSES_FILE = 'city_SE3_egovehicle.feather'
+CALIBRATION_FILE = 'calibration/egovehicle_SE3_sensor.feather'
 LIDAR_NAME = 'up_lidar'
 
 
@@ -73,12 +74,9 @@ class Writer(FolderWriter):
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
         columns = ANNOTATION_COLUMNS | EVIDENCE_COLUMNS
-        self._annotations = self.opened(Table(folder / FEATHER_FILE, columns, to_json(self.about)))
-        self._poses = self.opened(
-            Table(folder / EGO_POSES_FILE, {'timestamp_ns': 'int64'} | POSE_COLUMNS)
-        )
-        path = folder / 'calibration' / 'egovehicle_SE3_sensor.feather'
-        calibration = self.opened(Table(path, {'sensor_name': 'string'} | POSE_COLUMNS))
+        self._annotations = self.table(FEATHER_FILE, columns, to_json(self.about))
+        self._poses = self.table(EGO_POSES_FILE, {'timestamp_ns': 'int64'} | POSE_COLUMNS)
+        calibration = self.table(CALIBRATION_FILE, {'sensor_name': 'string'} | POSE_COLUMNS)
         calibration.add(LIDAR_NAME, *_pose_values(np.eye(4)))
 
     def add(self, frame: LabelFrame) -> None:
@@ -155,13 +153,13 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
 
 
 def _annotations(path: Path) -> Any:
-    return read_table(path, REQUIRED_COLUMNS, 'annotations of Argoverse 2')
+    return read_table(path, NEEDED_COLUMNS, 'annotations of Argoverse 2')
 
 
 def _refined(table: Any, frame_id: str) -> Iterator[RefinedBoxes]:
     """Yield the boxes of each stamp of a table, in the frame of the ego vehicle."""
-    rows = sorted(table.to_pylist(), key=STAMP)
-    for stamp_ns, group in groupby(rows, STAMP):
+    rows = sorted(table.to_pylist(), key=ROW_STAMP)
+    for stamp_ns, group in groupby(rows, ROW_STAMP):
         items = list(group)
         poses_xyz_xyzw = np.array([xyz_xyzw(item) for item in items])
         extents = np.array([[item[name] for name in EXTENT_COLUMNS] for item in items])

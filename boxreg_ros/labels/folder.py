@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
+from contextlib import closing, ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TextIO, TypeVar
+from typing import Any, ClassVar, TextIO
 
+from boxreg_ros.labels.arrow import Table
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import write_provenance
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
@@ -15,13 +18,6 @@ from boxreg_ros.reasons import Reason
 import numpy as np
 
 NO_POINTS = np.zeros((0, 3))
-
-
-class _Closable(Protocol):
-    def close(self) -> None: ...
-
-
-_T = TypeVar('_T', bound=_Closable)
 
 
 class FolderWriter:
@@ -52,6 +48,8 @@ class FolderWriter:
         Of the current frame, from 0.
     name : str
         Of the current frame, which sorts by time: its stamp [ns]; a repeated stamp gets ``_1``.
+    files : ExitStack
+        Files that are open until the writer is closed.
     about : dict
         Content of ``boxreg.json``: the provenance, then the names of frames.
 
@@ -70,7 +68,7 @@ class FolderWriter:
         self.name = ''
         self.about: dict[str, Any] = asdict(provenance)
         self._names = FrameNames()
-        self._to_close: list[_Closable] = []
+        self.files = ExitStack()
         self._with_points = options.with_points and self.cloud_file != ''
         for name in self.folders:
             (folder / name).mkdir(parents=True)
@@ -101,14 +99,13 @@ class FolderWriter:
             self._poses_file.write(' '.join(map(repr, values.ravel().tolist())) + '\n')
         self.number += 1
 
-    def opened(self, file: _T) -> _T:
-        """Return a file, which is closed at the end."""
-        self._to_close.append(file)
-        return file
-
     def text_file(self, name: str) -> TextIO:
         """Open a text file of the folder, which is closed at the end."""
-        return self.opened((self.folder / name).open('w', encoding='utf-8'))
+        return self.files.enter_context((self.folder / name).open('w', encoding='utf-8'))
+
+    def table(self, name: str, columns: Mapping[str, str], origin: str = '') -> Table:
+        """Open a table of the folder, as `Table`, which is closed at the end."""
+        return self.files.enter_context(closing(Table(self.folder / name, columns, origin)))
 
     def add(self, frame: LabelFrame) -> None:
         """Write the labels of a frame; `number` and `name` are its own."""
@@ -125,8 +122,7 @@ class FolderWriter:
     def close(self) -> None:
         """Complete the files."""
         self.finish()
-        for file in self._to_close:
-            file.close()
+        self.files.close()
         write_provenance(self.folder, self.about)
 
 

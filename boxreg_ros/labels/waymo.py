@@ -14,7 +14,7 @@ from itertools import groupby
 from pathlib import Path
 
 from boxreg_ros.config import Config, words_of
-from boxreg_ros.labels.arrow import read_rows, read_table, Table
+from boxreg_ros.labels.arrow import read_rows, read_table
 from boxreg_ros.labels.files import frame_names, require_single, to_json
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
@@ -66,9 +66,9 @@ BOX_COLUMNS = (
     | UNUSED_COLUMNS
     | BOXREG_COLUMNS
 )
-REQUIRED_COLUMNS = [name for name in BOX_COLUMNS if name not in UNUSED_COLUMNS | BOXREG_COLUMNS]
+REQUIRED = [name for name in BOX_COLUMNS if name not in UNUSED_COLUMNS | BOXREG_COLUMNS]
 VEHICLE_POSE = '[VehiclePoseComponent].world_from_vehicle.transform'
-POSE_COLUMNS = KEY_COLUMNS | {VEHICLE_POSE: 'double[16]'}
+VEHICLE_POSE_COLUMNS = KEY_COLUMNS | {VEHICLE_POSE: 'double[16]'}
 TYPE_NAMES = ('', 'vehicle', 'pedestrian', 'sign', 'cyclist')
 """Names of the values of the type column; '' is unknown."""
 
@@ -83,8 +83,8 @@ class Writer(FolderWriter):
         self._segment = Path((*provenance.recordings, 'boxreg')[0]).stem
         file = f'{self._segment}.parquet'
         origin = to_json(self.about)
-        self._boxes = self.opened(Table(folder / 'lidar_box' / file, BOX_COLUMNS, origin))
-        self._poses = self.opened(Table(folder / 'vehicle_pose' / file, POSE_COLUMNS))
+        self._boxes = self.table(f'lidar_box/{file}', BOX_COLUMNS, origin)
+        self._poses = self.table(f'vehicle_pose/{file}', VEHICLE_POSE_COLUMNS)
 
     def add(self, frame: LabelFrame) -> None:
         """Add a row per box, and the pose."""
@@ -121,7 +121,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         found = sorted((path / 'lidar_box').glob('*.parquet'))
         path = require_single(found, path, 'segment, lidar_box/NAME.parquet')
     folder = absolute(path).parent.parent
-    rows = read_table(path, REQUIRED_COLUMNS, 'lidar_box of Waymo').to_pylist()
+    rows = read_table(path, REQUIRED, 'lidar_box of Waymo').to_pylist()
     pose_file = folder / 'vehicle_pose' / path.name
     poses = read_rows(pose_file) if pose_file.exists() else []
     T_world_vehicle = {

@@ -14,8 +14,8 @@ from boxreg_ros.core.motion import EndMotion
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, X, Y, YAW, Z
 from boxreg_ros.tracks.links import best_links, join_links
-from boxreg_ros.tracks.motion import end_motion
 from boxreg_ros.tracks.tracklet import Tracklet
+from boxreg_ros.tracks.tracklet_motion import end_motion
 import numpy as np
 
 STITCH_GATE = 24.3
