@@ -381,10 +381,10 @@ def _stack_observations(
     seen: Observations, rows: Ints, valid: NDArray[np.bool_]
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """
-    Return input boxes, times, sensor origins, heights of road and of rings of `rows`, padded.
+    Return input boxes, times, sensor origins, and heights of road and rings, of `rows`, padded.
 
-    Shapes (B, N, 9), (B, N), (B, N, K, 3) and twice (B, N). Padding repeats the last box of a window, at
-    later times, and the last sensor of an observation.
+    Shapes (B, N, 9), (B, N), (B, N, K, 3) and twice (B, N). Padding repeats the last box of a
+    window, at later times, and the last sensor of an observation.
 
     """
     B, N = valid.shape
