@@ -19,10 +19,12 @@ from collections.abc import Callable, Iterable, Sequence
 import json
 import math
 from pathlib import Path
+import re
 from statistics import NormalDist
 import sys
 from typing import Any
 
+from boxreg_ros import __version__
 from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE
 from boxreg_ros.bench.speed.report import WANTED, WANTED_TICKS, WANTED_TIMES, WANTED_TRACKS
 from boxreg_ros.config import KINDS
@@ -40,13 +42,13 @@ MIN_TRACKS = 3
 """Fewest tracks of a cell whose standard error is trusted."""
 
 DATA = {
-    'resim_3bffdcff': 'Real surfaces on a real drive, exact truth, detector noise',
-    'resim_7fab2350': 'Real surfaces on a busier street, exact truth, detector noise',
-    'pandaset_002_a': 'PandaSet 002, human labels, detector noise',
-    'kitti_raw_0001': 'KITTI raw 0001, human labels, detector noise',
-    'street': 'The sample recording, simulated',
+    'resim_3bffdcff': ('Real drive', 'real surfaces, exact truth, detector noise'),
+    'resim_7fab2350': ('Busier street', 'real surfaces, exact truth, detector noise'),
+    'pandaset_002_a': ('PandaSet 002', 'human labels, detector noise'),
+    'kitti_raw_0001': ('KITTI raw 0001', 'human labels, detector noise'),
+    'street': ('Sample', 'simulated'),
 }
-"""Title of each recording, in the order of the tables."""
+"""Title and content of each recording, in the order of the tables."""
 PAGES = {
     **dict.fromkeys(('kinds', 'highway', 'lidars', 'paper'), 'scenes'),
     **dict.fromkeys(('covariance', 'review'), 'certainty'),
@@ -55,6 +57,7 @@ PAGES = {
     **dict.fromkeys(('node', 'load', 'kills'), 'node'),
 }
 """Page of the kinds of measurements that share one; the others have a page of their name."""
+PART_OF_RUN = re.compile(' (?:at the start|in the middle|at the end)')
 SHOWN_LOSS = 0.001
 """Smaller changes of mean IoU are within the scatter of noise seeds."""
 MAIN_METHODS = (
@@ -120,7 +123,7 @@ def _measurements(store: Path, kind: str) -> list[tuple[str, Any]]:
 
 def _title(data: str) -> str:
     """Return the title of the measurements of some data, '' if they have none."""
-    for name, title in DATA.items():
+    for name, (title, _) in DATA.items():
         if data.startswith(name):
             with_suffix = data.removeprefix(name).replace('_', ', with ')
             return f'{title}{with_suffix}'
@@ -128,7 +131,8 @@ def _title(data: str) -> str:
 
 
 def _origin(document: Any) -> str:
-    return f'    $ {document["command"]}    # version {document["version"]}\n'
+    suffix = '' if document['version'] == __version__ else f'    # version {document["version"]}'
+    return f'    $ {document["command"]}{suffix}\n'
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]], alignment: str = '---:') -> str:
@@ -148,8 +152,9 @@ def _signed(value: float, digits: int) -> str:
 
 def _overview(store: Path) -> Iterable[str]:
     """Yield the main tables of `docs/results.md`."""
-    recordings = [[f'`{name}`', title] for name, title in DATA.items()]
-    yield _table(['recording', 'content'], recordings, '---')
+    recordings = [[f'`{name}`', *texts] for name, texts in DATA.items()]
+    yield _table(['recording', 'title', 'content'], recordings, '---')
+    yield f'\nMeasured by version {__version__}, where no other one is named.'
     yield ''
     for section in (_mean_ious, _gains, _completion, _coverage, _ranking, _times):
         yield from (f'{part}\n' for part in section(store))
@@ -606,7 +611,7 @@ def _consistent(group: Any) -> Iterable[str]:
     for name, nees in group['nees'].items():
         error = group['nees_error'][name]
         spread = '' if error is None else f'±{error:.1f}'
-        yield f'{group["coverage"][name]:.2f} / {nees:.1f}{spread}'
+        yield f'{group["coverage"][name]:.2f}, {nees:.1f}{spread}'
 
 
 def _cells_of_kinds(estimates: Any) -> list[tuple[str, Any, str]]:
@@ -732,14 +737,23 @@ def _load(results: Any) -> Iterable[str]:
         yield _table([f'{policy}: tracks', *names], lines)
 
 
-def _flat(results: Any, prefix: str = '') -> Iterable[list[str]]:
+def _flat(results: Any) -> Iterable[list[str]]:
+    """Yield names and values; those of the start, the middle and the end of a run in one row."""
+    rows: dict[str, list[str]] = {}
+    for name, value in _named(results):
+        rows.setdefault(PART_OF_RUN.sub(': start, middle, end', name), []).append(value)
+    for name, values in rows.items():
+        yield [name, ', '.join(values)]
+
+
+def _named(results: Any, prefix: str = '') -> Iterable[tuple[str, str]]:
     for name, value in results.items():
         if isinstance(value, dict):
-            yield from _flat(value, f'{prefix}{name}: ')
+            yield from _named(value, f'{prefix}{name}: ')
         elif isinstance(value, float):
-            yield [f'{prefix}{name}', f'{value:,.0f}' if value >= 1e4 else f'{value:.4g}']
+            yield f'{prefix}{name}', f'{value:,.0f}' if value >= 1e4 else f'{value:.4g}'
         else:
-            yield [f'{prefix}{name}', str(value)]
+            yield f'{prefix}{name}', str(value)
 
 
 TABLES: dict[str, Callable[[Any], Iterable[str]]] = {
