@@ -114,8 +114,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--sweeps', type=int, metavar='N', help='sweeps of a drive')
     parser.add_argument(
-        '--data', type=Path, action='append', metavar='FOLDER',
-        help='a recording with its exact truth.csv, instead of a simulation; may be repeated',
+        'data', type=Path, nargs='*', metavar='FOLDER',
+        help='a recording with its exact truth.csv, instead of simulated drives',
     )  # fmt: skip
     add_json_argument(parser)
 
@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
 
 def drives(args: argparse.Namespace) -> Iterator[tuple[Drive, Truth]]:
     """Yield the drives that the options ask for."""
-    for folder in args.data or ():
+    for folder in args.data:
         drive = Drive.read(folder)
         yield drive, Truth.of_boxes(drive)
     for seed in range(0 if args.data else args.seeds):
