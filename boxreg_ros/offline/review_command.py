@@ -10,6 +10,8 @@ import sys
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.offline.arguments import add_options, Settings, words_of
 from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.result_folder import SUMMARY
+from boxreg_ros.offline.reviewed_drive import drive_of
 from boxreg_ros.review.server import add_server_arguments, serve
 
 
@@ -36,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
             raise ConfigError(
                 '-o: expected the folder for the results of these recordings, got none; add -o OUT'
             )
-        return serve(out, args.port, args.who)
+        return _serve(out, args)
     done = subprocess.run(
         [
             *(sys.executable, '-m', 'boxreg_ros.cli', 'relabel', *map(str, args.paths)),
@@ -48,4 +50,9 @@ def run(args: argparse.Namespace) -> int:
     )
     if done.returncode:
         return done.returncode
-    return serve(args.out, args.port, args.who)
+    return _serve(args.out, args)
+
+
+def _serve(out: Path, args: argparse.Namespace) -> int:
+    source = drive_of(out) if (out / SUMMARY).is_file() else None
+    return serve(out, args.port, args.who, source)

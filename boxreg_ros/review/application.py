@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from datetime import datetime, UTC
 from pathlib import Path
-import re
 import secrets
 import sys
 from threading import Lock, Thread
@@ -14,10 +13,12 @@ from typing import Any
 
 import anyio
 from boxreg_ros.errors import BoxregError, RecordingError
-from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
+from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, WITH_BOX
 from boxreg_ros.review.report import PAGE_VERSION, REPORT
+from boxreg_ros.review.requests import box_of, json_of, stamp_of, text_of
+from boxreg_ros.review.scene import DriveSource, Scene
+from boxreg_ros.review.scene_routes import SceneRoutes
 from boxreg_ros.review.solve import ReportParts
-import numpy as np
 import orjson
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -27,14 +28,10 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-MAX_BODY = 2**23
-"""Longest request [bytes]: one decision about a track whose id has 1 MB, several times over."""
 MAX_ROWS = 10_000
 """Most decisions of a request: a track that is made of as many parts; chosen."""
-BODY_SECONDS = 20.0
 POLL_SECONDS = 0.25
 """Another program may append to the file: the time until its decisions are seen; chosen."""
-STAMP = re.compile(r'-?[0-9]{1,19}')
 MARK = f'<html lang="en" data-page="{PAGE_VERSION}"'.encode()
 """Begins a page of this version, which offers decisions where ``data-review`` follows."""
 MARK_WITHIN = 1000
@@ -53,7 +50,11 @@ POLICY = (
 
 
 def review_application(
-    out: Path, port: int, who: str, is_ending: Callable[[], bool]
+    out: Path,
+    port: int,
+    who: str,
+    is_ending: Callable[[], bool],
+    source: DriveSource | None = None,
 ) -> tuple[ASGIApp, str, Path]:
     """
     Return the application for a result folder.
@@ -68,6 +69,8 @@ def review_application(
         Name of the person, where the page sends none.
     is_ending : callable
         Whether the server ends: streams of events end then.
+    source : DriveSource, optional
+        The recording of the result, for whole clouds and added objects.
 
     Returns
     -------
@@ -83,7 +86,7 @@ def review_application(
         If decisions or summary cannot be read.
 
     """
-    review = _Review(out, who, is_ending)
+    review = _Review(out, who, is_ending, source)
     token = secrets.token_urlsafe(16)
     application = Starlette(
         routes=[
@@ -93,6 +96,7 @@ def review_application(
             Route('/events', review.events),
             Route('/solve', review.solve, methods=['POST']),
             Route('/save', review.save, methods=['POST']),
+            *review.scene_routes(),
         ],
         exception_handlers={BoxregError: _refused, OSError: _failed},
     )
@@ -141,7 +145,9 @@ class _Guard:
 class _Review:
     """The state of a review, and the answers to its requests."""
 
-    def __init__(self, out: Path, who: str, is_ending: Callable[[], bool]) -> None:
+    def __init__(
+        self, out: Path, who: str, is_ending: Callable[[], bool], source: DriveSource | None
+    ) -> None:
         self._page = (out / REPORT).read_bytes()
         if MARK not in self._page[:MARK_WITHIN]:
             raise RecordingError(
@@ -157,7 +163,14 @@ class _Review:
         self._log_lock = Lock()
         self._save_lock = asyncio.Lock()
         self._is_ending = is_ending
+        self._source = source
         Thread(target=self._parts.warm_up, daemon=True).start()
+
+    def scene_routes(self) -> list[Route]:
+        """Return the routes about the recording; none without one."""
+        if self._source is None:
+            return []
+        return SceneRoutes(Scene(self._source), self._frame_id).routes()
 
     async def page(self, _: Request) -> Response:
         """Return the page; its scripts alone may run."""
@@ -170,11 +183,12 @@ class _Review:
     async def decisions(self, _: Request) -> Response:
         """Return all decisions."""
         await run_in_threadpool(self._refresh)
-        return JSONResponse({**self._since(0), 'who': self._who})
+        more = {'who': self._who, 'has_scene': self._source is not None}
+        return JSONResponse({**self._since(0), **more})
 
     async def decide(self, request: Request) -> Response:
         """Append decisions, unless others have decided about these tracks since."""
-        sent = await _json_of(request)
+        sent = await json_of(request)
         rows = sent.get('rows')
         if not isinstance(rows, list) or not 0 < len(rows) <= MAX_ROWS:
             raise RecordingError(f'rows: expected 1 to {MAX_ROWS} decisions in a list')
@@ -190,14 +204,14 @@ class _Review:
 
     async def solve(self, request: Request) -> Response:
         """Return the boxes of a track, solved again with its pinned boxes."""
-        sent = await _json_of(request)
+        sent = await json_of(request)
         return Response(
             await run_in_threadpool(self._parts.solved, sent), media_type='application/json'
         )
 
     async def save(self, request: Request) -> Response:
         """Run the command of the result again with the decisions, into a folder beside it."""
-        await _json_of(request)
+        await json_of(request)
         if self._save_lock.locked():
             raise HTTPException(409, 'label files are being written already: wait for them')
         async with self._save_lock:
@@ -243,17 +257,17 @@ class _Review:
         """Return the decision that the page has sent."""
         if not isinstance(sent, dict):
             raise RecordingError('decision: expected an object')
-        box = _box_of(sent.get('box')) if sent.get('decision') == 'pin' else None
+        box = box_of(sent.get('box')) if sent.get('decision') in WITH_BOX else None
         return Decision(
-            track_id=_text_of(sent, 'track_id'),
-            stamp_ns=_stamp_of(sent, 'stamp_ns'),
-            kind=_text_of(sent, 'decision'),
-            comment=_text_of(sent, 'comment'),
+            track_id=text_of(sent, 'track_id'),
+            stamp_ns=stamp_of(sent, 'stamp_ns'),
+            kind=text_of(sent, 'decision'),
+            comment=text_of(sent, 'comment'),
             frame_id=self._frame_id if box is not None else '',
             box=box,
-            end_ns=_stamp_of(sent, 'end_ns'),
-            value=_text_of(sent, 'value'),
-            who=_text_of(sent, 'who') or self._who,
+            end_ns=stamp_of(sent, 'end_ns'),
+            value=text_of(sent, 'value'),
+            who=text_of(sent, 'who') or self._who,
             when=datetime.now(UTC).isoformat(timespec='seconds'),
         )
 
@@ -286,50 +300,6 @@ class _Review:
         if process.returncode:
             raise RecordingError(lines[1][-1] if lines[1] else 'boxreg relabel failed')
         return JSONResponse({'out': str(new), 'line': lines[0][-1], 'notes': lines[1]})
-
-
-async def _json_of(request: Request) -> Mapping[str, Any]:
-    """Return the object that a request has sent."""
-    if request.headers.get('content-type') != 'application/json':  # no form of another page
-        raise HTTPException(415, 'expected application/json')
-    body = bytearray()
-    try:
-        with anyio.fail_after(BODY_SECONDS):
-            async for part in request.stream():
-                body += part
-                if len(body) > MAX_BODY:
-                    raise HTTPException(413, f'expected at most {MAX_BODY:,} bytes')
-    except TimeoutError:
-        raise HTTPException(408, f'expected the request within {BODY_SECONDS:g} s') from None
-    try:
-        sent = orjson.loads(body)
-    except ValueError as error:
-        raise RecordingError(f'request: expected JSON, got: {error}') from None
-    if not isinstance(sent, dict):
-        raise RecordingError('request: expected an object')
-    return sent
-
-
-def _text_of(sent: Mapping[str, Any], name: str) -> str:
-    value = sent.get(name, '')
-    if not isinstance(value, str):
-        raise RecordingError(f'{name}: expected a text, got {value!r:.80}')
-    return value
-
-
-def _stamp_of(sent: Mapping[str, Any], name: str) -> int | None:
-    text = _text_of(sent, name)
-    if text and not STAMP.fullmatch(text):
-        raise RecordingError(f'{name}: expected nanoseconds, got {text!r:.80}')
-    return int(text) if text else None
-
-
-def _box_of(sent: object) -> Any:
-    if not isinstance(sent, list) or not all(type(one) in (int, float) for one in sent):
-        raise RecordingError(f'box: expected nine numbers, got {sent!r:.80}')
-    if len(sent) != 9:
-        raise RecordingError(f'box: expected nine numbers, got {len(sent)}')
-    return np.array(sent, np.float64)
 
 
 async def _refused(_: Request, error: Exception) -> Response:

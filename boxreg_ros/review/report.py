@@ -46,8 +46,8 @@ PAGE = Path(__file__).parent / 'page'
 TEMPLATE = 'report.html.j2'
 STYLE = 'report.css'
 SCRIPTS = (
-    'base', 'geometry', 'log', 'tracks', 'list', 'overview', 'timeline', 'views', 'charts', 'edit',
-    'decide', 'keys', 'main',
+    'base', 'geometry', 'log', 'tracks', 'added', 'list', 'overview', 'timeline', 'views',
+    'charts', 'edit', 'decide', 'sweeps', 'scene', 'keys', 'main',
 )  # fmt: skip
 """Parts of the script, in the order that they are joined in."""
 MAX_MAP_SENSOR = 2000

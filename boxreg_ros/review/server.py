@@ -7,8 +7,12 @@ from getpass import getuser
 from pathlib import Path
 import signal
 import socket
+from typing import TYPE_CHECKING
 
 from boxreg_ros.errors import ConfigError, RecordingError
+
+if TYPE_CHECKING:
+    from boxreg_ros.review.scene import DriveSource
 
 HOST = '127.0.0.1'
 PORT = 8765
@@ -30,9 +34,9 @@ def add_server_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def serve(out: Path, port: int, who: str) -> int:
+def serve(out: Path, port: int, who: str, source: DriveSource | None = None) -> int:
     """Serve until interrupted, or ended by a signal: each decision is saved already."""
-    server = review_server(out, port, who)
+    server = review_server(out, port, who, source)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
             signal.signal(number, lambda *_: server.shutdown())
@@ -59,7 +63,9 @@ class ReviewServer:
 
     """
 
-    def __init__(self, out: Path, bound: socket.socket, who: str) -> None:
+    def __init__(
+        self, out: Path, bound: socket.socket, who: str, source: DriveSource | None
+    ) -> None:
         from boxreg_ros.review.application import review_application
         from boxreg_ros.review.connections import TimedProtocol
         from uvicorn import Config, Server
@@ -67,7 +73,7 @@ class ReviewServer:
         self._socket = bound
         self.server_port = int(bound.getsockname()[1])
         application, token, self.log_path = review_application(
-            out, self.server_port, who, self._is_ending
+            out, self.server_port, who, self._is_ending, source
         )
         self.address = f'http://{HOST}:{self.server_port}/?token={token}'
         config = Config(
@@ -89,7 +95,9 @@ class ReviewServer:
         return self._server.should_exit
 
 
-def review_server(out: Path, port: int, who: str = '') -> ReviewServer:
+def review_server(
+    out: Path, port: int, who: str = '', source: DriveSource | None = None
+) -> ReviewServer:
     """
     Return a server, bound to loopback, for the report and the decisions of a result folder.
 
@@ -121,7 +129,7 @@ def review_server(out: Path, port: int, who: str = '') -> ReviewServer:
             f'port: expected a free one, got {port} ({error}); choose another with --port, or 0 '
             f'for any'
         ) from None
-    return ReviewServer(out, bound, who or _user())
+    return ReviewServer(out, bound, who or _user(), source)
 
 
 def _user() -> str:

@@ -5,7 +5,13 @@ const MAX_PROPOSALS = 8;
 const current = () => view.open;
 const boxAt = row => current().members()[row];
 const heldOf = scope => log.held.get(scopeKey('judgement', scope));
-const pinOf = row => { const found = heldOf(scopeOfBox(boxAt(row))); return found?.decision === 'pin' ? found : null; };
+// The box of a person at a row: a pin, or a box that an added object is followed from.
+function pinOf(row) {
+  const scope = scopeOfBox(boxAt(row)), topic = isAdded(...boxAt(row)) ? 'addition' : 'judgement';
+  const found = log.held.get(scopeKey(topic, scope));
+  return ['pin', 'add'].includes(found?.decision) ? found : null;
+}
+
 const isOfTrack = row => !row.stamp_ns || Boolean(row.end_ns);
 
 // The judgement of a track: that of its first box, those about single boxes left out.
@@ -47,6 +53,7 @@ async function decideAbout(rows) {
 }
 
 async function judge(kind, isBox) {
+  if (kind === 'reject' && isAdded(...boxAt(view.row))) return fail('There is no input to keep: delete this object, or undo its addition.');
   const held = isBox ? judgementOfBox() : judgementOf(current());
   if (held?.decision === kind && (!isBox || view.mark === null)) {
     const rows = isBox ? [held] : heldOver('judgement', current().members()).filter(isOfTrack);
@@ -155,6 +162,7 @@ function ask(title, note, proposals, known, value = '') {
 async function solve() {
   if (!IS_REVIEW || isCorrecting()) return;
   const track = current();
+  if (track.pieces.some(({ s }) => DATA.tracks[s].added)) return say('An added object is solved whenever one of its boxes is corrected.');
   const pieces = track.pieces.flatMap(({ s, rows }) => runsOfRows(s, rows).map(([a, b]) => ({ index: s, begin: stampOf(s, a), end: stampOf(s, b) })));
   const pins = {};
   view.part.stamps.forEach((stamp, row) => { const found = pinOf(row); if (found) pins[stamp] = found.box; });

@@ -26,7 +26,7 @@ function edit() {
   if (!IS_REVIEW) return;
   if (view.isPlaying) play();
   if (!view.part.usable[view.row]) return fail('This box has numbers that are not finite: correct another box of the track.');
-  if (ADDED.includes(view.part.status[view.row])) return fail('This box was added by the run, and follows the boxes of the input: correct one of these.');
+  if (ADDED.includes(view.part.status[view.row]) && !isAdded(...boxAt(view.row))) return fail('This box was added by the run, and follows the boxes of the input: correct one of these.');
   const human = currentBoxes().find(([name]) => name === 'human');
   view.edit = (human ? human[1] : view.part.usable[view.row]).slice();
   view.steps = [];
@@ -43,7 +43,8 @@ async function pin() {
   $('failure').hidden = true;
   const scope = scopeOfBox(boxAt(view.row));
   const comment = heldOf(scope)?.comment ?? '';
-  if (await decide([rowOf(scope, 'pin', { box, comment })])) view.solved = null;
+  const seed = isAdded(...boxAt(view.row)) ? seedsOf(scope.track_id)[0] : null;
+  if (await decide([seed ? rowOf(scope, 'add', { box, value: seed.value }) : rowOf(scope, 'pin', { box, comment })])) view.solved = null;
   step(view.row, true);
 }
 

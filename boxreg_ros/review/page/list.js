@@ -96,6 +96,7 @@ function drawList() {
   drawLines();
   const place = view.shown.findIndex(track => track.index === view.track);
   if (place >= 0) view.place = place;
+  $('tab-count').textContent = number(TRACKS.length, 0);
   const decided = TRACKS.filter(track => decidedOf(track)).length;
   $('f-count').textContent = `${view.shown.length} of ${TRACKS.length} tracks` + (IS_REVIEW ? `, ${decided} decided` : '');
   $('f-clear').hidden = filters().every(input => input.value === input.defaultValue || (input.matches('select') && !input.value));

@@ -41,6 +41,7 @@ function drawViews() {
   const cacheKey = mode === 'sweep' ? view.row : mode;
   if (view.cacheKey !== cacheKey || view.cachePart !== part) {
     view.local = localPoints(part, view.row, mode);
+    view.accumulated = null;
     view.cacheKey = cacheKey;
     view.cachePart = part;
   }
@@ -51,8 +52,12 @@ function drawViews() {
   let boxes = currentBoxes();
   if (mode === 'before') boxes = boxes.filter(([name]) => name !== 'refined');
   if (mode === 'after') boxes = boxes.filter(([name]) => name !== 'input');
+  if (mode === 'sweep') loadCloud();
+  else loadAccumulated(mode);
+  if (mode !== 'sweep' && view.accumulated?.points) view.local = view.accumulated.points;
   const near = mode === 'sweep' ? aroundAt(part.stamps[view.row], part.origin) : [];
-  view.far = near.flatMap(({ points }) => points.map(inFrame));
+  const cloud = mode === 'sweep' && view.cloud?.track === view.open && view.cloud.stamp === part.stamps[view.row] ? view.cloud.points : null;
+  view.far = cloud ? cloud.map(inFrame) : near.flatMap(({ points }) => points.map(inFrame));
   view.lines = [...near.map(({ box }) => ['around', box]), ...boxes]
     .map(([name, box]) => ({ name, dash: DASHES[name] ?? [], corners: corners(box).map(inFrame) }));
   for (const [name, axes] of Object.entries(VIEWS)) drawFlat($(name), ...axes);
@@ -166,7 +171,8 @@ function spaceTraces() {
   const columns = list => ({ x: list.map(p => p[0]), y: list.map(p => p[1]), z: list.map(p => p[2]) });
   const cloud = (list, size, name) => ({ type: 'scatter3d', mode: 'markers', hoverinfo: 'skip', ...columns(list), marker: { size, color: colour(name) } });
   const isClose = point => Math.hypot(...point) < CLOSE;
-  const traces = [cloud(points, every > 1 || points.length > 1500 ? 1.2 : 2.2, 'points'), cloud((view.far ?? []).filter(isClose), 1.2, 'around')];
+  const far = (view.far ?? []).filter(isClose), some = Math.ceil(far.length / 8000);
+  const traces = [cloud(points, every > 1 || points.length > 1500 ? 1.2 : 2.2, 'points'), cloud(far.filter((_, k) => k % some === 0), 1.2, 'around')];
   for (const name of NAMES) {
     const found = view.lines.filter(line => line.name === name && (name !== 'around' || line.corners.every(isClose)));
     const gap = [null, null, null];
