@@ -16,7 +16,7 @@ from boxreg_ros.errors import BoxregError, RecordingError
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, WITH_BOX
 from boxreg_ros.review.report import PAGE_VERSION, REPORT
 from boxreg_ros.review.requests import box_of, json_of, stamp_of, text_of
-from boxreg_ros.review.scene import DriveSource, Scene
+from boxreg_ros.review.scene import DriveSource
 from boxreg_ros.review.scene_routes import SceneRoutes
 from boxreg_ros.review.solve import ReportParts
 import orjson
@@ -170,7 +170,7 @@ class _Review:
         """Return the routes about the recording; none without one."""
         if self._source is None:
             return []
-        return SceneRoutes(Scene(self._source), self._frame_id).routes()
+        return SceneRoutes(self._source, self._frame_id).routes()
 
     async def page(self, _: Request) -> Response:
         """Return the page; its scripts alone may run."""

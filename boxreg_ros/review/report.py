@@ -47,7 +47,7 @@ TEMPLATE = 'report.html.j2'
 STYLE = 'report.css'
 SCRIPTS = (
     'base', 'geometry', 'log', 'tracks', 'added', 'list', 'overview', 'timeline', 'views',
-    'charts', 'edit', 'decide', 'sweeps', 'scene', 'keys', 'main',
+    'charts', 'edit', 'decide', 'sweeps', 'camera', 'scene', 'keys', 'main',
 )  # fmt: skip
 """Parts of the script, in the order that they are joined in."""
 MAX_MAP_SENSOR = 2000

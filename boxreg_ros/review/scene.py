@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -12,8 +13,14 @@ from boxreg_ros.core.follow import follow_points, FollowedTrack, solved
 from boxreg_ros.errors import BoxregError, RecordingError
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
 from boxreg_ros.io.items import ItemSource
+from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.sweep_store import SweepStore
-from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.rotations import (
+    interpolate_rotation,
+    matrix_from_rpy,
+    quaternion_from_rpy,
+    rpy_from_matrix,
+)
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Sweep, Z
 from msg_adapters.convention import Convention
 import numpy as np
@@ -67,6 +74,7 @@ class Scene:
         self._store = SweepStore()
         self._origins: list[Floats] = []
         self._headings: list[float] = []
+        self._poses: dict[str, list[Floats | None]] = {}  # by frame, of each sweep
         self._changed = Condition()
         self._is_begun = self._is_done = False
         self._error = ''
@@ -149,6 +157,30 @@ class Scene:
             self._wait(max(stamps_ns))
             return np.array([self._origins[self._row(stamp_ns)] for stamp_ns in stamps_ns])
 
+    def pose_of(self, frame_id: str, stamp_ns: int) -> Floats | None:
+        """
+        Return the pose (4, 4) of the frame of a camera in the fixed frame; None if unknown.
+
+        Between the poses at the two sweeps around the stamp, it is interpolated.
+
+        """
+        with self._changed:
+            self._wait(stamp_ns)
+            poses, stamps_ns = self._poses.get(frame_id), self._store.stamps_ns
+            after = bisect_left(stamps_ns, stamp_ns)
+            rows = sorted({max(0, after - 1), min(after, len(stamps_ns) - 1)})
+            around = [] if poses is None else [poses[row] for row in rows]
+        known = [pose for pose in around if pose is not None]
+        if len(known) < 2:
+            return known[0] if known else None
+        begin_ns, end_ns = (stamps_ns[row] for row in rows)
+        part = (stamp_ns - begin_ns) / (end_ns - begin_ns)
+        pose = np.eye(4)
+        pose[:3, 3] = (1 - part) * known[0][:3, 3] + part * known[1][:3, 3]
+        turns = [quaternion_from_rpy(rpy_from_matrix(one[None, :3, :3]))[0] for one in known]
+        pose[:3, :3] = interpolate_rotation(turns[0], turns[1], part)
+        return pose
+
     def _row(self, stamp_ns: int) -> int:
         return int(np.abs(np.array(self._store.stamps_ns, np.int64) - stamp_ns).argmin())
 
@@ -177,9 +209,11 @@ class Scene:
                 items = FixedFrameItems(
                     recording, source.config, source.convention, source.fixed_frame
                 )
+                if isinstance(recording, Recording):
+                    self._poses = {one.frame_id: [] for one in recording.images().cameras}
                 for item in items.read():
                     if isinstance(item.moved, Sweep):
-                        self._add(item.moved, item)
+                        self._add(item.moved, item, items)
         except (BoxregError, OSError) as error:
             self._error = str(error)
         finally:
@@ -187,7 +221,7 @@ class Scene:
                 self._is_done = True
                 self._changed.notify_all()
 
-    def _add(self, sweep: Sweep, item: MovedItem) -> None:
+    def _add(self, sweep: Sweep, item: MovedItem, items: FixedFrameItems) -> None:
         heading = self._headings[-1] if self._headings else 0.0
         if item.T_fixed_item is not None:
             heading = float(np.arctan2(item.T_fixed_item[1, 0], item.T_fixed_item[0, 0]))
@@ -197,6 +231,8 @@ class Scene:
             if len(self._store) > count:
                 self._origins.append(sweep.origin)
                 self._headings.append(heading)
+                for frame_id, poses in self._poses.items():
+                    poses.append(items.pose_of(frame_id, sweep.stamp_ns))
             self._changed.notify_all()
 
 

@@ -8,9 +8,10 @@ from typing import Any
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.review.added import added_track
 from boxreg_ros.review.fit import fitted, USUAL_EXTENTS
+from boxreg_ros.review.images import DriveImages
 from boxreg_ros.review.payload import as_json
 from boxreg_ros.review.requests import box_of, json_of, numbers_of, stamp_of, text_of
-from boxreg_ros.review.scene import Scene, thinned
+from boxreg_ros.review.scene import DriveSource, Scene, thinned
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box
 import numpy as np
 from starlette.concurrency import run_in_threadpool
@@ -28,15 +29,16 @@ class SceneRoutes:
 
     Parameters
     ----------
-    scene : Scene
-        Its sweeps.
+    source : DriveSource
+        Its recording.
     frame_id : str
         Fixed frame.
 
     """
 
-    def __init__(self, scene: Scene, frame_id: str) -> None:
-        self._scene = scene
+    def __init__(self, source: DriveSource, frame_id: str) -> None:
+        self._scene = Scene(source)
+        self._images = DriveImages(source, self._scene)
         self._frame_id = frame_id
 
     def routes(self) -> list[Route]:
@@ -45,6 +47,8 @@ class SceneRoutes:
             Route('/sweep', self.sweep),
             Route('/fit', self.fit, methods=['POST']),
             Route('/follow', self.follow, methods=['POST']),
+            Route('/cameras', self.cameras),
+            Route('/image', self.image),
             Route('/accumulated', self.accumulated, methods=['POST']),
         ]
 
@@ -64,6 +68,22 @@ class SceneRoutes:
     async def accumulated(self, request: Request) -> Response:
         """Return the points of all sweeps in the boxes of a track."""
         return await run_in_threadpool(self._accumulated, await json_of(request))
+
+    async def cameras(self, request: Request) -> Response:
+        """Return the cameras, with their poses at a stamp."""
+        stamp_ns = _needed_stamp(request.query_params)
+        found = await run_in_threadpool(self._images.cameras, stamp_ns)
+        return Response(as_json(found), media_type='application/json')
+
+    async def image(self, request: Request) -> Response:
+        """Return the image of a camera that is nearest to a stamp."""
+        number = request.query_params.get('camera', '')
+        if not number.isdecimal() or len(number) > 4:
+            raise RecordingError(f'camera: expected a number, got {number!r:.80}')
+        stamp_ns = _needed_stamp(request.query_params)
+        found, pose = await run_in_threadpool(self._images.image, int(number), stamp_ns)
+        headers = {'X-Stamp': str(found.stamp_ns), 'X-Pose': as_json(pose).decode()}
+        return Response(found.content, media_type=found.media_type, headers=headers)
 
     def _sweep(self, stamp_ns: int) -> Response:
         found_ns, origin, points, sensor = self._scene.sweep(stamp_ns)

@@ -56,6 +56,7 @@ async function showScene(at, isNew = false) {
   clearTimeout(view.hashTimer);
   view.hashTimer = setTimeout(() => { if (!$('drive').hidden) history.replaceState(null, '', '#' + new URLSearchParams({ scene: stamp })); }, 200);
   drawScene();
+  drawCameras();
 }
 
 // The height of the road below the sensor: the lower tenth of the points near it.
@@ -175,6 +176,7 @@ async function fitAt(place, name = '') {
   const names = [...new Set([...sizes.keys(), found.class, 'car', 'truck', 'bus', 'cyclist', 'pedestrian'])].sort();
   fill($('scene-class'), ...names.map(one => element('option', { value: one, selected: one === found.class }, one)));
   drawScene();
+  drawCameras();
 }
 
 async function keepFit() {
@@ -245,6 +247,7 @@ function setUpScene() {
     event.preventDefault();
     if (scene.sweep) zoomScene(event.deltaY < 0 ? ZOOM_STEP : 1 / ZOOM_STEP, event);
   }, { passive: false });
+  $('camera-choice').onchange = drawCamera;
   $('scene-time').oninput = () => showScene(Number($('scene-time').value));
   $('scene-play').onclick = playScene;
   $('scene-add').onclick = () => startAdding();

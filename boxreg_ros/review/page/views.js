@@ -62,6 +62,7 @@ function drawViews() {
     .map(([name, box]) => ({ name, dash: DASHES[name] ?? [], corners: corners(box).map(inFrame) }));
   for (const [name, axes] of Object.entries(VIEWS)) drawFlat($(name), ...axes);
   drawSpace();
+  drawCamera();
   const labels = { around: 'neighbours', refined: part.status[view.row] === 'kept' ? 'kept' : 'refined', truth: 'true', solved: 'solved again' };
   const shown = NAMES.filter(name => view.lines.some(line => line.name === name));
   fill($('legend'), ...shown.map(name => element('span', {}, element('i', { style: `border-color: var(--${name}); border-top-style: ${{ input: 'dashed', truth: 'dotted' }[name] ?? 'solid'}` }), labels[name] ?? name)));
