@@ -130,7 +130,7 @@ def test_boxes_are_shown_in_the_nearest_image_of_the_best_camera(tmp_path):
         assert 'not in this image' in page.inner_text('#camera-text')
         page.click('#tab-drive')
         page.wait_for_function("document.querySelectorAll('#drive-cameras canvas').length === 2")
-        page.wait_for_function("document.querySelectorAll('#drive-cameras canvas')[1].at")
+        page.wait_for_function("Boolean(document.querySelectorAll('#drive-cameras canvas')[1].at)")
         shown = page.evaluate("""(() => {
           const c = document.querySelectorAll('#drive-cameras canvas')[1], [x, y] = c.at([9, 9]);
           return [...c.getContext('2d').getImageData(x, y, 1, 1).data]; })()""")
