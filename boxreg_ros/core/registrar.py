@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
+from boxreg_ros.core.following.stream import FollowedObjects
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.observation import Observation, Observations, observe
@@ -76,6 +77,8 @@ class BoxRegistrar:
         Sweeps and boxes added, boxes by status, and everything dropped or kept, by reason.
     box_time : BoxTimeEvidence
         Evidence of the time that the input boxes are of.
+    followed : FollowedObjects
+        Objects that are followed from one box each, see `follow`.
 
     Notes
     -----
@@ -102,6 +105,9 @@ class BoxRegistrar:
     the points confirm it. Such a box is in the results while it is refined, with the status
     ``coasted`` and the score 0.
 
+    An object that is **followed** has such a box wherever a box array has none of its id and its
+    points support it, refined or not.
+
     With a **budget**, the tracks that have waited longest are solved first, then those whose
     newest estimate is least certain, then the nearest. The boxes of the others are kept for now,
     with the reason ``budget``; their observations join the next window that is solved. After the
@@ -124,6 +130,7 @@ class BoxRegistrar:
         self._matcher = StampMatcher(config, self.counts)
         self._input_model = InputModel(config.faces)
         self.box_time = BoxTimeEvidence()
+        self.followed = FollowedObjects(config)
         self._pending = deque[PendingArray]()
         self._newest_ns = -inf
         self._tracks: dict[str, ObservedTrack] = {}
@@ -144,12 +151,17 @@ class BoxRegistrar:
     def add_sweep(self, sweep: Sweep) -> list[RefinedBoxes]:
         """Add a sweep; return the box arrays that are completed by it."""
         self.counts['sweeps'] += not sweep.is_dropped
+        self.followed.add_sweep(sweep)
         return list(self._process(self._matcher.add_sweep(sweep)))
 
     def add_boxes(self, boxes: BoxArray) -> list[RefinedBoxes]:
         """Add a box array; return the box arrays that are completed by it."""
         self.counts['boxes'] += len(boxes.track_ids)
         return list(self._process(self._matcher.add_boxes(boxes)))
+
+    def follow(self, boxes: BoxArray) -> None:
+        """Follow the object of each box, with `estimate` 'early' or 'final', see the notes."""
+        self.followed.add(boxes)
 
     def flush(self) -> list[RefinedBoxes]:
         """Return all box arrays held. Tracks end with `estimate` 'track', else they go on."""
@@ -232,7 +244,7 @@ class BoxRegistrar:
                 if track_id not in self._tracks:
                     self._tracks[track_id] = ObservedTrack(track_id, boxes.class_names[row])
                 given.append(BoxToObserve(self._tracks[track_id], boxes.boxes[row], row))
-        coasting = self._coasting(array)
+        coasting = [*self._followed(array, sweep), *self._coasting(array)]
         if not (given or coasting):
             return
         seen, velocities = self._seen([*given, *coasting], boxes, sweep)
@@ -257,12 +269,32 @@ class BoxRegistrar:
             entry.is_predicted = True
             item.track.entries.append(entry)
 
+    def _followed(self, array: PendingArray, sweep: Sweep) -> list[BoxToObserve]:
+        """Return the boxes of followed objects that have none in `array`."""
+        if not array.is_observed:
+            return []
+        boxes = array.input
+        others = boxes.boxes[is_valid_box(boxes.boxes)]
+        found = []
+        for one in self.followed.boxes_at(boxes.stamp_ns, sweep.stamp_ns, others):
+            if one.track_id in boxes.track_ids:
+                continue
+            if is_owned(one.box, others):
+                self.counts[Reason.COAST_UNCONFIRMED] += 1
+                continue
+            others = np.vstack([others, one.box])
+            track = self._tracks.setdefault(
+                one.track_id, ObservedTrack(one.track_id, one.class_name)
+            )
+            found.append(BoxToObserve(track, one.box, is_followed=True))
+        return found
+
     def _coasting(self, array: PendingArray) -> list[BoxToObserve]:
         """Return the predicted boxes of the tracks that have no box in `array`."""
         if not (self.config.coasts and array.is_observed):
             return []
         boxes = array.input
-        present = set(boxes.track_ids)
+        present = {*boxes.track_ids, *self.followed.track_ids}
         others = boxes.boxes[is_valid_box(boxes.boxes)]
         found = []
         for track in self._tracks.values():
@@ -440,7 +472,7 @@ def _confirmed(coasting: list[BoxToObserve], seen: list[Observation]) -> list[Bo
     return [
         item
         for item, count in zip(coasting, inside.tolist(), strict=True)
-        if count >= item.track.least_points
+        if item.is_followed or count >= item.track.least_points
     ]
 
 

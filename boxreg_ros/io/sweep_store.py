@@ -5,7 +5,7 @@ from __future__ import annotations
 import mmap
 from tempfile import TemporaryFile
 
-from boxreg_ros.core.follow import ascending
+from boxreg_ros.core.following.sweeps import ascending
 from boxreg_ros.structures import Floats, Sweep
 import numpy as np
 from numpy.typing import NDArray

@@ -7,13 +7,7 @@ from dataclasses import replace
 
 from boxreg_ros.core.follow import FollowedTrack
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import (
-    BoxArray,
-    Floats,
-    HUMAN,
-    RefinedBoxes,
-    ROLL,
-)
+from boxreg_ros.structures import BoxArray, Floats, HUMAN, RefinedBoxes, ROLL
 from boxreg_ros.tracks.complete import AddedBox, CompletionPlan, unchanged_plan
 from boxreg_ros.tracks.track_steps import TrackSteps
 import numpy as np
