@@ -40,6 +40,7 @@ async function readImage(index, stamp) {
 const inCamera = (pose, point) => [0, 1, 2].map(k => pose[k][0] * point[0] + pose[k][1] * point[1] + pose[k][2] * point[2] + pose[k][3]);
 
 // The pixel of a point in the axes of a camera; null where there is none.
+/** @param {Camera} camera @param {number[]} point */
 function pixelOf({ matrix, distortion, model }, [x, y, z]) {
   if (z < NEAREST || Math.atan2(Math.hypot(x, y), z) > WIDEST) return null;
   let [u, v] = [x / z, y / z];
@@ -49,17 +50,19 @@ function pixelOf({ matrix, distortion, model }, [x, y, z]) {
 }
 
 // Plumb bob and its rational form.
-function bent([k1, k2, p1, p2, k3 = 0, k4 = 0, k5 = 0, k6 = 0], u, v) {
+/** @type {(values: number[], u: number, v: number) => number[]} */
+const bent = ([k1, k2, p1, p2, k3 = 0, k4 = 0, k5 = 0, k6 = 0], u, v) => {
   const r2 = u * u + v * v;
   const radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)));
   return [u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u), v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v];
-}
+};
 
-function bentByAngle([k1, k2, k3, k4], u, v) {
+/** @type {(values: number[], u: number, v: number) => number[]} */
+const bentByAngle = ([k1, k2, k3, k4], u, v) => {
   const r = Math.hypot(u, v), angle = Math.atan(r), a2 = angle * angle;
   const scale = r > 1e-9 ? angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4)))) / r : 1;
   return [u * scale, v * scale];
-}
+};
 
 // How well a camera sees a box in the fixed frame: its place from the middle of the image; larger is worse.
 function offMiddle(camera, box) {
@@ -102,6 +105,7 @@ function drawImage(canvas, camera, found, boxes, focus) {
       middle = [0, 1].map(k => (2 * half[k] > size[k] ? size[k] / 2 : Math.max(half[k], Math.min(size[k] - half[k], (low[k] + high[k]) / 2))));
     }
   }
+  /** @type {(pixel: number[]) => [number, number]} */
   const at = ([u, v]) => [width / 2 + zoom * (u + 0.5 - middle[0]), height / 2 + zoom * (v + 0.5 - middle[1])];
   canvas.at = at;
   context.drawImage(bitmap, ...at([-0.5, -0.5]), zoom * bitmap.width, zoom * bitmap.height);

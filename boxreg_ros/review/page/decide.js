@@ -219,7 +219,7 @@ function drawDecisions() {
   if (document.activeElement?.id.startsWith('comment')) return;
   const button = (name, text, title, onclick, isPressed = null) => element('button', { 'data-do': name, title, onclick, 'aria-pressed': isPressed === null ? null : String(isPressed) }, text);
   const track = current(), isMarked = view.mark !== null;
-  const focused = document.activeElement?.dataset.do;
+  const focused = document.activeElement?.getAttribute('data-do');
   const what = isMarked ? 'Boxes' : 'Box';
   fill($('decide-track'), element('span', {}, 'Track'), ...judgements(false),
     button('next', 'Accept, next', 'Accept the track and open the next one without a decision (Enter)', acceptAndGoOn));
@@ -237,7 +237,7 @@ function drawDecisions() {
     view.edit ? button('pin', 'Pin', 'Save this box (Enter)', pin) : button('edit', pinOf(view.row) ? 'Edit pin' : 'Edit', 'Correct this box (e)', edit),
     view.edit ? button('cancel', 'Cancel', 'Discard this correction (Escape)', discard)
       : (pinOf(view.row) ? button('unpin', 'Unpin', 'Remove the pin', () => decide([takenBack(pinOf(view.row))])) : null));
-  if (focused) document.querySelector(`[data-do=${focused}]`)?.focus();
+  if (focused) $('decide').querySelector(`[data-do=${focused}]`)?.focus();
 
   // The buttons and the comment for the track, or for the box.
   function judgements(isBox) {

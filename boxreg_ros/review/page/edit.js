@@ -6,6 +6,7 @@ const GRIP = 8;                    // reach of a face, or of the stroke at the f
 const LEAST_SIZE = 0.1;            // [m]
 const DEGREES = 180 / Math.PI;
 // Name, letter, column of the box, scale, digits.
+/** @type {[string, string, number, number, number][]} */
 const TYPED = [['x', 'x', 0, 1, 2], ['y', 'y', 1, 1, 2], ['z', 'z', 2, 1, 2], ['length', 'l', 3, 1, 2], ['width', 'w', 4, 1, 2], ['height', 'h', 5, 1, 2], ['yaw', 'yaw', 8, DEGREES, 1]];
 
 // A correction that is neither pinned nor discarded is not left.
@@ -112,6 +113,7 @@ function setUpNumbers() {
 
 function setUpDragging(canvas) {
   const [right, up] = VIEWS[canvas.id];
+  /** @type {any} */
   let grip = null;
   const place = event => {
     const bounds = canvas.getBoundingClientRect();

@@ -5,6 +5,7 @@
 const TOPIC_OF = { accept: 'judgement', reject: 'judgement', unsure: 'judgement', pin: 'judgement', none: 'judgement',
                    delete: 'deletion', restore: 'deletion', rename: 'id', reclass: 'class', add: 'addition', withdraw: 'addition' };
 const TAKEN_BACK = { judgement: 'none', deletion: 'restore', id: 'rename', class: 'reclass', addition: 'withdraw' };
+/** @type {{ count: number, held: Map<string, Row>, ofInput: Map<string, Row[]>, made: Row[][], who: string, answered?: Promise<any> }} */
 const log = { count: 0, held: new Map(), ofInput: new Map(), made: [], who: '' };
 
 const scopeKey = (topic, row) => JSON.stringify([topic, row.track_id, row.stamp_ns, row.end_ns]);

@@ -4,7 +4,10 @@ const CLICK = 4;                   // a pointer that moves less has clicked [px]
 const LABELLED = 5;                // ids are written at this zoom and above [px/m]
 const ROAD = 0.4;                  // above the road: points of objects [m]
 const SHOWN = 90;                  // of the drive around the sensor [m]
+/** @type {{ [name: string]: any, sweep: Sweep, boxes: SceneBox[], fit: Fit, slim: Map<number, SlimPart> }} */
 const scene = { at: 0, zoom: 0, offset: [0, 0], sweep: null, boxes: [], isAdding: false, fit: null, playing: 0, slim: new Map() };
+/** @type {Record<string, [string, number, number]>} */
+const LOOKS = { road: ['around', 0.45, 1], object: ['points', 0.9, 1.6] };  // colour, opacity, size [px]
 const sceneStamp = () => DATA.stamps[scene.at];
 
 // Boxes of a track of the report without its points: those of all tracks stay read.
@@ -75,6 +78,7 @@ function sceneAxes() {
   const center = [sensor[0] + offset[0], sensor[1] + offset[1]];
   return {
     width, height,
+    /** @type {(place: number[]) => [number, number]} */
     to: ([x, y]) => [width / 2 + zoom * (x - center[0]), height / 2 - zoom * (y - center[1])],
     from: event => {
       const bounds = canvas.getBoundingClientRect();
@@ -91,7 +95,8 @@ function drawScene() {
   const context = canvas.getContext('2d', { willReadFrequently: true });
   context.setTransform(scale, 0, 0, scale, 0, 0);
   const { points, origin, sensor } = scene.sweep;
-  for (const [isObject, name, alpha, size] of [[false, 'around', 0.45, 1], [true, 'points', 0.9, 1.6]]) {
+  for (const isObject of [false, true]) {
+    const [name, alpha, size] = isObject ? LOOKS.object : LOOKS.road;
     context.fillStyle = colour(name);
     context.globalAlpha = alpha;
     for (let i = 0; i < points.length; i += 3) {

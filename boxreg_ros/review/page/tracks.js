@@ -158,9 +158,10 @@ async function loadAround(track) {
   const own = new Set(track.pieces.map(({ s }) => s));
   const end = track.begin + track.seconds;
   const away = other => Math.min(...other.path.flatMap(([x, y]) => track.path.map(([u, v]) => Math.hypot(x - u, y - v))));
-  const near = DATA.tracks.map((other, s) => [s, other])
+  /** @type {[number, number][]} */
+  const near = DATA.tracks.map((other, s) => /** @type {[number, Source]} */ ([s, other]))
     .filter(([s, other]) => !own.has(s) && other.begin <= end && other.begin + other.seconds >= track.begin)
-    .map(([s, other]) => [s, away(other)]).filter(([, distance]) => distance < REACH)
+    .map(([s, other]) => /** @type {[number, number]} */ ([s, away(other)])).filter(([, distance]) => distance < REACH)
     .sort((a, b) => a[1] - b[1]).slice(0, MAX_AROUND);
   const found = [];
   for (const [s] of near) {
