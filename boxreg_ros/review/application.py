@@ -95,6 +95,7 @@ def review_application(
             Route('/decisions', review.decide, methods=['POST']),
             Route('/events', review.events),
             Route('/solve', review.solve, methods=['POST']),
+            Route('/risk', review.risk, methods=['POST']),
             Route('/save', review.save, methods=['POST']),
             *review.scene_routes(),
         ],
@@ -207,6 +208,13 @@ class _Review:
         sent = await json_of(request)
         return Response(
             await run_in_threadpool(self._parts.solved, sent), media_type='application/json'
+        )
+
+    async def risk(self, request: Request) -> Response:
+        """Return the risk of a box as it is, and as a person drags it."""
+        sent = await json_of(request)
+        return Response(
+            await run_in_threadpool(self._parts.risks, sent), media_type='application/json'
         )
 
     async def save(self, request: Request) -> Response:

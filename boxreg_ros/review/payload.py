@@ -12,6 +12,7 @@ import zlib
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.review.changes import median, TrackChanges
 from boxreg_ros.review.quality import ious, quality
+from boxreg_ros.review.risk import UNKNOWN_USUAL, Usual
 from boxreg_ros.review.tables import TrackRow
 from boxreg_ros.review.track_points import to_millimetres
 from boxreg_ros.structures import (
@@ -124,6 +125,8 @@ class TrackPart:
         The points of the recording.
     truth : TrackTruth
         True boxes of the track.
+    usual : Usual
+        What is usual in the recording.
 
     Attributes
     ----------
@@ -132,12 +135,19 @@ class TrackPart:
 
     """
 
-    def __init__(self, row: TrackRow, collector: TrackPoints, truth: TrackTruth) -> None:
+    def __init__(
+        self,
+        row: TrackRow,
+        collector: TrackPoints,
+        truth: TrackTruth,
+        usual: Usual = UNKNOWN_USUAL,
+    ) -> None:
         track = row.track
         self._track = track
         self._risk = row.risk
         self._why = row.reasons
         self._truth = truth
+        self._usual = usual
         self._sensor = collector.sensor_at(track.stamps_ns)
         self._points = collector.points_of(track)
         self.before = quality(track, track.given, self._points, truth.iou_before)
@@ -210,6 +220,10 @@ class TrackPart:
             'deviations': np.round(track.deviations, DECIMALS),
             'extent_deviations': np.round(track.extent_deviations, DECIMALS),
             'risk': np.round(self._risk.boxes, RISK_DECIMALS),
+            'disagreement': np.round(track.disagreement, 3),
+            'faces': np.round(track.face_distances, 3),
+            'near': track.near_points,
+            'usual': [self._usual.outside, self._usual.sizes.get(track.class_name)],
             'num_points': track.num_points,
             'counts': [len(points) for points in shown],
             'points': b64encode(every.astype('<i2').tobytes()).decode('ascii'),

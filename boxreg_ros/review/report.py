@@ -31,6 +31,7 @@ from boxreg_ros.review.payload import (
     true_boxes,
 )
 from boxreg_ros.review.quality import CELL, Quality
+from boxreg_ros.review.risk import Usual
 from boxreg_ros.review.rules import RULES
 from boxreg_ros.review.rules.protocol import Rule, Violation
 from boxreg_ros.review.tables import TrackRow
@@ -109,11 +110,12 @@ def write_report(
     begin_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
     max_points = points_per_box(sum(len(track.stamps_ns) for track in tracks))
     violations = _by_track(violated)
+    usual = Usual.of(tracks)
     rows = []
     parts = []
     qualities = []
     for row, true in zip(found, true_boxes(tracks, truth), strict=True):
-        part = TrackPart(row, points, true)
+        part = TrackPart(row, points, true, usual)
         rows.append(part.row(stamps_ns) | {'rules': violations.get(row.track.track_id, [])})
         parts.append(compressed(as_json(part.part(begin_ns, max_points))))
         qualities.append((part.before, part.after))

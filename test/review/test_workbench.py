@@ -256,6 +256,10 @@ def test_a_correction_shows_its_figures_is_typed_and_undone_in_steps(server):
         expected = (width - 0.5) / (width + 0.5)
         shown = float(page.inner_text('#clock').split()[5])
         assert shown == pytest.approx(expected, abs=0.02)
+        page.wait_for_function("$('clock').textContent.includes(' → ')")
+        page.wait_for_function('!view.isAsking')
+        before, after = map(float, page.inner_text('#clock').split('risk ')[1].split(' ')[:3:2])
+        assert after > before + 0.1
         page.mouse.up()
         assert page.evaluate('numInside(pointsAt(view.part, view.row), view.edit)') < inside
         assert page.evaluate(LEAVING)  # the browser asks before it is lost

@@ -32,6 +32,7 @@ function edit() {
   view.edit = (human ? human[1] : view.part.usable[view.row]).slice();
   view.steps = [];
   view.isMoved = false;
+  view.risks = null;
   $('mode').value = 'sweep';
   step(view.row, true);
   $('top').focus({ preventScroll: true });
@@ -80,7 +81,26 @@ function redrawEdit() {
     if (!view.edit) return;
     drawViews();
     drawNumbers();
+    askRisk();
   });
+}
+
+// The risk of the box as it is dragged, one request after the other.
+async function askRisk() {
+  const [s, k] = boxAt(view.row);
+  view.riskWanted = true;
+  if (view.isAsking || DATA.tracks[s].added) return;
+  view.isAsking = true;
+  while (view.riskWanted && view.edit) {
+    view.riskWanted = false;
+    const box = view.edit;
+    try {
+      const risks = await post('risk', { index: s, row: k, class: current().class, box: moved(box, view.part.origin, 1) });
+      view.risks = view.edit ? risks : null;
+    } catch { break; }  // the page says when the server is gone: with the next decision
+    drawNumbers();
+  }
+  view.isAsking = false;
 }
 
 // The numbers of the box, which can be typed, and what follows from them.
@@ -95,7 +115,7 @@ function drawNumbers() {
   }
   const points = pointsAt(view.part, view.row), refined = view.part.usable[view.row];
   $('clock').textContent = `IoU with the ${view.part.status[view.row]} box ${number(overlap(view.edit, refined))} · ` +
-    `${numInside(points, view.edit)} of ${points.length} points inside (before ${numInside(points, refined)})`;
+    `${numInside(points, view.edit)} of ${points.length} points inside (before ${numInside(points, refined)})` + (view.risks ? ` · risk ${number(view.risks[0])} → ${number(view.risks[1])} m` : '');
 }
 
 function setUpNumbers() {
