@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from datetime import datetime, UTC
 from pathlib import Path
 import secrets
 import sys
 from threading import Lock, Thread
+from time import monotonic
 from typing import Any
 
 import anyio
 from boxreg_ros.errors import BoxregError, RecordingError
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, WITH_BOX
+from boxreg_ros.review.drives import drives_application
 from boxreg_ros.review.report import PAGE_VERSION, REPORT
 from boxreg_ros.review.requests import box_of, json_of, stamp_of, text_of
 from boxreg_ros.review.scene import DriveSource
@@ -30,6 +32,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 MAX_ROWS = 10_000
 """Most decisions of a request: a track that is made of as many parts; chosen."""
+OPEN_SECONDS = 600.0
+"""A track is open to one person for so long; chosen: then the person has left."""
 POLL_SECONDS = 0.25
 """Another program may append to the file: the time until its decisions are seen; chosen."""
 MARK = f'<html lang="en" data-page="{PAGE_VERSION}"'.encode()
@@ -50,35 +54,30 @@ POLICY = (
 
 
 def review_application(
-    out: Path,
+    results: Sequence[tuple[Path, DriveSource | None]],
     port: int,
     who: str,
     is_ending: Callable[[], bool],
-    source: DriveSource | None = None,
-) -> tuple[ASGIApp, str, Path]:
+) -> tuple[ASGIApp, str]:
     """
-    Return the application for a result folder.
+    Return the application for result folders; several are behind a page of their progress.
 
     Parameters
     ----------
-    out : Path
-        Result folder with a report.
+    results : sequence of Path and DriveSource
+        Result folders with a report, and their recordings, for whole clouds and added objects.
     port : int
         Port on loopback that it is served at: requests under another name are refused.
     who : str
         Name of the person, where the page sends none.
     is_ending : callable
         Whether the server ends: streams of events end then.
-    source : DriveSource, optional
-        The recording of the result, for whole clouds and added objects.
 
     Returns
     -------
     application : ASGI application
     token : str
         Requests need it, in the address of the first one or in the cookie that this one sets.
-    log_path : Path
-        File of the decisions.
 
     Raises
     ------
@@ -86,22 +85,11 @@ def review_application(
         If decisions or summary cannot be read.
 
     """
-    review = _Review(out, who, is_ending, source)
     token = secrets.token_urlsafe(16)
-    application = Starlette(
-        routes=[
-            Route('/', review.page),
-            Route('/decisions', review.decisions, methods=['GET']),
-            Route('/decisions', review.decide, methods=['POST']),
-            Route('/events', review.events),
-            Route('/solve', review.solve, methods=['POST']),
-            Route('/risk', review.risk, methods=['POST']),
-            Route('/save', review.save, methods=['POST']),
-            *review.scene_routes(),
-        ],
-        exception_handlers={BoxregError: _refused, OSError: _failed},
-    )
-    return _Guard(application, port, token), token, out / DECISIONS
+    reviews = [_Review(out, who, is_ending, source) for out, source in results]
+    found = [(review, review.application()) for review in reviews]
+    application = found[0][1] if len(found) == 1 else drives_application(found)
+    return _Guard(application, port, token), token
 
 
 class _Guard:
@@ -158,7 +146,9 @@ class _Review:
         self._parts = ReportParts(out, self._page)
         self._summary = orjson.loads((out / 'summary.json').read_bytes())
         self._frame_id: str = self._summary['fixed_frame']
-        self._out = out
+        self.out = out
+        self.listeners = 0
+        self._open: dict[str, tuple[str, float]] = {}  # tracks by page, and since when
         self._who = who
         self._log = DecisionLog(out / DECISIONS)
         self._log_lock = Lock()
@@ -167,11 +157,22 @@ class _Review:
         self._source = source
         Thread(target=self._parts.warm_up, daemon=True).start()
 
-    def scene_routes(self) -> list[Route]:
-        """Return the routes about the recording; none without one."""
-        if self._source is None:
-            return []
-        return SceneRoutes(self._source, self._frame_id).routes()
+    def application(self) -> Starlette:
+        """Return the application of this result."""
+        routes = [
+            Route('/', self.page),
+            Route('/decisions', self.decisions, methods=['GET']),
+            Route('/decisions', self.decide, methods=['POST']),
+            Route('/events', self.events),
+            Route('/open', self.open, methods=['POST']),
+            Route('/solve', self.solve, methods=['POST']),
+            Route('/risk', self.risk, methods=['POST']),
+            Route('/save', self.save, methods=['POST']),
+        ]
+        if self._source is not None:
+            routes += SceneRoutes(self._source, self._frame_id).routes()
+        handlers: Any = {BoxregError: _refused, OSError: _failed}
+        return Starlette(routes=routes, exception_handlers=handlers)
 
     async def page(self, _: Request) -> Response:
         """Return the page; its scripts alone may run."""
@@ -202,6 +203,18 @@ class _Review:
         if not seen.isdecimal():
             raise RecordingError('seen: expected the number of known decisions')
         return StreamingResponse(self._stream(int(seen)), media_type='text/event-stream')
+
+    async def open(self, request: Request) -> Response:
+        """Note the track that a page has open, and return those that others have."""
+        sent = await json_of(request)
+        page, track = text_of(sent, 'page'), text_of(sent, 'track')
+        now = monotonic()
+        self._open = {
+            one: known for one, known in self._open.items() if now - known[1] < OPEN_SECONDS
+        }
+        if track:
+            self._open[page] = track, now
+        return JSONResponse([known for one, (known, _) in self._open.items() if one != page])
 
     async def solve(self, request: Request) -> Response:
         """Return the boxes of a track, solved again with its pinned boxes."""
@@ -252,14 +265,18 @@ class _Review:
 
     async def _stream(self, seen: int) -> AsyncIterator[bytes]:
         yield b'retry: 1000\n\n'
-        while not self._is_ending():
-            await run_in_threadpool(self._refresh)
-            if len(self._log.decisions) != seen:
-                first = seen if seen < len(self._log.decisions) else 0
-                seen = len(self._log.decisions)
-                data = orjson.dumps(self._since(first)).decode()
-                yield f'id: {seen}\ndata: {data}\n\n'.encode()
-            await anyio.sleep(POLL_SECONDS)
+        self.listeners += 1
+        try:
+            while not self._is_ending():
+                await run_in_threadpool(self._refresh)
+                if len(self._log.decisions) != seen:
+                    first = seen if seen < len(self._log.decisions) else 0
+                    seen = len(self._log.decisions)
+                    data = orjson.dumps(self._since(first)).decode()
+                    yield f'id: {seen}\ndata: {data}\n\n'.encode()
+                await anyio.sleep(POLL_SECONDS)
+        finally:
+            self.listeners -= 1
 
     def _decision(self, sent: object) -> Decision:
         """Return the decision that the page has sent."""
@@ -282,14 +299,14 @@ class _Review:
     async def _relabel(self) -> Response:
         command = self._summary['command']
         folder = Path(self._summary['folder'])
-        decisions = (self._out / DECISIONS).resolve()
+        decisions = (self.out / DECISIONS).resolve()
         if command[:1] != ['relabel'] or not folder.is_dir():
             raise RecordingError(
                 f'expected a result of boxreg relabel in {str(folder)!r}, got one of '
                 f'{command[:1]}, or the folder is gone; run boxreg relabel RECORDING -o NEW '
                 f'--decisions {decisions}'
             )
-        out = self._out.resolve()
+        out = self.out.resolve()
         new = out.with_name(f'{out.name}.corrected')
         more = ['-o', str(new), '--report']
         if decisions.exists():

@@ -130,7 +130,7 @@ def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
 
 
 def test_labels_are_written_with_all_decisions_without_a_terminal(server):
-    out = server.log_path.parent
+    out = server.log_paths[0].parent
     before = BoxTable.read(out / 'boxes.csv')
     stamps = [stamp for (stamp,) in boxes_of(before, '1', 'stamps_ns')]
     with opened_page(server.address + '#track=1') as page:
@@ -177,7 +177,7 @@ def test_labels_are_written_with_all_decisions_without_a_terminal(server):
 
 
 def test_labels_that_cannot_be_written_leave_all_as_it_was(server, made):
-    out = server.log_path.parent
+    out = server.log_paths[0].parent
     hidden = made / 'drive.hidden'
     (made / 'drive').rename(hidden)
     try:
@@ -192,7 +192,7 @@ def test_labels_that_cannot_be_written_leave_all_as_it_was(server, made):
     for word in ('not written', 'drive'):
         assert word in text
     assert not out.with_name('out.corrected').exists()
-    assert [one.kind for one in read_decisions(server.log_path)] == ['delete']
+    assert [one.kind for one in read_decisions(server.log_paths[0])] == ['delete']
 
 
 def test_views_are_moved_zoomed_and_show_neighbours(server):
@@ -284,11 +284,11 @@ def test_a_correction_shows_its_figures_is_typed_and_undone_in_steps(server):
         assert page.evaluate(shift) == pytest.approx([0, 0.3, 0], abs=0.03)
         page.keyboard.press('Escape')
         assert page.evaluate('view.edit') is None
-        assert not server.log_path.exists()
+        assert not server.log_paths[0].exists()
 
 
 def test_a_track_is_solved_again_with_its_pin_within_the_page(server):
-    out = server.log_path.parent
+    out = server.log_paths[0].parent
     with opened_page(server.address + '#track=1') as page:
         page.keyboard.press('o')
         page.wait_for_function("$('notice').textContent.includes('pinned boxes')", timeout=120_000)
@@ -344,7 +344,7 @@ def test_people_see_the_decisions_of_each_other(server):
         second.evaluate("judge('unsure', false)")
         first.wait_for_selector('[data-do=unsure][aria-pressed=true]')
         assert 'ben' in first.get_attribute('#comment', 'title')
-    made = read_decisions(server.log_path)
+    made = read_decisions(server.log_paths[0])
     assert [(one.who, one.kind) for one in made] == [('anna', 'reject'), ('ben', 'unsure')]
 
 

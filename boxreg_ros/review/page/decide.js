@@ -72,11 +72,18 @@ async function comment(isBox, text) {
 
 async function acceptAndGoOn() {
   if (isCorrecting()) return;
-  const open = view.shown.filter(track => !decidedOf(track) && track.index !== view.track);
+  const taken = new Set(await notePage(''));
+  const open = view.shown.filter(track => !decidedOf(track) && track.index !== view.track && !taken.has(track.id));
   if (judgementOf(current())?.decision !== 'accept' && !await judge('accept', false)) return;
   if (!open.length) return say('All tracks of the list are decided.');
   const place = open.find(track => view.shown.indexOf(track) > view.place) ?? open[0];
   openTrack(place.index);
+}
+
+// Note the track that this page has open; the ids of those that other pages have.
+const page = crypto.randomUUID?.() ?? String(Math.random());
+async function notePage(track) {
+  return post('open', { page, track }).catch(() => []);
 }
 
 // Delete the track, the box or the range; once more takes that back.

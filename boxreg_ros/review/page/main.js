@@ -30,6 +30,7 @@ async function openTrack(index, stamp = null, row = null, isLinked = false) {
       view.around = [];
     }
     $('time').max = part.stamps.length - 1;
+    if (IS_REVIEW) notePage(track.id);
     row ??= part.num_points.indexOf(Math.max(...part.num_points));  // the object is seen best there
     drawTitle(track);
     loadAround(track).then(found => {
@@ -185,6 +186,7 @@ async function main() {
     hasScene = found.has_scene;
     $('tab-drive').hidden = !hasScene;
     setUpScene();
+    $('all-drives').hidden = location.pathname === '/';
     setUpNumbers();
     $('decide').hidden = $('save-button').hidden = $('person').hidden = false;
     $('save-button').onclick = save;
