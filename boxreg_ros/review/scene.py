@@ -6,11 +6,12 @@ from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from tempfile import gettempdir
 from threading import Condition, Thread
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.follow import follow_points, FollowedTrack, solved
-from boxreg_ros.errors import BoxregError, RecordingError
+from boxreg_ros.errors import BoxregError, RecordingError, remedy_of
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
 from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.recording import Recording
@@ -204,6 +205,7 @@ class Scene:
 
     def _read(self) -> None:
         source = self._source
+        self._error = 'recording: expected sweeps to its end, got an error; see the terminal'
         try:
             with source.open() as recording:
                 items = FixedFrameItems(
@@ -214,8 +216,14 @@ class Scene:
                 for item in items.read():
                     if isinstance(item.moved, Sweep):
                         self._add(item.moved, item, items)
-        except (BoxregError, OSError) as error:
+            self._error = ''
+        except BoxregError as error:
             self._error = str(error)
+        except OSError as error:
+            self._error = (
+                f'{gettempdir()}: the sweeps cannot be kept there: {error.strerror}; '
+                f'{remedy_of(error)}, or set TMPDIR to another folder'
+            )
         finally:
             with self._changed:
                 self._is_done = True

@@ -39,7 +39,7 @@ WRONG, GHOSTS, BROKEN, SWAPPED, MISSING = 20, 5, 3, 2, 3
 RUN = 5
 """Wrong boxes that follow each other."""
 RIGHT = 0.5
-"""3D IoU with the true box from which on a box is right; chosen: below it, anyone sees the error."""
+"""3D IoU with the true box from which on a box is right; chosen: anyone sees a smaller one."""
 MIN_POINTS = 20
 """Objects with fewer points, by the median, get no errors and are not judged."""
 SECONDS = {'key': 0.28, 'click': 1.3, 'drag': 2.5}

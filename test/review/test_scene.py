@@ -183,6 +183,11 @@ def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, out, serve):
         assert len(points) > 0.5 * 120 * NUM_SWEEPS
         half = np.array(page.evaluate('view.frame.slice(3, 6)')) / 2
         assert np.median(np.abs(np.abs(points) - half)[:, :2].min(1)) < 0.1
+    narrow = {'viewport': {'width': 390, 'height': 844}, 'color_scheme': 'dark'}
+    with opened_page(serve(out).address, **narrow) as page:
+        open_scene(page, 2)
+        assert page.evaluate('document.documentElement.scrollWidth - innerWidth') <= 0
+        assert page.locator('#scene-view').bounding_box()['height'] > 300
     recording = out.with_name('drive')
     recording.rename(out.with_name('moved'))
     with opened_page(serve(out).address, expected='400') as page:

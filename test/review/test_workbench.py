@@ -11,6 +11,7 @@ from boxreg_ros import Config, refine, Track
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
+from boxreg_ros.offline.reviewed_drive import drive_of
 from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
 from browser import NEEDS_BROWSER, opened_page
@@ -45,7 +46,8 @@ def made(tmp_path_factory):
 @pytest.fixture
 def server(made, tmp_path):
     """Return a running server for a copy of the result."""
-    found = review_server(shutil.copytree(made / 'out', tmp_path / 'out'), 0, 'anna')
+    out = shutil.copytree(made / 'out', tmp_path / 'out')
+    found = review_server(out, 0, 'anna', drive_of(out))
     Thread(target=found.serve_forever, daemon=True).start()
     yield found
     found.shutdown()
@@ -368,7 +370,7 @@ def test_one_key_accepts_and_opens_the_next_open_track(server):
 def test_axe_finds_nothing(server):
     axe = pytest.importorskip('axe_playwright_python.sync_playwright').Axe()
     with opened_page(server.address) as page:
-        for tab in ('overview', 'tracks', 'run'):
+        for tab in ('overview', 'tracks', 'drive', 'run'):
             page.click(f'#tab-{tab}')
             page.wait_for_timeout(500)
             found = axe.run(page)
