@@ -17,7 +17,7 @@ from boxreg_ros.errors import BoxregError, RecordingError
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, WITH_BOX
 from boxreg_ros.review.drives import drives_application
 from boxreg_ros.review.report import PAGE_VERSION, REPORT
-from boxreg_ros.review.requests import box_of, json_of, stamp_of, text_of
+from boxreg_ros.review.requests import box_of, json_of, STAMP, stamp_of, text_of
 from boxreg_ros.review.scene import DriveSource
 from boxreg_ros.review.scene_routes import SceneRoutes
 from boxreg_ros.review.solve import ReportParts
