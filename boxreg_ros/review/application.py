@@ -16,6 +16,7 @@ import anyio
 from boxreg_ros.errors import BoxregError, RecordingError
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, WITH_BOX
 from boxreg_ros.review.drives import drives_application
+from boxreg_ros.review.proposals import proposals_of
 from boxreg_ros.review.report import PAGE_VERSION, REPORT
 from boxreg_ros.review.requests import box_of, json_of, STAMP, stamp_of, text_of
 from boxreg_ros.review.scene import DriveSource
@@ -150,6 +151,7 @@ class _Review:
         self.listeners = 0
         self._open: dict[str, tuple[str, float]] = {}  # tracks by page, and since when
         self._who = who
+        self._proposals = proposals_of(out)
         self._log = DecisionLog(out / DECISIONS)
         self._log_lock = Lock()
         self._save_lock = asyncio.Lock()
@@ -185,7 +187,8 @@ class _Review:
     async def decisions(self, _: Request) -> Response:
         """Return all decisions."""
         await run_in_threadpool(self._refresh)
-        more = {'who': self._who, 'has_scene': self._source is not None}
+        has_scene = self._source is not None
+        more = {'who': self._who, 'has_scene': has_scene, 'proposals': self._proposals}
         return JSONResponse({**self._since(0), **more})
 
     async def decide(self, request: Request) -> Response:

@@ -12,6 +12,7 @@ from boxreg_ros.offline.reviewed_drive import drive_of
 from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.review.fit import fitted
 from boxreg_ros.review.server import review_server
+from boxreg_ros.structures import BoxArray
 from browser import NEEDS_BROWSER, opened_page
 import numpy as np
 import pytest
@@ -183,6 +184,20 @@ def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, out, serve):
         assert len(points) > 0.5 * 120 * NUM_SWEEPS
         half = np.array(page.evaluate('view.frame.slice(3, 6)')) / 2
         assert np.median(np.abs(np.abs(points) - half)[:, :2].min(1)) < 0.1
+    # The run proposes the car that has no box: two keys add it.
+    stamp = drive.stamps[6]
+    columns = ('2',), ('van',), np.ones(1), drive.truth[stamp][1][None]
+    BoxTable.from_arrays([BoxArray(stamp, 'odom', *columns)]).write(out / 'proposals.csv')
+    with opened_page(serve(out).address) as page:
+        open_scene(page, 0)
+        assert page.inner_text('#scene-proposals option') == '1 proposed'
+        page.locator('#scene-view').focus()
+        page.keyboard.press('p')
+        page.wait_for_function('scene.fit')
+        page.keyboard.press('Enter')
+        page.wait_for_function("!$('tracks').hidden && current()?.class === 'van'", timeout=60_000)
+        assert page.evaluate('[view.row, openProposals().length]') == [6, 0]
+    (out / DECISIONS).unlink()
     narrow = {'viewport': {'width': 390, 'height': 844}, 'color_scheme': 'dark'}
     with opened_page(serve(out).address, **narrow) as page:
         open_scene(page, 2)

@@ -42,6 +42,7 @@ const SCENE_KEYS = {
   '-': ['', '', () => zoomScene(1 / ZOOM_STEP)],
   0: ['', '', () => { scene.offset = [0, 0]; scene.zoom = $('scene-view').clientWidth / SHOWN; drawScene(); }],
   i: ['i', 'add an object: click its points, then Enter follows it both ways', () => startAdding()],
+  p: ['p', 'the next object that the run proposes; Enter follows it', () => nextProposal()],
   Enter: ['', '', () => keepFit()],
   Escape: ['', '', () => startAdding(false)],
   z: ['', '', () => undo()],

@@ -184,6 +184,7 @@ async function main() {
     receive(found);
     setUpPerson(found.who);
     hasScene = found.has_scene;
+    scene.proposals = found.proposals;
     $('tab-drive').hidden = !hasScene;
     setUpScene();
     $('all-drives').hidden = location.pathname === '/';

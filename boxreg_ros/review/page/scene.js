@@ -5,7 +5,7 @@ const LABELLED = 5;                // ids are written at this zoom and above [px
 const ROAD = 0.4;                  // above the road: points of objects [m]
 const SHOWN = 90;                  // of the drive around the sensor [m]
 /** @type {{ [name: string]: any, sweep: Sweep, boxes: SceneBox[], fit: Fit, slim: Map<number, SlimPart> }} */
-const scene = { at: 0, zoom: 0, offset: [0, 0], sweep: null, boxes: [], isAdding: false, fit: null, playing: 0, slim: new Map() };
+const scene = { at: 0, zoom: 0, offset: [0, 0], sweep: null, boxes: [], isAdding: false, fit: null, proposals: [], proposal: -1, playing: 0, slim: new Map() };
 /** @type {Record<string, [string, number, number]>} */
 const LOOKS = { road: ['around', 0.45, 1], object: ['points', 0.9, 1.6] };  // colour, opacity, size [px]
 const sceneStamp = () => DATA.stamps[scene.at];
@@ -141,6 +141,7 @@ function drawSceneTools() {
   $('scene-add').setAttribute('aria-pressed', String(scene.isAdding));
   $('scene-view').style.cursor = scene.isAdding ? 'crosshair' : 'grab';
   $('scene-fit').hidden = !scene.fit;
+  drawProposals();
   $('scene-hint').textContent = scene.fit ? `${number(scene.fit.points, 0)} points, ${scene.fit.box.slice(3, 6).map(v => number(v, 1)).join(' × ')} m. Enter follows it both ways.`
     : scene.isAdding ? 'Click the points of the object.' : 'Click a box to open its track.';
 }
@@ -176,10 +177,41 @@ async function fitAt(place, name = '') {
     return fail(error.message);
   }
   if (stamp !== sceneStamp()) return;
+  offerFit({ ...found, stamp: scene.sweep.stamp, place });
+}
+
+// Proposals of the run that nobody has added yet.
+function openProposals() {
+  const taken = new Set([...log.held.values()].filter(row => row.decision === 'add').map(row => row.box.slice(0, 2).map(v => v.toFixed(2)).join()));
+  return scene.proposals.filter(({ box }) => !taken.has(box.slice(0, 2).map(v => v.toFixed(2)).join()));
+}
+
+function drawProposals() {
+  const open = openProposals(), choice = $('scene-proposals');
+  choice.hidden = !open.length;
+  fill(choice, element('option', { value: '' }, `${open.length} proposed`), ...open.map((one, k) =>
+    element('option', { value: k, selected: k === scene.proposal }, `${one.class} at ${number(secondsOf(one.stamp), 1)} s, ${one.points} points`)));
+}
+
+// Show a proposal as an object that is about to be added.
+async function showProposal(index) {
+  const one = openProposals()[index];
+  if (!one) return;
+  scene.proposal = index;
+  const away = DATA.stamps.map(stamp => Math.abs(secondsOf(stamp) - secondsOf(one.stamp)));
+  await showScene(away.indexOf(Math.min(...away)), true);
+  scene.offset = [0, 1].map(k => one.box[k] - scene.sweep.sensor[k]);
+  offerFit({ ...one, stamp: scene.sweep.stamp, place: one.box.slice(0, 2) });
+}
+
+const nextProposal = () => showProposal((scene.proposal + 1) % Math.max(1, openProposals().length));
+
+// Offer a box of an object: its class can be chosen, Enter keeps it.
+function offerFit(fit) {
   $('failure').hidden = true;
-  scene.fit = { ...found, stamp: scene.sweep.stamp, place };
-  const names = [...new Set([...sizes.keys(), found.class, 'car', 'truck', 'bus', 'cyclist', 'pedestrian'])].sort();
-  fill($('scene-class'), ...names.map(one => element('option', { value: one, selected: one === found.class }, one)));
+  scene.fit = fit;
+  const names = [...new Set([...TRACKS.map(track => track.class), fit.class, 'car', 'truck', 'bus', 'cyclist', 'pedestrian'])].sort();
+  fill($('scene-class'), ...names.map(one => element('option', { value: one, selected: one === fit.class }, one)));
   drawScene();
   drawCameras();
 }
@@ -189,6 +221,7 @@ async function keepFit() {
   if (!fit) return;
   scene.fit = null;
   scene.isAdding = false;
+  scene.proposal = -1;
   drawSceneTools();
   await addObject(fit.stamp, fit.box, $('scene-class').value);
 }
@@ -255,6 +288,7 @@ function setUpScene() {
   $('camera-choice').onchange = drawCamera;
   $('scene-time').oninput = () => showScene(Number($('scene-time').value));
   $('scene-play').onclick = playScene;
+  $('scene-proposals').onchange = event => showProposal(Number(event.target.value));
   $('scene-add').onclick = () => startAdding();
   $('scene-follow').onclick = keepFit;
   $('scene-cancel').onclick = () => startAdding(false);
