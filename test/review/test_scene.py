@@ -1,5 +1,6 @@
 """The scene of `boxreg review`: whole clouds, and objects that a person adds."""
 
+from dataclasses import replace
 import math
 from threading import Thread
 
@@ -9,7 +10,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.reviewed_drive import drive_of
-from boxreg_ros.review.decisions import DECISIONS, read_decisions
+from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.fit import fitted
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray
@@ -212,6 +213,43 @@ def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, out, serve):
         page.click('#tab-tracks')
         page.keyboard.press('a')
         page.wait_for_function('log.count === 1')
+
+
+def test_a_run_follows_added_objects_beside_its_other_steps(drive, tmp_path, capsys):
+    recording = drive.write(tmp_path / 'drive')
+    stamp, box = drive.stamps[4], drive.truth[drive.stamps[4]][1]
+    added = Decision('new', stamp, 'add', frame_id='odom', box=box, value='car', who='anna')
+    late = Decision('late', stamp + 10**12, 'add', frame_id='odom', box=box, value='car')
+    gone = Decision('new', drive.stamps[9], 'delete', end_ns=drive.stamps[11])
+    joined = Decision('new', drive.stamps[12], 'rename', end_ns=drive.stamps[13], value='end')
+    path = tmp_path / DECISIONS
+    DecisionLog(path).append([added, late, gone, joined])
+    command = ['relabel', str(recording), *QUICK, '--decisions', str(path), '-o']
+    for name, more in (('plain', []), ('complete', ['--complete'])):
+        out = tmp_path / name
+        assert main([*command, str(out), *more]) == 0
+        assert "'late' at " in capsys.readouterr().err  # said, and not used
+        table = BoxTable.read(out / 'boxes.csv')
+        found = {
+            own: [
+                int(s) for s, n in zip(table.stamps_ns, table.track_ids, strict=True) if n == own
+            ]
+            for own in ('1', 'new', 'end')
+        }
+        assert found == {
+            '1': drive.stamps, 'new': drive.stamps[:9], 'end': drive.stamps[12:],
+        }  # fmt: skip
+        row = next(
+            k for k, (s, n) in enumerate(zip(table.stamps_ns, table.track_ids, strict=True))
+            if (s, n) == (stamp, 'new')
+        )  # fmt: skip
+        assert table.status[row] == 'human'
+        np.testing.assert_allclose(table.boxes[row], box, atol=1e-6)
+        assert np.median(ious_with_truth(table, drive, 'new')) > 0.8
+    other = tmp_path / 'other.csv'
+    DecisionLog(other).append([replace(added, frame_id='map')])
+    assert main([*command[:-3], '--decisions', str(other), '-o', str(tmp_path / 'other')]) == 1
+    assert "expected frame 'odom', got 'map'" in capsys.readouterr().err
 
 
 def test_a_box_is_fitted_to_the_points_at_a_place():
