@@ -87,6 +87,11 @@ def add_car(page, drive):
     page.wait_for_function("!$('tracks').hidden && current()?.id === '2'", timeout=60_000)
 
 
+def stamps_of(table, track_id):
+    rows = zip(table.stamps_ns, table.track_ids, strict=True)
+    return [int(stamp) for stamp, name in rows if name == track_id]
+
+
 def ious_with_truth(table, drive, track_id):
     truth, boxes = [], []
     for name, stamp, box in zip(table.track_ids, table.stamps_ns, table.boxes, strict=True):
@@ -139,7 +144,7 @@ def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serv
     again = out.with_name('out.corrected')
     table = BoxTable.read(again / 'boxes.csv')
     rows = [row for row, name in enumerate(table.track_ids) if name == '2']
-    stamps = [int(table.stamps_ns[row]) for row in rows]
+    stamps = stamps_of(table, '2')
     assert stamps == [stamp for stamp in drive.stamps if stamp != drive.stamps[5]]
     kinds = [table.status[row] for row in rows]
     assert [stamps[k] for k, kind in enumerate(kinds) if kind == 'human'] == [
@@ -230,19 +235,10 @@ def test_a_run_follows_added_objects_beside_its_other_steps(drive, tmp_path, cap
         assert main([*command, str(out), *more]) == 0
         assert "'late' at " in capsys.readouterr().err  # said, and not used
         table = BoxTable.read(out / 'boxes.csv')
-        found = {
-            own: [
-                int(s) for s, n in zip(table.stamps_ns, table.track_ids, strict=True) if n == own
-            ]
-            for own in ('1', 'new', 'end')
-        }
-        assert found == {
-            '1': drive.stamps, 'new': drive.stamps[:9], 'end': drive.stamps[12:],
-        }  # fmt: skip
-        row = next(
-            k for k, (s, n) in enumerate(zip(table.stamps_ns, table.track_ids, strict=True))
-            if (s, n) == (stamp, 'new')
-        )  # fmt: skip
+        assert stamps_of(table, '1') == drive.stamps
+        assert stamps_of(table, 'new') == drive.stamps[:9]
+        assert stamps_of(table, 'end') == drive.stamps[12:]
+        (row,) = np.flatnonzero((table.stamps_ns == stamp) & (np.array(table.track_ids) == 'new'))
         assert table.status[row] == 'human'
         np.testing.assert_allclose(table.boxes[row], box, atol=1e-6)
         assert np.median(ious_with_truth(table, drive, 'new')) > 0.8
