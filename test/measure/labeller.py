@@ -504,7 +504,8 @@ class Labeller:
         """Return what a person sees of the open track: its objects, and how well boxes fit."""
         stamps, boxes = self._page.evaluate(
             """isSolved => [view.part.stamps, view.part.usable.map((box, k) => {
-              const pin = pinOf(k), solved = isSolved && view.solved?.get(view.part.stamps[k]);
+              const pin = pinOf(k);
+              const solved = isSolved ? view.solved?.get(view.part.stamps[k]) : null;
               return pin?.box ?? solved ?? moved(box, view.part.origin, 1);
             })]""",
             with_solved,
