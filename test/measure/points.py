@@ -42,6 +42,8 @@ MIN_POINTS = {'vehicle': 100, 'cyclist': 30, 'pedestrian': 30}
 """Least returns of an object whose instance counts among the well seen ones."""
 MOVING_SPEED = 0.3
 """Least speed of a moving object [m/s]."""
+TRUTH_SECONDS = 1.0
+"""True boxes of so long state the speed [s]: those of parked vehicles wander by centimetres."""
 NOISE = 0.08
 """Points so far outside of a true box are on its object [m]: four deviations of the range."""
 
@@ -96,7 +98,11 @@ class Truth(NamedTuple):
                 near = np.flatnonzero(np.abs(points[:, :2] - box[:2]).max(1) < box[LENGTH])
                 local = (points[near] - box[:3]) @ matrix_from_rpy(box[ROLL:])
                 owner[near[(np.abs(local) <= box[LENGTH:ROLL] / 2 + NOISE).all(1)]] = i
-                ends = [max(row - 1, 0), min(row + 1, len(track.boxes) - 1)]
+                half_ns = round(TRUTH_SECONDS / 2 * 1e9)
+                ends = [
+                    np.searchsorted(track.stamps_ns, sweep.stamp_ns - half_ns),
+                    np.searchsorted(track.stamps_ns, sweep.stamp_ns + half_ns, 'right') - 1,
+                ]
                 way = np.linalg.norm(np.diff(track.boxes[ends, :2], axis=0))
                 seconds = np.ptp(track.stamps_ns[ends]) * 1e-9
                 is_moving[i] = way > MOVING_SPEED * seconds
