@@ -31,9 +31,7 @@ def parameters() -> str:
         default = item.default
         if isinstance(default, tuple):
             default = ', '.join(default)
-        bounds = ', '.join(item.choices)
-        if item.low is not None:
-            bounds = f'{item.low:g} to {item.high:g}'
+        bounds = item._replace(unit='').bounds
         rows.append((item.name, str(default), item.unit, bounds, item.meaning))
     return table(('name', 'default', 'unit', 'range', 'meaning'), rows)
 

@@ -36,6 +36,7 @@ from boxreg_ros.structures import BoxArray, RefinedBoxes
 import yaml
 
 if TYPE_CHECKING:
+    from boxreg_ros.core.latency import Latency
     from boxreg_ros.core.registrar import BoxRegistrar, Submit
     from boxreg_ros.offline.completion import Completion, Moved
     from boxreg_ros.offline.resume import EstimateJournal
@@ -82,7 +83,9 @@ def relabel(
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         corrections = _corrections(request)
         survey = _survey(request, clock, shown, journal, corrections)
-        receive = workers.enter_context(reader(request))
+        receive = workers.enter_context(
+            reader(request, None if survey is None else survey.latency)
+        )
         # The recording is opened while this process imports numba, which takes half a second.
         from boxreg_ros.core.registrar import BoxRegistrar
         from boxreg_ros.offline.registration_worker import registration_worker
@@ -167,6 +170,7 @@ class _Survey(NamedTuple):
     completion: Completion
     parts: list[Arrivals]
     ends: list[dict[str, Any]]
+    latency: Latency
 
 
 def _corrections(request: Request) -> Corrections:
@@ -201,7 +205,8 @@ def _survey(
             with clock('follow'):
                 plan, parts, tracks = keyframes(items, fixed_frame, request.config)
             completion = Completion(plan, request.config, has_keyframes=True)
-            return _Survey(plan, completion, parts, ends_of(tracks))
+            latency = recording.source.latency
+            return _Survey(plan, completion, parts, ends_of(tracks), latency)
         from boxreg_ros.offline.registration_worker import registration_worker
 
         submit = workers.enter_context(
@@ -209,7 +214,8 @@ def _survey(
         )
         first = first_pass(items, request.config, _journaled(submit, journal), fixed_frame)
         plan = first.plan(fixed_frame, request.config)
-        return _Survey(plan, Completion(plan, request.config), first.parts, [])
+        completion = Completion(plan, request.config)
+        return _Survey(plan, completion, first.parts, [], recording.source.latency)
 
 
 def _corrected(item: Moved, corrections: Corrections) -> Moved:

@@ -9,7 +9,7 @@ from boxreg_ros.live.params import (
     NODE_SETTINGS,
     parameters_yaml,
     READ_ONLY,
-    reals_from_integers,
+    numbers_as_declared,
 )
 import pytest
 import rclpy
@@ -184,7 +184,7 @@ def test_relabel_ignores_parameters_of_the_node_only(tmp_path):
 def test_integers_are_accepted_for_reals_at_run_time(make_node):
     node = make_node()
     declare(node)
-    node.add_pre_set_parameters_callback(lambda given: reals_from_integers(node, given))
+    node.add_pre_set_parameters_callback(lambda given: numbers_as_declared(node, given))
     result = node.set_parameters_atomically([Parameter('sampling.margin', value=1)])
     assert result.successful, result.reason
     assert node.get_parameter('sampling.margin').value == 1.0
