@@ -600,8 +600,7 @@ def _cast(name: str, value: Any, default: Any) -> Any:
             return tuple(value)
     elif type(value) is type(default):
         return value
-    elif isinstance(default, str) and isinstance(value, int | float) and not isinstance(value, bool):
-        return str(value)  # a number in place of a word; `check` knows which settings take one
+    elif isinstance(default, str) and type(value) in (int, float):
+        return str(value)  # in place of a word; `check` knows which settings take a number
     kind = 'a list such as [car, van]' if isinstance(default, tuple) else type(default).__name__
     raise ConfigError(f'{name}: expected {kind}, got {value!r}')
-

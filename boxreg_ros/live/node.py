@@ -19,7 +19,7 @@ from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
-from boxreg_ros.live.params import changed, declare, parameters_yaml, numbers_as_declared
+from boxreg_ros.live.params import changed, declare, numbers_as_declared, parameters_yaml
 from boxreg_ros.live.recorder_process import check_recording
 from boxreg_ros.live.recording import LabelRecording
 from boxreg_ros.live.topics import import_message, NodeTopics

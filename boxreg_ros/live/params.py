@@ -316,7 +316,11 @@ def _schema_of(item: Setting) -> dict[str, Any]:
         schema |= {'minimum': item.low, 'maximum': item.high}
     if item.choices and item.low is not None:  # a number, or a text with one
         schema['type'] = ['string', 'number']
-        schema['anyOf'] = [{'enum': schema.pop('enum')}, {'type': 'number'}, {'pattern': '^[-0-9]'}]
+        schema['anyOf'] = [
+            {'enum': schema.pop('enum')},
+            {'type': 'number'},
+            {'pattern': '^[-0-9]'},
+        ]
     return schema
 
 

@@ -197,9 +197,7 @@ class RecordingReader:
             'odometry': recording.odometry_topic,
         }
         seconds = (recording.end_ns - recording.start_ns) * 1e-9
-        self.source = Source(
-            topics, self._items.fixed_frame, sensor_frame, seconds, latency
-        )
+        self.source = Source(topics, self._items.fixed_frame, sensor_frame, seconds, latency)
 
     def __iter__(self) -> Iterator[ReadItem]:
         """

@@ -7,9 +7,9 @@ from boxreg_ros.live.params import (
     declare,
     DYNAMIC,
     NODE_SETTINGS,
+    numbers_as_declared,
     parameters_yaml,
     READ_ONLY,
-    numbers_as_declared,
 )
 import pytest
 import rclpy
