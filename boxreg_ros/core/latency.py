@@ -50,8 +50,8 @@ SIGNIFICANCE = 3.0
 """Deviations by which a latency, or a drift of it, is more than an error of the estimate."""
 PREFERENCE = 1.2
 """
-Deviations by which boxes fit the points better at the stamp, or where they were seen, to be of that
-time; otherwise the smaller latency is taken. Measured: 1.5 and more on a simulated highway of known
+Deviations by which boxes fit better at the stamp, or where points were seen, to be of that time;
+otherwise the smaller latency is taken. Measured: 1.5 and more on a simulated highway of known
 time, 0.8 and less where human labels are of neither.
 """
 SMOOTHING = 0.35

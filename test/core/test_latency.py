@@ -50,6 +50,20 @@ def test_one_latency_is_found_and_none_where_there_is_none(sample_drive):
         assert bool(found.warning) == (seconds > NOTABLE)
 
 
+def test_a_stream_is_corrected_from_its_first_seconds_on(sample_drive):
+    items = [*sample_drive.sweeps, *late(sample_drive.boxes, 0.3)]
+    known = LateBoxes()
+    shown = []
+    for item in sorted(items, key=lambda item: item.stamp_ns):
+        if isinstance(item, BoxArray):
+            known.add_boxes(item)
+            shown.append(known.kept_up().seconds)
+        else:
+            known.add_sweep(item)
+    assert shown[0] == 0
+    np.testing.assert_allclose(shown[len(shown) // 2 :], 0.3, atol=0.05)
+
+
 @pytest.mark.parametrize('at_sight', [False, True], ids=['stamp', 'sight'])
 def test_boxes_of_either_time_of_a_sweep_are_not_late(at_sight):
     scene = Drive.from_scene(highway(np.random.default_rng(0), 16, at_sight, 30.0))
