@@ -260,6 +260,20 @@ class Reason(StrEnum):
         'a track has no box in a message, and with `coast` none was added: too few points in the '
         'predicted box, or another box has its place',
     )
+    NOT_FOLLOWED = (
+        'not_followed',
+        'box on ~/follow',
+        'its object is not followed: it has no id or no points, no transform is known, or none of '
+        'the clouds of the last 2 s has its stamp; the log says which',
+        'correct the box, its frame or its stamp',
+    )
+    LOST = (
+        'lost',
+        'followed object',
+        'its points do not fit any more; `lost ID` in `/diagnostics` says since when, where and '
+        'why',
+        'publish another box of it on `~/follow`',
+    )
     SWEEP_WITHOUT_BOXES = ('sweep_without_boxes', 'cloud', 'no boxes arrived for it, or too late')
     NO_POINTS = (
         'no_points',

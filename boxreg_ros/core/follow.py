@@ -8,15 +8,14 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.following.between import between
+from boxreg_ros.core.following.sweeps import ascending, nearest, Points, Sweeps
 from boxreg_ros.core.following.tracker import (
     ARRIVED,
     END_OF_SWEEPS,
     Follower,
     Owned,
-    Points,
     POSE4,
     Seeds,
-    Sweeps,
     Way,
 )
 from boxreg_ros.core.observation import GOOD_POINTS, NEARBY
@@ -139,12 +138,6 @@ def follow(
     return _solved(tracks, ordered, config, sensor_origins)
 
 
-def ascending(points: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return finite points (M, 3), ascending by x."""
-    points = points[np.isfinite(points).all(1)]
-    return np.ascontiguousarray(points[np.argsort(points[:, 0], kind='stable')])
-
-
 def follow_points(
     stamps_ns: Ints,
     points: Points,
@@ -153,7 +146,7 @@ def follow_points(
 ) -> list[FollowedTrack]:
     """Follow as `follow` does, without the solve; `points` are those of `ascending`."""
     times = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
-    sweeps = Sweeps(times, points)
+    sweeps = Sweeps(times, points, len(times))
     objects = [_placed(name, rows, stamps_ns) for name, rows in _by_track(seeds).items()]
     objects = _overlapping(objects)
     owned = Owned()
@@ -203,7 +196,7 @@ def _placed(track_id: str, given: Sequence[_Seed], stamps_ns: Ints) -> _Object:
     boxes: dict[int, Floats] = {}
     problems = []
     for seed in given:
-        row, away, period = _nearest(stamps_ns, seed.stamp_ns)
+        row, away, period = nearest(stamps_ns, seed.stamp_ns)
         name = f'seed of track {track_id!r} at {seed.stamp_ns}'
         if not is_valid_box(seed.box):
             problems.append(f'{name}: expected finite numbers and positive extents')
@@ -218,16 +211,6 @@ def _placed(track_id: str, given: Sequence[_Seed], stamps_ns: Ints) -> _Object:
     rows = np.array(list(boxes), np.int64)
     seeds = Seeds(rows, np.array(list(boxes.values())).reshape(-1, 9))
     return _Object(track_id, given[0].class_name, seeds, tuple(problems))
-
-
-def _nearest(stamps_ns: Ints, stamp_ns: int) -> tuple[int, int, float]:
-    """Return the row of the nearest stamp, its distance, and the period there [ns]."""
-    if not len(stamps_ns):
-        return 0, 1, 0.0
-    away = np.abs(stamps_ns - stamp_ns)
-    row = int(away.argmin())
-    steps = np.diff(stamps_ns[max(0, row - 1) : row + 2])
-    return row, int(away[row]), float(steps.max(initial=0)) or 1e8
 
 
 def _followed(

@@ -49,11 +49,12 @@ is 50 m/s^2.
 
 
 class BoxToObserve(NamedTuple):
-    """A box that is to be observed: in a row of its array, or predicted."""
+    """A box that is to be observed: in a row of its array, predicted, or followed."""
 
     track: ObservedTrack
     box: Floats
     row: int = -1
+    is_followed: bool = False
 
 
 class PendingArray:
@@ -76,6 +77,8 @@ class PendingArray:
         Boxes whose estimate may still change; the array is settled at 0 or less.
     is_observed : bool
         True where a sweep was found and the array is in order.
+    followed : list of int
+        Rows of added boxes that are returned whether or not they are refined.
 
     """
 
@@ -88,6 +91,7 @@ class PendingArray:
         self.num_given = n
         self.num_unsettled = 0
         self.is_observed = False
+        self.followed: list[int] = []
 
     def set_reasons(self, reason: str) -> None:
         """Set the reason of each box that cannot be refined; `reason`, if any, holds for all."""
@@ -136,13 +140,16 @@ class PendingArray:
         self.reasons.append('')
         self.num_points = np.append(self.num_points, 0)
         self.estimates.append(None)
-        return len(self.estimates) - 1
+        row = len(self.estimates) - 1
+        if item.is_followed:
+            self.followed.append(row)
+        return row
 
     def result(self, is_final: bool) -> RefinedBoxes:
         """
         Return the present estimates as copies; without an estimate, the input box.
 
-        Of the predicted boxes, those that are refined.
+        Of the predicted boxes, those that are refined, and those of followed objects.
 
         """
         n = len(self.estimates)
@@ -162,6 +169,7 @@ class PendingArray:
                 values[estimated[places]] = estimates[rows]
         is_returned = columns.status == REFINED
         is_returned[: self.num_given] = True
+        is_returned[self.followed] = True
         columns.status[self.num_given :] = COASTED
         whole = RefinedBoxes(
             replace(self.input, boxes=columns.boxes),

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
+from boxreg_ros.core.following.stream import FollowedObjects
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.observation import Observation, Observations, observe
@@ -18,7 +19,7 @@ from boxreg_ros.core.pending import BoxToObserve, ObservedTrack, PendingArray, P
 from boxreg_ros.core.problem import SETTINGS_OF
 from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import column, joined
-from boxreg_ros.core.track_window import Estimate, Window
+from boxreg_ros.core.track_window import Estimate, PRIOR_POSES, Window
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, RefinedBoxes, Sweep, X, Z
 import numpy as np
@@ -76,6 +77,8 @@ class BoxRegistrar:
         Sweeps and boxes added, boxes by status, and everything dropped or kept, by reason.
     box_time : BoxTimeEvidence
         Evidence of the time that the input boxes are of.
+    followed : FollowedObjects
+        Objects that are followed from one box each, see `follow`.
 
     Notes
     -----
@@ -102,8 +105,12 @@ class BoxRegistrar:
     the points confirm it. Such a box is in the results while it is refined, with the status
     ``coasted`` and the score 0.
 
-    With a **budget**, the tracks that have waited longest are solved first, then those whose
-    newest estimate is least certain, then the nearest. The boxes of the others are kept for now,
+    An object that is **followed** has such a box wherever a box array has none of its id and its
+    points support it, refined or not.
+
+    With a **budget**, waiting tracks that have no box here are solved first, since their boxes
+    become final before they end; then those that have waited longest, then those whose newest
+    estimate is least certain, then the nearest. The boxes of the others are kept for now,
     with the reason ``budget``; their observations join the next window that is solved. After the
     early boxes are published, `catch_up` solves tracks that wait, for their final boxes.
 
@@ -124,6 +131,7 @@ class BoxRegistrar:
         self._matcher = StampMatcher(config, self.counts)
         self._input_model = InputModel(config.faces)
         self.box_time = BoxTimeEvidence()
+        self.followed = FollowedObjects(config)
         self._pending = deque[PendingArray]()
         self._newest_ns = -inf
         self._tracks: dict[str, ObservedTrack] = {}
@@ -144,12 +152,17 @@ class BoxRegistrar:
     def add_sweep(self, sweep: Sweep) -> list[RefinedBoxes]:
         """Add a sweep; return the box arrays that are completed by it."""
         self.counts['sweeps'] += not sweep.is_dropped
+        self.followed.add_sweep(sweep)
         return list(self._process(self._matcher.add_sweep(sweep)))
 
     def add_boxes(self, boxes: BoxArray) -> list[RefinedBoxes]:
         """Add a box array; return the box arrays that are completed by it."""
         self.counts['boxes'] += len(boxes.track_ids)
         return list(self._process(self._matcher.add_boxes(boxes)))
+
+    def follow(self, boxes: BoxArray) -> None:
+        """Follow the object of each box, with `estimate` 'early' or 'final', see the notes."""
+        self.followed.add(boxes)
 
     def flush(self) -> list[RefinedBoxes]:
         """Return all box arrays held. Tracks end with `estimate` 'track', else they go on."""
@@ -196,8 +209,7 @@ class BoxRegistrar:
             if self.config.estimate == 'track':
                 self._solve_full_windows()
             else:
-                observed = [track for track in self._tracks.values() if track.is_in(array)]
-                self._solve(self._within_budget(observed))
+                self._solve(self._within_budget(array))
                 yield array.result(is_final=False)
                 self._settle_after_lag()
             yield from self._pop_settled()
@@ -232,7 +244,7 @@ class BoxRegistrar:
                 if track_id not in self._tracks:
                     self._tracks[track_id] = ObservedTrack(track_id, boxes.class_names[row])
                 given.append(BoxToObserve(self._tracks[track_id], boxes.boxes[row], row))
-        coasting = self._coasting(array)
+        coasting = [*self._followed(array, sweep), *self._coasting(array)]
         if not (given or coasting):
             return
         seen, velocities = self._seen([*given, *coasting], boxes, sweep)
@@ -257,12 +269,32 @@ class BoxRegistrar:
             entry.is_predicted = True
             item.track.entries.append(entry)
 
+    def _followed(self, array: PendingArray, sweep: Sweep) -> list[BoxToObserve]:
+        """Return the boxes of followed objects that have none in `array`."""
+        if not array.is_observed:
+            return []
+        boxes = array.input
+        others = boxes.boxes[is_valid_box(boxes.boxes)]
+        found = []
+        for one in self.followed.boxes_at(boxes.stamp_ns, sweep.stamp_ns, others):
+            if one.track_id in boxes.track_ids:
+                continue
+            if is_owned(one.box, others):
+                self.counts[Reason.COAST_UNCONFIRMED] += 1
+                continue
+            others = np.vstack([others, one.box])
+            track = self._tracks.setdefault(
+                one.track_id, ObservedTrack(one.track_id, one.class_name)
+            )
+            found.append(BoxToObserve(track, one.box, is_followed=True))
+        return found
+
     def _coasting(self, array: PendingArray) -> list[BoxToObserve]:
         """Return the predicted boxes of the tracks that have no box in `array`."""
         if not (self.config.coasts and array.is_observed):
             return []
         boxes = array.input
-        present = set(boxes.track_ids)
+        present = {*boxes.track_ids, *self.followed.track_ids}
         others = boxes.boxes[is_valid_box(boxes.boxes)]
         found = []
         for track in self._tracks.values():
@@ -329,23 +361,31 @@ class BoxRegistrar:
             tracks = self._tracks.values()
             self._solve([track for track in tracks if len(track.entries) > full // 2])
 
-    def _within_budget(self, tracks: list[ObservedTrack]) -> list[ObservedTrack]:
+    def _within_budget(self, array: PendingArray) -> list[ObservedTrack]:
         """Return the tracks to solve now; the others are carried to the next box array."""
+        tracks = [track for track in self._tracks.values() if track.is_in(array)]
         if self._budget is None:
             return tracks
         ready = [t for t in tracks if len(t.entries) >= self.config.min_observations]
+        # Nothing is gained by a longer wait of those that have no box here.
+        silent = [t for t in self._tracks.values() if t.num_carried and not t.is_in(array)]
         # An ended track that waits has its last chance; the others have an estimate.
         self._ended_tracks.sort(key=lambda track: -track.num_carried)
         num_ended = sum(track.num_carried > 0 for track in self._ended_tracks)
-        limit = self._budget(num_ended + ceil(len(ready) / (self._lag + 1)))
+        # A track that has waited keeps two observations of its prior beside the new ones.
+        longest_wait = min(self._lag + 1, self.config.window - PRIOR_POSES)
+        num_last = num_ended + len(silent)
+        limit = self._budget(num_last + ceil(len(ready) / longest_wait))
         self._settle_ended_tracks_beyond(max(limit - len(ready), min(limit, num_ended)))
-        if len(ready) + len(self._ended_tracks) <= limit:
-            return tracks
-        limit -= len(self._ended_tracks)
+        limit = max(0, limit - len(self._ended_tracks))
+        silent = silent[:limit]
+        limit -= len(silent)
+        if len(ready) <= limit:
+            return silent + tracks
         ready = _by_urgency(ready)
         for track in ready[limit:]:
             track.carry(self._num_overlapping)
-        return ready[:limit]
+        return silent + ready[:limit]
 
     def _settle_ended_tracks_beyond(self, limit: int) -> None:
         """Settle ended tracks but the first ones: none can wait."""
@@ -440,7 +480,7 @@ def _confirmed(coasting: list[BoxToObserve], seen: list[Observation]) -> list[Bo
     return [
         item
         for item, count in zip(coasting, inside.tolist(), strict=True)
-        if count >= item.track.least_points
+        if item.is_followed or count >= item.track.least_points
     ]
 
 

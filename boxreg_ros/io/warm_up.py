@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
 from boxreg_ros.core.follow import follow
+from boxreg_ros.core.following.stream import FollowedObjects
 from boxreg_ros.core.observation import observe
 from boxreg_ros.core.registrar import BoxRegistrar, Submit
 from boxreg_ros.structures import BoxArray, Sweep
@@ -26,36 +29,45 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
         As for `BoxRegistrar`, which it is given to.
 
     """
-    rng = np.random.default_rng(0)
     quick = Config(
         objective=config.objective, mode=config.mode, estimate=config.estimate,
         window=4, lag=3, solver=SolverConfig(rounds=2, iterations=2),
         paper=PaperConfig(multiplier_rounds=1, iterations=2),
     )  # fmt: skip
     registrar = BoxRegistrar(quick, submit)
-    for k in range(6):
-        stamp_ns = k * 10**8
-        box = np.array([[10.0 + 0.5 * k, 0, 0, 4, 2, 1.5, 0, 0, 0]])
-        points = rng.uniform(-1, 1, (64, 3)) * [2, 1, 0.7] + box[0, :3]
-        registrar.add_sweep(Sweep(stamp_ns, 'map', points.astype(np.float32)))
-        registrar.add_boxes(BoxArray(stamp_ns, 'map', ('1',), ('car',), np.ones(1), box))
+    for sweep, boxes in zip(*_passing_car(), strict=True):
+        registrar.add_sweep(replace(sweep, points=sweep.points.astype(np.float32)))
+        registrar.add_boxes(boxes)
     registrar.flush()
 
 
 def warm_up_follower(config: Config) -> None:
-    """Follow a synthetic box through six sweeps, there and back: its kernels are loaded."""
+    """Follow a synthetic box through sweeps, there and back: its kernels are loaded."""
+    sweeps, seeds = _passing_car()
+    stamps_ns = np.array([sweep.stamp_ns for sweep in sweeps])
+    follow(stamps_ns, [sweep.points for sweep in sweeps], [seeds[1], seeds[4]], config)
+
+
+def warm_up_followed(config: Config) -> None:
+    """Follow a synthetic box as the node does: its kernels are loaded."""
+    sweeps, seeds = _passing_car()
+    followed = FollowedObjects(config)
+    followed.add(seeds[1])
+    for sweep in sweeps:
+        followed.add_sweep(sweep)
+        followed.boxes_at(sweep.stamp_ns, sweep.stamp_ns, np.zeros((0, 9)))
+
+
+def _passing_car() -> tuple[list[Sweep], list[BoxArray]]:
+    """Return six sweeps of a car, and its boxes."""
     rng = np.random.default_rng(0)
-    centres = 10.0 + 0.5 * np.arange(6)
-    sweeps = [rng.uniform(-1, 1, (64, 3)) * [2, 1, 0.7] + [x, 0, 0] for x in centres]
-    stamps_ns = np.arange(6) * 10**8
-    seeds = [
-        BoxArray(
-            int(stamps_ns[row]), 'map', ('1',), ('car',), np.ones(1),
-            np.array([[centres[row], 0, 0, 4, 2, 1.5, 0, 0, 0]]),
-        )
-        for row in (1, 4)
-    ]  # fmt: skip
-    follow(stamps_ns, sweeps, seeds, config)
+    sweeps, boxes = [], []
+    for k in range(6):
+        box = np.array([[10.0 + 0.5 * k, 0, 0, 4, 2, 1.5, 0, 0, 0]])
+        points = rng.uniform(-1, 1, (64, 3)) * [2, 1, 0.7] + box[0, :3]
+        sweeps.append(Sweep(k * 10**8, 'map', points))
+        boxes.append(BoxArray(k * 10**8, 'map', ('1',), ('car',), np.ones(1), box))
+    return sweeps, boxes
 
 
 def warm_up_crop(config: Config) -> None:

@@ -10,9 +10,8 @@ from pathlib import Path
 from boxreg_ros.io.box_table import BoxTable, cell, COLUMNS, csv_row
 from boxreg_ros.io.covariance_table import COVARIANCES, CovarianceWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.records import refined_boxes
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, X, Z
-from msg_adapters.poses import quaternions_of
+from boxreg_ros.labels.records import numbers_of, refined_boxes
+from boxreg_ros.structures import Floats
 import numpy as np
 import orjson
 
@@ -57,16 +56,8 @@ class Writer:
         if self._newest_ns is not None and stamp_ns < self._newest_ns:
             self._is_sorted = False
         self._newest_ns = stamp_ns
-        numbers = np.hstack(
-            [
-                boxes.scores[:, None],
-                boxes.boxes[:, X : Z + 1],
-                quaternions_of(boxes.boxes),
-                boxes.boxes[:, LENGTH : HEIGHT + 1],
-            ]
-        )
         begin = f'{stamp_ns},{cell(boxes.frame_id)}'
-        columns = boxes.track_ids, boxes.class_names, _texts(numbers), refined.status
+        columns = boxes.track_ids, boxes.class_names, _texts(numbers_of(boxes)), refined.status
         rows = zip(*columns, refined.num_points.tolist(), strict=True)
         lines = [
             f'{begin},{cell(track_id)},{cell(class_name)},{texts},{cell(status)},{num_points}\n'

@@ -43,6 +43,8 @@ Publishers of /tf at 10 Hz and faster have sent three messages by then.
 """
 BOXES_SILENCE = 3.0
 """After this time without boxes, final boxes are published without further observations [s]."""
+LOST_SHOWN = 10
+"""Followed objects that were lost last, of which /diagnostics says where; chosen."""
 CLOUD_SILENCE = 0.5
 """
 After this time without clouds, boxes that have waited as long are published unrefined [s].
@@ -202,6 +204,9 @@ class LiveRegistrar:
         self._jumps = JumpConfirmation[ReceivedMessage]()
         self._held: deque[_Pending | _Passing] = deque()  # in order of arrival; first: pending
         self._detections: dict[str, _Detection] = {}  # by track id, while tracks may coast
+        self._seeds: list[ReceivedMessage] = []  # of `follow`, without their transforms yet
+        self._sources: dict[str, _Detection] = {}  # the box that each followed object began with
+        self._following: dict[str, object] = {}
         self._made: list[Outgoing] = []  # survives an error while further messages are made
         self._choose_at: float | None = None
         self._last_boxes = 0.0
@@ -242,8 +247,9 @@ class LiveRegistrar:
 
     @property
     def facts(self) -> dict[str, object]:
-        """Return the origin of the ids and the latency of the boxes, for reports."""
-        return {**self._session.facts, 'box latency': self._latency.text}
+        """Return origin of the ids, latency of the boxes and followed objects, for reports."""
+        facts = {**self._session.facts, 'box latency': self._latency.text}
+        return facts | self._following
 
     def confirm(self, item: ReceivedMessage) -> tuple[list[ReceivedMessage], list[Outgoing]]:
         """
@@ -317,11 +323,55 @@ class LiveRegistrar:
             self._unknown_frames.remove(frame)
         return frame in self._unknown_frames
 
+    def follow(self, item: ReceivedMessage) -> None:
+        """Follow the object of each box of a message, as soon as its transform is known."""
+        self._seeds.append(item)
+
+    def _start_following(self, now: float) -> None:
+        waiting = self._seeds
+        self._seeds = []
+        for item in waiting:
+            content = item.content
+            assert isinstance(content, BoxArray)
+            if not self.is_ready(item, now):
+                self._seeds.append(item)
+                continue
+            try:
+                fixed_frame = self._session.require_fixed_frame(content)
+                T_fixed_item = self.tree.lookup(fixed_frame, content.frame_id, content.stamp_ns)
+            except TransformUnavailable as error:
+                self._trouble(Reason.NOT_FOLLOWED, str(error), len(content.track_ids))
+                continue
+            for row, track_id in enumerate(content.track_ids):
+                self._sources[track_id] = _Detection(item.message, row, content.stamp_ns)
+            self._registrar.follow(boxes_to_frame(content, T_fixed_item, fixed_frame))
+
+    def _report_followed(self) -> None:
+        """Report which objects are followed, where others were lost, and boxes not followed."""
+        followed = self._registrar.followed
+        for line in followed.refused:
+            self._trouble(Reason.NOT_FOLLOWED, line, 1)
+        lost = {}
+        for one in followed.lost:
+            x, y, z = one.box[:3]
+            place = f'{one.stamp_ns} ns, x {x:.1f} y {y:.1f} z {z:.1f} m in {self.fixed_frame}'
+            lost[f'lost {one.track_id}'] = f'{one.reason} at {place}'
+            self._trouble(Reason.LOST, f'{one.track_id}: {one.reason} at {place}', 1)
+        followed.refused.clear()
+        followed.lost.clear()
+        known = {name: text for name, text in self._following.items() if name != 'following'}
+        known = dict(list((known | lost).items())[-LOST_SHOWN:])
+        for track_id in followed.track_ids:
+            known.pop(f'lost {track_id}', None)
+        if followed.track_ids or self._following or known:
+            self._following = {'following': ', '.join(followed.track_ids) or 'none', **known}
+
     def process(self, item: ReceivedMessage) -> list[Outgoing]:
         """Register a message; return the messages that are ready to be published."""
         content = item.content
         if is_placeholder(content):
             return self.passed_through(item.message)
+        self._start_following(item.received)
         admitted = self._session.admit(content)
         if admitted.reason:
             self._report_missing_transform(content, admitted.reason, admitted.detail)
@@ -435,7 +485,7 @@ class LiveRegistrar:
     def reset(self) -> list[Outgoing]:
         """Forget everything but the transforms; return everything that is held."""
         ready = self.flush()
-        self._detections = {}
+        self._forget_detections()
         if self.static_points is not None:
             self.static_points.reset()
         self._registrar.reset()
@@ -463,7 +513,7 @@ class LiveRegistrar:
         self._registrar.reset()
         self._session.restart()
         self._late.restart()
-        self._detections = {}
+        self._forget_detections()
         held = list(self._held)
         self._held.clear()
         self.tap.keep_all(Reason.FAILED)
@@ -477,6 +527,11 @@ class LiveRegistrar:
         if item is not None and isinstance(item.content, BoxArray) and not is_held:
             ready += self.passed_through(item.message, Reason.FAILED)
         return ready
+
+    def _forget_detections(self) -> None:
+        self._detections = {}
+        self._seeds = []
+        self._sources = {}
 
     def passed_through(self, message: Any, reason: str = '') -> list[Outgoing]:
         """Return an input message as early boxes and, once those before it are, as final."""
@@ -562,6 +617,7 @@ class LiveRegistrar:
 
     def _outgoing(self, ready: list[RefinedBoxes]) -> list[Outgoing]:
         """Return the messages to publish for results of the registrar."""
+        self._report_followed()
         for refined in ready:
             pending = refined.boxes.ticket
             assert isinstance(pending, _Pending)
@@ -584,7 +640,11 @@ class LiveRegistrar:
         message = pending.message
         coasted = refined.boxes.track_ids[len(pending.given.track_ids) :]
         if coasted:
-            sources = [pending.earlier[track_id][:2] for track_id in coasted]
+            # A followed object may have begun after the message arrived.
+            sources = [
+                (pending.earlier.get(track_id) or self._sources[track_id])[:2]
+                for track_id in coasted
+            ]
             message = self.adapter.with_added(message, sources)
         T_output_item = pending.T_output_item
         is_changed = REFINED in refined.status or COASTED in refined.status

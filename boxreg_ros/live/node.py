@@ -12,16 +12,16 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.compilation import announced_compilation
 from boxreg_ros.io.lidars import Lidars
-from boxreg_ros.io.warm_up import warm_up
+from boxreg_ros.io.warm_up import warm_up, warm_up_followed
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
+from boxreg_ros.live.label_recording import LabelRecording
 from boxreg_ros.live.params import changed, declare, numbers_as_declared, parameters_yaml
 from boxreg_ros.live.recorder_process import check_recording
-from boxreg_ros.live.recording import LabelRecording
 from boxreg_ros.live.topics import import_message, NodeTopics
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
@@ -45,6 +45,8 @@ STATUS_PERIOD = 1.0
 """Time between two messages on /diagnostics [s]."""
 ODOMETRY_DEPTH = 50
 """Queue size of `odom`: a second at the rate of common odometry sources."""
+FOLLOW_DEPTH = 10
+"""Queue size of `~/follow`, where a person publishes."""
 CHECKED_BY_RECORDER = ('record_formats', 'record_camera')
 """Parameters whose values are known to the recorder alone."""
 FINALS_MARGIN = 10
@@ -97,6 +99,7 @@ class BoxregNode(Node):
         config, options = self._settings
         with announced_compilation(self.get_logger().info):
             warm_up(config)
+            warm_up_followed(config)
             cdr.walker()
         self._budget = TickBudget(options.deadline)
         warm_up(config, self._budget.submit)  # once more, timed without imports and compilation
@@ -250,6 +253,11 @@ class BoxregNode(Node):
         qos = QoSProfile(depth=2 * capacity, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._topics.subscribe(
             type_name, 'boxes', self._on_boxes, qos, is_required=True,
+            is_raw=serialized is not None,
+        )  # fmt: skip
+        few = QoSProfile(depth=FOLLOW_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
+        self._topics.subscribe(
+            type_name, '~/follow', partial(self._inbox.put_event, 'follow'), few,
             is_raw=serialized is not None,
         )  # fmt: skip
         self.get_logger().info(f'boxes are {type_name}; {self._topics.description()}')

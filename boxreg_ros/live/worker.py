@@ -283,6 +283,8 @@ class Worker:
                 self._live.tree.add_odometry(content)
             case 'points_info':
                 self._take_info(content)
+            case 'follow':
+                self._follow(content)
             case 'lost':
                 self._publish(self._guarded(partial(self._live.lose, *content)))
             case 'reset':
@@ -298,6 +300,17 @@ class Worker:
                 self._budget.deadline = options.deadline
             case _:
                 raise ValueError(f'kind: expected that of an event, got {kind!r}')
+
+    def _follow(self, message: Any) -> None:
+        assert self._live.adapter is not None  # set before boxes are subscribed to
+        try:
+            boxes = self._live.adapter.from_msg(message)
+        except UnsupportedMessage as error:
+            self._health.report(Reason.NOT_FOLLOWED, str(error))
+        except Exception as error:
+            self._health.report_failure(error)
+        else:
+            self._live.follow(ReceivedMessage(message, boxes, time.monotonic()))
 
     def _take_info(self, message: Any) -> None:
         try:

@@ -9,7 +9,8 @@ from tempfile import TemporaryFile
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.follow import ascending, End, follow_points, FollowedTrack
+from boxreg_ros.core.follow import End, follow_points, FollowedTrack
+from boxreg_ros.core.following.sweeps import ascending
 from boxreg_ros.offline.every_sweep import Arrivals
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from boxreg_ros.tracks.complete import CompletionPlan

@@ -23,12 +23,7 @@ from boxreg_ros.io.stamp_order import kept
 from boxreg_ros.labels import LabelFrame, Options, Provenance
 from boxreg_ros.labels.csv import Writer as csv_writer
 from boxreg_ros.review.corrections import Corrections
-from boxreg_ros.review.decisions import (
-    Decision,
-    DecisionLog,
-    DECISIONS,
-    read_decisions,
-)
+from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 from browser import NEEDS_BROWSER, opened_page
@@ -428,6 +423,16 @@ def test_foreign_and_broken_requests_write_nothing(server, capfd, headers, conte
     # What is decided next has a header, and is read.
     assert posted(server, {'seen': 0, 'rows': [row('2')]})[0] == 200
     assert [one.track_id for one in read_decisions(server.log_path)] == ['2']
+
+
+def test_pins_and_numbers_of_the_wrong_size_are_refused(server):
+    for box in ([1], [[1] * 9] * 9):
+        track = {'class': 'car', 'pieces': [{'index': 0}], 'pins': {'5': box}}
+        status, text = posted(server, track, '/solve')
+        assert (status, text.partition(',')[0]) == (400, 'solve: expected a track of the report')
+    connection, headers = opened(server)
+    connection.request('GET', f'/events?seen={"9" * 5000}', headers=headers)
+    assert connection.getresponse().status == 400
 
 
 def test_page_and_its_address_are_for_this_browser_alone(server):

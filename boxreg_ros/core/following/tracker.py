@@ -9,13 +9,14 @@ two seeds there are two ways; each is tested where it arrives at the other seed.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple, Protocol, Self
+from dataclasses import dataclass, field
+from typing import NamedTuple, Self
 
 from boxreg_ros.core.following.kernels import motion, registration, surface
-from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.core.following.sweeps import Sweeps
+from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
 import numpy as np
-from numpy.typing import NDArray
 
 POSE4 = [0, 1, 2, YAW]
 """Columns of a box that are followed; roll and pitch are those of the seed."""
@@ -101,20 +102,6 @@ MOTIONS = {
 }
 
 
-class Points(Protocol):
-    """The points (M, 3) of each sweep, ascending by x."""
-
-    def __getitem__(self, row: int, /) -> NDArray[np.floating]:
-        """Return the points of a sweep."""
-
-
-class Sweeps(NamedTuple):
-    """Times (S,) of sweeps [s], and their points, all in one frame."""
-
-    times: Floats
-    points: Points
-
-
 class Seeds(NamedTuple):
     """Boxes (N, 9) of a person in the sweeps `rows` (N,), ascending."""
 
@@ -140,6 +127,42 @@ class Way(NamedTuple):
     poses: dict[int, Floats]
     seen: set[int]
     reason: str
+
+
+@dataclass(slots=True, eq=False)
+class Walk:
+    """
+    A way under way.
+
+    Attributes
+    ----------
+    row, sign : int
+        The sweep that it is at, and its direction in time.
+    state : _State
+        There.
+    begin, last_seen : float
+        Times of the seed and of the last sweep where points support the pose [s].
+    usual : float
+        Running mean of the score of the fit.
+    poses, seen
+        As of `Way`.
+    reason : str
+        Why points do not support the pose here; empty if they do.
+    is_over : bool
+        True if it has been lost for too long.
+
+    """
+
+    row: int
+    sign: int
+    state: _State
+    begin: float
+    last_seen: float
+    usual: float
+    poses: dict[int, Floats] = field(default_factory=dict)
+    seen: set[int] = field(default_factory=set)
+    reason: str = ''
+    is_over: bool = False
 
 
 class _Found(NamedTuple):
@@ -186,8 +209,13 @@ class _State(NamedTuple):
         return np.asarray(np.linalg.inv(full), np.float64)
 
     @property
+    def speed(self) -> float:
+        """Speed along the heading [m/s]."""
+        return float(self.planar[3])
+
+    @property
     def is_parked(self) -> bool:
-        return bool(abs(self.planar[3]) < STOPPED)
+        return bool(abs(self.speed) < STOPPED)
 
 
 class Owned:
@@ -249,45 +277,66 @@ class Follower:
 
     def way(self, seed: int, sign: int, stop: int) -> Way:
         """Follow the object from a seed to the row `stop`, forwards or backwards."""
+        walk = self.walk(seed, sign)
+        while walk.row != stop and not walk.is_over:
+            self.step(walk)
+        return Way(walk.poses, walk.seen, walk.reason or ARRIVED)
+
+    def walk(self, seed: int, sign: int) -> Walk:
+        """Return a way of no step yet from a seed, forwards or backwards."""
         row = int(self._seeds.rows[seed])
         pose = self._seeds.boxes[seed, POSE4]
         state = _State.at_seed(pose, self._start_speed(seed))
+        time = self._sweeps.times[row]
+        return Walk(row, sign, state, time, time, _score(self._fit(self._near(row, pose), pose)))
+
+    def step(self, walk: Walk) -> None:
+        """Follow the object to the next sweep of a way."""
         times = self._sweeps.times
-        way = Way({}, set(), ARRIVED)
-        lost = ''
-        first = last_seen = times[row]
-        usual = _score(self._fit(self._near(row, pose), pose))
-        while row != stop:
-            row += sign
-            state = self._predicted(state, times[row] - times[row - sign])
-            is_lost = abs(times[row - sign] - last_seen) > 0
-            found = self._find(row, state, is_lost)
-            if is_lost and not found.reason and found.score < MIN_SCORE_AGAIN * usual:
-                found = found._replace(reason='no_fit')
-            if found.reason:
-                if not is_lost and abs(last_seen - first) < YOUNG:
-                    state.covariance[3, 3] += SPEED_AFTER_LOSS**2
-                hold = HOLD_PARKED if state.is_parked else HOLD
-                if abs(times[row] - last_seen) > hold:
-                    return way._replace(reason=found.reason)
-                way.poses[row] = state.pose
-                lost = found.reason
-                continue
-            lost = ''
-            planar, covariance = motion.update(
-                state.planar, state.covariance, found.pose[[0, 1, 3]], found.covariance[PLANAR]
-            )
-            state = _State(planar, covariance, found.pose[2], found.covariance[2, 2])
-            way.poses[row] = found.pose
-            way.seen.add(row)
-            last_seen = times[row]
-            usual += (found.score - usual) / 5
-            if found.part > MIN_FIT_TO_LEARN:
-                points = self._near(row, found.pose)
-                self._learn(points, found.pose)
-                if np.isnan(self._road):
-                    self._road = self._road_below(points, found.pose)
-        return way._replace(reason=lost or ARRIVED)
+        walk.row += walk.sign
+        row = walk.row
+        state = self._predicted(walk.state, times[row] - times[row - walk.sign])
+        found = self._find(row, state, bool(walk.reason))
+        if walk.reason and not found.reason and found.score < MIN_SCORE_AGAIN * walk.usual:
+            found = found._replace(reason='no_fit')
+        if found.reason:
+            if not walk.reason and abs(walk.last_seen - walk.begin) < YOUNG:
+                state.covariance[3, 3] += SPEED_AFTER_LOSS**2
+            hold = HOLD_PARKED if state.is_parked else HOLD
+            walk.is_over = abs(times[row] - walk.last_seen) > hold
+            if not walk.is_over:
+                walk.poses[row] = state.pose
+            walk.state = state
+            walk.reason = found.reason
+            return
+        planar, covariance = motion.update(
+            state.planar, state.covariance, found.pose[[0, 1, 3]], found.covariance[PLANAR]
+        )
+        walk.state = _State(planar, covariance, found.pose[2], found.covariance[2, 2])
+        walk.reason = ''
+        walk.poses[row] = found.pose
+        walk.seen.add(row)
+        walk.last_seen = times[row]
+        walk.usual += (found.score - walk.usual) / 5
+        if found.part > MIN_FIT_TO_LEARN:
+            points = self._near(row, found.pose)
+            self._learn(points, found.pose)
+            if np.isnan(self._road):
+                self._road = self._road_below(points, found.pose)
+
+    def continue_in(self, sweeps: Sweeps, owned: Owned) -> None:
+        """Go on with further sweeps, and the boxes of other objects in them."""
+        self._sweeps = sweeps
+        self._owned = owned
+
+    def box(self, pose: Floats, travel: float = 0.0) -> Floats:
+        """Return the object at a pose (4,), moved forward by `travel` [m], as a row (9,)."""
+        box: Floats = self._seeds.boxes[0].copy()
+        box[BOX_EXTENT] = 2 * self._half
+        box[POSE4] = pose
+        box[YAW] = wrap_angle(box[YAW])
+        box[:2] += travel * np.array([np.cos(box[YAW]), np.sin(box[YAW])])
+        return box
 
     def jumps(self, seed: int) -> bool:
         """Return whether the next seed is farther away than such an object can move."""
@@ -360,7 +409,7 @@ class Follower:
         row = int(self._seeds.rows[seed])
         pose = self._seeds.boxes[seed, POSE4]
         times = self._sweeps.times
-        around = [other for other in (row - 1, row + 1) if 0 <= other < len(times)]
+        around = [other for other in (row - 1, row + 1) if self._sweeps.has(other)]
         if not around:
             return 0.0
         period = max(abs(times[other] - times[row]) for other in around)
@@ -389,7 +438,7 @@ class Follower:
             state = _State.at_seed(pose, speed)
             for count in range(1, SEARCH_SWEEPS + 1):
                 other = row + sign * count
-                if not 0 <= other < len(times):
+                if not self._sweeps.has(other):
                     break
                 state = self._predicted(state, times[other] - times[other - sign])
                 prior, information = state.pose, state.information
