@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
-from math import nan
+from math import isnan, nan
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -90,7 +90,8 @@ class Setting(NamedTuple):
         with suppress(ValueError):
             number = float(value)
         if not self.low <= number <= self.high:
-            raise ConfigError(f'{self.name}: expected {self.bounds}, got {value!r}')
+            got = value if isnan(number) else number
+            raise ConfigError(f'{self.name}: expected {self.bounds}, got {got!r}')
 
 
 def setting(default: Any, *facts: Any, **more: Any) -> Any:

@@ -40,11 +40,11 @@ SAMPLE_PERIOD = 0.3
 """Least time between sweeps whose points are compared with boxes [s]."""
 MIN_SPEED = 2.0
 """Slower objects provide no evidence [m/s]."""
-MIN_POINTS, MAX_POINTS = 10, 128
+FEWEST_POINTS, POINTS_COMPARED = 10, 128
 """Points of an object that provide evidence, and those that are used of more."""
 CONSTANT_ERROR = 0.2
 """Deviation of the mean error of a track along its path [m]; measured: 0.07 to 0.16 m."""
-MAX_DEVIATION = 0.03
+USABLE_DEVIATION = 0.03
 """An estimate with a larger deviation is not used [s]."""
 SIGNIFICANCE = 3.0
 """Deviations by which a latency, or a drift of it, is more than an error of the estimate."""
@@ -66,7 +66,7 @@ FULL_WEIGHT = 5
 """Comparisons by which a track has its whole weight."""
 MAX_SAMPLES = 600
 """Comparisons that are kept: the newest, so that the estimate follows a latency that changes."""
-HISTORY = 3.0
+TRACK_SECONDS = 3.0
 """Boxes of a track are held this long [s]."""
 
 
@@ -171,7 +171,7 @@ class LateBoxes:
         for row in np.flatnonzero(is_valid_box(boxes.boxes)).tolist():
             path = self._tracks.setdefault(boxes.track_ids[row], _Path())
             path.add(boxes.stamp_ns, boxes.boxes[row])
-        oldest_ns = self.newest_ns - HISTORY * 1e9
+        oldest_ns = self.newest_ns - TRACK_SECONDS * 1e9
         self._tracks = {k: path for k, path in self._tracks.items() if path.newest_ns > oldest_ns}
         while self._sweeps and self._sweeps[0].stamp_ns < self.newest_ns - CANDIDATES[-1] * 1e9:
             self._compare(self._sweeps.popleft())
@@ -196,13 +196,13 @@ class LateBoxes:
         """
         Return the latency by the newest evidence, for a stream that goes on.
 
-        It changes in steps of `MAX_DEVIATION` or more: each step is a jump of the boxes.
+        It changes in steps of `USABLE_DEVIATION` or more: each step is a jump of the boxes.
 
         """
         if self._has_new_samples:
             self._has_new_samples = False
             found = _estimated(self._samples)
-            if abs(found.seconds - self._latency.seconds) < MAX_DEVIATION:
+            if abs(found.seconds - self._latency.seconds) < USABLE_DEVIATION:
                 found = found._replace(seconds=self._latency.seconds)
             self._latency = found
         return self._latency
@@ -264,7 +264,7 @@ class _Path:
             return
         self._stamps_ns.append(stamp_ns)
         self._boxes.append(box)
-        while self._stamps_ns[0] < stamp_ns - HISTORY * 1e9:
+        while self._stamps_ns[0] < stamp_ns - TRACK_SECONDS * 1e9:
             del self._stamps_ns[0], self._boxes[0]
 
     def covers(self, times_ns: Ints) -> bool:
@@ -330,12 +330,12 @@ def _costs(sweep: Sweep, boxes: Floats, velocity: Floats) -> Floats | None:
         across = np.abs(cos * offsets[..., Y] - sin * offsets[..., X]) - boxes[:, LENGTH + 1] / 2
         outside = np.maximum(along, across)
         is_of_path = (outside < REACH).any(1)
-        if is_of_path.sum() < MIN_POINTS:
+        if is_of_path.sum() < FEWEST_POINTS:
             return None
         outside = outside[is_of_path]
         inside = (outside < REACH / 2).sum(0)
         depth = np.abs(outside).clip(max=FACE_DEPTH).mean(0)
-        costs[row] = 1.5 * depth / FACE_DEPTH - inside / max(inside.max(), MIN_POINTS)
+        costs[row] = 1.5 * depth / FACE_DEPTH - inside / max(inside.max(), FEWEST_POINTS)
     return costs
 
 
@@ -359,9 +359,9 @@ def _points_near(sweep: Sweep, boxes: Floats, velocity: Floats) -> tuple[Floats,
     above = offsets[:, Z] + height / 2
     is_near = (np.abs(offsets @ np.stack([ahead, beside], 1)) < reach).all(1)
     kept = np.flatnonzero(is_near & (above > ROAD_CLEARANCE) & (above < height + ROAD_CLEARANCE))
-    if len(kept) < MIN_POINTS:
+    if len(kept) < FEWEST_POINTS:
         return None
-    kept = kept[:: -(-len(kept) // MAX_POINTS)]
+    kept = kept[:: -(-len(kept) // POINTS_COMPARED)]
     times = np.zeros(len(kept)) if sweep.times is None else sweep.times[near[kept]]
     return offsets[kept] + middle, times
 
@@ -387,7 +387,7 @@ def _estimated(samples: Any) -> Latency:
     found = Latency(0.0, '', estimated, deviation, n)
     if abs(estimated) >= max(NOTABLE, SIGNIFICANCE * deviation):
         found = found._replace(seconds=estimated)
-    elif deviation > MAX_DEVIATION:
+    elif deviation > USABLE_DEVIATION:
         found = found._replace(
             finding=f'the latency of the boxes is not known: {estimated:.2f} s with a deviation '
             f'of {deviation:.2f} s, by {n} moving objects'

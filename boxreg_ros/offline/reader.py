@@ -49,7 +49,7 @@ of 64 boxes, ten a second.
 
 SAMPLES = 4
 """Parts of a long recording that its latency is estimated from; chosen: one that drifts shows."""
-SAMPLE_SECONDS = 5.0
+SAMPLED_SECONDS = 5.0
 """Their duration [s]; chosen: some ten sweeps with 0.8 s of boxes after them."""
 
 
@@ -310,9 +310,9 @@ def latency_of(request: Request) -> Latency:
         seconds = (recording.end_ns - recording.start_ns) * 1e-9
     late = LateBoxes()
     parts = [(request.start, request.end)]
-    if seconds > 2 * SAMPLES * SAMPLE_SECONDS:
+    if seconds > 2 * SAMPLES * SAMPLED_SECONDS:
         starts = begin + (np.arange(SAMPLES) + 0.5) / SAMPLES * seconds
-        parts = [(start, start + SAMPLE_SECONDS) for start in starts.tolist()]
+        parts = [(start, start + SAMPLED_SECONDS) for start in starts.tolist()]
     for start, end in parts:
         part = replace(request, start=start, end=end, report=False)
         with part.recording() as recording:
