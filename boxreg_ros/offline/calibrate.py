@@ -369,6 +369,7 @@ def _bare(rows: Iterable[Sequence[Any]]) -> Window:
         counts=none,
         origins=np.full((n, 1, 3), np.nan),
         ground=unknown,
+        ring_heights=np.zeros(n),
         num_points=none,
         sights=np.zeros(n),
         is_pinned=np.zeros(n, bool),
