@@ -12,7 +12,7 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.compilation import announced_compilation
 from boxreg_ros.io.lidars import Lidars
-from boxreg_ros.io.warm_up import warm_up, warm_up_followed
+from boxreg_ros.io.warm_up import warm_up, warm_up_followed, warm_up_labels
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.budget import TickBudget
@@ -100,6 +100,8 @@ class BoxregNode(Node):
         with announced_compilation(self.get_logger().info):
             warm_up(config)
             warm_up_followed(config)
+            if options.static_points:
+                warm_up_labels(config)
             cdr.walker()
         self._budget = TickBudget(options.deadline)
         warm_up(config, self._budget.submit)  # once more, timed without imports and compilation
