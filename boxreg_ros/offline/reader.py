@@ -68,7 +68,7 @@ class ReadItem(NamedTuple):
         `moved` is None where no transform is known.
     T_fixed_given, T_fixed_sensor : array, shape (4, 4), or None
         Poses of its own frame and of the sensor frame of label files. None where unknown, and
-        for a cloud that is not written; of tracks that are completed, a cloud has the second.
+        for a cloud that is not written: it has the second.
     intensities : array, shape (M,), or None
         Of a cloud that is written.
 
@@ -181,7 +181,6 @@ class RecordingReader:
         self._recording = recording
         self._clock = clock
         self._with_points = request.options.with_points
-        self._completes = request.completes
         self._with_times = request.config.sampling.deskew
         self._waits = request.config.estimate == 'track'
         self._items = FixedFrameItems(
@@ -249,7 +248,7 @@ class RecordingReader:
         if isinstance(given, Sweep):
             if not self._with_points:
                 pose = None
-                if self._completes and moved is not None:
+                if moved is not None:
                     pose = self._items.pose_of(self.source.sensor_frame, given.stamp_ns)
                 return ReadItem(seconds, item.restarts, None, moved, None, pose, None)
             cloud = self._items.stored_cloud(item, self.source.sensor_frame)
