@@ -138,7 +138,11 @@ class SolverConfig:
         0, 'threads that share the windows of a batch; 0: one per core', '', 0, 256
     )
     tolerance: float = setting(
-        1e-4, 'relative decrease of the objective that ends the search of a round', '', 0.0, 1.0
+        0.05,
+        'predicted relative decrease of the sum that ends the search of a round',
+        '',
+        0.0,
+        1.0,
     )
 
 

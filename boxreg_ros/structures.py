@@ -25,8 +25,8 @@ Ints = NDArray[np.int64]
 
 X, Y, Z, LENGTH, WIDTH, HEIGHT, ROLL, PITCH, YAW = range(9)
 POSE = [X, Y, Z, ROLL, PITCH, YAW]
-BOX_EXTENT = slice(LENGTH, HEIGHT + 1)
-"""Columns of the extents of a box."""
+BOX_CENTER, BOX_EXTENT = slice(X, Z + 1), slice(LENGTH, HEIGHT + 1)
+"""Columns of the centre and of the extents of a box."""
 LARGEST_EXTENT = 1e3
 """Objects are smaller [m]; chosen: twice the longest ship."""
 LARGEST_COORDINATE = 3e7
@@ -38,6 +38,8 @@ INTERPOLATED, EXTENDED, REJECTED = 'interpolated', 'extended', 'rejected'
 COASTED = 'coasted'
 ADDED = (INTERPOLATED, EXTENDED, COASTED)
 """Status of boxes that the input does not have."""
+PROPOSED = 'proposed'
+"""Status of a box that may be of an object, until a person accepts it; it is no label."""
 HUMAN = 'human'
 """Status of a box that a person has corrected and pinned."""
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 import re
 
-from boxreg_ros.config import settings
+from boxreg_ros.config import KINDS, settings
 from boxreg_ros.offline import formats
 from boxreg_ros.reasons import Reason
 from msg_adapters import registry
@@ -25,17 +25,28 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def parameters() -> str:
-    """Return one row for each setting of `Config`."""
+    """Return one row for each setting of `Config`; one for the same setting of all kinds."""
     rows = []
+    of_kinds: dict[str, tuple[str, ...]] = {}
     for item in settings():
-        default = item.default
-        if isinstance(default, tuple):
-            default = ', '.join(default)
+        default = ', '.join(item.default) if isinstance(item.default, tuple) else str(item.default)
         bounds = ', '.join(item.choices)
         if item.low is not None:
             bounds = f'{item.low:g} to {item.high:g}'
-        rows.append((item.name, str(default), item.unit, bounds, item.meaning))
-    return table(('name', 'default', 'unit', 'range', 'meaning'), rows)
+        kind, _, name = item.name.partition('.')
+        if kind in KINDS:
+            first, *defaults = of_kinds.get(name, (f'.{name}',))[: 1 + KINDS.index(kind)]
+            of_kinds[name] = (first, *defaults, default, item.unit, bounds, item.meaning)
+        else:
+            rows.append((item.name, default, item.unit, bounds, item.meaning))
+    ends = ('unit', 'range', 'meaning')
+    return '\n\n'.join(
+        [
+            table(('name', 'default', *ends), rows),
+            'Of each kind of objects, as in `vehicle.names`; defaults of each:',
+            table(('name', *KINDS, *ends), of_kinds.values()),
+        ]
+    )
 
 
 def label_formats() -> str:
@@ -60,13 +71,11 @@ def counters() -> str:
 
 
 TABLES = {
-    'parameters.md': parameters,
-    'formats.md': label_formats,
-    'datasets.md': datasets,
-    'messages.md': messages,
-    'troubleshooting.md': counters,
+    'parameters.md': {'': parameters},
+    'formats.md': {'messages': messages, 'labels': label_formats, 'datasets': datasets},
+    'troubleshooting.md': {'': counters},
 }
-"""The table that each page holds between its two marks."""
+"""The tables that each page holds, by the names of the marks around them."""
 
 
 def between_marks(page: str, text: str, generated: str, section: str = '') -> str:
@@ -91,8 +100,11 @@ def between_marks(page: str, text: str, generated: str, section: str = '') -> st
 
 
 def renewed(page: str) -> str:
-    """Return the text of a page with the table that the code has now."""
-    return between_marks(page, (DOCS / page).read_text(encoding='utf-8'), TABLES[page]())
+    """Return the text of a page with the tables that the code has now."""
+    text = (DOCS / page).read_text(encoding='utf-8')
+    for section, table_of in TABLES[page].items():
+        text = between_marks(page, text, table_of(), section)
+    return text
 
 
 def main() -> None:

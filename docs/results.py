@@ -19,10 +19,12 @@ from collections.abc import Callable, Iterable, Sequence
 import json
 import math
 from pathlib import Path
+import re
 from statistics import NormalDist
 import sys
 from typing import Any
 
+from boxreg_ros import __version__
 from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE
 from boxreg_ros.bench.speed.report import WANTED, WANTED_TICKS, WANTED_TIMES, WANTED_TRACKS
 from boxreg_ros.config import KINDS
@@ -40,20 +42,22 @@ MIN_TRACKS = 3
 """Fewest tracks of a cell whose standard error is trusted."""
 
 DATA = {
-    'resim_3bffdcff': 'Real surfaces on a real drive, exact truth, detector noise',
-    'resim_7fab2350': 'Real surfaces on a busier street, exact truth, detector noise',
-    'pandaset_002_a': 'PandaSet 002, human labels, detector noise',
-    'kitti_raw_0001': 'KITTI raw 0001, human labels, detector noise',
-    'street': 'The sample recording, simulated',
+    'resim_3bffdcff': ('Real drive', 'real surfaces, exact truth, detector noise'),
+    'resim_7fab2350': ('Busier street', 'real surfaces, exact truth, detector noise'),
+    'pandaset_002_a': ('PandaSet 002', 'human labels, detector noise'),
+    'kitti_raw_0001': ('KITTI raw 0001', 'human labels, detector noise'),
+    'street': ('Sample', 'simulated'),
 }
-"""Title of each recording, in the order of the tables."""
+"""Title and content of each recording, in the order of the tables."""
 PAGES = {
     **dict.fromkeys(('kinds', 'highway', 'lidars', 'paper'), 'scenes'),
     **dict.fromkeys(('covariance', 'review'), 'certainty'),
+    **dict.fromkeys(('ablation', 'sensitivity'), 'ablation'),
     **dict.fromkeys(('speed', 'scale', 'report'), 'speed'),
     **dict.fromkeys(('node', 'load', 'kills'), 'node'),
 }
 """Page of the kinds of measurements that share one; the others have a page of their name."""
+PART_OF_RUN = re.compile(' (?:at the start|in the middle|at the end)')
 SHOWN_LOSS = 0.001
 """Smaller changes of mean IoU are within the scatter of noise seeds."""
 MAIN_METHODS = (
@@ -119,7 +123,7 @@ def _measurements(store: Path, kind: str) -> list[tuple[str, Any]]:
 
 def _title(data: str) -> str:
     """Return the title of the measurements of some data, '' if they have none."""
-    for name, title in DATA.items():
+    for name, (title, _) in DATA.items():
         if data.startswith(name):
             with_suffix = data.removeprefix(name).replace('_', ', with ')
             return f'{title}{with_suffix}'
@@ -127,7 +131,8 @@ def _title(data: str) -> str:
 
 
 def _origin(document: Any) -> str:
-    return f'    $ {document["command"]}    # version {document["version"]}\n'
+    suffix = '' if document['version'] == __version__ else f'    # version {document["version"]}'
+    return f'    $ {document["command"]}{suffix}\n'
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]], alignment: str = '---:') -> str:
@@ -147,8 +152,9 @@ def _signed(value: float, digits: int) -> str:
 
 def _overview(store: Path) -> Iterable[str]:
     """Yield the main tables of `docs/results.md`."""
-    recordings = [[f'`{name}`', title] for name, title in DATA.items()]
-    yield _table(['recording', 'content'], recordings, '---')
+    recordings = [[f'`{name}`', *texts] for name, texts in DATA.items()]
+    yield _table(['recording', 'title', 'content'], recordings, '---')
+    yield f'\nMeasured by version {__version__}, where no other one is named.'
     yield ''
     for section in (_mean_ious, _gains, _completion, _coverage, _ranking, _times):
         yield from (f'{part}\n' for part in section(store))
@@ -372,7 +378,7 @@ def _gain(found: Any) -> Iterable[str]:
 
 def _with_error(found: Any, key: str) -> str:
     """Return a difference with its standard error."""
-    return f'{_signed(found[key], 4)} ± {_number(found[f"{key}_error"], 4)}'
+    return f'{_signed(found[key], 4)}±{_number(found[f"{key}_error"], 4)}'
 
 
 def _classes(measured: Any) -> str:
@@ -382,7 +388,7 @@ def _classes(measured: Any) -> str:
     rows = []
     for method, scores in measured.items():
         found = [scores['by_class'][name] for name in names]
-        pairs = [f'{_number(row["iou_bev"])} / {_number(row["iou_3d"])}' for row in found]
+        pairs = [f'{_number(row["iou_bev"])}/{_number(row["iou_3d"])}' for row in found]
         rows.append([method, *pairs])
     return _table(['BEV / 3D IoU by class (boxes)', *header], rows)
 
@@ -549,27 +555,28 @@ def _highway(results: Any) -> Iterable[str]:
 
 
 def _review(results: Any) -> Iterable[str]:
-    """Yield the share of bad tracks at the top of each list, per recording and input."""
+    """Yield the share of bad tracks at the top of each list, per recording and input, and pins."""
+    pinned = []
     for recording, inputs in results.items():
         for name, found in inputs.items():
             rows = [[order, *map(_number, shares)] for order, shares in found['shares'].items()]
             head = f'{recording}, {name}: worst {found["bad"]} of {found["tracks"]}'
             yield _table([head, '1 %', '5 %', '10 %', '20 %'], rows)
             pins = found['pins']
-            yield (
-                f'With one box of each of these tracks pinned, the mean 3D IoU of their other '
-                f'boxes rises from {pins["before"]:.3f} to {pins["after"]:.3f}: '
-                f'{pins["gained"]:.0%} of 1 - IoU are removed; the errors that are constant along '
-                f'a track are {pins["constant"]:.0%} of it.'
+            pinned.append(
+                [
+                    f'{recording}, {name}',
+                    *(_number(pins[key]) for key in ('before', 'after')),
+                    *(f'{pins[key]:.0%}' for key in ('gained', 'constant')),
+                    *(_number(pins['left'][key], 2) for key in ('along', 'across', 'up')),
+                    _number(pins['left']['yaw']),
+                ]
             )
-            if 'left' in pins:  # measurements of earlier builds do not have them
-                yield f'Of these are left: {_left(pins["left"])}.'
-
-
-def _left(errors: Any) -> str:
-    """Return the constant errors of poses as text; extents are those of the pin."""
-    lengths = ', '.join(f'{name} {errors[name]:.2f} m' for name in ('along', 'across', 'up'))
-    return f'{lengths}, yaw {errors["yaw"]:.3f} rad'
+    header = (
+        'one box of each pinned', '3D IoU before', 'after', 'of 1 - IoU removed',
+        'constant along a track', 'left: along [m]', 'across', 'up', 'yaw [rad]',
+    )  # fmt: skip
+    yield _table(header, pinned)
 
 
 def _covariance(results: Any) -> Iterable[str]:
@@ -578,20 +585,33 @@ def _covariance(results: Any) -> Iterable[str]:
         rows = [
             [f'{estimate}, {name}', f'{group["boxes"]} of {group["tracks"]}', *_consistent(group)]
             for estimate, groups in estimates.items()
-            for name, group in groups.items()
-            if name == 'all' or group['boxes'] < groups['all']['boxes']
+            for name, group in _different(groups).items()
         ]
         variables = next(iter(next(iter(estimates.values())).values()))['nees']
         yield _table([recording, 'boxes of tracks', *variables], rows)
-        yield _consistent_cells(estimates)
+    low, high = CONSISTENT_NEES
+    header = (
+        'cells of kinds: along, across, up, yaw', 'cells', 'covered 90 to 98 %', 'more', 'less',
+        f'NEES {low:g} to {high:g}', 'less', 'more', f'more by {SIGNIFICANT:g} standard errors',
+    )  # fmt: skip
+    yield _table(header, [[name, *_consistent_cells(of)] for name, of in results.items()])
     yield _cells_and_chance(results)
+
+
+def _different(groups: Any) -> dict[str, Any]:
+    """Return the groups of objects without those that have the same boxes as an earlier one."""
+    found: dict[str, Any] = {}
+    for name, group in groups.items():
+        if group not in found.values():
+            found[name] = group
+    return found
 
 
 def _consistent(group: Any) -> Iterable[str]:
     for name, nees in group['nees'].items():
         error = group['nees_error'][name]
-        spread = '' if error is None else f' ± {error:.1f}'
-        yield f'{group["coverage"][name]:.2f} / {nees:.1f}{spread}'
+        spread = '' if error is None else f'±{error:.1f}'
+        yield f'{group["coverage"][name]:.2f}, {nees:.1f}{spread}'
 
 
 def _cells_of_kinds(estimates: Any) -> list[tuple[str, Any, str]]:
@@ -605,26 +625,28 @@ def _cells_of_kinds(estimates: Any) -> list[tuple[str, Any, str]]:
     ]
 
 
-def _consistent_cells(estimates: Any) -> str:
-    """Return how many cells of the kinds are consistent, and which are not."""
+def _consistent_cells(estimates: Any) -> Iterable[str]:
+    """Yield how many cells of the kinds are consistent, and which are not."""
     cells = _cells_of_kinds(estimates)
     low, high = CONSISTENT_NEES
     coverage = [group['coverage'][variable] for _, group, variable in cells]
     nees = [group['nees'][variable] for _, group, variable in cells]
     overconfident = [
-        f'{name} {value:.1f} ± {group["nees_error"][variable]:.1f}'
+        f'{name} {value:.1f}±{group["nees_error"][variable]:.1f}'
         for (name, group, variable), value in zip(cells, nees, strict=True)
         if value - high > SIGNIFICANT * (group['nees_error'][variable] or math.inf)
     ]
-    return (
-        f'By kind, along, across, up and in yaw: 90 to 98 % of the errors are within two '
-        f'standard deviations in {sum(0.9 <= part <= 0.98 for part in coverage)} of {len(cells)} '
-        f'cells, more in {sum(part > 0.98 for part in coverage)}, less in '
-        f'{sum(part < 0.9 for part in coverage)}. The mean of squared error over variance is '
-        f'{low:g} to {high:g} in {sum(low <= value <= high for value in nees)}, less in '
-        f'{sum(value < low for value in nees)}, more in {sum(value > high for value in nees)}; '
-        f'more by over {SIGNIFICANT:g} standard errors: {", ".join(overconfident) or "none"}.'
-    )
+    for count in (
+        len(cells),
+        sum(0.9 <= part <= 0.98 for part in coverage),
+        sum(part > 0.98 for part in coverage),
+        sum(part < 0.9 for part in coverage),
+        sum(low <= value <= high for value in nees),
+        sum(value < low for value in nees),
+        sum(value > high for value in nees),
+    ):
+        yield str(count)
+    yield ', '.join(overconfident) or 'none'
 
 
 def _cells_and_chance(results: Any) -> str:
@@ -694,7 +716,9 @@ def _scale(results: Any) -> Iterable[str]:
     ]
     named = [[f'`{name}`', *cells] for name, *cells in rows]
     yield _table(['figure', 'value', 'of'], named, '---')
-    yield from _figures(results)
+    shown = {name for name, *_ in rows}
+    others = [row for row in _flat(results) if row[0].replace(': ', '.') not in shown]
+    yield _table(['', ''], others)
 
 
 def _recording_size(measured: Any) -> str:
@@ -713,14 +737,23 @@ def _load(results: Any) -> Iterable[str]:
         yield _table([f'{policy}: tracks', *names], lines)
 
 
-def _flat(results: Any, prefix: str = '') -> Iterable[list[str]]:
+def _flat(results: Any) -> Iterable[list[str]]:
+    """Yield names and values; those of the start, the middle and the end of a run in one row."""
+    rows: dict[str, list[str]] = {}
+    for name, value in _named(results):
+        rows.setdefault(PART_OF_RUN.sub(': start, middle, end', name), []).append(value)
+    for name, values in rows.items():
+        yield [name, ', '.join(values)]
+
+
+def _named(results: Any, prefix: str = '') -> Iterable[tuple[str, str]]:
     for name, value in results.items():
         if isinstance(value, dict):
-            yield from _flat(value, f'{prefix}{name}: ')
+            yield from _named(value, f'{prefix}{name}: ')
         elif isinstance(value, float):
-            yield [f'{prefix}{name}', f'{value:,.0f}' if value >= 1e4 else f'{value:.4g}']
+            yield f'{prefix}{name}', f'{value:,.0f}' if value >= 1e4 else f'{value:.4g}'
         else:
-            yield [f'{prefix}{name}', str(value)]
+            yield f'{prefix}{name}', str(value)
 
 
 TABLES: dict[str, Callable[[Any], Iterable[str]]] = {

@@ -9,7 +9,16 @@ from math import pi
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.options import option
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
-from boxreg_ros.structures import BoxArray, Floats, HEIGHT, LENGTH, PITCH, ROLL, X, YAW, Z
+from boxreg_ros.structures import (
+    BOX_CENTER,
+    BOX_EXTENT,
+    BoxArray,
+    Floats,
+    LENGTH,
+    PITCH,
+    ROLL,
+    YAW,
+)
 import numpy as np
 
 REFERENCES = {
@@ -110,15 +119,15 @@ class Convention:
     def to_centers(self, boxes: BoxArray) -> BoxArray:
         """Return boxes of this convention with the pose at their centre, as in `structures`."""
         changed = self._rotated(boxes.boxes, FORWARD[self.forward_axis])
-        changed[:, LENGTH : HEIGHT + 1] = boxes.boxes[:, self._columns]
-        changed[:, X : Z + 1] -= self._offsets(changed)
+        changed[:, BOX_EXTENT] = boxes.boxes[:, self._columns]
+        changed[:, BOX_CENTER] -= self._offsets(changed)
         return replace(boxes, boxes=changed)
 
     def from_centers(self, boxes: BoxArray) -> BoxArray:
         """Return boxes with the pose at their centre in this convention."""
         changed = self._rotated(boxes.boxes, -FORWARD[self.forward_axis])
-        changed[:, X : Z + 1] += self._offsets(boxes.boxes)
-        changed[:, self._columns] = boxes.boxes[:, LENGTH : HEIGHT + 1]
+        changed[:, BOX_CENTER] += self._offsets(boxes.boxes)
+        changed[:, self._columns] = boxes.boxes[:, BOX_EXTENT]
         return replace(boxes, boxes=changed)
 
     def covariances_from_centers(self, boxes: BoxArray, covariances: Floats) -> Floats:
@@ -140,7 +149,7 @@ class Convention:
 
     def _offsets(self, boxes: Floats) -> Floats:
         """Return the vectors (n, 3) from the centres of boxes (n, 9) to their references [m]."""
-        offsets = self.reference * boxes[:, LENGTH : HEIGHT + 1]
+        offsets = self.reference * boxes[:, BOX_EXTENT]
         if not self.reference.any():
             return offsets
         has_angles = np.isfinite(boxes[:, ROLL:]).all(axis=1)

@@ -15,7 +15,7 @@ from boxreg_ros.rotations import (
     quaternion_from_rpy,
     rpy_from_quaternion,
 )
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, ROLL, X, Z
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, ROLL
 import numpy as np
 
 UNIT_TOLERANCE = 0.01
@@ -135,8 +135,8 @@ def boxes_from(poses: Floats, sizes: Floats) -> Floats:
 
     """
     boxes = np.full((len(poses), 9), np.nan)
-    boxes[:, X : Z + 1] = poses[:, :3]
-    boxes[:, LENGTH : HEIGHT + 1] = sizes
+    boxes[:, BOX_CENTER] = poses[:, :3]
+    boxes[:, BOX_EXTENT] = sizes
     quaternions_xyzw = poses[:, 3:]
     is_unit = _is_unit(quaternions_xyzw)
     boxes[is_unit, ROLL:] = rpy_from_quaternion(quaternions_xyzw[is_unit])
@@ -207,12 +207,12 @@ def with_box(pose: Any, size: Any, box: Floats, quaternion_xyzw: Floats) -> tupl
     is published.
 
     """
-    if np.isfinite(box[X : Z + 1]).all():
-        pose = with_position(pose, box[X : Z + 1].tolist())
+    if np.isfinite(box[BOX_CENTER]).all():
+        pose = with_position(pose, box[BOX_CENTER].tolist())
     if np.isfinite(quaternion_xyzw).all():
         pose = with_orientation(pose, quaternion_xyzw.tolist())
-    if np.isfinite(box[LENGTH : HEIGHT + 1]).all():
-        extent = box[LENGTH : HEIGHT + 1].tolist()
+    if np.isfinite(box[BOX_EXTENT]).all():
+        extent = box[BOX_EXTENT].tolist()
         if hasattr(size, 'x'):
             size = replaced(size, **dict(zip('xyz', extent, strict=True)))
         else:

@@ -156,11 +156,7 @@ def av2(path):
 
 def av2_log(folder, stamp_ns):
     """Return a sweep, the pose of the vehicle and the poses of the LiDARs."""
-    from av2.utils.io import (
-        read_city_SE3_ego,
-        read_ego_SE3_sensor,
-        read_lidar_sweep,
-    )
+    from av2.utils.io import read_city_SE3_ego, read_ego_SE3_sensor, read_lidar_sweep
 
     mounts = read_ego_SE3_sensor(Path(folder))
     return {

@@ -13,9 +13,7 @@ from boxreg_ros.core.method.arrays import (
     SHARED,
     SIDESLIP,
 )
-from boxreg_ros.core.method.arrays import (
-    EXTENT as LENGTH,
-)
+from boxreg_ros.core.method.arrays import EXTENT as LENGTH
 from boxreg_ros.core.method.residuals import RESIDUALS, TERMS
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.problem import CLASS_SETTINGS, Problem, SETTINGS_OF

@@ -91,7 +91,7 @@ def test_every_package_is_a_room():
         ('boxreg_ros.core.geometry', 'boxreg_ros.io.recording'),
         ('boxreg_ros.core.geometry', 'msg_adapters.vision'),
         ('boxreg_ros.live.node', 'boxreg_ros.offline.relabel'),
-        ('boxreg_ros.live.recording', 'boxreg_ros.recorder.main'),
+        ('boxreg_ros.live.label_recording', 'boxreg_ros.recorder.main'),
         ('boxreg_ros.recorder.main', 'boxreg_ros.live.driver'),
         ('boxreg_ros.offline.relabel', 'boxreg_ros.live.driver'),
         ('boxreg_ros.config', 'boxreg_ros.core.geometry'),

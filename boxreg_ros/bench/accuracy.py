@@ -28,15 +28,7 @@ from boxreg_ros.bench.methods import add_method_argument, run_methods
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.offline.arguments import add_options, values_of
-from boxreg_ros.offline.box_scores import (
-    groups,
-    Mask,
-    match,
-    Matches,
-    RECALLS,
-    Scores,
-    summarise,
-)
+from boxreg_ros.offline.box_scores import groups, Mask, match, Matches, RECALLS, Scores, summarise
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.structures import Floats
 import numpy as np

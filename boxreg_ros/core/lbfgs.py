@@ -2,7 +2,7 @@
 L-BFGS for B independent problems at once, of any kind.
 
 Every row has its own curvature history, step length, stopping test and best point, so that its
-result does not depend on the other rows. See docs/decisions/batched-lbfgs.md.
+result does not depend on the other rows. See docs/decisions.md.
 
 """
 

@@ -7,7 +7,6 @@ a module with ``DATASET``, ``scene_names``, ``inputs`` and ``open_scene``, and a
 """
 
 from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
-from boxreg_ros.datasets.recording import SceneRecording
 from boxreg_ros.datasets.registry import (
     Address,
     address_of,
@@ -20,6 +19,7 @@ from boxreg_ros.datasets.registry import (
     scene_inputs,
     scene_names,
 )
+from boxreg_ros.datasets.scene_recording import SceneRecording
 
 __all__ = [
     'Address',

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from boxreg_ros.structures import BoxArray, Floats, HEIGHT, is_valid_box, LENGTH, X, Z
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, Floats, is_valid_box
 import numpy as np
 
 CENTER_STD = 0.3
@@ -43,8 +43,8 @@ class _Track:
     @classmethod
     def started(cls, track_id: str, stamp_ns: int, box: Floats) -> _Track:
         covariance = np.diag([CENTER_STD**2, INITIAL_SPEED_STD**2])
-        extent = box[LENGTH : HEIGHT + 1]
-        return cls(track_id, stamp_ns, box[X : Z + 1], np.zeros(3), covariance, extent)
+        extent = box[BOX_EXTENT]
+        return cls(track_id, stamp_ns, box[BOX_CENTER], np.zeros(3), covariance, extent)
 
     def predicted(self, stamp_ns: int) -> tuple[Floats, Floats]:
         """Return centre (3,) and covariance (2, 2) at a stamp."""
@@ -57,12 +57,12 @@ class _Track:
         """Update the filter with the newest box of this track."""
         center, covariance = self.predicted(stamp_ns)
         gain = covariance[0] / (covariance[0, 0] + CENTER_STD**2)
-        innovation = box[X : Z + 1] - center
+        innovation = box[BOX_CENTER] - center
         self.stamp_ns = stamp_ns
         self.center = center + gain[0] * innovation
         self.velocity = self.velocity + gain[1] * innovation
         self.covariance = covariance - np.outer(gain, covariance[0])
-        self.extent = box[LENGTH : HEIGHT + 1]
+        self.extent = box[BOX_EXTENT]
 
 
 class Tracker:
@@ -141,7 +141,7 @@ class Tracker:
         costs = np.zeros((len(boxes), len(self._tracks)))
         for k, track in enumerate(self._tracks):
             center, covariance = track.predicted(stamp_ns)
-            away = np.square(boxes[:, X : Z + 1] - center).sum(axis=1)
-            unlike = np.square(np.log(boxes[:, LENGTH : HEIGHT + 1] / track.extent)).sum(axis=1)
+            away = np.square(boxes[:, BOX_CENTER] - center).sum(axis=1)
+            unlike = np.square(np.log(boxes[:, BOX_EXTENT] / track.extent)).sum(axis=1)
             costs[:, k] = away / (covariance[0, 0] + CENTER_STD**2) + unlike / LOG_EXTENT_STD**2
         return costs

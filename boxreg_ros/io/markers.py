@@ -10,6 +10,8 @@ from typing import Any
 
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import (
+    BOX_CENTER,
+    BOX_EXTENT,
     BoxArray,
     COASTED,
     Floats,
@@ -18,7 +20,6 @@ from boxreg_ros.structures import (
     LENGTH,
     REFINED,
     RefinedBoxes,
-    X,
     Z,
 )
 from msg_adapters.poses import quaternions_of
@@ -209,20 +210,20 @@ def _colour_of(status: str, reason: str) -> Colour:
 def _cube(
     m: Any, header: Any, ns: str, number: int, box: Floats, quaternion_xyzw: Floats, colour: Colour
 ) -> Any:
-    length, width, height = _plain(box[LENGTH : HEIGHT + 1])
+    length, width, height = _plain(box[BOX_EXTENT])
     return m.Marker(
         header=header, ns=ns, id=number, type=CUBE, action=ADD,
-        pose=_pose(m, box[X : Z + 1], quaternion_xyzw),
+        pose=_pose(m, box[BOX_CENTER], quaternion_xyzw),
         scale=m.Vector3(x=length, y=width, z=height), color=_colour(m, colour),
     )  # fmt: skip
 
 
 def _outline(m: Any, header: Any, number: int, box: Floats, quaternion_xyzw: Floats) -> Any:
     """Return the outline of the bottom face: it hides no colour of the box above it."""
-    length, width, height = _plain(box[LENGTH : HEIGHT + 1])
+    length, width, height = _plain(box[BOX_EXTENT])
     return m.Marker(
         header=header, ns=FINAL, id=number, type=LINE_STRIP, action=ADD,
-        pose=_pose(m, box[X : Z + 1], quaternion_xyzw), scale=m.Vector3(x=0.1),
+        pose=_pose(m, box[BOX_CENTER], quaternion_xyzw), scale=m.Vector3(x=0.1),
         color=_colour(m, CYAN),
         points=[m.Point(x=x * length / 2, y=y * width / 2, z=-height / 2) for x, y in OUTLINE],
     )  # fmt: skip
@@ -232,7 +233,7 @@ def _arrow(m: Any, header: Any, number: int, box: Floats, quaternion_xyzw: Float
     """Return an arrow from the centre along the heading, beyond the front."""
     return m.Marker(
         header=header, ns='heading', id=number, type=ARROW, action=ADD,
-        pose=_pose(m, box[X : Z + 1], quaternion_xyzw),
+        pose=_pose(m, box[BOX_CENTER], quaternion_xyzw),
         scale=m.Vector3(x=0.8 * float(box[LENGTH]), y=0.15, z=0.15), color=_colour(m, WHITE),
     )  # fmt: skip
 
@@ -242,7 +243,7 @@ def _ellipse(m: Any, header: Any, number: int, box: Floats, spread: Floats) -> A
     variances, axes = np.linalg.eigh(spread)
     across, along = _plain(2 * DEVIATIONS * np.sqrt(variances.clip(0)) + 1e-3)
     half = 0.5 * np.arctan2(axes[1, 1], axes[0, 1])  # eigenvalues ascend
-    above = box[X : Z + 1].copy()
+    above = box[BOX_CENTER].copy()
     above[Z] += 0.5 * box[HEIGHT]
     return m.Marker(
         header=header, ns='covariance', id=number, type=SPHERE, action=ADD,
@@ -252,7 +253,7 @@ def _ellipse(m: Any, header: Any, number: int, box: Floats, spread: Floats) -> A
 
 
 def _text(m: Any, header: Any, number: int, box: Floats, text: str) -> Any:
-    above = box[X : Z + 1].copy()
+    above = box[BOX_CENTER].copy()
     above[Z] += 0.5 * box[HEIGHT] + 0.5
     return m.Marker(
         header=header, ns='id', id=number, type=TEXT, action=ADD,

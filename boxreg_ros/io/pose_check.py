@@ -6,16 +6,14 @@ from dataclasses import replace
 
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
+    BOX_CENTER,
+    BOX_EXTENT,
     BoxArray,
     Floats,
-    HEIGHT,
     Ints,
     is_valid_box,
-    LENGTH,
     ROLL,
     Sweep,
-    X,
-    Z,
 )
 from msg_adapters.convention import Convention, REFERENCES, SIZE_ORDERS
 import numpy as np
@@ -107,8 +105,8 @@ class PoseCheck:
             if self._is_over:
                 break
             self._seen += 1
-            reach = 1.5 * np.linalg.norm(rows[0, LENGTH : HEIGHT + 1])
-            counts = _inside(_near(points, rows[0, X : Z + 1], reach), rows)
+            reach = 1.5 * np.linalg.norm(rows[0, BOX_EXTENT])
+            counts = _inside(_near(points, rows[0, BOX_CENTER], reach), rows)
             if counts.max() >= MIN_POINTS_OF_POSE:
                 self._counts.append(counts)
 
@@ -164,7 +162,7 @@ def _near(
 def _inside(points: NDArray[np.floating], boxes: Floats) -> Ints:
     """Count the points in each of n boxes, a margin around it included, (n,)."""
     R = matrix_from_rpy(boxes[:, ROLL:])
-    local = (points - boxes[:, None, X : Z + 1]) @ R  # (n, points, 3)
-    limit = boxes[:, None, LENGTH : HEIGHT + 1] / 2 + HELD_POINT_MARGIN
+    local = (points - boxes[:, None, BOX_CENTER]) @ R  # (n, points, 3)
+    limit = boxes[:, None, BOX_EXTENT] / 2 + HELD_POINT_MARGIN
     counts: Ints = (np.abs(local) <= limit).all(axis=2).sum(axis=1)
     return counts

@@ -18,7 +18,7 @@ from boxreg_ros.io.foxglove import encoded
 from boxreg_ros.io.items import Item, LOOKAHEAD_NS, not_measured, Stage
 from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder
-from boxreg_ros.io.motion import RecordedMotion
+from boxreg_ros.io.recorded_motion import RecordedMotion
 from boxreg_ros.io.recorded_type import RecordedType
 from boxreg_ros.io.resync import MessageOrder
 from boxreg_ros.io.storage.files import is_ros1, part_of

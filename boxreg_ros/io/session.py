@@ -16,13 +16,7 @@ from typing import Generic, NamedTuple, TYPE_CHECKING, TypeVar
 from boxreg_ros.config import Config
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.id_assignment import Tracker
-from boxreg_ros.io.lidars import (
-    ignore,
-    MergedSweep,
-    Report,
-    SensorPlacement,
-    SweepMerger,
-)
+from boxreg_ros.io.lidars import ignore, MergedSweep, Report, SensorPlacement, SweepMerger
 from boxreg_ros.io.pose_check import PoseCheck
 from boxreg_ros.io.transforms import move_to_frame, TIME_JUMP, TransformTree
 from boxreg_ros.reasons import Reason

@@ -20,7 +20,7 @@ from boxreg_ros.rotations import (
     matrix_from_rpy,
     rpy_from_matrix,
 )
-from boxreg_ros.structures import BoxArray, Floats, ROLL, Sweep, X, Z
+from boxreg_ros.structures import BOX_CENTER, BoxArray, Floats, ROLL, Sweep
 import numpy as np
 
 MAX_EXTRAPOLATION = 0.2
@@ -420,7 +420,7 @@ def boxes_to_frame(boxes: BoxArray, T_frame_boxes: Floats, frame_id: str) -> Box
     """Return the boxes in another frame; NaN stays NaN."""
     moved = boxes.boxes.copy()
     R = T_frame_boxes[:3, :3]
-    moved[:, X : Z + 1] = boxes.boxes[:, X : Z + 1] @ R.T + T_frame_boxes[:3, 3]
+    moved[:, BOX_CENTER] = boxes.boxes[:, BOX_CENTER] @ R.T + T_frame_boxes[:3, 3]
     moved[:, ROLL:] = rpy_from_matrix(R @ matrix_from_rpy(moved[:, ROLL:]))
     return replace(boxes, frame_id=frame_id, boxes=moved)
 

@@ -11,21 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.transforms import matrix
-from boxreg_ros.labels.arrow import read_rows, read_table, Table
+from boxreg_ros.labels.arrow import read_rows, read_table
 from boxreg_ros.labels.files import frame_names, to_json
 from boxreg_ros.labels.folder import FolderWriter
-from boxreg_ros.labels.protocol import (
-    Format,
-    LabelFrame,
-    Options,
-    Provenance,
-    SceneFrames,
-)
+from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance, SceneFrames
 from boxreg_ros.labels.records import (
     boxes_from_quaternions,
     EVIDENCE_COLUMNS,
@@ -33,7 +28,7 @@ from boxreg_ros.labels.records import (
     refined_boxes,
 )
 from boxreg_ros.rotations import quaternion_from_matrix
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, Sweep, X, Z
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, RefinedBoxes, Sweep
 from msg_adapters.poses import quaternions_of
 import numpy as np
 
@@ -59,12 +54,14 @@ ANNOTATION_COLUMNS = {
     'num_interior_pts': 'int64',
 }
 POINT_COLUMNS = {'intensity': 'uint8', 'laser_number': 'uint8', 'offset_ns': 'int32'}
-OPTIONAL_COLUMNS = {'track_uuid', 'num_interior_pts'}
-"""Detections that are submitted lack these."""
+NEEDED_COLUMNS = sorted(ANNOTATION_COLUMNS.keys() - {'track_uuid', 'num_interior_pts'})
+"""Detections that are submitted lack the others."""
+ROW_STAMP = itemgetter('timestamp_ns')
 LOG_COLUMN = 'log_id'
 CITY_FRAME, EGO_FRAME = 'city', 'egovehicle'
 FEATHER_FILE = 'annotations.feather'
 EGO_POSES_FILE = 'city_SE3_egovehicle.feather'
+CALIBRATION_FILE = 'calibration/egovehicle_SE3_sensor.feather'
 LIDAR_NAME = 'up_lidar'
 
 
@@ -77,12 +74,10 @@ class Writer(FolderWriter):
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
         columns = ANNOTATION_COLUMNS | EVIDENCE_COLUMNS
-        self._annotations = Table(folder / FEATHER_FILE, columns, to_json(self.about))
-        self._poses = Table(folder / EGO_POSES_FILE, {'timestamp_ns': 'int64'} | POSE_COLUMNS)
-        path = folder / 'calibration' / 'egovehicle_SE3_sensor.feather'
-        calibration = Table(path, {'sensor_name': 'string'} | POSE_COLUMNS)
+        self._annotations = self.table(FEATHER_FILE, columns, to_json(self.about))
+        self._poses = self.table(EGO_POSES_FILE, {'timestamp_ns': 'int64'} | POSE_COLUMNS)
+        calibration = self.table(CALIBRATION_FILE, {'sensor_name': 'string'} | POSE_COLUMNS)
         calibration.add(LIDAR_NAME, *_pose_values(np.eye(4)))
-        calibration.close()
 
     def add(self, frame: LabelFrame) -> None:
         """Add a row per box, and the pose."""
@@ -95,9 +90,9 @@ class Writer(FolderWriter):
                 array.stamp_ns,
                 array.track_ids[row],
                 array.class_names[row],
-                *box[LENGTH : HEIGHT + 1],
+                *box[BOX_EXTENT],
                 *quaternion,
-                *box[X : Z + 1],
+                *box[BOX_CENTER],
                 int(refined.num_points[row]),
                 *evidence_of(refined, row).values(),
             )
@@ -111,11 +106,6 @@ class Writer(FolderWriter):
         path = path.with_name(f'{stamp_ns}.feather')
         _write_cloud(path, stamp_ns, frame.sweep, frame.intensities)
 
-    def finish(self) -> None:
-        """Complete the tables."""
-        self._annotations.close()
-        self._poses.close()
-
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """Yield the annotated stamps of a log, with the poses of its pose file."""
@@ -126,7 +116,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     poses = read_rows(pose_file) if pose_file.exists() else []
     T_city_ego = {row['timestamp_ns']: matrix(xyz_xyzw(row)) for row in poses}
     fixed_frame, sensor_frame = frame_names(folder, CITY_FRAME, EGO_FRAME)
-    for refined in _refined(path, read_table(path), sensor_frame):
+    for refined in _refined(_annotations(path), sensor_frame):
         T = T_city_ego.get(refined.boxes.stamp_ns)
         yield LabelFrame(refined, fixed_frame, sensor_frame, T)
 
@@ -144,33 +134,32 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
         The log.
 
     """
+    from pyarrow import compute
+
     if path.is_dir():
         path = path / FEATHER_FILE
-    table = read_table(path)
+    table = _annotations(path)
     if LOG_COLUMN in table.column_names:
         logs = table.column(LOG_COLUMN)
-        mine = table.filter(_equal(logs, scene.name))
+        mine = table.filter(compute.equal(logs, scene.name))
         if not mine.num_rows:
             raise RecordingError(
                 f'{path}: expected boxes of log {scene.name}, got {table.num_rows} boxes of '
                 f'{len(logs.unique())} other logs; name the file with this log'
             )
         table = mine
-    for refined in _refined(path, table, scene.sensor_frame):
+    for refined in _refined(table, scene.sensor_frame):
         yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame)
 
 
-def _refined(path: Path, table: Any, frame_id: str) -> Iterator[RefinedBoxes]:
+def _annotations(path: Path) -> Any:
+    return read_table(path, NEEDED_COLUMNS, 'annotations of Argoverse 2')
+
+
+def _refined(table: Any, frame_id: str) -> Iterator[RefinedBoxes]:
     """Yield the boxes of each stamp of a table, in the frame of the ego vehicle."""
-    needed = ANNOTATION_COLUMNS.keys() - OPTIONAL_COLUMNS
-    missing = sorted(needed.difference(table.column_names))
-    if missing:
-        raise RecordingError(
-            f'{path}: columns missing: {", ".join(missing)}; expected annotations of Argoverse 2'
-        )
-    rows = table.to_pylist()
-    rows.sort(key=lambda row: row['timestamp_ns'])
-    for stamp_ns, group in groupby(rows, lambda row: row['timestamp_ns']):
+    rows = sorted(table.to_pylist(), key=ROW_STAMP)
+    for stamp_ns, group in groupby(rows, ROW_STAMP):
         items = list(group)
         poses_xyz_xyzw = np.array([xyz_xyzw(item) for item in items])
         extents = np.array([[item[name] for name in EXTENT_COLUMNS] for item in items])
@@ -188,13 +177,6 @@ def _pose_values(T: Floats) -> list[float]:
     """Return qw qx qy qz x y z of a pose (4, 4)."""
     qx, qy, qz, qw = quaternion_from_matrix(T[:3, :3]).tolist()
     return [qw, qx, qy, qz, *T[:3, 3].tolist()]
-
-
-def _equal(column: Any, value: str) -> Any:
-    """Return for each row of a column whether it is `value`."""
-    from pyarrow import compute
-
-    return compute.equal(column, value)
 
 
 def xyz_xyzw(row: dict[str, float]) -> Floats:

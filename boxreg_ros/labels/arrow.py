@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,14 +70,14 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return list(read_table(path).to_pylist())
 
 
-def read_table(path: Path) -> Any:
+def read_table(path: Path, required: Collection[str] = (), what: str = '') -> Any:
     """
     Return the pyarrow table of a Parquet or Feather file.
 
     Raises
     ------
     RecordingError
-        If the file cannot be read.
+        If the file cannot be read, or lacks some of the `required` columns of `what`.
 
     """
     import pyarrow
@@ -86,11 +86,18 @@ def read_table(path: Path) -> Any:
     try:
         with path.open('rb') as file:
             if path.suffix == '.parquet':
-                return parquet.ParquetFile(file).read()
-            return feather.read_table(file)
+                table = parquet.ParquetFile(file).read()
+            else:
+                table = feather.read_table(file)
     except (OSError, pyarrow.ArrowException) as error:
         text = ' '.join(str(error).split())
         raise RecordingError(f'{path}: cannot be read: {text}') from None
+    missing = [name for name in required if name not in table.column_names]
+    if missing:
+        raise RecordingError(
+            f'{path}: columns missing: {", ".join(missing)}; expected those of {what}'
+        )
+    return table
 
 
 def _arrow_type(text: str) -> Any:

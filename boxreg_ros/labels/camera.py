@@ -9,7 +9,7 @@ from boxreg_ros.config import YAML_ERRORS
 from boxreg_ros.errors import ConfigError, unreadable
 from boxreg_ros.io.transforms import inverse
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, ROLL, X, Z
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, ROLL
 import numpy as np
 from numpy.typing import NDArray
 import yaml
@@ -122,8 +122,8 @@ class Camera:
         P = self.projection
         R = matrix_from_rpy(boxes[:, ROLL:])
         # (n, corner, axis) in the box, then the LiDAR, then the rectified camera frame.
-        corners = (CORNERS * boxes[:, None, LENGTH : HEIGHT + 1]) @ R.transpose(0, 2, 1)
-        corners = (corners + boxes[:, None, X : Z + 1]) @ T[:3, :3].T + T[:3, 3]
+        corners = (CORNERS * boxes[:, None, BOX_EXTENT]) @ R.transpose(0, 2, 1)
+        corners = (corners + boxes[:, None, BOX_CENTER]) @ T[:3, :3].T + T[:3, 3]
         is_in_front = corners[..., 2] >= NEAR_PLANE
         clipped, is_clipped = _clipped_edges(corners)
         vertices = np.concatenate([corners, clipped], axis=1)
@@ -157,7 +157,7 @@ class Camera:
 
         """
         T = self.T_rect_sensor
-        centres = boxes[:, X : Z + 1] @ T[:3, :3].T + T[:3, 3]
+        centres = boxes[:, BOX_CENTER] @ T[:3, :3].T + T[:3, 3]
         R = matrix_from_rpy(boxes[:, ROLL:])
         headings = R[:, :, 0] @ T[:3, :3].T
         return centres, np.arctan2(-headings[:, 2], headings[:, 0])

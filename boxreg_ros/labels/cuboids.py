@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels.files import following, require_single
+from boxreg_ros.labels.files import following, from_json, require_single
 from boxreg_ros.labels.folder import FolderWriter, FrameNames
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame
 from boxreg_ros.labels.records import evidence_of, refined_boxes, UPPER_TRIANGLE
 from boxreg_ros.labels.sidecar import read_sidecar, STAMPS_FILE
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, ROLL, X, Z
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, ROLL
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -120,9 +120,9 @@ class CuboidWriter(FolderWriter):
                 row,
                 array.track_ids[row],
                 array.class_names[row] or UNKNOWN_CLASS,
-                xyz(box[X : Z + 1]),
+                xyz(box[BOX_CENTER]),
                 xyz(angles),
-                xyz(box[LENGTH : HEIGHT + 1]),
+                xyz(box[BOX_EXTENT]),
                 {
                     'status': evidence['status'],
                     'reason': evidence['reason'],
@@ -162,6 +162,33 @@ def single_part(path: Path, what: str, members: Collection[str]) -> tuple[Path, 
     part = require_single(found, path, f'{what}, a folder with {" or ".join(members)}')
     has_sidecar = (part / STAMPS_FILE).exists()
     return part, part if has_sidecar else absolute(part).parent
+
+
+def read_files(
+    folder: Path,
+    labels: Path,
+    names: Iterable[str],
+    what: str,
+    cuboids_of: Callable[[Any], list[ReadCuboid]],
+    has_all: bool = True,
+) -> Iterator[LabelFrame]:
+    """
+    Yield the frames of a folder with sidecar files and a file of labels per frame.
+
+    `labels` has the files, whose content `cuboids_of` reads; frames without boxes may lack theirs
+    unless the tool `has_all`. `names` and errors are as of `read_frames`; `what` the file has.
+
+    """
+
+    def cuboids_by_name(name: str) -> list[ReadCuboid]:
+        file = labels / f'{name}.json'
+        if not has_all and not file.exists():
+            return []
+        content = from_json(file)
+        with following(file, what):
+            return cuboids_of(content)
+
+    yield from read_frames(folder, sorted(names), cuboids_by_name)
 
 
 def read_frames(

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
+from contextlib import closing, ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TextIO
 
+from boxreg_ros.labels.arrow import Table
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import write_provenance
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
@@ -45,6 +48,8 @@ class FolderWriter:
         Of the current frame, from 0.
     name : str
         Of the current frame, which sorts by time: its stamp [ns]; a repeated stamp gets ``_1``.
+    files : ExitStack
+        Files that are open until the writer is closed.
     about : dict
         Content of ``boxreg.json``: the provenance, then the names of frames.
 
@@ -63,14 +68,15 @@ class FolderWriter:
         self.name = ''
         self.about: dict[str, Any] = asdict(provenance)
         self._names = FrameNames()
+        self.files = ExitStack()
         self._with_points = options.with_points and self.cloud_file != ''
         for name in self.folders:
             (folder / name).mkdir(parents=True)
         if self._with_points:
             (folder / self.cloud_file).parent.mkdir(parents=True, exist_ok=True)
         if self.has_sidecar:
-            self._stamps_file = (folder / STAMPS_FILE).open('w', encoding='utf-8')
-            self._poses_file = (folder / POSES_FILE).open('w', encoding='utf-8')
+            self._stamps_file = self.text_file(STAMPS_FILE)
+            self._poses_file = self.text_file(POSES_FILE)
 
     def write(self, frame: LabelFrame) -> None:
         """Add a frame."""
@@ -93,6 +99,14 @@ class FolderWriter:
             self._poses_file.write(' '.join(map(repr, values.ravel().tolist())) + '\n')
         self.number += 1
 
+    def text_file(self, name: str) -> TextIO:
+        """Open a text file of the folder, which is closed at the end."""
+        return self.files.enter_context((self.folder / name).open('w', encoding='utf-8'))
+
+    def table(self, name: str, columns: Mapping[str, str], origin: str = '') -> Table:
+        """Open a table of the folder, as `Table`, which is closed at the end."""
+        return self.files.enter_context(closing(Table(self.folder / name, columns, origin)))
+
     def add(self, frame: LabelFrame) -> None:
         """Write the labels of a frame; `number` and `name` are its own."""
         raise NotImplementedError
@@ -103,14 +117,12 @@ class FolderWriter:
         write_cloud(path, points, frame.intensities)
 
     def finish(self) -> None:
-        """Complete the label files."""
+        """Complete the labels, before their files are closed."""
 
     def close(self) -> None:
         """Complete the files."""
         self.finish()
-        if self.has_sidecar:
-            self._stamps_file.close()
-            self._poses_file.close()
+        self.files.close()
         write_provenance(self.folder, self.about)
 
 

@@ -71,8 +71,7 @@ class Writer(FolderWriter):
         self._camera = Camera.read(options.camera, 'format kitti')
         super().__init__(folder, provenance, options)
         _write_calibration(self._camera, folder / 'calib' / f'{SEQUENCE}.txt')
-        path = folder / 'label_02' / f'{SEQUENCE}.txt'
-        self._file = path.open('w', encoding='utf-8')
+        self._file = self.text_file(f'label_02/{SEQUENCE}.txt')
         self._tracks = TrackNumbers()
 
     def add(self, frame: LabelFrame) -> None:
@@ -99,10 +98,8 @@ class Writer(FolderWriter):
             self._file.write(' '.join(f'{value:.6f}' for value in numbers) + '\n')
 
     def finish(self) -> None:
-        """Complete the labels, and name the tracks."""
-        self._file.close()
-        names = self._tracks.names()
-        if names:
+        """Name the tracks."""
+        if names := self._tracks.names():
             self.about['tracks'] = names
 
 

@@ -27,9 +27,7 @@ from boxreg_ros.labels.recording_copy import RawMessage, RecordingCopy
 from boxreg_ros.structures import ADDED, BoxArray, RefinedBoxes
 from msg_adapters.poses import turned_covariances
 import numpy as np
-from rosbags.interfaces import (
-    Nodetype,
-)
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 

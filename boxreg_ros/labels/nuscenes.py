@@ -39,7 +39,7 @@ from boxreg_ros.labels.protocol import (
 )
 from boxreg_ros.labels.records import boxes_from_quaternions, evidence_of, refined_boxes
 from boxreg_ros.rotations import quaternion_from_matrix
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, WIDTH, X, Z
+from boxreg_ros.structures import BOX_CENTER, Floats, HEIGHT, LENGTH, RefinedBoxes, WIDTH
 from msg_adapters.poses import quaternions_of
 import numpy as np
 
@@ -177,7 +177,7 @@ class Writer(FolderWriter):
                 'instance_token': self._instance(key, track_id, class_name, token),
                 'attribute_tokens': [],
                 'visibility_token': 'unavailable',
-                'translation': box[X : Z + 1].tolist(),
+                'translation': box[BOX_CENTER].tolist(),
                 'size': box[[WIDTH, LENGTH, HEIGHT]].tolist(),
                 'rotation': quaternion,
                 'num_lidar_pts': int(refined.num_points[row]),

@@ -22,7 +22,7 @@ from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import refined_boxes
 from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import rpy_from_quaternion
-from boxreg_ros.structures import Floats, HEIGHT, is_valid_box, LENGTH, RefinedBoxes, X, Z
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, is_valid_box, RefinedBoxes
 from msg_adapters.poses import quaternions_of
 import numpy as np
 from numpy.typing import NDArray
@@ -158,8 +158,8 @@ class Writer:
 def _cuboids(refined: RefinedBoxes, is_valid: Mask) -> Iterator[dict[str, Any]]:
     """Yield the valid boxes with their evidence as attributes."""
     boxes = refined.boxes
-    position = boxes.boxes[:, X : Z + 1]
-    extent = boxes.boxes[:, LENGTH : HEIGHT + 1]
+    position = boxes.boxes[:, BOX_CENTER]
+    extent = boxes.boxes[:, BOX_EXTENT]
     values = np.hstack([position, quaternions_of(boxes.boxes), extent])
     covariances = refined.covariances.reshape(-1, 36).round(COVARIANCE_DIGITS)
     extents = refined.extent_covariances.reshape(-1, 9).round(COVARIANCE_DIGITS)

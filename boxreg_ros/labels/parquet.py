@@ -21,9 +21,12 @@ from boxreg_ros.io.box_table import COLUMNS
 from boxreg_ros.labels.arrow import read_table, Table
 from boxreg_ros.labels.files import to_json
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.records import boxes_from_quaternions, finite_or_none, refined_boxes
-from boxreg_ros.structures import HEIGHT, LENGTH, X, Z
-from msg_adapters.poses import quaternions_of
+from boxreg_ros.labels.records import (
+    boxes_from_quaternions,
+    finite_or_none,
+    numbers_of,
+    refined_boxes,
+)
 import numpy as np
 
 FORMAT = Format(
@@ -65,17 +68,9 @@ class Writer:
         """Add one row per box."""
         refined = frame.refined
         boxes = refined.boxes
-        numbers = np.hstack(
-            [
-                boxes.scores[:, None],
-                boxes.boxes[:, X : Z + 1],
-                quaternions_of(boxes.boxes),
-                boxes.boxes[:, LENGTH : HEIGHT + 1],
-            ]
-        )
         T = frame.T_fixed_sensor
         pose = None if T is None else T.ravel().tolist()
-        for i, row in enumerate(numbers.tolist()):
+        for i, row in enumerate(numbers_of(boxes).tolist()):
             self._table.add(
                 boxes.stamp_ns,
                 boxes.frame_id,
@@ -134,12 +129,7 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     """
     from pyarrow import ArrowException
 
-    table = read_table(path)
-    missing = [name for name in COLUMNS if name not in table.column_names]
-    if missing:
-        raise RecordingError(
-            f'{path}: columns missing: {", ".join(missing)}; expected those of boxes.parquet'
-        )
+    table = read_table(path, COLUMNS, 'boxes.parquet')
     for i, name in enumerate(table.column_names):
         kind = COLUMN_TYPES.get(name)
         if kind not in NULL_VALUES:

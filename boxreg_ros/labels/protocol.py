@@ -220,12 +220,8 @@ class Options:
 
     Attributes
     ----------
-    with_points : bool
-        Also write the point clouds that a tool needs beside its labels.
-    camera : Path or None
-        Calibration file, for formats in a camera frame.
-    swap_axes : bool
-        Write extents in the order in which Datumaro and CVAT read them.
+    with_points, camera, swap_axes : bool, Path or None, bool
+        As their help says.
     recording : Recording or None
         Source recording, open or closed, for formats that copy it.
 
@@ -302,14 +298,10 @@ class FormatModule(Protocol):
 
 
 class ReadableModule(FormatModule, Protocol):
-    """A format module whose files can be read back."""
+    """A format module whose files can be read back; only those of data sets have `read_scene`."""
 
     def read(self, path: Path) -> Iterator[LabelFrame]:
         """Yield the frames of a label file or folder."""
-
-
-class SceneModule(FormatModule, Protocol):
-    """A format module that reads files of a data set, by the facts of one of its scenes."""
 
     def read_scene(self, path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
         """Yield the frames of one scene in a label file or folder."""

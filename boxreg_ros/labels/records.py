@@ -8,7 +8,8 @@ from typing import Any
 
 from boxreg_ros.labels.protocol import INPUT_STATUS
 from boxreg_ros.rotations import rpy_from_quaternion
-from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, Floats, RefinedBoxes
+from msg_adapters.poses import quaternions_of
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -92,6 +93,19 @@ def boxes_from_quaternions(
     if is_rotation.any():
         angles[is_rotation] = rpy_from_quaternion(quaternion[is_rotation])
     return np.hstack([centre, extent, angles])
+
+
+def numbers_of(boxes: BoxArray) -> Floats:
+    """Return rows (n, 11) of score, x y z, qx qy qz qw, length width height, as in boxes.csv."""
+    values = boxes.boxes
+    return np.hstack(
+        [
+            boxes.scores[:, None],
+            values[:, BOX_CENTER],
+            quaternions_of(values),
+            values[:, BOX_EXTENT],
+        ]
+    )
 
 
 EVIDENCE_COLUMNS = {

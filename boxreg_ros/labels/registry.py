@@ -20,27 +20,16 @@ from boxreg_ros.labels.protocol import (
     Provenance,
     ReadableModule,
     SceneFrames,
-    SceneModule,
 )
 from boxreg_ros.labels.segments import segments_of
 
 BUILT_IN = {
-    'csv': 'boxreg_ros.labels.csv',
-    'parquet': 'boxreg_ros.labels.parquet',
-    'openlabel': 'boxreg_ros.labels.openlabel',
-    'kitti': 'boxreg_ros.labels.kitti',
-    'tracklets': 'boxreg_ros.labels.tracklets',
-    'nuscenes': 'boxreg_ros.labels.nuscenes',
-    't4': 'boxreg_ros.labels.t4',
-    'argoverse2': 'boxreg_ros.labels.argoverse2',
-    'waymo': 'boxreg_ros.labels.waymo',
-    'sustechpoints': 'boxreg_ros.labels.sustechpoints',
-    'datumaro': 'boxreg_ros.labels.datumaro',
-    'supervisely': 'boxreg_ros.labels.supervisely',
-    'xtreme1': 'boxreg_ros.labels.xtreme1',
-    'mcap': 'boxreg_ros.labels.mcap',
-    'semantickitti': 'boxreg_ros.labels.semantickitti',
-    'lidarseg': 'boxreg_ros.labels.lidarseg',
+    name: f'boxreg_ros.labels.{name}'
+    for name in (
+        *('csv', 'parquet', 'openlabel', 'kitti', 'tracklets', 'nuscenes', 't4', 'argoverse2'),
+        *('waymo', 'sustechpoints', 'datumaro', 'supervisely', 'xtreme1', 'mcap'),
+        *('semantickitti', 'lidarseg'),
+    )
 }
 GROUP = 'boxreg_ros.labels'
 """Entry points of this group are formats of other packages: ``name = package.module``."""
@@ -168,13 +157,13 @@ def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterat
         raise ConfigError(f'format {name!r} can only be written; readable: {able}')
     if not path.exists():
         raise RecordingError(f'labels {str(path)!r}: no such file or folder; correct the path')
+    readable = cast(ReadableModule, module)
     if scene is not None and hasattr(module, 'read_scene'):
-        return cast(SceneModule, module).read_scene(path, scene)
-    read = cast(ReadableModule, module).read
+        return readable.read_scene(path, scene)
     segments = segments_of(path)
     if not segments:
-        return read(path)
-    return chain.from_iterable(read(_folder_of(name, segment)) for segment in segments)
+        return readable.read(path)
+    return chain.from_iterable(readable.read(_folder_of(name, part)) for part in segments)
 
 
 def import_format(name: str) -> FormatModule:

@@ -62,9 +62,9 @@ class Writer(FolderWriter):
         self._sequence = folder / SEQUENCE_FOLDER
         identity = ' '.join(map(str, np.eye(4)[:3].ravel()))
         lines = [f'{name}: {identity}\n' for name in ('P0', 'P1', 'P2', 'P3', 'Tr')]
-        (self._sequence / 'calib.txt').write_text(''.join(lines), encoding='utf-8')
-        self._poses = (self._sequence / 'poses.txt').open('w', encoding='utf-8')
-        self._times = (self._sequence / 'times.txt').open('w', encoding='utf-8')
+        self.text_file(f'{SEQUENCE_FOLDER}/calib.txt').writelines(lines)
+        self._poses = self.text_file(f'{SEQUENCE_FOLDER}/poses.txt')
+        self._times = self.text_file(f'{SEQUENCE_FOLDER}/times.txt')
         self._T_first_fixed: Floats | None = None
         self._first_ns = 0
 
@@ -86,11 +86,6 @@ class Writer(FolderWriter):
         if not self.number:
             names = [track.track_id for track in frame.points.tracks]
             self.about['tracks'] = {str(i + 1): name for i, name in enumerate(names)}
-
-    def finish(self) -> None:
-        """Complete the poses and times."""
-        self._poses.close()
-        self._times.close()
 
 
 def numbers_of(points: PointLabels) -> tuple[Ints, Ints]:

@@ -18,10 +18,10 @@ from boxreg_ros.labels.cuboids import (
     cuboid_format,
     CuboidWriter,
     EVIDENCE_KEY,
-    read_frames,
+    read_files,
     ReadCuboid,
 )
-from boxreg_ros.labels.files import following, from_json, write_json
+from boxreg_ros.labels.files import write_json
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 
 FORMAT = cuboid_format(
@@ -54,12 +54,8 @@ def read(path: Path) -> Iterator[LabelFrame]:
     Raises RecordingError if a file is missing or does not follow the format of the tool.
 
     """
-
-    def cuboids_by_name(name: str) -> list[ReadCuboid]:
-        return _read_cuboids(path / 'label' / f'{name}.json')
-
-    names = sorted(file.stem for file in path.glob('label/*.json'))
-    yield from read_frames(path, names, cuboids_by_name)
+    names = {file.stem for file in path.glob('label/*.json')}
+    yield from read_files(path, path / 'label', names, 'boxes of SUSTechPOINTS', _cuboids)
 
 
 def _item(cuboid: Cuboid) -> dict[str, Any]:
@@ -77,11 +73,8 @@ def _item(cuboid: Cuboid) -> dict[str, Any]:
     }
 
 
-def _read_cuboids(file: Path) -> list[ReadCuboid]:
-    content = from_json(file)
-    with following(file, 'boxes of SUSTechPOINTS'):
-        items = content['objs'] if isinstance(content, dict) else content
-        return [_cuboid(item) for item in items]
+def _cuboids(content: Any) -> list[ReadCuboid]:
+    return [_cuboid(item) for item in (content['objs'] if isinstance(content, dict) else content)]
 
 
 def _cuboid(item: dict[str, Any]) -> ReadCuboid:

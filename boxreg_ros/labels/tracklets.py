@@ -23,27 +23,11 @@ from xml.sax.saxutils import escape, unescape
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.files import following, to_json
 from boxreg_ros.labels.folder import FolderWriter
-from boxreg_ros.labels.protocol import (
-    Format,
-    LabelFrame,
-    Options,
-    Provenance,
-    SceneFrames,
-)
+from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance, SceneFrames
 from boxreg_ros.labels.records import refined_boxes
 from boxreg_ros.labels.sidecar import read_sidecar
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import (
-    ADDED,
-    Floats,
-    HEIGHT,
-    LENGTH,
-    RefinedBoxes,
-    ROLL,
-    X,
-    YAW,
-    Z,
-)
+from boxreg_ros.structures import ADDED, BOX_CENTER, BOX_EXTENT, Floats, RefinedBoxes, ROLL, YAW
 import numpy as np
 
 FORMAT = Format(
@@ -153,7 +137,7 @@ class Writer(FolderWriter):
 
     def _write(self, tracklet: _Tracklet) -> None:
         boxes = np.array(tracklet.boxes)
-        extent = np.median(boxes[:, LENGTH : HEIGHT + 1], axis=0)
+        extent = np.median(boxes[:, BOX_EXTENT], axis=0)
         sizes = dict(zip(EXTENT_TAGS[self._is_swapped], extent.tolist(), strict=True))
         shift = 0.0 if self._is_swapped else -extent[2] / 2
         poses = np.hstack([_shifted_centres(boxes, shift), boxes[:, ROLL : YAW + 1]])
@@ -270,7 +254,7 @@ def _boxes_by_frame(root: ElementTree.Element, is_swapped: bool) -> dict[int, li
             values = [_number(pose, tag) for tag in POSE_TAGS]
             box = np.array([*values[:3], *extent, *values[3:]])
             if not is_swapped:
-                box[X : Z + 1] = _shifted_centres(box[None], extent[2] / 2)[0]
+                box[BOX_CENTER] = _shifted_centres(box[None], extent[2] / 2)[0]
             boxes_by_frame.setdefault(index, []).append(_ReadBox(track_id, class_name, box))
     return boxes_by_frame
 
@@ -292,7 +276,7 @@ def _is_comment(element: ElementTree.Element) -> bool:
 def _shifted_centres(boxes: Floats, shift: float) -> Floats:
     """Return the centres (n, 3) of boxes (n, 9), moved along z of the box by `shift` [m]."""
     R = matrix_from_rpy(boxes[:, ROLL:])
-    return boxes[:, X : Z + 1] + shift * R[:, :, 2]
+    return boxes[:, BOX_CENTER] + shift * R[:, :, 2]
 
 
 def _number(item: ElementTree.Element, tag: str) -> float:

@@ -14,14 +14,13 @@ from itertools import groupby
 from pathlib import Path
 
 from boxreg_ros.config import Config, words_of
-from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels.arrow import read_rows, Table
+from boxreg_ros.labels.arrow import read_rows, read_table
 from boxreg_ros.labels.files import frame_names, require_single, to_json
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import EVIDENCE_COLUMNS, evidence_of, refined_boxes
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import HEIGHT, LENGTH, X, YAW, Z
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, HEIGHT, YAW
 import numpy as np
 
 FORMAT = Format(
@@ -67,7 +66,9 @@ BOX_COLUMNS = (
     | UNUSED_COLUMNS
     | BOXREG_COLUMNS
 )
+REQUIRED = [name for name in BOX_COLUMNS if name not in UNUSED_COLUMNS | BOXREG_COLUMNS]
 VEHICLE_POSE = '[VehiclePoseComponent].world_from_vehicle.transform'
+VEHICLE_POSE_COLUMNS = KEY_COLUMNS | {VEHICLE_POSE: 'double[16]'}
 TYPE_NAMES = ('', 'vehicle', 'pedestrian', 'sign', 'cyclist')
 """Names of the values of the type column; '' is unknown."""
 
@@ -79,14 +80,11 @@ class Writer(FolderWriter):
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
-        self._segment = 'boxreg'
-        if provenance.recordings:
-            self._segment = Path(provenance.recordings[0]).stem
+        self._segment = Path((*provenance.recordings, 'boxreg')[0]).stem
         file = f'{self._segment}.parquet'
-        self._boxes = Table(folder / 'lidar_box' / file, BOX_COLUMNS, to_json(self.about))
-        self._poses = Table(
-            folder / 'vehicle_pose' / file, KEY_COLUMNS | {VEHICLE_POSE: 'double[16]'}
-        )
+        origin = to_json(self.about)
+        self._boxes = self.table(f'lidar_box/{file}', BOX_COLUMNS, origin)
+        self._poses = self.table(f'vehicle_pose/{file}', VEHICLE_POSE_COLUMNS)
 
     def add(self, frame: LabelFrame) -> None:
         """Add a row per box, and the pose."""
@@ -98,8 +96,8 @@ class Writer(FolderWriter):
             self._boxes.add(
                 *key,
                 array.track_ids[row],
-                *box[X : Z + 1],
-                *box[LENGTH : HEIGHT + 1],
+                *box[BOX_CENTER],
+                *box[BOX_EXTENT],
                 float(wrap_angle(box[YAW])),
                 _type(array.class_names[row]),
                 int(refined.num_points[row]),
@@ -110,11 +108,6 @@ class Writer(FolderWriter):
             )
         if frame.T_fixed_sensor is not None:
             self._poses.add(*key, frame.T_fixed_sensor.ravel().tolist())
-
-    def finish(self) -> None:
-        """Complete the tables."""
-        self._boxes.close()
-        self._poses.close()
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
@@ -128,11 +121,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         found = sorted((path / 'lidar_box').glob('*.parquet'))
         path = require_single(found, path, 'segment, lidar_box/NAME.parquet')
     folder = absolute(path).parent.parent
-    rows = read_rows(path)
-    optional = {*UNUSED_COLUMNS, *BOXREG_COLUMNS}
-    missing = [name for name in BOX_COLUMNS if rows and name not in {*rows[0], *optional}]
-    if missing:
-        raise RecordingError(f'{path}: columns missing: {", ".join(missing)}')
+    rows = read_table(path, REQUIRED, 'lidar_box of Waymo').to_pylist()
     pose_file = folder / 'vehicle_pose' / path.name
     poses = read_rows(pose_file) if pose_file.exists() else []
     T_world_vehicle = {

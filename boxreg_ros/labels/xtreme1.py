@@ -18,11 +18,11 @@ from boxreg_ros.labels.cuboids import (
     cuboid_format,
     CuboidWriter,
     EVIDENCE_KEY,
-    read_frames,
+    read_files,
     ReadCuboid,
     single_part,
 )
-from boxreg_ros.labels.files import following, from_json, write_json
+from boxreg_ros.labels.files import write_json
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 
 FORMAT = cuboid_format(
@@ -67,13 +67,10 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
     """
     scene, folder = single_part(path, 'scene', [RESULT_FOLDER, LIDAR_FOLDER])
-
-    def cuboids_by_name(name: str) -> list[ReadCuboid]:
-        return _read_cuboids(scene / RESULT_FOLDER / f'{name}.json')
-
     files = [*scene.glob(f'{RESULT_FOLDER}/*.json'), *scene.glob(f'{LIDAR_FOLDER}/*.pcd')]
     names = {file.stem for file in files}
-    yield from read_frames(folder, sorted(names), cuboids_by_name)
+    labels = scene / RESULT_FOLDER
+    yield from read_files(folder, labels, names, 'objects of Xtreme1', _cuboids, has_all=False)
 
 
 def _object(cuboid: Cuboid, frame_name: str) -> dict[str, Any]:
@@ -95,15 +92,10 @@ def _object(cuboid: Cuboid, frame_name: str) -> dict[str, Any]:
     }
 
 
-def _read_cuboids(file: Path) -> list[ReadCuboid]:
-    """Return the boxes of a result file; none if there is no such file."""
-    if not file.exists():
-        return []
-    content = from_json(file)
-    with following(file, 'objects of Xtreme1'):
-        parts = content if isinstance(content, list) else [content]
-        objects = [item for part in parts for item in part['objects']]
-        return [_cuboid(item) for item in objects if item.get('type', BOX_TYPE) == BOX_TYPE]
+def _cuboids(content: Any) -> list[ReadCuboid]:
+    parts = content if isinstance(content, list) else [content]
+    objects = [item for part in parts for item in part['objects']]
+    return [_cuboid(item) for item in objects if item.get('type', BOX_TYPE) == BOX_TYPE]
 
 
 def _cuboid(item: dict[str, Any]) -> ReadCuboid:

@@ -9,8 +9,8 @@ from threading import Event
 
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.live.bond import Bond
+from boxreg_ros.live.label_recording import RECORDING_TIME
 from boxreg_ros.live.node import BoxregNode
-from boxreg_ros.live.recording import RECORDING_TIME
 from boxreg_ros.live.worker import Worker
 from lifecycle_msgs.srv import ChangeState
 from rclpy.impl.implementation_singleton import rclpy_implementation

@@ -19,9 +19,9 @@ from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
+from boxreg_ros.live.label_recording import LabelRecording
 from boxreg_ros.live.params import changed, declare, parameters_yaml, reals_from_integers
 from boxreg_ros.live.recorder_process import check_recording
-from boxreg_ros.live.recording import LabelRecording
 from boxreg_ros.live.topics import import_message, NodeTopics
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray

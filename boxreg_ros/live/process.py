@@ -11,9 +11,9 @@ import sys
 from threading import Event, Thread
 import time
 
+from boxreg_ros.live.label_recording import RECORDING_TIME
 from boxreg_ros.live.lifecycle import BoxregLifecycleNode
 from boxreg_ros.live.node import BoxregNode
-from boxreg_ros.live.recording import RECORDING_TIME
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions

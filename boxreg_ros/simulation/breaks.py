@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import BoxArray, Floats, HEIGHT, LENGTH, ROLL, X, Y, YAW, Z
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, Floats, ROLL, X, Y, YAW
 import numpy as np
 
 BREAK_MISS_PROBABILITY = 0.08
@@ -207,8 +207,8 @@ def _with_ghosts(
         box = ghost.box.copy()
         if ghost.source in original.track_ids:
             box = original.boxes[original.track_ids.index(ghost.source)].copy()
-            box[LENGTH : HEIGHT + 1] *= rng.uniform(0.8, 1.2, 3)
-        box[X : Z + 1] += matrix_from_rpy(box[ROLL:]) @ rng.normal(0, GHOST_JITTER, 3)
+            box[BOX_EXTENT] *= rng.uniform(0.8, 1.2, 3)
+        box[BOX_CENTER] += matrix_from_rpy(box[ROLL:]) @ rng.normal(0, GHOST_JITTER, 3)
         ids.append(ghost.track_id)
         classes.append(ghost.class_name)
         boxes.append(box)

@@ -17,10 +17,10 @@ from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.simulation.breaks import break_tracks
 from boxreg_ros.simulation.raycast import ROAD
-from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.scenarios import SCENARIOS
 from boxreg_ros.simulation.scene import FIXED_FRAME, SENSOR_FRAME, SimulatedScene
 from boxreg_ros.simulation.truck import truck_scene, TRUCK_SENSORS, write_truck
+from boxreg_ros.simulation.writer import write_recording
 from boxreg_ros.structures import Ints
 import numpy as np
 

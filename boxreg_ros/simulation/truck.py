@@ -28,7 +28,6 @@ from boxreg_ros.simulation.raycast import (
     SWEEP_PERIOD,
     to_matrix,
 )
-from boxreg_ros.simulation.recorder import LidarMessages, write_messages
 from boxreg_ros.simulation.scenarios import (
     constant,
     drive,
@@ -48,6 +47,7 @@ from boxreg_ros.simulation.scene import (
     make_sweep,
     START_NS,
 )
+from boxreg_ros.simulation.writer import LidarMessages, write_messages
 from boxreg_ros.structures import BoxArray, Floats, Ints, Sweep
 import numpy as np
 

@@ -15,9 +15,9 @@ from boxreg_ros.core.support import is_owned, least_support
 from boxreg_ros.structures import EXTENDED, Floats, Ints
 from boxreg_ros.tracks.added import AddedBoxes
 from boxreg_ros.tracks.fill import accelerations
-from boxreg_ros.tracks.motion import end_motion, is_parked
 from boxreg_ros.tracks.prune import CONFIRMED_BOXES
 from boxreg_ros.tracks.tracklet import Tracklet
+from boxreg_ros.tracks.tracklet_motion import end_motion, is_parked
 import numpy as np
 
 

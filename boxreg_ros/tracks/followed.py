@@ -7,14 +7,7 @@ from dataclasses import replace
 
 from boxreg_ros.core.follow import FollowedTrack
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import (
-    BoxArray,
-    Floats,
-    HUMAN,
-    INTERPOLATED,
-    RefinedBoxes,
-    ROLL,
-)
+from boxreg_ros.structures import BoxArray, Floats, HUMAN, INTERPOLATED, RefinedBoxes, ROLL
 from boxreg_ros.tracks.complete import AddedBox, CompletionPlan, PlannedArray
 from boxreg_ros.tracks.track_steps import TrackSteps
 import numpy as np

@@ -11,7 +11,6 @@ box, where most of its points are.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from boxreg_ros.rotations import matrix_from_rpy
@@ -37,7 +36,7 @@ RING = 3
 """Cells around a cluster that have to be open road, but for the nearest ones."""
 MIN_OPEN = 2
 """So many of them have points of it."""
-OPEN_PART = 0.7
+OPEN_PART = 0.6
 """Part of the cells around a cluster, of those with points, that are open road."""
 BOX_MARGIN = 0.4
 """Points so far outside of a box are of its object [m]."""
@@ -107,32 +106,16 @@ class _Cluster(NamedTuple):
     origin: Floats
 
 
-@dataclass(slots=True, eq=False)
-class _Chain:
-    """Clusters of one object, ascending in time."""
-
-    clusters: list[_Cluster] = field(default_factory=list)
-
-    def distance(self, cluster: _Cluster) -> float:
-        """Return how far a cluster is from its prediction, relative to the gate."""
-        last = self.clusters[-1]
-        seconds = (cluster.stamp_ns - last.stamp_ns) * 1e-9
-        expected, gate = last.centre, GATE
-        before = self.clusters[max(0, len(self.clusters) - 4)]
-        if before is last:
-            gate += GATE_SPEED * seconds
-        else:
-            elapsed = (last.stamp_ns - before.stamp_ns) * 1e-9
-            expected = last.centre + (last.centre - before.centre) / elapsed * seconds
-        return float(np.linalg.norm(cluster.centre - expected)) / gate
+Chain = list[_Cluster]
+"""Clusters of one object, ascending in time."""
 
 
 class Proposer:
     """Collects the clusters of sweeps; sweeps and boxes are in one fixed frame."""
 
     def __init__(self) -> None:
-        self._open: list[_Chain] = []
-        self._ended: list[_Chain] = []
+        self._open: list[Chain] = []
+        self._ended: list[Chain] = []
 
     def add(
         self, stamp_ns: int, points: NDArray[np.floating], origin: Floats, boxes: Floats
@@ -152,36 +135,53 @@ class Proposer:
             Boxes of the objects that are known at the stamp.
 
         """
-        still_open = [c for c in self._open if c.clusters[-1].stamp_ns >= stamp_ns - MAX_GAP_NS]
-        self._ended += [c for c in self._open if c not in still_open]
-        self._open = still_open
+        chains, self._open = self._open, []
+        for chain in chains:
+            goes_on = 0 < stamp_ns - chain[-1].stamp_ns <= MAX_GAP_NS
+            (self._open if goes_on else self._ended).append(chain)
         clusters = _clusters(stamp_ns, points, origin, boxes)
         pairs = sorted(
-            (chain.distance(cluster), i, k)
+            (_distance(chain, cluster), i, k)
             for i, chain in enumerate(self._open)
             for k, cluster in enumerate(clusters)
         )
-        taken: set[int] = set()
         linked: set[int] = set()
+        taken: set[int] = set()
         for distance, i, k in pairs:
-            if distance > 1 or i in linked or k in taken:
-                continue
-            self._open[i].clusters.append(clusters[k])
-            linked.add(i)
-            taken.add(k)
-        self._open += [_Chain([c]) for k, c in enumerate(clusters) if k not in taken]
+            if distance < 1 and i not in linked and k not in taken:
+                self._open[i].append(clusters[k])
+                linked.add(i)
+                taken.add(k)
+        self._open += [[cluster] for k, cluster in enumerate(clusters) if k not in taken]
 
     def proposals(self) -> list[Proposal]:
         """Return all proposals, longest first."""
-        chains = [c for c in self._ended + self._open if len(c.clusters) >= MIN_SWEEPS]
+        chains = [c for c in self._ended + self._open if len(c) >= MIN_SWEEPS]
         found = [one for one in map(_proposal, chains) if one is not None]
         return sorted(found, key=lambda one: (-len(one.stamps_ns), one.stamp_ns))
+
+
+def _distance(chain: Chain, cluster: _Cluster) -> float:
+    """Return how far a cluster is from the prediction of a chain, relative to the gate."""
+    last, before = chain[-1], chain[max(0, len(chain) - 4)]
+    seconds = (cluster.stamp_ns - last.stamp_ns) * 1e-9
+    expected, gate = last.centre, GATE
+    if before is last:
+        gate += GATE_SPEED * seconds
+    else:
+        elapsed = (last.stamp_ns - before.stamp_ns) * 1e-9
+        expected = last.centre + (last.centre - before.centre) / elapsed * seconds
+    return float(np.linalg.norm(cluster.centre - expected)) / gate
 
 
 def _clusters(
     stamp_ns: int, points: NDArray[np.floating], origin: Floats, boxes: Floats
 ) -> list[_Cluster]:
     """Return the clusters of a sweep that may be objects."""
+    if not len(points):
+        return []
+    if not np.isfinite(origin).all():
+        origin = np.median(points, axis=0)
     near = np.abs(points[:, :2] - origin[:2]).max(1) < RANGE
     near_points = points[near].astype(np.float64)
     cells = np.floor((near_points[:, :2] - origin[:2] + RANGE) / CELL).astype(np.int64)
@@ -251,11 +251,11 @@ def _stands_free(cells: Ints, is_open: NDArray[np.bool_], seen: NDArray[np.bool_
     ring &= ~ndimage.binary_dilation(own, np.ones((3, 3)))
     known = ring & seen[window]
     is_open_there = int((known & is_open[window]).sum())
-    return is_open_there >= max(MIN_OPEN, OPEN_PART * known.sum())
+    return is_open_there >= max(MIN_OPEN, OPEN_PART * int(known.sum()))
 
 
 def _rectangle(points: Floats) -> tuple[float, Floats, Floats]:
-    """Return yaw and limits (2,), (2,) of the rectangle whose sides points (M, 2) are nearest to."""
+    """Return yaw and limits (2,), (2,) of the rectangle whose sides are nearest to points."""
     thinned = points[:: 1 + len(points) // 200]
     yaws = np.radians(np.arange(0, 90, 3))
     axes = np.stack([np.cos(yaws), np.sin(yaws)], 1)  # (A, 2)
@@ -279,9 +279,8 @@ def _turned(place: Floats, yaw: float) -> Floats:
     return np.array([c * place[0] - s * place[1], s * place[0] + c * place[1]])
 
 
-def _proposal(chain: _Chain) -> Proposal | None:
+def _proposal(clusters: Chain) -> Proposal | None:
     """Return what is proposed for a chain; None where it neither moves nor keeps its size."""
-    clusters = chain.clusters
     centres = np.array([one.centre for one in clusters])
     stamps_ns = np.array([one.stamp_ns for one in clusters], np.int64)
     travel = centres[-1] - centres[0]

@@ -12,8 +12,8 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import iou_3d, iou_bev
 from boxreg_ros.structures import Floats
 from boxreg_ros.tracks.links import join_links
-from boxreg_ros.tracks.motion import is_parked
 from boxreg_ros.tracks.tracklet import Tracklet
+from boxreg_ros.tracks.tracklet_motion import is_parked
 import numpy as np
 
 SAME_PLACE = 0.5

@@ -12,10 +12,10 @@ from __future__ import annotations
 from boxreg_ros.config import Config
 from boxreg_ros.core.motion import EndMotion
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import HEIGHT, LENGTH, X, Y, YAW, Z
+from boxreg_ros.structures import BOX_EXTENT, X, Y, YAW, Z
 from boxreg_ros.tracks.links import best_links, join_links
-from boxreg_ros.tracks.motion import end_motion
 from boxreg_ros.tracks.tracklet import Tracklet
+from boxreg_ros.tracks.tracklet_motion import end_motion
 import numpy as np
 
 STITCH_GATE = 24.3
@@ -85,7 +85,7 @@ def _cost(before: EndMotion, after: EndMotion) -> float:
     seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
     up = HEIGHT_DEVIATION + before.model.vertical * seconds**2 / 2
     distance += (after.box[Z] - before.box[Z]) ** 2 / up**2
-    extents = slice(LENGTH, HEIGHT + 1)
+    extents = BOX_EXTENT
     ratios = np.log(after.box[extents] / before.box[extents])
     distance += np.square(ratios).sum() / (2 * EXTENT_DEVIATION**2)
     predicted_yaw = before.predict(after.stamp_ns)[YAW]

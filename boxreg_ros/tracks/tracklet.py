@@ -10,14 +10,13 @@ from typing import NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.structures import (
+    BOX_CENTER,
     Floats,
     Ints,
     is_valid_box,
     KEPT,
     LENGTH,
     RefinedBoxes,
-    X,
-    Z,
 )
 import numpy as np
 
@@ -180,13 +179,13 @@ class _Part:
             return np.inf
         speed = UNKNOWN_SPEED if self._velocity is None else SWITCH_SPEED
         velocity = np.zeros(3) if self._velocity is None else self._velocity
-        predicted = self._box[X : Z + 1] + seconds * velocity
+        predicted = self._box[BOX_CENTER] + seconds * velocity
         gate = self._box[LENGTH] / 2 + speed * seconds
-        return float(np.linalg.norm((box[X : Z + 1] - predicted)[:2]) / gate)
+        return float(np.linalg.norm((box[BOX_CENTER] - predicted)[:2]) / gate)
 
     def add(self, place: Place, stamp_ns: int, box: Floats) -> None:
         seconds = (stamp_ns - self._stamp_ns) * 1e-9
-        self._velocity = (box - self._box)[X : Z + 1] / seconds
+        self._velocity = (box - self._box)[BOX_CENTER] / seconds
         self.places.append(place)
         self._stamp_ns = stamp_ns
         self._box = box

@@ -8,8 +8,8 @@ from boxreg_ros.bench import ablation as bench_ablation
 from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE, without
 from boxreg_ros.config import Ingredients, settings
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.simulate import simulate
+from boxreg_ros.simulation.writer import write_recording
 import numpy as np
 import pytest
 

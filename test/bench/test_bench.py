@@ -13,8 +13,8 @@ from boxreg_ros.bench.paper import ERROR_COLUMNS, error_row
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.box_scores import evaluate, match
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.simulate import simulate
+from boxreg_ros.simulation.writer import write_recording
 import numpy as np
 import pytest
 import torch

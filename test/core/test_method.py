@@ -1,13 +1,6 @@
 """The compiled method: residuals and their sum against automatic differentiation, and by hand."""
 
-from boxreg_ros.core.method.arrays import (
-    Arrowhead,
-    PIVOT,
-    POSE,
-    SHARED,
-    SIDESLIP,
-    SPAN,
-)
+from boxreg_ros.core.method.arrays import Arrowhead, PIVOT, POSE, SHARED, SIDESLIP, SPAN
 from boxreg_ros.core.method.arrowhead import (
     factorise,
     fix_variables,

@@ -5,9 +5,9 @@ from dataclasses import replace
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.live.topics import import_message
-from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.scene import FIXED_FRAME
 from boxreg_ros.simulation.simulate import simulate
+from boxreg_ros.simulation.writer import write_recording
 from msg_adapters import vision
 import numpy as np
 import pytest

@@ -6,12 +6,7 @@ from xml.etree import ElementTree
 
 from boxreg_ros.config import Config
 from boxreg_ros.io.markers import NAMESPACES
-from boxreg_ros.live.params import (
-    declare,
-    NODE_SETTINGS,
-    parameters_schema,
-    parameters_yaml,
-)
+from boxreg_ros.live.params import declare, NODE_SETTINGS, parameters_schema, parameters_yaml
 from measure.node import PROFILE
 from paths import ROOT, SHARE
 import pytest

@@ -1,8 +1,8 @@
 """Clouds without moving objects, published by the node for a SLAM beside it."""
 
-from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.scene import FIXED_FRAME
 from boxreg_ros.simulation.simulate import simulate
+from boxreg_ros.simulation.writer import write_recording
 from msg_adapters import pointcloud
 import numpy as np
 import pytest

@@ -14,8 +14,8 @@ from boxreg_ros.offline.calibrate import (
     Measured,
 )
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.simulate import simulate
+from boxreg_ros.simulation.writer import write_recording
 from boxreg_ros.structures import BoxArray
 import numpy as np
 import pytest

@@ -10,9 +10,9 @@ from boxreg_ros.labels.semantickitti import class_of
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
 from boxreg_ros.simulation.raycast import ROAD
-from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.scene import FIXED_FRAME
 from boxreg_ros.simulation.simulate import simulate
+from boxreg_ros.simulation.writer import write_recording
 from consumers import consumer
 from mcap.reader import make_reader
 import numpy as np

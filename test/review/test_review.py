@@ -23,12 +23,7 @@ from boxreg_ros.io.stamp_order import kept
 from boxreg_ros.labels import LabelFrame, Options, Provenance
 from boxreg_ros.labels.csv import Writer as csv_writer
 from boxreg_ros.review.corrections import Corrections
-from boxreg_ros.review.decisions import (
-    Decision,
-    DecisionLog,
-    DECISIONS,
-    read_decisions,
-)
+from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 from browser import NEEDS_BROWSER, opened_page

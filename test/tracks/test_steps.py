@@ -5,11 +5,11 @@ from boxreg_ros.core.motion import motion_at
 from boxreg_ros.tracks.extend import extend, num_free, num_supported
 from boxreg_ros.tracks.fill import fill
 from boxreg_ros.tracks.links import best_links
-from boxreg_ros.tracks.motion import between, is_parked
 from boxreg_ros.tracks.prune import duplicates, ghosts
 from boxreg_ros.tracks.static import join_static
 from boxreg_ros.tracks.stitch import stitch
 from boxreg_ros.tracks.tracklet import joined_tracklets, unused_id
+from boxreg_ros.tracks.tracklet_motion import between, is_parked
 from drives import path, STEP_NS, tracklet
 import numpy as np
 import pytest

@@ -16,7 +16,7 @@ from time import perf_counter, sleep
 
 from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.bench.speed.streams import SWEEP_PERIOD, traffic
-from boxreg_ros.simulation.recorder import write_recording
+from boxreg_ros.simulation.writer import write_recording
 from boxreg_ros.structures import Sweep
 import numpy as np
 

@@ -10,7 +10,7 @@ the matrix A. Large products are those of BLAS, since numba unrolls short loops 
 from math import sqrt
 
 from boxreg_ros.core.method.arrays import POSE, SHARED, SPAN
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
 
 NEXT = 2 * POSE
@@ -22,7 +22,7 @@ RIDGE = 1e-9
 information of a deviation of 30 km."""
 
 
-@kernel
+@loop
 def clear(A):
     """Set a matrix to zero."""
     A.links[:] = 0.0
@@ -30,7 +30,7 @@ def clear(A):
     A.corner[:] = 0.0
 
 
-@kernel
+@loop
 def fix_variables(A, free):
     """Make rows and columns of variables that are not `free` (6 N + 23,) those of the identity."""
     n = len(free) - SHARED
@@ -48,7 +48,7 @@ def fix_variables(A, free):
         A.corner[s, s] += 1.0 - free[n + s] + RIDGE
 
 
-@kernel
+@loop
 def factorise_rows(links, border):
     """Replace the rows of one pose by those of U; return False if it is not positive definite."""
     for a in range(POSE):
@@ -68,7 +68,7 @@ def factorise_rows(links, border):
     return True
 
 
-@kernel
+@loop
 def factorise_corner(corner):
     """Replace the corner by its factor; return False where it is not positive definite."""
     size = len(corner)
@@ -122,7 +122,7 @@ def factorise(A):
     return factorise_corner(A.corner)
 
 
-@kernel
+@loop
 def substitute_forward(U, x, count):
     """Eliminate the first `count` variables of the chain from a right side (6 N + 23,)."""
     n = len(x) - SHARED
@@ -136,7 +136,7 @@ def substitute_forward(U, x, count):
             x[n + s] -= U.border[pose, a, s] * x[i]
 
 
-@kernel
+@loop
 def solve(U, x):
     """Replace a right side `x` (6 N + 23,) by the solution of U' U x = b."""
     links, border, corner = U
@@ -161,7 +161,7 @@ def solve(U, x):
         x[i] = value / links[pose, a, a]
 
 
-@kernel
+@loop
 def fill_inverse_root(U, inverse):
     """Write the inverse (m, m) of an upper triangle U (m, m)."""
     size = len(inverse)
@@ -185,7 +185,7 @@ def invert_corner(corner, inverse):
     np.dot(root, root.T, inverse)
 
 
-@kernel
+@loop
 def shift_known(known, own, across):
     """
     Move the known part of the inverse (35, 35) to the pose before.

@@ -25,7 +25,7 @@ from boxreg_ros.core.method.arrowhead import (
     solve,
     substitute_forward,
 )
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.residuals import (
     Axes,
     fill_axes,
@@ -54,13 +54,13 @@ def no_matrix():
     return Arrowhead(np.empty((0, POSE, SPAN)), np.empty((0, POSE, SHARED)), np.empty((0, 0)))
 
 
-@kernel
+@loop
 def is_wanted(A):
     """Return whether the curvature is wanted."""
     return len(A.links) > 0
 
 
-@kernel
+@loop
 def add(n, poses, rows, columns, W, out, gradient, A):
     """Add one residual `out` of some poses from n on, with diagonal weights W (6,)."""
     first = len(gradient) - SHARED
@@ -92,7 +92,7 @@ def add(n, poses, rows, columns, W, out, gradient, A):
     return value
 
 
-@kernel
+@loop
 def add_plane(n, face, w, v, by_angles, pull, weighted, gradient, A):
     """
     Add the plane v (4,) of a face with the weight w (4, 4): the sum over its outermost points.
@@ -141,7 +141,7 @@ def add_plane(n, face, w, v, by_angles, pull, weighted, gradient, A):
     return value
 
 
-@kernel
+@loop
 def add_shared_prior(shared, common, gradient, A):
     """Add the deviation of the shared variables from those expected (M8)."""
     first = len(gradient) - SHARED
@@ -313,13 +313,13 @@ def weigh_each(poses, shared, terms, window, constants, at, out):
         i += 1
 
 
-@kernel
+@loop
 def number_of(length, poses, is_used):
     """Return how many residuals of some `poses` each there are."""
     return max(length + 1 - poses, 0) if is_used else 0
 
 
-@kernel
+@loop
 def squared_norm(rows, W, r):
     """Return r' W r with diagonal weights."""
     total = 0.0
@@ -348,7 +348,7 @@ def linearise(x, terms, common, free, at, out, gradient, A):
     return value
 
 
-@kernel
+@loop
 def fill_dense(A, dense):
     """Write a matrix with a chain of two poses as a dense one, (35, 35)."""
     for pose in range(2):

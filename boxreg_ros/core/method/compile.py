@@ -16,7 +16,17 @@ DIGEST_LENGTH = 12
 """Letters of the digest of the sources. Chosen: 48 bits."""
 
 
-def kernel(function: Callable[..., Any]) -> Any:
+def loop(function: Callable[..., Any]) -> Any:
+    """
+    Compile a kernel that makes no array: views then count no references.
+
+    That takes a tenth less time, and a tenth less to compile.
+
+    """
+    return kernel(function, _nrt=False)
+
+
+def kernel(function: Callable[..., Any], **options: Any) -> Any:
     """
     Compile a function of numbers and arrays at its first call.
 
@@ -34,7 +44,7 @@ def kernel(function: Callable[..., Any]) -> Any:
     """
     folder = Path(function.__code__.co_filename).parent
     function.__qualname__ += f'_{sources_digest(folder)}'
-    options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'fastmath': REORDER}
+    options |= {'nogil': True, 'error_model': 'numpy', 'fastmath': REORDER}
     try:
         dispatcher = numba.njit(function, cache=True, **options)
     except RuntimeError as error:  # no folder for the cache can be written

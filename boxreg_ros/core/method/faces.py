@@ -9,7 +9,7 @@ from math import ceil, inf, isfinite, isnan, sqrt
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
 
@@ -27,7 +27,7 @@ MIN_ALONG = 0.5
 """Least distance along a face in the tangent of its visibility [m]. Chosen."""
 
 
-@kernel
+@loop
 def fill_candidates(depth, m, constants, index):
     """
     Write which of m points may be outermost on a face; return how many, and their largest depth.
@@ -46,7 +46,7 @@ def fill_candidates(depth, m, constants, index):
     return count, limit
 
 
-@kernel
+@loop
 def fill_depths(m, half, level, constants, work):
     """
     Write how far inside of the expected surface of each face each of m points is, (5, M) [m].
@@ -89,7 +89,7 @@ def fill_depths(m, half, level, constants, work):
     return near
 
 
-@kernel
+@loop
 def outermost_points(m, wanted, constants, work, moments):
     """
     Find the outermost ones of m points on each of the five faces of one box.
@@ -147,7 +147,7 @@ def returns_of(problem, values, b, n):
     return values[first : first + problem.counts[b, n] * problem.stride : problem.stride]
 
 
-@kernel
+@loop
 def centre_of(points, centre):
     """Write the mean of points (M, 3); zero without points."""
     centre[:] = 0.0
@@ -158,7 +158,7 @@ def centre_of(points, centre):
         centre[k] /= max(len(points), 1)
 
 
-@kernel
+@loop
 def fill_visibility(box, origins, points, R, toward, tangent):
     """Write the visibility of each face of one input box from its best sensor, (6,)."""
     fill_rotation(box[6], box[7], box[8], R)
@@ -169,7 +169,7 @@ def fill_visibility(box, origins, points, R, toward, tangent):
     tangent[5] = -ALWAYS_VISIBLE
 
 
-@kernel
+@loop
 def raise_visibility(box, origin, points, R, toward, tangent):
     """Raise the visibility of the upright faces to that from one sensor."""
     if isfinite(origin[0]) and isfinite(origin[1]) and isfinite(origin[2]):
@@ -191,7 +191,7 @@ def raise_visibility(box, origin, points, R, toward, tangent):
         tangent[face] = max(tangent[face], outward / max(along, MIN_ALONG))
 
 
-@kernel
+@loop
 def fill_insets(origins, tangent, occlusion_inset, range_inset, constants, shares, inset, weight):
     """Write the shares (2, 6) of the two insets, their sum (6,), and the weights of faces (6,)."""
     reach = sqrt(origins[0, 0] ** 2 + origins[0, 1] ** 2)
@@ -210,7 +210,7 @@ def fill_insets(origins, tangent, occlusion_inset, range_inset, constants, share
         weight[face] = seen / (1.0 + (by_range / constants.range_half_weight) ** 2)
 
 
-@kernel
+@loop
 def fill_velocity(poses, times, n, length, velocity):
     """Write the velocity (3,) of pose n: the mean over the steps before and after it."""
     before = max(n - 1, 0)
@@ -234,7 +234,7 @@ def fill_moved(b, n, problem, velocity, moved):
                 moved[k, i] -= velocity[k] * delays[i]
 
 
-@kernel
+@loop
 def to_box_axes(m, moved, shift, R, local):
     """Write m points in box axes, (3, M) [m]; the box is `shift` (3,) from their origin."""
     for i in range(m):
@@ -246,7 +246,7 @@ def to_box_axes(m, moved, shift, R, local):
         local[2, i] = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
 
 
-@kernel
+@loop
 def add_road(shift, ground, half_height, gap, moment, distance):
     """Write the observation of the bottom: a point of the road under the centre of the box."""
     road = ground if isfinite(ground) else 0.0
@@ -304,7 +304,7 @@ def empty_face_work(begin, end, problem, constants):
     )  # fmt: skip
 
 
-@kernel
+@loop
 def clear_padding(length, terms):
     """Set the face observations of padding to zero."""
     for n in range(length, len(terms)):

@@ -10,7 +10,7 @@ variables), and returns how many rows of r and columns of S it has. Its weight s
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.arrays import ANCHOR, BIAS, EXTENT, GAP, PIVOT, POSE, SIDESLIP, SPAN
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.rotation import fill_rotation_derivatives
 from boxreg_ros.core.method.weights import (
     acceleration_weight,
@@ -94,7 +94,7 @@ def empty_linearised():
     )  # fmt: skip
 
 
-@kernel
+@loop
 def fill_plane(n, face, poses, shared, terms, at, v, by_angles):
     """
     Write the plane of a face (M2): its signed distance from a point q is v'(q, 1).
@@ -119,7 +119,7 @@ def fill_plane(n, face, poses, shared, terms, at, v, by_angles):
             by_angles[3, k] -= by_angles[j, k] * shift
 
 
-@kernel
+@loop
 def fill_step(pose, origin, axes, out):
     """Write diag(axes', I)(p - origin), the step of a pose in the axes of its box."""
     for k in range(3):
@@ -131,7 +131,7 @@ def fill_step(pose, origin, axes, out):
         out.J[3 + k, 3 + k] = 1.0
 
 
-@kernel
+@loop
 def input_pose(n, poses, shared, terms, at, out):
     """Write the step of a pose from its input, less the bias (M3)."""
     fill_step(poses[n], terms[n].given, terms[n].axes, out)
@@ -186,7 +186,7 @@ def acceleration(n, poses, shared, terms, at, out):
     return POSE, 0
 
 
-@kernel
+@loop
 def zero_motion(n, poses, shared, terms, at, out):
     """Write the step from a pose to the next (M6)."""
     for k in range(POSE):
@@ -196,7 +196,7 @@ def zero_motion(n, poses, shared, terms, at, out):
     return POSE, 0
 
 
-@kernel
+@loop
 def slip(n, poses, shared, terms, at, out):
     """
     Write the velocity of the pivot across the path and upward (M7) [m/s].
@@ -291,7 +291,7 @@ W
 """
 
 
-@kernel
+@loop
 def fill_axes(poses, first, last, at):
     """Write the axes of the poses `first` to `last`."""
     for n in range(first, last):

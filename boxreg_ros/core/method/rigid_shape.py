@@ -11,7 +11,7 @@ in point-to-plane ICP.
 from math import sqrt
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.faces import fill_moved, fill_velocity, to_box_axes
 from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
@@ -25,7 +25,7 @@ ROOT_TOLERANCE = 1e-14
 """Least pivot of a root, over the largest one. Derived: rounding."""
 
 
-@kernel
+@loop
 def cell_of(x, y, z, half, cells):
     """Return the number of the cell that a point in box axes lies in."""
     cell = 0
@@ -151,7 +151,7 @@ def fill_agreement(m, local, half, constants, work, total, wanted):
     wanted[:] = np.linalg.solve(total + STEP_RIDGE * np.eye(6), pull)
 
 
-@kernel
+@loop
 def fill_root(information, root):
     """Write the lower Cholesky root (6, 6) of a matrix, 0 in directions without information."""
     least = 0.0
@@ -208,7 +208,7 @@ def agree(b, problem, poses, extents, constants, work, terms):
         fill_root(information, terms[n].root)
 
 
-@kernel
+@loop
 def is_near(x, y, z, half, margin):
     """Return whether a point is within `margin` of a box."""
     outside = max(abs(x) - half[0], abs(y) - half[1], abs(z) - half[2])

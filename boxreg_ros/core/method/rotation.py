@@ -2,10 +2,10 @@
 
 from math import cos, sin
 
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import loop
 
 
-@kernel
+@loop
 def fill_rotation(roll, pitch, yaw, R):
     """Write R (3, 3)."""
     cr, sr = cos(roll), sin(roll)
@@ -22,7 +22,7 @@ def fill_rotation(roll, pitch, yaw, R):
     R[2, 2] = cp * cr
 
 
-@kernel
+@loop
 def fill_rotation_derivatives(roll, pitch, yaw, R, dR):
     """Write R (3, 3) and its derivatives dR (3, 3, 3) by roll, pitch and yaw, in front."""
     fill_rotation(roll, pitch, yaw, R)

@@ -1,9 +1,9 @@
 """Selection of few numbers by rank: numba's own sort takes seconds to compile."""
 
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import loop
 
 
-@kernel
+@loop
 def nth(values, rank):
     """
     Return the value of a rank among values (n,), 0 for the smallest; any value if one is NaN.
@@ -41,7 +41,7 @@ def nth(values, rank):
     return values[rank]
 
 
-@kernel
+@loop
 def lower_median(values):
     """Return the median of values (n,), the lower one of two; any value if one is NaN."""
     return nth(values, (len(values) - 1) // 2)

@@ -10,7 +10,7 @@ from math import hypot, sqrt
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.arrays import BIAS, BOTTOM, EXTENT, GAP, POSE, SHARED
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.selection import lower_median
 import numpy as np
 
@@ -45,7 +45,7 @@ class Weighing(NamedTuple):
     of_class: Any
 
 
-@kernel
+@loop
 def input_weight(n, r, window, constants, w):
     """Write Cauchy's weight of an input pose (M21); a pinned one has a deviation of its own."""
     for k in range(POSE):
@@ -55,20 +55,20 @@ def input_weight(n, r, window, constants, w):
             w[k] = 1 / constants.pin_deviations[k] ** 2
 
 
-@kernel
+@loop
 def rigid_shape_weight(n, r, window, constants, w):
     """Write ones: the residual is whitened by the root of its information (M4)."""
     w[:] = 1.0
 
 
-@kernel
+@loop
 def acceleration_weight(n, r, window, constants, w):
     """Write the weight of an acceleration along the axes of the body (M23)."""
     for k in range(POSE):
         w[k] = 1 / window.of_class.acceleration[k] ** 2
 
 
-@kernel
+@loop
 def zero_motion_weight(n, r, window, constants, w):
     """Write the weight of the step of a parked object; zero where it drives (M25)."""
     for k in range(POSE):
@@ -76,14 +76,14 @@ def zero_motion_weight(n, r, window, constants, w):
         w[k] = 1 / deviation**2 if window.parked[n] else 0.0
 
 
-@kernel
+@loop
 def slip_weight(n, r, window, constants, w):
     """Write the weight of the velocity of the pivot across the path and upward (M7)."""
     for k in range(2):
         w[k] = 1 / window.of_class.slip[k] ** 2
 
 
-@kernel
+@loop
 def robustify(i, length, squared, outlier, terms):
     """
     Down-weight residual `i` where it is far off at the start of the round (M24).
@@ -100,7 +100,7 @@ def robustify(i, length, squared, outlier, terms):
             terms[n].W[i, k] /= (1 + least / outlier**2) ** 2
 
 
-@kernel
+@loop
 def fill_rates(boxes, times, length, rate):
     """Write the slopes of x, y and yaw over time by linear regression, (3,) [m/s, rad/s]."""
     mean = 0.0
@@ -157,7 +157,7 @@ def fill_parked(boxes, times, length, yaw_deviation, constants, parked):
             parked[step + 1 - span : step + span] = False
 
 
-@kernel
+@loop
 def fill_pin_factor(length, common, factor):
     """Write the factor on the weights of the boxes beside pinned ones (M21a), (6,)."""
     for k in range(POSE):
@@ -166,14 +166,14 @@ def fill_pin_factor(length, common, factor):
         factor[k] = variance / (variance + unmodelled)
 
 
-@kernel
+@loop
 def face_deviation(face, shape, constants):
     """Return the deviation of one observation of a face of an object rigid up to `shape` [m]."""
     deviation = constants.face_deviations[face]
     return deviation if face == BOTTOM else max(deviation, shape)
 
 
-@kernel
+@loop
 def weigh_faces(length, shape, constants, terms, face_weight):
     """
     Write the weights of the faces (M20), (N, 6) [1/m^2], and multiply their moments by them.
@@ -193,7 +193,7 @@ def weigh_faces(length, shape, constants, terms, face_weight):
                     moments[face, i, j] *= w
 
 
-@kernel
+@loop
 def weigh_shared(length, shared, terms, common, face_weight, constants):
     """
     Write the weights of the shared variables (M22), (23,).

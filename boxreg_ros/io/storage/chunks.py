@@ -17,14 +17,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
-from boxreg_ros.io.storage.record import (
-    Damage,
-    Damages,
-    one_line,
-    Record,
-    shown,
-    span_ns,
-)
+from boxreg_ros.io.storage.record import Damage, Damages, one_line, Record, shown, span_ns
 from boxreg_ros.io.storage.urls import byte_source_of, ByteSource
 from rosbags.interfaces import Connection
 

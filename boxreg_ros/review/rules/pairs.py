@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.review.rules.protocol import LabelTrack
-from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, X, Z
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, Ints, X
 import numpy as np
 
 
@@ -56,7 +56,7 @@ def _near_pairs(tracks: Sequence[LabelTrack]) -> Pairs:
         i, j = order[first], order[first + step]
         is_beside = (stamps_ns[i] == stamps_ns[j]) & (boxes[j, X] - boxes[i, X] < reach)
         first, i, j = first[is_beside], i[is_beside], j[is_beside]
-        distance = np.linalg.norm(boxes[i, X : Z + 1] - boxes[j, X : Z + 1], axis=1)
+        distance = np.linalg.norm(boxes[i, BOX_CENTER] - boxes[j, BOX_CENTER], axis=1)
         is_near = (distance < radius[i] + radius[j]) & (owner[i] != owner[j])
         found.append(np.sort(np.column_stack([i, j])[is_near], axis=1))
         if not len(first):

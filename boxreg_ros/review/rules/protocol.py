@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.config import Config
-from boxreg_ros.structures import Floats, Ints, is_valid_box, X, Z
+from boxreg_ros.structures import BOX_CENTER, Floats, Ints, is_valid_box
 import numpy as np
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class LabelTrack:
         """Return the steps between consecutive boxes, without those across gaps."""
         seconds = np.diff(self.stamps_ns) * 1e-9
         rows = np.flatnonzero((seconds > 0) & (seconds <= MAX_STEP))
-        velocity = np.diff(self.boxes[:, X : Z + 1], axis=0)[rows] / seconds[rows, None]
+        velocity = np.diff(self.boxes[:, BOX_CENTER], axis=0)[rows] / seconds[rows, None]
         return Steps(rows, seconds[rows], velocity)
 
 

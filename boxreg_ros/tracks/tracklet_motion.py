@@ -5,7 +5,7 @@ from __future__ import annotations
 from boxreg_ros.config import Config
 from boxreg_ros.core.motion import EndMotion, motion_at, UNKNOWN_SPEED_DEVIATION
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import Floats, Ints, PITCH, ROLL, X, Y, YAW, Z
+from boxreg_ros.structures import BOX_CENTER, Floats, Ints, PITCH, ROLL, X, Y, YAW
 from boxreg_ros.tracks.tracklet import Tracklet
 import numpy as np
 
@@ -36,13 +36,13 @@ def between(before: EndMotion, after: EndMotion, stamps_ns: Ints) -> Floats:
     duration_ns = after.stamp_ns - before.stamp_ns
     s = ((stamps_ns - before.stamp_ns) / duration_ns)[:, None]
     seconds = duration_ns * 1e-9
-    chord = (after.box - before.box)[X : Z + 1] / seconds
+    chord = (after.box - before.box)[BOX_CENTER] / seconds
     ends = [_velocity_or(motion, chord) * seconds for motion in (before, after)]
     boxes = (1 - s) * before.box + s * after.box
-    boxes[:, X : Z + 1] = (
-        (1 + 2 * s) * (1 - s) ** 2 * before.box[X : Z + 1]
+    boxes[:, BOX_CENTER] = (
+        (1 + 2 * s) * (1 - s) ** 2 * before.box[BOX_CENTER]
         + s * (1 - s) ** 2 * ends[0]
-        + s**2 * (3 - 2 * s) * after.box[X : Z + 1]
+        + s**2 * (3 - 2 * s) * after.box[BOX_CENTER]
         - s**2 * (1 - s) * ends[1]
     )
     turn = wrap_angle(2 * (after.box[YAW] - before.box[YAW])) / 2
