@@ -285,6 +285,8 @@ class Ingredients:
     """Faces turned away from the sensor have a weight."""
     range_inset: bool = True
     """Points are expected further inside the faces of distant objects."""
+    ring_inset: bool = True
+    """The top of an object is expected half a ring of the LiDAR above its highest points."""
     point_ownership: bool = True
     """A point near two boxes belongs to the one it is deeper inside of."""
     road: bool = True

@@ -2,7 +2,7 @@
 Read label files and recordings with third-party libraries, which `test/consumers.txt` lists.
 
 The libraries have an environment of their own. Tests call `consumer`, which runs this file there
-with the name of a function below and its arguments; the program prints the result as JSON.
+with names of functions below and their arguments; the program prints the results as JSON.
 
 """
 
@@ -15,13 +15,19 @@ MARKER_ARRAY = 'visualization_msgs.msg.MarkerArray'
 HOME = Path(__file__).resolve().parents[1] / '.venv-consumers'
 
 
-def consumer(name, *arguments):
+def consumer(*call):
     """Run a function below in the environment of the libraries, and return its result."""
+    return consumers(call)[0]
+
+
+def consumers(*calls):
+    """Run several functions in one process, which loads a library once; return their results."""
     import pytest
 
     if not (HOME / 'bin' / 'python').exists():
         pytest.skip('.venv-consumers does not exist: make test creates it')
-    command = [HOME / 'bin' / 'python', '-W', 'ignore', __file__, name, *map(str, arguments)]
+    calls = json.dumps([list(map(str, call)) for call in calls])
+    command = [HOME / 'bin' / 'python', '-W', 'ignore', __file__, calls]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
@@ -383,4 +389,5 @@ def _marker_of(marker):
 
 
 if __name__ == '__main__':
-    json.dump(globals()[sys.argv[1]](*sys.argv[2:]), sys.stdout)
+    results = [globals()[name](*arguments) for name, *arguments in json.loads(sys.argv[1])]
+    json.dump(results, sys.stdout)

@@ -108,7 +108,7 @@ def observation(**changes):
     blank = Observations(
         stamps_ns=0, boxes=np.array([0.0, 0, 0, 4, 2, 1.5, 0, 0, 0]), points=np.zeros((0, 3)),
         delays=np.zeros(0), counts=0, origins=np.full((1, 3), np.nan), ground=np.nan,
-        num_points=0, sights=0.0, is_pinned=False,
+        ring_heights=0.0, num_points=0, sights=0.0, is_pinned=False,
     )  # fmt: skip
     row = blank._replace(**changes)
     columns = {name: np.array([value]) for name, value in row._asdict().items()}
@@ -172,6 +172,7 @@ def problem_of(boxes, **changes):
         'times': np.tile(0.1 * np.arange(N), (B, 1)),
         'origins': np.full((B, N, 1, 3), np.nan),
         'ground': np.full((B, N), np.nan),
+        'ring_heights': np.zeros((B, N)),
         'stride': 1,
         'pinned': np.zeros((B, N), bool),
         'prior_mean': np.zeros((B, PRIOR)),

@@ -77,6 +77,7 @@ INGREDIENTS = {
         'points of occluded faces have no inset',
         {'faces.inset_ends': 0.0, 'faces.inset_sides': 0.0},
     ),
+    'ring inset': Ingredient('the highest points are at the top', _off('ring_inset')),
     'range inset': Ingredient('points of distant faces have no inset', _off('range_inset')),
     'noise estimation': Ingredient(
         'the input has the errors of the settings', _off('noise_estimation')

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.method import crop as crop_kernels
+from boxreg_ros.core.method.rings import ring_heights
 from boxreg_ros.core.tables import column
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, Ints, ROLL, Sweep, YAW
@@ -78,6 +79,8 @@ class Observations(NamedTuple):
         Each sensor that sees the object minus centre [m]; NaN where unknown. The last repeats.
     ground : array, shape (n,)
         Height of the road beside the box minus z of the centre [m]; NaN where not found.
+    ring_heights : array, shape (n,)
+        Height between two rings of the LiDAR at the object [m]; 0 where unknown.
     num_points : array, shape (n,)
         Sweep points inside the input box.
     sights : array, shape (n,)
@@ -94,6 +97,7 @@ class Observations(NamedTuple):
     counts: Ints
     origins: Floats
     ground: Floats
+    ring_heights: Floats
     num_points: Ints
     sights: Floats
     is_pinned: NDArray[np.bool_]
@@ -126,6 +130,7 @@ class Observations(NamedTuple):
             counts=counts,
             origins=self.origins[rows],
             ground=self.ground[rows],
+            ring_heights=self.ring_heights[rows],
             num_points=self.num_points[rows],
             sights=self.sights[rows],
             is_pinned=self.is_pinned[rows],
@@ -238,14 +243,16 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> Obser
         sights = _medians(delays, counts)
     up = np.cos(boxes[:, ROLL:YAW]).prod(1)  # of the z axis of each box, in the fixed frame
     ground = (own.road - boxes[:, 5] / 2) / up.clip(0.1)  # along z of the fixed frame
+    origins = _origins(sweep, rows, owner, centers)
     return Observations(
         stamps_ns=np.full(n, stamp_ns, np.int64),
         boxes=boxes,
         points=points,
         delays=delays,
         counts=counts,
-        origins=_origins(sweep, rows, owner, centers),
+        origins=origins,
         ground=ground,
+        ring_heights=ring_heights(points, counts, origins),
         num_points=own.num_inside,
         sights=sights,
         is_pinned=np.zeros(n, bool),

@@ -113,6 +113,8 @@ class Problem(NamedTuple):
         Each sensor that sees the object minus the centre of the input box [m]; NaN if unknown.
     ground : array, shape (B, N)
         Height of the road minus that of the input centre [m]; NaN if unknown.
+    ring_heights : array, shape (B, N)
+        Height between two rings of the LiDAR at the object [m]; 0 if unknown.
     points, delays : array, shapes (P, 3) and (P,)
         Returns of all observations minus the centre of their input box [m], and their measurement
         times relative to the stamp of the box [s].
@@ -141,6 +143,7 @@ class Problem(NamedTuple):
     times: Floats
     origins: Floats
     ground: Floats
+    ring_heights: Floats
     points: NDArray[np.float32]
     delays: NDArray[np.float32]
     first: Ints
@@ -209,6 +212,7 @@ class Problem(NamedTuple):
             times=self.times[row, column] + PADDING_PERIOD * (~valid).cumsum(1),
             origins=self.origins[row, column],
             ground=self.ground[row, column],
+            ring_heights=self.ring_heights[row, column],
             first=self.first[row, column],
             counts=self.counts[row, column],
             pinned=self.pinned[row, column],
@@ -319,7 +323,7 @@ def stack_windows(
     seen = Observations.concatenated(tables)
     if 2 * len(rows) < len(seen.boxes):  # of another group: their points are not held twice
         seen, rows = seen.take(rows), np.arange(len(rows))
-    boxes, times, origins, ground = _stack_observations(seen, rows, valid)
+    boxes, times, origins, ground, ring_heights = _stack_observations(seen, rows, valid)
     priors = [w.prior or _no_prior(w.observations[0].box[:3]) for w in windows]
     base, state, step, information, extents = (
         np.array(part) for part in zip(*priors, strict=True)
@@ -338,6 +342,8 @@ def stack_windows(
     first, counts = np.zeros((2, *valid.shape), np.int64)
     first[valid] = seen.first[rows]
     counts[valid] = seen.counts[rows]
+    if not config.ingredients.ring_inset:
+        ring_heights[:] = 0.0
     if not config.ingredients.marginalisation:
         information[:] = 0.0
     kind, of_class = _of_classes(windows, config)
@@ -349,6 +355,7 @@ def stack_windows(
         times=times,
         origins=origins,
         ground=ground,
+        ring_heights=ring_heights,
         points=seen.points,
         delays=delays,
         first=first,
@@ -372,12 +379,12 @@ def _no_prior(base: Floats) -> MarginalisationPrior:
 
 def _stack_observations(
     seen: Observations, rows: Ints, valid: NDArray[np.bool_]
-) -> tuple[Floats, Floats, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """
-    Return input boxes, times, sensor origins and ground heights of `rows`, padded.
+    Return input boxes, times, sensor origins, and heights of road and rings, of `rows`, padded.
 
-    Shapes (B, N, 9), (B, N), (B, N, K, 3) and (B, N). Padding repeats the last box of a window, at
-    later times, and the last sensor of an observation.
+    Shapes (B, N, 9), (B, N), (B, N, K, 3) and twice (B, N). Padding repeats the last box of a
+    window, at later times, and the last sensor of an observation.
 
     """
     B, N = valid.shape
@@ -390,9 +397,11 @@ def _stack_observations(
     origins[valid] = seen.origins[rows]
     ground = np.full((B, N), np.nan)
     ground[valid] = seen.ground[rows]
+    ring_heights = np.zeros((B, N))
+    ring_heights[valid] = seen.ring_heights[rows]
     stamps_ns = seen.stamps_ns[padded]
     times = (stamps_ns - stamps_ns[:, :1]) * 1e-9 + PADDING_PERIOD * np.maximum(column - last, 0)
-    return seen.boxes[padded], times, origins, ground
+    return seen.boxes[padded], times, origins, ground, ring_heights
 
 
 def _delays(seen: Observations, config: Config) -> NDArray[np.float32]:

@@ -19,7 +19,7 @@ from boxreg_ros.core.pending import BoxToObserve, ObservedTrack, PendingArray, P
 from boxreg_ros.core.problem import SETTINGS_OF
 from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import column, joined
-from boxreg_ros.core.track_window import Estimate, Window
+from boxreg_ros.core.track_window import Estimate, PRIOR_POSES, Window
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, RefinedBoxes, Sweep, X, Z
 import numpy as np
@@ -108,8 +108,9 @@ class BoxRegistrar:
     An object that is **followed** has such a box wherever a box array has none of its id and its
     points support it, refined or not.
 
-    With a **budget**, the tracks that have waited longest are solved first, then those whose
-    newest estimate is least certain, then the nearest. The boxes of the others are kept for now,
+    With a **budget**, waiting tracks that have no box here are solved first, since their boxes
+    become final before they end; then those that have waited longest, then those whose newest
+    estimate is least certain, then the nearest. The boxes of the others are kept for now,
     with the reason ``budget``; their observations join the next window that is solved. After the
     early boxes are published, `catch_up` solves tracks that wait, for their final boxes.
 
@@ -208,8 +209,7 @@ class BoxRegistrar:
             if self.config.estimate == 'track':
                 self._solve_full_windows()
             else:
-                observed = [track for track in self._tracks.values() if track.is_in(array)]
-                self._solve(self._within_budget(observed))
+                self._solve(self._within_budget(array))
                 yield array.result(is_final=False)
                 self._settle_after_lag()
             yield from self._pop_settled()
@@ -361,23 +361,31 @@ class BoxRegistrar:
             tracks = self._tracks.values()
             self._solve([track for track in tracks if len(track.entries) > full // 2])
 
-    def _within_budget(self, tracks: list[ObservedTrack]) -> list[ObservedTrack]:
+    def _within_budget(self, array: PendingArray) -> list[ObservedTrack]:
         """Return the tracks to solve now; the others are carried to the next box array."""
+        tracks = [track for track in self._tracks.values() if track.is_in(array)]
         if self._budget is None:
             return tracks
         ready = [t for t in tracks if len(t.entries) >= self.config.min_observations]
+        # Nothing is gained by a longer wait of those that have no box here.
+        silent = [t for t in self._tracks.values() if t.num_carried and not t.is_in(array)]
         # An ended track that waits has its last chance; the others have an estimate.
         self._ended_tracks.sort(key=lambda track: -track.num_carried)
         num_ended = sum(track.num_carried > 0 for track in self._ended_tracks)
-        limit = self._budget(num_ended + ceil(len(ready) / (self._lag + 1)))
+        # A track that has waited keeps two observations of its prior beside the new ones.
+        longest_wait = min(self._lag + 1, self.config.window - PRIOR_POSES)
+        num_last = num_ended + len(silent)
+        limit = self._budget(num_last + ceil(len(ready) / longest_wait))
         self._settle_ended_tracks_beyond(max(limit - len(ready), min(limit, num_ended)))
-        if len(ready) + len(self._ended_tracks) <= limit:
-            return tracks
-        limit -= len(self._ended_tracks)
+        limit = max(0, limit - len(self._ended_tracks))
+        silent = silent[:limit]
+        limit -= len(silent)
+        if len(ready) <= limit:
+            return silent + tracks
         ready = _by_urgency(ready)
         for track in ready[limit:]:
             track.carry(self._num_overlapping)
-        return ready[:limit]
+        return silent + ready[:limit]
 
     def _settle_ended_tracks_beyond(self, limit: int) -> None:
         """Settle ended tracks but the first ones: none can wait."""

@@ -10,7 +10,7 @@ from typing import Self
 from boxreg_ros.datasets.protocol import Scene, SweepFile
 from boxreg_ros.datasets.registry import Address, module_of, open_scene, resolved, scene_files
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
-from boxreg_ros.io.items import Item, LOOKAHEAD_NS, not_measured, Stage
+from boxreg_ros.io.items import Item, LOOKAHEAD_NS, not_measured, requested_part, Stage
 from boxreg_ros.io.lidars import SensorPlacement
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.transforms import TransformTree
@@ -85,17 +85,8 @@ class SceneRecording:
         self._scene: Scene = open_scene(self._address, self._lidars)
         self.points_topic = self._scene.points_topic
         first_ns, last_ns = self._scene.sweep_stamps_ns[[0, -1]].tolist()
-        self.start_ns = first_ns + round((self._start or 0.0) * 1e9)
-        self.end_ns = last_ns + 1
-        if self._end is not None:
-            self.end_ns = min(self.end_ns, first_ns + round(self._end * 1e9))
-        if self.start_ns >= self.end_ns:
-            raise RecordingError(
-                f'start and end: expected a part of the {(last_ns - first_ns) * 1e-9:.1f} s of '
-                f'{self}, got {self._start or 0:g} to '
-                f'{"the end" if self._end is None else f"{self._end:g}"}; choose a smaller '
-                f'--start, or leave it out'
-            )
+        part_ns = requested_part(str(self), first_ns, last_ns + 1, self._start, self._end)
+        self.start_ns, self.end_ns = part_ns
         if self.has_boxes:
             self._frames()  # raises if there are no boxes
         return self

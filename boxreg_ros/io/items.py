@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.lidars import SensorPlacement
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.transforms import TransformTree
@@ -47,6 +47,29 @@ Stage = Callable[[str], AbstractContextManager[object]]
 def not_measured(stage: str) -> AbstractContextManager[object]:
     """Measure nothing."""
     return nullcontext()
+
+
+def requested_part(
+    source: str, begin_ns: int, end_ns: int, start: float | None, end: float | None
+) -> tuple[int, int]:
+    """
+    Return begin and end of the part of a drive from `start` to `end` [s], in nanoseconds.
+
+    Raises
+    ------
+    RecordingError
+        If it is empty.
+
+    """
+    first_ns = begin_ns + round((start or 0.0) * 1e9)
+    behind_ns = end_ns if end is None else min(end_ns, begin_ns + round(end * 1e9))
+    if first_ns >= behind_ns:
+        raise RecordingError(
+            f'start and end: expected a part of the {(end_ns - begin_ns) * 1e-9:.1f} s of '
+            f'{source}, got {start or 0:g} to {"the end" if end is None else f"{end:g}"}; choose '
+            f'a smaller --start, or leave it out'
+        )
+    return first_ns, behind_ns
 
 
 @runtime_checkable

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import errno
+from functools import partial
 from io import BytesIO
 from itertools import count
 from pathlib import Path
@@ -117,14 +118,14 @@ class Journal:
 
     def _open(self) -> None:
         # Autocommit; the recorder closes its segments in a second thread.
-        self._database = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False)
+        connect = partial(sqlite3.connect, isolation_level=None, check_same_thread=False)
         try:
+            self._database = connect(self.path)
             for statement in SETUP:
                 self._database.execute(statement)
+        except sqlite3.OperationalError as error:
+            raise self._system_error(error, b'') from None
         except sqlite3.DatabaseError as error:
-            self.close()
-            if isinstance(error, sqlite3.OperationalError):
-                raise self._system_error(error, b'') from None
             raise RecordingError(
                 f'{self.path}: expected a journal of boxreg, got another file: {error}; delete it '
                 f'to begin again'

@@ -15,7 +15,7 @@ from typing import Any, cast, Self, TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.foxglove import encoded
-from boxreg_ros.io.items import Item, LOOKAHEAD_NS, not_measured, Stage
+from boxreg_ros.io.items import Item, LOOKAHEAD_NS, not_measured, requested_part, Stage
 from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder
 from boxreg_ros.io.recorded_motion import RecordedMotion
@@ -143,22 +143,12 @@ class Recording:
         self._timeline = MessageOrder(self._reader, self.points_topic, self._stamp_of)
         motion = (topics.transforms - topics.static_transforms) | topics.of((ODOMETRY_TYPE,))
         begin_ns, last_ns = self._timeline.span_ns(self.data_topics | motion)
-        self.start_ns = begin_ns + round((self._start or 0.0) * 1e9)
-        self.end_ns = last_ns
-        if self._end is not None:
-            self.end_ns = min(last_ns, begin_ns + round(self._end * 1e9))
+        part_ns = requested_part(str(self), begin_ns, last_ns, self._start, self._end)
+        self.start_ns, self.end_ns = part_ns
         self.part_ns = (
             self.start_ns if self._start else None,
             None if self._end is None else self.end_ns,
         )
-        if self.start_ns >= self.end_ns:
-            end = 'the end' if self._end is None else f'{self._end:g}'
-            raise RecordingError(
-                f'start and end: expected a part of the {(last_ns - begin_ns) * 1e-9:.1f} s of '
-                f'{self}, got {self._start or 0:g} to {end}; '
-                f'choose a smaller --start, or leave it out'
-            )
-        part_ns = (self.start_ns, self.end_ns)
         self._motion = RecordedMotion(
             topics, self._decoder, self._read, part_ns, self._asked_odometry
         )

@@ -24,17 +24,18 @@ def written_whole(path: Path) -> Iterator[TextIO]:
     """
     Yield a file that replaces `path`, also a URL, on success and is deleted on failure.
 
-    On success it is on the disk itself: a power cut leaves it, or the one before.
+    On success it is on the disk itself: a power cut leaves it, or the one before. Characters of
+    file names that are no text are written as escapes.
 
     """
     if url_of(path) is not None:
         text = StringIO()
         yield text
-        write_text(path, text.getvalue())
+        write_text(path, text.getvalue().encode(errors='backslashreplace').decode())
         return
     partial = path.with_name(f'.{path.name}.{uuid4().hex[:8]}.partial')
     try:
-        with partial.open('w', encoding='utf-8', newline='') as file:
+        with partial.open('w', encoding='utf-8', errors='backslashreplace', newline='') as file:
             yield file
         store([partial])
         os.replace(partial, path)

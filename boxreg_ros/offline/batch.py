@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed, ThreadPoolExecutor
 from contextlib import contextmanager, ExitStack
 from dataclasses import fields, replace
+from math import inf
 from pathlib import Path
 import sys
 from typing import Any
@@ -114,7 +115,12 @@ def run(args: argparse.Namespace) -> int:
         else:
             _check(args)
             known = {name: one['recordings'] for name, one in read_states(args.out).items()}
-            jobs = jobs_of(args.recordings, known)[index - 1 :: count]
+            drives = jobs_of(args.recordings, known)
+            if not drives:
+                raise ConfigError(
+                    'RECORDING: expected at least one drive, got none; see boxreg batch -h'
+                )
+            jobs = drives[index - 1 :: count]
         with _alone(args.out, part):
             rows += [vars(result) for result in _results(jobs, args)]
             write_results(args.out, rows, part)
@@ -137,15 +143,14 @@ def _alone(out: Path, part: str) -> Iterator[None]:
 
 def _check(args: argparse.Namespace) -> None:
     """Refuse wrong options before any drive is begun."""
-    if not args.recordings:
-        raise ConfigError('RECORDING: expected at least one drive, got none; see boxreg batch -h')
     if args.workers < 1 or args.retries < 0:
         raise ConfigError(
             f'workers and retries: expected 1 and 0 or more, got {args.workers} and {args.retries}'
         )
-    if not (args.timeout > 0 and args.memory > 0):
+    if not (args.timeout > 0 and 0 < args.memory < inf):
         raise ConfigError(
-            f'timeout and memory: expected more than 0, got {args.timeout:g} and {args.memory:g}'
+            f'timeout and memory: expected more than 0, and a number of GB, got '
+            f'{args.timeout:g} and {args.memory:g}'
         )
     if args.address is not None and args.engine != 'ray':
         raise ConfigError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 import csv
 from dataclasses import dataclass, fields
 from html import escape
@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.box_table import unprotected
+from boxreg_ros.io.box_table import csv_row, protected, unprotected
 from boxreg_ros.io.storage.urls import names_of, read_text, url_of
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.result_folder import SUMMARY
@@ -112,10 +112,19 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], shard: str = '') ->
 
     """
     with written_whole(out / f'index{shard}.csv') as file:
-        writer = csv.DictWriter(file, INDEX_COLUMNS, lineterminator='\n')
-        writer.writeheader()
-        writer.writerows(rows)
-    merged = {
+        file.write(csv_row(INDEX_COLUMNS))
+        for row in rows:
+            file.write(csv_row(protected(str(row[name])) for name in INDEX_COLUMNS))
+    stem, suffix = SUMMARY.split('.')
+    with written_whole(out / f'{stem}{shard}.{suffix}') as file:
+        file.write(json.dumps(_merged(rows), indent=2) + '\n')
+    with written_whole(out / f'report{shard}.html') as file:
+        file.write(_page(rows, _riskiest(out, [row['drive'] for row in rows])))
+
+
+def _merged(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the summary over all drives."""
+    return {
         'drives': len(rows),
         'done': sum(row['status'] != DRIVE_FAILED for row in rows),
         **{name: sum(int(row[name]) for row in rows) for name in COUNTS},
@@ -126,11 +135,6 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], shard: str = '') ->
             row['drive']: row['last_line'] for row in rows if row['status'] == DRIVE_FAILED
         },
     }
-    stem, suffix = SUMMARY.split('.')
-    with written_whole(out / f'{stem}{shard}.{suffix}') as file:
-        file.write(json.dumps(merged, indent=2) + '\n')
-    with written_whole(out / f'report{shard}.html') as file:
-        file.write(_page(rows, _riskiest(out, [row['drive'] for row in rows])))
 
 
 def rows_of_shards(out: Path) -> list[dict[str, Any]]:
@@ -163,8 +167,21 @@ def rows_of_shards(out: Path) -> list[dict[str, Any]]:
         )
     rows: list[dict[str, Any]] = []
     for path in found.values():
-        rows += csv.DictReader(StringIO(read_text(path)))
+        try:
+            part = list(_read_rows(read_text(path)))
+            _merged(part)
+        except (KeyError, ValueError) as error:  # UnicodeDecodeError, too
+            raise RecordingError(
+                f'{path}: expected the index of a shard, got an error in {error}; run it again'
+            ) from None
+        rows += part
     return sorted(rows, key=lambda row: str(row['drive']))
+
+
+def _read_rows(text: str) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a table whose cells are no formulas."""
+    for row in csv.DictReader(StringIO(text, newline='')):
+        yield {name: unprotected(cell or '') for name, cell in row.items() if name}
 
 
 def _listed(numbers: Iterable[int]) -> str:
@@ -179,10 +196,9 @@ def _riskiest(out: Path, drives: Iterable[str]) -> list[dict[str, Any]]:
             text = read_text(out / drive / REVIEW)
         except OSError:  # the drive has failed
             continue
-        for row in csv.DictReader(StringIO(text, newline='')):
+        for row in _read_rows(text):
             try:
-                shown = {name: unprotected(cell) for name, cell in row.items()}
-                found.append((float(row[RISK]), {'drive': drive, **shown}))
+                found.append((float(row[RISK]), {'drive': drive, **row}))
             except (KeyError, TypeError, ValueError):
                 continue  # a review without this column has no order
     found.sort(key=lambda item: -item[0])
@@ -211,4 +227,5 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
 
 def _cell(name: str, value: Any) -> str:
     text = escape('' if value is None else str(value))
-    return f'<a href="{quote(str(value))}/">{text}</a>' if name == 'drive' else text
+    link = quote(str(value), errors='surrogateescape')  # names of files may be no text
+    return f'<a href="{link}/">{text}</a>' if name == 'drive' else text

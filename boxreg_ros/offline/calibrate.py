@@ -236,8 +236,8 @@ def write_settings(path: Path, values: Mapping[str, Any], origin: str) -> None:
         inner[last] = value
     text = yaml.safe_dump({'/**': {'ros__parameters': nested}}, sort_keys=False)
     text = f'# boxreg calibrate, {origin}\n{text}'
-    with written_whole(path) as file:  # `origin` has file names, which may not be valid text
-        file.write(text.encode(errors='backslashreplace').decode())
+    with written_whole(path) as file:
+        file.write(text)
 
 
 def table(measured: Mapping[str, Measured], config: Config) -> list[str]:
@@ -369,6 +369,7 @@ def _bare(rows: Iterable[Sequence[Any]]) -> Window:
         counts=none,
         origins=np.full((n, 1, 3), np.nan),
         ground=unknown,
+        ring_heights=np.zeros(n),
         num_points=none,
         sights=np.zeros(n),
         is_pinned=np.zeros(n, bool),

@@ -226,10 +226,18 @@ def _absolute(drive: tuple[Path, ...]) -> tuple[Path, ...]:
 
 
 def _manifest(path: Path) -> Iterator[tuple[Path, ...]]:
-    for line in path.read_text(encoding='utf-8').splitlines():
-        words = shlex.split(COMMENT.sub('', line))
-        if words:
-            yield tuple(_listed(path.parent, word) for word in words)
+    try:
+        text = path.read_text(encoding='utf-8-sig')
+        if '\0' in text:
+            raise ValueError('a NUL character')
+        drives = [shlex.split(COMMENT.sub('', line)) for line in text.splitlines()]
+    except ValueError as error:  # UnicodeDecodeError, too
+        raise ConfigError(
+            f'{path}: expected a text in UTF-8 with the recordings of one drive per line, got '
+            f'{error}; correct it'
+        ) from None
+    for words in filter(None, drives):
+        yield tuple(_listed(path.parent, word) for word in words)
 
 
 def _listed(folder: Path, word: str) -> Path:

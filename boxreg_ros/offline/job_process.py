@@ -32,7 +32,7 @@ from boxreg_ros.offline.time_limit import Watch, watched
 
 DRIVE = '{drive}'
 """Stands for the name of the drive in the options of a batch."""
-STATE_KEYS = frozenset({'key', 'recordings', 'files', 'peak_mb'})
+JOB_STATE = {'key': str, 'recordings': list, 'files': list, 'peak_mb': int}
 """Fields of the state of a job that is done; one without them, of another version, is none."""
 END_SECONDS = 10.0
 """Time that a job has to remove its files after SIGTERM [s]; then it is killed."""
@@ -313,4 +313,7 @@ def _read_state(path: Path) -> dict[str, Any]:
         state = json.loads(read_text(path))
     except (OSError, ValueError):
         return {}
-    return state if isinstance(state, dict) and STATE_KEYS.issubset(state) else {}
+    is_state = isinstance(state, dict) and all(
+        isinstance(state.get(name), kind) for name, kind in JOB_STATE.items()
+    )
+    return state if is_state else {}

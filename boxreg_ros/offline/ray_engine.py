@@ -44,7 +44,7 @@ def ray_engine(
     Raises
     ------
     ConfigError
-        If Ray is not installed.
+        If Ray is not installed, or no node has the memory of a job.
     RecordingError
         If the cluster does not answer.
 
@@ -71,6 +71,7 @@ def ray_engine(
             ray.cancel(reference, force=True)
 
     try:
+        _check_memory(ray.nodes(), runner.memory)
         yield run, max(JOBS_AHEAD * int(ray.cluster_resources().get('CPU', 1)), 1), end
     finally:
         ray.shutdown()
@@ -102,6 +103,17 @@ def _check_answers(address: str | None) -> None:
     host, _, port = (address or '').removeprefix('ray://').rpartition(':')
     if host and port.isdecimal():
         socket.create_connection((host, int(port)), CLUSTER_SECONDS).close()
+
+
+def _check_memory(nodes: list[dict[str, Any]], memory: float) -> None:
+    """Refuse jobs that need more memory [bytes] than any node has: Ray would wait for ever."""
+    sizes = [node['Resources'].get('memory', 0) for node in nodes if node['Alive']]
+    largest = max(sizes, default=0)
+    if memory > largest:
+        raise ConfigError(
+            f'--memory: expected at most {largest / 1e9:.1f} GB, all that the largest node of the '
+            f'Ray cluster offers, got {memory / 1e9:g} GB; lower it, or start a larger node'
+        )
 
 
 def _run_job(runner: JobRunner, job: Job) -> Result:

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lock import locked
 from boxreg_ros.recorder.segment import recover
 
@@ -45,6 +45,8 @@ def recover_all(opened: Sequence[Path]) -> Recovery:
     for path in opened:
         try:
             recovered += recover(path) > 0
-        except RecordingError:
+        except (ConfigError, OSError):  # a package that is missing, a full disk: no fault of it
+            raise
+        except Exception:  # label writers, also of other packages, may fail with any
             damaged.append(path.rename(path.with_suffix(DAMAGED)))
     return Recovery(recovered, tuple(damaged))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from difflib import get_close_matches
 import os
 from pathlib import Path
 import pickle
@@ -27,7 +28,7 @@ from boxreg_ros.io.label_feed import (
 )
 from boxreg_ros.io.transforms import TIME_JUMP
 from boxreg_ros.io.whole_files import DISK_ERRORS
-from boxreg_ros.labels import LabelFrame, module_of
+from boxreg_ros.labels import FORMATS, import_format, LabelFrame, module_of
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.cloud_spool import FOLDER as CLOUDS
 from boxreg_ros.labels.cloud_spool import Spool
@@ -48,8 +49,8 @@ SIZING_PART = 0.1
 """Largest part of the time that may be spent on measuring the size of the files; chosen."""
 NICENESS = 10
 """Lower priority than the node: where cores are few, labels wait and boxes do not; chosen."""
-NOT_LIVE = ('mcap',)
-"""Formats that copy a recording, which does not exist while driving."""
+COPY = 'mcap'
+"""Format that copies a recording, which does not exist while driving."""
 
 
 class Recorder:
@@ -267,18 +268,29 @@ def check_each(formats: Sequence[str], camera: str) -> None:
         By name of the parameter.
 
     """
+    live = [name for name in FORMATS if is_live(name)]
     for name in formats:
-        if name in NOT_LIVE:
+        if name not in live:
+            similar = get_close_matches(name, live, 1)
+            meant = f'did you mean {similar[0]}? ' if similar else ''
             raise ConfigError(
-                f'record_formats: expected formats of labels alone, got {name!r}, which copies a '
-                f'recording; leave it out, and record the topics with ros2 bag record'
+                f'record_formats: expected some of {", ".join(live)}, got {name!r}; {meant}labels '
+                f'of points and copies of a recording are made later, by boxreg relabel of a '
+                f'recording made by ros2 bag record'
             )
-        options_of(name)
+        module_of(name)
     if camera:
         try:
             Camera.read(Path(camera).expanduser())
         except ConfigError as error:
             raise ConfigError(f'record_camera: {error}') from None
+
+
+def is_live(name: str) -> bool:
+    """Return whether a format needs no recording; one that cannot be imported may be such."""
+    with suppress(ConfigError):
+        return not (name == COPY or import_format(name).FORMAT.has_points)
+    return True
 
 
 def options_of(name: str) -> tuple[str, ...]:
@@ -341,9 +353,9 @@ def _explained(error: OSError, folder: Path, has_begun: bool) -> RecordingError:
             f'{place}: expected room for labels, got: {error.strerror}; free some space and call '
             f'~/start_recording, which completes the segment that was open'
         )
-    if folder.is_file():
+    if os.path.isfile(folder):
         return RecordingError(f'{place}: expected a folder, got a file; choose another')
-    if folder.exists():
+    if os.path.exists(folder):  # False for a name that is too long
         return RecordingError(
             f'{place}: expected a folder that can be written to, got: {error.strerror} '
             f'({error.filename}); choose another, or change its owner or mode'

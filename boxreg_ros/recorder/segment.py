@@ -24,8 +24,8 @@ JOURNAL = 'journal.sqlite'
 LABEL_FILES = 'labels'
 """Folder of the label files inside that of an open segment."""
 CONFIG = 'config.yaml'
-OPEN_NAME = re.compile(r'\.(segment_\d{6})\.open')
-SEGMENT_NAME = re.compile(r'\.?segment_(\d{6})(\.open|\.damaged)?')
+OPEN_NAME = re.compile(r'\.(segment_\d{6,})\.open')
+SEGMENT_NAME = re.compile(r'\.?segment_(\d{6,})(\.open|\.damaged)?')
 
 
 class SegmentFiles:

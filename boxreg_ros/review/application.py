@@ -184,7 +184,7 @@ class _Review:
     async def events(self, request: Request) -> Response:
         """Stream decisions as they are made, by whomever."""
         seen = request.headers.get('last-event-id') or request.query_params.get('seen', '')
-        if not seen.isdecimal():
+        if not (seen.isdecimal() and STAMP.fullmatch(seen)):
             raise RecordingError('seen: expected the number of known decisions')
         return StreamingResponse(self._stream(int(seen)), media_type='text/event-stream')
 

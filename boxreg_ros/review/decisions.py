@@ -326,8 +326,6 @@ class DecisionLog:
     def _write_new(self, rows: bytes) -> None:
         with written_whole(self._path) as file:
             file.write(f'{VERSION_LINE}{VERSION}\n' + csv_row(DECISION_COLUMNS) + rows.decode())
-            file.flush()
-            os.fsync(file.fileno())
 
     def _write_at(self, end: int, rows: bytes) -> None:
         with open(self._path, 'r+b', buffering=0) as file:

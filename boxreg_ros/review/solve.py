@@ -73,7 +73,8 @@ class ReportParts:
         from boxreg_ros.core.refine import refine, Track
 
         try:
-            pins = {int(stamp): np.array(box, np.float64) for stamp, box in sent['pins'].items()}
+            given = sent['pins'].items()
+            pins = {int(stamp): np.array(box, np.float64).reshape(9) for stamp, box in given}
             rows = [row for piece in sent['pieces'] for row in self._rows(piece)]
             class_name = str(sent['class'])
         except (KeyError, TypeError, ValueError, AttributeError) as error:

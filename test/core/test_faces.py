@@ -22,12 +22,12 @@ def visibility(problem):
     return tangent
 
 
-def inset_shares(origins, tangent):
-    """Return the multiples of occlusion inset and range inset, (2, 6)."""
+def insets(origins, tangent, ring_height=0.0):
+    """Return the multiples of occlusion and range inset (2, 6), insets and weights, (6,) each."""
     shares, inset, weight = np.empty((2, 6)), np.empty(6), np.empty(6)
     record = CONSTANTS.with_settings(CONFIG).record()
-    fill_insets(origins, tangent, np.zeros(6), np.zeros(6), record, shares, inset, weight)
-    return shares
+    fill_insets(origins, ring_height, tangent, no_inputs()[0], record, shares, inset, weight)
+    return shares, inset, weight
 
 
 def seen_from(origin, points=((0.0, 0, 0),), yaw=0.0, **changes):
@@ -57,7 +57,7 @@ def test_without_a_sensor_faces_toward_the_centre_of_mass_are_visible():
 def test_occlusion_inset_grows_as_a_face_turns_away():
     unknown = np.full((1, 3), np.nan)
     tangents = np.linspace(-50, 50, 201)
-    hidden, distant = np.stack([inset_shares(unknown, np.full(6, t)) for t in tangents], 1)
+    hidden, distant = np.stack([insets(unknown, np.full(6, t))[0] for t in tangents], 1)
     assert (np.diff(hidden, axis=0) <= 0).all()
     np.testing.assert_allclose(hidden[0], 1, atol=1e-4)
     np.testing.assert_allclose(hidden[-1], 0, atol=1e-4)
@@ -71,7 +71,7 @@ def test_range_inset_grows_with_range(away, share):
     # From 20 m on the share grows by 1 in another 50 m, to 1.5 at most; the range is horizontal.
     # Front and roof are visible; back and bottom are occluded and have the occlusion inset only.
     problem = seen_from([0.6 * away, 0.8 * away, 5.0])
-    hidden, distant = inset_shares(problem.origins[0, 0], visibility(problem))
+    hidden, distant = insets(problem.origins[0, 0], visibility(problem))[0]
     np.testing.assert_allclose(distant, share * (1 - hidden))
     assert (hidden[[0, 2, 4]] < 0.2).all()
     assert (hidden[[1, 3, 5]] > 0.8).all()
@@ -87,6 +87,23 @@ def test_range_inset_lowers_the_weight_of_a_face():
         assert found['distance'][0, 0, 4] == pytest.approx(distant - 0.15, abs=1e-3)
         assert found['inset'][0, 0, 4] == pytest.approx(distant, abs=1e-3)
         assert found['inset'][0, 0, 5] == pytest.approx(0, abs=1e-3)  # the road
+
+
+def test_a_roof_is_half_a_ring_above_the_highest_ring():
+    # The highest of rings h apart is 0 to h below the edge: h / 2 on average, with the variance
+    # h^2 / 12. That is as much as the deviation of a roof, 0.08 m, for h = 0.08 sqrt(12).
+    h = 0.08 * np.sqrt(12)
+    _, inset, weight = insets(np.full((1, 3), np.nan), np.full(6, 9.0), h)
+    np.testing.assert_allclose(inset, [0, 0, 0, 0, h / 2, 0], atol=1e-12)
+    np.testing.assert_allclose(weight, [1, 1, 1, 1, 0.5, 1], rtol=1e-12)
+
+
+def test_an_observed_roof_has_the_inset_of_its_rings():
+    rings = [[0.2]]
+    problem = seen_from([12.0, 16.0, 2.0], on_faces(0.15, faces=(4,)), ring_heights=rings)
+    found = supported(problem)
+    assert found['distance'][0, 0, 4] == pytest.approx(0.1 - 0.15, abs=1e-6)
+    assert found['inset'][0, 0].tolist()[4:] == pytest.approx([0.1, 0], abs=1e-3)
 
 
 def on_faces(inside, n=40, faces=(0, 2, 4)):

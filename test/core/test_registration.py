@@ -70,10 +70,10 @@ def test_refined_boxes_are_closer_to_the_truth():
     assert after.mean() < 0.5 * before.mean()
 
 
-def test_covariances_are_as_large_as_the_errors():
+def test_covariances_follow_the_errors():
     # Squared errors over covariances of x, y and yaw average to 1 where covariances are right.
-    # Ours are for real detectors and sensors: points with a labelling margin known to 1 cm
-    # leave smaller errors, by less than a factor of six in the deviation, and not larger ones.
+    # Ours are for real detectors and sensors: points with a labelling margin known to 1 cm leave
+    # deviations a third as large. The mean is 0.09; a factor of two in the covariances shows.
     ratios = []
     for seed in range(8):
         truth = drive(10)
@@ -83,7 +83,7 @@ def test_covariances_are_as_large_as_the_errors():
         ratios.append((error**2 / variance).mean())
         np.testing.assert_allclose(found.covariances, found.covariances.swapaxes(1, 2), atol=1e-9)
         assert (np.linalg.eigvalsh(found.covariances) > 0).all()
-    assert 1 / 36 < np.mean(ratios) < 2
+    assert 0.045 < np.mean(ratios) < 0.18
 
 
 # --- repeated boxes -----------------------------------------------------------------------------

@@ -179,6 +179,19 @@ def test_noisy_boxes_give_no_finding():
     assert not checked(boxes, points, STANDARD, STANDARD)
 
 
+@pytest.mark.parametrize(('off', 'is_found'), [(6, False), (9, True)])
+def test_most_boxes_must_fit_another_convention_better(off, is_found):
+    """Of 12 boxes some have their points above them, the others in their upper half."""
+    boxes, _ = scene(count=12)
+    heights = np.where(np.arange(12) < off, 0.8, 0.25)[:, None, None] * [0, 0, 1]
+    unit = np.random.default_rng(1).uniform(-0.15, 0.15, (12, 30, 3)) + heights
+    points = boxes[:, None, :3] + unit * boxes[:, None, 3:6]
+    check = PoseCheck(STANDARD, tolerance=0.02)
+    check.add(Sweep(STAMP, 'map', points.reshape(-1, 3)))
+    check.add(array_of(*boxes))
+    assert ('pose_reference:=bottom' in check.finding) == is_found
+
+
 def test_the_check_pairs_equal_stamps_and_ends_after_enough_boxes():
     boxes, points = scene()
     check = PoseCheck(Convention('bottom'), tolerance=0.02)

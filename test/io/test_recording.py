@@ -6,7 +6,9 @@ import sqlite3
 from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.resync import MessageOrder
 from boxreg_ros.io.storage.files import opened, part_of
+from boxreg_ros.io.storage.reader import Reader
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Sweep
 from mcap.reader import make_reader
@@ -269,6 +271,28 @@ def test_a_part_of_a_file_has_its_first_time_but_not_its_last(tmp_path, storage)
     times = [record.received_ns for record in records]
     assert times == [time_ns for time_ns in received if start <= time_ns < stop]
     assert start in times and stop in received and stop not in times
+
+
+@pytest.mark.parametrize('late', [-3600, 3600])
+def test_a_part_of_a_topic_recorded_apart_is_that_of_its_stamps(tmp_path, late):
+    drive = Drive(sweeps=12)
+    moved = [(t, at + late * SECOND, m) for t, at, m in drive.items if t == '/boxes']
+    others = [item for item in drive.items if item[0] != '/boxes']
+    paths = [
+        write_recording(tmp_path / name, items) for name, items in (('a', others), ('b', moved))
+    ]
+    with closing(Reader([part_of(path) for path in paths])) as reader:
+
+        def stamp_of(connection, data):
+            stamp = reader.typestore.deserialize_cdr(data, connection.msgtype).header.stamp
+            return stamp.sec * SECOND + stamp.nanosec
+
+        order = MessageOrder(reader, '/points', stamp_of)
+        boxes = [c for c in reader.connections if c.topic == '/boxes']
+        for start, stop in ((4, 8), (0, 12), (3, None), (None, 5)):
+            limits = [None if i is None else [*drive.stamps, 2**62][i] for i in (start, stop)]
+            found = [record.received_ns for record in order.messages(boxes, *limits)]
+            assert found == drive.stamps[start:stop]
 
 
 # Errors ----------------------------------------------------------------------------------------

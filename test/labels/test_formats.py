@@ -43,7 +43,7 @@ from boxreg_ros.labels import (
 )
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
-from consumers import consumer
+from consumers import consumer, consumers
 import numpy as np
 import pytest
 
@@ -123,6 +123,7 @@ def sorted_by_track(frame):
 def written(name, folder, frames=None, **options):
     """Write `frames`; return the writer and the folder of the format."""
     require_packages(name)
+    folder.mkdir(exist_ok=True)
     provenance = Provenance(('drive.mcap',), 'cafe')
     writer = writer_for(name, folder, provenance, options_in(folder, **options))
     for frame in [frame_of()] if frames is None else frames:
@@ -608,26 +609,30 @@ def test_camera_from_yaml(tmp_path):
 # Third-party readers -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(('name', 'version'), [('nuscenes', 'v1.0-boxreg'), ('t4', 'annotation')])
-def test_nuscenes_devkit_reads_the_labels(tmp_path, name, version):
+def test_nuscenes_devkit_reads_the_labels(tmp_path):
     sweep = Sweep(STAMP, 'lidar', POINTS)
     later = [14.0, *IN_FIXED[1:]]  # 1 m in 0.5 s
     frames = [frame_of(sweep=sweep), frame_of([later], stamp_ns=STAMP + 5 * 10**8)]
-    _, folder = written(name, tmp_path, frames, with_points=True)
-    first, second = consumer('nuscenes', folder, version)
-    assert first['channel'] == ('LIDAR_TOP' if name == 'nuscenes' else 'LIDAR_CONCAT')
-    assert (first['name'], first['num_points']) == ('Car', 42)
-    np.testing.assert_allclose(first['wlh'], [2.0, 4.0, 1.6])
-    np.testing.assert_allclose(first['local'], [6, -3, 1], atol=1e-9)
-    in_fixed = (T_FIXED_SENSOR @ np.c_[CORNERS, np.ones(8)].T).T[:, :3]
-    found = np.array(first['corners'])
-    assert np.abs(found[:, None] - in_fixed).max(axis=2).min(axis=1).max() < 1e-9
-    heading = T_FIXED_SENSOR[:3, :3] @ AXES[0]
-    np.testing.assert_allclose(np.array(first['matrix'])[:, 0], heading, atol=1e-9)
-    np.testing.assert_allclose(first['points'], POINTS)
-    assert first['track'] == second['track']
-    assert (bool(first['next']), first['prev'], second['next']) == (True, '', '')
-    np.testing.assert_allclose(first['velocity'], [2.0, 0.0, 0.0], atol=1e-9)
+    calls = []
+    for name, version in (('nuscenes', 'v1.0-boxreg'), ('t4', 'annotation')):
+        _, folder = written(name, tmp_path / name, frames, with_points=True)
+        calls.append(('nuscenes', folder, version))
+    for (first, second), channel in zip(
+        consumers(*calls), ('LIDAR_TOP', 'LIDAR_CONCAT'), strict=True
+    ):
+        assert first['channel'] == channel
+        assert (first['name'], first['num_points']) == ('Car', 42)
+        np.testing.assert_allclose(first['wlh'], [2.0, 4.0, 1.6])
+        np.testing.assert_allclose(first['local'], [6, -3, 1], atol=1e-9)
+        in_fixed = (T_FIXED_SENSOR @ np.c_[CORNERS, np.ones(8)].T).T[:, :3]
+        found = np.array(first['corners'])
+        assert np.abs(found[:, None] - in_fixed).max(axis=2).min(axis=1).max() < 1e-9
+        heading = T_FIXED_SENSOR[:3, :3] @ AXES[0]
+        np.testing.assert_allclose(np.array(first['matrix'])[:, 0], heading, atol=1e-9)
+        np.testing.assert_allclose(first['points'], POINTS)
+        assert first['track'] == second['track']
+        assert (bool(first['next']), first['prev'], second['next']) == (True, '', '')
+        np.testing.assert_allclose(first['velocity'], [2.0, 0.0, 0.0], atol=1e-9)
 
 
 def test_t4_devkit_reads_the_labels(tmp_path):
@@ -643,24 +648,20 @@ def test_t4_devkit_reads_the_labels(tmp_path):
     assert found['sample_data'][0]['fileformat'] == 'pcd.bin'
 
 
-def test_av2_reads_the_labels(tmp_path):
-    _, folder = written('argoverse2', tmp_path)
-    (cuboid,) = consumer('av2', folder / 'annotations.feather')
+def test_av2_reads_labels_pose_and_sweep(tmp_path):
+    frames = [frame_of(sweep=Sweep(STAMP, 'lidar', POINTS))]
+    _, folder = written('argoverse2', tmp_path, frames, with_points=True)
+    calls = ('av2', folder / 'annotations.feather'), ('av2_log', folder, STAMP)
+    (cuboid,), log = consumers(*calls)
     assert (cuboid['category'], cuboid['stamp_ns']) == ('Car', STAMP)
     np.testing.assert_allclose(cuboid['center'], [6, -3, 1], atol=1e-9)
     np.testing.assert_allclose(cuboid['lwh'], EXTENT)
     np.testing.assert_allclose(np.array(cuboid['matrix']).T, AXES, atol=1e-9)
     # Its first vertex is at the front left top.
     np.testing.assert_allclose(cuboid['vertices'][0], CORNERS[7], atol=1e-9)
-
-
-def test_av2_reads_pose_and_sweep(tmp_path):
-    frames = [frame_of(sweep=Sweep(STAMP, 'lidar', POINTS))]
-    _, folder = written('argoverse2', tmp_path, frames, with_points=True)
-    found = consumer('av2_log', folder, STAMP)
-    np.testing.assert_allclose(found['points'], POINTS)
-    np.testing.assert_allclose(found['city_SE3_ego'], T_FIXED_SENSOR, atol=1e-9)
-    np.testing.assert_allclose(found['ego_SE3_lidar'], np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(log['points'], POINTS)
+    np.testing.assert_allclose(log['city_SE3_ego'], T_FIXED_SENSOR, atol=1e-9)
+    np.testing.assert_allclose(log['ego_SE3_lidar'], np.eye(4), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -696,14 +697,14 @@ def test_pykitti_reads_calibration_and_sweep(tmp_path):
     np.testing.assert_allclose(np.array(found['points'])[:, :3], POINTS)
 
 
-@pytest.mark.parametrize('name', ['parquet', 'csv'])
-def test_pandas_reads_the_table(tmp_path, name):
-    _, folder = written(name, tmp_path, drive())
-    found = consumer('pandas', folder / f'boxes.{name}')
+def test_pandas_reads_the_tables(tmp_path):
+    folders = {name: written(name, tmp_path / name, drive())[1] for name in ('parquet', 'csv')}
+    calls = [('pandas', folder / f'boxes.{name}') for name, folder in folders.items()]
     expected = [frame.refined.boxes.boxes[0, 0] for frame in drive()]
-    assert found['x of 7'] == pytest.approx(expected)
-    assert found['stamps'] == [frame.refined.boxes.stamp_ns for frame in drive()]
-    assert found['kinds'] == {'stamp_ns': 'int64', 'x': 'float64', 'num_points': 'int64'}
+    for found in consumers(*calls):
+        assert found['x of 7'] == pytest.approx(expected)
+        assert found['stamps'] == [frame.refined.boxes.stamp_ns for frame in drive()]
+        assert found['kinds'] == {'stamp_ns': 'int64', 'x': 'float64', 'num_points': 'int64'}
 
 
 # Memory ------------------------------------------------------------------------------------------

@@ -132,6 +132,14 @@ def test_datumaro_golden_values_in_datumaro(tmp_path, swapped):
         assert tracklet == {'h': length, 'w': width, 'l': height}
 
 
+def test_datumaro_has_a_track_once_in_a_frame(tmp_path):
+    frames = [frame(STAMP, ['7', '7', 'x']), frame(STAMP + 1, ['7', 'x'])]
+    write('datumaro', tmp_path, frames)
+    items = content(tmp_path / 'datumaro' / 'annotations' / 'default.json')['items']
+    numbers = [[box['attributes']['track_id'] for box in item['annotations']] for item in items]
+    assert numbers == [[7, 1_000_000, 1_000_001], [7, 1_000_001]]
+
+
 def test_supervisely_golden_values_in_supervisely(tmp_path):
     frames = [
         frame(STAMP + k * 10**8, ['x7', 'y'][:n], status=(status, 'kept')[:n], sweep=CLOUD)

@@ -217,6 +217,7 @@ def test_services_start_split_and_stop_a_recording(tmp_path):
             ('record_segment', '1 week', ('record_segment', '1 week', '60 s')),
             ('record_formats', ['kitty'], ('kitty', 'kitti')),
             ('record_formats', ['csv', 'mcap'], ('record_formats', 'mcap', 'ros2 bag record')),
+            ('record_formats', ['semantickitti'], ('record_formats', 'semantickitti')),
             ('record_camera', str(tmp_path / 'missing'), ('record_camera', 'missing')),
             ('record_camera', str(tmp_path / 'file'), ('record_camera', 'file')),
         ):

@@ -12,6 +12,7 @@ import time
 
 from boxreg_ros.cli import main
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.offline.batch_results import INDEX_COLUMNS
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.offline.job_process import JobRunner, memory_bytes
 from boxreg_ros.offline.result_folder import whole_folder
@@ -97,7 +98,8 @@ def test_manifests_patterns_and_their_errors(tmp_path):
     (tmp_path / 'x').mkdir()
     (tmp_path / 'x' / 'a.mcap').touch()
     manifest = tmp_path / 'drives.txt'
-    manifest.write_text('# two files of one drive\na.mcap b.mcap\n\nx/a.mcap  # another\n')
+    text = '# two files of one drive\na.mcap b.mcap\n\nx/a.mcap  # another\n'
+    manifest.write_text(text, encoding='utf-8-sig')  # as editors of Windows store it
     jobs = jobs_of([manifest, tmp_path / '[c]*.mcap'])
     assert [job.name for job in jobs] == [f'{tmp_path.name}_a', 'x_a', 'c']
     assert jobs[0].recordings == (tmp_path / 'a.mcap', tmp_path / 'b.mcap')
@@ -214,7 +216,7 @@ def test_missing_and_repeated_drives_fail_and_the_others_go_on(tmp_path, capsys)
 
 
 def test_shards_of_the_recipe_for_slurm_are_merged_to_the_results_of_one_run(tmp_path, capsys):
-    paths = [str(Drive(sweeps=n).write(tmp_path / str(n))) for n in (5, 6)]
+    paths = [str(Drive(sweeps=n).write(tmp_path / name)) for n, name in ((5, '=5'), (6, '6'))]
     (tmp_path / 'drives.txt').write_text('\n'.join(paths))
     out = tmp_path / 'out'
     page = (ROOT / 'docs' / 'tasks' / 'many-recordings.md').read_text()
@@ -240,7 +242,9 @@ def test_shards_of_the_recipe_for_slurm_are_merged_to_the_results_of_one_run(tmp
     run_shard(2)
     assert main(['batch', '-o', str(out), '--merge']) == 0
     assert f'{out}: 2 of 2 drives done' in capsys.readouterr().out
-    assert [row['boxes_in'] for row in index_of(out).values()] == ['10', '12']
+    rows = index_of(out)
+    assert [rows[name]['boxes_in'] for name in ("'=5", '6')] == ['10', '12']  # no formula
+    assert 'href="%3D5/"' in (out / 'report.html').read_text()
     merged = json.loads((out / 'summary.json').read_text())
     # One run over all drives finds them done, and writes the same.
     assert main(['batch', *paths, '-o', str(out), *QUICK]) == 0
@@ -255,9 +259,46 @@ def test_wrong_shards_and_no_drives_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(['batch', 'x.mcap', '-o', str(tmp_path), '--shard=3/2'])
     assert 'expected I/N' in capsys.readouterr().err
-    assert main(['batch', '-o', str(tmp_path)]) == 2
     assert main(['batch', 'x.mcap', '-o', str(tmp_path), '--address=x:1']) == 2
     assert 'add --engine ray' in capsys.readouterr().err
+    assert main(['batch', 'x.mcap', '-o', str(tmp_path), '--memory=inf']) == 2
+    assert 'expected more than 0' in capsys.readouterr().err
+    assert main(['batch', '-o', str(tmp_path)]) == 2
+    assert 'at least one drive' in capsys.readouterr().err
+
+
+def test_files_of_a_fleet_that_are_damaged_end_in_one_line(tmp_path, capsys, monkeypatch):
+    out = tmp_path / 'out'
+    manifest = tmp_path / 'drives.txt'
+    for content, words in (
+        ('a.mcap\n'.encode('utf-16'), 'expected a text in UTF-8'),
+        (b"it's.mcap\n", 'No closing quotation'),
+        (b'a\0b.mcap\n', 'a NUL character'),
+        (b'# none\n', 'expected at least one drive'),
+    ):
+        manifest.write_bytes(content)
+        assert main(['batch', str(manifest), '-o', str(out)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert words in line
+    index = tmp_path / 'index.1-of-1.csv'
+    for text in ('drive\none\n', ','.join(INDEX_COLUMNS) + '\n' + 'many,' * 13, '\xff'):
+        index.write_text(text, encoding='latin-1')
+        assert main(['batch', '--merge', '-o', str(tmp_path)]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f'{index}: expected the index of a shard, got an error in' in line
+    # A name that is no text, and a state that is none; the process of the drive fails.
+    script = tmp_path / 'python'
+    script.write_text('#!/bin/sh\nexit 1\n')
+    script.chmod(0o755)
+    monkeypatch.setattr('sys.executable', str(script))
+    drive = tmp_path / os.fsdecode(b'a\xff.mcap')
+    drive.write_bytes(b'')
+    (out / 'jobs').mkdir(parents=True)
+    (out / 'jobs' / 'a.json').write_text('{"key": 1, "recordings": 5, "files": 0, "peak_mb": 0}')
+    assert main(['batch', str(drive), '-o', str(out)]) == 1
+    assert 'ended with status 1' in capsys.readouterr().err
+    assert [*index_of(out)] == ['a\\udcff']
+    assert 'href="a%FF/"' in (out / 'report.html').read_text()
 
 
 def test_a_killed_process_is_tried_again_and_named(tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """Segments of label files: whole, indexed, and recovered after any end."""
 
+from dataclasses import replace
 from io import BytesIO
 import json
 import os
@@ -140,11 +141,20 @@ def test_a_power_cut_leaves_the_whole_frames(tmp_path):
     assert 0 < len(found[-1]) < 12
 
 
-def test_a_journal_that_cannot_be_read_is_kept_and_stops_nothing(tmp_path, capsys):
+@pytest.mark.parametrize('damage', ['zeros', 'a frame that no writer takes'])
+def test_a_journal_that_cannot_be_read_is_kept_and_stops_nothing(tmp_path, capsys, damage):
     folder = tmp_path / 'labels'
     journal, log = cut_off_segment(folder, 2)
-    journal.write_bytes(bytes(4096))
-    log.unlink()
+    if damage == 'zeros':
+        journal.write_bytes(bytes(4096))
+        log.unlink()
+    else:
+        refined = final_boxes(2, 1).refined
+        boxes = replace(refined.boxes, track_ids=('\ud800',))  # half a character
+        opened = Journal(journal)
+        assert opened.cut(3) == 3
+        opened.append(LabelFrame(replace(refined, boxes=boxes), 'odom', 'lidar', T_FIXED_SENSOR))
+        opened.close()
     status = record(settings_of(folder), [final_boxes(7)])
     assert (status.damaged, status.recovered, status.segments, status.error) == (1, 0, 1, '')
     assert stamps_in(folder) == [7]
@@ -299,6 +309,8 @@ def test_folder_that_cannot_be_made_is_named(tmp_path):
         RecordingError, match=r"file/labels': .*be made, got: Not a directory; cho"
     ):
         record(settings_of(tmp_path / 'file' / 'labels'), [final_boxes(0)])
+    with pytest.raises(RecordingError, match=r'or can be made, got: File name too long; choose'):
+        record(settings_of(tmp_path / ('x' * 300)), [final_boxes(0)])
 
 
 def test_full_disk_ends_the_recording_and_keeps_the_journal(tmp_path):
@@ -353,8 +365,9 @@ def test_lengths_of_segments():
 @pytest.mark.parametrize(
     ('changes', 'error'),
     [
-        ({'formats': ('csv', 'mcap')}, "got 'mcap', which copies a recording"),
-        ({'formats': ('kity',)}, "'kity': expected one of"),
+        ({'formats': ('csv', 'mcap')}, 'record_formats: .* xtreme1, got .* ros2 bag record'),
+        ({'formats': ('lidarseg',)}, "xtreme1, got 'lidarseg'; labels of points"),
+        ({'formats': ('kity',)}, r"xtreme1, got 'kity'; did you mean kitti\?"),
         ({'formats': ('csv',), 'with_points': True}, 'expected a format with clouds'),
         ({'formats': ('kitti',)}, 'record_camera'),
         ({'segment': '5'}, 'record_segment'),
@@ -363,7 +376,7 @@ def test_lengths_of_segments():
 def test_settings_that_cannot_work_are_named(tmp_path, changes, error):
     with pytest.raises(ConfigError, match=error):
         record(settings_of(tmp_path, **changes), [final_boxes(0)])
-    assert not read_index(tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_index_that_was_edited_is_named(tmp_path):

@@ -425,6 +425,16 @@ def test_foreign_and_broken_requests_write_nothing(server, capfd, headers, conte
     assert [one.track_id for one in read_decisions(server.log_path)] == ['2']
 
 
+def test_pins_and_numbers_of_the_wrong_size_are_refused(server):
+    for box in ([1], [[1] * 9] * 9):
+        track = {'class': 'car', 'pieces': [{'index': 0}], 'pins': {'5': box}}
+        status, text = posted(server, track, '/solve')
+        assert (status, text.partition(',')[0]) == (400, 'solve: expected a track of the report')
+    connection, headers = opened(server)
+    connection.request('GET', f'/events?seen={"9" * 5000}', headers=headers)
+    assert connection.getresponse().status == 400
+
+
 def test_page_and_its_address_are_for_this_browser_alone(server):
     connection, headers = opened(server)
     connection.request('GET', server.address.partition(str(server.server_port))[2])

@@ -119,6 +119,14 @@ def test_fragments_that_disagree_are_not_stitched(change):
     assert ids(found) == ['a', 'b']
 
 
+def test_the_motion_of_both_fragments_leads_to_the_other_one():
+    slow = tracklet('a', path((0, 0), (8, 0), 10))
+    start = path((0, 0), (8, 0), 16)[15, :2]
+    for speed, number in ((8, 1), (20, 2)):  # the second car comes from elsewhere
+        later = tracklet('b', path(start, (speed, 0), 12), 15)
+        assert len(stitch([slow, later], CONFIG)[0]) == number
+
+
 def test_fragments_of_other_kinds_are_not_stitched():
     boxes = path((0, 0), (8, 0), 30)
     for name, number in (('truck', 1), ('cyclist', 2)):  # a vehicle, and none
@@ -167,6 +175,9 @@ def test_parked_tracks_with_a_pause_are_one():
         tracklet('other', path((12, 5), (0, 0), 8), 100),
     ]
     assert ids(join_static(parts, CONFIG)) == ['a', 'other']
+    # Of two tracks that begin there at a time one continues it, and the other one stays.
+    twins = [parts[0], parts[1], tracklet('c', place[:6], 100)]
+    assert ids(join_static(twins, CONFIG)) == ['a', 'c']
     # Another car stood there meanwhile.
     between_them = tracklet('x', path((7.5, 5), (0, 0), 5), 50)
     assert ids(join_static([parts[0], between_them, parts[1]], CONFIG)) == ['a', 'x', 'b']
@@ -193,6 +204,12 @@ def test_long_gaps_are_filled_for_parked_objects_only():
     parked = tracklet('b', path((0, 0), (0, 0), 65)[steps], steps=steps)
     (added,) = fill(parked, STAMPS, CONFIG)
     assert len(added.boxes) == 55
+    # A gap of exactly `fill_gap`, 2 s, is filled.
+    for first, number in ((24, 1), (25, 0)):
+        steps = [*range(5), *range(first, first + 5)]
+        moving = tracklet('c', path((0, 0), (3, 0), 30)[steps], steps=steps)
+        assert len(fill(moving, STAMPS, CONFIG)) == number
+    steps = [*range(5), *range(60, 65)]
     # A stamp at which the input has no boxes of any object is no gap.
     assert fill(parked, STAMPS[steps], CONFIG) == []
 

@@ -19,7 +19,7 @@ EXTENT, BIAS, GAP, PIVOT, ANCHOR, SIDESLIP, SHARED = 0, 3, 9, 15, 16, 22, 23
 labelling margins (6), pivot, anchor of the rigid shape (6), sideslip."""
 PRIOR = 2 * POSE + SHARED
 """Variables of the marginalisation prior: two poses and the shared ones."""
-BOTTOM = 5
+TOP, BOTTOM = 4, 5
 """The face that is observed by the road, not by points of the object."""
 SPAN = 3 * POSE
 """Variables of the poses that a residual depends on at most."""

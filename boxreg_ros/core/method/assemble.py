@@ -381,7 +381,7 @@ def marginalise(x, gradient, A, mean, step, information):
     mean[NEXT:] = x[n:]
     for a in range(POSE):
         A.links[0, a, a] += RIDGE
-    is_definite = eliminate_pose(A, 0)
+    is_definite = eliminate_pose(A, np.int64(0))
     A.corner[:] -= np.dot(A.border[0].T, A.border[0])
     rest = Arrowhead(A.links[1:5], A.border[1:5], A.corner)
     fill_dense(rest, information)
@@ -394,7 +394,7 @@ def marginalise(x, gradient, A, mean, step, information):
         step[:] = np.nan
         information[:] = np.nan
         return
-    substitute_forward(A, gradient, POSE)
+    substitute_forward(A, gradient, np.int64(POSE))
     step[:NEXT] = -gradient[POSE : POSE + NEXT]
     step[NEXT:] = -gradient[n:]
     solve(rest, step)

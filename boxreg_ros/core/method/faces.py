@@ -8,7 +8,7 @@ This is the correspondence search of every round.
 from math import ceil, inf, isfinite, isnan, sqrt
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP
+from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, TOP
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
@@ -192,8 +192,14 @@ def raise_visibility(box, origin, points, R, toward, tangent):
 
 
 @loop
-def fill_insets(origins, tangent, occlusion_inset, range_inset, constants, shares, inset, weight):
-    """Write the shares (2, 6) of the two insets, their sum (6,), and the weights of faces (6,)."""
+def fill_insets(origins, ring_height, tangent, inputs, constants, shares, inset, weight):
+    """
+    Write the shares (2, 6) of occlusion and range inset, insets (6,) and weights (6,) of faces.
+
+    The top is anywhere between the highest ring on an object and the next one, which misses it: h
+    apart, half of that further out on average, with the variance of a uniform distribution.
+
+    """
     reach = sqrt(origins[0, 0] ** 2 + origins[0, 1] ** 2)
     for sensor in range(1, len(origins)):
         reach = min(reach, sqrt(origins[sensor, 0] ** 2 + origins[sensor, 1] ** 2))
@@ -204,10 +210,12 @@ def fill_insets(origins, tangent, occlusion_inset, range_inset, constants, share
         occluded = 0.5 - 0.5 * u / sqrt(u**2 + constants.visibility_softness)
         shares[0, face] = occluded
         shares[1, face] = (1.0 - occluded) * beyond
-        by_range = shares[1, face] * range_inset[face]
-        inset[face] = occluded * occlusion_inset[face] + by_range
+        by_range = shares[1, face] * inputs.range_inset[face]
+        inset[face] = occluded * inputs.occlusion_inset[face] + by_range
         seen = 1.0 if tangent[face] > 0.0 else constants.occluded_weight
         weight[face] = seen / (1.0 + (by_range / constants.range_half_weight) ** 2)
+    inset[TOP] += ring_height / 2
+    weight[TOP] /= 1.0 + ring_height**2 / 12 / constants.face_deviations[TOP] ** 2
 
 
 @loop
@@ -367,8 +375,8 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
         points = returns_of(problem, problem.points, b, n)
         fill_visibility(box, origins, points, R, toward, tangent)
         fill_insets(
-            origins, tangent, inputs.occlusion_inset, inputs.range_inset, constants,
-            term.inset_shares, inset, weight,
+            origins, problem.ring_heights[b, n], tangent, inputs, constants, term.inset_shares,
+            inset, weight,
         )  # fmt: skip
         for k in range(3):
             shift[k] = pose[k] - box[k]

@@ -183,6 +183,7 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
     """
     N = solution.poses.shape[1]
     n = POSE * N
+    oldest = np.int64(1)  # for a literal 1 all that sums residuals would be compiled once more
     at, out, gradient = empty_axes(N), empty_linearised(), np.empty(n + SHARED)
     work = empty_covariance_work(N)
     inverse = Inverse(
@@ -211,7 +212,7 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
             work, solution.posterior,
         )  # fmt: skip
         if len(solution.prior_state) and problem.lengths[b] == N:
-            accumulate(x[row], 1, terms, common, at, out, gradient, A)
+            accumulate(x[row], oldest, terms, common, at, out, gradient, A)
             marginalise(
                 x[row], gradient, A, solution.prior_state[b], solution.prior_step[b],
                 solution.prior_information[b],

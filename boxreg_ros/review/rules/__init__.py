@@ -17,8 +17,7 @@ from boxreg_ros.review.rules import (
     sliding,
     spin,
 )
-from boxreg_ros.review.rules.pairs import Labels
-from boxreg_ros.review.rules.protocol import LabelTrack, Rule, Violation
+from boxreg_ros.review.rules.protocol import Labels, LabelTrack, Rule, Violation
 
 RULES: dict[str, Rule] = {
     module.RULE.rule_id: module.RULE

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from boxreg_ros.review.rules.overlap import DUPLICATE_IOU
-from boxreg_ros.review.rules.pairs import Labels
-from boxreg_ros.review.rules.protocol import ERROR, Rule, Violation
+from boxreg_ros.review.rules.protocol import ERROR, Labels, Rule, Violation
 import numpy as np
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from boxreg_ros.review.rules.pairs import Labels
-from boxreg_ros.review.rules.protocol import ERROR, Rule, Violation
+from boxreg_ros.review.rules.protocol import ERROR, Labels, Rule, Violation
 import numpy as np
 
 MAX_IOU = 0.1
