@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 Limits = tuple[float, float]
-RANGE = 50.0
-"""Clusters farther away are left out [m]; chosen: few have `MIN_POINTS`."""
-CELL = 0.3
+CLUSTER_RANGE = 50.0
+"""Clusters farther away are left out [m]; chosen: few have `MIN_CLUSTER_POINTS`."""
+CLUSTER_CELL = 0.3
 """Side of a cell of the grid that points are joined in [m]; swept: parked cars 0.5 m apart."""
 ROAD_REACH = 7
 """Cells to each side in which the lowest point is the road: 2 m, half a car."""
@@ -30,7 +30,7 @@ CLEARANCE, TOP = 0.3, 4.2
 """Heights above the road of the points of objects [m]; what is higher is no vehicle."""
 ROAD_HEIGHT = 0.2
 """Points up to this height are of the road [m]."""
-MIN_POINTS = 15
+MIN_CLUSTER_POINTS = 15
 """Of a cluster."""
 RING = 3
 """Cells around a cluster that have to be open road, but for the nearest ones."""
@@ -44,7 +44,7 @@ MIN_SWEEPS = 8
 """A proposal is seen in so many sweeps; chosen: 0.8 s at 10 Hz."""
 MAX_GAP_NS = 5 * 10**8
 """A link of two clusters spans at most so much time [ns]."""
-GATE, GATE_SPEED = 0.8, 4.0
+LINK_GATE, LINK_GATE_SPEED = 0.8, 4.0
 """A cluster is nearer to its prediction than this [m] and, before its speed is known, [m/s]."""
 MOVED = 1.5
 """What moves has come so far [m], and most of its way straight on."""
@@ -52,9 +52,9 @@ STRAIGHT_PART = 0.7
 STEADY = 0.25
 """Deviation of the centre and of the sides of what stands, from sweep to sweep [m]."""
 
-VEHICLE = (1.2, 18.0), 3.2, (0.9, TOP)
-PERSON = (0.2, 1.1), 0.9, (1.2, 2.1)
-CYCLIST = (1.1, 2.2), 0.9, (1.2, 2.1)
+VEHICLE_SIZES = (1.2, 18.0), 3.2, (0.9, TOP)
+PERSON_SIZES = (0.2, 1.1), 0.9, (1.2, 2.1)
+CYCLIST_SIZES = (1.1, 2.2), 0.9, (1.2, 2.1)
 """Least and most of the longer side, most of the shorter, and least and most height above the
 road, of what is seen of an object [m]."""
 USUAL = {
@@ -165,9 +165,9 @@ def _distance(chain: Chain, cluster: _Cluster) -> float:
     """Return how far a cluster is from the prediction of a chain, relative to the gate."""
     last, before = chain[-1], chain[max(0, len(chain) - 4)]
     seconds = (cluster.stamp_ns - last.stamp_ns) * 1e-9
-    expected, gate = last.centre, GATE
+    expected, gate = last.centre, LINK_GATE
     if before is last:
-        gate += GATE_SPEED * seconds
+        gate += LINK_GATE_SPEED * seconds
     else:
         elapsed = (last.stamp_ns - before.stamp_ns) * 1e-9
         expected = last.centre + (last.centre - before.centre) / elapsed * seconds
@@ -182,10 +182,12 @@ def _clusters(
         return []
     if not np.isfinite(origin).all():
         origin = np.median(points, axis=0)
-    near = np.abs(points[:, :2] - origin[:2]).max(1) < RANGE
+    near = np.abs(points[:, :2] - origin[:2]).max(1) < CLUSTER_RANGE
     near_points = points[near].astype(np.float64)
-    cells = np.floor((near_points[:, :2] - origin[:2] + RANGE) / CELL).astype(np.int64)
-    size = int(2 * RANGE / CELL) + 1
+    cells = np.floor((near_points[:, :2] - origin[:2] + CLUSTER_RANGE) / CLUSTER_CELL).astype(
+        np.int64
+    )
+    size = int(2 * CLUSTER_RANGE / CLUSTER_CELL) + 1
     lowest = np.full((size, size), np.inf)
     np.minimum.at(lowest, (cells[:, 0], cells[:, 1]), near_points[:, 2])
     road = ndimage.minimum_filter(lowest, 2 * ROAD_REACH + 1)
@@ -202,7 +204,7 @@ def _clusters(
     numbers, starts = np.unique(of_point[order], return_index=True)
     found = []
     for number, part in zip(numbers, np.split(order, starts[1:]), strict=True):
-        if number == 0 or len(part) < MIN_POINTS:
+        if number == 0 or len(part) < MIN_CLUSTER_POINTS:
             continue
         top = float(height[part].max())
         may_be = _may_be_object(np.ptp(near_points[part, :2], axis=0), top)
@@ -237,7 +239,7 @@ def _fits(sides: Floats, height: float, sizes: tuple[Limits, float, Limits]) -> 
 
 
 def _may_be_object(sides: Floats, height: float) -> bool:
-    return _fits(sides, height, VEHICLE) or _fits(sides, height, PERSON)
+    return _fits(sides, height, VEHICLE_SIZES) or _fits(sides, height, PERSON_SIZES)
 
 
 def _stands_free(cells: Ints, is_open: NDArray[np.bool_], seen: NDArray[np.bool_]) -> bool:
@@ -307,9 +309,9 @@ def _class_of(clusters: Sequence[_Cluster], moves: bool) -> str:
     """Return the class by the sides and the height that are seen most often."""
     sides = np.median([one.sides for one in clusters], axis=0)
     height = float(np.median([one.points[:, 2].max() - one.road for one in clusters]))
-    if _fits(sides, height, PERSON):
+    if _fits(sides, height, PERSON_SIZES):
         return 'pedestrian'
-    if moves and _fits(sides, height, CYCLIST):
+    if moves and _fits(sides, height, CYCLIST_SIZES):
         return 'bicycle'
     return 'truck' if sides[0] > 6.0 or height > 2.4 else 'car'
 
