@@ -23,7 +23,7 @@ Limits = tuple[float, float]
 CLUSTER_RANGE = 50.0
 """Clusters farther away are left out [m]; chosen: few have `MIN_CLUSTER_POINTS`."""
 CLUSTER_CELL = 0.3
-"""Side of a cell of the grid that points are joined in [m]; swept: parked cars 0.5 m apart."""
+"""Side of a cell of the grid that points are joined in [m]; chosen: cars park 0.5 m apart."""
 ROAD_REACH = 7
 """Cells to each side in which the lowest point is the road: 2 m, half a car."""
 CLEARANCE, TOP = 0.3, 4.2
