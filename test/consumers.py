@@ -87,6 +87,38 @@ def lidarseg(folder, version):
     return samples
 
 
+def semantickitti(sequence, truth):
+    """
+    Return the instances of each scan and the IoU of each class, as semantic-kitti-api has them.
+
+    None where it is not installed. `truth` has the true ``.label`` files.
+
+    """
+    import importlib.util
+
+    if importlib.util.find_spec('auxiliary') is None:  # its only package
+        return None
+    from auxiliary.laserscan import SemLaserScan
+    from auxiliary.np_ioueval import iouEval
+    import numpy as np
+
+    scan = SemLaserScan(sem_color_dict={0: [0, 0, 0]})
+    evaluator = iouEval(n_classes=260, ignore=[0])
+    instances = []
+    for path in sorted(Path(sequence, 'velodyne').iterdir()):
+        scan.open_scan(str(path))
+        scan.open_label(str(Path(truth, path.stem + '.label')))
+        true = scan.sem_label
+        scan.open_label(str(Path(sequence, 'labels', path.stem + '.label')))
+        evaluator.addBatch(scan.sem_label, true)
+        instances.append(np.bincount(scan.inst_label).tolist())
+    iou = evaluator.getIoU()[1].tolist()
+    return {
+        'iou': {number: value for number, value in enumerate(iou) if value},
+        'instances': instances,
+    }
+
+
 def nuscenes_scene(folder, version, name):
     """Return sweeps and boxes of a scene in the global frame, through the devkit's transforms."""
     import numpy as np

@@ -329,9 +329,9 @@ class OwnPoints(NamedTuple):
     num_inside: Ints
 
 
-def own_points(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
-    """Return the points that belong to each box of `boxes` (n, 9)."""
-    numbers = crop_kernels.CropNumbers(
+def crop_numbers(config: Config) -> crop_kernels.CropNumbers:
+    """Return what the kernels need to know to find points and the road."""
+    return crop_kernels.CropNumbers(
         margin=max(NEARBY, config.sampling.margin),
         own_margin=config.sampling.margin,
         ownership_tolerance=FACE_TOLERANCE if config.ingredients.point_ownership else np.inf,
@@ -344,8 +344,13 @@ def own_points(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
         road_flatness=ROAD_FLATNESS,
         min_road_points=GOOD_POINTS,
     )
+
+
+def own_points(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
+    """Return the points that belong to each box of `boxes` (n, 9)."""
+    numbers = crop_numbers(config)
     columns = np.ascontiguousarray(sweep.points.T)
-    shapes = _shapes(sweep, boxes, numbers.margin)
+    shapes = shapes_of(sweep, boxes, numbers.margin)
     return OwnPoints(*crop_kernels.own_points(columns, shapes, numbers))
 
 
@@ -363,7 +368,7 @@ def _among_points(sweep: Sweep, centers: Floats) -> tuple[Floats, Floats]:
     return (centers - t) @ R, R.copy()
 
 
-def _shapes(sweep: Sweep, boxes: Floats, margin: float) -> crop_kernels.Shapes:
+def shapes_of(sweep: Sweep, boxes: Floats, margin: float) -> crop_kernels.Shapes:
     """Return `boxes` (n, 9) for the kernels that find the points within `margin` of them."""
     centers, turn = _among_points(sweep, boxes[:, :3])
     R = matrix_from_rpy(boxes[:, ROLL:])  # (n, 3, 3)
@@ -392,7 +397,7 @@ def crop(sweep: Sweep, boxes: Floats, margin: float) -> Crop:
 
     """
     columns = np.ascontiguousarray(sweep.points.T)
-    shapes = _shapes(sweep, boxes, margin)
+    shapes = shapes_of(sweep, boxes, margin)
     row, owner, offset, outside = crop_kernels.crop(columns, shapes, margin)
     order = np.argsort(owner, kind='stable')
     return Crop(row[order], owner[order], offset[order].T, outside[order].T)

@@ -30,18 +30,22 @@ def shared_between(workers: int) -> Iterator[None]:
 
     They end with the block: a process that is forked later would wait for threads that it does
     not have. Each starts when it gets its first part. A block within another uses its threads.
+    An exception, of a signal too, does not wait for them: one may compile for a minute.
 
     """
     if _threads.get() is not None:
         yield
         return
     workers = workers or NUM_CORES
-    with ThreadPoolExecutor(workers) as pool:
-        token = _threads.set(_Threads(pool, workers))
-        try:
-            yield
-        finally:
-            _threads.reset(token)
+    pool = ThreadPoolExecutor(workers)
+    token = _threads.set(_Threads(pool, workers))
+    is_whole = False
+    try:
+        yield
+        is_whole = True
+    finally:
+        _threads.reset(token)
+        pool.shutdown(wait=is_whole, cancel_futures=True)
 
 
 def num_workers() -> int:

@@ -8,6 +8,7 @@ from boxreg_ros.config import Config, PaperConfig, SolverConfig
 from boxreg_ros.core.follow import follow
 from boxreg_ros.core.following.stream import FollowedObjects
 from boxreg_ros.core.observation import observe
+from boxreg_ros.core.point_labels import ObjectTrack, PointLabeller
 from boxreg_ros.core.registrar import BoxRegistrar, Submit
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
@@ -56,6 +57,17 @@ def warm_up_followed(config: Config) -> None:
     for sweep in sweeps:
         followed.add_sweep(sweep)
         followed.boxes_at(sweep.stamp_ns, sweep.stamp_ns, np.zeros((0, 9)))
+
+
+def warm_up_labels(config: Config) -> None:
+    """Label the points of a synthetic sweep: its kernels are loaded."""
+    sweeps, arrays = _passing_car()
+    stamps_ns = np.array([sweep.stamp_ns for sweep in sweeps])
+    boxes = np.concatenate([array.boxes for array in arrays])
+    track = ObjectTrack('1', 'car', stamps_ns, boxes, np.ones(len(boxes), bool))
+    points = sweeps[0].points.astype(np.float32)
+    sweep = replace(sweeps[0], points=points, times=np.zeros(len(points)))
+    PointLabeller([track], stamps_ns, config, np.zeros((1, 6))).label(sweep)
 
 
 def _passing_car() -> tuple[list[Sweep], list[BoxArray]]:

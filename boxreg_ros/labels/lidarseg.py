@@ -10,12 +10,14 @@ times the category plus the number of the instance in its category.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from boxreg_ros.config import words_of
-from boxreg_ros.core.point_labels import BACKGROUND, PointLabels, UNKNOWN
+from boxreg_ros.core.point_labels import BACKGROUND, ObjectTrack, UNKNOWN
 from boxreg_ros.labels import nuscenes
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.structures import Ints
@@ -71,13 +73,15 @@ class Writer(nuscenes.Writer):
             (folder / name / self.version).mkdir(parents=True)
         for name in CATEGORIES:
             self._categories[name] = self._token('category', name)
-        self._of_tracks: tuple[list[int], list[int]] | None = None
+        self._codes: Ints | None = None
 
     def add(self, frame: LabelFrame) -> None:
         """Add a sample with its annotations and the labels of its points."""
         super().add(frame)
         assert frame.points is not None
-        categories, instances = self._numbers(frame.points)
+        if self._codes is None:
+            self._codes = codes_of(frame.points.tracks)
+        codes = self._codes[frame.points.track]
         sweep = self._token('sample_data', self.number)
         for kind, suffix in (('lidarseg', 'bin'), ('panoptic', 'npz')):
             token = self._token(kind, self.number)
@@ -85,26 +89,9 @@ class Writer(nuscenes.Writer):
             row = {'token': token, 'sample_data_token': sweep, 'filename': path}
             self._rows[kind].append(row)
             if kind == 'lidarseg':
-                categories.astype(np.uint8).tofile(self.folder / path)
+                (codes // 1000).astype(np.uint8).tofile(self.folder / path)
             else:
-                codes = (1000 * categories + instances).astype(np.uint16)
-                np.savez_compressed(self.folder / path, data=codes)
-
-    def _numbers(self, points: PointLabels) -> tuple[Ints, Ints]:
-        """Return the category and the instance of each point; the same over all sweeps."""
-        if self._of_tracks is None:
-            counts: Counter[str] = Counter()
-            categories, instances = [], []
-            for track in points.tracks:
-                name = category_of(track.class_name)
-                counts[name] += 1
-                categories.append(CATEGORIES.index(name))
-                instances.append(counts[name] if counts[name] <= MAX_PANOPTIC_INSTANCE else 0)
-            assert (UNKNOWN, BACKGROUND) == (-2, -1)  # the last two entries
-            ends = [UNKNOWN_CATEGORY, BACKGROUND_CATEGORY]
-            self._of_tracks = [*categories, *ends], [*instances, 0, 0]
-        of_categories, of_instances = (np.array(numbers) for numbers in self._of_tracks)
-        return of_categories[points.track], of_instances[points.track]
+                np.savez(self.folder / path, data=codes)
 
     def _instance(self, key: str, track_id: str, class_name: str, annotation: str) -> str:
         """Return the token of an instance, of a category that the devkit knows."""
@@ -118,6 +105,22 @@ class Writer(nuscenes.Writer):
         return tables | self._rows
 
 
+def codes_of(tracks: Sequence[ObjectTrack]) -> Ints:
+    """Return 1000 times the category plus the instance of the points of each track."""
+    counts: Counter[str] = Counter()
+    codes = []
+    for track in tracks:
+        name = category_of(track.class_name)
+        counts[name] += 1
+        instance = counts[name] if counts[name] <= MAX_PANOPTIC_INSTANCE else 0
+        codes.append(1000 * CATEGORIES.index(name) + instance)
+    # The last two entries are those of the track numbers -2 and -1.
+    assert (UNKNOWN, BACKGROUND) == (-2, -1)
+    ends = [1000 * UNKNOWN_CATEGORY, 1000 * BACKGROUND_CATEGORY]
+    return np.array([*codes, *ends], np.uint16)
+
+
+@cache
 def category_of(class_name: str) -> str:
     """Return the category of objects with a class name."""
     if class_name in CATEGORIES:

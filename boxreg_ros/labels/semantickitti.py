@@ -17,8 +17,9 @@ from boxreg_ros.core.point_labels import BACKGROUND, PointLabels, UNKNOWN
 from boxreg_ros.io.transforms import inverse
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
-from boxreg_ros.structures import Floats, Ints
+from boxreg_ros.structures import Floats
 import numpy as np
+from numpy.typing import NDArray
 
 FORMAT = Format(
     name='semantickitti',
@@ -67,6 +68,7 @@ class Writer(FolderWriter):
         self._times = self.text_file(f'{SEQUENCE_FOLDER}/times.txt')
         self._T_first_fixed: Floats | None = None
         self._first_ns = 0
+        self._numbers: Numbers | None = None
 
     def add(self, frame: LabelFrame) -> None:
         """Write the labels of a sweep, its pose and its time."""
@@ -80,32 +82,39 @@ class Writer(FolderWriter):
         numbers = ' '.join(map(repr, (self._T_first_fixed @ T)[:3].ravel().tolist()))
         self._poses.write(f'{numbers}\n')
         self._times.write(f'{(stamp_ns - self._first_ns) * 1e-9:.6e}\n')
-        classes, instances = numbers_of(frame.points)
-        labels = (classes | instances << 16).astype('<u4')
-        labels.tofile(self._sequence / 'labels' / f'{self.number:06d}.label')
-        if not self.number:
+        if self._numbers is None:
+            self._numbers = Numbers(frame.points)
             names = [track.track_id for track in frame.points.tracks]
             self.about['tracks'] = {str(i + 1): name for i, name in enumerate(names)}
+        labels = np.column_stack(self._numbers.of(frame.points)).astype('<u2', copy=False)
+        labels.tofile(self._sequence / 'labels' / f'{self.number:06d}.label')
 
 
-def numbers_of(points: PointLabels) -> tuple[Ints, Ints]:
+class Numbers:
     """
-    Return the class and the instance of each point, (M,) each.
+    The class and the instance of the points of each track.
 
-    Instances are the rows of the tracks, from 1; 0 for points on none, and beyond
-    `MAX_INSTANCE`.
+    Instances are the rows of the tracks, from 1; 0 for points on none, and beyond `MAX_INSTANCE`.
+
+    Parameters
+    ----------
+    points : PointLabels
+        Of any sweep: all have the same tracks.
 
     """
-    of_tracks = [
-        class_of(track.class_name, bool(moves))
-        for track, moves in zip(points.tracks, points.moves, strict=True)
-    ]
-    # The last two entries are those of the track numbers -2 and -1.
-    assert (UNKNOWN, BACKGROUND) == (-2, -1)
-    classes = np.array([*of_tracks, UNLABELED, OTHER_OBJECT], np.int64)
-    instances = np.array([*range(1, len(of_tracks) + 1), 0, 0], np.int64)
-    instances[instances > MAX_INSTANCE] = 0
-    return classes[points.track], instances[points.track]
+
+    def __init__(self, points: PointLabels) -> None:
+        pairs = zip(points.tracks, points.moves.tolist(), strict=True)
+        classes = [class_of(track.class_name, moves) for track, moves in pairs]
+        # The last two entries are those of the track numbers -2 and -1.
+        assert (UNKNOWN, BACKGROUND) == (-2, -1)
+        self._classes = np.array([*classes, UNLABELED, OTHER_OBJECT], np.uint16)
+        instances = np.append(np.arange(1, len(classes) + 1), [0, 0])
+        self._instances = np.where(instances > MAX_INSTANCE, 0, instances).astype(np.uint16)
+
+    def of(self, points: PointLabels) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+        """Return the class and the instance of each point, (M,) each."""
+        return self._classes[points.track], self._instances[points.track]
 
 
 def class_of(class_name: str, moves: bool) -> int:

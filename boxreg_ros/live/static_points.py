@@ -18,8 +18,6 @@ import numpy as np
 
 HISTORY_SECONDS = 2.0
 """Boxes that the motion of an object is estimated from [s]; longer than the longest gap."""
-COAST_SECONDS = 0.5
-"""An object that the detector misses goes on for so long [s]: five sweeps at 10 Hz."""
 MOST_WAITING = 50
 """Clouds that wait for boxes; derived: 5 s at 10 Hz, no more memory than that."""
 
@@ -183,4 +181,4 @@ class StaticPoints:
             kinds.append(KINDS.index(config.kind(name)))
         margins = self._registrar.margins()[kinds].reshape(-1, 6)
         stamps_ns = np.array(self._array_stamps, np.int64)
-        return PointLabeller(tracks, stamps_ns, config, margins, COAST_SECONDS)
+        return PointLabeller(tracks, stamps_ns, config, margins)

@@ -33,18 +33,19 @@ from boxreg_ros.labels import LabelFrame, LabelWriter, Options, Provenance, writ
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.mcap import OVERLAY
 from boxreg_ros.labels.recording_copy import RawMessage, RecordingCopy
-from boxreg_ros.labels.records import refined_boxes
-from boxreg_ros.labels.semantickitti import numbers_of
+from boxreg_ros.labels.semantickitti import Numbers
 from boxreg_ros.offline.labelled_recording import label_frame_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.structures import (
+    BoxArray,
     FLOAT32_RANGE,
     Floats,
     HUMAN,
     Ints,
     KEPT,
     REFINED,
+    RefinedBoxes,
     REJECTED,
     Sweep,
 )
@@ -109,7 +110,9 @@ def write_point_products(
     margins = registrar.margins()[kinds].reshape(-1, 6)
     labeller = PointLabeller(objects, np.array(array_stamps_ns, np.int64), config, margins)
     products = _Products(folder, request)
-    with request.recording() as recording:
+    source = request.recording()
+    source.has_boxes = False  # they are known
+    with source as recording:
         items = FixedFrameItems(recording, request.config, request.convention, request.fixed_frame)
         sensor_frame = label_frame_of(
             recording, items.tree, items.fixed_frame, request.label_frame
@@ -162,6 +165,7 @@ class _Products:
         self._tracks: Sequence[ObjectTrack] = ()
         self._origin: Floats | None = None
         self._counts: Counter[str] = Counter()
+        self._numbers: Numbers | None = None
 
     def add(
         self, item: MovedItem, items: FixedFrameItems, sensor_frame: str, labeller: PointLabeller
@@ -176,7 +180,7 @@ class _Products:
         labels = labeller.label(sweep)
         is_known = labeller.knows(sweep.stamp_ns)
         self._count(labels, is_known)
-        self._write_formats(item, items, sensor_frame, labeller, labels)
+        self._write_formats(item, items, sensor_frame, labels)
         if self._maps:
             self._accumulate(sweep, labels, is_known)
         if 'object' in self._request.clouds:
@@ -212,8 +216,7 @@ class _Products:
         self._counts['sweeps_without_boxes'] += not is_known
         self._counts['points'] += len(labels.track)
         self._counts['points_on_objects'] += len(labels.rows)
-        is_on = labels.track >= 0
-        self._counts['points_on_moving'] += int((is_on & (labels.motion == MOVING)).sum())
+        self._counts['points_on_moving'] += int((labels.motion[labels.rows] == MOVING).sum())
         self._counts['points_dynamic'] += int(labels.is_dynamic.sum())
         self._counts['points_unknown'] += int((labels.track == UNKNOWN).sum())
 
@@ -222,25 +225,28 @@ class _Products:
         item: MovedItem,
         items: FixedFrameItems,
         sensor_frame: str,
-        labeller: PointLabeller,
         labels: PointLabels,
     ) -> None:
         if not self._writers:
             return
         cloud = items.stored_cloud(item, sensor_frame)
-        objects = labeller.objects_at(cloud.sweep.stamp_ns)
-        tracks = [labeller.tracks[row] for row in objects.track]
-        counts = np.bincount(labels.track[labels.rows], minlength=len(labeller.tracks))
-        refined = refined_boxes(
-            cloud.sweep.stamp_ns,
-            items.fixed_frame,
-            [track.track_id for track in tracks],
-            [track.class_name for track in tracks],
-            objects.boxes,
-            [
-                {'status': REFINED if is_certain else KEPT, 'num_points': counts[row]}
-                for row, is_certain in zip(objects.track, objects.is_certain, strict=True)
-            ],
+        objects = labels.objects
+        rows = np.flatnonzero(~objects.is_lost)
+        tracks = [labels.tracks[row] for row in objects.track[rows]]
+        n = len(rows)
+        refined = RefinedBoxes(
+            BoxArray(
+                cloud.sweep.stamp_ns,
+                items.fixed_frame,
+                tuple(track.track_id for track in tracks),
+                tuple(track.class_name for track in tracks),
+                np.full(n, np.nan),
+                objects.boxes[rows],
+            ),
+            tuple(np.where(objects.is_certain[rows], REFINED, KEPT).tolist()),
+            ('',) * n,
+            np.bincount(labels.owner, minlength=len(objects.track))[rows],
+            np.tile(np.eye(6), (n, 1, 1)),
         )
         frame = LabelFrame(
             refined,
@@ -285,14 +291,16 @@ class _Products:
         Clouds of a sweep without boxes are copied whole: what moves in them is not known.
 
         """
-        classes, instances = numbers_of(labels)
+        if self._numbers is None:
+            self._numbers = Numbers(labels)
+        classes, instances = self._numbers.of(labels)
         codes = np.zeros(len(labels.track), np.uint8)
         codes[labels.motion == MOVING] = MOVING_CODE
         codes[labels.motion == STOOD] = STOOD_CODE
         codes[labels.track == UNKNOWN] = UNKNOWN_CODE
         columns: dict[str, NDArray[Any]] = {
-            'label': classes.astype(np.uint16),
-            'instance': instances.astype(np.uint16),
+            'label': classes,
+            'instance': instances,
             'moving': codes,
             **{name: _is_kept(labels, name) | (not is_known) for name in self._request.maps},
         }

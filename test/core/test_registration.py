@@ -1,6 +1,7 @@
 """Windows solved together, alone, and by torch's own L-BFGS; weights and acceptance tests."""
 
 from dataclasses import replace
+from threading import Event
 
 from boxreg_ros.config import Config
 from boxreg_ros.core import paper, solver
@@ -13,6 +14,7 @@ from boxreg_ros.core.paper import Observed, solve_paper
 from boxreg_ros.core.problem import stack_windows as stack
 from boxreg_ros.core.registration import register
 from boxreg_ros.core.solver import Objective, run_round, SolverPlan, start
+from boxreg_ros.core.threads import mapped, shared_between
 from boxreg_ros.structures import POSE
 import numpy as np
 import pytest
@@ -298,6 +300,22 @@ def test_an_error_in_a_thread_is_raised(monkeypatch):
 
 
 # --- extents ------------------------------------------------------------------------------------
+
+
+def test_a_signal_does_not_wait_for_threads():
+    """One may compile for a minute."""
+    is_interrupted, ended = Event(), Event()
+
+    def work(part):
+        if part == 0:
+            raise KeyboardInterrupt
+        is_interrupted.wait(5.0)
+        ended.set()
+
+    with pytest.raises(KeyboardInterrupt), shared_between(2):
+        mapped(work, [0, 1])
+    assert not ended.is_set()
+    is_interrupted.set()
 
 
 def test_shrunk_extents_are_corrected_by_the_population():

@@ -1,8 +1,10 @@
 """
-`measure points`: labels of points against those of a simulation, whose points know their object.
+`measure points`: labels of points against those of drives whose points have a known object.
 
 Boxes of the input, smoothed ones, and those that the method has refined label the same sweeps.
 Points of the accumulated map that were measured on a moving object are its shadows.
+
+In a recording with exact truth a point is on the object whose true box it is in.
 
 """
 
@@ -10,10 +12,11 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from pathlib import Path
 import time
+from typing import NamedTuple
 
 from boxreg_ros.bench.common import add_json_argument, line
 from boxreg_ros.bench.methods import run_methods
@@ -22,9 +25,11 @@ from boxreg_ros.core.point_labels import MOVING, ObjectTrack, PointLabeller
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.drive import Drive
+from boxreg_ros.offline.point_products import MAP_VOXEL
+from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.scene import SimulatedScene
 from boxreg_ros.simulation.simulate import simulate
-from boxreg_ros.structures import Floats
+from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL
 from measure import print_json
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +38,72 @@ SCENARIOS = ('street', 'highway')
 METHODS = ('input', 'smoothing only', 'ours, track')
 RANGES = (0.0, 20.0, 40.0, 80.0)
 """Ends of the classes of distance [m]."""
-MIN_POINTS = 100
-"""Least returns of a vehicle whose instance counts among the well seen ones."""
-MOVING_STEP = 0.03
-"""Least motion of a moving object in 0.1 s [m]."""
+MIN_POINTS = {'vehicle': 100, 'cyclist': 30, 'pedestrian': 30}
+"""Least returns of an object whose instance counts among the well seen ones."""
+MOVING_SPEED = 0.3
+"""Least speed of a moving object [m/s]."""
+NOISE = 0.08
+"""Points so far outside of a true box are on its object [m]: four deviations of the range."""
+
+
+class Truth(NamedTuple):
+    """
+    What the points of a drive are on.
+
+    Attributes
+    ----------
+    ids, classes : sequence of n str
+        Of the objects.
+    owners : sequence of arrays, shape (M,)
+        Row of the object of each point, for each sweep; -1 for none.
+    moves : sequence of arrays, shape (n + 1,)
+        Whether each object moves, for each sweep; the last is False, that of points on none.
+
+    """
+
+    ids: Sequence[str]
+    classes: Sequence[str]
+    owners: Sequence[Ints]
+    moves: Sequence[NDArray[np.bool_]]
+
+    @classmethod
+    def of_scene(cls, scene: SimulatedScene) -> Truth:
+        """Return that of a simulation."""
+        moves = []
+        for sweep in scene.sweeps:
+            seconds = (sweep.stamp_ns - scene.sweeps[0].stamp_ns) * 1e-9
+            ends = np.array([seconds - 0.05, seconds + 0.05])
+            ways = [np.diff(actor.motion.at(ends)[:, :2], axis=0) for actor in scene.actors]
+            speeds = [np.linalg.norm(way) / 0.1 for way in ways]
+            moves.append(np.array([*speeds, 0.0]) > MOVING_SPEED)
+        ids = [actor.track_id for actor in scene.actors]
+        return cls(ids, [actor.class_name for actor in scene.actors], scene.owners, moves)
+
+    @classmethod
+    def of_boxes(cls, drive: Drive) -> Truth:
+        """Return that of a recording, by its true boxes, which are at the stamps of the sweeps."""
+        tracks = tracks_of(drive.truth)
+        owners, moves = [], []
+        for sweep in drive.sweeps:
+            points = sweep.in_frame().points.astype(np.float64)
+            owner = np.full(len(points), -1)
+            is_moving = np.zeros(len(tracks) + 1, bool)
+            for i, track in enumerate(tracks):
+                row = int(np.searchsorted(track.stamps_ns, sweep.stamp_ns))
+                if row == len(track.stamps_ns) or track.stamps_ns[row] != sweep.stamp_ns:
+                    continue
+                box = track.boxes[row]
+                near = np.flatnonzero(np.abs(points[:, :2] - box[:2]).max(1) < box[LENGTH])
+                local = (points[near] - box[:3]) @ matrix_from_rpy(box[ROLL:])
+                owner[near[(np.abs(local) <= box[LENGTH:ROLL] / 2 + NOISE).all(1)]] = i
+                ends = [max(row - 1, 0), min(row + 1, len(track.boxes) - 1)]
+                way = np.linalg.norm(np.diff(track.boxes[ends, :2], axis=0))
+                seconds = np.ptp(track.stamps_ns[ends]) * 1e-9
+                is_moving[i] = way > MOVING_SPEED * seconds
+            owners.append(owner)
+            moves.append(is_moving)
+        ids = [track.track_id for track in tracks]
+        return cls(ids, [track.class_name for track in tracks], owners, moves)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,15 +113,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--seeds', type=int, default=2, metavar='N', help='number of drives (default: 2)'
     )
     parser.add_argument('--sweeps', type=int, metavar='N', help='sweeps of a drive')
+    parser.add_argument(
+        '--data', type=Path, action='append', metavar='FOLDER',
+        help='a recording with its exact truth.csv, instead of a simulation; may be repeated',
+    )  # fmt: skip
     add_json_argument(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the IoU of labels by method: of instances, of "moving" and by distance."""
     counts: dict[str, Counter[str]] = {name: Counter() for name in METHODS}
-    for seed in range(args.seeds):
-        scene = simulate(args.scenario, seed, args.sweeps)
-        for name, found in measured(scene).items():
+    for drive, truth in drives(args):
+        for name, found in measured(drive, truth).items():
             counts[name] += found
     results = {name: scores(found) for name, found in counts.items()}
     if args.json:
@@ -66,27 +136,33 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def measured(scene: SimulatedScene) -> dict[str, Counter[str]]:
-    """Return the counts of each of `METHODS` on a scene."""
-    drive = Drive.from_scene(scene)
-    methods = run_methods(drive, wanted=('smoothing', 'ours'))
-    margins = learnt_margins(drive)
-    found = {}
-    for name in METHODS:
-        table = methods[name]
-        assert isinstance(table, BoxTable)
-        found[name] = labelled(scene, drive, tracks_of(table), margins)
-    return found
+def drives(args: argparse.Namespace) -> Iterator[tuple[Drive, Truth]]:
+    """Yield the drives that the options ask for."""
+    for folder in args.data or ():
+        drive = Drive.read(folder)
+        yield drive, Truth.of_boxes(drive)
+    for seed in range(0 if args.data else args.seeds):
+        scene = simulate(args.scenario, seed, args.sweeps)
+        yield Drive.from_scene(scene), Truth.of_scene(scene)
 
 
-def learnt_margins(drive: Drive) -> Floats:
-    """Return the labelling margins that the registrar learns from a drive, (K, 6) [m]."""
+def measured(drive: Drive, truth: Truth) -> dict[str, Counter[str]]:
+    """Return the counts of each of `METHODS` on a drive."""
     registrar = BoxRegistrar(Config())
     for sweep, boxes in zip(drive.sweeps, drive.boxes, strict=True):
         registrar.add_sweep(sweep)
         registrar.add_boxes(boxes)
     registrar.flush()
-    return registrar.margins()
+    methods = run_methods(drive, wanted=('smoothing', 'ours'))
+    at_stamp = Config().updated({'sampling.box_time': 'stamp'})  # as detections are simulated
+    refined = registrar.box_time.resolved(Config())  # as the run takes them
+    found = {}
+    for name in METHODS:
+        table = methods[name]
+        assert isinstance(table, BoxTable)
+        config = refined if name.startswith('ours') else at_stamp
+        found[name] = labelled(drive, truth, tracks_of(table), config, registrar.margins())
+    return found
 
 
 def tracks_of(table: BoxTable) -> list[ObjectTrack]:
@@ -104,52 +180,52 @@ def tracks_of(table: BoxTable) -> list[ObjectTrack]:
 
 
 def labelled(
-    scene: SimulatedScene, drive: Drive, tracks: Sequence[ObjectTrack], margins: Floats
+    drive: Drive, truth: Truth, tracks: Sequence[ObjectTrack], config: Config, margins: Floats
 ) -> Counter[str]:
     """Return counts of points, named by what they are of; see `scores`."""
-    config = Config()
-    sampling = replace(config.sampling, box_time='stamp')
     kinds = [KINDS.index(config.kind(track.class_name)) for track in tracks]
-    stamps_ns = np.array([sweep.stamp_ns for sweep in scene.sweeps])
-    config = replace(config, sampling=sampling)
+    stamps_ns = np.array([boxes.stamp_ns for boxes in drive.boxes])
     labeller = PointLabeller(tracks, stamps_ns, config, margins[kinds])
-    ids = [actor.track_id for actor in scene.actors]
-    actor_of = np.array([*(ids.index(track.track_id) for track in tracks), -2, -1])
-    classes = np.array([*(actor.class_name for actor in scene.actors), 'unknown', 'background'])
-    is_vehicle = np.array([config.kind(name) == 'vehicle' for name in classes])
+    object_of = np.array([*(truth.ids.index(track.track_id) for track in tracks), -2, -1])
+    classes = np.array([*truth.classes, 'unknown', 'background'])
+    kind_of = np.array([*(config.kind(name) for name in truth.classes), '', ''])
     counts: Counter[str] = Counter()
-    for index, (sweep, owners) in enumerate(zip(drive.sweeps, scene.owners, strict=True)):
+    kept, is_shadow = [], []
+    for sweep, owners, moving in zip(drive.sweeps, truth.owners, truth.moves, strict=True):
         begun = time.process_time()
         labels = labeller.label(sweep)
         counts['nanoseconds'] += round(1e9 * (time.process_time() - begun))
         counts['sweeps'] += 1
-        found = actor_of[labels.track]
-        moves = moving_actors(scene, index)[owners]
+        found = object_of[labels.track]
+        moves = moving[owners]
         is_moving = (labels.motion == MOVING) & (labels.track >= 0)
-        add_iou(counts, 'moving', is_moving, moves)
+        points = sweep.in_frame().points
+        kept.append(points[~labels.is_dynamic])
+        is_shadow.append(moves[~labels.is_dynamic])
         counts['unknown'] += int((found == -2).sum())
+        counts['background unknown'] += int((found[owners < 0] == -2).sum())
+        counts['background'] += int((owners < 0).sum())
         counts['points'] += len(owners)
-        counts['shadow'] += int((moves & ~labels.is_dynamic).sum())
-        counts['map'] += int((~labels.is_dynamic).sum())
         counts['measured on moving'] += int(moves.sum())
-        distance = np.linalg.norm(scene.sweeps[index].points, axis=1)
+        counts['moving left'] += int(is_shadow[-1].sum())
+        add_iou(counts, 'moving', is_moving, moves)
+        distance = np.linalg.norm(points - sweep.origin, axis=1)
         for low, high in pairwise(RANGES):
             near = (distance >= low) & (distance < high)
             add_iou(counts, f'moving, {low:g} to {high:g} m', is_moving[near], moves[near])
-        for name in dict.fromkeys(classes[:-2]):
-            add_iou(counts, name, classes[found] == name, classes[owners] == name)
-        returns = np.bincount(owners + 1, minlength=len(ids) + 1)[1:]
-        for actor in np.flatnonzero((returns >= MIN_POINTS) & is_vehicle[:-2]):
-            add_iou(counts, 'well seen vehicles', found == actor, owners == actor)
+        for name in dict.fromkeys(truth.classes):
+            is_class, of_class = classes[found] == name, classes[owners] == name
+            add_iou(counts, name, is_class, of_class)
+            add_iou(counts, f'moving {name}', is_moving & is_class, moves & of_class)
+        returns = np.bincount(owners + 1, minlength=len(truth.ids) + 1)[1:]
+        for row, kind in enumerate(kind_of[:-2]):
+            if returns[row] >= MIN_POINTS[kind]:
+                add_iou(counts, f'{kind} instances', found == row, owners == row)
+    cells = np.floor(np.concatenate(kept) / MAP_VOXEL).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    counts['map'] = len(first)
+    counts['shadow'] = int(np.concatenate(is_shadow)[first].sum())
     return counts
-
-
-def moving_actors(scene: SimulatedScene, index: int) -> NDArray[np.bool_]:
-    """Return which actors move at a sweep; the last entry is that of the road."""
-    seconds = (scene.sweeps[index].stamp_ns - scene.sweeps[0].stamp_ns) * 1e-9
-    ends = np.array([seconds - 0.05, seconds + 0.05])
-    steps = [np.diff(actor.motion.at(ends)[:, :2], axis=0) for actor in scene.actors]
-    return np.array([*(np.linalg.norm(step) > MOVING_STEP for step in steps), False])
 
 
 def add_iou(
@@ -168,8 +244,9 @@ def scores(counts: Counter[str]) -> dict[str, float]:
         for name in names
         if counts[f'{name}: either']
     }
+    found['background unknown'] = counts['background unknown'] / counts['background']
     found['unknown'] = counts['unknown'] / counts['points']
     found['shadows in the map'] = counts['shadow'] / counts['map']
-    found['moving points left'] = counts['shadow'] / max(counts['measured on moving'], 1)
+    found['moving points left'] = counts['moving left'] / max(counts['measured on moving'], 1)
     found['CPU of a sweep [ms]'] = counts['nanoseconds'] * 1e-6 / counts['sweeps']
     return found

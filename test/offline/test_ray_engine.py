@@ -17,8 +17,6 @@ from ros_messages import Drive
 pytest.importorskip('ray')
 MEMORY = 100 * 2**20
 """Smallest object store that Ray accepts [bytes]; no objects are stored in it."""
-HANGING = 900
-"""A driver that takes longer for one of three small drives hangs [s]; on an idle machine: 20."""
 
 
 @pytest.fixture
@@ -38,10 +36,8 @@ def address(monkeypatch):
 
 def wait_until(condition, process):
     """Wait as long as a process runs: how long it takes depends on what else the machine does."""
-    deadline = time.monotonic() + HANGING
     while not condition():
         assert process.poll() is None
-        assert time.monotonic() < deadline
         time.sleep(0.05)
 
 

@@ -1,0 +1,318 @@
+"""Which object each point of a sweep is on, and the motion of objects by their boxes."""
+
+from typing import Any, NamedTuple
+
+from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.crop import candidates, offset_of, road_heights
+from boxreg_ros.core.method.selection import lower_median
+import numpy as np
+
+NOWHERE = -1
+"""Value of `owner` of points that are neither on an object nor near one."""
+
+
+class Placed(NamedTuple):
+    """
+    Objects as points are compared with them.
+
+    Attributes
+    ----------
+    velocities : array, shape (n, 3)
+        Of the centres, in the frame of the boxes [m/s].
+    turn_rates : array, shape (n,)
+        About the z axis of that frame [rad/s].
+    limits : array, shape (n, 4)
+        How far points are outside of the ends, sides, top and bottom at most [m].
+    bands : array, shape (n,)
+        Points up to this much further outside are on the object or beside it [m].
+    is_lost : array, shape (n,)
+        Whether the box is a guess: no point is known to be on it.
+    is_at_stamp : bool
+        Whether boxes are at the stamp, not where the sweep sees the object.
+    is_dynamic : array, shape (n,)
+        Whether it moves now or later, or may.
+    clearance : float
+        Points so little above or below the road are of the road or the object [m]: of neither
+        where it moves, since they would stay behind in a map, of the road where it is parked.
+
+    """
+
+    velocities: Any
+    turn_rates: Any
+    limits: Any
+    bands: Any
+    is_lost: Any
+    is_at_stamp: bool
+    is_dynamic: Any
+    clearance: float
+
+
+@loop
+def inside_out(shapes, box, x, y, z):
+    """Return an offset along the axes of a box, less its half extents; and height in it [m]."""
+    R = shapes.rotations[box]
+    half = shapes.half[box]
+    up = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+    u = abs(R[0, 0] * x + R[1, 0] * y + R[2, 0] * z) - half[0]
+    v = abs(R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) - half[1]
+    return u, v, abs(up) - half[2], half[2] + up
+
+
+@kernel
+def medians(owner, values, n):
+    """Return the lower median of the values (P,) of each of n owners; 0 for one without any."""
+    first = np.zeros(n + 1, np.int64)
+    for k in range(len(owner)):
+        first[owner[k] + 1] += 1
+    for row in range(n):
+        first[row + 1] += first[row]
+    place = first[:-1].copy()
+    ordered = np.empty_like(values)
+    for k in range(len(owner)):
+        ordered[place[owner[k]]] = values[k]
+        place[owner[k]] += 1
+    found = np.zeros(n)
+    for row in range(n):
+        if first[row] < first[row + 1]:
+            found[row] = lower_median(ordered[first[row] : first[row + 1]])
+    return found
+
+
+@kernel
+def surroundings(points, times, shapes, found, numbers):
+    """
+    Return the height of the road in each box, and when the sweep sees its object, (n,) each.
+
+    The height is above the bottom [m], NaN where unknown; the time is the median of the points
+    inside [s], 0 without any.
+
+    """
+    near, cells, first, boxes, capacity = found
+    n = len(shapes.half)
+    owner = np.empty(capacity, np.int32)
+    height = np.empty(capacity)
+    is_beside = np.ones(capacity, np.bool_)
+    inner = np.empty(capacity, np.int32)
+    delays = np.empty(capacity if len(times) else 0, np.float32)
+    square = np.hypot(shapes.half[:, 0], shapes.half[:, 1]) + numbers.road_width
+    P, inside = 0, 0
+    for k in range(len(near)):
+        for place in range(first[cells[k]], first[cells[k] + 1]):
+            box = boxes[place]
+            x, y, z = offset_of(points, near[k], shapes, box)
+            u, v, w, high = inside_out(shapes, box, x, y, z)
+            aside = max(u, v)
+            owner[P], height[P] = box, high
+            P += (
+                (aside > numbers.road_gap)
+                & (max(aside, w) < numbers.road_width)
+                & (abs(high) < numbers.road_range)
+                & (max(abs(x), abs(y)) < square[box])
+            )
+            if len(delays):
+                inner[inside], delays[inside] = box, times[near[k]]
+                inside += max(aside, w) <= 0.0
+    road = np.full(n, np.nan)
+    if numbers.has_road:
+        road = road_heights(owner[:P], height[:P], is_beside[:P], n, numbers)
+    return road, medians(inner[:inside], delays[:inside], n)
+
+
+@loop
+def moved_back(placed, box, delay, x, y, z):
+    """Return an offset from the centre of an object at a delay [s], as it is without [m]."""
+    x -= placed.velocities[box, 0] * delay
+    y -= placed.velocities[box, 1] * delay
+    z -= placed.velocities[box, 2] * delay
+    angle = placed.turn_rates[box] * delay
+    cos, sin = np.cos(angle), np.sin(angle)
+    return cos * x + sin * y, cos * y - sin * x, z
+
+
+@loop
+def outside(shapes, placed, road, box, x, y, z):
+    """Return how far a point is outside of a surface [m], inf if too far; whether it is on it."""
+    u, v, w, high = inside_out(shapes, box, x, y, z)
+    ends, sides, top, bottom = placed.limits[box]
+    excess = max(u - ends, v - sides)
+    above = high - (road[box] if road[box] == road[box] else 0.0)
+    if abs(above) <= placed.clearance:
+        is_either = placed.is_dynamic[box] and excess < 0.0
+        return (excess if is_either else np.inf), False
+    excess = max(excess, w - (top if high > shapes.half[box, 2] else bottom))
+    if above < 0.0 or excess >= placed.bands[box]:
+        return np.inf, False
+    return excess, excess <= 0.0 and not placed.is_lost[box]
+
+
+@kernel
+def label(points, times, shapes, placed, numbers):
+    """
+    Find the object that each point is on, at the time of the point.
+
+    Parameters
+    ----------
+    points : array, shape (3, M)
+        Coordinates [m].
+    times : array, shape (M,) or (0,)
+        Of the points relative to the stamp [s]; empty where unknown.
+    shapes : crop.Shapes
+        Boxes at the stamp; their bounding boxes include where they go while the sweep takes place.
+    placed : Placed
+        The same objects.
+    numbers : crop.CropNumbers
+        Constants and settings of the road.
+
+    Returns
+    -------
+    owner : array, shape (M,)
+        Object that the point is on or next to; `NOWHERE` for the others.
+    is_on : array, shape (M,)
+        Whether it is on it. Of several objects, it is the one that it is deepest inside of.
+    rows : array, shape (L,)
+        Points on an object, ascending.
+    local : array, shape (L, 3)
+        These in the frame of the box at their own time [m].
+
+    """
+    found = candidates(points, shapes)
+    near, cells, first, boxes, _ = found
+    road, seen = surroundings(points, times, shapes, found, numbers)
+    owner = np.full(points.shape[1], NOWHERE, np.int32)
+    is_on = np.zeros(points.shape[1], np.bool_)
+    rows = np.empty(len(near), np.int64)
+    local = np.empty((len(near), 3))
+    L = 0
+    for k in range(len(near)):
+        i = near[k]
+        least = np.inf
+        for place in range(first[cells[k]], first[cells[k] + 1]):
+            box = boxes[place]
+            x, y, z = offset_of(points, i, shapes, box)
+            if len(times):
+                delay = times[i] - (0.0 if placed.is_at_stamp else seen[box])
+                x, y, z = moved_back(placed, box, delay, x, y, z)
+            excess, is_sure = outside(shapes, placed, road, box, x, y, z)
+            if is_sure < is_on[i] or (is_sure == is_on[i] and excess >= least):
+                continue
+            owner[i], is_on[i], least = box, is_sure, excess
+            R = shapes.rotations[box]
+            for axis in range(3):
+                local[L, axis] = R[0, axis] * x + R[1, axis] * y + R[2, axis] * z
+        rows[L] = i
+        L += is_on[i]
+    return owner, is_on, rows[:L], local[:L]
+
+
+class MotionNumbers(NamedTuple):
+    """
+    When an object moves; `boxreg_ros.core.point_labels` describes the values.
+
+    Attributes
+    ----------
+    seconds, min_seconds : float
+        Time that the boxes of a speed span, and least duration of a track [s].
+    speed, distance, deviations, way : float
+        Least speed [m/s], least way in that time [m], least speed in standard errors, least way
+        between two rests [m].
+
+    """
+
+    seconds: float
+    min_seconds: float
+    speed: float
+    distance: float
+    deviations: float
+    way: float
+
+
+@loop
+def slope(t, values, i, seconds, rate, error):
+    """
+    Find the slope of values (n, 4) at row `i` of times t (n,): `rate` and its `error`, (4,) each.
+
+    The rows within a time of `seconds` are used, in the middle of which `i` is; at an end all of
+    it is on one side. Returns the time that they span [s].
+
+    """
+    n = len(t)
+    begin = min(max(t[i] - seconds / 2, t[0]), max(t[0], t[-1] - seconds)) - 1e-6
+    end = begin + seconds + 2e-6
+    low, high = max(i - 1, 0), min(i + 2, n)  # both neighbours at least
+    while low > 0 and t[low - 1] >= begin:
+        low -= 1
+    while high < n and t[high] < end:
+        high += 1
+    m = high - low
+    for axis in range(values.shape[1]):
+        middle, mean = 0.0, 0.0
+        for k in range(low, high):
+            middle += t[k] / m
+            mean += values[k, axis] / m
+        spread, product, square = 0.0, 0.0, 0.0
+        for k in range(low, high):
+            spread += (t[k] - middle) ** 2
+            product += (t[k] - middle) * (values[k, axis] - mean)
+            square += (values[k, axis] - mean) ** 2
+        rate[axis] = product / spread
+        rest = max(square - rate[axis] * product, 0.0)
+        error[axis] = np.sqrt(rest / max(m - 2, 1) / spread)
+    return t[high - 1] - t[low]
+
+
+@kernel
+def motions(first, t, values, numbers):
+    """
+    Find the motion at each box of T tracks, by the slope of the boxes around it.
+
+    Parameters
+    ----------
+    first : array, shape (T + 1,)
+        First box of each track, and the number of all.
+    t : array, shape (N,)
+        Times [s].
+    values : array, shape (N, 4)
+        Centres and headings [m, rad]; half turns of the heading are taken back, in place.
+    numbers : MotionNumbers
+        Settings.
+
+    Returns
+    -------
+    rates : array, shape (N, 4)
+        Of the values where the object moves, else 0.
+    moves, is_known : array, shape (N,)
+        Whether it moves, and whether the track is long enough to tell.
+
+    """
+    N = len(t)
+    rates = np.zeros((N, 4))
+    moves = np.zeros(N, np.bool_)
+    is_known = np.zeros(N, np.bool_)
+    rate, error = np.empty(4), np.empty(4)
+    for track in range(len(first) - 1):
+        a, b = first[track], first[track + 1]
+        if t[b - 1] - t[a] < numbers.min_seconds:
+            continue
+        is_known[a:b] = True
+        for i in range(a + 1, b):
+            turns = np.floor((values[i, 3] - values[i - 1, 3]) / np.pi + 0.5)
+            values[i, 3] -= turns * np.pi
+        for i in range(b - a):
+            span = slope(t[a:b], values[a:b], i, numbers.seconds, rate, error)
+            speed = np.hypot(rate[0], rate[1])
+            noise = numbers.deviations * np.hypot(error[0], error[1])
+            moves[a + i] = speed > max(numbers.speed, numbers.distance / span, noise)
+        begin = a
+        while begin < b:  # motions between two rests that lead nowhere
+            end = begin + 1
+            while end < b and moves[end] == moves[begin]:
+                end += 1
+            if moves[begin] and begin > a and end < b:
+                x = values[end, 0] - values[begin - 1, 0]
+                y = values[end, 1] - values[begin - 1, 1]
+                moves[begin:end] = np.hypot(x, y) >= numbers.way
+            begin = end
+        for i in range(b - a):
+            if moves[a + i]:  # less smooth, for the place
+                slope(t[a:b], values[a:b], i, numbers.seconds / 2, rates[a + i], error)
+    return rates, moves, is_known
