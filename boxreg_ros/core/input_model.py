@@ -9,7 +9,15 @@ from collections.abc import Sequence
 from typing import Any
 
 from boxreg_ros.config import Config, FaceConfig, KINDS
-from boxreg_ros.core.input_noise import set_noise
+from boxreg_ros.core.input_noise import add_past_noise, noise_of, set_noise
+from boxreg_ros.core.input_statistics import (
+    drive_of,
+    Drives,
+    KindStatistics,
+    NOISE,
+    pooled_noise,
+    TRACK,
+)
 from boxreg_ros.core.method import constants
 from boxreg_ros.core.method.arrays import INPUTS
 from boxreg_ros.core.method.faces import observe_faces
@@ -61,6 +69,8 @@ class InputModel:
     ----------
     config : FaceConfig
         Expected insets, and whether margins are estimated.
+    drives : Drives, optional
+        Of the same detector and labelling rule: their tracks count as those of this stream.
 
     Attributes
     ----------
@@ -69,7 +79,7 @@ class InputModel:
 
     """
 
-    def __init__(self, config: FaceConfig) -> None:
+    def __init__(self, config: FaceConfig, drives: Drives | None = None) -> None:
         self.constants = constants.CONSTANTS
         self._estimates_margins = config.learn
         self._occlusion_insets = (config.inset_ends, config.inset_sides, 0.0, 0.0)
@@ -81,6 +91,15 @@ class InputModel:
         self._margins: list[tuple[Floats, ...] | None] = [None] * len(KINDS)
         self._residuals = [TrackRows(unknown, self.constants.max_tracks) for _ in KINDS]
         self._evidence = [TrackRows(np.zeros((3, 3)), self.constants.max_tracks) for _ in KINDS]
+        self._noise = np.zeros(len(KINDS), NOISE)  # of whole tracks, whose residuals are not kept
+        known = list((drives or {}).values())
+        self._past = [
+            np.concatenate([np.zeros(0, TRACK), *(drive[k].tracks for drive in known)])
+            for k in range(len(KINDS))
+        ]
+        self._past_noise = np.array(
+            [pooled_noise([drive[k].noise for drive in known]) for k in range(len(KINDS))], NOISE
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what was observed; margins that follow from it are computed again."""
@@ -188,18 +207,51 @@ class InputModel:
             for name, column in zip(MARGIN_FIELDS, margins, strict=True):
                 inputs[name][k] = column
         if with_noise and config.ingredients.noise_estimation:
-            set_noise(inputs, *_of_all_kinds(self._residuals), self.constants)
+            self.set_noise(inputs, *_of_all_kinds(self._residuals))
         if config.ingredients.population_extents:
             set_population(inputs, *self.extent_evidence(), self.constants)
         return inputs
 
     def extent_evidence(self) -> tuple[Floats, Ints]:
         """Return the evidence of the extents of the last fit of each track, and their kinds."""
-        return _of_all_kinds(self._evidence)
+        evidence, kinds = _of_all_kinds(self._evidence)
+        past = np.concatenate([tracks['evidence'] for tracks in self._past])
+        of_past = np.repeat(np.arange(len(KINDS)), list(map(len, self._past)))
+        has_any = past[:, 0].any(1)
+        return (
+            np.concatenate([past[has_any], evidence]),
+            np.concatenate([of_past[has_any], kinds]),
+        )
+
+    def set_noise(self, inputs: Inputs, residuals: Floats, kind: Ints) -> None:
+        """Set the noise of tracks (B, N, 9) of a kind (B,), with that of other drives (M14)."""
+        set_noise(inputs, residuals, kind, self.constants)
+        add_past_noise(inputs, self._past_noise, self.constants)
+
+    def add_noise(self, residuals: Floats, kind: Ints) -> None:
+        """Add the noise of whole tracks, by their residuals (B, N, 9), to the statistics."""
+        for k in set(kind.tolist()):
+            found = _noise_record(residuals[kind == k], self.constants)
+            self._noise[k] = pooled_noise([self._noise[k], found])
+
+    def statistics(self, name: str = '') -> Drives:
+        """Return what this drive has shown, for others to begin with, by a `name`."""
+        kinds = []
+        for k in range(len(KINDS)):
+            sums, evidence = self._faces[k].by_track, self._evidence[k].by_track
+            tracks = np.zeros(len(sums.keys() | evidence.keys()), TRACK)
+            for track, track_id in zip(tracks, {**sums, **evidence}, strict=True):
+                track['sums'] = sums.get(track_id, 0.0)
+                track['evidence'] = evidence.get(track_id, 0.0)
+            noise = self._noise[k]
+            if not noise['boxes']:
+                noise = _noise_record(self._residuals[k].in_order, self.constants)
+            kinds.append(KindStatistics(tracks, noise))
+        return drive_of(kinds, name)
 
     def _margins_of(self, kind: int) -> tuple[Floats, ...]:
         """Return margin corrections, insets and scatter of gaps for one kind, (6,) each."""
-        known = self._faces[kind].in_order
+        known = np.concatenate([self._past[kind]['sums'], self._faces[kind].in_order])
         none = (0.0,) * len(FACE_GROUPS)
         deviations = GAP_DEVIATIONS[KINDS[kind]]
         of_gaps = _means_of_groups(known[:, 0])
@@ -274,6 +326,13 @@ def _means_of_groups(known: Floats) -> Means:
         order = np.argsort(means)
         found.append((means[order], count[is_known][order]))
     return found
+
+
+def _noise_record(residuals: Floats, numbers: constants.Constants) -> NDArray[np.void]:
+    """Return the noise of tracks (B, N, 9) as a record `NOISE`."""
+    noise = noise_of(residuals, numbers)
+    boxes = numbers.half_weight * noise.weight[0] / (1 - noise.weight[0])
+    return np.array((noise.deviation, noise.correlation, boxes), NOISE)
 
 
 def _of_all_kinds(known: Sequence[TrackRows]) -> tuple[Floats, Ints]:

@@ -74,6 +74,19 @@ def set_noise(
     inputs['weight'] = weight[:, 0]
 
 
+def add_past_noise(inputs: NDArray[np.void], past: NDArray[np.void], constants: Constants) -> None:
+    """Add the noise of other drives, records `NOISE` (K,), which counts by its boxes."""
+    if not past['boxes'].any():
+        return
+    boxes = constants.half_weight * inputs['weight'] / (1 - inputs['weight'])
+    together = (past['boxes'] + boxes)[:, None]
+    share = past['boxes'][:, None] / np.maximum(together, 1.0)
+    squares = np.square(inputs['deviation'])
+    inputs['deviation'] = np.sqrt(squares + share * (np.square(past['deviation']) - squares))
+    inputs['correlation'] += share * (past['correlation'] - inputs['correlation'])
+    inputs['weight'] = together[:, 0] / (together[:, 0] + constants.half_weight)
+
+
 def noise_of(residuals: Floats, constants: Constants) -> InputNoise:
     """Estimate the noise of tracks (B, N, 9) of one kind (M14), shapes (9,) and (1,)."""
     found = InputNoise(np.zeros(9), np.zeros(9), np.zeros(1))

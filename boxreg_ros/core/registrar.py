@@ -13,6 +13,7 @@ from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.following.stream import FollowedObjects
 from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.input_statistics import Drives
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.pending import BoxToObserve, ObservedTrack, PendingArray, PendingBox
@@ -66,6 +67,8 @@ class BoxRegistrar:
     budget : callable, optional
         Called once for each box array with `estimate` 'early' or 'final'; limits the windows that
         are solved for it. Default: all are.
+    drives : Drives, optional
+        What other drives of the same detector have shown of its errors, to begin with.
 
     Attributes
     ----------
@@ -117,19 +120,24 @@ class BoxRegistrar:
     """
 
     def __init__(
-        self, config: Config, submit: Submit | None = None, budget: Budget | None = None
+        self,
+        config: Config,
+        submit: Submit | None = None,
+        budget: Budget | None = None,
+        drives: Drives | None = None,
     ) -> None:
         self.config = config
         self.counts: Counter[str] = Counter()
         self._submit = submit
         self._budget = budget
+        self._drives = drives
         self.reset()
 
     def reset(self) -> None:
         """Discard tracks and box arrays that are held; keep the counts."""
         config = self.config
         self._matcher = StampMatcher(config, self.counts)
-        self._input_model = InputModel(config.faces)
+        self._input_model = InputModel(config.faces, self._drives)
         self.box_time = BoxTimeEvidence()
         self.followed = FollowedObjects(config)
         self._pending = deque[PendingArray]()
@@ -202,6 +210,10 @@ class BoxRegistrar:
         inputs = self._input_model.inputs(self.config, with_noise=False)
         margins: Floats = of_settings + inputs['gap_correction']
         return margins
+
+    def statistics(self, name: str = '') -> Drives:
+        """Return what the boxes so far have shown of their detector, by a `name`."""
+        return self._input_model.statistics(name)
 
     def _process(self, pairs: list[Pair]) -> Iterator[RefinedBoxes]:
         for pair in pairs:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel, Inputs
-from boxreg_ros.core.input_noise import normalised_residuals, set_noise
+from boxreg_ros.core.input_noise import normalised_residuals
 from boxreg_ros.core.lbfgs import HISTORY, minimize
 from boxreg_ros.core.method import round as method
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, Posterior, PRIOR, SHARED, Solution
@@ -251,7 +251,9 @@ def _from_batch(
     if config.ingredients.noise_estimation and turn <= NOISE_ROUNDS:
         extents = solution.shared[:, EXTENT:BIAS]
         residuals = normalised_residuals(problem, solution.poses, extents)
-        set_noise(inputs, residuals, problem.kind, model.constants)
+        model.set_noise(inputs, residuals, problem.kind)
+        if turn == NOISE_ROUNDS:
+            model.add_noise(residuals, problem.kind)
     if config.ingredients.population_extents:
         evidence, kind = model.extent_evidence()
         evidence = np.concatenate([evidence, solution.evidence])

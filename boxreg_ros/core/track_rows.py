@@ -34,6 +34,11 @@ class TrackRows:
         self.arrays = self._fresh[:0]
 
     @property
+    def by_track(self) -> dict[str, Floats]:
+        """The array of each track, those seen last at the end."""
+        return {track_id: self.arrays[row] for track_id, row in self._row_of.items()}
+
+    @property
     def in_order(self) -> Floats:
         """Copy of the arrays of all tracks, (n, ...), those seen last at the end."""
         copy: Floats = self.arrays[list(self._row_of.values())]

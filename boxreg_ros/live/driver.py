@@ -7,12 +7,15 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.input_statistics import Drives, joined, to_text
 from boxreg_ros.core.latency import LateBoxes, Latency, set_latency
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable, UnsupportedMessage
+from boxreg_ros.io.input_models import disagreements, read_models
 from boxreg_ros.io.lidars import Lidars, MergedSweep, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.session import (
     covariances_to_write,
@@ -22,6 +25,7 @@ from boxreg_ros.io.session import (
     Session,
 )
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
+from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.label_tap import CloudPart, LabelTap
 from boxreg_ros.live.static_points import StaticPoints
@@ -157,6 +161,8 @@ class LiveRegistrar:
     static_patience : float, optional
         How long a cloud without moving objects waits for its boxes [s]. Default: no such clouds
         are made.
+    input_model : str, optional
+        File of what drives have shown of the detector: read now, and written by `save_model`.
 
     Attributes
     ----------
@@ -184,6 +190,7 @@ class LiveRegistrar:
         lidars: Lidars = SINGLE_LIDAR,
         budget: TickBudget | None = None,
         static_patience: float | None = None,
+        input_model: str = '',
     ) -> None:
         self.output_frame = output_frame.lstrip('/')
         self.transform_timeout = transform_timeout
@@ -193,9 +200,12 @@ class LiveRegistrar:
         self._unknown_frames: set[str] = set()  # of LiDARs; not waited for
         self._session = Session(convention, config, fixed_frame, self.placement, trouble)
         self.tap = LabelTap(self._session)
-        self._registrar = BoxRegistrar(config)
-        if budget is not None:
-            self._registrar = BoxRegistrar(config, budget.submit, budget.windows)
+        self._model_file = Path(input_model).expanduser() if input_model else None
+        self._drives: Drives = {}
+        if self._model_file is not None and self._model_file.exists():
+            self._drives = read_models([self._model_file])
+        limits = () if budget is None else (budget.submit, budget.windows)
+        self._registrar = BoxRegistrar(config, *limits, drives=self._drives)
         self.static_points: StaticPoints | None = None
         if static_patience is not None:
             self.static_points = StaticPoints(static_patience, self._registrar)
@@ -492,6 +502,23 @@ class LiveRegistrar:
         self._session.restart()
         self._late.restart()
         return ready
+
+    def save_model(self) -> str:
+        """
+        Add what this drive has shown of its detector to the file of the input model.
+
+        Returns
+        -------
+        differing : str
+            Where drives in it differ, which one detector would not do.
+
+        """
+        if self._model_file is None:
+            return ''
+        drives = joined([self._drives, self._registrar.statistics()])
+        with written_whole(self._model_file) as file:
+            file.write(to_text(drives))
+        return '; '.join(disagreements(drives))
 
     def abandon(self, item: ReceivedMessage | None) -> list[Outgoing]:
         """

@@ -108,7 +108,7 @@ class BoxregNode(Node):
         self._live = LiveRegistrar(
             config, options.fixed_frame, options.output_frame, options.transform_timeout,
             self._health.report, options.convention, options.lidars, self._budget,
-            options.static_points_wait if options.static_points else None,
+            options.static_points_wait if options.static_points else None, options.input_model,
         )  # fmt: skip
         gc.collect()
         gc.freeze()  # a collection of imported objects would take 50 ms, several times a minute

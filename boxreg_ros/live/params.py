@@ -109,6 +109,11 @@ NODE_SETTINGS = (
         'length of a segment of label files: a number with the unit s, min, h, MB or GB',
     ),
     Setting(
+        'input_model', '',
+        'file of what drives have shown of the errors of this detector: read at the start where '
+        'it exists, and written at the end; empty: none',
+    ),
+    Setting(
         'record_camera', '', 'calibration file, for recorded formats in the frame of a camera'
     ),
 )  # fmt: skip
@@ -150,6 +155,7 @@ class NodeOptions(NamedTuple):
     record_formats: tuple[str, ...]
     record_points: bool
     record_segment: str
+    input_model: str
     record_camera: str
 
     @property

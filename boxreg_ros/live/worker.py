@@ -379,6 +379,18 @@ class Worker:
             else:
                 self._markers.publish(self._board.update(out.given, out.refined))
 
+    def _save_model(self) -> None:
+        """Write what the drive has shown of its detector, and log where drives differ."""
+        try:
+            differing = self._live.save_model()
+        except OSError as error:
+            self._logger.error(f'input_model: cannot be written: {error}')
+            return
+        if differing:
+            self._logger.warning(
+                f'input_model: expected drives of one detector and labelling rule, got {differing}'
+            )
+
     def _publish_static(self) -> None:
         """Publish clouds without moving objects, and those that wait no longer for their boxes."""
         if self._live.static_points is None or self._static is None:
@@ -406,6 +418,7 @@ class Worker:
                 self._publish(self._live.last(message.content, NO_TIME))
             message = self._inbox.take()
         self._live.tap.finish()
+        self._save_model()
         self._publish_static()
         self._markers.publish(self._board.clear())
         publishers = [p for p in (self._early, self._final, self._markers) if p is not None]

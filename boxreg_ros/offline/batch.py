@@ -23,6 +23,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lock import locked
 from boxreg_ros.io.storage.urls import url_of
+from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.arguments import (
     add_options,
     add_recordings,
@@ -37,11 +38,11 @@ from boxreg_ros.offline.batch_results import (
     UP_TO_DATE,
     write_results,
 )
-from boxreg_ros.offline.job import Job, jobs_of
+from boxreg_ros.offline.job import Job, jobs_of, LEARNING
 from boxreg_ros.offline.job_process import JobRunner, read_states
 from boxreg_ros.offline.relabel_command import Demands
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import writing
+from boxreg_ros.offline.result_folder import INPUT_MODEL, writing
 
 ENGINES = ('local', 'ray')
 DRIVE_TIMEOUT = 1800.0
@@ -67,6 +68,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--workers', type=int, default=1, metavar='N',
         help='drives that are relabelled at a time, each on one core (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--learn', action='store_true',
+        help='relabel every drive twice: first into OUT/learning, then beginning with what all '
+        'drives have shown of their detector, OUT/input_model.json',
     )  # fmt: skip
     _add_machine_arguments(parser)
 
@@ -122,6 +128,8 @@ def run(args: argparse.Namespace) -> int:
                 )
             jobs = drives[index - 1 :: count]
         with _alone(args.out, part):
+            if args.learn and jobs:
+                args.input_model = (*args.input_model, _learnt(jobs, args))
             rows += [vars(result) for result in _results(jobs, args)]
             write_results(args.out, rows, part)
     done = sum(row['status'] != DRIVE_FAILED for row in rows)
@@ -151,6 +159,11 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(
             f'timeout and memory: expected more than 0, and a number of GB, got '
             f'{args.timeout:g} and {args.memory:g}'
+        )
+    if args.learn and (args.shard != (1, 1) or url_of(args.out) is not None):
+        raise ConfigError(
+            '--learn: expected all drives in one folder of this machine, got --shard or a URL; '
+            'run boxreg batch there first, and give its input_model.json files to --input-model'
         )
     if args.address is not None and args.engine != 'ray':
         raise ConfigError(
@@ -200,6 +213,22 @@ def _results(jobs: Sequence[Job], args: argparse.Namespace) -> list[Result]:
             bar.update()
             bar.set_postfix_str(f'{failed} failed')
     return [results[job] for job in jobs]
+
+
+def _learnt(jobs: Sequence[Job], args: argparse.Namespace) -> Path:
+    """Relabel all drives once, and return the file of what they have shown together."""
+    from boxreg_ros.core.input_statistics import to_text
+    from boxreg_ros.io.input_models import read_models
+
+    first = argparse.Namespace(**vars(args) | {'out': args.out / LEARNING, 'report': False})
+    first.formats = ('csv',)
+    found = _results(jobs, first)
+    done = [job.name for job, result in zip(jobs, found, strict=True) if result.is_done]
+    together = args.out / INPUT_MODEL
+    drives = read_models([first.out / name / INPUT_MODEL for name in done])
+    with written_whole(together) as file:
+        file.write(to_text(drives))
+    return together.absolute()
 
 
 def _ended(

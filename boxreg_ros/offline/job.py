@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 from boxreg_ros.datasets import address_of, all_scenes, resolved, scene_files
 from boxreg_ros.errors import BoxregError, ConfigError, RecordingError
 from boxreg_ros.io.storage.urls import entries_of, Entry, url_of
+from boxreg_ros.offline.result_folder import INPUT_MODEL
 
 MANIFESTS = ('.txt', '.lst')
 COMMENT = re.compile(r'(^|\s)#.*')
@@ -26,7 +27,9 @@ SUFFIX = re.compile(r'(?<=.)\.(mcap|db3|bag|active)(\.zstd?)?$')
 """Suffixes of recordings; other dots belong to the name, as those of dates."""
 JOBS = 'jobs'
 """Folder with the key and the log of each job."""
-RESERVED = frozenset({JOBS, 'index.csv', 'summary.json', 'report.html'})
+LEARNING = 'learning'
+"""Folder of the first results of `--learn`."""
+RESERVED = frozenset({JOBS, LEARNING, INPUT_MODEL, 'index.csv', 'summary.json', 'report.html'})
 """Names in the output that no drive may have."""
 READ_BYTES = 2**24
 """Bytes that are read for the hash of a file until progress is noted; chosen."""

@@ -67,6 +67,11 @@ def notes(summary: Summary) -> Iterator[str]:
     yield from _lidar_notes(summary)
     yield from _label_notes(summary)
     yield from _keyframe_notes(summary)
+    if summary.input_model.get('warning'):
+        yield (
+            f'input model: expected drives of one detector and labelling rule, got '
+            f'{summary.input_model["warning"]}; give --input-model files of the same one only'
+        )
     if summary.unknown_classes:
         names = ', '.join(repr(name) for name in summary.unknown_classes)
         boxes = sum(summary.unknown_classes.values())

@@ -27,7 +27,13 @@ from boxreg_ros.offline.products import (
 from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.reader import ReadAhead, reader, ReadItem
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import claimed, CONFIG, whole_folder, write_summary
+from boxreg_ros.offline.result_folder import (
+    claimed,
+    CONFIG,
+    INPUT_MODEL,
+    whole_folder,
+    write_summary,
+)
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.review.corrections import Corrections
@@ -89,16 +95,21 @@ def relabel(
             reader(request, None if survey is None else survey.latency)
         )
         # The recording is opened while this process imports numba, which takes half a second.
+        from boxreg_ros.core.input_statistics import to_text
         from boxreg_ros.core.registrar import BoxRegistrar
+        from boxreg_ros.io.input_models import disagreements, read_models
         from boxreg_ros.offline.registration_worker import registration_worker
 
+        name = request.drive_name()
+        drives = read_models(request.input_model)
+        drives.pop(name, None)  # it would count twice
         recording = ReadAhead(receive)
         if survey is None:
             clock.begun('start')
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.announce)
         )
-        registrar = BoxRegistrar(request.config, _journaled(submit, journal))
+        registrar = BoxRegistrar(request.config, _journaled(submit, journal), drives=drives)
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock, corrections) as sink:
                 _register(recording, registrar, survey, sink, clock, shown)
@@ -134,6 +145,12 @@ def relabel(
                 write_run_report(folder, out, request, summary, rows, violated, sink.points, clock)
             if request.decisions is not None:
                 copyfile(request.decisions, folder / DECISIONS)  # a review goes on from there
+            taught = registrar.statistics(name)
+            (folder / INPUT_MODEL).write_text(to_text(taught), encoding='utf-8')
+            summary.input_model = {
+                'drives': len(drives),
+                'warning': '; '.join(disagreements({**drives, **taught})),
+            }
             settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
             (folder / CONFIG).write_text(settings, encoding='utf-8')
             write_summary(folder, summary.as_json())

@@ -119,6 +119,15 @@ class Request:
         metavar='FILE',
         parse=Path,
     )
+    input_model: tuple[Path, ...] = option(
+        (),
+        'input_model.json of another drive of the same detector, to begin with what it has shown '
+        'of its errors; can be repeated',
+        metavar='FILE',
+        parse=Path,
+        text=str,
+        is_repeated=True,
+    )
     formats: tuple[str, ...] = option(
         ('csv', 'openlabel'),
         'label formats to write, see `boxreg formats`; csv is always written (default: '
@@ -285,7 +294,24 @@ class Request:
             paths += _parts_of(self.truth)
         if self.decisions is not None:
             paths.append(self.decisions)
-        return tuple(paths)
+        return (*paths, *self.input_model)
+
+    def drive_name(self) -> str:
+        """Return a name of the drive: a hash of the names and sizes of its recordings."""
+        files = [
+            (Path(str(one.path)).name, one.size)
+            for path in self.recordings
+            if url_of(path) is not None
+            for one in entries_of(path)
+        ]
+        local = [path for path in self.recordings if path.exists()]
+        inner = [
+            file
+            for path in local
+            for file in (sorted(path.iterdir()) if path.is_dir() else [path])
+        ]
+        files += [(file.name, file.stat().st_size) for file in inner if file.is_file()]
+        return hashlib.sha256(repr((files, self.start, self.end)).encode()).hexdigest()[:16]
 
     def fingerprint(self) -> str:
         """Return a hash of the request and of its input files, by size and modification time."""

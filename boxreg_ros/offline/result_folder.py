@@ -24,6 +24,7 @@ REFUSED_ERRORS = (
 """No permission, read-only file system, a file in place of a folder, no folders as in /proc."""
 SUMMARY = 'summary.json'
 CONFIG = 'config.yaml'
+INPUT_MODEL = 'input_model.json'
 FILES = 'files'
 """Field of the summary: size and SHA-256 of each other file, by name."""
 

@@ -98,6 +98,8 @@ class Summary:
         Violations of each rule before and after the run.
     points : dict
         Sweeps and points by their label; empty where points are not labelled.
+    input_model : dict
+        Drives that the input model began with, and where drives of it differ.
 
     """
 
@@ -143,6 +145,7 @@ class Summary:
     seconds: dict[str, float] = field(default_factory=dict)
     rules: dict[str, dict[str, int]] = field(default_factory=dict)
     points: dict[str, Any] = field(default_factory=dict)
+    input_model: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(
