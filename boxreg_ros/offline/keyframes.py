@@ -2,74 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-import mmap
-from tempfile import TemporaryFile
 from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.follow import End, follow_points, FollowedTrack
-from boxreg_ros.core.following.sweeps import ascending
+from boxreg_ros.io.sweep_store import SweepStore
+from boxreg_ros.offline.completion import Moved
 from boxreg_ros.offline.every_sweep import Arrivals
-from boxreg_ros.structures import BoxArray, Floats, Sweep
+from boxreg_ros.review.corrections import Corrections
+from boxreg_ros.structures import BoxArray, Sweep
 from boxreg_ros.tracks.complete import CompletionPlan
 from boxreg_ros.tracks.followed import followed_plan
 import numpy as np
-from numpy.typing import NDArray
-
-POINT = np.dtype((np.float32, 3))
-
-
-class SweepStore:
-    """
-    The points of sweeps in a temporary file: a drive has more of them than fit the memory.
-
-    Attributes
-    ----------
-    stamps_ns : list of int
-        Stamps of the sweeps [ns].
-    origin : array, shape (3,)
-        Points are stored relative to this place, so that float32 is enough [m].
-
-    """
-
-    def __init__(self) -> None:
-        self.stamps_ns: list[int] = []
-        self.origin: Floats | None = None
-        self._file = TemporaryFile()  # noqa: SIM115  closed with the store
-        self._ends = [0]
-        self._map: mmap.mmap | None = None
-
-    def add(self, sweep: Sweep) -> None:
-        """Add a sweep in the fixed frame that is later than those before."""
-        if self.stamps_ns and sweep.stamp_ns <= self.stamps_ns[-1]:
-            return
-        points = sweep.in_frame().points
-        if self.origin is None:
-            self.origin = np.round(points[0]).astype(float) if len(points) else np.zeros(3)
-        self.stamps_ns.append(sweep.stamp_ns)
-        relative = ascending((points - self.origin).astype(np.float32))
-        self._file.write(relative.tobytes())
-        self._ends.append(self._ends[-1] + len(relative))
-
-    def __len__(self) -> int:
-        """Return the number of sweeps."""
-        return len(self.stamps_ns)
-
-    def __getitem__(self, row: int, /) -> NDArray[np.float32]:
-        """Return the points (M, 3) of a sweep, ascending by x."""
-        first, last = self._ends[row], self._ends[row + 1]
-        if first == last:
-            return np.zeros((0, 3), np.float32)
-        if self._map is None:
-            self._file.flush()
-            self._map = mmap.mmap(self._file.fileno(), 0)
-        return np.frombuffer(self._map, POINT, last - first, first * POINT.itemsize)
 
 
 def keyframes(
-    items: Iterable[tuple[Sweep | BoxArray | None, bool]], fixed_frame: str, config: Config
+    items: Iterable[tuple[Moved, bool]], fixed_frame: str, config: Config
 ) -> tuple[CompletionPlan, list[Arrivals], list[FollowedTrack]]:
     """
     Follow the boxes of a recording through its sweeps.
@@ -93,31 +43,91 @@ def keyframes(
         Of all parts.
 
     """
-    parts = [Arrivals()]
-    stores = [SweepStore()]
-    for item, restarts in items:
-        if restarts:
-            parts.append(Arrivals())
-            stores.append(SweepStore())
-        if item is None:
-            continue
-        parts[-1].add(item)
-        if isinstance(item, Sweep):
-            stores[-1].add(item)
+    stores: list[SweepStore] = []
+    parts = arrivals(stored(items, stores))
     plan = CompletionPlan([], [])
     tracks: list[FollowedTrack] = []
     for part, store in zip(parts, stores, strict=True):
-        found = _followed(part.arrays, store, config)
+        found = followed(part.arrays, store, config)
         plan.append(followed_plan(part.completed(fixed_frame), found))
         tracks += found
     return plan, parts, tracks
 
 
-def _followed(
-    arrays: Sequence[BoxArray], store: SweepStore, config: Config
+def stored(items: Iterable[tuple[Moved, bool]], stores: list[SweepStore]) -> Iterator[Any]:
+    """Yield items, and put their sweeps into `stores`: one for each part between time jumps."""
+    stores.append(SweepStore())
+    for item, restarts in items:
+        if restarts:
+            stores.append(SweepStore())
+        if isinstance(item, Sweep):
+            stores[-1].add(item)
+        yield item, restarts
+
+
+def arrivals(items: Iterable[tuple[Moved, bool]]) -> list[Arrivals]:
+    """Return what arrived in each part between time jumps."""
+    parts = [Arrivals()]
+    for item, restarts in items:
+        if restarts:
+            parts.append(Arrivals())
+        if item is not None:
+            parts[-1].add(item)
+    return parts
+
+
+def add_objects(
+    plan: CompletionPlan,
+    parts: Sequence[Arrivals],
+    stores: Sequence[SweepStore],
+    corrections: Corrections,
+    fixed_frame: str,
+    config: Config,
 ) -> list[FollowedTrack]:
+    """
+    Add the objects of a person to a plan, followed through the sweeps of their part.
+
+    Parameters
+    ----------
+    plan : CompletionPlan
+        For the arrays of `Arrivals.completed`.
+    parts, stores : sequences of Arrivals and SweepStore
+        Between time jumps.
+    corrections : Corrections
+        The decisions of a person.
+    fixed_frame, config
+        As of `keyframes`.
+
+    Returns
+    -------
+    tracks : list of FollowedTrack
+        As they were followed.
+
+    """
+    seeds_of: dict[int, list[BoxArray]] = {}
+    for seed in corrections.seeds(fixed_frame):
+        away = [_away(store, seed.stamp_ns) for store in stores]
+        seeds_of.setdefault(int(np.argmin(away)), []).append(seed)
+    tracks: list[FollowedTrack] = []
+    first = 0
+    for index, (part, store) in enumerate(zip(parts, stores, strict=True)):
+        arrays = part.completed(fixed_frame)
+        found = followed(seeds_of.get(index, []), store, config)
+        plan.add(followed_plan(arrays, corrections.added(found), has_seeds=False), first)
+        tracks += found
+        first += len(arrays)
+    return tracks
+
+
+def _away(store: SweepStore, stamp_ns: int) -> float:
+    """Return the time from a stamp to the nearest sweep of a store [ns]."""
+    stamps_ns = np.array(store.stamps_ns, np.int64)
+    return float(np.abs(stamps_ns - stamp_ns).min()) if len(stamps_ns) else np.inf
+
+
+def followed(arrays: Sequence[BoxArray], store: SweepStore, config: Config) -> list[FollowedTrack]:
     """Return the tracks of keyframes, in the fixed frame."""
-    if not len(store):
+    if not len(store) or not arrays:
         return []
     assert store.origin is not None
     offset = np.append(store.origin, np.zeros(6))

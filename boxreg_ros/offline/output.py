@@ -18,7 +18,6 @@ from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.reasons import Reason
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.structures import (
-    ADDED,
     BoxArray,
     REFINED,
     RefinedBoxes,
@@ -124,6 +123,7 @@ class Sink:
         self.array_stamps_ns: list[int] = []
         self.boxes_in = 0
         self.boxes_out = 0
+        self._boxes_added = 0
         self.arrays_in = 0
         self.arrays_out = 0
         self.status: Counter[str] = Counter()
@@ -191,7 +191,7 @@ class Sink:
 
     def missing(self) -> int:
         """Return the number of input boxes that have not been written."""
-        return self.boxes_in - (self.boxes_out - sum(self.status[word] for word in ADDED))
+        return self.boxes_in - (self.boxes_out - self._boxes_added)
 
     def _note_time(self, content: Sweep | BoxArray | None) -> None:
         """Widen the time range of clouds or boxes by a message; empty box arrays count."""
@@ -230,12 +230,16 @@ class Sink:
 
     def _put(self, refined: RefinedBoxes, slot: Slot, early: RefinedBoxes | None) -> None:
         """Count the boxes of one array and write them in all formats; in the thread."""
+        count = len(slot.boxes.track_ids)
         self.boxes_out += len(refined.status)
+        self._boxes_added += len(refined.status) - count
         self.arrays_out += len(refined.status) > 0
         self.status.update(refined.status)
         self.reasons.update(filter(None, refined.reasons))
         self.heading_flips += _heading_flips(slot.boxes, refined)
-        self.changes.add(slot.boxes, refined, early)
+        stamp_ns, added = refined.boxes.stamp_ns, refined.boxes.track_ids[count:]
+        added_ids = [self.corrections.origin_of(stamp_ns, track_id) for track_id in added]
+        self.changes.add(slot.boxes, refined, early, added_ids)
         with self._clock('write'):
             self._output.write(self._frame(refined, slot))
 

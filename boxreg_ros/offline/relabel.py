@@ -36,7 +36,10 @@ from boxreg_ros.structures import BoxArray, RefinedBoxes
 import yaml
 
 if TYPE_CHECKING:
+    from boxreg_ros.core.follow import FollowedTrack
+    from boxreg_ros.core.latency import Latency
     from boxreg_ros.core.registrar import BoxRegistrar, Submit
+    from boxreg_ros.io.sweep_store import SweepStore
     from boxreg_ros.offline.completion import Completion, Moved
     from boxreg_ros.offline.resume import EstimateJournal
     from boxreg_ros.tracks.complete import CompletionPlan
@@ -77,12 +80,14 @@ def relabel(
     clock = Stopwatch()
     progress = progress or Progress()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
-    shown = _Passes(progress, 1 + request.completes)
+    corrections = _corrections(request)
+    shown = _Passes(progress, 1 + (request.completes or corrections.adds))
     with claimed(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
-        corrections = _corrections(request)
         survey = _survey(request, clock, shown, journal, corrections)
-        receive = workers.enter_context(reader(request))
+        receive = workers.enter_context(
+            reader(request, None if survey is None else survey.latency)
+        )
         # The recording is opened while this process imports numba, which takes half a second.
         from boxreg_ros.core.registrar import BoxRegistrar
         from boxreg_ros.offline.registration_worker import registration_worker
@@ -106,8 +111,14 @@ def relabel(
             summary.fingerprint = fingerprint
             summary.seconds = clock.seconds()
             tracks = sink.changes.tracks()
+            if request.proposals:
+                from boxreg_ros.offline.proposals import write_proposals
+
+                with clock('proposals'):
+                    stamps_ns, frame = sink.array_stamps_ns, summary.fixed_frame
+                    summary.proposals = write_proposals(folder, request, tracks, stamps_ns, frame)
             with clock('write'):
-                rows = write_track_tables(folder, tracks, plan)
+                rows = write_track_tables(folder, tracks, plan, summary.proposals)
                 summary.rules, violated = checked(tracks, request.config)
             if request.needs_point_labels:
                 from boxreg_ros.offline.point_products import write_point_products
@@ -167,6 +178,7 @@ class _Survey(NamedTuple):
     completion: Completion
     parts: list[Arrivals]
     ends: list[dict[str, Any]]
+    latency: Latency
 
 
 def _corrections(request: Request) -> Corrections:
@@ -182,34 +194,51 @@ def _survey(
     corrections: Corrections,
 ) -> _Survey | None:
     """Read the recording a first time and plan its whole tracks; None where none is completed."""
-    if not request.completes:
+    if not (request.completes or corrections.adds):
         return None
     with ExitStack() as workers:
         receive = workers.enter_context(reader(request))
         from boxreg_ros.offline.completion import Completion, first_pass
+        from boxreg_ros.offline.keyframes import (
+            add_objects,
+            arrivals,
+            ends_of,
+            keyframes,
+            stored,
+        )
+        from boxreg_ros.tracks.complete import unchanged_plan
 
         recording = ReadAhead(receive)
         clock.begun('start')
         fixed_frame = recording.source.fixed_frame
-        items = (
+        moved = (
             (_corrected(item.moved, corrections), item.restarts)
             for item in progress.each(recording)
         )
+        stores: list[SweepStore] = []
+        items = stored(moved, stores) if corrections.adds else moved
+        tracks: list[FollowedTrack] = []
         if request.keyframes:
-            from boxreg_ros.offline.keyframes import ends_of, keyframes
-
             with clock('follow'):
                 plan, parts, tracks = keyframes(items, fixed_frame, request.config)
-            completion = Completion(plan, request.config, has_keyframes=True)
-            return _Survey(plan, completion, parts, ends_of(tracks))
-        from boxreg_ros.offline.registration_worker import registration_worker
+        elif request.completes:
+            from boxreg_ros.offline.registration_worker import registration_worker
 
-        submit = workers.enter_context(
-            registration_worker(request.config, clock, progress.progress.announce)
-        )
-        first = first_pass(items, request.config, _journaled(submit, journal), fixed_frame)
-        plan = first.plan(fixed_frame, request.config)
-        return _Survey(plan, Completion(plan, request.config), first.parts, [])
+            submit = workers.enter_context(
+                registration_worker(request.config, clock, progress.progress.announce)
+            )
+            first = first_pass(items, request.config, _journaled(submit, journal), fixed_frame)
+            plan, parts = first.plan(fixed_frame, request.config), first.parts
+        else:
+            parts = arrivals(items)
+            plan = unchanged_plan([a for part in parts for a in part.completed(fixed_frame)])
+        if corrections.adds:
+            with clock('follow'):
+                tracks += add_objects(
+                    plan, parts, stores, corrections, fixed_frame, request.config
+                )
+        completion = Completion(plan, request.config, has_keyframes=request.keyframes)
+        return _Survey(plan, completion, parts, ends_of(tracks), recording.source.latency)
 
 
 def _corrected(item: Moved, corrections: Corrections) -> Moved:

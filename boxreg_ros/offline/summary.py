@@ -56,7 +56,7 @@ class Summary:
     recorded_apart : dict
         Topics that were recorded apart from the clouds, and by how much [s].
     box_time : dict
-        Estimated time of the boxes.
+        Estimated time and latency of the boxes.
     time_ranges : dict
         First and last stamp [ns] of boxes and clouds.
     unknown_classes : dict
@@ -86,6 +86,8 @@ class Summary:
     seeds : list of dict
         Where each track of keyframes ends in both directions and why, and keyframes that could
         not be used; empty without keyframes.
+    proposals : list of dict
+        Objects that no box covers, longest first; empty where they are not looked for.
     sweeps_with_boxes : dict
         Sweeps with a box ``before`` and ``after`` the run.
     fingerprint : str
@@ -135,6 +137,7 @@ class Summary:
     associated_tracks: int | None = None
     complete: dict[str, int] = field(default_factory=dict)
     seeds: list[dict[str, Any]] = field(default_factory=list)
+    proposals: list[dict[str, Any]] = field(default_factory=list)
     sweeps_with_boxes: dict[str, int] = field(default_factory=dict)
     fingerprint: str = ''
     seconds: dict[str, float] = field(default_factory=dict)
@@ -179,7 +182,8 @@ class Summary:
             time_jumps=findings.counts[Reason.TIME_JUMP],
             recorded_apart={topic: round(late, 3) for topic, late in findings.apart.items()},
             heading_flips=sink.heading_flips,
-            box_time=registrar.box_time.summary(request.config),
+            box_time=registrar.box_time.summary(request.config)
+            | {'latency': source.latency.summary()},
             time_ranges={name: list(ends) for name, ends in sink.time_ranges.items()},
             unknown_classes=dict(sink.unknown_classes.most_common()),
             dropped=_dropped(registrar.counts, findings),
@@ -190,7 +194,8 @@ class Summary:
             first_missing_transform=findings.first_missing_transform,
             first_unplaced=findings.first_unplaced,
             first_unreadable=findings.first_unreadable,
-            warning=findings.warning or ('' if sink.boxes_in else NO_BOXES),
+            warning='; '.join(filter(None, (findings.warning, source.latency.warning)))
+            or ('' if sink.boxes_in else NO_BOXES),
             **findings.facts,
             left_out_of_labels=sink.left_out(),
             unused_decisions=sink.corrections.unused(),

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Sequence
 from datetime import datetime, UTC
 from pathlib import Path
-import re
 import secrets
 import sys
 from threading import Lock, Thread
+from time import monotonic
 from typing import Any
 
 import anyio
 from boxreg_ros.errors import BoxregError, RecordingError
-from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
+from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, WITH_BOX
+from boxreg_ros.review.drives import drives_application
+from boxreg_ros.review.proposals import proposals_of
 from boxreg_ros.review.report import PAGE_VERSION, REPORT
+from boxreg_ros.review.requests import box_of, json_of, STAMP, stamp_of, text_of
+from boxreg_ros.review.scene import DriveSource
+from boxreg_ros.review.scene_routes import SceneRoutes
 from boxreg_ros.review.solve import ReportParts
-import numpy as np
 import orjson
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -27,14 +31,12 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-MAX_BODY = 2**23
-"""Longest request [bytes]: one decision about a track whose id has 1 MB, several times over."""
 MAX_ROWS = 10_000
 """Most decisions of a request: a track that is made of as many parts; chosen."""
-BODY_SECONDS = 20.0
+OPEN_SECONDS = 600.0
+"""A track is open to one person for so long; chosen: then the person has left."""
 POLL_SECONDS = 0.25
 """Another program may append to the file: the time until its decisions are seen; chosen."""
-STAMP = re.compile(r'-?[0-9]{1,19}')
 MARK = f'<html lang="en" data-page="{PAGE_VERSION}"'.encode()
 """Begins a page of this version, which offers decisions where ``data-review`` follows."""
 MARK_WITHIN = 1000
@@ -53,15 +55,18 @@ POLICY = (
 
 
 def review_application(
-    out: Path, port: int, who: str, is_ending: Callable[[], bool]
-) -> tuple[ASGIApp, str, Path]:
+    results: Sequence[tuple[Path, DriveSource | None]],
+    port: int,
+    who: str,
+    is_ending: Callable[[], bool],
+) -> tuple[ASGIApp, str]:
     """
-    Return the application for a result folder.
+    Return the application for result folders; several are behind a page of their progress.
 
     Parameters
     ----------
-    out : Path
-        Result folder with a report.
+    results : sequence of Path and DriveSource
+        Result folders with a report, and their recordings, for whole clouds and added objects.
     port : int
         Port on loopback that it is served at: requests under another name are refused.
     who : str
@@ -74,8 +79,6 @@ def review_application(
     application : ASGI application
     token : str
         Requests need it, in the address of the first one or in the cookie that this one sets.
-    log_path : Path
-        File of the decisions.
 
     Raises
     ------
@@ -83,20 +86,11 @@ def review_application(
         If decisions or summary cannot be read.
 
     """
-    review = _Review(out, who, is_ending)
     token = secrets.token_urlsafe(16)
-    application = Starlette(
-        routes=[
-            Route('/', review.page),
-            Route('/decisions', review.decisions, methods=['GET']),
-            Route('/decisions', review.decide, methods=['POST']),
-            Route('/events', review.events),
-            Route('/solve', review.solve, methods=['POST']),
-            Route('/save', review.save, methods=['POST']),
-        ],
-        exception_handlers={BoxregError: _refused, OSError: _failed},
-    )
-    return _Guard(application, port, token), token, out / DECISIONS
+    reviews = [_Review(out, who, is_ending, source) for out, source in results]
+    found = [(review, review.application()) for review in reviews]
+    application = found[0][1] if len(found) == 1 else drives_application(found)
+    return _Guard(application, port, token), token
 
 
 class _Guard:
@@ -141,7 +135,9 @@ class _Guard:
 class _Review:
     """The state of a review, and the answers to its requests."""
 
-    def __init__(self, out: Path, who: str, is_ending: Callable[[], bool]) -> None:
+    def __init__(
+        self, out: Path, who: str, is_ending: Callable[[], bool], source: DriveSource | None
+    ) -> None:
         self._page = (out / REPORT).read_bytes()
         if MARK not in self._page[:MARK_WITHIN]:
             raise RecordingError(
@@ -151,13 +147,34 @@ class _Review:
         self._parts = ReportParts(out, self._page)
         self._summary = orjson.loads((out / 'summary.json').read_bytes())
         self._frame_id: str = self._summary['fixed_frame']
-        self._out = out
+        self.out = out
+        self.listeners = 0
+        self._open: dict[str, tuple[str, float]] = {}  # tracks by page, and since when
         self._who = who
+        self._proposals = proposals_of(out)
         self._log = DecisionLog(out / DECISIONS)
         self._log_lock = Lock()
         self._save_lock = asyncio.Lock()
         self._is_ending = is_ending
+        self._source = source
         Thread(target=self._parts.warm_up, daemon=True).start()
+
+    def application(self) -> Starlette:
+        """Return the application of this result."""
+        routes = [
+            Route('/', self.page),
+            Route('/decisions', self.decisions, methods=['GET']),
+            Route('/decisions', self.decide, methods=['POST']),
+            Route('/events', self.events),
+            Route('/open', self.open, methods=['POST']),
+            Route('/solve', self.solve, methods=['POST']),
+            Route('/risk', self.risk, methods=['POST']),
+            Route('/save', self.save, methods=['POST']),
+        ]
+        if self._source is not None:
+            routes += SceneRoutes(self._source, self._frame_id).routes()
+        handlers: Any = {BoxregError: _refused, OSError: _failed}
+        return Starlette(routes=routes, exception_handlers=handlers)
 
     async def page(self, _: Request) -> Response:
         """Return the page; its scripts alone may run."""
@@ -170,11 +187,13 @@ class _Review:
     async def decisions(self, _: Request) -> Response:
         """Return all decisions."""
         await run_in_threadpool(self._refresh)
-        return JSONResponse({**self._since(0), 'who': self._who})
+        has_scene = self._source is not None
+        more = {'who': self._who, 'has_scene': has_scene, 'proposals': self._proposals}
+        return JSONResponse({**self._since(0), **more})
 
     async def decide(self, request: Request) -> Response:
         """Append decisions, unless others have decided about these tracks since."""
-        sent = await _json_of(request)
+        sent = await json_of(request)
         rows = sent.get('rows')
         if not isinstance(rows, list) or not 0 < len(rows) <= MAX_ROWS:
             raise RecordingError(f'rows: expected 1 to {MAX_ROWS} decisions in a list')
@@ -188,16 +207,35 @@ class _Review:
             raise RecordingError('seen: expected the number of known decisions')
         return StreamingResponse(self._stream(int(seen)), media_type='text/event-stream')
 
+    async def open(self, request: Request) -> Response:
+        """Note the track that a page has open, and return those that others have."""
+        sent = await json_of(request)
+        page, track = text_of(sent, 'page'), text_of(sent, 'track')
+        now = monotonic()
+        self._open = {
+            one: known for one, known in self._open.items() if now - known[1] < OPEN_SECONDS
+        }
+        if track:
+            self._open[page] = track, now
+        return JSONResponse([known for one, (known, _) in self._open.items() if one != page])
+
     async def solve(self, request: Request) -> Response:
         """Return the boxes of a track, solved again with its pinned boxes."""
-        sent = await _json_of(request)
+        sent = await json_of(request)
         return Response(
             await run_in_threadpool(self._parts.solved, sent), media_type='application/json'
         )
 
+    async def risk(self, request: Request) -> Response:
+        """Return the risk of a box as it is, and as a person drags it."""
+        sent = await json_of(request)
+        return Response(
+            await run_in_threadpool(self._parts.risks, sent), media_type='application/json'
+        )
+
     async def save(self, request: Request) -> Response:
         """Run the command of the result again with the decisions, into a folder beside it."""
-        await _json_of(request)
+        await json_of(request)
         if self._save_lock.locked():
             raise HTTPException(409, 'label files are being written already: wait for them')
         async with self._save_lock:
@@ -230,44 +268,48 @@ class _Review:
 
     async def _stream(self, seen: int) -> AsyncIterator[bytes]:
         yield b'retry: 1000\n\n'
-        while not self._is_ending():
-            await run_in_threadpool(self._refresh)
-            if len(self._log.decisions) != seen:
-                first = seen if seen < len(self._log.decisions) else 0
-                seen = len(self._log.decisions)
-                data = orjson.dumps(self._since(first)).decode()
-                yield f'id: {seen}\ndata: {data}\n\n'.encode()
-            await anyio.sleep(POLL_SECONDS)
+        self.listeners += 1
+        try:
+            while not self._is_ending():
+                await run_in_threadpool(self._refresh)
+                if len(self._log.decisions) != seen:
+                    first = seen if seen < len(self._log.decisions) else 0
+                    seen = len(self._log.decisions)
+                    data = orjson.dumps(self._since(first)).decode()
+                    yield f'id: {seen}\ndata: {data}\n\n'.encode()
+                await anyio.sleep(POLL_SECONDS)
+        finally:
+            self.listeners -= 1
 
     def _decision(self, sent: object) -> Decision:
         """Return the decision that the page has sent."""
         if not isinstance(sent, dict):
             raise RecordingError('decision: expected an object')
-        box = _box_of(sent.get('box')) if sent.get('decision') == 'pin' else None
+        box = box_of(sent.get('box')) if sent.get('decision') in WITH_BOX else None
         return Decision(
-            track_id=_text_of(sent, 'track_id'),
-            stamp_ns=_stamp_of(sent, 'stamp_ns'),
-            kind=_text_of(sent, 'decision'),
-            comment=_text_of(sent, 'comment'),
+            track_id=text_of(sent, 'track_id'),
+            stamp_ns=stamp_of(sent, 'stamp_ns'),
+            kind=text_of(sent, 'decision'),
+            comment=text_of(sent, 'comment'),
             frame_id=self._frame_id if box is not None else '',
             box=box,
-            end_ns=_stamp_of(sent, 'end_ns'),
-            value=_text_of(sent, 'value'),
-            who=_text_of(sent, 'who') or self._who,
+            end_ns=stamp_of(sent, 'end_ns'),
+            value=text_of(sent, 'value'),
+            who=text_of(sent, 'who') or self._who,
             when=datetime.now(UTC).isoformat(timespec='seconds'),
         )
 
     async def _relabel(self) -> Response:
         command = self._summary['command']
         folder = Path(self._summary['folder'])
-        decisions = (self._out / DECISIONS).resolve()
+        decisions = (self.out / DECISIONS).resolve()
         if command[:1] != ['relabel'] or not folder.is_dir():
             raise RecordingError(
                 f'expected a result of boxreg relabel in {str(folder)!r}, got one of '
                 f'{command[:1]}, or the folder is gone; run boxreg relabel RECORDING -o NEW '
                 f'--decisions {decisions}'
             )
-        out = self._out.resolve()
+        out = self.out.resolve()
         new = out.with_name(f'{out.name}.corrected')
         more = ['-o', str(new), '--report']
         if decisions.exists():
@@ -286,50 +328,6 @@ class _Review:
         if process.returncode:
             raise RecordingError(lines[1][-1] if lines[1] else 'boxreg relabel failed')
         return JSONResponse({'out': str(new), 'line': lines[0][-1], 'notes': lines[1]})
-
-
-async def _json_of(request: Request) -> Mapping[str, Any]:
-    """Return the object that a request has sent."""
-    if request.headers.get('content-type') != 'application/json':  # no form of another page
-        raise HTTPException(415, 'expected application/json')
-    body = bytearray()
-    try:
-        with anyio.fail_after(BODY_SECONDS):
-            async for part in request.stream():
-                body += part
-                if len(body) > MAX_BODY:
-                    raise HTTPException(413, f'expected at most {MAX_BODY:,} bytes')
-    except TimeoutError:
-        raise HTTPException(408, f'expected the request within {BODY_SECONDS:g} s') from None
-    try:
-        sent = orjson.loads(body)
-    except ValueError as error:
-        raise RecordingError(f'request: expected JSON, got: {error}') from None
-    if not isinstance(sent, dict):
-        raise RecordingError('request: expected an object')
-    return sent
-
-
-def _text_of(sent: Mapping[str, Any], name: str) -> str:
-    value = sent.get(name, '')
-    if not isinstance(value, str):
-        raise RecordingError(f'{name}: expected a text, got {value!r:.80}')
-    return value
-
-
-def _stamp_of(sent: Mapping[str, Any], name: str) -> int | None:
-    text = _text_of(sent, name)
-    if text and not STAMP.fullmatch(text):
-        raise RecordingError(f'{name}: expected nanoseconds, got {text!r:.80}')
-    return int(text) if text else None
-
-
-def _box_of(sent: object) -> Any:
-    if not isinstance(sent, list) or not all(type(one) in (int, float) for one in sent):
-        raise RecordingError(f'box: expected nine numbers, got {sent!r:.80}')
-    if len(sent) != 9:
-        raise RecordingError(f'box: expected nine numbers, got {len(sent)}')
-    return np.array(sent, np.float64)
 
 
 async def _refused(_: Request, error: Exception) -> Response:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from boxreg_ros.core.metrics import iou_3d, pose_errors
@@ -119,7 +120,11 @@ class Changes:
         self._counts: list[Ints] = []  # rows of stamp, number of points
 
     def add(
-        self, given: BoxArray, refined: RefinedBoxes, early: RefinedBoxes | None = None
+        self,
+        given: BoxArray,
+        refined: RefinedBoxes,
+        early: RefinedBoxes | None = None,
+        added_ids: Sequence[str] = (),
     ) -> None:
         """
         Add the boxes of one array.
@@ -132,6 +137,8 @@ class Changes:
             The result; added boxes stand behind those of the input.
         early : RefinedBoxes, optional
             The early estimate of the same boxes, where the result is another.
+        added_ids : sequence of str
+            Ids that a person gave the objects of the added boxes; empty for others, and without.
 
         """
         boxes = refined.boxes
@@ -159,7 +166,8 @@ class Changes:
             )
         )
         self._counts.append(np.column_stack([np.full(n, boxes.stamp_ns), refined.num_points]))
-        input_ids = (*given.track_ids, *('' for _ in range(n - len(given.track_ids))))
+        added_ids = added_ids or ('',) * (n - len(given.track_ids))
+        input_ids = (*given.track_ids, *added_ids)
         names = boxes.track_ids, boxes.class_names, refined.status, refined.reasons, input_ids
         self._names += zip(*names, strict=True)
 

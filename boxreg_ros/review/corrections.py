@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.stamp_order import kept
@@ -22,6 +22,11 @@ from boxreg_ros.structures import (
 import numpy as np
 from numpy.typing import NDArray
 
+if TYPE_CHECKING:
+    from boxreg_ros.core.follow import FollowedTrack
+
+SAME_SWEEP_NS = 50_000_000
+"""Boxes are of a sweep if its stamp is nearer than this [ns]; chosen: half a revolution."""
 WITHOUT_EFFECT = ('accept', 'unsure', 'none')
 
 
@@ -49,10 +54,81 @@ class Corrections:
             if one.kind not in WITHOUT_EFFECT and not one.is_taken_back
         }
         self._extents = self._extents_of_pins()
+        self._origins: dict[str, list[tuple[int, str]]] = {}  # stamps and first ids of added boxes
 
     def unused(self) -> list[str]:
         """Return the tracks and boxes with a decision that the recording does not have."""
         return [_text_of(scope) for scope in sorted(self._unused, key=str)]
+
+    def seeds(self, frame_id: str) -> list[BoxArray]:
+        """
+        Return the boxes of added objects, one array each, in the fixed frame.
+
+        Raises
+        ------
+        RecordingError
+            If a box was added in another frame.
+
+        """
+        found = []
+        for one in self._additions():
+            if one.frame_id != frame_id:
+                raise RecordingError(
+                    f'added box of track {one.track_id!r} at {one.stamp_ns}: expected frame '
+                    f'{frame_id!r}, got {one.frame_id!r}; relabel with --fixed-frame '
+                    f'{one.frame_id}'
+                )
+            assert one.stamp_ns is not None and one.box is not None
+            columns = (one.track_id,), (one.value,), np.ones(1), one.box[None]
+            found.append(BoxArray(one.stamp_ns, frame_id, *columns))
+        return found
+
+    @property
+    def adds(self) -> bool:
+        """Return whether objects were added."""
+        return bool(self._additions())
+
+    def added(self, tracks: Iterable[FollowedTrack]) -> list[FollowedTrack]:
+        """Return followed objects without deleted boxes, with the ids and classes decided."""
+        found: list[FollowedTrack] = []
+        for track in tracks:
+            rows_of: dict[tuple[str, str], list[int]] = {}
+            for row, stamp_ns in enumerate(track.stamps_ns.tolist()):
+                if self._last('deletion', track.track_id, stamp_ns) is not None:
+                    continue
+                names = []
+                for topic, name in (('id', track.track_id), ('class', track.class_name)):
+                    changed = self._last(topic, track.track_id, stamp_ns)
+                    names.append(changed.value if changed else name)
+                rows_of.setdefault((names[0], names[1]), []).append(row)
+                self._origins.setdefault(names[0], []).append((stamp_ns, track.track_id))
+            own = {one.scope for one in self._additions() if one.track_id == track.track_id}
+            if len(track.rows):
+                self._unused -= own
+            for (track_id, class_name), rows in rows_of.items():
+                found.append(
+                    replace(
+                        track,
+                        track_id=track_id,
+                        class_name=class_name,
+                        rows=track.rows[rows],
+                        stamps_ns=track.stamps_ns[rows],
+                        boxes=track.boxes[rows],
+                        status=tuple(track.status[row] for row in rows),
+                    )
+                )
+        return found
+
+    def origin_of(self, stamp_ns: int, track_id: str) -> str:
+        """Return the id under which the object of an added box was added; empty for others."""
+        known = self._origins.get(track_id)
+        if known is None:
+            return ''
+        near_ns, origin = min(known, key=lambda one: abs(one[0] - stamp_ns))
+        return origin if abs(near_ns - stamp_ns) < SAME_SWEEP_NS else ''
+
+    def _additions(self) -> list[Decision]:
+        return [one for rows in self._of_track.values() for one in rows if one.kind == 'add']
 
     def to_register(self, given: BoxArray, with_pins: bool = True) -> BoxArray:
         """

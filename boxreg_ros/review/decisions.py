@@ -35,8 +35,11 @@ KINDS_OF_TOPIC: Mapping[str, tuple[str, ...]] = {
     'deletion': ('delete', 'restore'),
     'id': ('rename',),
     'class': ('reclass',),
+    'addition': ('add', 'withdraw'),
 }
 """Kinds of decisions by topic: a decision replaces those of its topic about the same boxes."""
+WITH_BOX = ('pin', 'add')
+"""Kinds that state a box."""
 TOPIC_OF = {kind: topic for topic, kinds in KINDS_OF_TOPIC.items() for kind in kinds}
 PINNED_BOX_COLUMNS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height')
 FIRST_COLUMNS = ('track_id', 'stamp_ns', 'decision', 'comment', 'frame_id', *PINNED_BOX_COLUMNS)
@@ -63,13 +66,15 @@ class Decision:
     kind : str
         ``accept``, ``reject`` (keep the input), ``unsure``, ``pin`` (the box is right as given),
         ``none`` (no judgement any more); ``delete``, ``restore``; ``rename`` and ``reclass``
-        (their `value` is the new id or class; empty for that of the input).
+        (their `value` is the new id or class; empty for that of the input); ``add`` (a box of an
+        object that the input does not have, which is followed both ways; `value` is its class),
+        ``withdraw``.
     comment : str
         Free text in one line.
     frame_id : str
         Frame of `box`; empty without one.
     box : array, shape (9,), or None
-        The pinned box [m, rad].
+        The pinned or added box [m, rad].
     end_ns : int or None
         Last stamp of a range [ns]; None for one box, or the whole track.
     value : str
@@ -80,8 +85,8 @@ class Decision:
     Raises
     ------
     RecordingError
-        If the kind is unknown, stamps are no range of 64-bit numbers, or a pin has no stamp or no
-        valid box.
+        If the kind is unknown, stamps are no range of 64-bit numbers, or a pinned or added box has
+        no stamp, is none, or has no class.
 
     """
 
@@ -104,8 +109,8 @@ class Decision:
                 f'again, or remove the row'
             )
         self._check_stamps()
-        if self.kind == 'pin':
-            self._check_pin()
+        if self.kind in WITH_BOX:
+            self._check_box()
 
     def _check_stamps(self) -> None:
         stamps = [stamp for stamp in (self.stamp_ns, self.end_ns) if stamp is not None]
@@ -117,18 +122,20 @@ class Decision:
                 f'or remove the row'
             )
 
-    def _check_pin(self) -> None:
+    def _check_box(self) -> None:
+        about = f'{self.kind} of track {self.track_id!r:.80}'
         if self.stamp_ns is None or self.end_ns is not None:
             got = 'none' if self.stamp_ns is None else 'a range'
             raise RecordingError(
-                f'pin of track {self.track_id!r:.80}: expected the stamp of a box, got {got}; pin '
-                f'one box'
+                f'{about}: expected the stamp of a box, got {got}; {self.kind} one box'
             )
+        if self.kind == 'add' and not (self.track_id and self.value):
+            raise RecordingError(f'{about}: expected an id and a class, got none; add it again')
         if self.box is None or not is_valid_box(self.box):
             got = 'none' if self.box is None else np.array2string(self.box, precision=3)
             raise RecordingError(
-                f'pinned box of track {self.track_id!r:.80} at {self.stamp_ns}: expected finite '
-                f'numbers and positive extents, got {got}; pin the box again, or remove the row'
+                f'{about} at {self.stamp_ns}: expected finite numbers and positive extents, got '
+                f'{got}; {self.kind} the box again, or remove the row'
             )
 
     @property
@@ -146,7 +153,7 @@ class Decision:
         """Return whether there is no decision any more."""
         if self.kind in ('rename', 'reclass'):
             return not self.value
-        return self.kind in ('none', 'restore')
+        return self.kind in ('none', 'restore', 'withdraw')
 
     def covers(self, stamp_ns: int) -> bool:
         """Return whether a box of the track at a stamp is one of those decided about."""

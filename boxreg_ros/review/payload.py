@@ -6,14 +6,15 @@ from base64 import b64encode
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 import zlib
 
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.review.changes import median, TrackChanges
 from boxreg_ros.review.quality import ious, quality
+from boxreg_ros.review.risk import UNKNOWN_USUAL, Usual
 from boxreg_ros.review.tables import TrackRow
-from boxreg_ros.review.track_points import PointCollector, to_millimetres
+from boxreg_ros.review.track_points import to_millimetres
 from boxreg_ros.structures import (
     ADDED,
     BOX_EXTENT,
@@ -102,6 +103,16 @@ def true_boxes(tracks: Sequence[TrackChanges], truth: BoxTable | None) -> list[T
     return [TrackTruth(*found) for found in zip(*parts, strict=True)]
 
 
+class TrackPoints(Protocol):
+    """The points of a recording near the boxes of its tracks; see `PointCollector`."""
+
+    def points_of(self, track: TrackChanges) -> list[Floats]:
+        """Return the points near each box of a track, n arrays (M_i, 3) [m]."""
+
+    def sensor_at(self, stamps_ns: Ints) -> Floats:
+        """Return the position of the sensor (n, 3) at each stamp [m]."""
+
+
 class TrackPart:
     """
     The points and figures of one track, as the report shows them.
@@ -110,10 +121,12 @@ class TrackPart:
     ----------
     row : TrackRow
         The track and its risk.
-    collector : PointCollector
+    collector : TrackPoints
         The points of the recording.
     truth : TrackTruth
         True boxes of the track.
+    usual : Usual
+        What is usual in the recording.
 
     Attributes
     ----------
@@ -122,12 +135,19 @@ class TrackPart:
 
     """
 
-    def __init__(self, row: TrackRow, collector: PointCollector, truth: TrackTruth) -> None:
+    def __init__(
+        self,
+        row: TrackRow,
+        collector: TrackPoints,
+        truth: TrackTruth,
+        usual: Usual = UNKNOWN_USUAL,
+    ) -> None:
         track = row.track
         self._track = track
         self._risk = row.risk
         self._why = row.reasons
         self._truth = truth
+        self._usual = usual
         self._sensor = collector.sensor_at(track.stamps_ns)
         self._points = collector.points_of(track)
         self.before = quality(track, track.given, self._points, truth.iou_before)
@@ -171,6 +191,7 @@ class TrackPart:
             'risk': round(self._risk.track, RISK_DECIMALS),
             'riskiest': str(track.stamps_ns[int(np.argmax(self._risk.boxes))]),
             'why': self._why,
+            'added': _is_added(track),
         }
 
     def part(self, begin_ns: int, max_points: int) -> dict[str, Any]:
@@ -199,6 +220,10 @@ class TrackPart:
             'deviations': np.round(track.deviations, DECIMALS),
             'extent_deviations': np.round(track.extent_deviations, DECIMALS),
             'risk': np.round(self._risk.boxes, RISK_DECIMALS),
+            'disagreement': np.round(track.disagreement, 3),
+            'faces': np.round(track.face_distances, 3),
+            'near': track.near_points,
+            'usual': [self._usual.outside, self._usual.sizes.get(track.class_name)],
             'num_points': track.num_points,
             'counts': [len(points) for points in shown],
             'points': b64encode(every.astype('<i2').tobytes()).decode('ascii'),
@@ -219,6 +244,11 @@ def _inputs_of(track: TrackChanges) -> tuple[list[str], list[int] | None]:
         ids[row] = known
     inputs = list(dict.fromkeys(ids))
     return inputs, [inputs.index(name) for name in ids] if len(inputs) > 1 else None
+
+
+def _is_added(track: TrackChanges) -> bool:
+    """Return whether a person has added the object: the input has none of its boxes."""
+    return bool(np.isin(track.status, (*ADDED, HUMAN)).all() and np.isnan(track.given).all())
 
 
 def _moved(boxes: Floats, origin: Floats) -> Floats:

@@ -31,6 +31,7 @@ from boxreg_ros.review.payload import (
     true_boxes,
 )
 from boxreg_ros.review.quality import CELL, Quality
+from boxreg_ros.review.risk import Usual
 from boxreg_ros.review.rules import RULES
 from boxreg_ros.review.rules.protocol import Rule, Violation
 from boxreg_ros.review.tables import TrackRow
@@ -46,8 +47,8 @@ PAGE = Path(__file__).parent / 'page'
 TEMPLATE = 'report.html.j2'
 STYLE = 'report.css'
 SCRIPTS = (
-    'base', 'geometry', 'log', 'tracks', 'list', 'overview', 'timeline', 'views', 'charts', 'edit',
-    'decide', 'keys', 'main',
+    'base', 'geometry', 'log', 'tracks', 'added', 'list', 'overview', 'timeline', 'views',
+    'charts', 'edit', 'decide', 'sweeps', 'camera', 'scene', 'keys', 'main',
 )  # fmt: skip
 """Parts of the script, in the order that they are joined in."""
 MAX_MAP_SENSOR = 2000
@@ -109,11 +110,12 @@ def write_report(
     begin_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
     max_points = points_per_box(sum(len(track.stamps_ns) for track in tracks))
     violations = _by_track(violated)
+    usual = Usual.of(tracks)
     rows = []
     parts = []
     qualities = []
     for row, true in zip(found, true_boxes(tracks, truth), strict=True):
-        part = TrackPart(row, points, true)
+        part = TrackPart(row, points, true, usual)
         rows.append(part.row(stamps_ns) | {'rules': violations.get(row.track.track_id, [])})
         parts.append(compressed(as_json(part.part(begin_ns, max_points))))
         qualities.append((part.before, part.after))

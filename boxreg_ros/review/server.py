@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from getpass import getuser
 from pathlib import Path
 import signal
 import socket
+from typing import TYPE_CHECKING
 
 from boxreg_ros.errors import ConfigError, RecordingError
+
+if TYPE_CHECKING:
+    from boxreg_ros.review.scene import DriveSource
+
+    Results = Sequence[tuple[Path, DriveSource | None]]
 
 HOST = '127.0.0.1'
 PORT = 8765
@@ -30,23 +37,24 @@ def add_server_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def serve(out: Path, port: int, who: str) -> int:
+def serve(results: Results, port: int, who: str) -> int:
     """Serve until interrupted, or ended by a signal: each decision is saved already."""
-    server = review_server(out, port, who)
+    server = results_server(results, port, who)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
             signal.signal(number, lambda *_: server.shutdown())
     print(server.address, flush=True)
-    print(f'decisions: {server.log_path}; Ctrl-C ends', flush=True)
+    for path in server.log_paths:
+        print(f'decisions: {path}; Ctrl-C ends', flush=True)
     server.serve_forever()
-    if server.log_path.exists():
-        print(f'to apply them: boxreg relabel RECORDING -o NEW --decisions {server.log_path}')
+    for path in filter(Path.exists, server.log_paths):
+        print(f'to apply them: boxreg relabel RECORDING -o NEW --decisions {path}')
     return 0
 
 
 class ReviewServer:
     """
-    A server for one result folder, bound to loopback.
+    A server for result folders, bound to loopback.
 
     Attributes
     ----------
@@ -54,21 +62,21 @@ class ReviewServer:
         Port that it listens on.
     address : str
         Address of the page, with the token that opens it.
-    log_path : Path
-        File of the decisions.
+    log_paths : list of Path
+        Files of the decisions.
 
     """
 
-    def __init__(self, out: Path, bound: socket.socket, who: str) -> None:
+    def __init__(self, results: Results, bound: socket.socket, who: str) -> None:
         from boxreg_ros.review.application import review_application
         from boxreg_ros.review.connections import TimedProtocol
+        from boxreg_ros.review.decisions import DECISIONS
         from uvicorn import Config, Server
 
         self._socket = bound
         self.server_port = int(bound.getsockname()[1])
-        application, token, self.log_path = review_application(
-            out, self.server_port, who, self._is_ending
-        )
+        application, token = review_application(results, self.server_port, who, self._is_ending)
+        self.log_paths = [out / DECISIONS for out, _ in results]
         self.address = f'http://{HOST}:{self.server_port}/?token={token}'
         config = Config(
             application, http=TimedProtocol, ws='none', lifespan='off', log_config=None,
@@ -89,14 +97,26 @@ class ReviewServer:
         return self._server.should_exit
 
 
-def review_server(out: Path, port: int, who: str = '') -> ReviewServer:
+def review_server(
+    out: Path, port: int, who: str = '', source: DriveSource | None = None
+) -> ReviewServer:
     """
     Return a server, bound to loopback, for the report and the decisions of a result folder.
+
+    Errors are those of `results_server`.
+
+    """
+    return results_server([(out, source)], port, who)
+
+
+def results_server(results: Results, port: int, who: str = '') -> ReviewServer:
+    """
+    Return a server, bound to loopback, for result folders and their recordings.
 
     Raises
     ------
     RecordingError
-        If the folder has no finished report, or its decisions cannot be read.
+        If a folder has no finished report, or its decisions cannot be read.
     ConfigError
         If the port is in use, or a package is missing.
 
@@ -104,12 +124,13 @@ def review_server(out: Path, port: int, who: str = '') -> ReviewServer:
     from boxreg_ros.review.report import check_packages, REPORT
 
     check_packages('boxreg review', SERVER_PACKAGES)
-    missing = [name for name in (SUMMARY, REPORT) if not (out / name).is_file()]
-    if missing:
-        raise RecordingError(
-            f'{out}: expected a finished result with {SUMMARY} and {REPORT}, got one without '
-            f'{" and ".join(missing)}; run boxreg relabel RECORDING -o {out} --report'
-        )
+    for out, _ in results:
+        missing = [name for name in (SUMMARY, REPORT) if not (out / name).is_file()]
+        if missing:
+            raise RecordingError(
+                f'{out}: expected a finished result with {SUMMARY} and {REPORT}, got one without '
+                f'{" and ".join(missing)}; run boxreg relabel RECORDING -o {out} --report'
+            )
     bound = socket.socket()
     try:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -121,7 +142,7 @@ def review_server(out: Path, port: int, who: str = '') -> ReviewServer:
             f'port: expected a free one, got {port} ({error}); choose another with --port, or 0 '
             f'for any'
         ) from None
-    return ReviewServer(out, bound, who or _user())
+    return ReviewServer(results, bound, who or _user())
 
 
 def _user() -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64decode
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +14,11 @@ import zlib
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.review.box_risk import risks_of_box
 from boxreg_ros.review.payload import as_json
+from boxreg_ros.review.requests import box_of
 from boxreg_ros.review.track_points import MILLIMETRES
-from boxreg_ros.structures import BOX_EXTENT, Floats, is_valid_box, Z
+from boxreg_ros.structures import BOX_EXTENT, Floats, is_valid_box, LENGTH, Z
 import numpy as np
 import orjson
 
@@ -92,33 +94,70 @@ class ReportParts:
         names = [str(stamp) for stamp in stamps]
         return as_json({'stamps': names, 'boxes': found.boxes, 'status': found.status})
 
+    def risks(self, sent: Mapping[str, Any]) -> bytes:
+        """
+        Return the risk of a box as it is and as a person drags it [m], as JSON.
+
+        Parameters
+        ----------
+        sent : mapping
+            ``index`` of the track in the report, ``row`` of the box, ``class``, and the ``box``
+            (9) in the fixed frame.
+
+        Raises
+        ------
+        RecordingError
+            If the request is none.
+
+        """
+        box = box_of(sent.get('box'))
+        if not is_valid_box(box):
+            raise RecordingError('box: expected finite numbers and positive extents')
+        try:
+            part = self._part(int(sent['index']))
+            row = range(len(part['stamps']))[int(sent['row'])]
+            class_name = str(sent['class'])
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise RecordingError(f'risk: expected a box of the report, got: {error}') from None
+        origin = np.array(part['origin'], np.float64)
+        box[: Z + 1] -= origin
+        _, points = self._points_of(part)[row]
+        return as_json(risks_of_box(part, row, box, class_name, points))
+
+    def _part(self, index: int) -> dict[str, Any]:
+        found: dict[str, Any] = orjson.loads(zlib.decompress(b64decode(self._texts[index])))
+        return found
+
+    def _points_of(self, part: Mapping[str, Any]) -> list[tuple[Floats, Floats]]:
+        """Return the input boxes (9,) and points (M, 3) of a part, relative to its origin."""
+        offsets = np.frombuffer(b64decode(part['points']), '<i2').reshape(-1, 3) / MILLIMETRES
+        ends = np.cumsum([0, *part['counts']])
+        given, shown = (
+            np.array(part[name], np.float64).reshape(-1, 9) for name in ('given', 'boxes')
+        )
+        centers = np.where(np.isfinite(shown), shown, given)[:, : Z + 1]
+        return [
+            (given[k], offsets[ends[k] : ends[k + 1]] + center) for k, center in enumerate(centers)
+        ]
+
     def _config(self) -> Config:
         return replace(Config.from_yaml(self._config_path), estimate='track')
 
     def _rows(self, piece: Mapping[str, Any]) -> list[tuple[int, Floats, Floats, Floats]]:
         """Return the stamps, input boxes, points and sensor positions of a part of a track."""
-        part = orjson.loads(zlib.decompress(b64decode(self._texts[int(piece['index'])])))
+        part = self._part(int(piece['index']))
         first = int(piece.get('begin') or part['stamps'][0])
         last = int(piece.get('end') or part['stamps'][-1])
         origin = np.array(part['origin'], np.float64)
-        offsets = np.frombuffer(b64decode(part['points']), '<i2').reshape(-1, 3) / MILLIMETRES
-        ends = np.cumsum([0, *part['counts']])
-        given, shown = (_boxes_of(part[name], origin) for name in ('given', 'boxes'))
+        found = self._points_of(part)
         sensor = np.array(part['sensor'], np.float64) + origin
         rows = []
         for k, stamp in enumerate(map(int, part['stamps'])):
-            if first <= stamp <= last and is_valid_box(given[k]):
-                center = np.where(np.isfinite(shown[k]), shown[k], given[k])[: Z + 1]
-                points = offsets[ends[k] : ends[k + 1]] + center
-                rows.append((stamp, given[k], points, sensor[k]))
+            box, points = found[k]
+            if first <= stamp <= last and is_valid_box(box):
+                box = np.append(box[: Z + 1] + origin, box[LENGTH:])
+                rows.append((stamp, box, points + origin, sensor[k]))
         return rows
-
-
-def _boxes_of(values: Sequence[Any], origin: Floats) -> Floats:
-    """Return boxes (n, 9) of a report in the fixed frame; NaN where unknown."""
-    boxes = np.array(values, np.float64).reshape(-1, 9)
-    boxes[:, : Z + 1] += origin
-    return boxes
 
 
 def _with_pins(

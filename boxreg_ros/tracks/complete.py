@@ -20,6 +20,7 @@ from boxreg_ros.structures import (
     BoxArray,
     EXTENDED,
     Floats,
+    HUMAN,
     INTERPOLATED,
     Ints,
     KEPT,
@@ -75,9 +76,11 @@ class PlannedArray:
     def to_register(self, given: BoxArray) -> BoxArray:
         """Return the boxes of an array without rejected ones, and with the added ones."""
         rows = [row for row in range(len(given.track_ids)) if row not in self.rejected]
+        of_person = np.array([added.status == HUMAN for added in self.added], bool)
         pinned = None
-        if given.pinned is not None:
-            pinned = np.append(given.pinned[rows], np.zeros(len(self.added), bool))
+        if given.pinned is not None or of_person.any():
+            own = np.zeros(len(rows), bool) if given.pinned is None else given.pinned[rows]
+            pinned = np.append(own, of_person)
         return replace(
             given,
             track_ids=(*(self.track_ids[i] for i in rows), *(a.track_id for a in self.added)),
@@ -175,6 +178,12 @@ class CompletionPlan:
         self.tracks += other.tracks
         self.extensions += other.extensions
 
+    def add(self, other: CompletionPlan, first: int) -> None:
+        """Add the boxes of a plan for the same arrays, from the one with the index `first` on."""
+        for array, more in zip(self.arrays[first:], other.arrays, strict=False):
+            array.added += more.added
+        self.tracks += other.tracks
+
     def _supported(self, given: Sequence[BoxArray], num_points: Sequence[Ints]) -> list[set[int]]:
         """Return the stamps of the boxes of each extension that points support."""
         points: list[dict[int, int]] = [{} for _ in self.extensions]  # by stamp
@@ -189,6 +198,11 @@ class CompletionPlan:
             count = num_supported(np.array(outwards), extension.at_end)
             found.append(set(extension.stamps_ns[:count].tolist()))
         return found
+
+
+def unchanged_plan(given: Sequence[BoxArray]) -> CompletionPlan:
+    """Return the plan that changes nothing in some arrays."""
+    return CompletionPlan([PlannedArray([*a.track_ids], [*a.class_names]) for a in given], [])
 
 
 def complete(
@@ -222,7 +236,7 @@ def complete(
     """
     steps = config.complete
     tracks = tracklets_of(results, num_points, fixed_frame, config)
-    plan = CompletionPlan([PlannedArray([*a.track_ids], [*a.class_names]) for a in given], [])
+    plan = unchanged_plan(given)
     if steps.prune:  # first: a duplicate could be stitched to its object
         tracks = _rejected(tracks, duplicates(tracks, config), Reason.DUPLICATE, plan)
     ambiguous: list[tuple[str, str]] = []
@@ -357,7 +371,10 @@ def _finished(
         return np.concatenate([column, values[rows]])
 
     covariances = completed(registered.covariances, np.eye(6))
+    boxes = completed(registered.boxes.boxes, given.boxes)
     for i, row in enumerate(rows):
+        if array.added[kept[i]].status == HUMAN:
+            boxes[n + i] = array.added[kept[i]].box
         covariances[n + i] = _covariance_of_added(
             array.added[kept[i]], registered, row, int(num_points[row])
         )
@@ -372,7 +389,7 @@ def _finished(
             track_ids=(*array.track_ids, *(array.added[i].track_id for i in kept)),
             class_names=(*array.class_names, *(array.added[i].class_name for i in kept)),
             scores=np.append(given.scores, [array.added[i].score for i in kept]),
-            boxes=completed(registered.boxes.boxes, given.boxes),
+            boxes=boxes,
             pinned=None,
         ),
         (*status, *(array.added[i].status for i in kept)),

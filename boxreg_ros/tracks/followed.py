@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from boxreg_ros.core.follow import FollowedTrack
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import BoxArray, Floats, HUMAN, INTERPOLATED, RefinedBoxes, ROLL
-from boxreg_ros.tracks.complete import AddedBox, CompletionPlan, PlannedArray
+from boxreg_ros.structures import BoxArray, Floats, HUMAN, RefinedBoxes, ROLL
+from boxreg_ros.tracks.complete import AddedBox, CompletionPlan, unchanged_plan
 from boxreg_ros.tracks.track_steps import TrackSteps
 import numpy as np
 
@@ -22,7 +22,9 @@ MIN_KEYFRAMES = 20
 """Fewer keyframes give no median; chosen."""
 
 
-def followed_plan(given: Sequence[BoxArray], tracks: Sequence[FollowedTrack]) -> CompletionPlan:
+def followed_plan(
+    given: Sequence[BoxArray], tracks: Sequence[FollowedTrack], has_seeds: bool = True
+) -> CompletionPlan:
     """
     Return the plan that adds the boxes of followed tracks; none is rejected or renamed.
 
@@ -32,16 +34,18 @@ def followed_plan(given: Sequence[BoxArray], tracks: Sequence[FollowedTrack]) ->
         Keyframes, and an empty array for each sweep without one.
     tracks : sequence of FollowedTrack
         From these keyframes.
+    has_seeds : bool
+        Whether the keyframes are in `given`; if not, they are added too.
 
     """
-    plan = CompletionPlan([PlannedArray([*a.track_ids], [*a.class_names]) for a in given], [])
+    plan = unchanged_plan(given)
     stamps = np.array([array.stamp_ns for array in given], np.int64)
     order = np.argsort(stamps, kind='stable')
     for track in tracks:
         steps = TrackSteps(track.track_id, track.class_name)
         plan.tracks.append(steps)
         for stamp_ns, box, word in zip(track.stamps_ns, track.boxes, track.status, strict=True):
-            if word == HUMAN:
+            if word == HUMAN and has_seeds:
                 continue
             after = int(np.searchsorted(stamps[order], stamp_ns))
             near = order[max(0, after - 1) : after + 1]
@@ -49,8 +53,6 @@ def followed_plan(given: Sequence[BoxArray], tracks: Sequence[FollowedTrack]) ->
             array.added.append(
                 AddedBox(track.track_id, track.class_name, word, box, UNSUPPORTED, 1.0)
             )
-            steps.filled += word == INTERPOLATED
-            steps.extended += word != INTERPOLATED
     return plan
 
 

@@ -19,6 +19,7 @@ MEASUREMENTS = {
     'lidars': 'accuracy on a truck with LiDARs at its corners',
     'covariance': 'covariances against errors, by estimate and class',
     'review': 'how early the review list shows the bad tracks',
+    'labeller': 'actions of a labeller until a drive with planted errors is right',
     'report': 'first paint and frame times of report.html',
     'scale': 'core hours and memory per hour, and a simulated fleet',
     'load': 'latency and accuracy of the live node by number of tracks',

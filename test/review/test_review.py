@@ -418,11 +418,11 @@ PIN = {'decision': 'pin', 'stamp_ns': '5'}
 def test_foreign_and_broken_requests_write_nothing(server, capfd, headers, content, status):
     found, text = posted(server, content, **headers)
     assert (found, bool(text)) == (status, True)
-    assert not server.log_path.exists()
+    assert not server.log_paths[0].exists()
     assert capfd.readouterr().err == ''  # no traceback
     # What is decided next has a header, and is read.
     assert posted(server, {'seen': 0, 'rows': [row('2')]})[0] == 200
-    assert [one.track_id for one in read_decisions(server.log_path)] == ['2']
+    assert [one.track_id for one in read_decisions(server.log_paths[0])] == ['2']
 
 
 def test_pins_and_numbers_of_the_wrong_size_are_refused(server):
@@ -466,7 +466,7 @@ def test_connection_without_a_request_ends(server, monkeypatch):
 
 def test_what_others_have_decided_is_not_overwritten_unseen(server):
     """Another tab, another server on the same folder, and decisions about other tracks."""
-    second, _ = served(server.log_path.parent)
+    second, _ = served(server.log_paths[0].parent)
     assert posted(server, {'seen': 0, 'rows': [row('1', who='anna')]})[0] == 200
     status, text = posted(second, {'seen': 0, 'rows': [row('1', 'reject')]})
     assert status == 409
@@ -484,7 +484,7 @@ def test_what_others_have_decided_is_not_overwritten_unseen(server):
         (one['track_id'], one['decision'], one['who']) for one in json.loads(data[6:])['rows']
     ]
     assert found == [('2', 'reject', 'ben'), ('1', 'reject', 'ben')]
-    made = read_decisions(server.log_path)
+    made = read_decisions(server.log_paths[0])
     assert [one.who for one in made] == ['anna', 'ben', 'ben']
     assert all(datetime.fromisoformat(one.when).tzinfo for one in made)
 
@@ -601,6 +601,10 @@ def test_narrow_page_does_not_overflow(result, scheme):
             page.click(f'#tab-{tab}')
             overflow = 'document.documentElement.scrollWidth - innerWidth'
             assert page.evaluate(overflow) <= 0
+        page.emulate_media(media='print')
+        assert page.evaluate(overflow) <= 0
+        assert page.locator('.tabs').is_hidden()
+        assert page.locator('#quality').is_visible()
         back = page.evaluate('getComputedStyle(document.body).backgroundColor')
         assert (back == 'rgb(255, 255, 255)') == (scheme == 'light')
 

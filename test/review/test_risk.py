@@ -2,6 +2,7 @@
 
 import csv
 
+from boxreg_ros.review.box_risk import risks_of_box
 from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.risk import assess, MIN_COMPARED, Usual
 from boxreg_ros.review.tables import assessed, REVIEW_COLUMNS, write_tables
@@ -188,3 +189,32 @@ def test_the_first_reason_is_what_other_tracks_do_not_have():
 def test_no_tracks_give_empty_tables(tmp_path):
     write_tables(tmp_path, [])
     assert (tmp_path / 'review.csv').read_text() == ','.join(REVIEW_COLUMNS) + '\n'
+
+
+def test_a_box_that_is_dragged_has_the_risk_of_its_place():
+    size = np.array(CAR[3:6])
+    track = track_with(**near(50, 0))
+    rng = np.random.default_rng(5)
+    sides = rng.uniform(-0.5, 0.5, (200, 3)) * size
+    sides[:100, 0] = -size[0] / 2
+    sides[100:, 1] = -size[1] / 2
+    counts = [len(sides)] * 4
+    part = {name: getattr(track, name).tolist() for name in (
+        'given', 'boxes', 'change', 'deviations', 'extent_deviations', 'disagreement', 'status',
+        'reasons', 'num_points',
+    )} | {
+        'stamps': [str(stamp) for stamp in track.stamps_ns], 'flipped': track.is_flipped.tolist(),
+        'faces': track.face_distances.tolist(), 'near': track.near_points.tolist(),
+        'usual': [0.1, None], 'counts': counts,
+    }  # fmt: skip
+    box = track.boxes[1]
+    points = sides + box[:3]
+    same = risks_of_box(part, 1, box, track.class_name, points)
+    assert same[0] == pytest.approx(same[1])
+    assert same[0] == pytest.approx(assess(track, Usual(0.1)).boxes[1])
+    risks = []
+    for off in (0.1, 0.3, 0.6):  # off the face that the points show
+        moved = box - np.eye(9)[0] * off
+        risks.append(risks_of_box(part, 1, moved, track.class_name, points)[1])
+    assert same[0] < risks[0] < risks[1] < risks[2]
+    assert risks[2] - same[0] == pytest.approx(0.5, abs=0.4)  # about the distance of a car

@@ -11,6 +11,7 @@ from boxreg_ros import Config, refine, Track
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
+from boxreg_ros.offline.reviewed_drive import drive_of
 from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
 from browser import NEEDS_BROWSER, opened_page
@@ -45,7 +46,8 @@ def made(tmp_path_factory):
 @pytest.fixture
 def server(made, tmp_path):
     """Return a running server for a copy of the result."""
-    found = review_server(shutil.copytree(made / 'out', tmp_path / 'out'), 0, 'anna')
+    out = shutil.copytree(made / 'out', tmp_path / 'out')
+    found = review_server(out, 0, 'anna', drive_of(out))
     Thread(target=found.serve_forever, daemon=True).start()
     yield found
     found.shutdown()
@@ -130,7 +132,7 @@ def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
 
 
 def test_labels_are_written_with_all_decisions_without_a_terminal(server):
-    out = server.log_path.parent
+    out = server.log_paths[0].parent
     before = BoxTable.read(out / 'boxes.csv')
     stamps = [stamp for (stamp,) in boxes_of(before, '1', 'stamps_ns')]
     with opened_page(server.address + '#track=1') as page:
@@ -177,7 +179,7 @@ def test_labels_are_written_with_all_decisions_without_a_terminal(server):
 
 
 def test_labels_that_cannot_be_written_leave_all_as_it_was(server, made):
-    out = server.log_path.parent
+    out = server.log_paths[0].parent
     hidden = made / 'drive.hidden'
     (made / 'drive').rename(hidden)
     try:
@@ -192,7 +194,7 @@ def test_labels_that_cannot_be_written_leave_all_as_it_was(server, made):
     for word in ('not written', 'drive'):
         assert word in text
     assert not out.with_name('out.corrected').exists()
-    assert [one.kind for one in read_decisions(server.log_path)] == ['delete']
+    assert [one.kind for one in read_decisions(server.log_paths[0])] == ['delete']
 
 
 def test_views_are_moved_zoomed_and_show_neighbours(server):
@@ -256,6 +258,10 @@ def test_a_correction_shows_its_figures_is_typed_and_undone_in_steps(server):
         expected = (width - 0.5) / (width + 0.5)
         shown = float(page.inner_text('#clock').split()[5])
         assert shown == pytest.approx(expected, abs=0.02)
+        page.wait_for_function("$('clock').textContent.includes(' → ')")
+        page.wait_for_function('!view.isAsking')
+        before, after = map(float, page.inner_text('#clock').split('risk ')[1].split(' ')[:3:2])
+        assert after > before + 0.1
         page.mouse.up()
         assert page.evaluate('numInside(pointsAt(view.part, view.row), view.edit)') < inside
         assert page.evaluate(LEAVING)  # the browser asks before it is lost
@@ -280,11 +286,11 @@ def test_a_correction_shows_its_figures_is_typed_and_undone_in_steps(server):
         assert page.evaluate(shift) == pytest.approx([0, 0.3, 0], abs=0.03)
         page.keyboard.press('Escape')
         assert page.evaluate('view.edit') is None
-        assert not server.log_path.exists()
+        assert not server.log_paths[0].exists()
 
 
 def test_a_track_is_solved_again_with_its_pin_within_the_page(server):
-    out = server.log_path.parent
+    out = server.log_paths[0].parent
     with opened_page(server.address + '#track=1') as page:
         page.keyboard.press('o')
         page.wait_for_function("$('notice').textContent.includes('pinned boxes')", timeout=120_000)
@@ -340,7 +346,7 @@ def test_people_see_the_decisions_of_each_other(server):
         second.evaluate("judge('unsure', false)")
         first.wait_for_selector('[data-do=unsure][aria-pressed=true]')
         assert 'ben' in first.get_attribute('#comment', 'title')
-    made = read_decisions(server.log_path)
+    made = read_decisions(server.log_paths[0])
     assert [(one.who, one.kind) for one in made] == [('anna', 'reject'), ('ben', 'unsure')]
 
 
@@ -364,7 +370,7 @@ def test_one_key_accepts_and_opens_the_next_open_track(server):
 def test_axe_finds_nothing(server):
     axe = pytest.importorskip('axe_playwright_python.sync_playwright').Axe()
     with opened_page(server.address) as page:
-        for tab in ('overview', 'tracks', 'run'):
+        for tab in ('overview', 'tracks', 'drive', 'run'):
             page.click(f'#tab-{tab}')
             page.wait_for_timeout(500)
             found = axe.run(page)

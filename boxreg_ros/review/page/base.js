@@ -3,12 +3,17 @@
 // review/report.py lists. Boxes are x y z length width height roll pitch yaw [m, rad];
 // R = Rz(yaw) Ry(pitch) Rx(roll).
 
+// An element of the page: those that are asked for are there.
+/** @type {(id: string) => any} */
 const $ = id => document.getElementById(id);
-const NONCE = document.currentScript.nonce;
+const NONCE = document.currentScript?.nonce;
 const IS_REVIEW = document.documentElement.hasAttribute('data-review');
+/** @type {Report} */
 let DATA;                          // the report: tracks of the run, largest risk first
+/** @type {Track[]} */
 let TRACKS = [];                   // tracks as decided: split, joined, renamed
 // The line `track` is selected; `open` is the track whose `part` is shown.
+/** @type {any} */
 const view = { track: -1, open: null, part: null, row: 0, mark: null, sort: 'rank', descending: false, shown: [], place: 0,
                space: false, charts: false, pending: false, edit: null, isMoved: false, playing: 0,
                zoom: 1, center: [0, 0, 0], around: [], solved: null };

@@ -1,6 +1,7 @@
 // Charts over time -------------------------------------------------------------------------------
 
 // From top to bottom: name, unit, height.
+/** @type {[string, string, number][]} */
 const CHARTS = [['risk', 'm', 1], ['along', 'm', 1], ['across', 'm', 1], ['up', 'm', 1], ['yaw', '°', 1], ['size', 'm', 1.3], ['faces', 'm', 1.5]];
 const SIZES = ['length', 'width', 'height'];
 const SIZE_COLOURS = ['refined', 'truth', 'human'];
@@ -24,12 +25,14 @@ function chartTraces() {
   const traces = [];
   const degrees = 180 / Math.PI;
   traces.push({ xaxis: 'x', yaxis: 'y' + chartNumber('risk'), name: 'risk', x: part.times, y: part.risk, mode: 'lines+markers', line: { width: 1 }, marker: { size: 4, color: colour('input') } });
+  /** @type {[string, string, (status: string) => boolean][]} */
+  const kinds = [['refined', 'circle', s => s === 'refined'], ['input', 'x', s => s === 'kept'], ['human', 'diamond', s => s === 'human']];
   ['along', 'across', 'up', 'yaw'].forEach((axis, k) => {
     const scale = k === 3 ? degrees : 1;
     const axes = { xaxis: 'x', yaxis: 'y' + chartNumber(axis) };
     const reach = part.deviations.map(d => d[k] === null ? null : 2 * scale * d[k]);
     traces.push(band(part, axes, 'refined', reach.map(r => r === null ? null : -r), reach));
-    for (const [name, shape, is] of [['refined', 'circle', s => s === 'refined'], ['input', 'x', s => s === 'kept'], ['human', 'diamond', s => s === 'human']]) {
+    for (const [name, shape, is] of kinds) {
       const rows = part.times.map((_, i) => i).filter(i => is(part.status[i]));
       traces.push({ ...axes, name: name === 'input' ? 'kept' : name, x: rows.map(i => part.times[i]), y: rows.map(i => part.change[i][k] === null ? null : scale * part.change[i][k]),
                     mode: name === 'refined' ? 'lines+markers' : 'markers', line: { width: 1 }, marker: { size: 4, symbol: shape, color: colour(name) } });

@@ -5,7 +5,13 @@ const MAX_PROPOSALS = 8;
 const current = () => view.open;
 const boxAt = row => current().members()[row];
 const heldOf = scope => log.held.get(scopeKey('judgement', scope));
-const pinOf = row => { const found = heldOf(scopeOfBox(boxAt(row))); return found?.decision === 'pin' ? found : null; };
+// The box of a person at a row: a pin, or a box that an added object is followed from.
+function pinOf(row) {
+  const scope = scopeOfBox(boxAt(row)), topic = isAdded(...boxAt(row)) ? 'addition' : 'judgement';
+  const found = log.held.get(scopeKey(topic, scope));
+  return ['pin', 'add'].includes(found?.decision) ? found : null;
+}
+
 const isOfTrack = row => !row.stamp_ns || Boolean(row.end_ns);
 
 // The judgement of a track: that of its first box, those about single boxes left out.
@@ -47,6 +53,7 @@ async function decideAbout(rows) {
 }
 
 async function judge(kind, isBox) {
+  if (kind === 'reject' && isAdded(...boxAt(view.row))) return fail('There is no input to keep: delete this object, or undo its addition.');
   const held = isBox ? judgementOfBox() : judgementOf(current());
   if (held?.decision === kind && (!isBox || view.mark === null)) {
     const rows = isBox ? [held] : heldOver('judgement', current().members()).filter(isOfTrack);
@@ -65,11 +72,18 @@ async function comment(isBox, text) {
 
 async function acceptAndGoOn() {
   if (isCorrecting()) return;
-  const open = view.shown.filter(track => !decidedOf(track) && track.index !== view.track);
+  const taken = new Set(await notePage(''));
+  const open = view.shown.filter(track => !decidedOf(track) && track.index !== view.track && !taken.has(track.id));
   if (judgementOf(current())?.decision !== 'accept' && !await judge('accept', false)) return;
   if (!open.length) return say('All tracks of the list are decided.');
   const place = open.find(track => view.shown.indexOf(track) > view.place) ?? open[0];
   openTrack(place.index);
+}
+
+// Note the track that this page has open; the ids of those that other pages have.
+const page = crypto.randomUUID?.() ?? String(Math.random());
+async function notePage(track) {
+  return post('open', { page, track }).catch(() => []);
 }
 
 // Delete the track, the box or the range; once more takes that back.
@@ -155,6 +169,7 @@ function ask(title, note, proposals, known, value = '') {
 async function solve() {
   if (!IS_REVIEW || isCorrecting()) return;
   const track = current();
+  if (track.pieces.some(({ s }) => DATA.tracks[s].added)) return say('An added object is solved whenever one of its boxes is corrected.');
   const pieces = track.pieces.flatMap(({ s, rows }) => runsOfRows(s, rows).map(([a, b]) => ({ index: s, begin: stampOf(s, a), end: stampOf(s, b) })));
   const pins = {};
   view.part.stamps.forEach((stamp, row) => { const found = pinOf(row); if (found) pins[stamp] = found.box; });
@@ -211,7 +226,7 @@ function drawDecisions() {
   if (document.activeElement?.id.startsWith('comment')) return;
   const button = (name, text, title, onclick, isPressed = null) => element('button', { 'data-do': name, title, onclick, 'aria-pressed': isPressed === null ? null : String(isPressed) }, text);
   const track = current(), isMarked = view.mark !== null;
-  const focused = document.activeElement?.dataset.do;
+  const focused = document.activeElement?.getAttribute('data-do');
   const what = isMarked ? 'Boxes' : 'Box';
   fill($('decide-track'), element('span', {}, 'Track'), ...judgements(false),
     button('next', 'Accept, next', 'Accept the track and open the next one without a decision (Enter)', acceptAndGoOn));
@@ -229,7 +244,7 @@ function drawDecisions() {
     view.edit ? button('pin', 'Pin', 'Save this box (Enter)', pin) : button('edit', pinOf(view.row) ? 'Edit pin' : 'Edit', 'Correct this box (e)', edit),
     view.edit ? button('cancel', 'Cancel', 'Discard this correction (Escape)', discard)
       : (pinOf(view.row) ? button('unpin', 'Unpin', 'Remove the pin', () => decide([takenBack(pinOf(view.row))])) : null));
-  if (focused) document.querySelector(`[data-do=${focused}]`)?.focus();
+  if (focused) $('decide').querySelector(`[data-do=${focused}]`)?.focus();
 
   // The buttons and the comment for the track, or for the box.
   function judgements(isBox) {

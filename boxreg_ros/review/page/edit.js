@@ -6,6 +6,7 @@ const GRIP = 8;                    // reach of a face, or of the stroke at the f
 const LEAST_SIZE = 0.1;            // [m]
 const DEGREES = 180 / Math.PI;
 // Name, letter, column of the box, scale, digits.
+/** @type {[string, string, number, number, number][]} */
 const TYPED = [['x', 'x', 0, 1, 2], ['y', 'y', 1, 1, 2], ['z', 'z', 2, 1, 2], ['length', 'l', 3, 1, 2], ['width', 'w', 4, 1, 2], ['height', 'h', 5, 1, 2], ['yaw', 'yaw', 8, DEGREES, 1]];
 
 // A correction that is neither pinned nor discarded is not left.
@@ -26,11 +27,12 @@ function edit() {
   if (!IS_REVIEW) return;
   if (view.isPlaying) play();
   if (!view.part.usable[view.row]) return fail('This box has numbers that are not finite: correct another box of the track.');
-  if (ADDED.includes(view.part.status[view.row])) return fail('This box was added by the run, and follows the boxes of the input: correct one of these.');
+  if (ADDED.includes(view.part.status[view.row]) && !isAdded(...boxAt(view.row))) return fail('This box was added by the run, and follows the boxes of the input: correct one of these.');
   const human = currentBoxes().find(([name]) => name === 'human');
   view.edit = (human ? human[1] : view.part.usable[view.row]).slice();
   view.steps = [];
   view.isMoved = false;
+  view.risks = null;
   $('mode').value = 'sweep';
   step(view.row, true);
   $('top').focus({ preventScroll: true });
@@ -43,7 +45,8 @@ async function pin() {
   $('failure').hidden = true;
   const scope = scopeOfBox(boxAt(view.row));
   const comment = heldOf(scope)?.comment ?? '';
-  if (await decide([rowOf(scope, 'pin', { box, comment })])) view.solved = null;
+  const seed = isAdded(...boxAt(view.row)) ? seedsOf(scope.track_id)[0] : null;
+  if (await decide([seed ? rowOf(scope, 'add', { box, value: seed.value }) : rowOf(scope, 'pin', { box, comment })])) view.solved = null;
   step(view.row, true);
 }
 
@@ -78,7 +81,26 @@ function redrawEdit() {
     if (!view.edit) return;
     drawViews();
     drawNumbers();
+    askRisk();
   });
+}
+
+// The risk of the box as it is dragged, one request after the other.
+async function askRisk() {
+  const [s, k] = boxAt(view.row);
+  view.riskWanted = true;
+  if (view.isAsking || DATA.tracks[s].added) return;
+  view.isAsking = true;
+  while (view.riskWanted && view.edit) {
+    view.riskWanted = false;
+    const box = view.edit;
+    try {
+      const risks = await post('risk', { index: s, row: k, class: current().class, box: moved(box, view.part.origin, 1) });
+      view.risks = view.edit ? risks : null;
+    } catch { break; }  // the page says when the server is gone: with the next decision
+    drawNumbers();
+  }
+  view.isAsking = false;
 }
 
 // The numbers of the box, which can be typed, and what follows from them.
@@ -93,7 +115,7 @@ function drawNumbers() {
   }
   const points = pointsAt(view.part, view.row), refined = view.part.usable[view.row];
   $('clock').textContent = `IoU with the ${view.part.status[view.row]} box ${number(overlap(view.edit, refined))} · ` +
-    `${numInside(points, view.edit)} of ${points.length} points inside (before ${numInside(points, refined)})`;
+    `${numInside(points, view.edit)} of ${points.length} points inside (before ${numInside(points, refined)})` + (view.risks ? ` · risk ${number(view.risks[0])} → ${number(view.risks[1])} m` : '');
 }
 
 function setUpNumbers() {
@@ -111,6 +133,7 @@ function setUpNumbers() {
 
 function setUpDragging(canvas) {
   const [right, up] = VIEWS[canvas.id];
+  /** @type {any} */
   let grip = null;
   const place = event => {
     const bounds = canvas.getBoundingClientRect();

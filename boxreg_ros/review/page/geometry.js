@@ -1,5 +1,6 @@
 // Boxes and points -------------------------------------------------------------------------------
 
+/** @param {number[]} box */
 function rotation([, , , , , , roll, pitch, yaw]) {
   const [a, b, c, d, e, f] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch), Math.cos(roll), Math.sin(roll)];
   return [[a * c, a * d * f - b * e, a * d * e + b * f], [b * c, b * d * f + a * e, b * d * e - a * f], [-d, c * f, c * e]];

@@ -32,6 +32,21 @@ const REVIEW_KEYS = {
   o: ['o', 'solve the track again with its pinned boxes', () => solve()],
   z: ['z', 'undo the last decision', () => undo()],
 };
+const SCENE_KEYS = {
+  ArrowLeft: ['←  →', 'step one sweep; with Shift ten', event => showScene(scene.at - (event.shiftKey ? 10 : 1))],
+  ArrowRight: ['', '', event => showScene(scene.at + (event.shiftKey ? 10 : 1))],
+  Home: ['', '', () => showScene(0)],
+  End: ['', '', () => showScene(DATA.stamps.length - 1)],
+  ' ': ['', '', () => playScene()],
+  '+': ['', '', () => zoomScene(ZOOM_STEP)],
+  '-': ['', '', () => zoomScene(1 / ZOOM_STEP)],
+  0: ['', '', () => { scene.offset = [0, 0]; scene.zoom = $('scene-view').clientWidth / SHOWN; drawScene(); }],
+  i: ['i', 'add an object: click its points, then Enter follows it both ways', () => startAdding()],
+  p: ['p', 'the next object that the run proposes; Enter follows it', () => nextProposal()],
+  Enter: ['', '', () => keepFit()],
+  Escape: ['', '', () => startAdding(false)],
+  z: ['', '', () => undo()],
+};
 const EDIT_KEYS = {
   ArrowRight: ['←  →', 'move 2 cm along, as in the views; with Shift 10 cm', n => moveEdit(n * STEP, 0, 0)],
   ArrowLeft: ['', '', n => moveEdit(-n * STEP, 0, 0)],
@@ -41,6 +56,7 @@ const EDIT_KEYS = {
   PageDown: ['', '', n => moveEdit(0, 0, -n * STEP)],
   '[': ['[  ]', 'turn by 0.5°', n => { view.edit[8] += n * TURN; redrawEdit(); }],
   ']': ['', '', n => { view.edit[8] -= n * TURN; redrawEdit(); }],
+  t: ['t', 'turn by 90°', () => { view.edit[8] += Math.PI / 2; redrawEdit(); }],
   f: ['f', 'flip the heading', () => { view.edit = flipped(view.edit); redrawEdit(); }],
   l: ['l w h', 'lengthen, widen, heighten by 2 cm; with Shift shrink', n => resizeEdit(0, 1, n > 1 ? -STEP : STEP)],
   w: ['', '', n => resizeEdit(1, 1, n > 1 ? -STEP : STEP)],
@@ -73,9 +89,13 @@ function onKey(event) {
     return;
   }
   const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-  const isTracks = !$('tracks').hidden && view.part;
+  const isTracks = !$('tracks').hidden && view.part, isScene = !$('drive').hidden;
   if (name === 'Enter' && target.matches('button, a')) return;
-  if (name === ' ' && target.matches('button, a, input') && !isTracks) return;
+  if (name === ' ' && target.matches('button, a, input') && !isTracks && !isScene) return;
+  if (isScene && SCENE_KEYS[name]) {
+    event.preventDefault();
+    return SCENE_KEYS[name][2](event);
+  }
   if (!isTracks && event.key !== '?' && event.key !== '/') return;
   const isView = ['+', '-', '0', ' '].includes(name);
   if (view.edit && !isView) {
@@ -94,7 +114,8 @@ function onKey(event) {
 function setUpKeys() {
   const groups = [KEYS, ...(IS_REVIEW ? [REVIEW_KEYS, { save: ['Ctrl s', 'write the label files with all decisions, beside the first result'] }] : [])];
   const lines = group => Object.values(group).filter(([keys]) => keys).map(([keys, text]) => element('tr', {}, element('td', {}, element('kbd', {}, keys)), element('td', {}, text)));
-  const editing = IS_REVIEW ? [element('tr', {}, element('th', { colspan: 2 }, 'While correcting a box')), ...lines(EDIT_KEYS), ...lines(END_EDIT_KEYS)] : [];
+  const editing = IS_REVIEW ? [element('tr', {}, element('th', { colspan: 2 }, 'In the drive')), ...lines(SCENE_KEYS),
+    element('tr', {}, element('th', { colspan: 2 }, 'While correcting a box')), ...lines(EDIT_KEYS), ...lines(END_EDIT_KEYS)] : [];
   fill($('keys'), ...groups.flatMap(lines), ...editing);
   document.addEventListener('keydown', onKey);
   $('ask-form').onsubmit = event => { event.preventDefault(); $('ask').close('=' + $('ask-text').value.trim()); };

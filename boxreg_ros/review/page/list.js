@@ -15,7 +15,9 @@ const causesOf = track => partsOf(track.why).filter(part => !/^\d+ kept: /.test(
 const rulesOf = track => [...new Set(track.rules.map(([name]) => name))];
 
 // Name, title, value to sort by, text, width [em], meaning.
+/** @returns {[string, string, (track: Track) => any, (track: Track) => any, number, string][]} */
 function columns() {
+  /** @type {[string, string, (track: Track) => any, (track: Track) => any, number, string][]} */
   const all = [
     ['rank', '#', t => t.rank, t => t.rank, 3, 'place in review.csv: largest risk first'],
     ['id', 'track', t => t.id, t => t.id || 'no id', 6, 'track id'],
@@ -58,7 +60,7 @@ function decidedOf(track) {
 function compare(a, b) {
   if (typeof a === 'string') return a.localeCompare(b, 'en', { numeric: true });
   const known = [isKnown(a), isKnown(b)];
-  if (!known[0] || !known[1]) return known[1] - known[0];
+  if (!known[0] || !known[1]) return Number(known[1]) - Number(known[0]);
   return a - b;
 }
 
@@ -96,6 +98,7 @@ function drawList() {
   drawLines();
   const place = view.shown.findIndex(track => track.index === view.track);
   if (place >= 0) view.place = place;
+  $('tab-count').textContent = number(TRACKS.length, 0);
   const decided = TRACKS.filter(track => decidedOf(track)).length;
   $('f-count').textContent = `${view.shown.length} of ${TRACKS.length} tracks` + (IS_REVIEW ? `, ${decided} decided` : '');
   $('f-clear').hidden = filters().every(input => input.value === input.defaultValue || (input.matches('select') && !input.value));
@@ -131,6 +134,7 @@ function selectLine() {
   drawLines();
 }
 
+/** @returns {any[]} */
 const filters = () => [...document.querySelectorAll('.filters input, .filters select')];
 
 function clearFilters() {

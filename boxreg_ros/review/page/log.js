@@ -3,13 +3,14 @@
 // several rows of one topic about the same boxes the last one holds.
 
 const TOPIC_OF = { accept: 'judgement', reject: 'judgement', unsure: 'judgement', pin: 'judgement', none: 'judgement',
-                   delete: 'deletion', restore: 'deletion', rename: 'id', reclass: 'class' };
-const TAKEN_BACK = { judgement: 'none', deletion: 'restore', id: 'rename', class: 'reclass' };
+                   delete: 'deletion', restore: 'deletion', rename: 'id', reclass: 'class', add: 'addition', withdraw: 'addition' };
+const TAKEN_BACK = { judgement: 'none', deletion: 'restore', id: 'rename', class: 'reclass', addition: 'withdraw' };
+/** @type {{ count: number, held: Map<string, Row>, ofInput: Map<string, Row[]>, made: Row[][], who: string, answered?: Promise<any> }} */
 const log = { count: 0, held: new Map(), ofInput: new Map(), made: [], who: '' };
 
 const scopeKey = (topic, row) => JSON.stringify([topic, row.track_id, row.stamp_ns, row.end_ns]);
 const keyOf = row => scopeKey(TOPIC_OF[row.decision], row);
-const isTakenBack = row => ['none', 'restore'].includes(row.decision) || (['rename', 'reclass'].includes(row.decision) && !row.value);
+const isTakenBack = row => ['none', 'restore', 'withdraw'].includes(row.decision) || (['rename', 'reclass'].includes(row.decision) && !row.value);
 const rowOf = (scope, decision, more = {}) => ({ ...scope, decision, comment: '', value: '', box: null, ...more });
 const takenBack = row => rowOf({ track_id: row.track_id, stamp_ns: row.stamp_ns, end_ns: row.end_ns }, TAKEN_BACK[TOPIC_OF[row.decision]]);
 
@@ -94,7 +95,10 @@ function listen() {
 // Decisions about ids change the list of tracks.
 async function showDecisions(fresh) {
   if (!fresh) return;
+  if (fresh.some(row => TOPIC_OF[row.decision] === 'addition')) await followAdded();
   if (fresh.some(row => TOPIC_OF[row.decision] !== 'judgement')) await rebuildTracks();
   drawList();
   if (view.part) step(view.row, true);
+  else if (!$('tracks').hidden && view.shown.length) openTrack(view.shown[Math.min(view.place, view.shown.length - 1)].index);
+  if (!$('drive').hidden) showScene(scene.at, true);
 }

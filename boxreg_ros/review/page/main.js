@@ -30,6 +30,7 @@ async function openTrack(index, stamp = null, row = null, isLinked = false) {
       view.around = [];
     }
     $('time').max = part.stamps.length - 1;
+    if (IS_REVIEW) notePage(track.id);
     row ??= part.num_points.indexOf(Math.max(...part.num_points));  // the object is seen best there
     drawTitle(track);
     loadAround(track).then(found => {
@@ -54,15 +55,18 @@ function nearestRow(stamp) {
 }
 
 function drawTitle(track) {
-  const facts = [`${track.boxes} boxes in ${number(track.seconds, 1)} s`, `${number(track.points, 0)} points (median)`,
-    `moved ${number(track.shift)} m`, `turned ${number(track.turn, 1)}°`, track.flips ? `${track.flips} heading ${track.flips === 1 ? 'flip' : 'flips'} corrected` : '',
-    `extents ${track.extents.map(e => e.map(v => number(v)).join(' × ')).join(' → ')} m`,
+  const isGiven = track.extents[0].every(isKnown);
+  const facts = [`${track.boxes + track.interpolated} boxes in ${number(track.seconds, 1)} s`, `${number(track.points, 0)} points (median)`,
+    ...(isGiven ? [`moved ${number(track.shift)} m`, `turned ${number(track.turn, 1)}°`] : []), track.flips ? `${track.flips} heading ${track.flips === 1 ? 'flip' : 'flips'} corrected` : '',
+    `extents ${track.extents.filter(e => e.every(isKnown)).map(e => e.map(v => number(v)).join(' × ')).join(' → ')} m`,
     isKnown(track.after.iou) ? `3D IoU ${number(track.before.iou, 3)} → ${number(track.after.iou, 3)}` : '', sumOf(track.reasons)];
   const violations = track.rules.map(([rule, stamp, text]) => element('a', { href: hashOf(track.id, stamp) }, `${rule}: ${text}`));
+  const seeds = track.pieces.map(({ s }) => DATA.tracks[s]).filter(source => source.added).flatMap(source => source.inputs);
+  const ends = seeds.map(id => `added by a person. ${endsText(id)} ${(additions.get(id)?.problems ?? []).join(' ')}`);
   const origin = track.isWhole ? '' : `of ${[...new Set(track.pieces.map(({ s }) => DATA.tracks[s].id))].join(', ')}`;
   fill($('title'), element('b', {}, track.id || 'no id'), element('span', {}, track.class), ...(origin ? [element('span', { class: 'grey' }, origin)] : []),
     element('span', {}, `risk ${number(track.risk)} m: `, ...reasonsOf(track), ' · ', element('a', { href: hashOf(track.id, track.riskiest), title: 'key g' }, 'riskiest box')),
-    ...violations, element('span', { class: 'grey' }, facts.filter(Boolean).join(' · ')));
+    ...violations, ...ends.map(text => element('span', {}, text)), element('span', { class: 'grey' }, facts.filter(Boolean).join(' · ')));
 }
 
 function step(row, isNew = false) {
@@ -108,20 +112,28 @@ function play() {
   view.playing = requestAnimationFrame(next);
 }
 
+const TABS = ['overview', 'tracks', 'drive', 'run'];
+
 function showTab(name) {
-  for (const one of ['overview', 'tracks', 'run']) {
+  for (const one of TABS) {
     $(one).hidden = one !== name;
     $('tab-' + one).setAttribute('aria-selected', String(one === name));
   }
   if (name === 'overview') drawTimeline();
   if (name === 'overview' && !$('map').hasChildNodes()) setTimeout(() => { drawMap(); drawExample(); });
   if (name === 'tracks') drawLines();
+  if (name === 'drive') showScene(scene.sweep ? scene.at : Math.max(0, view.part ? DATA.stamps.indexOf(view.part.stamps[view.row]) : 0), true);
 }
 
 async function followHash() {
   const hash = location.hash.slice(1);
-  if (['overview', 'run', 'tracks'].includes(hash)) return selectTab(hash);
+  if (TABS.includes(hash)) return selectTab(hash);
   const wanted = new URLSearchParams(hash);
+  if (wanted.has('scene') && hasScene) {
+    scene.at = Math.max(0, DATA.stamps.indexOf(wanted.get('scene')));
+    showTab('drive');
+    return showScene(scene.at, true);
+  }
   if (wanted.has('rule')) {
     clearFilters();
     $('f-rule').value = wanted.get('rule');
@@ -151,6 +163,7 @@ function redrawAll() {
   $('map').replaceChildren();
   if (!$('overview').hidden) { drawMap(); drawTimeline(); drawExample(); }
   if (view.part && !$('tracks').hidden) { drawViews(); drawCharts(); }
+  drawScene();
 }
 
 function setUpPerson(who) {
@@ -170,18 +183,27 @@ async function main() {
     const found = await (await fetch('decisions')).json();
     receive(found);
     setUpPerson(found.who);
+    hasScene = found.has_scene;
+    scene.proposals = found.proposals;
+    $('tab-drive').hidden = !hasScene;
+    setUpScene();
+    $('all-drives').hidden = location.pathname === '/';
     setUpNumbers();
     $('decide').hidden = $('save-button').hidden = $('person').hidden = false;
     $('save-button').onclick = save;
     listen();
   }
   TRACKS = buildTracks();
+  if (hasScene && [...log.held.values()].some(row => row.decision === 'add')) {
+    await followAdded();
+    TRACKS = buildTracks();
+  }
   setUpList();
   drawOverview();
   setUpTimeline();
   setUpKeys();
   for (const name of Object.keys(VIEWS)) setUpDragging($(name));
-  for (const one of ['overview', 'tracks', 'run']) $('tab-' + one).onclick = () => {
+  for (const one of TABS) $('tab-' + one).onclick = () => {
     selectTab(one);
     if (one === 'tracks') $('rows').focus({ preventScroll: true });
   };
@@ -193,6 +215,7 @@ async function main() {
   addEventListener('resize', () => {
     drawLines();
     if (!$('overview').hidden) drawTimeline();
+    drawScene();
     if (view.part && !$('tracks').hidden) { drawViews(); drawCursor(); }
   });
   matchMedia('(prefers-color-scheme: dark)').addEventListener('change', redrawAll);

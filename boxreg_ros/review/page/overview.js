@@ -14,13 +14,14 @@ const MIN_SHARP_POINTS = 30;        // of a box whose track is shown as an examp
 
 function drawOverview() {
   const [before, after] = DATA.total;
+  /** @type {[string, string, number, number, string][]} */
   const rows = [
     ['heading flips between two boxes', 'flips', 0, 1, ''],
     ['jitter of the centre', 'jitter', 3, 1, ' m'],
     ['jitter of the yaw', 'yaw_jitter', 2, 180 / Math.PI, '°'],
     ['spread of the size of a track', 'size_spread', 3, 1, ' m'],
     [`cells of ${DATA.cell} m filled by the points of all sweeps`, 'cells', 0, 1, ''],
-    ...(DATA.has_truth ? [['3D IoU with the true boxes', 'iou', 3, 1, '']] : []),
+    .../** @type {[string, string, number, number, string][]} */ (DATA.has_truth ? [['3D IoU with the true boxes', 'iou', 3, 1, '']] : []),
   ];
   fill($('quality'), element('tr', {}, element('td'), ...['input', 'refined', 'change'].map(t => element('th', { class: 'n', scope: 'col' }, t))),
     ...rows.map(([title, name, digits, scale, unit]) => {
@@ -63,7 +64,7 @@ async function drawExample() {
     view.frame = frame;
     const box = { name: mode === 'before' ? 'input' : 'refined', dash: [], box: frame };
     view.lines = [{ ...box, corners: corners(frame).map(c => toFrame(c, frame, rotation(frame))) }];
-    drawFlat($('example-' + mode), 0, 1);
+    drawFlat($('example-' + mode), ...VIEWS.top);
   }
   [view.local, view.lines, view.limits, view.frame, view.zoom, view.center] = saved;
 }

@@ -17,6 +17,7 @@ const isDeleted = (s, k) => covering('deletion', inputOf(s, k), stampOf(s, k)).l
 function buildTracks() {
   const groups = new Map();
   DATA.tracks.forEach((source, s) => {
+    if (source.withdrawn) return;
     for (const [id, rows] of rowsById(source, s)) {
       if (!groups.has(id)) groups.set(id, []);
       groups.get(id).push({ s, rows });
@@ -72,7 +73,8 @@ async function rebuildTracks() {
   const [s, k] = shown;
   const index = TRACKS.findIndex(track => track.members().some(([t, l]) => t === s && l === k));
   view.track = -1;
-  if (index >= 0) await openTrack(index, null, TRACKS[index].members().findIndex(([t, l]) => t === s && l === k));
+  if (index < 0) view.open = view.part = view.edit = null;
+  else await openTrack(index, null, TRACKS[index].members().findIndex(([t, l]) => t === s && l === k));
 }
 
 // Decisions are about ids and stamps of the input: the fewest scopes that are just these boxes.
@@ -109,13 +111,18 @@ function stampsOfInput(input) {
 
 // The boxes and points of a track of the report.
 async function loadPart(s) {
+  if (DATA.tracks[s].part) return DATA.tracks[s].part;
   if (cached.has(s)) return cached.get(s);
-  const part = JSON.parse(await inflate(await textOf('part-' + s)));
+  const part = decoded(JSON.parse(await inflate(await textOf('part-' + s))));
+  cached.set(s, part);
+  if (cached.size > MAX_CACHED) cached.delete(cached.keys().next().value);
+  return part;
+}
+
+function decoded(part) {
   const bytes = Uint8Array.from(atob(part.points), c => c.charCodeAt(0));
   part.points = new Int16Array(bytes.buffer);
   complete(part);
-  cached.set(s, part);
-  if (cached.size > MAX_CACHED) cached.delete(cached.keys().next().value);
   return part;
 }
 
@@ -151,9 +158,10 @@ async function loadAround(track) {
   const own = new Set(track.pieces.map(({ s }) => s));
   const end = track.begin + track.seconds;
   const away = other => Math.min(...other.path.flatMap(([x, y]) => track.path.map(([u, v]) => Math.hypot(x - u, y - v))));
-  const near = DATA.tracks.map((other, s) => [s, other])
+  /** @type {[number, number][]} */
+  const near = DATA.tracks.map((other, s) => /** @type {[number, Source]} */ ([s, other]))
     .filter(([s, other]) => !own.has(s) && other.begin <= end && other.begin + other.seconds >= track.begin)
-    .map(([s, other]) => [s, away(other)]).filter(([, distance]) => distance < REACH)
+    .map(([s, other]) => /** @type {[number, number]} */ ([s, away(other)])).filter(([, distance]) => distance < REACH)
     .sort((a, b) => a[1] - b[1]).slice(0, MAX_AROUND);
   const found = [];
   for (const [s] of near) {

@@ -7,6 +7,7 @@ const SLAB = 1.5;                  // around the object, of neighbours in the vi
 const CLOSE = 8;                   // of neighbours in the 3D view [m]
 const ZOOM = { least: 0.1, most: 20 };
 // The axes to the right and upwards, by view, and the corners of the outline that is seen.
+/** @type {Record<string, [number, number, number[]]>} */
 const VIEWS = { top: [0, 1, [4, 5, 6, 7]], side: [0, 2, [0, 1, 5, 4]], front: [1, 2, [0, 3, 7, 4]] };
 const NAMES = ['around', 'input', 'refined', 'truth', 'solved', 'human'];
 const DASHES = { input: [6, 4], truth: [2, 3] };
@@ -41,6 +42,7 @@ function drawViews() {
   const cacheKey = mode === 'sweep' ? view.row : mode;
   if (view.cacheKey !== cacheKey || view.cachePart !== part) {
     view.local = localPoints(part, view.row, mode);
+    view.accumulated = null;
     view.cacheKey = cacheKey;
     view.cachePart = part;
   }
@@ -51,12 +53,17 @@ function drawViews() {
   let boxes = currentBoxes();
   if (mode === 'before') boxes = boxes.filter(([name]) => name !== 'refined');
   if (mode === 'after') boxes = boxes.filter(([name]) => name !== 'input');
+  if (mode === 'sweep') loadCloud();
+  else loadAccumulated(mode);
+  if (mode !== 'sweep' && view.accumulated?.points) view.local = view.accumulated.points;
   const near = mode === 'sweep' ? aroundAt(part.stamps[view.row], part.origin) : [];
-  view.far = near.flatMap(({ points }) => points.map(inFrame));
+  const cloud = mode === 'sweep' && view.cloud?.track === view.open && view.cloud.stamp === part.stamps[view.row] ? view.cloud.points : null;
+  view.far = cloud ? cloud.map(inFrame) : near.flatMap(({ points }) => points.map(inFrame));
   view.lines = [...near.map(({ box }) => ['around', box]), ...boxes]
     .map(([name, box]) => ({ name, dash: DASHES[name] ?? [], corners: corners(box).map(inFrame) }));
   for (const [name, axes] of Object.entries(VIEWS)) drawFlat($(name), ...axes);
   drawSpace();
+  drawCamera();
   const labels = { around: 'neighbours', refined: part.status[view.row] === 'kept' ? 'kept' : 'refined', truth: 'true', solved: 'solved again' };
   const shown = NAMES.filter(name => view.lines.some(line => line.name === name));
   fill($('legend'), ...shown.map(name => element('span', {}, element('i', { style: `border-color: var(--${name}); border-top-style: ${{ input: 'dashed', truth: 'dotted' }[name] ?? 'solid'}` }), labels[name] ?? name)));
@@ -72,7 +79,7 @@ function drawNothing() {
 }
 
 // One orthogonal view: its axes to the right and upwards, in the frame of the box.
-function drawFlat(canvas, right, up) {
+function drawFlat(canvas, right, up, outline) {
   const scale = devicePixelRatio, width = canvas.clientWidth, height = canvas.clientHeight;
   if (canvas.width !== Math.round(width * scale)) canvas.width = Math.round(width * scale);
   if (canvas.height !== Math.round(height * scale)) canvas.height = Math.round(height * scale);
@@ -92,7 +99,6 @@ function drawFlat(canvas, right, up) {
   // Points near the lower face may be road: they would hide the object from above.
   const shown = canvas.id === 'top' ? view.local.filter(point => point[2] >= -0.35 * view.frame[5]) : view.local;
   drawPoints(context, shown, at, isDense ? 1.4 : 2.4, isDense ? 0.35 : 0.85, 'points');
-  const outline = right === 1 ? VIEWS.front[2] : up === 1 ? VIEWS.top[2] : VIEWS.side[2];
   for (const { name, dash, corners: c } of view.lines) {
     if (name === 'around' && !c.some(isNear)) continue;
     context.strokeStyle = colour(name);
@@ -166,7 +172,9 @@ function spaceTraces() {
   const columns = list => ({ x: list.map(p => p[0]), y: list.map(p => p[1]), z: list.map(p => p[2]) });
   const cloud = (list, size, name) => ({ type: 'scatter3d', mode: 'markers', hoverinfo: 'skip', ...columns(list), marker: { size, color: colour(name) } });
   const isClose = point => Math.hypot(...point) < CLOSE;
-  const traces = [cloud(points, every > 1 || points.length > 1500 ? 1.2 : 2.2, 'points'), cloud((view.far ?? []).filter(isClose), 1.2, 'around')];
+  const far = (view.far ?? []).filter(isClose), some = Math.ceil(far.length / 8000);
+  /** @type {any[]} */
+  const traces = [cloud(points, every > 1 || points.length > 1500 ? 1.2 : 2.2, 'points'), cloud(far.filter((_, k) => k % some === 0), 1.2, 'around')];
   for (const name of NAMES) {
     const found = view.lines.filter(line => line.name === name && (name !== 'around' || line.corners.every(isClose)));
     const gap = [null, null, null];

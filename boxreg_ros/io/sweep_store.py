@@ -1,0 +1,60 @@
+"""The points of all sweeps of a drive, in a temporary file."""
+
+from __future__ import annotations
+
+import mmap
+from tempfile import TemporaryFile
+
+from boxreg_ros.core.following.sweeps import ascending
+from boxreg_ros.structures import Floats, Sweep
+import numpy as np
+from numpy.typing import NDArray
+
+POINT = np.dtype((np.float32, 3))
+
+
+class SweepStore:
+    """
+    The points of sweeps in a temporary file: a drive has more of them than fit the memory.
+
+    Attributes
+    ----------
+    stamps_ns : list of int
+        Stamps of the sweeps [ns].
+    origin : array, shape (3,)
+        Points are stored relative to this place, so that float32 is enough [m].
+
+    """
+
+    def __init__(self) -> None:
+        self.stamps_ns: list[int] = []
+        self.origin: Floats | None = None
+        self._file = TemporaryFile()  # noqa: SIM115  closed with the store
+        self._ends = [0]
+        self._map: mmap.mmap | None = None
+
+    def add(self, sweep: Sweep) -> None:
+        """Add a sweep in the fixed frame that is later than those before."""
+        if self.stamps_ns and sweep.stamp_ns <= self.stamps_ns[-1]:
+            return
+        points = sweep.in_frame().points
+        if self.origin is None:
+            self.origin = np.round(points[0]).astype(float) if len(points) else np.zeros(3)
+        self.stamps_ns.append(sweep.stamp_ns)
+        relative = ascending((points - self.origin).astype(np.float32))
+        self._file.write(relative.tobytes())
+        self._ends.append(self._ends[-1] + len(relative))
+
+    def __len__(self) -> int:
+        """Return the number of sweeps."""
+        return len(self.stamps_ns)
+
+    def __getitem__(self, row: int, /) -> NDArray[np.float32]:
+        """Return the points (M, 3) of a sweep, ascending by x."""
+        first, last = self._ends[row], self._ends[row + 1]
+        if first == last:
+            return np.zeros((0, 3), np.float32)
+        if self._map is None or len(self._map) < last * POINT.itemsize:
+            self._file.flush()
+            self._map = mmap.mmap(self._file.fileno(), 0)
+        return np.frombuffer(self._map, POINT, last - first, first * POINT.itemsize)

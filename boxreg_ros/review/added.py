@@ -1,0 +1,100 @@
+"""The track of an object that a person has added, as the page shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from boxreg_ros.core.follow import FollowedTrack
+from boxreg_ros.review.changes import TrackChanges
+from boxreg_ros.review.payload import TrackPart, TrackTruth
+from boxreg_ros.review.risk import assess
+from boxreg_ros.review.scene import Scene
+from boxreg_ros.review.tables import TrackRow
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, Ints, ROLL, Z
+import numpy as np
+
+MAX_POINTS = 400
+"""Most points of a box that the page gets; as in a report."""
+
+
+def added_track(scene: Scene, seeds: Sequence[BoxArray], begin_ns: int) -> dict[str, Any]:
+    """
+    Follow an added object from its boxes.
+
+    Returns
+    -------
+    found : dict
+        ``row`` and ``part`` as of the tracks of a report; ``ends``: stamp and reason before the
+        first box and after the last; ``problems``: seeds that could not be used, and why.
+
+    Raises
+    ------
+    RecordingError
+        If the recording cannot be read, or no seed can be followed.
+
+    """
+    track = scene.follow(seeds)
+    points = _Near(scene, track)
+    changes = _changes(track, points)
+    row = TrackRow(changes, assess(changes), '')
+    n = len(track.rows)
+    unknown = TrackTruth(np.full((n, 9), np.nan), np.full(n, np.nan), np.full(n, np.nan))
+    part = TrackPart(row, points, unknown)
+    return {
+        'row': part.row(track.stamps_ns),
+        'part': part.part(begin_ns, MAX_POINTS),
+        'ends': [{'stamp': str(end.stamp_ns), 'reason': end.reason} for end in track.ends],
+        'problems': track.problems,
+    }
+
+
+class _Near:
+    """The points of the sweeps near the boxes of a track."""
+
+    def __init__(self, scene: Scene, track: FollowedTrack) -> None:
+        stamps_ns = track.stamps_ns.tolist()
+        self._sensors = scene.sensors_at(stamps_ns)
+        self.local = scene.near(stamps_ns, track.boxes)
+
+    def sensor_at(self, _: Ints) -> Floats:
+        """Return the positions of the sensor (n, 3) [m]."""
+        return self._sensors
+
+    def points_of(self, track: TrackChanges) -> list[Floats]:
+        """Return the points near each box, n arrays (M_i, 3) [m]."""
+        R = matrix_from_rpy(track.boxes[:, ROLL:])
+        centers = track.boxes[:, : Z + 1]
+        return [
+            local @ turn.T + center
+            for local, turn, center in zip(self.local, R, centers, strict=True)
+        ]
+
+
+def _changes(track: FollowedTrack, points: _Near) -> TrackChanges:
+    n = len(track.rows)
+    half = track.boxes[:, BOX_EXTENT] / 2
+    inside = [
+        int((np.abs(local) < extent).all(1).sum())
+        for local, extent in zip(points.local, half, strict=True)
+    ]
+    near = [len(local) - count for local, count in zip(points.local, inside, strict=True)]
+    return TrackChanges(
+        track_id=track.track_id,
+        class_name=track.class_name,
+        input_ids=(track.track_id,) * n,
+        stamps_ns=track.stamps_ns,
+        given=np.full((n, 9), np.nan),
+        boxes=track.boxes,
+        change=np.full((n, 4), np.nan),
+        deviations=np.full((n, 4), np.nan),
+        extent_deviations=np.full((n, 3), np.nan),
+        face_distances=np.zeros((n, 6)),
+        near_points=np.column_stack([inside, near]).astype(np.int64),
+        disagreement=np.zeros(n),
+        is_flipped=np.zeros(n, bool),
+        status=np.array(track.status),
+        reasons=np.full(n, '', '<U1'),
+        num_points=np.array(inside, np.int64),
+    )

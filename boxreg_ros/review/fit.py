@@ -1,0 +1,177 @@
+"""A box for an object that a person points at: its points, their shape, and the class by size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.structures import Floats
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+REACH = 9.0
+"""Points up to this far from the place are looked at [m]; chosen: half an articulated bus."""
+CELL = 0.25
+"""Points in touching cells of this size are of one object [m]; chosen: cars park farther apart."""
+ROAD_CELL = 1.5
+"""The lowest point of a cell of this size is of the road [m]; chosen."""
+CLEARANCE = 0.25
+"""Points so far above the road are of objects [m]; chosen: curbs are lower."""
+MAX_HEIGHT = 4.5
+"""Points higher above the road are of bridges and trees [m]."""
+MAX_AWAY = 1.5
+"""An object is not farther from the place that a person points at [m]; chosen."""
+MIN_POINTS = 5
+"""Fewer points do not show an object."""
+ANGLES = np.radians(np.arange(0, 90, 1.5))
+"""Headings that are tried [rad]."""
+NEAREST = 0.05
+"""Distances to a side below this count the same [m]: range noise."""
+MISSING = np.array([0.3, 0.5, 0.7])
+"""Weights of length, width and height that are not seen; chosen: the width is seen more often."""
+USUAL_EXTENTS = {
+    'car': np.array([4.5, 1.9, 1.6]),
+    'truck': np.array([8.0, 2.6, 3.2]),
+    'bus': np.array([11.5, 2.6, 3.2]),
+    'cyclist': np.array([1.8, 0.7, 1.7]),
+    'pedestrian': np.array([0.7, 0.7, 1.7]),
+}
+"""Length, width and height of classes that a drive has no track of [m]; chosen: mid-sizes."""
+
+
+class Fitted(NamedTuple):
+    """A box (9,) [m, rad], the class whose size is nearest, and the points of the object."""
+
+    box: Floats
+    class_name: str
+    num_points: int
+
+
+def fitted(
+    points: NDArray[np.floating],
+    place: Floats,
+    sensor: Floats,
+    heading: float,
+    extents: Mapping[str, Floats],
+) -> Fitted:
+    """
+    Return the box of the object at a place.
+
+    The points around it that are above the road and touch each other are the object. The heading
+    is that whose sides are nearest to the points (the closeness of L-shapes), and the half of it
+    that is nearer to the heading of the sensor. Sides that the sensor does not see are completed
+    by the size of the class.
+
+    Parameters
+    ----------
+    points : array, shape (M, 3)
+        Of the sweep [m].
+    place : array, shape (2,)
+        That a person points at [m].
+    sensor : array, shape (2,)
+        Position of the sensor [m].
+    heading : float
+        Heading of the sensor [rad].
+    extents : mapping of str to array, shape (3,)
+        Length, width and height by class, of those that it may be; `USUAL_EXTENTS` if empty.
+
+    Raises
+    ------
+    RecordingError
+        If there is no object at the place.
+
+    """
+    near = points[(np.abs(points[:, :2] - place) < REACH).all(1)].astype(np.float64)
+    road = _road_below(near)
+    height = near[:, 2] - road
+    near, road = (a[(height > CLEARANCE) & (height < MAX_HEIGHT)] for a in (near, road))
+    own = _touching(near[:, :2], place)
+    if own.sum() < MIN_POINTS:
+        raise RecordingError(
+            f'place: expected points of an object above the road, got {own.sum()} within '
+            f'{MAX_AWAY:g} m of it; point at the middle of its points, or at another sweep'
+        )
+    cluster, bottom = near[own], float(np.median(road[own]))
+    yaw, class_name, usual = _shape(cluster, bottom, extents or USUAL_EXTENTS)
+    if np.cos(yaw - heading) < 0:
+        yaw += np.pi
+    low, high = _span(cluster[:, :2], yaw)
+    # Of each axis, the side on the side of the sensor is seen.
+    away = _turned(sensor[None], -yaw)[0] < (low + high) / 2
+    size = np.append(high - low, cluster[:, 2].max() - bottom)
+    grown = np.maximum(size, usual)
+    low = np.where(away, low, high - grown[:2])
+    center = _turned((low + grown[:2] / 2)[None], yaw)[0]
+    z = bottom + grown[2] / 2
+    angle = float(np.arctan2(np.sin(yaw), np.cos(yaw)))
+    return Fitted(np.array([*center, z, *grown, 0, 0, angle]), class_name, int(own.sum()))
+
+
+def _road_below(points: Floats) -> Floats:
+    """Return the height of the road below each point (M,): the lowest of its cells around."""
+    if not len(points):
+        return np.zeros(0)
+    cells = ((points[:, :2] - points[:, :2].min(0)) / ROAD_CELL).astype(int)
+    lowest = np.full(cells.max(0) + 1, np.inf)
+    np.minimum.at(lowest, tuple(cells.T), points[:, 2])
+    return np.asarray(ndimage.minimum_filter(lowest, 3, mode='nearest')[tuple(cells.T)])
+
+
+def _touching(points: Floats, place: Floats) -> NDArray[np.bool_]:
+    """Return which points (M, 2) are of the object nearest to a place."""
+    if not len(points):
+        return np.zeros(0, bool)
+    cells = ((points - points.min(0)) / CELL).astype(int)
+    is_filled = np.zeros(cells.max(0) + 1, bool)
+    is_filled[tuple(cells.T)] = True
+    labels, _ = ndimage.label(is_filled, np.ones((3, 3)))
+    label = labels[tuple(cells.T)]
+    away = np.linalg.norm(points - place, axis=1)
+    nearest = int(away.argmin())
+    return np.asarray((label == label[nearest]) & (away[nearest] < MAX_AWAY))
+
+
+def _heading(points: Floats) -> float:
+    """Return the heading whose box has its sides nearest to the points (M, 2)."""
+    scores = []
+    for yaw in ANGLES:
+        local = _turned(points, -yaw)
+        to_sides = np.minimum(local - local.min(0), local.max(0) - local).min(1)
+        scores.append((1 / to_sides.clip(NEAREST)).sum())
+    return float(ANGLES[int(np.argmax(scores))])
+
+
+def _span(points: Floats, yaw: float) -> tuple[Floats, Floats]:
+    """Return the least and the largest coordinates (2,) along the axes of a heading."""
+    local = _turned(points, -yaw)
+    return local.min(0), local.max(0)
+
+
+def _turned(points: Floats, yaw: float) -> Floats:
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]))
+
+
+def _shape(
+    cluster: Floats, bottom: float, extents: Mapping[str, Floats]
+) -> tuple[float, str, Floats]:
+    """
+    Return heading, class and usual extents (3,) that agree best with the points (M, 3).
+
+    What is seen beyond the size of a class speaks against it; that less is seen hardly does, but
+    the height, and one of length and width, are nearly always seen.
+
+    """
+    found = []
+    first = _heading(cluster[:, :2])
+    for yaw in (first, first + np.pi / 2):
+        low, high = _span(cluster[:, :2], yaw)
+        size = np.append(high - low, cluster[:, 2].max() - bottom)
+        for name, usual in extents.items():
+            ratio = np.log(size.clip(0.1) / usual)
+            cost = (np.maximum(ratio, 0) * 2 - np.minimum(ratio, 0) * MISSING).sum()
+            found.append((float(cost), yaw, name, usual))
+    _, yaw, name, usual = min(found, key=lambda one: one[0])
+    return yaw, name, usual

@@ -1,0 +1,296 @@
+// The scene: the whole cloud of a sweep from above, all boxes, and objects that are missing ---------
+
+const CLICK = 4;                   // a pointer that moves less has clicked [px]
+const LABELLED = 5;                // ids are written at this zoom and above [px/m]
+const ROAD = 0.4;                  // above the road: points of objects [m]
+const SHOWN = 90;                  // of the drive around the sensor [m]
+/** @type {{ [name: string]: any, sweep: Sweep, boxes: SceneBox[], fit: Fit, slim: Map<number, SlimPart> }} */
+const scene = { at: 0, zoom: 0, offset: [0, 0], sweep: null, boxes: [], isAdding: false, fit: null, proposals: [], proposal: -1, playing: 0, slim: new Map() };
+/** @type {Record<string, [string, number, number]>} */
+const LOOKS = { road: ['around', 0.45, 1], object: ['points', 0.9, 1.6] };  // colour, opacity, size [px]
+const sceneStamp = () => DATA.stamps[scene.at];
+
+// Boxes of a track of the report without its points: those of all tracks stay read.
+async function slimPart(s) {
+  if (DATA.tracks[s].part) return DATA.tracks[s].part;
+  if (!scene.slim.has(s)) {
+    const { origin, usable, stamps } = await loadPart(s);
+    scene.slim.set(s, { origin, usable, stamps });
+  }
+  return scene.slim.get(s);
+}
+
+// All boxes at a number of the drive, in the fixed frame, with their tracks.
+async function boxesAt(at) {
+  const found = [];
+  for (const track of TRACKS) {
+    for (const [s, k] of track.members().filter(([t, l]) => DATA.tracks[t].at[l] === at)) {
+      const part = await slimPart(s), box = part.usable[k];
+      if (box) found.push({ track, box: moved(box, part.origin, 1), isGone: isDeleted(s, k) });
+    }
+  }
+  return found;
+}
+
+async function showScene(at, isNew = false) {
+  if (!DATA.stamps.length) return;
+  at = Math.max(0, Math.min(DATA.stamps.length - 1, at));
+  if (at === scene.at && scene.sweep && !isNew) return;
+  if (at !== scene.at) scene.fit = null;
+  scene.at = at;
+  $('scene-time').max = DATA.stamps.length - 1;
+  $('scene-time').value = at;
+  const stamp = sceneStamp();
+  if (!scene.sweep) $('scene-clock').textContent = 'reading the recording …';
+  let sweep;
+  try {
+    sweep = await sweepAt(stamp);
+  } catch (error) {
+    $('scene-clock').textContent = '';
+    return fail(`The scene cannot be shown: ${error.message}`);
+  }
+  const boxes = await boxesAt(at);
+  if (scene.at !== at) return;
+  Object.assign(scene, { sweep, boxes });
+  scene.zoom ||= $('scene-view').clientWidth / SHOWN;
+  scene.road = roadOf(sweep);
+  const count = sweep.points.length / 3;
+  $('scene-clock').textContent = `${number(DATA.times[at], 2)} s · ${number(count, 0)} points · ${boxes.length} boxes`;
+  clearTimeout(view.hashTimer);
+  view.hashTimer = setTimeout(() => { if (!$('drive').hidden) history.replaceState(null, '', '#' + new URLSearchParams({ scene: stamp })); }, 200);
+  drawScene();
+  drawCameras();
+}
+
+// The height of the road below the sensor: the lower tenth of the points near it.
+function roadOf({ points, sensor, origin }) {
+  const heights = [];
+  for (let i = 0; i < points.length; i += 3) {
+    if (Math.hypot(points[i] + origin[0] - sensor[0], points[i + 1] + origin[1] - sensor[1]) < 25) heights.push(points[i + 2]);
+  }
+  return heights.sort((a, b) => a - b)[heights.length / 10 | 0] ?? 0;
+}
+
+// From the fixed frame to the canvas, and back.
+function sceneAxes() {
+  const canvas = $('scene-view'), { sensor } = scene.sweep, { zoom, offset } = scene;
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  const center = [sensor[0] + offset[0], sensor[1] + offset[1]];
+  return {
+    width, height,
+    /** @type {(place: number[]) => [number, number]} */
+    to: ([x, y]) => [width / 2 + zoom * (x - center[0]), height / 2 - zoom * (y - center[1])],
+    from: event => {
+      const bounds = canvas.getBoundingClientRect();
+      return [center[0] + (event.clientX - bounds.left - width / 2) / zoom, center[1] - (event.clientY - bounds.top - height / 2) / zoom];
+    },
+  };
+}
+
+function drawScene() {
+  if (!scene.sweep || $('drive').hidden) return;
+  const canvas = $('scene-view'), scale = devicePixelRatio, { width, height, to } = sceneAxes();
+  canvas.width = Math.round(width * scale);
+  canvas.height = Math.round(height * scale);
+  const context = canvas.getContext('2d', { willReadFrequently: true });
+  context.setTransform(scale, 0, 0, scale, 0, 0);
+  const { points, origin, sensor } = scene.sweep;
+  for (const isObject of [false, true]) {
+    const [name, alpha, size] = isObject ? LOOKS.object : LOOKS.road;
+    context.fillStyle = colour(name);
+    context.globalAlpha = alpha;
+    for (let i = 0; i < points.length; i += 3) {
+      if (points[i + 2] > scene.road + ROAD !== isObject) continue;
+      const [x, y] = to([points[i] + origin[0], points[i + 1] + origin[1]]);
+      if (x > 0 && y > 0 && x < width && y < height) context.fillRect(x - size / 2, y - size / 2, size, size);
+    }
+  }
+  context.globalAlpha = 1;
+  context.font = '11px system-ui, sans-serif';
+  for (const { track, box, isGone: gone } of scene.boxes) drawSceneBox(context, to, box, gone ? 'around' : 'refined', track.id, gone, track === view.open);
+  if (scene.fit) drawSceneBox(context, to, scene.fit.box, 'human', scene.fit.class, false, true);
+  const [x, y] = to(sensor), nose = to([sensor[0] + 2 * Math.cos(sensor[3]), sensor[1] + 2 * Math.sin(sensor[3])]);
+  context.strokeStyle = colour('input');
+  context.lineWidth = 2;
+  context.beginPath();
+  context.arc(x, y, 4, 0, 2 * Math.PI);
+  context.moveTo(x, y);
+  context.lineTo(...nose);
+  context.stroke();
+  drawSceneTools();
+}
+
+function drawSceneBox(context, to, box, name, text, isDashed, isBold) {
+  const c = corners(box).map(to);
+  context.strokeStyle = context.fillStyle = colour(name);
+  context.lineWidth = isBold ? 2.5 : 1.5;
+  context.setLineDash(isDashed ? [4, 4] : []);
+  context.beginPath();
+  VIEWS.top[2].forEach((k, i) => context[i ? 'lineTo' : 'moveTo'](...c[k]));
+  context.closePath();
+  const nose = [0, 1].map(k => (c[4][k] + c[7][k]) / 2), middle = [0, 1].map(k => (c[4][k] + c[6][k]) / 2);
+  context.moveTo(...nose);
+  context.lineTo(...[0, 1].map(k => nose[k] + 0.25 * (nose[k] - middle[k])));
+  context.stroke();
+  context.setLineDash([]);
+  if (scene.zoom >= LABELLED || isBold) context.fillText(text, Math.max(...c.map(p => p[0])) + 3, Math.min(...c.map(p => p[1])) + 9);
+}
+
+// What is offered while an object is added.
+function drawSceneTools() {
+  $('scene-add').setAttribute('aria-pressed', String(scene.isAdding));
+  $('scene-view').style.cursor = scene.isAdding ? 'crosshair' : 'grab';
+  $('scene-fit').hidden = !scene.fit;
+  drawProposals();
+  $('scene-hint').textContent = scene.fit ? `${number(scene.fit.points, 0)} points, ${scene.fit.box.slice(3, 6).map(v => number(v, 1)).join(' × ')} m. Enter follows it both ways.`
+    : scene.isAdding ? 'Click the points of the object.' : 'Click a box to open its track.';
+}
+
+function sceneBoxAt(place) {
+  return scene.boxes.find(({ box }) => {
+    const [along, across] = toFrame([...place, box[2]], box, rotation(box));
+    return Math.abs(along) < box[3] / 2 && Math.abs(across) < box[4] / 2;
+  });
+}
+
+function startAdding(isAdding = !scene.isAdding) {
+  scene.isAdding = isAdding;
+  scene.fit = null;
+  drawScene();
+}
+
+// The box of the object at a place, of its class by size or of the one chosen.
+async function fitAt(place, name = '') {
+  const sizes = new Map();
+  for (const track of TRACKS) {
+    if (!track.extents[1].every(isKnown)) continue;
+    if (!sizes.has(track.class)) sizes.set(track.class, []);
+    sizes.get(track.class).push(track.extents[1]);
+  }
+  const median = values => values.sort((a, b) => a - b)[values.length >> 1];
+  const extents = Object.fromEntries([...sizes].map(([one, rows]) => [one, [0, 1, 2].map(k => median(rows.map(row => row[k])))]));
+  const stamp = sceneStamp();
+  let found;
+  try {
+    found = await post('fit', { stamp, place, class: name, extents });
+  } catch (error) {
+    return fail(error.message);
+  }
+  if (stamp !== sceneStamp()) return;
+  offerFit({ ...found, stamp: scene.sweep.stamp, place });
+}
+
+// Proposals of the run that nobody has added yet.
+function openProposals() {
+  const taken = new Set([...log.held.values()].filter(row => row.decision === 'add').map(row => row.box.slice(0, 2).map(v => v.toFixed(2)).join()));
+  return scene.proposals.filter(({ box }) => !taken.has(box.slice(0, 2).map(v => v.toFixed(2)).join()));
+}
+
+function drawProposals() {
+  const open = openProposals(), choice = $('scene-proposals');
+  choice.hidden = !open.length;
+  fill(choice, element('option', { value: '' }, `${open.length} proposed`), ...open.map((one, k) =>
+    element('option', { value: k, selected: k === scene.proposal }, `${one.class} at ${number(secondsOf(one.stamp), 1)} s, ${one.points} points`)));
+}
+
+// Show a proposal as an object that is about to be added.
+async function showProposal(index) {
+  const one = openProposals()[index];
+  if (!one) return;
+  scene.proposal = index;
+  const away = DATA.stamps.map(stamp => Math.abs(secondsOf(stamp) - secondsOf(one.stamp)));
+  await showScene(away.indexOf(Math.min(...away)), true);
+  scene.offset = [0, 1].map(k => one.box[k] - scene.sweep.sensor[k]);
+  offerFit({ ...one, stamp: scene.sweep.stamp, place: one.box.slice(0, 2) });
+}
+
+const nextProposal = () => showProposal((scene.proposal + 1) % Math.max(1, openProposals().length));
+
+// Offer a box of an object: its class can be chosen, Enter keeps it.
+function offerFit(fit) {
+  $('failure').hidden = true;
+  scene.fit = fit;
+  const names = [...new Set([...TRACKS.map(track => track.class), fit.class, 'car', 'truck', 'bus', 'cyclist', 'pedestrian'])].sort();
+  fill($('scene-class'), ...names.map(one => element('option', { value: one, selected: one === fit.class }, one)));
+  drawScene();
+  drawCameras();
+}
+
+async function keepFit() {
+  const { fit } = scene;
+  if (!fit) return;
+  scene.fit = null;
+  scene.isAdding = false;
+  scene.proposal = -1;
+  drawSceneTools();
+  await addObject(fit.stamp, fit.box, $('scene-class').value);
+}
+
+function playScene() {
+  clearTimeout(scene.playing);
+  scene.isPlaying = !scene.isPlaying;
+  $('scene-play').textContent = scene.isPlaying ? 'Pause' : 'Play';
+  const next = async () => {
+    if (!scene.isPlaying) return;
+    if (scene.at >= DATA.stamps.length - 1 || $('drive').hidden) return playScene();
+    const begin = performance.now(), wait = 1000 * (DATA.times[scene.at + 1] - DATA.times[scene.at]);
+    await showScene(scene.at + 1);
+    scene.playing = setTimeout(next, Math.max(0, wait - performance.now() + begin));
+  };
+  next();
+}
+
+function zoomScene(factor, event = null) {
+  const place = event && sceneAxes().from(event);
+  scene.zoom = Math.max(1, Math.min(120, scene.zoom * factor));
+  if (place) {
+    const now = sceneAxes().from(event);
+    scene.offset = scene.offset.map((v, k) => v + place[k] - now[k]);
+  }
+  drawScene();
+}
+
+function setUpScene() {
+  const canvas = $('scene-view');
+  let drag = null;
+  canvas.onpointerdown = event => {
+    if (!scene.sweep) return;
+    canvas.setPointerCapture(event.pointerId);
+    drag = { x: event.clientX, y: event.clientY, far: 0 };
+  };
+  canvas.onpointermove = event => {
+    if (!drag) {
+      const found = scene.sweep && sceneBoxAt(sceneAxes().from(event));
+      canvas.title = found ? `${found.track.id} ${found.track.class}` : '';
+      return;
+    }
+    const [dx, dy] = [event.clientX - drag.x, event.clientY - drag.y];
+    drag.far += Math.hypot(dx, dy);
+    if (drag.far < CLICK) return;
+    scene.offset = [scene.offset[0] - dx / scene.zoom, scene.offset[1] + dy / scene.zoom];
+    [drag.x, drag.y] = [event.clientX, event.clientY];
+    drawScene();
+  };
+  canvas.onpointerup = event => {
+    const isClick = drag && drag.far < CLICK;
+    drag = null;
+    if (!isClick) return;
+    const place = sceneAxes().from(event);
+    if (scene.isAdding) return void fitAt(place);
+    const found = sceneBoxAt(place);
+    if (found) openTrack(found.track.index, sceneStamp());
+  };
+  canvas.onpointercancel = () => { drag = null; };
+  canvas.addEventListener('wheel', event => {
+    event.preventDefault();
+    if (scene.sweep) zoomScene(event.deltaY < 0 ? ZOOM_STEP : 1 / ZOOM_STEP, event);
+  }, { passive: false });
+  $('camera-choice').onchange = drawCamera;
+  $('scene-time').oninput = () => showScene(Number($('scene-time').value));
+  $('scene-play').onclick = playScene;
+  $('scene-proposals').onchange = event => showProposal(Number(event.target.value));
+  $('scene-add').onclick = () => startAdding();
+  $('scene-follow').onclick = keepFit;
+  $('scene-cancel').onclick = () => startAdding(false);
+  $('scene-class').onchange = event => fitAt(scene.fit.place, event.target.value);
+}

@@ -1,0 +1,258 @@
+"""The sweeps of a drive under review, read once when its page first asks for them."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from tempfile import gettempdir
+from threading import Condition, Thread
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.follow import follow_points, FollowedTrack, solved
+from boxreg_ros.errors import BoxregError, RecordingError, remedy_of
+from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
+from boxreg_ros.io.items import ItemSource
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.sweep_store import SweepStore
+from boxreg_ros.rotations import (
+    interpolate_rotation,
+    matrix_from_rpy,
+    quaternion_from_rpy,
+    rpy_from_matrix,
+)
+from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Sweep, Z
+from msg_adapters.convention import Convention
+import numpy as np
+from numpy.typing import NDArray
+
+SHOWN_MARGIN = 0.6
+"""Points up to this far outside a box belong to its part of the scene [m]; chosen."""
+GRAIN = 0.03
+"""Of accumulated points one is kept in each cube of this edge [m]; chosen: range noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSource:
+    """
+    The recording of a result.
+
+    Attributes
+    ----------
+    open : callable
+        Returns the recording, not yet entered.
+    convention : Convention
+        Of its boxes.
+    fixed_frame : str
+        Frame of the result.
+    config : Config
+        Settings of the result.
+
+    """
+
+    open: Callable[[], AbstractContextManager[ItemSource]]
+    convention: Convention
+    fixed_frame: str
+    config: Config
+
+
+class Scene:
+    """
+    The sweeps of a drive, in the fixed frame.
+
+    They are read in a thread, into a temporary file; who asks for one waits for it.
+
+    Parameters
+    ----------
+    source : DriveSource
+        The recording.
+
+    """
+
+    def __init__(self, source: DriveSource) -> None:
+        self._source = source
+        self._store = SweepStore()
+        self._origins: list[Floats] = []
+        self._headings: list[float] = []
+        self._poses: dict[str, list[Floats | None]] = {}  # by frame, of each sweep
+        self._changed = Condition()
+        self._is_begun = self._is_done = False
+        self._error = ''
+
+    def sweep(self, stamp_ns: int) -> tuple[int, Floats, NDArray[np.float32], Floats]:
+        """
+        Return the sweep nearest to a stamp.
+
+        Returns
+        -------
+        stamp_ns : int
+            Its stamp [ns].
+        origin : array, shape (3,)
+            Place that its points are relative to [m].
+        points : array, shape (M, 3)
+            In the fixed frame, relative to `origin` [m].
+        sensor : array, shape (4,)
+            Position and heading of the sensor [m, rad].
+
+        Raises
+        ------
+        RecordingError
+            If the recording cannot be read.
+
+        """
+        with self._changed:
+            self._wait(stamp_ns)
+            row = self._row(stamp_ns)
+            assert self._store.origin is not None
+            sensor = np.append(self._origins[row], self._headings[row])
+            return self._store.stamps_ns[row], self._store.origin, self._store[row], sensor
+
+    def follow(self, seeds: Sequence[BoxArray]) -> FollowedTrack:
+        """
+        Follow an object through all sweeps from its boxes, and solve its track.
+
+        Raises
+        ------
+        RecordingError
+            If the recording cannot be read, or no seed can be followed.
+
+        """
+        with self._changed:
+            self._wait(None)
+        origin = self._store.origin
+        assert origin is not None
+        offset = np.append(origin, np.zeros(6))
+        config = self._source.config
+        stamps_ns = np.array(self._store.stamps_ns, np.int64)
+        moved = [BoxArray(s.stamp_ns, s.frame_id, s.track_ids, s.class_names, s.scores,
+                          s.boxes - offset) for s in seeds]  # fmt: skip
+        (track,) = follow_points(stamps_ns, self._store, moved, config)
+        if not len(track.rows):
+            raise RecordingError('; '.join(track.problems))
+        origins = np.array(self._origins) - origin
+        (found,) = solved([track], self._store, config, origins)
+        return _at(found, offset)
+
+    def near(self, stamps_ns: Sequence[int], boxes: Floats) -> list[Floats]:
+        """Return the points near each box (n, 9) in the frame of the box, n arrays (M_i, 3)."""
+        with self._changed:
+            self._wait(max(stamps_ns))
+            rows = [self._row(stamp_ns) for stamp_ns in stamps_ns]
+        assert self._store.origin is not None
+        R = matrix_from_rpy(boxes[:, ROLL:])
+        centers = boxes[:, : Z + 1] - self._store.origin
+        found = []
+        for row, center, turn, extent in zip(rows, centers, R, boxes[:, BOX_EXTENT], strict=True):
+            half = extent / 2 + SHOWN_MARGIN
+            points = self._store[row]
+            reach = np.linalg.norm(half)
+            first, last = np.searchsorted(points[:, 0], [center[0] - reach, center[0] + reach])
+            local = (points[first:last] - center) @ turn
+            found.append(local[(np.abs(local) < half).all(1)])
+        return found
+
+    def sensors_at(self, stamps_ns: Sequence[int]) -> Floats:
+        """Return the positions of the sensor (n, 3) of the sweeps nearest to some stamps [m]."""
+        with self._changed:
+            self._wait(max(stamps_ns))
+            return np.array([self._origins[self._row(stamp_ns)] for stamp_ns in stamps_ns])
+
+    def pose_of(self, frame_id: str, stamp_ns: int) -> Floats | None:
+        """
+        Return the pose (4, 4) of the frame of a camera in the fixed frame; None if unknown.
+
+        Between the poses at the two sweeps around the stamp, it is interpolated.
+
+        """
+        with self._changed:
+            self._wait(stamp_ns)
+            poses, stamps_ns = self._poses.get(frame_id), self._store.stamps_ns
+            after = bisect_left(stamps_ns, stamp_ns)
+            rows = sorted({max(0, after - 1), min(after, len(stamps_ns) - 1)})
+            around = [] if poses is None else [poses[row] for row in rows]
+        known = [pose for pose in around if pose is not None]
+        if len(known) < 2:
+            return known[0] if known else None
+        begin_ns, end_ns = (stamps_ns[row] for row in rows)
+        part = (stamp_ns - begin_ns) / (end_ns - begin_ns)
+        pose = np.eye(4)
+        pose[:3, 3] = (1 - part) * known[0][:3, 3] + part * known[1][:3, 3]
+        turns = [quaternion_from_rpy(rpy_from_matrix(one[None, :3, :3]))[0] for one in known]
+        pose[:3, :3] = interpolate_rotation(turns[0], turns[1], part)
+        return pose
+
+    def _row(self, stamp_ns: int) -> int:
+        return int(np.abs(np.array(self._store.stamps_ns, np.int64) - stamp_ns).argmin())
+
+    def _wait(self, stamp_ns: int | None) -> None:
+        """Wait until sweeps up to a stamp, or all of them, have been read."""
+        if not self._is_begun:
+            self._is_begun = True
+            Thread(target=self._read, daemon=True).start()
+        self._changed.wait_for(lambda: self._has(stamp_ns))
+        if not self._store.stamps_ns:
+            raise RecordingError(self._error or 'recording: expected sweeps, got none')
+        if self._error and not self._has_read(stamp_ns):
+            raise RecordingError(self._error)
+
+    def _has(self, stamp_ns: int | None) -> bool:
+        return self._is_done or self._has_read(stamp_ns)
+
+    def _has_read(self, stamp_ns: int | None) -> bool:
+        stamps_ns = self._store.stamps_ns
+        return stamp_ns is not None and bool(stamps_ns) and stamps_ns[-1] > stamp_ns
+
+    def _read(self) -> None:
+        source = self._source
+        self._error = 'recording: expected sweeps to its end, got an error; see the terminal'
+        try:
+            with source.open() as recording:
+                items = FixedFrameItems(
+                    recording, source.config, source.convention, source.fixed_frame
+                )
+                if isinstance(recording, Recording):
+                    self._poses = {one.frame_id: [] for one in recording.images().cameras}
+                for item in items.read():
+                    if isinstance(item.moved, Sweep):
+                        self._add(item.moved, item, items)
+            self._error = ''
+        except BoxregError as error:
+            self._error = str(error)
+        except OSError as error:
+            self._error = (
+                f'{gettempdir()}: the sweeps cannot be kept there: {error.strerror}; '
+                f'{remedy_of(error)}, or set TMPDIR to another folder'
+            )
+        finally:
+            with self._changed:
+                self._is_done = True
+                self._changed.notify_all()
+
+    def _add(self, sweep: Sweep, item: MovedItem, items: FixedFrameItems) -> None:
+        heading = self._headings[-1] if self._headings else 0.0
+        if item.T_fixed_item is not None:
+            heading = float(np.arctan2(item.T_fixed_item[1, 0], item.T_fixed_item[0, 0]))
+        with self._changed:
+            count = len(self._store)
+            self._store.add(sweep)
+            if len(self._store) > count:
+                self._origins.append(sweep.origin)
+                self._headings.append(heading)
+                for frame_id, poses in self._poses.items():
+                    poses.append(items.pose_of(frame_id, sweep.stamp_ns))
+            self._changed.notify_all()
+
+
+def thinned(points: Sequence[Floats]) -> Floats:
+    """Return points (M, 3) of several sweeps, one in each cube of the edge `GRAIN`."""
+    every = np.concatenate([np.zeros((0, 3)), *points])
+    _, first = np.unique(np.floor(every / GRAIN).astype(np.int32), axis=0, return_index=True)
+    return np.asarray(every[first])
+
+
+def _at(track: FollowedTrack, offset: Floats) -> FollowedTrack:
+    return FollowedTrack(
+        track.track_id, track.class_name, track.rows, track.stamps_ns, track.boxes + offset,
+        track.status, track.ends, track.problems,
+    )  # fmt: skip

@@ -1,0 +1,548 @@
+"""
+`measure labeller`: actions of a labeller until a drive with planted errors is right.
+
+The sample street gets 20 wrong boxes, 5 ghosts, 3 broken and 2 swapped tracks, and 3 objects lose
+their boxes. `boxreg relabel` runs, and a script reviews the result in a headless Chromium, by the
+mouse and the keys of a person. It knows the true boxes, as a person sees the points. Beside its
+actions are those of the page of the first release, which could neither delete, split, join nor
+add: there, files are edited by hand.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+import subprocess
+from tempfile import TemporaryDirectory
+from threading import Thread
+import time
+from typing import Any
+
+from boxreg_ros.bench.common import add_json_argument, BOXREG
+from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.fixed_frame import input_boxes
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.offline.reviewed_drive import drive_of
+from boxreg_ros.review.server import review_server
+from boxreg_ros.structures import Floats, REJECTED, YAW
+from browser import opened_page
+from measure import print_json
+import numpy as np
+
+STREET = Path(__file__).parents[2] / 'bags'
+WRONG, GHOSTS, BROKEN, SWAPPED, MISSING = 20, 5, 3, 2, 3
+RUN = 5
+"""Wrong boxes that follow each other."""
+RIGHT = 0.5
+"""3D IoU with the true box from which on a box is right; chosen: anyone sees a smaller one."""
+MIN_POINTS = 20
+"""Objects with fewer points, by the median, get no errors and are not judged."""
+SECONDS = {'key': 0.28, 'click': 1.3, 'drag': 2.5}
+"""Of the keystroke-level model: a key; pointing and a click; pointing, a press, pointing [s]."""
+THINKING = 1.35
+"""Of the same model, before each decision [s]."""
+BEFORE: Mapping[str, tuple[str, ...]] = {
+    'wrong': ('open', 'step', 'e', 'drag', 'drag', 'Enter', 'next'),
+    'ghost': ('open', 'read id', 'editor', 'search', 'select rows', 'delete', 'save'),
+    'broken': ('open', 'read id', 'open', 'read id', 'editor', 'replace', 'type', 'type',
+               'save'),
+    'swapped': ('open', 'step', 'read stamp', 'open', 'read id', 'editor', 'search', 'select',
+                'replace', 'type', 'search', 'select', 'replace', 'type', 'save'),
+    'missing': ('another tool', 'open', 'step', 'draw', 'class', 'id', 'keyframe', 'keyframe',
+                'export', 'merge'),
+    'right': ('a', 'next'),
+    'apply': ('terminal', 'command', 'Enter'),
+}  # fmt: skip
+"""What one error of each kind took in the page of the first release and in a text editor."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `measure labeller`."""
+    parser.add_argument('--seed', type=int, default=0, metavar='N', help='default: 0')
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Plant, relabel, review, and print actions and errors."""
+    with TemporaryDirectory() as folder:
+        found = measure(Path(folder), args.seed)
+    if args.json:
+        print_json(found)
+        return 0
+    print('errors    ' + '  '.join(f'{name:>8}' for name in found['planted']))
+    for name in ('planted', 'relabelled', 'reviewed'):
+        print(f'{name:10}' + '  '.join(f'{count:8}' for count in found[name].values()))
+    print(f'actions   {found["actions"]} ({found["kinds"]}), before {found["actions_before"]}')
+    print(
+        f'seconds   {found["seconds"]:.0f} of a person (keystroke-level model), of these '
+        f'{found["thinking"]:.0f} of thought; the script took {found["script_seconds"]:.0f}'
+    )
+    return 0
+
+
+def measure(folder: Path, seed: int = 0) -> dict[str, Any]:
+    """Return the errors that were planted, left by the run and by the review, and its actions."""
+    truth = BoxTable.read(STREET / 'street_truth.csv')
+    given = planted(truth, seed)
+    given.write(folder / 'planted.csv')
+    out = folder / 'out'
+    labels = f'csv:{folder / "planted.csv"}'
+    command = ['relabel', str(STREET / 'street.mcap'), '-o', str(out), '--report']
+    subprocess.run([*BOXREG, *command, '--labels', labels, '--formats', 'csv'], check=True)
+    begin = time.perf_counter()
+    labeller = reviewed(out, truth)
+    seconds = time.perf_counter() - begin
+    first, last = (
+        errors(BoxTable.read(one / 'boxes.csv'), truth)
+        for one in (out, out.with_name('out.corrected'))
+    )
+    before = sum(first[kind] * len(BEFORE[kind]) for kind in first)
+    right = labeller.decided['right'] * len(BEFORE['right'])
+    return {
+        'planted': errors(given, truth),
+        'relabelled': first,
+        'reviewed': last,
+        'actions': labeller.actions.total(),
+        'kinds': dict(labeller.actions),
+        'decisions': dict(labeller.decided),
+        'actions_before': before + right + len(BEFORE['apply']),
+        'seconds': labeller.seconds,
+        'thinking': THINKING * labeller.decided.total(),
+        'script_seconds': seconds,
+    }
+
+
+def judged(truth: BoxTable) -> list[str]:
+    """Return the objects that get errors and are judged: those with points, the most first."""
+    names = np.array(truth.track_ids)
+    points = {
+        name: float(np.median(truth.num_points[names == name])) for name in set(truth.track_ids)
+    }
+    return sorted((n for n in points if points[n] >= MIN_POINTS), key=lambda n: (-points[n], n))
+
+
+def planted(truth: BoxTable, seed: int) -> BoxTable:
+    """Return the boxes of the detector of the street, with errors."""
+    rng = np.random.default_rng(seed)
+    arrays, _ = input_boxes(Recording([STREET / 'street.mcap']))
+    table = BoxTable.from_arrays(arrays)
+    names = np.array(table.track_ids, object)
+    boxes = table.boxes.copy()
+    order = iter(rng.permutation(judged(truth)).tolist())
+    stamps = np.unique(table.stamps_ns)
+    middle = stamps[len(stamps) // 2]
+    is_late = table.stamps_ns >= middle
+    keep = np.ones(len(names), bool)
+    for _ in range(MISSING):
+        keep &= names != next(order)
+    for number in range(BROKEN):
+        names[is_late & (names == next(order))] = str(101 + number)
+    first, second = next(order), next(order)
+    assert SWAPPED == 2
+    late = [is_late & (names == one) for one in (first, second)]
+    names[late[0]], names[late[1]] = second, first
+    for _ in range(WRONG // RUN):
+        rows = np.flatnonzero(names == next(order))
+        begin = int(rng.integers(0, len(rows) - RUN))
+        part = rows[begin : begin + RUN]
+        sign = rng.choice([-1.0, 1.0])
+        boxes[part, :2] += sign * rng.uniform(1.6, 2.0, 2)
+        boxes[part, YAW] += sign * 0.4
+    columns = [keep.nonzero()[0]]
+    table = replace(table, track_ids=tuple(names), boxes=boxes)
+    table = _rows(table, columns[0])
+    return _with_ghosts(table, truth, rng)
+
+
+def _rows(table: BoxTable, rows: Any) -> BoxTable:
+    return replace(
+        table,
+        stamps_ns=table.stamps_ns[rows],
+        track_ids=tuple(table.track_ids[row] for row in rows),
+        class_names=tuple(table.class_names[row] for row in rows),
+        status=tuple(table.status[row] for row in rows),
+        scores=table.scores[rows],
+        boxes=table.boxes[rows],
+        num_points=table.num_points[rows],
+    )
+
+
+def _with_ghosts(table: BoxTable, truth: BoxTable, rng: np.random.Generator) -> BoxTable:
+    """Return a table with boxes at places where no object ever is."""
+    stamps = np.unique(table.stamps_ns)
+    low, high = truth.boxes[:, :2].min(0), truth.boxes[:, :2].max(0)
+    places: list[Floats] = []
+    while len(places) < GHOSTS:
+        place = rng.uniform(low, high)
+        taken = np.concatenate([truth.boxes[:, :2], np.array(places).reshape(-1, 2)])
+        if np.linalg.norm(taken - place, axis=1).min() > 5:
+            places.append(place)
+    parts = [table]
+    for number, place in enumerate(places):
+        box = np.array([*place, 0.8, 4.4, 1.8, 1.6, 0, 0, rng.uniform(-3, 3)])
+        n = len(stamps)
+        parts.append(replace(
+            table, stamps_ns=stamps, track_ids=(str(201 + number),) * n,
+            class_names=('car',) * n, status=('input',) * n, scores=np.ones(n),
+            boxes=box + rng.normal(0, 0.05, (n, 9)) * [1, 1, 0, 0, 0, 0, 0, 0, 0.1],
+            num_points=np.zeros(n, np.int64),
+        ))  # fmt: skip
+    whole = replace(
+        table,
+        **{name: np.concatenate([getattr(part, name) for part in parts])
+           for name in ('stamps_ns', 'scores', 'boxes', 'num_points')},
+        **{name: tuple(one for part in parts for one in getattr(part, name))
+           for name in ('track_ids', 'class_names', 'status')},
+    )  # fmt: skip
+    return _rows(whole, np.argsort(whole.stamps_ns, kind='stable'))
+
+
+class Matches:
+    """The true boxes by stamp, and the object that each box is nearest to."""
+
+    def __init__(self, truth: BoxTable) -> None:
+        self._truth = truth
+        self._rows: dict[int, Any] = {
+            int(stamp): np.flatnonzero(truth.stamps_ns == stamp)
+            for stamp in np.unique(truth.stamps_ns)
+        }
+        self.judged = set(judged(truth))
+
+    def of(self, stamp_ns: int, box: Floats) -> tuple[str, float, Floats]:
+        """Return the nearest object, the 3D IoU with it, and its true box."""
+        rows = self._rows[stamp_ns]
+        boxes = self._truth.boxes[rows]
+        nearest = int(np.linalg.norm(boxes[:, :2] - box[:2], axis=1).argmin())
+        if np.linalg.norm(boxes[nearest, :2] - box[:2]) > 4:
+            return '', 0.0, boxes[nearest]
+        overlap = float(iou_3d(box[None], boxes[nearest : nearest + 1])[0])
+        return self._truth.track_ids[rows[nearest]], overlap, boxes[nearest]
+
+    def of_track(self, stamps_ns: Iterable[int], boxes: Floats) -> list[tuple[str, float, Floats]]:
+        """Return the same of each box of a track."""
+        return [self.of(stamp, box) for stamp, box in zip(stamps_ns, boxes, strict=True)]
+
+
+def errors(table: BoxTable, truth: BoxTable) -> dict[str, int]:
+    """Return the wrong boxes, ghosts, broken and swapped tracks, and missing objects of labels."""
+    matches = Matches(truth)
+    tracks: dict[str, list[int]] = {}
+    for row, name in enumerate(table.track_ids):
+        if table.status[row] != REJECTED:
+            tracks.setdefault(name, []).append(row)
+    found = Counter(wrong=0, ghost=0, broken=0, swapped=0, missing=0)
+    owners: dict[str, set[str]] = {}
+    for name, rows in tracks.items():
+        near = matches.of_track(table.stamps_ns[rows].tolist(), table.boxes[rows])
+        objects = Counter(one for one, _, _ in near if one)
+        if objects.total() < len(rows) / 2:
+            found['ghost'] += 1
+            continue
+        main = {one for one, count in objects.items() if count > len(rows) / 4}
+        found['swapped'] += len(main) > 1
+        for one in main & matches.judged:
+            owners.setdefault(one, set()).add(name)
+        found['wrong'] += sum(one in matches.judged and iou < RIGHT for one, iou, _ in near)
+    names = {name for name in owners if len(owners[name]) > 1}
+    found['broken'] = len([n for n in names if all(_is_pure(table, tracks[t], matches)
+                                                   for t in owners[n])])  # fmt: skip
+    found['missing'] = len(matches.judged - owners.keys())
+    return dict(found)
+
+
+def _is_pure(table: BoxTable, rows: Sequence[int], matches: Matches) -> bool:
+    near = matches.of_track(table.stamps_ns[rows].tolist(), table.boxes[rows])
+    objects = Counter(one for one, _, _ in near if one)
+    return sum(count > len(rows) / 4 for count in objects.values()) == 1
+
+
+class Labeller:
+    """
+    A person at the page, who sees what is wrong and acts by mouse and keys.
+
+    Attributes
+    ----------
+    actions : Counter
+        Keys, clicks and drags.
+    decided : Counter
+        Decisions by the kind of error.
+
+    """
+
+    def __init__(self, page: Any, truth: BoxTable) -> None:
+        self._page = page
+        self._matches = Matches(truth)
+        self._truth = truth
+        self.actions: Counter[str] = Counter()
+        self.decided: Counter[str] = Counter()
+
+    @property
+    def seconds(self) -> float:
+        """Return the time that a person needs [s]."""
+        acting = sum(SECONDS[kind] * count for kind, count in self.actions.items())
+        return acting + THINKING * self.decided.total()
+
+    def key(self, name: str) -> None:
+        """Press a key."""
+        self.actions['key'] += 1
+        self._page.keyboard.press(name)
+
+    def click(self, selector: str) -> None:
+        """Click an element."""
+        self.actions['click'] += 1
+        self._page.click(selector)
+
+    def click_slider(self, selector: str, row: int, last: int) -> None:
+        """Click a slider at one of its rows."""
+        self.actions['click'] += 1
+        bounds = self._page.locator(selector).bounding_box()
+        x = bounds['x'] + 8 + (bounds['width'] - 16) * row / max(1, last)
+        self._page.mouse.click(x, bounds['y'] + bounds['height'] / 2)
+
+    def review(self) -> None:
+        """Look at every track, then at what is broken, then at what is missing."""
+        self.click('#tab-tracks')
+        self._page.wait_for_function('view.part')
+        seen: set[str] = set()
+        while True:
+            name = self._page.evaluate('current().id')
+            if name in seen:
+                break
+            seen.add(name)
+            self._look()
+        self._join()
+        self._add()
+        self.key('Control+s')
+        self._page.wait_for_function("$('notice').textContent.includes('boxes in')",
+                                     timeout=600_000)  # fmt: skip
+
+    def _look(self) -> None:
+        """Decide about the open track, and go on with the next one."""
+        near = self._near()
+        objects = [one for one, _, _ in near]
+        if sum(not one for one in objects) > len(near) / 2:
+            self._decide('ghost', 'key:d', 'isGone(current())')
+            return self._next()
+        half = len(near) // 2
+        first, last = (Counter(filter(None, part)).most_common(1)
+                       for part in (objects[:half], objects[half:]))  # fmt: skip
+        if first and last and first[0][0] != last[0][0]:
+            row = next(k for k in range(len(near)) if objects[k] == last[0][0])
+            self._go(row)
+            count = self._page.evaluate('TRACKS.length')
+            self._decide('swapped', 'key:s', f'TRACKS.length === {count + 1}')
+            self._page.wait_for_timeout(300)
+            return None  # the new track is open
+        self._correct()
+        return self._next()
+
+    def _next(self) -> None:
+        """Accept and go on, unless the track was deleted."""
+        name = self._page.evaluate('current().id')
+        if self._page.evaluate('isGone(current())'):
+            self.key('ArrowDown')
+        else:
+            self.decided['right'] += 1
+            self.key('Enter')
+        with_next = f"current().id !== {name!r} || $('notice').textContent.includes('All tracks')"
+        self._page.wait_for_function(with_next)
+        self._page.wait_for_timeout(50)
+
+    def _correct(self) -> None:
+        """Correct boxes of the open track until all that are judged are right."""
+        for _ in range(RUN):
+            near = self._near(with_solved=True)
+            wrong = [k for k, (one, iou, _) in enumerate(near)
+                     if one in self._matches.judged and iou < RIGHT]  # fmt: skip
+            if not wrong:
+                return
+            row = wrong[len(wrong) // 2]
+            self._go(row)
+            self.decided['wrong'] += 1
+            self.key('e')
+            self._drag_to(near[row][2])
+            self.key('Enter')
+            self._page.wait_for_function('!view.edit && pinOf(view.row)')
+            if self._page.evaluate('DATA.tracks[boxAt(view.row)[0]].added'):
+                self._page.wait_for_timeout(500)
+                continue
+            self.key('o')
+            self._page.wait_for_function('view.solved', timeout=120_000)
+
+    def _drag_to(self, target: Floats) -> None:
+        """Drag the box, and the stroke at its front, to a true box."""
+        for _ in range(2):
+            off, turn, length, zoom, center, size = self._page.evaluate(
+                """target => {
+                  const box = moved(target, view.part.origin, -1), c = $('top');
+                  const here = toFrame(view.edit, view.frame, view.R);
+                  const there = toFrame(box, view.frame, view.R);
+                  const by = box[8] - view.edit[8], turn = Math.atan2(Math.sin(by), Math.cos(by));
+                  const size = [c.clientWidth, c.clientHeight];
+                  return [[here, there], turn, view.edit[3], c.zoom, view.center, size];
+                }""",
+                target.tolist(),
+            )
+            if abs(turn) > 0.1:
+                heading = self._page.evaluate('view.edit[8] - view.frame[8]')
+                reach = 0.58 * length
+                places = [np.array(off[0][:2]) + reach * np.array([np.cos(a), np.sin(a)])
+                          for a in (heading, heading + turn)]  # fmt: skip
+                self._drag(places, zoom, center, size)
+                continue
+            self._drag([np.array(one[:2]) for one in off], zoom, center, size)
+            return
+
+    def _drag(self, places: Sequence[Floats], zoom: float, center: Sequence[float],
+              size: Sequence[float]) -> None:  # fmt: skip
+        """Drag in the top view, zoomed out as far as both places need it."""
+        self.actions['drag'] += 1
+        bounds = self._page.locator('#top').bounding_box()
+        points = []
+        for place in places:
+            x = size[0] / 2 + zoom * (place[0] - center[0])
+            y = size[1] / 2 - zoom * (place[1] - center[1])
+            points.append((bounds['x'] + x, bounds['y'] + y))
+        self._page.mouse.move(*points[0])
+        self._page.mouse.down()
+        self._page.mouse.move(*points[1], steps=4)
+        self._page.mouse.up()
+        self._page.wait_for_timeout(50)
+
+    def _join(self) -> None:
+        """Join the tracks of one object."""
+        for name in self._matches.judged:
+            pieces = [one for one, near in self._all().items() if near == name]
+            while len(pieces) > 1:
+                self._open(pieces[0])
+                self.decided['joined'] += 1
+                self.key('j')
+                self._page.wait_for_selector('#ask[open]')
+                shown = self._page.locator('#ask-proposals button').all_inner_texts()
+                place = next((k for k, text in enumerate(shown) if text.split()[0] in pieces), -1)
+                if place == 0:
+                    self.key('Enter')
+                elif place > 0:
+                    self.click(f'#ask-proposals button:nth-child({place + 1})')
+                else:
+                    self.click('#ask-text')
+                    self._page.fill('#ask-text', pieces[1])
+                    self.actions['key'] += len(pieces[1])
+                    self.key('Enter')
+                count = len(self._all())
+                self._page.wait_for_function(f'TRACKS.length < {count}')
+                pieces = [one for one, near in self._all().items() if near == name]
+
+    def _add(self) -> None:
+        """Add the objects that have no box."""
+        missing = sorted(self._matches.judged - set(self._all().values()))
+        names = np.array(self._truth.track_ids)
+        for name in missing:
+            rows = np.flatnonzero(names == name)
+            row = rows[int(self._truth.num_points[rows].argmax())]
+            stamp, box = str(self._truth.stamps_ns[row]), self._truth.boxes[row]
+            self.decided['missing'] += 1
+            self.click('#tab-drive')
+            stamps = self._page.evaluate('DATA.stamps')
+            at, last = stamps.index(stamp), len(stamps) - 1
+            self._page.wait_for_function('scene.sweep', timeout=120_000)
+            self.click_slider('#scene-time', at, last)
+            self._page.wait_for_timeout(500)
+            self.key('i')
+            place = self._page.evaluate(
+                """box => {
+                  const { points, origin } = scene.sweep, R = rotation(box);
+                  const own = [];
+                  for (let i = 0; i < points.length; i += 3) {
+                    const point = [0, 1, 2].map(k => points[i + k] + origin[k]);
+                    const at = toFrame(point, box, R);
+                    const isInside = at.every((v, k) => Math.abs(v) < box[3 + k] / 2);
+                    if (isInside && at[2] > -box[5] / 5) own.push(point);
+                  }
+                  const [x, y] = sceneAxes().to(own[own.length >> 1] ?? box);
+                  const bounds = $('scene-view').getBoundingClientRect();
+                  return [bounds.left + x, bounds.top + y];
+                }""",
+                box.tolist(),
+            )
+            self.actions['click'] += 1
+            self._page.mouse.click(*place)
+            self._page.wait_for_function('scene.fit', timeout=60_000)
+            wanted = self._truth.class_names[row]
+            if self._page.evaluate('scene.fit.class') != wanted:
+                self.actions['click'] += 2
+                self._page.select_option('#scene-class', wanted)
+                self._page.wait_for_function(f'scene.fit?.class === {wanted!r}')
+                self._page.locator('#scene-view').focus()
+            count = self._page.evaluate('TRACKS.length')
+            self.key('Enter')
+            self._page.wait_for_function(
+                f"TRACKS.length > {count} && !$('tracks').hidden && view.part && "
+                'view.open === TRACKS.at(-1)',
+                timeout=120_000,
+            )
+            self._correct()
+
+    def _open(self, name: str) -> None:
+        self.actions['click'] += 1  # on its line
+        self._page.evaluate(f'openTrack(TRACKS.findIndex(t => t.id === {name!r}))')
+        self._page.wait_for_function(f'view.part && current().id === {name!r}')
+
+    def _go(self, row: int) -> None:
+        """Go to a box of the open track by the slider."""
+        last = self._page.evaluate('view.part.stamps.length - 1')
+        self.click_slider('#time', row, last)
+        while self._page.evaluate('view.row') != row:
+            self.key('ArrowRight' if self._page.evaluate('view.row') < row else 'ArrowLeft')
+
+    def _near(self, with_solved: bool = False) -> list[tuple[str, float, Floats]]:
+        """Return what a person sees of the open track: its objects, and how well boxes fit."""
+        stamps, boxes = self._page.evaluate(
+            """isSolved => [view.part.stamps, view.part.usable.map((box, k) => {
+              const pin = pinOf(k);
+              const solved = isSolved ? view.solved?.get(view.part.stamps[k]) : null;
+              return pin?.box ?? solved ?? moved(box, view.part.origin, 1);
+            })]""",
+            with_solved,
+        )
+        return self._matches.of_track(map(int, stamps), np.array(boxes))
+
+    def _all(self) -> dict[str, str]:
+        """Return the object of each track that is not deleted."""
+        found = self._page.evaluate(
+            """(async () => {
+              const tracks = [];
+              for (const track of TRACKS.filter(one => !isGone(one))) {
+                const part = await loadTrack(track), n = part.usable.length;
+                const rows = [n >> 2, n >> 1, (3 * n) >> 2];
+                const boxes = rows.map(r => moved(part.usable[r], part.origin, 1));
+                tracks.push([track.id, rows.map(r => part.stamps[r]), boxes]);
+              }
+              return tracks; })()"""
+        )
+        objects = {}
+        for name, stamps, boxes in found:
+            near = self._matches.of_track(map(int, stamps), np.array(boxes))
+            objects[name] = Counter(one for one, _, _ in near).most_common(1)[0][0]
+        return objects
+
+    def _decide(self, kind: str, action: str, until: str) -> None:
+        self.decided[kind] += 1
+        self.key(action.removeprefix('key:'))
+        self._page.wait_for_function(until)
+
+
+def reviewed(out: Path, truth: BoxTable) -> Labeller:
+    """Review a result until it is right, write the labels, and return who did it."""
+    server = review_server(out, 0, 'script', drive_of(out))
+    Thread(target=server.serve_forever, daemon=True).start()
+    with opened_page(server.address, expected='409') as page:
+        labeller = Labeller(page, truth)
+        labeller.review()
+    server.shutdown()
+    return labeller

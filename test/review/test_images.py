@@ -1,0 +1,179 @@
+"""Camera images in the page of `boxreg review`, read from real recordings, in a real browser."""
+
+from io import BytesIO
+from threading import Thread
+
+from boxreg_ros.cli import main
+from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.offline.reviewed_drive import drive_of
+from boxreg_ros.review.server import review_server
+from browser import NEEDS_BROWSER, opened_page
+import numpy as np
+import pytest
+from ros_messages import Drive
+
+pytest.importorskip('plotly')
+Picture = pytest.importorskip('PIL.Image')
+QUICK = ['--set', 'solver.rounds=2', '--set', 'sampling.points=64']
+WIDTH, HEIGHT, FOCAL = 320, 240, 150.0
+MOUNT = np.array([0.5, 0.0, 1.5])
+FORWARD = (-0.5, 0.5, -0.5, 0.5)
+"""Axes of a camera that looks ahead: x right, y down, z forward."""
+BACKWARD = (0.5, 0.5, -0.5, -0.5)
+LATE = 30_000_000
+IMAGE = 'sensor_msgs/msg/Image'
+COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+INFO = 'sensor_msgs/msg/CameraInfo'
+
+
+def picture(level):
+    """Return an image of one grey level."""
+    return np.full((HEIGHT, WIDTH, 3), level, np.uint8)
+
+
+def as_file(pixels, kind):
+    file = BytesIO()
+    Picture.fromarray(pixels).save(file, kind)
+    return np.frombuffer(file.getvalue(), np.uint8)
+
+
+def info(messages, stamp, frame_id, distortion=()):
+    matrix = [FOCAL, 0, WIDTH / 2, 0, FOCAL, HEIGHT / 2, 0, 0, 1]
+    names = ('d', 'k', 'r', 'p')
+    values = (distortion, matrix, np.eye(3).ravel(), [*matrix[:3], 0, *matrix[3:6], 0, 0, 0, 1, 0])
+    if messages.ros1:
+        names = tuple(name.upper() for name in names)
+    return messages.build(
+        INFO, header=messages.header(stamp, frame_id), height=HEIGHT, width=WIDTH,
+        distortion_model='plumb_bob',
+        **{n: np.array(v, np.float64) for n, v in zip(names, values, strict=True)},
+    )  # fmt: skip
+
+
+def with_cameras(drive):
+    """Add a camera ahead, 30 ms after each other sweep, and one that looks back, as raw images."""
+    m = drive.messages
+    start = drive.stamps[0]
+    for frame_id, turn in (('ahead', FORWARD), ('back', BACKWARD)):
+        pose = m.tf(m.transform(start, 'base', frame_id, MOUNT, turn))
+        drive.items.append(('/tf_static', start, pose))
+    for k, stamp in enumerate(drive.stamps):
+        if k % 2 == 0:
+            at = stamp + LATE
+            message = m.build(
+                COMPRESSED, header=m.header(at, 'ahead'), format='jpeg',
+                data=as_file(picture(10 * k), 'JPEG'),
+            )  # fmt: skip
+            drive.items.append(('/front/image_raw/compressed', at, message))
+            drive.items.append(('/front/camera_info', at, info(m, at, 'ahead', [-0.1, 0, 0, 0])))
+        message = m.build(
+            IMAGE, header=m.header(stamp, 'back'), height=HEIGHT, width=WIDTH, encoding='bgr8',
+            step=3 * WIDTH, data=(picture(200) * [1, 0, 0]).astype(np.uint8).ravel(),
+        )  # fmt: skip
+        drive.items.append(('/rear/image_rect', stamp, message))
+        drive.items.append(('/rear/camera_info', stamp, info(m, stamp, 'back')))
+    drive.items.sort(key=lambda item: item[1])
+    return drive
+
+
+def pixel_ahead(place, stamp, drive):
+    """Return the pixel of a place in the image at a stamp, by the model of the lens."""
+    sweep = (stamp - drive.stamps[0]) / 1e8
+    x, y, z = place - MOUNT - [0.5 * sweep, 0, 0]
+    u, v = -y / x, -z / x
+    bend = 1 - 0.1 * (u * u + v * v)
+    return np.array([FOCAL * u * bend + WIDTH / 2, FOCAL * v * bend + HEIGHT / 2])
+
+
+@NEEDS_BROWSER
+def test_boxes_are_shown_in_the_nearest_image_of_the_best_camera(tmp_path):
+    drive = with_cameras(Drive())
+    out = tmp_path / 'out'
+    recording = drive.write(tmp_path / 'drive')
+    assert main(['relabel', str(recording), '-o', str(out), '--report', *QUICK]) == 0
+    assert b'image/jpeg' not in (out / 'report.html').read_bytes()
+    server = review_server(out, 0, 'anna', drive_of(out))
+    Thread(target=server.serve_forever, daemon=True).start()
+    with opened_page(server.address + '#track=1') as page:
+        for row, image in ((0, 0), (1, 0), (2, 2), (4, 4)):  # 70 ms are nearer than 130
+            page.evaluate(f'step({row})')
+            page.wait_for_function(f"cameras.shown === '1 ' + view.part.stamps[{row}]")
+            stamp = drive.stamps[image] + LATE
+            late = round((stamp - drive.stamps[row]) * 1e-6)
+            assert f'/front/image_raw/compressed · {late:+d} ms' in page.inner_text('#camera-text')
+            # The lower left of the image, away from the box, has its grey level.
+            shown = page.evaluate("""(() => {
+              const c = $('camera-view'), [x, y] = c.at([20, 225]);
+              return [...c.getContext('2d').getImageData(x, y, 1, 1).data]; })()""")
+            if shown[3]:
+                assert shown[0] == pytest.approx(10 * image, abs=3)
+            found = page.evaluate(f"""(async () => {{
+              const stamp = view.part.stamps[{row}], camera = (await camerasAt(stamp))[0];
+              const {{ pose }} = await imageAt(0, stamp);
+              const box = boxAtTime(view.part, {row}, '{stamp}');
+              return [box.slice(0, 3), pixelOf(camera, inCamera(pose, box))]; }})()""")
+            assert found[1] == pytest.approx(pixel_ahead(found[0], stamp, drive), abs=0.5)
+            truth = pixel_ahead(drive.truth[drive.stamps[0]][0][:3], stamp, drive)
+            assert found[1] == pytest.approx(truth, abs=4)
+        # The box is drawn there: its colour is along the outline.
+        count = page.evaluate("""(() => {
+          const c = $('camera-view'), hex = colour('refined').match(/[0-9a-f]{2}/g);
+          const { data } = c.getContext('2d').getImageData(0, 0, c.width, c.height);
+          const isNear = i => hex.every((v, k) => Math.abs(data[i + k] - parseInt(v, 16)) < 40);
+          let n = 0;
+          for (let i = 0; i < data.length; i += 4) n += isNear(i);
+          return n; })()""")
+        assert count > 100
+        page.select_option('#camera-choice', '1')
+        page.wait_for_function("$('camera-text').textContent.includes('/rear/image_rect')")
+        assert 'not in this image' in page.inner_text('#camera-text')
+        page.click('#tab-drive')
+        page.wait_for_function("document.querySelectorAll('#drive-cameras canvas').length === 2")
+        page.wait_for_function("Boolean(document.querySelectorAll('#drive-cameras canvas')[1].at)")
+        shown = page.evaluate("""(() => {
+          const c = document.querySelectorAll('#drive-cameras canvas')[1], [x, y] = c.at([9, 9]);
+          return [...c.getContext('2d').getImageData(x, y, 1, 1).data]; })()""")
+        assert np.abs(np.subtract(shown, [0, 0, 200, 255])).max() < 6  # bgr8
+    server.shutdown()
+
+
+@pytest.mark.parametrize('ros1', [False, True])
+def test_images_are_read_with_the_model_beside_them(tmp_path, ros1):
+    drive = with_cameras(Drive(ros1=ros1, boxes='markers'))
+    m = drive.messages
+    start = drive.stamps[0]
+    grey = (np.arange(WIDTH * HEIGHT) // 2).astype('<u2')
+    odd = [
+        ('/a/mono16', m.build(IMAGE, header=m.header(start, 'a'), height=HEIGHT, width=WIDTH,
+                              encoding='mono16', step=2 * WIDTH, data=grey.view(np.uint8))),
+        ('/a/short', m.build(IMAGE, header=m.header(start, 'a'), height=HEIGHT, width=WIDTH,
+                             encoding='mono8', step=WIDTH, data=np.zeros(9, np.uint8))),
+        ('/a/other', m.build(IMAGE, header=m.header(start, 'a'), height=1, width=1,
+                             encoding='64FC3', step=24, data=np.zeros(24, np.uint8))),
+        ('/a/video', m.build(COMPRESSED, header=m.header(start, 'a'), format='h264',
+                             data=np.zeros(9, np.uint8))),
+    ]  # fmt: skip
+    drive.items += [(topic, start, message) for topic, message in odd]
+    drive.items.sort(key=lambda item: item[1])
+    with Recording([drive.write(tmp_path / 'drive', 'bag' if ros1 else 'mcap')]) as recording:
+        images = recording.images()
+        by_topic = {camera.topic: camera for camera in images.cameras}
+        front, rear = by_topic['/front/image_raw/compressed'], by_topic['/rear/image_rect']
+        assert (front.frame_id, front.size, front.model) == ('ahead', (WIDTH, HEIGHT), 'plumb_bob')
+        assert front.distortion.tolist() == [-0.1, 0, 0, 0]
+        assert not len(rear.distortion)  # rectified
+        assert rear.matrix[:, :3].ravel()[:3].tolist() == [FOCAL, 0, WIDTH / 2]
+        assert by_topic['/a/mono16'].matrix is None
+        found = images.nearest(front, drive.stamps[3])
+        assert (found.stamp_ns, found.media_type) == (drive.stamps[2] + LATE, 'image/jpeg')
+        with Picture.open(BytesIO(found.content)) as shown:
+            assert np.abs(np.asarray(shown).astype(int) - 20).max() < 4
+        found = images.nearest(by_topic['/a/mono16'], start)
+        with Picture.open(BytesIO(found.content)) as shown:
+            assert np.asarray(shown).astype(int)[-1, -1] > 245
+        for topic, text in (('/a/short', '9 bytes'), ('/a/other', '64FC3'), ('/a/video', 'h264')):
+            with pytest.raises(UnsupportedMessage, match=text):
+                images.nearest(by_topic[topic], start)
+        with pytest.raises(RecordingError, match='expected an image within'):
+            images.nearest(front, start + 10**10)

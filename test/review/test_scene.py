@@ -1,0 +1,273 @@
+"""The scene of `boxreg review`: whole clouds, and objects that a person adds."""
+
+from dataclasses import replace
+import math
+from threading import Thread
+
+from boxreg_ros.cli import main
+from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.labels import frames_of
+from boxreg_ros.offline.reviewed_drive import drive_of
+from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
+from boxreg_ros.review.fit import fitted
+from boxreg_ros.review.server import review_server
+from boxreg_ros.structures import BoxArray
+from browser import NEEDS_BROWSER, opened_page
+import numpy as np
+import pytest
+from ros_messages import Drive
+
+pytest.importorskip('plotly')
+QUICK = ['--set', 'solver.rounds=2', '--set', 'sampling.points=64']
+FORMATS = ['--formats', 'openlabel,sustechpoints']
+NUM_SWEEPS = 14
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """Return a drive whose moving car, track 2, the detector has missed."""
+    found = Drive(sweeps=NUM_SWEEPS)
+    for topic, _, message in found.items:
+        if topic == '/boxes':
+            message.detections = message.detections[:1]
+    return found
+
+
+@pytest.fixture
+def out(drive, tmp_path):
+    recording = drive.write(tmp_path / 'drive')
+    folder = tmp_path / 'out'
+    command = ['relabel', str(recording), '-o', str(folder), '--report', *FORMATS, *QUICK]
+    assert main(command) == 0
+    return folder
+
+
+@pytest.fixture
+def serve():
+    """Return a function that serves a result with its recording, and returns the server."""
+    running = []
+
+    def begin(folder):
+        found = review_server(folder, 0, 'anna', drive_of(folder))
+        Thread(target=found.serve_forever, daemon=True).start()
+        running.append(found)
+        return found
+
+    yield begin
+    for one in running:
+        one.shutdown()
+
+
+def open_scene(page, at):
+    page.click('#tab-drive')
+    page.evaluate(f'showScene({at})')
+    page.wait_for_function(f'scene.sweep?.stamp === DATA.stamps[{at}]', timeout=60_000)
+
+
+def click_at(page, x, y):
+    left, top = page.evaluate(f"""(() => {{
+      const [x, y] = sceneAxes().to([{x}, {y}]), bounds = $('scene-view').getBoundingClientRect();
+      return [bounds.left + x, bounds.top + y]; }})()""")
+    page.mouse.click(left, top)
+
+
+def add_car(page, drive):
+    """Add the missed car by a key, a click on its rear, and a key."""
+    open_scene(page, 7)
+    (x, y, *_), length = drive.truth[drive.stamps[7]][1], drive.truth[drive.stamps[7]][1][3]
+    page.keyboard.press('i')
+    click_at(page, x - length / 2, y)
+    page.wait_for_function('scene.fit', timeout=60_000)
+    page.select_option('#scene-class', 'car')
+    page.wait_for_function("scene.fit.class === 'car'")
+    page.locator('#scene-view').focus()
+    page.keyboard.press('Enter')
+    page.wait_for_function("!$('tracks').hidden && current()?.id === '2'", timeout=60_000)
+
+
+def stamps_of(table, track_id):
+    rows = zip(table.stamps_ns, table.track_ids, strict=True)
+    return [int(stamp) for stamp, name in rows if name == track_id]
+
+
+def ious_with_truth(table, drive, track_id):
+    truth, boxes = [], []
+    for name, stamp, box in zip(table.track_ids, table.stamps_ns, table.boxes, strict=True):
+        if name == track_id:
+            truth.append(drive.truth[int(stamp)][1])
+            boxes.append(box)
+    return iou_3d(np.array(boxes), np.array(truth))
+
+
+@NEEDS_BROWSER
+def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serve):
+    server = serve(out)
+    with opened_page(server.address) as page:
+        add_car(page, drive)
+        assert page.evaluate('view.part.stamps.length') == NUM_SWEEPS
+        assert 'end of the recording' in page.inner_text('#title')
+        (seed,) = read_decisions(out / DECISIONS)
+        assert (seed.kind, seed.track_id, seed.value, seed.who) == ('add', '2', 'car', 'anna')
+        assert seed.stamp_ns == drive.stamps[7]
+        # Undone, and added again.
+        page.keyboard.press('z')
+        page.wait_for_function('TRACKS.length === 1')
+        assert read_decisions(out / DECISIONS)[-1].kind == 'withdraw'
+        add_car(page, drive)
+        # A correction is a second box that it is followed from.
+        page.keyboard.press('Home')
+        page.keyboard.press('e')
+        page.keyboard.press('Shift+ArrowRight')
+        page.keyboard.press('Enter')
+        page.wait_for_function("view.part.status.filter(one => one === 'human').length === 2")
+        assert page.evaluate('view.row') == 0
+        page.evaluate('step(5)')
+        page.keyboard.press('Shift+D')
+        page.wait_for_function('current().deleted === 1')
+        page.keyboard.press('k')
+        page.fill('#ask-text', 'van')
+        page.keyboard.press('Enter')
+        page.wait_for_function("current().class === 'van'")
+        page.keyboard.press('r')
+        assert 'no input to keep' in page.inner_text('#failure')
+        # The page opened again follows it again.
+        page.reload()
+        page.wait_for_selector('html[data-ready]', timeout=60_000)
+        assert page.evaluate('TRACKS.map(track => [track.id, track.class])') == [
+            ['1', 'car'],
+            ['2', 'van'],
+        ]
+        page.keyboard.press('Control+s')
+        page.wait_for_function("$('notice').textContent.includes('boxes in')", timeout=120_000)
+    again = out.with_name('out.corrected')
+    table = BoxTable.read(again / 'boxes.csv')
+    rows = [row for row, name in enumerate(table.track_ids) if name == '2']
+    stamps = stamps_of(table, '2')
+    assert stamps == [stamp for stamp in drive.stamps if stamp != drive.stamps[5]]
+    kinds = [table.status[row] for row in rows]
+    assert [stamps[k] for k, kind in enumerate(kinds) if kind == 'human'] == [
+        drive.stamps[0],
+        drive.stamps[7],
+    ]
+    assert set(kinds) == {'human', 'interpolated', 'extended'}
+    assert {table.class_names[row] for row in rows} == {'van'}
+    assert np.median(ious_with_truth(table, drive, '2')) > 0.7
+    frames = [frame.refined.boxes for frame in frames_of('openlabel', again / 'openlabel')]
+    assert [boxes.stamp_ns for boxes in frames if '2' in boxes.track_ids] == stamps
+    texts = [path.read_text() for path in sorted((again / 'sustechpoints').rglob('label/*.json'))]
+    assert [text.count('"van"') for text in texts] == [int(row != 5) for row in range(NUM_SWEEPS)]
+    # The review goes on in the new folder: the object is there once, and can be corrected.
+    with opened_page(serve(again).address + '#track=2') as page:
+        assert sorted(page.evaluate('TRACKS.map(track => track.id)')) == ['1', '2']
+        page.evaluate('step(11)')
+        page.keyboard.press('e')
+        page.keyboard.press('PageUp')
+        page.keyboard.press('Enter')
+        page.wait_for_function("view.part.status.filter(one => one === 'human').length === 3")
+    assert read_decisions(again / DECISIONS)[-1].kind == 'add'
+
+
+@NEEDS_BROWSER
+def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, out, serve):
+    with opened_page(serve(out).address) as page:
+        open_scene(page, 3)
+        # All points of the sweep: those of both cars, one of which has no box.
+        assert page.evaluate('[scene.sweep.points.length, scene.boxes.length]') == [720, 1]
+        page.keyboard.press(' ')
+        page.wait_for_function(f'scene.at === {NUM_SWEEPS - 1} && !scene.isPlaying')
+        page.keyboard.press('Home')
+        page.wait_for_function('scene.at === 0 && scene.sweep.stamp === DATA.stamps[0]')
+        box = drive.truth[drive.stamps[0]][0]
+        click_at(page, box[0], box[1])
+        page.wait_for_function("!$('tracks').hidden && view.cloud")
+        assert page.evaluate('[current().id, view.row, view.far.length]') == ['1', 0, 240]
+        # All sweeps of the parked car, from whole clouds, on its sides.
+        page.select_option('#mode', 'after')
+        page.wait_for_function('view.accumulated?.points')
+        points = np.array(page.evaluate('view.local'))
+        assert len(points) > 0.5 * 120 * NUM_SWEEPS
+        half = np.array(page.evaluate('view.frame.slice(3, 6)')) / 2
+        assert np.median(np.abs(np.abs(points) - half)[:, :2].min(1)) < 0.1
+    # The run proposes the car that has no box: two keys add it.
+    stamp = drive.stamps[6]
+    columns = ('2',), ('van',), np.ones(1), drive.truth[stamp][1][None]
+    BoxTable.from_arrays([BoxArray(stamp, 'odom', *columns)]).write(out / 'proposals.csv')
+    with opened_page(serve(out).address) as page:
+        open_scene(page, 0)
+        assert page.inner_text('#scene-proposals option') == '1 proposed'
+        page.locator('#scene-view').focus()
+        page.keyboard.press('p')
+        page.wait_for_function('scene.fit')
+        page.keyboard.press('Enter')
+        page.wait_for_function("!$('tracks').hidden && current()?.class === 'van'", timeout=60_000)
+        assert page.evaluate('[view.row, openProposals().length]') == [6, 0]
+    (out / DECISIONS).unlink()
+    narrow = {'viewport': {'width': 390, 'height': 844}, 'color_scheme': 'dark'}
+    with opened_page(serve(out).address, **narrow) as page:
+        open_scene(page, 2)
+        assert page.evaluate('document.documentElement.scrollWidth - innerWidth') <= 0
+        assert page.locator('#scene-view').bounding_box()['height'] > 300
+    recording = out.with_name('drive')
+    recording.rename(out.with_name('moved'))
+    with opened_page(serve(out).address, expected='400') as page:
+        page.click('#tab-drive')
+        page.wait_for_selector('#failure:not([hidden])')
+        assert 'cannot be shown' in page.inner_text('#failure')
+        page.click('#tab-tracks')
+        page.keyboard.press('a')
+        page.wait_for_function('log.count === 1')
+
+
+def test_a_run_follows_added_objects_beside_its_other_steps(drive, tmp_path, capsys):
+    recording = drive.write(tmp_path / 'drive')
+    stamp, box = drive.stamps[4], drive.truth[drive.stamps[4]][1]
+    added = Decision('new', stamp, 'add', frame_id='odom', box=box, value='car', who='anna')
+    late = Decision('late', stamp + 10**12, 'add', frame_id='odom', box=box, value='car')
+    gone = Decision('new', drive.stamps[9], 'delete', end_ns=drive.stamps[11])
+    joined = Decision('new', drive.stamps[12], 'rename', end_ns=drive.stamps[13], value='end')
+    path = tmp_path / DECISIONS
+    DecisionLog(path).append([added, late, gone, joined])
+    command = ['relabel', str(recording), *QUICK, '--decisions', str(path), '-o']
+    for name, more in (('plain', []), ('complete', ['--complete'])):
+        out = tmp_path / name
+        assert main([*command, str(out), *more]) == 0
+        assert "'late' at " in capsys.readouterr().err  # said, and not used
+        table = BoxTable.read(out / 'boxes.csv')
+        assert stamps_of(table, '1') == drive.stamps
+        assert stamps_of(table, 'new') == drive.stamps[:9]
+        assert stamps_of(table, 'end') == drive.stamps[12:]
+        (row,) = np.flatnonzero((table.stamps_ns == stamp) & (np.array(table.track_ids) == 'new'))
+        assert table.status[row] == 'human'
+        np.testing.assert_allclose(table.boxes[row], box, atol=1e-6)
+        assert np.median(ious_with_truth(table, drive, 'new')) > 0.8
+    other = tmp_path / 'other.csv'
+    DecisionLog(other).append([replace(added, frame_id='map')])
+    assert main([*command[:-3], '--decisions', str(other), '-o', str(tmp_path / 'other')]) == 1
+    assert "expected frame 'odom', got 'map'" in capsys.readouterr().err
+
+
+def test_a_box_is_fitted_to_the_points_at_a_place():
+    rng = np.random.default_rng(3)
+    road = np.column_stack([rng.uniform(-15, 25, (4000, 2)), rng.normal(0, 0.02, 4000)])
+    yaw, center, size = math.radians(20), np.array([12.0, 4.0]), np.array([4.4, 1.8, 1.5])
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    local = rng.uniform(-0.5, 0.5, (600, 2)) * size[:2]
+    local[:400, 1] = -size[1] / 2  # the side and the rear are seen from the origin
+    local[400:, 0] = -size[0] / 2
+    car = np.column_stack([local @ turn.T + center, rng.uniform(0.2, 1.5, 600)])
+    post = np.column_stack([rng.normal([12, 8], 0.05, (50, 2)), rng.uniform(0.3, 2, 50)])
+    points = np.concatenate([road, car, post])
+    sizes = {'car': size, 'bus': np.array([12.0, 2.6, 3.2])}
+    sensor = np.zeros(2)
+    found = fitted(points, car[0, :2], sensor, 0.0, sizes)
+    assert found.class_name == 'car'
+    assert found.num_points > 550  # not the road below it, nor the post
+    truth = np.array([*center, 0.75, *size, 0, 0, yaw])
+    assert iou_3d(found.box[None], truth[None])[0] > 0.85
+    # By the heading of the sensor it is the other way round.
+    turned = fitted(points, car[0, :2], sensor, math.pi, sizes).box[8]
+    assert abs(math.cos(turned - yaw) + 1) < 0.01
+    with pytest.raises(RecordingError, match='expected points of an object'):
+        fitted(points, np.array([20.0, -10.0]), sensor, 0.0, sizes)
