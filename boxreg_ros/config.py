@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
+from math import isnan, nan
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -58,7 +59,7 @@ class Setting(NamedTuple):
     low, high : float or None
         Bounds, both included.
     choices : tuple of str
-        Allowed values; empty for any.
+        Allowed words; empty for any. With bounds, a number within them is allowed as well.
 
     """
 
@@ -69,6 +70,28 @@ class Setting(NamedTuple):
     low: float | None = None
     high: float | None = None
     choices: tuple[str, ...] = ()
+
+    @property
+    def bounds(self) -> str:
+        """Return what is allowed, as users read it; empty for anything."""
+        words = ', '.join(self.choices)
+        if self.low is None or self.high is None:
+            return words
+        numbers = f'{self.low:g} to {self.high:g} {self.unit}'.rstrip()
+        return f'{words}, or {numbers}' if words else numbers
+
+    def check(self, value: Any) -> None:
+        """Raise ConfigError for a value of the right type that is not allowed."""
+        if value in self.choices or not self.bounds:
+            return
+        if self.low is None or self.high is None:
+            raise ConfigError(f'{self.name}: expected one of {self.bounds}, got {value!r}')
+        number = nan
+        with suppress(ValueError):
+            number = float(value)
+        if not self.low <= number <= self.high:
+            got = value if isnan(number) else number
+            raise ConfigError(f'{self.name}: expected {self.bounds}, got {got!r}')
 
 
 def setting(default: Any, *facts: Any, **more: Any) -> Any:
@@ -83,8 +106,12 @@ class SamplingConfig:
     deskew: bool = setting(True, 'motion-compensate points by their own times, where known')
     box_time: str = setting(
         'auto',
-        'time that the input boxes are of: the stamp, when the sweep saw the object (sight), or '
-        'as estimated from fast objects',
+        'latency of the input boxes: how long before their stamp they were right; estimated '
+        'from moving objects (auto), or none, with boxes of the stamp or of when the sweep saw '
+        'the object (sight)',
+        unit='s',
+        low=-1.0,
+        high=2.0,
         choices=('auto', 'stamp', 'sight'),
     )
     margin: float = setting(
@@ -416,7 +443,7 @@ class Config:
                     f'Config.from_dict takes groups as dictionaries'
                 )
         for item, value in self.items():
-            _check(item, _cast(item.name, value, item.default))
+            item.check(_cast(item.name, value, item.default))
         if self.lag >= self.window and self.lag != DEFAULT_LAG:
             raise ConfigError(
                 f'lag: expected less than window ({self.window}), got {self.lag}: a final box '
@@ -580,13 +607,7 @@ def _cast(name: str, value: Any, default: Any) -> Any:
             return tuple(value)
     elif type(value) is type(default):
         return value
+    elif isinstance(default, str) and type(value) in (int, float):
+        return str(value)  # in place of a word; `check` knows which settings take a number
     kind = 'a list such as [car, van]' if isinstance(default, tuple) else type(default).__name__
     raise ConfigError(f'{name}: expected {kind}, got {value!r}')
-
-
-def _check(item: Setting, value: Any) -> None:
-    if item.choices and value not in item.choices:
-        raise ConfigError(f'{item.name}: expected one of {", ".join(item.choices)}, got {value!r}')
-    if item.low is not None and item.high is not None and not item.low <= value <= item.high:
-        bounds = f'{item.low:g} to {item.high:g} {item.unit}'.rstrip()
-        raise ConfigError(f'{item.name}: expected {bounds}, got {value!r}')

@@ -204,6 +204,12 @@ class Reason(StrEnum):
         'its boxes are displaced from their points; the log has the figures',
         'set `pose_reference`, `size_order` or `forward_axis` as the log suggests',
     )
+    LATENCY = (
+        'latency',
+        'message',
+        'its boxes are late, or early, and were moved along their tracks; the log has the figure',
+        'correct their stamps where they are made, or set `sampling.box_time`',
+    )
     LATE = (
         'late',
         'box',

@@ -30,9 +30,7 @@ def parameters() -> str:
     of_kinds: dict[str, tuple[str, ...]] = {}
     for item in settings():
         default = ', '.join(item.default) if isinstance(item.default, tuple) else str(item.default)
-        bounds = ', '.join(item.choices)
-        if item.low is not None:
-            bounds = f'{item.low:g} to {item.high:g}'
+        bounds = item._replace(unit='').bounds
         kind, _, name = item.name.partition('.')
         if kind in KINDS:
             first, *defaults = of_kinds.get(name, (f'.{name}',))[: 1 + KINDS.index(kind)]

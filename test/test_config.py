@@ -107,10 +107,10 @@ def test_unknown_dotted_names_are_refused(name):
         Config().updated({name: 3})
 
 
-@pytest.mark.parametrize('values', [{'window': 10.5}, {'window': True}, {'mode': 3}])
+@pytest.mark.parametrize('values', [{'window': 10.5}, {'window': True}])
 def test_values_of_another_type_are_refused_by_name(values):
     ((name, value),) = values.items()
-    with pytest.raises(ConfigError, match=rf'^{name}: expected (int|str), got {value!r}$'):
+    with pytest.raises(ConfigError, match=rf'^{name}: expected int, got {value!r}$'):
         Config(**values)
 
 

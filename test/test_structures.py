@@ -1,6 +1,7 @@
 """Sweeps and boxes as callers give them: what is converted, and what is refused."""
 
 from boxreg_ros import BoxArray, BoxRegistrar, Config, ShapeError, Sweep
+from boxreg_ros.structures import is_valid_box
 import numpy as np
 import pytest
 
@@ -72,3 +73,15 @@ def test_other_shapes_and_types_are_refused(make, changes, words):
     with pytest.raises(ShapeError) as error:
         make(**changes)
     assert all(word in str(error.value) for word in words)
+
+
+@pytest.mark.parametrize('column', range(9))
+def test_boxes_of_no_object_are_invalid(column):
+    box = np.array([1.0, 2, 3, 4, 2, 1.5, 0.1, 0.2, 0.3])
+    limit = 3e7 if column < 3 else 1e3 if column < 6 else np.inf  # [m], [m], [rad]
+    at, below = limit, np.nextafter(limit, 0)
+    values = [np.nan, at, -at, below, *([0.0] if 3 <= column < 6 else [])]
+    boxes = np.tile(box, (len(values), 1))
+    boxes[:, column] = values
+    assert is_valid_box(boxes).tolist() == [value == below for value in values]
+    assert is_valid_box(box)

@@ -10,6 +10,7 @@ from math import inf
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.latency import LateBoxes, Latency, set_latency
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.lidars import Lidars, MergedSweep, SensorPlacement, SINGLE_LIDAR
@@ -118,6 +119,7 @@ class _Pending:
     has_new_ids: bool
     earlier: dict[str, _Detection]
     """By id, of the tracks that have no box in the message."""
+    is_late: bool
     is_early_out: bool = False
 
 
@@ -197,6 +199,8 @@ class LiveRegistrar:
         self.static_points: StaticPoints | None = None
         if static_patience is not None:
             self.static_points = StaticPoints(static_patience, self._registrar)
+        self._late = LateBoxes()
+        self._latency = Latency()
         self._jumps = JumpConfirmation[ReceivedMessage]()
         self._held: deque[_Pending | _Passing] = deque()  # in order of arrival; first: pending
         self._detections: dict[str, _Detection] = {}  # by track id, while tracks may coast
@@ -243,8 +247,9 @@ class LiveRegistrar:
 
     @property
     def facts(self) -> dict[str, object]:
-        """Return the origin of the ids and the followed objects, for reports."""
-        return self._session.facts | self._following
+        """Return origin of the ids, latency of the boxes and followed objects, for reports."""
+        facts = {**self._session.facts, 'box latency': self._latency.text}
+        return facts | self._following
 
     def confirm(self, item: ReceivedMessage) -> tuple[list[ReceivedMessage], list[Outgoing]]:
         """
@@ -381,11 +386,21 @@ class LiveRegistrar:
             return self._register(self._session.merged(moved, part))
         if moved is not None:
             assert isinstance(moved, BoxArray) and admitted.T_fixed_item is not None
+            moved = self._in_time(moved)
             moved = self._with_ticket(item, content, moved, admitted.T_fixed_item)
         ready = self._outgoing(hand_to_registrar(self._registrar, moved, restarts=False))
         if moved is None:
             ready += self.passed_through(item.message, Reason.NO_TRANSFORM)
         return ready
+
+    def _in_time(self, boxes: BoxArray) -> BoxArray:
+        """Return late boxes as predicted for their stamp."""
+        self._late.add_boxes(boxes)
+        known = set_latency(self.config)
+        self._latency = self._late.kept_up() if known is None else known
+        if self._latency.warning:
+            self._trouble(Reason.LATENCY, self._latency.warning, 1)
+        return self._late.corrected(boxes, self._latency.seconds)
 
     def _note_unknown(self, sweep: Sweep) -> None:
         """Do not let the other LiDARs wait for a frame that TF does not know."""
@@ -397,6 +412,7 @@ class LiveRegistrar:
         ready: list[Outgoing] = []
         for sweep, parts in complete:
             clouds = [part for part in parts if part is not None]
+            self._late.add_sweep(sweep)
             self.tap.add_cloud(sweep, clouds)
             if self.static_points is not None:
                 self.static_points.add_cloud(sweep, clouds)
@@ -474,6 +490,7 @@ class LiveRegistrar:
             self.static_points.reset()
         self._registrar.reset()
         self._session.restart()
+        self._late.restart()
         return ready
 
     def abandon(self, item: ReceivedMessage | None) -> list[Outgoing]:
@@ -495,6 +512,7 @@ class LiveRegistrar:
             self.static_points.reset()
         self._registrar.reset()
         self._session.restart()
+        self._late.restart()
         self._forget_detections()
         held = list(self._held)
         self._held.clear()
@@ -570,7 +588,7 @@ class LiveRegistrar:
         pending = _Pending(
             item.message, replace(given, track_ids=moved.track_ids), item.received,
             T_output_fixed, T_output_item, moved.track_ids != content.track_ids,
-            self._earlier_detections(item.message, moved),
+            self._earlier_detections(item.message, moved), self._latency.seconds != 0,
         )  # fmt: skip
         self._held.append(pending)
         self.tap.expect(pending, moved, T_fixed_item)
@@ -631,7 +649,7 @@ class LiveRegistrar:
         T_output_item = pending.T_output_item
         is_changed = REFINED in refined.status or COASTED in refined.status
         # Copying a message takes time; under load most boxes are kept.
-        if is_changed or T_output_item is not None or pending.has_new_ids:
+        if is_changed or T_output_item is not None or pending.has_new_ids or pending.is_late:
             covariances = covariances_to_write(moved)
             message = self.adapter.to_msg(message, moved.boxes, covariances, T_output_item)
         return Outgoing(message, refined.is_final, pending.given, moved, pending.received)

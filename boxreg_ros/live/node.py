@@ -20,7 +20,7 @@ from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.label_recording import LabelRecording
-from boxreg_ros.live.params import changed, declare, parameters_yaml, reals_from_integers
+from boxreg_ros.live.params import changed, declare, numbers_as_declared, parameters_yaml
 from boxreg_ros.live.recorder_process import check_recording
 from boxreg_ros.live.topics import import_message, NodeTopics
 from boxreg_ros.live.worker import Worker
@@ -85,7 +85,7 @@ class BoxregNode(Node):
                 raise
             raise self._error_of_empty_lists() from None
         self._settings = declare(self)
-        self.add_pre_set_parameters_callback(partial(reals_from_integers, self))
+        self.add_pre_set_parameters_callback(partial(numbers_as_declared, self))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
         self._health = Health(self.get_logger())

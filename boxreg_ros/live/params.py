@@ -211,20 +211,22 @@ def declare(node: Node) -> tuple[Config, NodeOptions]:
     return config, options
 
 
-def reals_from_integers(node: Node, parameters: list[Parameter]) -> list[Parameter]:
+def numbers_as_declared(node: Node, parameters: list[Parameter]) -> list[Parameter]:
     """
-    Return parameters with integers converted where the node declares a real.
+    Return parameters with numbers converted where the node declares a real or a text.
 
     ``ros2 param set NODE sampling.margin 1`` sends an integer.
 
     """
     converted = []
     for parameter in parameters:
-        is_integer = parameter.type_ == Parameter.Type.INTEGER
-        if is_integer and node.has_parameter(parameter.name):
+        is_number = parameter.type_ in (Parameter.Type.INTEGER, Parameter.Type.DOUBLE)
+        if is_number and node.has_parameter(parameter.name):
             kind = node.get_parameter(parameter.name).type_
             if kind == Parameter.Type.DOUBLE:
                 parameter = Parameter(parameter.name, kind, float(parameter.value))
+            elif kind == Parameter.Type.STRING:
+                parameter = Parameter(parameter.name, kind, str(parameter.value))
         converted.append(parameter)
     return converted
 
@@ -312,6 +314,13 @@ def _schema_of(item: Setting) -> dict[str, Any]:
         schema['enum'] = list(item.choices)
     if item.low is not None:
         schema |= {'minimum': item.low, 'maximum': item.high}
+    if item.choices and item.low is not None:  # a number, or a text with one
+        schema['type'] = ['string', 'number']
+        schema['anyOf'] = [
+            {'enum': schema.pop('enum')},
+            {'type': 'number'},
+            {'pattern': '^[-0-9]'},
+        ]
     return schema
 
 
@@ -319,7 +328,7 @@ def describe(item: Setting) -> ParameterDescriptor:
     """Return the descriptor of a parameter: meaning, unit, bounds and whether it may change."""
     unit = f' [{item.unit}]' if item.unit else ''
     is_fixed = not item.name.startswith(DYNAMIC)
-    constraints = [f'one of {", ".join(item.choices)}'] if item.choices else []
+    constraints = [f'one of {item.bounds}'] if item.choices else []
     if is_fixed:
         constraints.append(READ_ONLY)
     descriptor = ParameterDescriptor(
@@ -353,16 +362,8 @@ def _updated(
 
 def _yaml_line(item: Setting, indent: str, name: str, value: Any) -> str:
     """Return the line of one setting; its comment gives meaning and bounds."""
-    bounds = ', '.join(item.choices) or _bounds_of(item)
-    comment = f'{item.meaning} ({bounds})' if bounds else item.meaning
+    comment = f'{item.meaning} ({item.bounds})' if item.bounds else item.meaning
     return f'{indent}{name}: {json.dumps(_plain(value))}  # {comment}'
-
-
-def _bounds_of(item: Setting) -> str:
-    """Return the bounds of a number with its unit, or an empty text."""
-    if item.low is None or item.high is None:
-        return ''
-    return f'{item.low:g} to {item.high:g} {item.unit}'.rstrip()
 
 
 def _plain(value: Any) -> Any:
@@ -390,10 +391,7 @@ def _checked(item: Setting, value: Any) -> Any:
         value = float(value)
     if type(value) is not kind:
         raise ConfigError(f'{item.name}: expected {kind.__name__} ({item.meaning}), got {value!r}')
-    if item.choices and value not in item.choices:
-        raise ConfigError(f'{item.name}: expected one of {", ".join(item.choices)}, got {value!r}')
-    if item.low is not None and item.high is not None and not item.low <= value <= item.high:
-        raise ConfigError(f'{item.name}: expected {_bounds_of(item)}, got {value!r}')
+    item.check(value)
     if item.name == 'record_segment':
         segment_limit(value)
     if item.name == 'deadline' and value == 0:

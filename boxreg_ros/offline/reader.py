@@ -8,14 +8,16 @@ core; see `reader`.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Generator, Iterator
+from collections import Counter, deque
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
+from math import inf
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.latency import LateBoxes, Latency, set_latency
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
 from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.recording import Recording
@@ -26,6 +28,7 @@ from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send
 from boxreg_ros.structures import BoxArray, Floats, Sweep
+import numpy as np
 
 MESSAGES_AHEAD = 4
 """
@@ -42,6 +45,12 @@ Derived: it takes 0.7 s of CPU, in parallel with the other processes, and saves 
 of 64 boxes, ten a second.
 
 """
+
+
+SAMPLES = 4
+"""Parts of a long recording that its latency is estimated from; chosen: one that drifts shows."""
+SAMPLED_SECONDS = 5.0
+"""Their duration [s]; chosen: some ten sweeps with 0.8 s of boxes after them."""
 
 
 class ReadItem(NamedTuple):
@@ -86,6 +95,8 @@ class Source(NamedTuple):
         Frame to refine in, and sensor frame of label files.
     seconds : float
         Duration of the part that is read [s].
+    latency : Latency
+        Of the boxes, which have been corrected for it.
 
     """
 
@@ -93,6 +104,7 @@ class Source(NamedTuple):
     fixed_frame: str
     sensor_frame: str
     seconds: float
+    latency: Latency
 
 
 class Findings(NamedTuple):
@@ -149,6 +161,8 @@ class RecordingReader:
         Frames, convention and settings.
     clock : Stopwatch
         Measures the stages ``read``, ``decode`` and ``transform``.
+    latency : Latency
+        By which the boxes are corrected.
 
     Attributes
     ----------
@@ -157,11 +171,18 @@ class RecordingReader:
 
     """
 
-    def __init__(self, recording: ItemSource, request: Request, clock: Stopwatch) -> None:
+    def __init__(
+        self,
+        recording: ItemSource,
+        request: Request,
+        clock: Stopwatch,
+        latency: Latency = Latency(),  # noqa: B008
+    ) -> None:
         self._recording = recording
         self._clock = clock
         self._with_points = request.options.with_points
         self._with_times = request.config.sampling.deskew
+        self._waits = request.config.estimate == 'track'
         self._items = FixedFrameItems(
             recording, request.config, request.convention, request.fixed_frame, clock
         )
@@ -175,7 +196,7 @@ class RecordingReader:
             'odometry': recording.odometry_topic,
         }
         seconds = (recording.end_ns - recording.start_ns) * 1e-9
-        self.source = Source(topics, self._items.fixed_frame, sensor_frame, seconds)
+        self.source = Source(topics, self._items.fixed_frame, sensor_frame, seconds, latency)
 
     def __iter__(self) -> Iterator[ReadItem]:
         """
@@ -187,11 +208,15 @@ class RecordingReader:
             At the end, if no cloud, or no message of boxes, was readable.
 
         """
+        yield from in_time(self._read(), self.source.latency.seconds, self._waits)
+        self._recording.check_readable()
+
+    def _read(self) -> Iterator[ReadItem]:
+        """Yield clouds and boxes, as they are."""
         for item in self._items.read(with_intensities=self._with_points):
             with self._clock('transform'):
                 read_item = self._trimmed(item)
             yield read_item
-        self._recording.check_readable()
 
     def findings(self) -> Findings:
         """Return the properties that are known after the last item."""
@@ -234,19 +259,88 @@ class RecordingReader:
         )
 
 
+def in_time(items: Iterable[ReadItem], latency: float, waits: bool) -> Iterator[ReadItem]:
+    """
+    Yield items in their order, late boxes moved to where their objects are at their stamp.
+
+    Parameters
+    ----------
+    items : iterable of ReadItem
+        In the fixed frame, as read.
+    latency : float
+        Of the boxes [s].
+    waits : bool
+        Whether boxes wait for the later ones that show their objects; as the node, which cannot
+        wait, they are otherwise predicted.
+
+    """
+    late = LateBoxes()
+    waiting = deque[ReadItem]()
+
+    def ready(until_ns: float) -> Iterator[ReadItem]:
+        while waiting:
+            moved = waiting[0].moved
+            if isinstance(moved, BoxArray):
+                if moved.stamp_ns + latency * 1e9 > until_ns:
+                    return
+                moved = late.corrected(moved, latency)
+            yield waiting.popleft()._replace(moved=moved)
+
+    for item in items:
+        if item.restarts:
+            yield from ready(inf)
+            late.restart()
+        if latency and isinstance(item.moved, BoxArray):
+            late.add_boxes(item.moved)
+        waiting.append(item)
+        yield from ready(late.newest_ns if waits and latency > 0 else inf)
+    yield from ready(inf)
+
+
+def latency_of(request: Request) -> Latency:
+    """Return the latency of the boxes: as set, or estimated from parts of the recording."""
+    known = set_latency(request.config)
+    if request.keyframes:
+        return Latency()
+    if known is not None:
+        return known
+    begin = request.start or 0.0
+    with request.recording() as recording:
+        seconds = (recording.end_ns - recording.start_ns) * 1e-9
+    late = LateBoxes()
+    parts = [(request.start, request.end)]
+    if seconds > 2 * SAMPLES * SAMPLED_SECONDS:
+        starts = begin + (np.arange(SAMPLES) + 0.5) / SAMPLES * seconds
+        parts = [(start, start + SAMPLED_SECONDS) for start in starts.tolist()]
+    for start, end in parts:
+        part = replace(request, start=start, end=end, report=False)
+        with part.recording() as recording:
+            items = FixedFrameItems(recording, part.config, part.convention, part.fixed_frame)
+            late.restart()
+            for item in items.read():
+                if item.restarts:
+                    late.restart()
+                if isinstance(item.moved, BoxArray):
+                    late.add_boxes(item.moved)
+                elif item.moved is not None:
+                    late.add_sweep(item.moved)
+    return late.estimate()
+
+
 @contextmanager
-def reader(request: Request) -> Iterator[Receive]:
+def reader(request: Request, latency: Latency | None = None) -> Iterator[Receive]:
     """
     Yield, for a block, a function that returns the next message for `ReadAhead`.
 
     The recording is read in a process of its own, or in this one where it may use one core only.
+    Without a `latency` that is known, it is estimated first.
 
     """
     if uses_one_core(request.config):
-        with closing(_messages(request)) as messages:
+        with closing(_messages(request, latency)) as messages:
             yield messages.__next__
         return
-    with run_in_worker(partial(_read, request), 'reads the recording') as process:
+    with run_in_worker(partial(_read, request, latency), 'reads the recording') as process:
         yield process.receive
 
 
@@ -288,20 +382,23 @@ class ReadAhead:
             yield received
 
 
-def _read(request: Request, _: Receive, send: Send) -> None:
+def _read(request: Request, latency: Latency | None, _: Receive, send: Send) -> None:
     """Send the messages, in a thread that waits for the receiver while others are read."""
     background = Background(MESSAGES_AHEAD)
     try:
-        for message in _messages(request):
+        for message in _messages(request, latency):
             background(send, message)
     finally:
         background.complete()  # an error is sent after the messages before it
 
 
-def _messages(request: Request) -> Generator[Source | ReadItem | Findings]:
+def _messages(
+    request: Request, latency: Latency | None
+) -> Generator[Source | ReadItem | Findings]:
     """Yield the source of a recording, all its items, and the findings."""
+    latency = latency_of(request) if latency is None else latency
     with request.recording() as recording:
-        reading = RecordingReader(recording, request, Stopwatch())
+        reading = RecordingReader(recording, request, Stopwatch(), latency)
         yield reading.source
         if isinstance(recording, Recording) and reading.source.seconds > LONG:
             recording.read_boxes_as_arrays()  # the main process goes on meanwhile

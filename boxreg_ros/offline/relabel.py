@@ -37,6 +37,7 @@ import yaml
 
 if TYPE_CHECKING:
     from boxreg_ros.core.follow import FollowedTrack
+    from boxreg_ros.core.latency import Latency
     from boxreg_ros.core.registrar import BoxRegistrar, Submit
     from boxreg_ros.io.sweep_store import SweepStore
     from boxreg_ros.offline.completion import Completion, Moved
@@ -84,7 +85,9 @@ def relabel(
     with claimed(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         survey = _survey(request, clock, shown, journal, corrections)
-        receive = workers.enter_context(reader(request))
+        receive = workers.enter_context(
+            reader(request, None if survey is None else survey.latency)
+        )
         # The recording is opened while this process imports numba, which takes half a second.
         from boxreg_ros.core.registrar import BoxRegistrar
         from boxreg_ros.offline.registration_worker import registration_worker
@@ -169,6 +172,7 @@ class _Survey(NamedTuple):
     completion: Completion
     parts: list[Arrivals]
     ends: list[dict[str, Any]]
+    latency: Latency
 
 
 def _corrections(request: Request) -> Corrections:
@@ -228,7 +232,7 @@ def _survey(
                     plan, parts, stores, corrections, fixed_frame, request.config
                 )
         completion = Completion(plan, request.config, has_keyframes=request.keyframes)
-        return _Survey(plan, completion, parts, ends_of(tracks))
+        return _Survey(plan, completion, parts, ends_of(tracks), recording.source.latency)
 
 
 def _corrected(item: Moved, corrections: Corrections) -> Moved:

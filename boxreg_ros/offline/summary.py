@@ -56,7 +56,7 @@ class Summary:
     recorded_apart : dict
         Topics that were recorded apart from the clouds, and by how much [s].
     box_time : dict
-        Estimated time of the boxes.
+        Estimated time and latency of the boxes.
     time_ranges : dict
         First and last stamp [ns] of boxes and clouds.
     unknown_classes : dict
@@ -179,7 +179,8 @@ class Summary:
             time_jumps=findings.counts[Reason.TIME_JUMP],
             recorded_apart={topic: round(late, 3) for topic, late in findings.apart.items()},
             heading_flips=sink.heading_flips,
-            box_time=registrar.box_time.summary(request.config),
+            box_time=registrar.box_time.summary(request.config)
+            | {'latency': source.latency.summary()},
             time_ranges={name: list(ends) for name, ends in sink.time_ranges.items()},
             unknown_classes=dict(sink.unknown_classes.most_common()),
             dropped=_dropped(registrar.counts, findings),
@@ -190,7 +191,8 @@ class Summary:
             first_missing_transform=findings.first_missing_transform,
             first_unplaced=findings.first_unplaced,
             first_unreadable=findings.first_unreadable,
-            warning=findings.warning or ('' if sink.boxes_in else NO_BOXES),
+            warning='; '.join(filter(None, (findings.warning, source.latency.warning)))
+            or ('' if sink.boxes_in else NO_BOXES),
             **findings.facts,
             left_out_of_labels=sink.left_out(),
             unused_decisions=sink.corrections.unused(),

@@ -282,6 +282,12 @@ def test_samples_after_a_time_jump_replace_the_old_ones():
     with pytest.raises(TransformUnavailable, match='since time went back'):
         tree.lookup('odom', 'lidar', 100 * S)
     assert tree.connects('odom', 'lidar')
+    # The last sample, up to a second after the stamp that time goes back to, is a new one.
+    for stamp, is_new in ((91 * S, True), (91 * S + 1, False)):
+        tree = tree_of(*moves, static=static)
+        tree.add_transforms(M.tf(M.transform(stamp, 'odom', 'base', (0, 0, 0))).transforms)
+        tree.rewind(90 * S)
+        assert tree.covers('odom', 'lidar', stamp) == is_new
 
 
 def test_two_consecutive_old_stamps_are_a_time_jump():

@@ -7,9 +7,9 @@ from boxreg_ros.live.params import (
     declare,
     DYNAMIC,
     NODE_SETTINGS,
+    numbers_as_declared,
     parameters_yaml,
     READ_ONLY,
-    reals_from_integers,
 )
 import pytest
 import rclpy
@@ -58,7 +58,7 @@ def test_every_setting_is_a_described_parameter(make_node):
         assert (READ_ONLY in descriptor.additional_constraints) == descriptor.read_only
         ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
         assert [(r.from_value, r.to_value) for r in ranges] == (
-            [] if item.low is None else [(item.low, item.high)]
+            [] if item.low is None or item.choices else [(item.low, item.high)]
         )
         for choice in item.choices:
             assert choice in descriptor.additional_constraints
@@ -184,9 +184,12 @@ def test_relabel_ignores_parameters_of_the_node_only(tmp_path):
 def test_integers_are_accepted_for_reals_at_run_time(make_node):
     node = make_node()
     declare(node)
-    node.add_pre_set_parameters_callback(lambda given: reals_from_integers(node, given))
+    node.add_pre_set_parameters_callback(lambda given: numbers_as_declared(node, given))
     result = node.set_parameters_atomically([Parameter('sampling.margin', value=1)])
     assert result.successful, result.reason
     assert node.get_parameter('sampling.margin').value == 1.0
+    result = node.set_parameters_atomically([Parameter('sampling.box_time', value=0.3)])
+    assert result.successful, result.reason
+    assert node.get_parameter('sampling.box_time').value == '0.3'
     result = node.set_parameters_atomically([Parameter('solver.rounds', value=2.5)])
     assert not result.successful

@@ -2,15 +2,16 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.motion import motion_at
+from boxreg_ros.io.stamp_order import kept
 from boxreg_ros.tracks.extend import extend, num_free, num_supported
 from boxreg_ros.tracks.fill import fill
 from boxreg_ros.tracks.links import best_links
 from boxreg_ros.tracks.prune import duplicates, ghosts
 from boxreg_ros.tracks.static import join_static
 from boxreg_ros.tracks.stitch import stitch
-from boxreg_ros.tracks.tracklet import joined_tracklets, unused_id
+from boxreg_ros.tracks.tracklet import joined_tracklets, tracklets_of, unused_id
 from boxreg_ros.tracks.tracklet_motion import between, is_parked
-from drives import path, STEP_NS, tracklet
+from drives import detections, path, STEP_NS, tracklet
 import numpy as np
 import pytest
 
@@ -258,6 +259,15 @@ def test_confirmed_tracks_are_never_rejected():
     assert duplicates(tracks, CONFIG) == ghosts(tracks) == set()
     fewer = tracklet('c', car[:5], points=0)
     assert duplicates([tracks[0], fewer], CONFIG) == ghosts([fewer]) == {'c'}
+
+
+def test_an_id_is_split_after_a_gap_longer_than_max_gap():
+    place = path((5, 5), (0, 0), 1)[0]
+    for gap, number in ((16, 1), (17, 2)):  # 1.6 s is `max_gap`
+        steps = [0, 1, 2, 2 + gap, 3 + gap]
+        results = [kept(detections(step, [('7', place)]), '') for step in steps]
+        points = [np.array([20])] * len(steps)
+        assert len(tracklets_of(results, points, 'odom', CONFIG)) == number
 
 
 def test_joined_tracks_have_the_majority_class_and_the_longest_id():
