@@ -38,6 +38,8 @@ INTERPOLATED, EXTENDED, REJECTED = 'interpolated', 'extended', 'rejected'
 COASTED = 'coasted'
 ADDED = (INTERPOLATED, EXTENDED, COASTED)
 """Status of boxes that the input does not have."""
+PROPOSED = 'proposed'
+"""Status of a box that may be of an object, until a person accepts it; it is no label."""
 HUMAN = 'human'
 """Status of a box that a person has corrected and pinned."""
 

@@ -11,7 +11,7 @@ from boxreg_ros.io.box_table import BoxTable, cell, COLUMNS, csv_row
 from boxreg_ros.io.covariance_table import COVARIANCES, CovarianceWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import numbers_of, refined_boxes
-from boxreg_ros.structures import Floats
+from boxreg_ros.structures import Floats, PROPOSED
 import numpy as np
 import orjson
 
@@ -101,18 +101,21 @@ def read(path: Path) -> Iterator[LabelFrame]:
     """
     Yield the boxes of each stamp and frame.
 
-    The frame of most boxes is used as the fixed frame.
+    The frame of most boxes is used as the fixed frame. Proposals are left out: they are no labels.
 
     """
     if path.is_dir():
         path = path / 'boxes.csv'
-    tables = BoxTable.read_frames(path)
+    tables = {
+        name: table.rows(np.array(table.status) != PROPOSED)
+        for name, table in BoxTable.read_frames(path).items()
+    }
     fixed_frame = max(tables, key=lambda name: len(tables[name].boxes), default='')
     groups = []
     for name, table in tables.items():
         order = np.argsort(table.stamps_ns, kind='stable')
         starts = np.flatnonzero(np.diff(table.stamps_ns[order])) + 1
-        for rows in np.split(order, starts):
+        for rows in np.split(order, starts) if len(order) else ():
             groups.append((int(table.stamps_ns[rows[0]]), name, rows))
     for stamp_ns, name, rows in sorted(groups, key=lambda group: group[0]):
         table = tables[name]

@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+import sys
 
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline import relabel_command
 from boxreg_ros.offline.arguments import RECORDINGS
+from boxreg_ros.structures import PROPOSED
 
 DEFAULT_OUT = Path('followed')
 """Result folder unless another is given."""
@@ -39,5 +42,19 @@ def run(args: argparse.Namespace) -> int:
         )
     args.recordings = [args.recording]
     if args.seeds is not None:
+        _require_accepted(args.seeds)
         args.labels = ('csv', args.seeds)
     return relabel_command.run(args)
+
+
+def _require_accepted(seeds: Path) -> None:
+    """Say how many boxes are proposals that no one has accepted; raise if all are."""
+    words = [word for table in BoxTable.read_frames(seeds).values() for word in table.status]
+    proposed = words.count(PROPOSED)
+    if not proposed:
+        return
+    line = f'{seeds}: {proposed} of {len(words)} boxes are proposals'
+    remedy = f'write accepted in place of {PROPOSED} into the column status to follow one'
+    if proposed == len(words):
+        raise ConfigError(f'{line}, expected accepted ones; {remedy}')
+    print(f'boxreg: {line} and not followed; {remedy}', file=sys.stderr)

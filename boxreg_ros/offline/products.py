@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
@@ -45,16 +45,18 @@ def completed_counts(plan: CompletionPlan | None) -> dict[str, int]:
 
 
 def write_track_tables(
-    folder: Path, tracks: Sequence[TrackChanges], plan: CompletionPlan | None
+    folder: Path,
+    tracks: Sequence[TrackChanges],
+    plan: CompletionPlan | None,
+    proposals: Sequence[Mapping[str, Any]] = (),
 ) -> list[TrackRow]:
     """Write the tables of tracks; return their rows, largest risk first."""
     from boxreg_ros.review.tables import assessed, write_tables
 
     rows = assessed(tracks)
-    if plan is None:
-        write_tables(folder, rows)
-    else:
-        write_tables(folder, rows, STEP_COLUMNS, _step_cells(plan.tracks))
+    columns = () if plan is None else STEP_COLUMNS
+    cells = {} if plan is None else _step_cells(plan.tracks)
+    write_tables(folder, rows, columns, cells, proposals)
     return rows
 
 

@@ -111,8 +111,14 @@ def relabel(
             summary.fingerprint = fingerprint
             summary.seconds = clock.seconds()
             tracks = sink.changes.tracks()
+            if request.proposals:
+                from boxreg_ros.offline.proposals import write_proposals
+
+                with clock('proposals'):
+                    stamps_ns, frame = sink.array_stamps_ns, summary.fixed_frame
+                    summary.proposals = write_proposals(folder, request, tracks, stamps_ns, frame)
             with clock('write'):
-                rows = write_track_tables(folder, tracks, plan)
+                rows = write_track_tables(folder, tracks, plan, summary.proposals)
                 summary.rules, violated = checked(tracks, request.config)
             if request.needs_point_labels:
                 from boxreg_ros.offline.point_products import write_point_products

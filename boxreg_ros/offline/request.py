@@ -153,6 +153,11 @@ class Request:
         'also write OUT/clouds/undistorted.mcap: points of moving objects moved to the stamp by '
         'the motion of their boxes',
     )
+    proposals: bool = option(
+        False,
+        'also look for objects that no box covers; they are listed in review.csv and the report, '
+        'and written to OUT/proposals.csv for boxreg follow',
+    )
     truth: Path | None = option(
         None,
         'with --report, true boxes that it shows: CSV with the columns of boxes.csv, or a scene '

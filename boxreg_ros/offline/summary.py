@@ -86,6 +86,8 @@ class Summary:
     seeds : list of dict
         Where each track of keyframes ends in both directions and why, and keyframes that could
         not be used; empty without keyframes.
+    proposals : list of dict
+        Objects that no box covers, longest first; empty where they are not looked for.
     sweeps_with_boxes : dict
         Sweeps with a box ``before`` and ``after`` the run.
     fingerprint : str
@@ -135,6 +137,7 @@ class Summary:
     associated_tracks: int | None = None
     complete: dict[str, int] = field(default_factory=dict)
     seeds: list[dict[str, Any]] = field(default_factory=list)
+    proposals: list[dict[str, Any]] = field(default_factory=list)
     sweeps_with_boxes: dict[str, int] = field(default_factory=dict)
     fingerprint: str = ''
     seconds: dict[str, float] = field(default_factory=dict)

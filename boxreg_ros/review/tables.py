@@ -89,6 +89,7 @@ def write_tables(
     rows: Sequence[TrackRow],
     more_columns: Sequence[str] = (),
     more_cells: Mapping[str, Sequence[Any]] | None = None,
+    proposals: Sequence[Mapping[str, Any]] = (),
 ) -> None:
     """
     Write ``tracks.csv`` and ``review.csv`` into a folder of results.
@@ -103,6 +104,8 @@ def write_tables(
         Further columns of ``tracks.csv``.
     more_cells : mapping, optional
         Their cells by track id; empty for other tracks.
+    proposals : sequence of mapping
+        Objects that no box covers, as in ``summary.json``, for the end of ``review.csv``.
 
     """
     found = more_cells or {}
@@ -116,7 +119,9 @@ def write_tables(
             for row in rows
         ],
     )
-    _write(folder / REVIEW, REVIEW_COLUMNS, [_review_row(i, row) for i, row in enumerate(rows, 1)])
+    review = [_review_row(i, row) for i, row in enumerate(rows, 1)]
+    review += [_proposal_row(i, one) for i, one in enumerate(proposals, len(rows) + 1)]
+    _write(folder / REVIEW, REVIEW_COLUMNS, review)
 
 
 def _review_row(rank: int, row: TrackRow) -> list[Any]:
@@ -125,6 +130,13 @@ def _review_row(rank: int, row: TrackRow) -> list[Any]:
     worst = int(np.argmax(row.risk.boxes))
     stamp_ns = int(track.stamps_ns[worst])
     return [rank, track.track_id, track.class_name, stamp_ns, row.risk.track, row.reasons]
+
+
+def _proposal_row(rank: int, one: Mapping[str, Any]) -> list[Any]:
+    """Return the cells of ``review.csv`` for an object that no box covers; it has no risk."""
+    motion = f'moves at {one["speed"]} m/s' if one['speed'] else 'stands'
+    reasons = f'no box; {one["sweeps"]} clouds, {one["points"]} points, {motion}; proposals.csv'
+    return [rank, one['track_id'], one['class_name'], one['stamp_ns'], float('nan'), reasons]
 
 
 def _write(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

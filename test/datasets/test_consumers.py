@@ -1,5 +1,8 @@
 """Data sets read by the libraries of their publishers: the same clouds, poses and boxes."""
 
+import json
+
+from boxreg_ros.cli import main
 from boxreg_ros.datasets.kitti import oxts_poses, oxts_rows
 from boxreg_ros.io.transforms import matrix
 from consumers import consumer
@@ -19,6 +22,24 @@ def test_nuscenes_devkit_has_the_same_clouds_and_boxes(tmp_path):
         np.testing.assert_allclose(sweep.points, points, atol=5e-5)  # float32, 200 m away
     boxes = np.concatenate([array.boxes for array in arrays])
     np.testing.assert_allclose(boxes[:, [0, 1, 2, 3, 4, 5, 8]], found['boxes'], atol=1e-9)
+
+
+def test_keyframes_of_nuscenes_become_boxes_at_every_sweep(tmp_path):
+    """One command from annotations at a part of the sweeps to tables that the devkit reads."""
+    layouts.nuscenes(tmp_path)
+    words = ['relabel', f'nuscenes:{tmp_path}#scene-0061', '--keyframes', '-o', f'{tmp_path}/out']
+    assert main([*words, '--formats', 'nuscenes']) == 0
+    found = consumer('nuscenes', tmp_path / 'out' / 'nuscenes', 'v1.0-boxreg')
+    assert [box['timestamp'] * 1000 for box in found] == layouts.stamps_ns()
+    truth = np.array([layouts.car_in_map(i) for i in range(layouts.FRAMES)])
+    np.testing.assert_allclose([box['center'] for box in found], truth[:, :3], atol=0.05)
+    np.testing.assert_allclose([box['wlh'] for box in found], truth[:, [4, 3, 5]], atol=0.05)
+    assert {box['name'] for box in found} == {'vehicle.car'}
+    assert len({box['track'] for box in found}) == 1
+    assert [box['prev'] == '' for box in found] == [True] + [False] * 11
+    rows = json.loads((tmp_path / 'out/nuscenes/v1.0-boxreg/sample_annotation.json').read_text())
+    words = [row['status'] for row in sorted(rows, key=lambda row: row['stamp_ns'])]
+    assert words == ['refined', 'interpolated'] * 5 + ['refined', 'extended']
 
 
 def test_av2_has_the_same_clouds_and_poses(tmp_path):
