@@ -50,7 +50,7 @@ DATA = {
 }
 """Title and content of each recording, in the order of the tables."""
 PAGES = {
-    **dict.fromkeys(('kinds', 'highway', 'lidars', 'paper'), 'scenes'),
+    **dict.fromkeys(('kinds', 'points', 'highway', 'lidars', 'paper'), 'scenes'),
     **dict.fromkeys(('covariance', 'review'), 'certainty'),
     **dict.fromkeys(('ablation', 'sensitivity'), 'ablation'),
     **dict.fromkeys(('speed', 'scale', 'report'), 'speed'),
@@ -554,6 +554,15 @@ def _highway(results: Any) -> Iterable[str]:
         yield _table([f'boxes of the time of {convention}', *speeds], rows)
 
 
+def _points(results: Any) -> Iterable[str]:
+    """Yield the scores of labels of points, one column for each kind of boxes."""
+    scores = dict.fromkeys(score for found in results.values() for score in found)
+    rows = [
+        [score, *(_number(found.get(score)) for found in results.values())] for score in scores
+    ]
+    yield _table(['', *results], rows)
+
+
 def _review(results: Any) -> Iterable[str]:
     """Yield the share of bad tracks at the top of each list, per recording and input, and pins."""
     pinned = []
@@ -764,6 +773,7 @@ TABLES: dict[str, Callable[[Any], Iterable[str]]] = {
     'ablation': _ablation,
     'sensitivity': _sensitivity,
     'highway': _highway,
+    'points': _points,
     'lidars': _lidars,
     'covariance': _covariance,
     'review': _review,

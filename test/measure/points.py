@@ -42,6 +42,8 @@ MIN_POINTS = {'vehicle': 100, 'cyclist': 30, 'pedestrian': 30}
 """Least returns of an object whose instance counts among the well seen ones."""
 MOVING_SPEED = 0.3
 """Least speed of a moving object [m/s]."""
+TRUTH_SECONDS = 1.0
+"""True boxes of so long state the speed [s]: those of parked vehicles wander by centimetres."""
 NOISE = 0.08
 """Points so far outside of a true box are on its object [m]: four deviations of the range."""
 
@@ -96,7 +98,11 @@ class Truth(NamedTuple):
                 near = np.flatnonzero(np.abs(points[:, :2] - box[:2]).max(1) < box[LENGTH])
                 local = (points[near] - box[:3]) @ matrix_from_rpy(box[ROLL:])
                 owner[near[(np.abs(local) <= box[LENGTH:ROLL] / 2 + NOISE).all(1)]] = i
-                ends = [max(row - 1, 0), min(row + 1, len(track.boxes) - 1)]
+                half_ns = round(TRUTH_SECONDS / 2 * 1e9)
+                ends = [
+                    np.searchsorted(track.stamps_ns, sweep.stamp_ns - half_ns),
+                    np.searchsorted(track.stamps_ns, sweep.stamp_ns + half_ns, 'right') - 1,
+                ]
                 way = np.linalg.norm(np.diff(track.boxes[ends, :2], axis=0))
                 seconds = np.ptp(track.stamps_ns[ends]) * 1e-9
                 is_moving[i] = way > MOVING_SPEED * seconds
@@ -114,8 +120,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--sweeps', type=int, metavar='N', help='sweeps of a drive')
     parser.add_argument(
-        '--data', type=Path, action='append', metavar='FOLDER',
-        help='a recording with its exact truth.csv, instead of a simulation; may be repeated',
+        'data', type=Path, nargs='*', metavar='FOLDER',
+        help='a recording with its exact truth.csv, instead of simulated drives',
     )  # fmt: skip
     add_json_argument(parser)
 
@@ -138,7 +144,7 @@ def run(args: argparse.Namespace) -> int:
 
 def drives(args: argparse.Namespace) -> Iterator[tuple[Drive, Truth]]:
     """Yield the drives that the options ask for."""
-    for folder in args.data or ():
+    for folder in args.data:
         drive = Drive.read(folder)
         yield drive, Truth.of_boxes(drive)
     for seed in range(0 if args.data else args.seeds):
