@@ -461,6 +461,8 @@ class Destroyed:
         time.sleep(0.01)
 sys.meta_path.insert(0, Finder())
 from boxreg_ros.cli import command
+if os.environ['WHERE'] == 'fork':
+    os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.SIGINT))
 if os.environ['WHERE'] == 'destructor':
     from boxreg_ros.review import risk
     begun = risk.assess
@@ -472,10 +474,11 @@ command()
 """
 
 
-@pytest.mark.parametrize('where', ['llvmlite.binding.common', 'destructor'])
+@pytest.mark.parametrize('where', ['llvmlite.binding.common', 'destructor', 'fork'])
 def test_a_signal_where_an_exception_would_be_lost_is_raised_afterwards(tmp_path, where):
     recording = Drive(sweeps=40).write(tmp_path / 'drive')
-    relabel = 'relabel', recording, '-o', tmp_path / 'r' / 'out', '--resume', '--workers', 1
+    workers = 2 if where == 'fork' else 1
+    relabel = 'relabel', recording, '-o', tmp_path / 'r' / 'out', '--resume', '--workers', workers
     command = [sys.executable, '-c', SIGNAL_THAT_IS_LOST, *map(str, relabel), *QUICK]
     done = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, timeout=60,

@@ -18,6 +18,7 @@ from typing import Any
 from boxreg_ros.bench.common import (
     add_json_argument,
     add_scope_arguments,
+    class_words,
     in_scope,
     line,
     print_json,
@@ -44,6 +45,17 @@ Least extent of the path of an object that moves [m].
 Chosen: labels of parked cars wander by .26 m on KITTI, and nothing that drives stays within 2 m.
 
 """
+PEOPLE = {'all': (0.880, 0.809), '0-30': (0.913, 0.858)}
+"""
+BEV and 3D IoU of people who box objects again with the public labels of Waymo, by range [m].
+
+Literature: Qi et al., Offboard 3D Object Detection from Point Cloud Sequences (3DAL), CVPR 2021,
+appendix G, table 13.
+
+"""
+PEOPLE_RANGES = {'all': (0, math.inf), '0-30': (0, 30), '30-50': (30, 50), '50+': (50, math.inf)}
+MIN_PAIR_IOU = 0.03
+"""Least 3D IoU of a box and a label that are compared by that protocol; of the same table."""
 GROUPINGS = {'by_range': 'by range [m]', 'by_points': 'by points'}
 
 Groups = dict[str, dict[str, float]]
@@ -69,6 +81,11 @@ def run(args: argparse.Namespace) -> int:
                 name: boxes if isinstance(boxes, str) else in_scope(boxes, drive.truth, args)
                 for name, boxes in methods.items()
             }
+            by_people = {
+                name: as_by_people(drive, match(boxes, drive.truth, 1, class_words(args)))
+                for name, boxes in methods.items()
+                if not isinstance(boxes, str)
+            }
             classes = {
                 name: scores_by_class(boxes, drive.truth)
                 for name, boxes in methods.items()
@@ -77,6 +94,7 @@ def run(args: argparse.Namespace) -> int:
             if not args.json:
                 bar.clear()
                 print_tables(folder, drive, found)
+                print_people(by_people)
                 print_differences(drive.truth, found)
                 print_classes(classes)
             report[str(folder)] = {
@@ -84,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
                 if isinstance(matches, str)
                 else _scores(drive, matches)
                 | _compared(name, found, drive.truth)
-                | {'by_class': _plain(classes[name])}
+                | {'by_class': _plain(classes[name]), 'as_people': by_people[name]}
                 for name, matches in found.items()
             }
     if args.json:
@@ -96,6 +114,37 @@ def scores_by_class(boxes: BoxTable, truth: BoxTable) -> dict[str, Scores]:
     """Return the scores of every class of true boxes with points, and enough of them."""
     by_class = groups(match(boxes, truth, min_points=1))['by_class']
     return {name: scores for name, scores in by_class.items() if scores.boxes >= MIN_CLASS_BOXES}
+
+
+def as_by_people(drive: Drive, matches: Matches) -> dict[str, dict[str, float]]:
+    """Return number, BEV and 3D IoU by range of pairs as `PEOPLE` were compared."""
+    ranges = drive.ranges(matches.rows)
+    is_pair = matches.is_matched & (matches.iou_3d > MIN_PAIR_IOU)
+    found = {}
+    for label, (low, high) in PEOPLE_RANGES.items():
+        mask = is_pair & (ranges >= low) & (ranges < high)
+        if mask.any():
+            bev, whole = matches.iou_bev[mask].mean(), matches.iou_3d[mask].mean()
+            found[label] = {
+                'boxes': int(mask.sum()),
+                'iou_bev': float(bev),
+                'iou_3d': float(whole),
+            }
+    return found
+
+
+def print_people(found: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
+    """Print the agreement with the labels as that of people is published, and theirs."""
+    print(f'boxes with a point, pairs above {MIN_PAIR_IOU} IoU, by range [m]')
+    for row, (iou, title) in enumerate((('iou_bev', 'BEV'), ('iou_3d', '3D'))):
+        print(line(title, list(PEOPLE_RANGES)))
+        for name, scores in found.items():
+            known = [
+                scores[label][iou] if label in scores else math.nan for label in PEOPLE_RANGES
+            ]
+            print(line(name, known))
+        people = [PEOPLE.get(label, (math.nan, math.nan))[row] for label in PEOPLE_RANGES]
+        print(line('people, on Waymo', people))
 
 
 def _scores(drive: Drive, matches: Matches) -> dict[str, Any]:

@@ -24,6 +24,8 @@ Receive = Callable[[], Any]
 Send = Callable[[Any], None]
 Serve = Callable[[Receive, Send], None]
 
+SIGNALS = (signal.SIGINT, signal.SIGHUP, signal.SIGTERM)
+"""Signals that end a run."""
 ENDED = (EOFError, OSError, pickle.UnpicklingError)
 """Errors of a connection whose other end was closed, also within an item."""
 
@@ -109,6 +111,8 @@ def run_in_worker(serve: Serve, purpose: str) -> Iterator[WorkerProcess]:
     """
     parent_end, worker_end = socket.socketpair()
     gc.freeze()  # collections then leave alone what both processes share
+    # A signal would be lost in the functions that modules run after a fork.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     pid = os.fork()
     if pid == 0:
         parent_end.close()
@@ -118,6 +122,7 @@ def run_in_worker(serve: Serve, purpose: str) -> Iterator[WorkerProcess]:
             os._exit(0)  # skips the clean-up handlers: the parent runs the same ones
     worker_end.close()  # otherwise the end of the worker does not close the connection
     try:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         yield WorkerProcess(parent_end, purpose)
     finally:
         parent_end.close()
@@ -129,7 +134,7 @@ def run_in_worker(serve: Serve, purpose: str) -> Iterator[WorkerProcess]:
 
 def _run(serve: Serve, connection: socket.socket) -> None:
     """Run the function in the worker and send back the exception it raises."""
-    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+    for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)  # the parent handles them and ends the worker
 
     receive, send = _ends(connection)

@@ -176,7 +176,8 @@ def _risks(path: Path) -> dict[str, float]:
     try:
         with path.open(newline='', encoding='utf-8') as file:
             rows = list(csv.DictReader(file))
-        return {unprotected(row['track_id']): float(row['risk_m'] or 0) for row in rows}
+        tracks = [row for row in rows if row['risk_m']]  # proposals have no risk
+        return {unprotected(row['track_id']): float(row['risk_m']) for row in tracks}
     except OSError as error:
         raise RecordingError(unreadable(path, error)) from None
     except (KeyError, ValueError) as error:

@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from boxreg_ros.core.id_switches import by_id, id_switches, Switch
 from boxreg_ros.io.box_table import csv_row, protected
 from boxreg_ros.review.changes import median, TrackChanges
 from boxreg_ros.review.risk import assess, reasons_of, Risk, typical_parts, Usual
-from boxreg_ros.structures import ADDED, BOX_EXTENT, INTERPOLATED, KEPT, REFINED
+from boxreg_ros.structures import ADDED, BOX_EXTENT, INTERPOLATED, KEPT, REFINED, Y
 import numpy as np
 
 TRACKS = 'tracks.csv'
@@ -58,11 +59,29 @@ def assessed(tracks: Sequence[TrackChanges]) -> list[TrackRow]:
     usual = Usual.of(tracks)
     risks = [assess(track, usual) for track in tracks]
     typical = typical_parts(risks)
-    rows = [
-        TrackRow(track, risk, reasons_of(track, risk, typical))
-        for track, risk in zip(tracks, risks, strict=True)
-    ]
+    switches = _switches(tracks)
+    rows = []
+    for track, risk in zip(tracks, risks, strict=True):
+        names = set(track.input_ids)
+        switched = [
+            f'{switch.first} and {switch.second} changed places at {switch.stamp_ns}'
+            for switch in switches
+            if names & {switch.first, switch.second}
+        ]
+        reasons = '; '.join(filter(None, (*switched, reasons_of(track, risk, typical))))
+        rows.append(TrackRow(track, risk, reasons))
     return sorted(rows, key=lambda row: (-row.risk.track, row.track.track_id))
+
+
+def _switches(tracks: Sequence[TrackChanges]) -> list[Switch]:
+    """Return where two ids of the input changed places."""
+    if not tracks:
+        return []
+    names = [name for track in tracks for name in track.input_ids]
+    stamps_ns = np.concatenate([track.stamps_ns for track in tracks])
+    centers = np.concatenate([track.given[:, : Y + 1] for track in tracks])
+    known = np.flatnonzero(np.isfinite(centers).all(1))
+    return id_switches(by_id([names[row] for row in known], stamps_ns[known], centers[known]))
 
 
 def write_tables(

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.id_switches import by_id, id_switches
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import (
     BoxArray,
@@ -23,9 +24,11 @@ from boxreg_ros.structures import (
     HUMAN,
     INTERPOLATED,
     Ints,
+    is_valid_box,
     KEPT,
     RefinedBoxes,
     REJECTED,
+    Y,
 )
 from boxreg_ros.tracks.added import AddedBoxes
 from boxreg_ros.tracks.extend import extend, num_free, num_supported, points_at_end
@@ -235,6 +238,8 @@ def complete(
 
     """
     steps = config.complete
+    if steps.stitch:
+        results = _exchanged(given, results, fixed_frame)
     tracks = tracklets_of(results, num_points, fixed_frame, config)
     plan = unchanged_plan(given)
     if steps.prune:  # first: a duplicate could be stitched to its object
@@ -258,6 +263,28 @@ def complete(
         _extend(tracks, stamps_ns, plan, array_of, config)
     _note_ambiguous(plan, ambiguous)
     return plan
+
+
+def _exchanged(
+    given: Sequence[BoxArray], results: Sequence[RefinedBoxes], fixed_frame: str
+) -> list[RefinedBoxes]:
+    """Return results in which tracks that changed places have their ids back."""
+    arrays = [array for array in given if array.frame_id == fixed_frame]
+    if not arrays:
+        return [*results]
+    boxes = np.concatenate([array.boxes for array in arrays])
+    valid = np.flatnonzero(is_valid_box(boxes))
+    names = [name for array in arrays for name in array.track_ids]
+    stamps_ns = np.repeat([a.stamp_ns for a in arrays], [len(a.track_ids) for a in arrays])
+    tracks = by_id([names[row] for row in valid], stamps_ns[valid], boxes[valid, : Y + 1])
+    found = id_switches(tracks)
+    exchanged = []
+    for result in results:
+        ids = result.boxes.track_ids
+        for switch in reversed(found):
+            ids = tuple(switch.exchanged(name, result.boxes.stamp_ns) for name in ids)
+        exchanged.append(replace(result, boxes=replace(result.boxes, track_ids=ids)))
+    return exchanged
 
 
 def _rejected(

@@ -115,10 +115,18 @@ def test_real_prints_all_methods_and_groups(folder, capsys):
     for grouping in ('by_range', 'by_points'):
         values = report['input'][grouping].values()
         assert min(values) <= report['input']['iou_3d'] <= max(values)
+    whole, *ranges = report['input']['as_people'].values()
+    assert whole['boxes'] == sum(part['boxes'] for part in ranges) > ours['boxes']
     words = ['--classes', 'van', '--min-points', 10, '--methods', 'smoothing', 'ours']
     assert run('real', folder, *words) == 0
     text = capsys.readouterr().out
-    for shown in ('smoothing only', '3D by range [m]', '3D by points', 'ours, track, all, minus'):
+    for shown in (
+        'people, on Waymo',
+        'smoothing only',
+        '3D by range [m]',
+        '3D by points',
+        'ours, track, all, minus',
+    ):
         assert shown in text
     assert 'CTRA' not in text
 

@@ -12,6 +12,7 @@ from boxreg_ros.errors import BoxregError
 
 MEASUREMENTS = {
     'kinds': 'gain of each class of objects, with standard errors',
+    'proposals': 'objects without boxes that are proposed, and false alarms',
     'tracks': 'broken tracks before and after each completing step',
     'sensitivity': 'accuracy with each setting halved and doubled',
     'highway': 'accuracy at 5 and at 30 m/s, with boxes of either time',

@@ -44,6 +44,8 @@ MIN_POINTS = 20
 """Objects with fewer points, by the median, get no errors and are not judged."""
 SECONDS = {'key': 0.28, 'click': 1.3, 'drag': 2.5}
 """Of the keystroke-level model: a key; pointing and a click; pointing, a press, pointing [s]."""
+TIMEOUT = 120_000
+"""Of the page, on a loaded machine [ms]."""
 THINKING = 1.35
 """Of the same model, before each decision [s]."""
 BEFORE: Mapping[str, tuple[str, ...]] = {
@@ -276,6 +278,7 @@ class Labeller:
 
     def __init__(self, page: Any, truth: BoxTable) -> None:
         self._page = page
+        page.set_default_timeout(TIMEOUT)
         self._matches = Matches(truth)
         self._truth = truth
         self.actions: Counter[str] = Counter()
@@ -421,6 +424,7 @@ class Labeller:
             while len(pieces) > 1:
                 self._open(pieces[0])
                 self.decided['joined'] += 1
+                count = self._page.evaluate('TRACKS.length')
                 self.key('j')
                 self._page.wait_for_selector('#ask[open]')
                 shown = self._page.locator('#ask-proposals button').all_inner_texts()
@@ -434,7 +438,6 @@ class Labeller:
                     self._page.fill('#ask-text', pieces[1])
                     self.actions['key'] += len(pieces[1])
                     self.key('Enter')
-                count = len(self._all())
                 self._page.wait_for_function(f'TRACKS.length < {count}')
                 pieces = [one for one, near in self._all().items() if near == name]
 

@@ -1,6 +1,7 @@
 """The risk grows with the error to expect; the tables list it."""
 
 import csv
+from dataclasses import replace
 
 from boxreg_ros.review.box_risk import risks_of_box
 from boxreg_ros.review.changes import Changes
@@ -143,6 +144,13 @@ def test_an_id_switch_raises_the_risk_and_steady_motion_does_not():
         switched = driving.copy()
         switched[4:, 1] += across
         assert assess(track_with(n=8, boxes=switched)).parts['id switch'].all()
+    switched, beside = driving.copy(), driving.copy()
+    switched[4:, 1] += 3.5
+    beside[:4, 1] += 3.5
+    other = replace(track_with(n=8, boxes=beside), track_id='2', input_ids=('2',) * 8)
+    rows = assessed([track_with(n=8, boxes=switched), other])
+    assert all('1 and 2 changed places at 400000000' in row.reasons for row in rows)
+    assert 'changed places' not in assessed([track_with(n=8, boxes=driving)])[0].reasons
 
 
 def test_added_boxes_have_the_risk_of_the_others_of_their_track():

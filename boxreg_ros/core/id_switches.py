@@ -1,0 +1,113 @@
+"""Tracks that changed places: two ids whose objects are swapped from some stamp on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from boxreg_ros.structures import Floats, Ints
+import numpy as np
+
+Centers = tuple[Ints, Floats]
+"""Stamps (n,) [ns] and centres (n, 2) [m] of the boxes of one id."""
+MOST_APART = 8.0
+"""Objects that change places are so near each other [m]; chosen: two lanes."""
+NUM_BOXES = 4
+"""Boxes before and after that show the motion; chosen: .4 s at 10 Hz."""
+MOTION_TIME = 0.3
+"""Time by which a difference of velocities counts as a distance [s]; chosen."""
+MAX_SHARE = 0.4
+"""Largest cost of the exchange, as part of that of the ids as they are; chosen."""
+MIN_SWITCH_GAIN = 2.0
+"""Least difference of both [m]; chosen: boxes err by 0.2 m, so each cost by less than 1 m."""
+
+
+class Switch(NamedTuple):
+    """Two ids that are exchanged from a stamp on."""
+
+    stamp_ns: int
+    first: str
+    second: str
+
+    def exchanged(self, track_id: str, stamp_ns: int) -> str:
+        """Return the id of an object that has `track_id` at a stamp."""
+        if stamp_ns < self.stamp_ns or track_id not in (self.first, self.second):
+            return track_id
+        return self.second if track_id == self.first else self.first
+
+
+def by_id(track_ids: Sequence[str], stamps_ns: Ints, centers: Floats) -> dict[str, Centers]:
+    """Return stamps and centres of each id, of boxes (n,) in any order; without an id of none."""
+    rows_of: dict[str, list[int]] = {}
+    for row in np.argsort(stamps_ns, kind='stable').tolist():
+        if track_ids[row]:
+            rows_of.setdefault(track_ids[row], []).append(row)
+    return {name: (stamps_ns[rows], centers[rows]) for name, rows in rows_of.items()}
+
+
+def id_switches(tracks: Mapping[str, Centers]) -> list[Switch]:
+    """
+    Return where two tracks continue each other better than themselves, oldest first.
+
+    Parameters
+    ----------
+    tracks : mapping of str to Centers
+        Of each id, ascending by stamp, as of `by_id`.
+
+    """
+    known = {name: track for name, track in tracks.items() if len(track[0]) >= 2 * NUM_BOXES}
+    names = sorted(known)
+    found = []
+    for i, first in enumerate(names):
+        for second in names[i + 1 :]:
+            if _are_near(known[first], known[second]):
+                found += _switches_of(first, second, known)
+    return sorted(found)
+
+
+def _are_near(first: Centers, second: Centers) -> bool:
+    """Return whether two tracks may have been near each other, by their bounds."""
+    (stamps, centers), (others, other_centers) = first, second
+    if stamps[-1] < others[0] or others[-1] < stamps[0]:
+        return False
+    gap = np.maximum(centers.min(0) - other_centers.max(0), other_centers.min(0) - centers.max(0))
+    return bool((gap < MOST_APART).all())
+
+
+def _switches_of(first: str, second: str, tracks: Mapping[str, Centers]) -> list[Switch]:
+    """Return the switches of two tracks: the best in each run of stamps that show one."""
+    (stamps, centers), (others, other_centers) = tracks[first], tracks[second]
+    common, rows, other_rows = np.intersect1d(stamps, others, return_indices=True)
+    if len(common) < 2 * NUM_BOXES:
+        return []
+    both = np.stack([centers[rows], other_centers[other_rows]], 1)  # (n, 2 tracks, 2)
+    seconds = (common - common[0]) * 1e-9
+    at = np.arange(NUM_BOXES, len(common) - NUM_BOXES + 1)  # first rows after a switch
+    middle = (seconds[at - 1] + seconds[at]) / 2
+    before = _lines(seconds, both, at - NUM_BOXES, middle)
+    after = _lines(seconds, both, at, middle)
+    own = np.linalg.norm(before - after, axis=-1).sum((1, 2))
+    exchanged = np.linalg.norm(before - after[:, :, ::-1], axis=-1).sum((1, 2))
+    is_near = np.linalg.norm(both[at, 0] - both[at, 1], axis=1) < MOST_APART
+    is_switch = is_near & (exchanged < MAX_SHARE * own) & (own - exchanged > MIN_SWITCH_GAIN)
+    shown = np.flatnonzero(is_switch)
+    runs = np.split(shown, np.flatnonzero(np.diff(shown) >= NUM_BOXES) + 1)
+    best = [run[np.argmax((own - exchanged)[run])] for run in runs if len(run)]
+    return [Switch(int(common[at[row]]), first, second) for row in best]
+
+
+def _lines(seconds: Floats, places: Floats, begin: Ints, middle: Floats) -> Floats:
+    """
+    Return lines through `NUM_BOXES` places (n, 2 tracks, 2) from each of m rows on.
+
+    Places at the times `middle` (m,), and velocities as distances; (m, 2, 2 tracks, 2) [m].
+
+    """
+    rows = begin[:, None] + np.arange(NUM_BOXES)
+    times = seconds[rows] - middle[:, None]  # (m, NUM_BOXES)
+    mean = times.mean(1)
+    offsets = times - mean[:, None]
+    slope = offsets / np.square(offsets).sum(1, keepdims=True)
+    velocity = np.einsum('mk,mktc->mtc', slope, places[rows])
+    at_middle = places[rows].mean(1) - mean[:, None, None] * velocity
+    return np.stack([at_middle, MOTION_TIME * velocity], 1)
