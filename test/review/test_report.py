@@ -92,8 +92,8 @@ def street(tmp_path_factory):
 def test_page_needs_no_other_file(street):
     out, _, page = street
     assert sorted(item.name for item in out.iterdir()) == [
-        'boxes.csv', 'config.yaml', 'covariances.csv', 'report.html', 'review.csv',
-        'summary.json', 'tracks.csv',
+        'boxes.csv', 'config.yaml', 'covariances.csv', 'input_model.json', 'report.html',
+        'review.csv', 'summary.json', 'tracks.csv',
     ]  # fmt: skip
     assert all(link.startswith(('#', 'data:')) for link in page.links)
     assert not set(page.tags) & {'iframe', 'object', 'img'}
