@@ -35,7 +35,7 @@ class TrackRows:
 
     @property
     def by_track(self) -> dict[str, Floats]:
-        """The array of each track, those seen last at the end."""
+        """Return the array of each track, those seen last at the end."""
         return {track_id: self.arrays[row] for track_id, row in self._row_of.items()}
 
     @property
