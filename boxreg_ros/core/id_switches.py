@@ -18,7 +18,7 @@ MOTION_TIME = 0.3
 """Time by which a difference of velocities counts as a distance [s]; chosen."""
 MAX_SHARE = 0.4
 """Largest cost of the exchange, as part of that of the ids as they are; chosen."""
-MIN_GAIN = 2.0
+MIN_SWITCH_GAIN = 2.0
 """Least difference of both [m]; chosen: boxes err by 0.2 m, so each cost by less than 1 m."""
 
 
@@ -89,7 +89,7 @@ def _switches_of(first: str, second: str, tracks: Mapping[str, Centers]) -> list
     own = np.linalg.norm(before - after, axis=-1).sum((1, 2))
     exchanged = np.linalg.norm(before - after[:, :, ::-1], axis=-1).sum((1, 2))
     is_near = np.linalg.norm(both[at, 0] - both[at, 1], axis=1) < MOST_APART
-    is_switch = is_near & (exchanged < MAX_SHARE * own) & (own - exchanged > MIN_GAIN)
+    is_switch = is_near & (exchanged < MAX_SHARE * own) & (own - exchanged > MIN_SWITCH_GAIN)
     shown = np.flatnonzero(is_switch)
     runs = np.split(shown, np.flatnonzero(np.diff(shown) >= NUM_BOXES) + 1)
     best = [run[np.argmax((own - exchanged)[run])] for run in runs if len(run)]

@@ -56,7 +56,7 @@ time, 0.8 and less where human labels are of neither.
 """
 SMOOTHING = 0.35
 """Reach of the local lines through the centres of a track [s]: noise must not be motion."""
-REACH = 0.3
+PATH_REACH = 0.3
 """Points up to this far outside of the predicted boxes are compared with them [m]."""
 ROAD_CLEARANCE = 0.3
 """Points less than this above the bottom of a box may be of the road [m]."""
@@ -329,11 +329,11 @@ def _costs(sweep: Sweep, boxes: Floats, velocity: Floats) -> Floats | None:
         along = np.abs(cos * offsets[..., X] + sin * offsets[..., Y]) - boxes[:, LENGTH] / 2
         across = np.abs(cos * offsets[..., Y] - sin * offsets[..., X]) - boxes[:, LENGTH + 1] / 2
         outside = np.maximum(along, across)
-        is_of_path = (outside < REACH).any(1)
+        is_of_path = (outside < PATH_REACH).any(1)
         if is_of_path.sum() < FEWEST_POINTS:
             return None
         outside = outside[is_of_path]
-        inside = (outside < REACH / 2).sum(0)
+        inside = (outside < PATH_REACH / 2).sum(0)
         depth = np.abs(outside).clip(max=FACE_DEPTH).mean(0)
         costs[row] = 1.5 * depth / FACE_DEPTH - inside / max(inside.max(), FEWEST_POINTS)
     return costs
@@ -350,7 +350,7 @@ def _points_near(sweep: Sweep, boxes: Floats, velocity: Floats) -> tuple[Floats,
     ahead = velocity / np.linalg.norm(velocity)
     beside = np.array([-ahead[Y], ahead[X], 0.0])
     reach = np.abs((centers - middle) @ np.stack([ahead, beside], 1)).max(0)
-    reach += np.array([length, width]) / 2 + REACH
+    reach += np.array([length, width]) / 2 + PATH_REACH
     there = (middle - t) @ R
     x, y = sweep.points[:, X], sweep.points[:, Y]
     radius = reach.sum()

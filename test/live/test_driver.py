@@ -158,7 +158,9 @@ def test_associated_ids_are_the_same_in_markers_and_messages():
     for item in out:
         assert item.given.track_ids == item.refined.boxes.track_ids == ('1', '2')
         assert [d.id for d in item.message.detections] == ['1', '2']
-    assert live.facts == {'ids': 'by association', 'associated_tracks': 2}
+    assert live.facts['ids'] == 'by association'
+    assert live.facts['associated_tracks'] == 2
+    assert live.facts['box latency'].startswith('nothing moves')
 
 
 def test_heading_signs_are_resolved_per_track_and_stay_marked_as_unknown():
