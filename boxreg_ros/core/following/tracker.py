@@ -8,7 +8,6 @@ two seeds there are two ways; each is tested where it arrives at the other seed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple, Self
 
@@ -222,23 +221,25 @@ class Owned:
     """Boxes of objects that are followed already: their points are of no other object."""
 
     def __init__(self) -> None:
-        self._boxes: dict[int, list[Floats]] = {}  # by row of the sweep
+        self._boxes: dict[int, tuple[Floats, int]] = {}  # by row of the sweep; rows in use
 
     def add(self, rows: Ints, boxes: Floats) -> None:
         """Add the boxes (N, 9) of an object in the sweeps `rows` (N,)."""
         for row, box in zip(rows.tolist(), boxes, strict=True):
-            self._boxes.setdefault(row, []).append(box)
+            known, count = self._boxes.get(row, (np.empty((8, 9)), 0))
+            if count == len(known):
+                known = np.concatenate([known, np.empty_like(known)])
+            known[count] = box
+            self._boxes[row] = known, count + 1
 
-    def others(self, row: int, pose: Floats, half: Floats) -> Iterator[Floats]:
-        """Yield boxes near a pose (4,); not one whose centre is in it: that is the same object."""
-        boxes = self._boxes.get(row)
-        if not boxes:
-            return
-        reach = np.hypot(half[0], half[1])
-        for box in boxes:
-            away = np.hypot(box[0] - pose[0], box[1] - pose[1])
-            if half[1] < away < reach + np.hypot(box[LENGTH], box[WIDTH]) / 2 + 1.0:
-                yield box
+    def others(self, row: int, pose: Floats, half: Floats) -> Floats:
+        """Return boxes (n, 9) near a pose (4,); none whose centre is in it: that is the object."""
+        known, count = self._boxes.get(row, (np.empty((0, 9)), 0))
+        boxes = known[:count]
+        away = np.hypot(boxes[:, 0] - pose[0], boxes[:, 1] - pose[1])
+        reach = np.hypot(half[0], half[1]) + np.hypot(boxes[:, LENGTH], boxes[:, WIDTH]) / 2 + 1.0
+        near: Floats = boxes[(half[1] < away) & (away < reach)]
+        return near
 
 
 class Follower:
