@@ -166,7 +166,7 @@ class _Review:
             Route('/decisions', self.decisions, methods=['GET']),
             Route('/decisions', self.decide, methods=['POST']),
             Route('/events', self.events),
-            Route('/open', self.open, methods=['POST']),
+            Route('/open', self.note_open, methods=['POST']),
             Route('/solve', self.solve, methods=['POST']),
             Route('/risk', self.risk, methods=['POST']),
             Route('/save', self.save, methods=['POST']),
@@ -207,7 +207,7 @@ class _Review:
             raise RecordingError('seen: expected the number of known decisions')
         return StreamingResponse(self._stream(int(seen)), media_type='text/event-stream')
 
-    async def open(self, request: Request) -> Response:
+    async def note_open(self, request: Request) -> Response:
         """Note the track that a page has open, and return those that others have."""
         sent = await json_of(request)
         page, track = text_of(sent, 'page'), text_of(sent, 'track')

@@ -70,7 +70,7 @@ class DriveImages:
     def _known(self) -> list[Camera]:
         with self._lock:
             if not self._is_open:
-                recording = self._opened.enter_context(self._source.open())
+                recording = self._opened.enter_context(self._source.recording())
                 if isinstance(recording, Recording):
                     self._images = recording.images()
                 self._is_open = True

@@ -40,7 +40,7 @@ class DriveSource:
 
     Attributes
     ----------
-    open : callable
+    recording : callable
         Returns the recording, not yet entered.
     convention : Convention
         Of its boxes.
@@ -51,7 +51,7 @@ class DriveSource:
 
     """
 
-    open: Callable[[], AbstractContextManager[ItemSource]]
+    recording: Callable[[], AbstractContextManager[ItemSource]]
     convention: Convention
     fixed_frame: str
     config: Config
@@ -207,7 +207,7 @@ class Scene:
         source = self._source
         self._error = 'recording: expected sweeps to its end, got an error; see the terminal'
         try:
-            with source.open() as recording:
+            with source.recording() as recording:
                 items = FixedFrameItems(
                     recording, source.config, source.convention, source.fixed_frame
                 )
