@@ -37,6 +37,8 @@ evidence
 """
 NOISE = np.dtype([('deviation', float, 9), ('correlation', float, 9), ('boxes', float)])
 """Noise of one kind of a drive (M14), and the number of boxes that it is estimated from."""
+TRACK_FIELDS = ('sums', 'evidence')
+NOISE_FIELDS = ('deviation', 'correlation', 'boxes')
 
 
 class KindStatistics(NamedTuple):
@@ -122,8 +124,8 @@ def _checked_drive(file: str, name: str, drive: Any) -> tuple[str, tuple[KindSta
     """Return name and content of one drive of a file."""
     known = {'sha256', *KINDS}
     if not isinstance(drive, dict) or set(drive) != known:
-        found = ', '.join(drive) if isinstance(drive, dict) else type(drive).__name__
-        raise _wrong(file, f'{", ".join(sorted(known))} of each drive', found)
+        others = ', '.join(drive) if isinstance(drive, dict) else type(drive).__name__
+        raise _wrong(file, f'{", ".join(sorted(known))} of each drive', others)
     try:
         found = tuple(_kind_of(drive[kind]) for kind in KINDS)
     except (ValueError, TypeError, KeyError, IndexError) as error:
@@ -176,9 +178,9 @@ def _rounded(values: Floats) -> list[Any]:
 
 def _as_json(kind: KindStatistics) -> dict[str, Any]:
     """Return the statistics of a kind as a file has them."""
-    tracks = [{name: _rounded(track[name]) for name in TRACK.names} for track in kind.tracks]
+    tracks = [{name: _rounded(track[name]) for name in TRACK_FIELDS} for track in kind.tracks]
     return {
-        'noise': {name: _rounded(kind.noise[name]) for name in NOISE.names},
+        'noise': {name: _rounded(kind.noise[name]) for name in NOISE_FIELDS},
         'tracks': tracks,
     }
 
@@ -186,10 +188,10 @@ def _as_json(kind: KindStatistics) -> dict[str, Any]:
 def _kind_of(content: dict[str, Any]) -> KindStatistics:
     """Return the statistics of a kind from a file: the inverse of `_as_json`."""
     tracks, noise = np.zeros(len(content['tracks']), TRACK), np.zeros((), NOISE)
-    for name in NOISE.names:
+    for name in NOISE_FIELDS:
         noise[name] = _exactly(content['noise'][name], noise[name].shape)
     for track, given in zip(tracks, content['tracks'], strict=True):
-        for name in TRACK.names:
+        for name in TRACK_FIELDS:
             track[name] = _exactly(given[name], track[name].shape)
     return KindStatistics(tracks, noise)
 
