@@ -32,7 +32,7 @@ PATTERNS = ('bayer_rggb8', 'bayer_bggr8', 'bayer_gbrg8', 'bayer_grbg8')
 QUALITY = 90
 
 
-class Camera(NamedTuple):
+class ImageCamera(NamedTuple):
     """
     A topic of images, and the model of its camera.
 
@@ -87,7 +87,7 @@ class RecordedImages:
         self._reader = reader
         self._decoder = decoder
         self._delays: dict[str, int] = {}  # of receive times after the stamps [ns]
-        self.cameras: list[Camera] = []
+        self.cameras: list[ImageCamera] = []
         for topic in topics.filled(IMAGE_TYPES):
             first = next(self._messages({topic}), None)
             if first is not None:
@@ -96,7 +96,7 @@ class RecordedImages:
                 frame_id = str(clouds.header_of(message).frame_id).lstrip('/')
                 self.cameras.append(self._camera(topic, frame_id, message))
 
-    def nearest(self, camera: Camera, stamp_ns: int) -> Image:
+    def nearest(self, camera: ImageCamera, stamp_ns: int) -> Image:
         """
         Return the image of a camera that is nearest to a stamp.
 
@@ -131,10 +131,10 @@ class RecordedImages:
                 message = self._decoder.message(record)
                 yield record.received_ns, _stamp_of(record, message), message
 
-    def _camera(self, topic: str, frame_id: str, message: Any) -> Camera:
+    def _camera(self, topic: str, frame_id: str, message: Any) -> ImageCamera:
         """Return the camera of a topic by the info beside it, or of its frame."""
         size = (int(getattr(message, 'width', 0)), int(getattr(message, 'height', 0)))
-        camera = Camera(topic, frame_id, size, None, np.zeros(0), '')
+        camera = ImageCamera(topic, frame_id, size, None, np.zeros(0), '')
         infos = [
             (name, next(self._messages({name}), None)) for name in self._topics.filled(INFO_TYPES)
         ]
@@ -157,7 +157,7 @@ def _stamp_of(record: Record, message: Any) -> int:
         return poses.stamp_ns(clouds.header_of(message))
 
 
-def _with_model(camera: Camera, info: Any) -> Camera:
+def _with_model(camera: ImageCamera, info: Any) -> ImageCamera:
     """Return a camera with the model of a CameraInfo; ROS 1 and Foxglove write capitals."""
 
     def values(name: str) -> Floats:

@@ -204,8 +204,8 @@ class LiveRegistrar:
         self._drives: Drives = {}
         if self._model_file is not None and self._model_file.exists():
             self._drives = read_models([self._model_file])
-        limits = () if budget is None else (budget.submit, budget.windows)
-        self._registrar = BoxRegistrar(config, *limits, drives=self._drives)
+        submit, windows = (None, None) if budget is None else (budget.submit, budget.windows)
+        self._registrar = BoxRegistrar(config, submit, windows, self._drives)
         self.static_points: StaticPoints | None = None
         if static_patience is not None:
             self.static_points = StaticPoints(static_patience, self._registrar)

@@ -224,7 +224,7 @@ def _learnt(jobs: Sequence[Job], args: argparse.Namespace) -> Path:
     first.formats = ('csv',)
     found = _results(jobs, first)
     done = [job.name for job, result in zip(jobs, found, strict=True) if result.is_done]
-    together = args.out / INPUT_MODEL
+    together: Path = args.out / INPUT_MODEL
     drives = read_models([first.out / name / INPUT_MODEL for name in done])
     with written_whole(together) as file:
         file.write(to_text(drives))

@@ -9,17 +9,17 @@ from boxreg_ros.core.follow import FollowedTrack
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.review.payload import TrackPart, TrackTruth
 from boxreg_ros.review.risk import assess
-from boxreg_ros.review.scene import Scene
+from boxreg_ros.review.scene import DriveScene
 from boxreg_ros.review.tables import TrackRow
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, Ints, ROLL, Z
 import numpy as np
 
-MAX_POINTS = 400
+MAX_CLICKED = 400
 """Most points of a box that the page gets; as in a report."""
 
 
-def added_track(scene: Scene, seeds: Sequence[BoxArray], begin_ns: int) -> dict[str, Any]:
+def added_track(scene: DriveScene, seeds: Sequence[BoxArray], begin_ns: int) -> dict[str, Any]:
     """
     Follow an added object from its boxes.
 
@@ -44,7 +44,7 @@ def added_track(scene: Scene, seeds: Sequence[BoxArray], begin_ns: int) -> dict[
     part = TrackPart(row, points, unknown)
     return {
         'row': part.row(track.stamps_ns),
-        'part': part.part(begin_ns, MAX_POINTS),
+        'part': part.part(begin_ns, MAX_CLICKED),
         'ends': [{'stamp': str(end.stamp_ns), 'reason': end.reason} for end in track.ends],
         'problems': track.problems,
     }
@@ -53,7 +53,7 @@ def added_track(scene: Scene, seeds: Sequence[BoxArray], begin_ns: int) -> dict[
 class _Near:
     """The points of the sweeps near the boxes of a track."""
 
-    def __init__(self, scene: Scene, track: FollowedTrack) -> None:
+    def __init__(self, scene: DriveScene, track: FollowedTrack) -> None:
         stamps_ns = track.stamps_ns.tolist()
         self._sensors = scene.sensors_at(stamps_ns)
         self.local = scene.near(stamps_ns, track.boxes)

@@ -24,8 +24,8 @@ from starlette.responses import HTMLResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp
 
-TEMPLATE = 'drives.html.j2'
-POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'"
+DRIVES_TEMPLATE = 'drives.html.j2'
+DRIVES_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'"
 
 
 class Reviewed(Protocol):
@@ -41,7 +41,7 @@ def drives_application(reviews: Sequence[tuple[Reviewed, ASGIApp]]) -> Starlette
 
     async def page(_: Request) -> Response:
         text = await run_in_threadpool(_page, [review for review, _ in reviews])
-        return HTMLResponse(text, headers={'Content-Security-Policy': POLICY})
+        return HTMLResponse(text, headers={'Content-Security-Policy': DRIVES_POLICY})
 
     mounts = [Mount(f'/{number}', app=one) for number, (_, one) in enumerate(reviews)]
     return Starlette(routes=[Route('/', page), *mounts])
@@ -69,7 +69,7 @@ def _page(reviews: Sequence[Reviewed]) -> str:
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     css = Markup((PAGE / STYLE).read_text(encoding='utf-8'))
-    return environment.get_template(TEMPLATE).render(
+    return environment.get_template(DRIVES_TEMPLATE).render(
         css=css, drives=rows, problems=problems, unread=UNREAD, pause=PAUSE,
         agreement=agreement_text([one.out for one in found]),
     )  # fmt: skip

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-REACH = 9.0
+FIT_REACH = 9.0
 """Points up to this far from the place are looked at [m]; chosen: half an articulated bus."""
-CELL = 0.25
+FIT_CELL = 0.25
 """Points in touching cells of this size are of one object [m]; chosen: cars park farther apart."""
 ROAD_CELL = 1.5
 """The lowest point of a cell of this size is of the road [m]; chosen."""
-CLEARANCE = 0.25
+FIT_CLEARANCE = 0.25
 """Points so far above the road are of objects [m]; chosen: curbs are lower."""
 MAX_HEIGHT = 4.5
 """Points higher above the road are of bridges and trees [m]."""
@@ -83,10 +83,10 @@ def fitted(
         If there is no object at the place.
 
     """
-    near = points[(np.abs(points[:, :2] - place) < REACH).all(1)].astype(np.float64)
+    near = points[(np.abs(points[:, :2] - place) < FIT_REACH).all(1)].astype(np.float64)
     road = _road_below(near)
     height = near[:, 2] - road
-    near, road = (a[(height > CLEARANCE) & (height < MAX_HEIGHT)] for a in (near, road))
+    near, road = (a[(height > FIT_CLEARANCE) & (height < MAX_HEIGHT)] for a in (near, road))
     own = _touching(near[:, :2], place)
     if own.sum() < MIN_POINTS:
         raise RecordingError(
@@ -123,7 +123,7 @@ def _touching(points: Floats, place: Floats) -> NDArray[np.bool_]:
     """Return which points (M, 2) are of the object nearest to a place."""
     if not len(points):
         return np.zeros(0, bool)
-    cells = ((points - points.min(0)) / CELL).astype(int)
+    cells = ((points - points.min(0)) / FIT_CELL).astype(int)
     is_filled = np.zeros(cells.max(0) + 1, bool)
     is_filled[tuple(cells.T)] = True
     labels, _ = ndimage.label(is_filled, np.ones((3, 3)))

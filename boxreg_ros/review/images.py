@@ -7,10 +7,10 @@ from threading import Lock
 from typing import Any
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.images import Camera, Image, RecordedImages
+from boxreg_ros.io.images import Image, ImageCamera, RecordedImages
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import inverse
-from boxreg_ros.review.scene import DriveSource, Scene
+from boxreg_ros.review.scene import DriveScene, DriveSource
 from boxreg_ros.structures import Floats
 
 
@@ -22,12 +22,12 @@ class DriveImages:
     ----------
     source : DriveSource
         The recording.
-    scene : Scene
+    scene : DriveScene
         Knows the poses of the cameras.
 
     """
 
-    def __init__(self, source: DriveSource, scene: Scene) -> None:
+    def __init__(self, source: DriveSource, scene: DriveScene) -> None:
         self._source = source
         self._scene = scene
         self._lock = Lock()
@@ -67,7 +67,7 @@ class DriveImages:
             found = self._images.nearest(cameras[index], stamp_ns)
         return found, self._T_camera_fixed(cameras[index], found.stamp_ns)
 
-    def _known(self) -> list[Camera]:
+    def _known(self) -> list[ImageCamera]:
         with self._lock:
             if not self._is_open:
                 recording = self._opened.enter_context(self._source.recording())
@@ -76,6 +76,6 @@ class DriveImages:
                 self._is_open = True
             return [] if self._images is None else self._images.cameras
 
-    def _T_camera_fixed(self, camera: Camera, stamp_ns: int) -> Floats | None:
+    def _T_camera_fixed(self, camera: ImageCamera, stamp_ns: int) -> Floats | None:
         pose = self._scene.pose_of(camera.frame_id, stamp_ns)
         return None if pose is None else inverse(pose)

@@ -57,7 +57,7 @@ class DriveSource:
     config: Config
 
 
-class Scene:
+class DriveScene:
     """
     The sweeps of a drive, in the fixed frame.
 

@@ -11,7 +11,7 @@ from boxreg_ros.review.fit import fitted, USUAL_EXTENTS
 from boxreg_ros.review.images import DriveImages
 from boxreg_ros.review.payload import as_json
 from boxreg_ros.review.requests import box_of, json_of, numbers_of, stamp_of, text_of
-from boxreg_ros.review.scene import DriveSource, Scene, thinned
+from boxreg_ros.review.scene import DriveScene, DriveSource, thinned
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box
 import numpy as np
 from starlette.concurrency import run_in_threadpool
@@ -19,7 +19,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-MAX_BOXES = 20_000
+MAX_SCENE_BOXES = 20_000
 """Most boxes of a request: a track of half an hour; chosen."""
 
 
@@ -37,7 +37,7 @@ class SceneRoutes:
     """
 
     def __init__(self, source: DriveSource, frame_id: str) -> None:
-        self._scene = Scene(source)
+        self._scene = DriveScene(source)
         self._images = DriveImages(source, self._scene)
         self._frame_id = frame_id
 
@@ -136,8 +136,10 @@ def _needed_stamp(sent: Mapping[str, Any]) -> int:
 
 
 def _objects_of(sent: object, name: str) -> list[Mapping[str, Any]]:
-    if not isinstance(sent, list) or not 0 < len(sent) <= MAX_BOXES:
-        raise RecordingError(f'{name}: expected 1 to {MAX_BOXES} in a list, got {sent!r:.80}')
+    if not isinstance(sent, list) or not 0 < len(sent) <= MAX_SCENE_BOXES:
+        raise RecordingError(
+            f'{name}: expected 1 to {MAX_SCENE_BOXES} in a list, got {sent!r:.80}'
+        )
     if not all(isinstance(one, dict) for one in sent):
         raise RecordingError(f'{name}: expected objects in a list')
     return sent
