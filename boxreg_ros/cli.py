@@ -177,6 +177,7 @@ def _ended_by_signals(arguments: list[str]) -> Iterator[None]:
             retries[-1].daemon = True
             retries[-1].start()
             return
+        sys.unraisablehook = _ignored  # of objects that an interrupted import leaves half-made
         if number == signal.SIGINT:
             signal.default_int_handler(number, frame)
         for one in handled:  # a second signal must not interrupt the clean-up
@@ -198,6 +199,10 @@ def _ended_by_signals(arguments: list[str]) -> Iterator[None]:
             timer.cancel()
         for one in handled:
             signal.signal(one, before[one])
+
+
+def _ignored(_: object) -> None:
+    """Print nothing of an exception that cannot be raised."""
 
 
 def _ended_by(number: int, arguments: list[str]) -> str:

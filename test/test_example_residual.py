@@ -28,7 +28,7 @@ def copy(tmp_path):
     residual, weight = functions.split('\n\n\n')[:2]
     method = tmp_path / 'boxreg_ros' / 'core' / 'method'
     insert(method / 'residuals.py', 'RESIDUALS = (', f'{residual}\n\n\n')
-    insert(method / 'weights.py', '@kernel\ndef robustify', f'{weight}\n\n\n')
+    insert(method / 'weights.py', '@loop\ndef robustify', f'{weight}\n\n\n')
     insert(method / 'residuals.py', '    slip_weight,\n', '    rise_weight,\n')
     row = re.search(r'`(Residual\(rise, .*\))`', PAGE.read_text(encoding='utf-8'))[1]
     insert(method / 'residuals.py', '    Residual(slip, ', f'    {row},\n')

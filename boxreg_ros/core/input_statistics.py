@@ -18,10 +18,10 @@ from boxreg_ros.structures import Floats
 import numpy as np
 from numpy.typing import NDArray
 
-FORMAT, VERSION, UNITS = 'boxreg input model', 1, 'm, rad'
+FORMAT, MODEL_VERSION, MODEL_UNITS = 'boxreg input model', 1, 'm, rad'
 DIGITS = 6
 """Significant digits of a number in a file. Chosen: more than any of them is known."""
-MAX_RATIO = 1e3
+MAX_NOISE = 1e3
 """Deviations of an input over those of the settings are smaller. Chosen."""
 MAX_METRES = 1e3
 """Extents and gaps of objects are smaller [m]. Chosen."""
@@ -91,7 +91,7 @@ def to_text(drives: Drives) -> str:
         name: {'sha256': _digest(drive), **dict(zip(KINDS, map(_as_json, drive), strict=True))}
         for name, drive in sorted(drives.items())
     }
-    head = {'format': FORMAT, 'version': VERSION, 'units': UNITS, 'drives': content}
+    head = {'format': FORMAT, 'version': MODEL_VERSION, 'units': MODEL_UNITS, 'drives': content}
     return json.dumps(head, indent=1) + '\n'
 
 
@@ -111,7 +111,7 @@ def from_text(text: str, name: str) -> Drives:
         raise _wrong(name, 'JSON of finite numbers', str(error)) from None
     if not isinstance(head, dict) or head.get('format') != FORMAT:
         raise _wrong(name, f'a file with the format {FORMAT!r}', 'another one')
-    for key, known in (('version', VERSION), ('units', UNITS)):
+    for key, known in (('version', MODEL_VERSION), ('units', MODEL_UNITS)):
         if head.get(key) != known:
             raise _wrong(name, f'{key} {known!r}', repr(head.get(key)))
     drives = head.get('drives')
@@ -131,7 +131,7 @@ def _checked_drive(file: str, name: str, drive: Any) -> tuple[str, tuple[KindSta
     except (ValueError, TypeError, KeyError, IndexError) as error:
         raise _wrong(file, 'the numbers of its version', str(error)) from None
     if not all(map(_is_plausible, found)):
-        raise _wrong(file, f'numbers in {UNITS}', f'others in drive {name}')
+        raise _wrong(file, f'numbers in {MODEL_UNITS}', f'others in drive {name}')
     if _digest(found) != drive['sha256']:
         raise _wrong(file, f'drive {name} as it was written', 'a changed one')
     return name, found
@@ -147,7 +147,7 @@ def _is_plausible(kind: KindStatistics) -> bool:
         (counts >= 0).all()
         and (sums <= MAX_METRES * counts).all()
         and (logarithms < np.log(MAX_METRES)).all()
-        and ((noise['deviation'] >= 0) & (noise['deviation'] < MAX_RATIO)).all()
+        and ((noise['deviation'] >= 0) & (noise['deviation'] < MAX_NOISE)).all()
         and ((noise['correlation'] >= 0) & (noise['correlation'] < 1)).all()
         and noise['boxes'] >= 0
     )

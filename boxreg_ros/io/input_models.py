@@ -18,9 +18,9 @@ import numpy as np
 
 CHANCE = 1e-3
 """Drives of one detector are said to differ with this probability. Chosen."""
-MIN_TRACKS = 8
+MIN_SCATTER = 8
 """Faces of tracks whose scatter is an estimate. Chosen."""
-NAMES = ('ends', 'sides', 'top', 'bottom')
+GROUP_NAMES = ('ends', 'sides', 'top', 'bottom')
 """Of `FACE_GROUPS`."""
 
 
@@ -62,12 +62,12 @@ def disagreements(drives: Drives) -> Iterator[str]:
     By the mean gap of each group of faces, with the scatter between its tracks.
 
     """
-    tests = len(drives) * len(KINDS) * len(NAMES)
+    tests = len(drives) * len(KINDS) * len(GROUP_NAMES)
     for digest, k in product(drives if len(drives) > 1 else (), range(len(KINDS))):
         own = drives[digest][k]
         others = [drive[k] for name, drive in drives.items() if name != digest]
         sums = np.concatenate([kind.tracks['sums'] for kind in others])
-        pairs = zip(NAMES, _means(own.tracks['sums']), _means(sums), strict=True)
+        pairs = zip(GROUP_NAMES, _means(own.tracks['sums']), _means(sums), strict=True)
         for name, (mean, variance), (known, error) in pairs:
             if _is_chance(mean - known, variance + error, tests):
                 continue
@@ -90,6 +90,6 @@ def _means(sums: Floats) -> list[tuple[float, float]]:
         is_known = count >= MIN_HITS
         known = total[is_known] / share[is_known]
         n = len(known)
-        variance = known.var(ddof=1) / n if n > MIN_TRACKS else np.nan
+        variance = known.var(ddof=1) / n if n > MIN_SCATTER else np.nan
         found.append((known.mean() if n else np.nan, variance))
     return found

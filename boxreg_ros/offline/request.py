@@ -298,20 +298,17 @@ class Request:
 
     def drive_name(self) -> str:
         """Return a name of the drive: a hash of the names and sizes of its recordings."""
-        files = [
-            (Path(str(one.path)).name, one.size)
-            for path in self.recordings
-            if url_of(path) is not None
-            for one in entries_of(path)
-        ]
-        local = [path for path in self.recordings if path.exists()]
-        inner = [
-            file
-            for path in local
-            for file in (sorted(path.iterdir()) if path.is_dir() else [path])
-        ]
-        files += [(file.name, file.stat().st_size) for file in inner if file.is_file()]
-        return hashlib.sha256(repr((files, self.start, self.end)).encode()).hexdigest()[:16]
+        names = [path.name for path in self.recordings]
+        files: list[tuple[str, int]] = []
+        for path in (part for recording in self.recordings for part in _parts_of(recording)):
+            if url_of(path) is not None:
+                files += [(Path(str(one.path)).name, one.size) for one in entries_of(path)]
+            elif path.is_dir():
+                inner = filter(Path.is_file, sorted(path.iterdir()))
+                files += [(file.name, file.stat().st_size) for file in inner]
+            elif path.exists():
+                files.append((path.name, path.stat().st_size))
+        return hashlib.sha256(repr((names, files, self.start, self.end)).encode()).hexdigest()[:16]
 
     def fingerprint(self) -> str:
         """Return a hash of the request and of its input files, by size and modification time."""

@@ -37,7 +37,7 @@ P2: 700 0 600 0 0 700 180 0 0 0 1 0
 R_rect: 1 0 0 0 1 0 0 0 1
 Tr_velo_cam: 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.5
 """
-OWN_FILES = ('summary.json', 'config.yaml', 'tracks.csv', 'review.csv')
+OWN_FILES = ('summary.json', 'config.yaml', 'tracks.csv', 'review.csv', 'input_model.json')
 """Files of `relabel` about the run, and of the segment about the settings; no labels."""
 
 

@@ -52,8 +52,8 @@ def test_check_finds_a_stale_page(tmp_path, monkeypatch, capsys):
 
 
 def test_numbers_without_an_effect_exist():
-    text = (STORE / 'sensitivity.md').read_text(encoding='utf-8')
-    _, _, section = text.partition('## Numbers without an effect here')
+    text = (STORE / 'ablation.md').read_text(encoding='utf-8')
+    _, _, section = text.partition('### Numbers without an effect here')
     rows = [line for line in section.splitlines() if line.startswith('| `')]
     listed = {name for row in rows for name in re.findall(r'`([^`]+)`', row.split('|')[1])}
     settings = {item.name for item, _ in Config().items()}

@@ -188,6 +188,7 @@ async function main() {
     $('tab-drive').hidden = !hasScene;
     setUpScene();
     $('all-drives').hidden = location.pathname === '/';
+    $('all-drives').href = '../';
     setUpNumbers();
     $('decide').hidden = $('save-button').hidden = $('person').hidden = false;
     $('save-button').onclick = save;
