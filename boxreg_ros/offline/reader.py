@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Generator, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from math import inf
@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.latency import LateBoxes, Latency, set_latency
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
 from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.recording import Recording
@@ -313,18 +314,23 @@ def latency_of(request: Request) -> Latency:
         starts = begin + (np.arange(SAMPLES) + 0.5) / SAMPLES * seconds
         parts = [(start, start + SAMPLED_SECONDS) for start in starts.tolist()]
     for start, end in parts:
-        part = replace(request, start=start, end=end, report=False)
-        with part.recording() as recording:
-            items = FixedFrameItems(recording, part.config, part.convention, part.fixed_frame)
-            late.restart()
-            for item in items.read():
-                if item.restarts:
-                    late.restart()
-                if isinstance(item.moved, BoxArray):
-                    late.add_boxes(item.moved)
-                elif item.moved is not None:
-                    late.add_sweep(item.moved)
+        late.restart()
+        with suppress(RecordingError):  # a pause shows nothing; what is wrong is said on reading
+            _show(replace(request, start=start, end=end, report=False), late)
     return late.estimate()
+
+
+def _show(part: Request, late: LateBoxes) -> None:
+    """Add the boxes and sweeps of a part of a recording to the evidence of the latency."""
+    with part.recording() as recording:
+        items = FixedFrameItems(recording, part.config, part.convention, part.fixed_frame)
+        for item in items.read():
+            if item.restarts:
+                late.restart()
+            if isinstance(item.moved, BoxArray):
+                late.add_boxes(item.moved)
+            elif item.moved is not None:
+                late.add_sweep(item.moved)
 
 
 @contextmanager

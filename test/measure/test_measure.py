@@ -31,7 +31,17 @@ def drive():
 def test_every_measurement_declares_options(name):
     parser = argparse.ArgumentParser()
     import_module(f'measure.{name}').add_arguments(parser)
-    without_data = ('highway', 'kills', 'lidars', 'load', 'node', 'report', 'kinds', 'points', 'labeller')
+    without_data = (
+        'highway',
+        'kills',
+        'lidars',
+        'load',
+        'node',
+        'report',
+        'kinds',
+        'points',
+        'labeller',
+    )
     needs_data = name not in without_data
     parser.parse_args(['folder'] if needs_data else [])
 

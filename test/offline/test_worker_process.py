@@ -290,7 +290,7 @@ def test_exception_in_the_worker_ends_relabel(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('which', ['registers windows', 'reads the recording'])
 def test_killed_worker_is_an_error_with_a_remedy(tmp_path, monkeypatch, which):
-    recording = Drive(sweeps=30).write(tmp_path / 'drive')
+    recording = Drive(sweeps=120).write(tmp_path / 'drive')
     added = []
     parent = os.getpid()
     others = set(children_of(parent))  # of earlier tests
