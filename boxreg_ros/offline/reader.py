@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Generator, Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
 from math import inf
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.latency import LateBoxes, Latency, set_latency
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, TransferError
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
 from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.recording import Recording
@@ -315,8 +315,12 @@ def latency_of(request: Request) -> Latency:
         parts = [(start, start + SAMPLED_SECONDS) for start in starts.tolist()]
     for start, end in parts:
         late.restart()
-        with suppress(RecordingError):  # a pause shows nothing; what is wrong is said on reading
+        try:
             _show(replace(request, start=start, end=end, report=False), late)
+        except TransferError:
+            raise
+        except RecordingError:  # a pause shows nothing; what else is wrong is said on reading
+            continue
     return late.estimate()
 
 
