@@ -108,7 +108,7 @@ def from_text(text: str, name: str) -> Drives:
     try:
         head = json.loads(text, parse_constant=_refuse_constant)
     except ValueError as error:
-        raise _wrong(name, 'JSON of finite numbers', str(error)) from None
+        raise _wrong(name, 'JSON of finite numbers', f'other text ({error})') from None
     if not isinstance(head, dict) or head.get('format') != FORMAT:
         raise _wrong(name, f'a file with the format {FORMAT!r}', 'another one')
     for key, known in (('version', MODEL_VERSION), ('units', MODEL_UNITS)):

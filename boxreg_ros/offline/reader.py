@@ -300,9 +300,9 @@ def in_time(items: Iterable[ReadItem], latency: float, waits: bool) -> Iterator[
 
 def latency_of(request: Request) -> Latency:
     """Return the latency of the boxes: as set, or estimated from parts of the recording."""
-    known = set_latency(request.config)
     if request.keyframes:
         return Latency()
+    known = set_latency(request.config)
     if known is not None:
         return known
     begin = request.start or 0.0

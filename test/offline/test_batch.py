@@ -74,6 +74,23 @@ def test_failures_are_isolated_and_a_second_run_skips_done_drives(tmp_path, caps
     assert page.index('0.75') < page.index('0.25')
 
 
+def test_each_drive_begins_with_what_the_others_have_shown(tmp_path, capsys):
+    paths = [Drive(sweeps=sweeps).write(tmp_path / name) for name, sweeps in (('a', 6), ('b', 8))]
+    out = tmp_path / 'out'
+    command = ['batch', *map(str, paths), '-o', str(out), '--learn', *QUICK]
+    assert main(command) == 0
+    together = json.loads((out / 'input_model.json').read_text())
+    own = [json.loads((out / name / 'input_model.json').read_text()) for name in ('a', 'b')]
+    assert set(together['drives']) == {name for one in own for name in one['drives']}
+    assert len(together['drives']) == 2
+    for name in ('a', 'b'):  # its own drive does not count twice
+        summary = json.loads((out / name / 'summary.json').read_text())
+        assert summary['input_model']['drives'] == 1
+    capsys.readouterr()
+    assert main(command) == 0
+    assert '2 of 2 drives done, 2 of them earlier' in capsys.readouterr().out
+
+
 def test_a_call_without_progress_is_left(tmp_path):
     """As the read from a network mount that no longer answers: here from an empty pipe."""
     ends = os.pipe()

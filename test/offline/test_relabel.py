@@ -64,7 +64,7 @@ def test_the_summary_states_the_time_of_the_boxes(tmp_path, scenario, known, set
 
 
 def test_late_boxes_are_mended_and_said(tmp_path):
-    """Boxes of the sample 0.3 s late are nearly as good as those in time, and told."""
+    """Boxes of the sample 0.3 s late are nearly as good as those in time; a warning names that."""
     truth = BoxTable.read(BAGS / 'street_truth.csv')
     boxes, _ = input_boxes(Recording([BAGS / 'street.mcap']))
     late = [replace(array, stamp_ns=array.stamp_ns + 300_000_000) for array in boxes[:-3]]

@@ -281,7 +281,7 @@ def motions(first, t, values, numbers):
     rates : array, shape (N, 4)
         Of the values where the object moves, else 0.
     moves, is_known : array, shape (N,)
-        Whether it moves, and whether the track is long enough to tell.
+        Whether it moves, and whether the track is long enough to show that.
 
     """
     N = len(t)

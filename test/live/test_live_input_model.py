@@ -1,0 +1,32 @@
+"""What the node has shown of its detector, in a file that the next drive begins with."""
+
+from boxreg_ros.core.input_statistics import from_text
+from paths import BAGS
+from ros_graph import ended_cleanly, graph_in, play, publishers_for, QUICK, records_of, RELIABLE
+from ros_messages import DETECTIONS
+
+SWEEPS = 12
+
+
+def first_sweeps(records, count):
+    """Return the records up to the boxes of a number of sweeps."""
+    ends = [i + 1 for i, record in enumerate(records) if record.boxes_stamp_ns is not None]
+    return records[: ends[count - 1]]
+
+
+def test_a_drive_is_added_to_the_file_of_the_drives_before(tmp_path):
+    model = tmp_path / 'detector.json'
+    records = first_sweeps(records_of(BAGS / 'street.mcap', '/detections'), SWEEPS)
+    for part, number in ((records, 1), (records[: len(records) // 2], 2)):
+        with graph_in(tmp_path) as graph:
+            publishers_for(graph, part)
+            early = graph.collect(DETECTIONS, '/refined_boxes')
+            node = graph.start(
+                *RELIABLE, *QUICK, '-r', 'boxes:=/detections', '-p', f'input_model:={model}'
+            )
+            graph.wait_until_connected()
+            play(graph, part, early)
+            ended_cleanly(node)
+        drives = from_text(model.read_text(), str(model))
+        assert len(drives) == number
+        assert all(len(kinds[0].tracks) for kinds in drives.values())
