@@ -66,7 +66,7 @@ JSON_FIELDS: dict[str, Any] = {
     'foxglove.RawImage': _IMAGE | _SIZE | {'step': int, 'encoding': str},
     'foxglove.CameraCalibration': {
         'timestamp': _TIME, 'frame_id': str, 'distortion_model': str, **_SIZE,
-        **dict.fromkeys('DKRP', [_NUMBER]),
+        **{key: [_NUMBER] for key in 'DKRP'},
     },
 }  # fmt: skip
 """
@@ -200,8 +200,9 @@ def _cloud(message: Any) -> Any:
     if stride < 0:
         raise UnsupportedMessage(f'PointCloud.point_stride: expected 0 or more, got {stride}')
     return SimpleNamespace(
-        header=_header(message), height=1, width=len(data) // stride if stride else 0, fields=fields,
-        is_bigendian=False, point_step=stride, row_step=len(data), data=data, is_dense=False,
+        header=_header(message), height=1, width=len(data) // stride if stride else 0,
+        fields=fields, is_bigendian=False, point_step=stride, row_step=len(data), data=data,
+        is_dense=False,
     )  # fmt: skip
 
 
@@ -238,9 +239,7 @@ def _bytes_of(message: Any) -> bytes:
 
 def _compressed_image(message: Any) -> Any:
     """Return a foxglove CompressedImage as the ROS message of that name."""
-    return SimpleNamespace(
-        header=_header(message), format=message.format, data=_bytes_of(message)
-    )
+    return SimpleNamespace(header=_header(message), format=message.format, data=_bytes_of(message))
 
 
 def _raw_image(message: Any) -> Any:
