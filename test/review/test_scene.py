@@ -266,6 +266,10 @@ def test_a_box_is_fitted_to_the_points_at_a_place():
     assert found.num_points > 550  # not the road below it, nor the post
     truth = np.array([*center, 0.75, *size, 0, 0, yaw])
     assert iou_3d(found.box[None], truth[None])[0] > 0.85
+    # Close to the sensor neither the road around it nor its lower half is seen.
+    upper = np.concatenate([road[np.abs(road[:, :2] - center).max(1) > 5], car[car[:, 2] > 0.8]])
+    beside = fitted(upper, car[0, :2], sensor, 0.0, {'car': size}).box
+    assert beside[2] - beside[5] / 2 == pytest.approx(0, abs=0.1)
     # By the heading of the sensor it is the other way round.
     turned = fitted(points, car[0, :2], sensor, math.pi, sizes).box[8]
     assert abs(math.cos(turned - yaw) + 1) < 0.01

@@ -212,7 +212,6 @@ async function main() {
     TRACKS = buildTracks();
   }
   setUpList();
-  drawOverview();
   setUpTimeline();
   setUpKeys();
   for (const name of Object.keys(VIEWS)) setUpDragging($(name));
