@@ -118,7 +118,7 @@ def _road_below(points: Floats) -> Floats:
     Return the height of the road below each point (M,).
 
     It is the lowest point of the cells around, or the plane of the lowest points of all cells
-    where that is clearly lower: beside the sensor the road, and the lower part of an object, is not seen.
+    where that is clearly lower: beside the sensor the road below an object is not seen.
 
     """
     if not len(points):
@@ -132,7 +132,7 @@ def _road_below(points: Floats) -> Floats:
 
 
 def _plane(lowest: Floats, cells: NDArray[np.int64]) -> Floats:
-    """Return the height at some cells (M, 2) of the plane below the lowest points of all (n, m)."""
+    """Return the height at cells (M, 2) of the plane of the road, by the lowest points (n, m)."""
     known = np.argwhere(np.isfinite(lowest))
     heights = lowest[tuple(known.T)]
     is_road = np.ones(len(heights), bool)
