@@ -224,7 +224,7 @@ def articulated(rng: np.random.Generator, sweeps: int | None, is_joined: bool) -
         for shape, x, y, yaw, speed in CARS_BESIDE
     ]
     cars = [_actor(str(i + 1), plan, count, rng) for i, plan in enumerate(plans)]
-    tractors = []
+    tractors: list[Actor] = []
     for x, y, yaw, speed, turn in CURVES:
         turning = _after_a_second(turn)
         plan = ActorPlan('truck', 'tractor', (x, y, yaw), constant(speed), turning)
