@@ -31,6 +31,7 @@ from boxreg_ros.structures import BoxArray, Sweep, YAW
 import numpy as np
 from paths import BAGS
 import pytest
+from scenes import simulated
 from scipy.optimize import linprog
 
 
@@ -41,7 +42,7 @@ def street():
 
 @pytest.fixture(scope='module')
 def paper():
-    return simulate('paper', seed=1)
+    return simulated('paper', 1)
 
 
 def run(*words):
@@ -133,7 +134,7 @@ def test_each_ray_gives_one_point(street):
 
 
 def test_street_has_parked_turning_and_reversing_cars(street):
-    whole = simulate('street', seed=0, sweeps=50).actors
+    whole = simulated('street', 0).actors
     times = np.arange(50) * 0.1
     boxes = [boxes_of(actor, actor.motion.at(times)) for actor in whole]
     for one, other in combinations(boxes, 2):
@@ -214,7 +215,7 @@ def test_paper_path_follows_equation_ten(paper):
 
 
 def test_paper_noise_has_the_errors_of_table_one():
-    scenes = [simulate('paper', seed) for seed in range(4)]
+    scenes = [simulated('paper', seed) for seed in range(4)]
     scores, errors = [], []
     for scene in scenes:
         boxes = BoxTable.from_arrays(scene.fixed_detections())
@@ -304,7 +305,7 @@ def test_sample_recording_equals_the_street():
     """The committed recording is seed 0 of the street; compressed bytes may differ by version."""
     path = BAGS / 'street.mcap'
     assert path.stat().st_size < 5e6
-    first = simulate('street', seed=0, sweeps=50)
+    first = simulated('street', 0)
     truth = BoxTable.read(BAGS / 'street_truth.csv')
     errors = truth.boxes - first.truth.boxes
     errors[:, YAW] = wrap_angle(errors[:, YAW])  # pi and -pi are the same heading
