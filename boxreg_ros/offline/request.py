@@ -279,9 +279,20 @@ class Request:
         return tuple(dict.fromkeys(name for name in self.clouds if name != 'object'))
 
     @property
+    def cloud_copies(self) -> tuple[str, ...]:
+        """Return the kinds of copies of the recording whose clouds are edited."""
+        is_labelled = self.label_points and 'mcap' in self.formats
+        return (*('overlay',) * is_labelled, *self.maps, *('undistorted',) * self.undistort)
+
+    @property
     def needs_point_labels(self) -> bool:
-        """Return whether the recording is read again, to label its points."""
-        return bool(self.point_formats or self.clouds or self.undistort or self.label_points)
+        """Return whether the points are labelled."""
+        return bool(self.point_formats or self.clouds or self.undistort)
+
+    @property
+    def needs_sweeps(self) -> bool:
+        """Return whether all sweeps are stored until the boxes of all tracks are known."""
+        return self.proposals or self.needs_point_labels
 
     @property
     def completes(self) -> bool:
