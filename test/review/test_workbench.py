@@ -228,9 +228,7 @@ def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path):
         assert 'the earlier ones are as they were' in text and 'too large' in text
         assert sorted(path.name for path in tmp_path.iterdir()) == ['out']
         # Killed while it decides: the page has what the file has, and says so.
-        page.evaluate("""(async () => {
-          while (await judge('unsure', false)) ;
-        })()""")
+        page.evaluate("void (async () => { while (await judge('unsure', false)) ; })()")
         page.wait_for_function('log.count > 5')
         process.kill()
         page.wait_for_selector('#failure:not([hidden])')
