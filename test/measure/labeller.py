@@ -30,7 +30,7 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.reviewed_drive import drive_of
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import Floats, REJECTED, YAW
-from browser import opened_page
+from browser import end_shared_browser, opened_page
 from measure import print_json
 import numpy as np
 
@@ -569,5 +569,6 @@ def reviewed(out: Path, truth: BoxTable) -> Labeller:
     with opened_page(server.address, expected='409') as page:
         labeller = Labeller(page, truth)
         labeller.review()
+    end_shared_browser()
     server.shutdown()
     return labeller
