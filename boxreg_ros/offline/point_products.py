@@ -17,13 +17,12 @@ from pathlib import Path
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.config import Config, KINDS
+from boxreg_ros.core.method.labelling import MOVING, STOOD
 from boxreg_ros.core.point_labels import (
     BACKGROUND,
-    MOVING,
     ObjectTrack,
     PointLabeller,
     PointLabels,
-    STOOD,
     UNKNOWN,
 )
 from boxreg_ros.errors import UnsupportedMessage
