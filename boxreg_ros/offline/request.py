@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from boxreg_ros.datasets import SceneRecording
     from boxreg_ros.io.recording import Recording
 
+NO_TOPIC = 'none'
+"""In place of a topic of boxes: the drive has no boxes."""
 POINT_FORMATS = ('semantickitti', 'lidarseg')
 """Formats that ``--label-points`` writes."""
 
@@ -72,7 +74,10 @@ class Request:
     recordings: tuple[Path, ...]
     lidars: Lidars = SINGLE_LIDAR
     boxes: str | None = option(
-        None, 'topic of the boxes (default: found by type)', metavar='TOPIC'
+        None,
+        'topic of the boxes, or none for a drive without boxes, whose objects a person adds '
+        '(default: found by type)',
+        metavar='TOPIC',
     )
     odometry: str | None = option(
         None,
