@@ -11,13 +11,15 @@ from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.labels import check_options, LabelOutput, Options, Provenance
 from boxreg_ros.labels.semantickitti import class_of
+from boxreg_ros.offline.point_products import object_tracks
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
+from boxreg_ros.review.changes import Changes
 from boxreg_ros.simulation.raycast import ROAD
 from boxreg_ros.simulation.scene import FIXED_FRAME
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.simulation.writer import write_recording
-from boxreg_ros.structures import Sweep
+from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 from consumers import consumer
 from mcap.reader import make_reader
 import numpy as np
@@ -242,6 +244,25 @@ def test_sweeps_without_boxes_are_unknown_and_copied_unchanged(scene, recording,
     assert [len(cloud) for cloud in clouds[half:]] == [
         len(owners) for owners in scene.owners[half:]
     ]
+
+
+def test_boxes_that_no_point_confirms_are_uncertain_and_rejected_ones_no_objects():
+    box = np.array([[10.0, 0, 1, 4, 2, 1.5, 0, 0, 0]])
+    found = [
+        ('refined', 9),
+        ('kept', 9),
+        ('interpolated', 9),
+        ('interpolated', 0),
+        ('rejected', 9),
+    ]
+    changes = Changes('odom')
+    for stamp, (status, points) in enumerate(found):
+        boxes = BoxArray(stamp, 'odom', ('1',), ('car',), np.array([np.nan]), box)
+        refined = RefinedBoxes(boxes, (status,), ('',), np.array([points]), np.eye(6)[None])
+        changes.add(boxes, refined, None, [])
+    (track,) = object_tracks(changes.tracks())
+    assert track.stamps_ns.tolist() == [0, 1, 2, 3]
+    assert track.is_certain.tolist() == [True, False, True, False]
 
 
 def test_clouds_of_several_lidars_are_copied_each_on_its_topic(tmp_path):
