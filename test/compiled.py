@@ -19,16 +19,21 @@ def copy_compiled(root):
 
     """
     for folder in (*KERNELS, READER):
-        sources = ROOT / folder
-        for path in sources.glob('*.py'):
+        for path in (ROOT / folder).glob('*.py'):
             shutil.copystat(path, root / folder / path.name)
-        shutil.copytree(sources / '__pycache__', root / folder / '__pycache__', dirs_exist_ok=True)
+        copy_cache(folder, root / folder / '__pycache__')
 
 
 def fill_cache(cache):
     """Give folder `cache` for NUMBA_CACHE_DIR what is compiled, except the reader of messages."""
     locator = pytest.importorskip('numba.core.caching')._CacheLocator
     for folder in KERNELS:
-        kernels = ROOT / folder
-        target = cache / locator.get_suitable_cache_subpath(str(kernels / '__init__.py'))
-        shutil.copytree(kernels / '__pycache__', target, ignore=shutil.ignore_patterns('*.pyc'))
+        source = str(ROOT / folder / '__init__.py')
+        copy_cache(folder, cache / locator.get_suitable_cache_subpath(source))
+
+
+def copy_cache(folder, target):
+    """Copy the compiled functions of a folder of the source tree."""
+    target.mkdir(parents=True, exist_ok=True)
+    for path in (ROOT / folder / '__pycache__').glob('*.nb[ic]'):
+        shutil.copy2(path, target)

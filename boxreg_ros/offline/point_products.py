@@ -34,7 +34,7 @@ from boxreg_ros.labels.mcap import OVERLAY
 from boxreg_ros.labels.recording_copy import RawMessage, RecordingCopy
 from boxreg_ros.labels.semantickitti import Numbers
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.stored_sweeps import Part, StoredSweeps
+from boxreg_ros.offline.stored_sweeps import MergedCloud, StoredSweeps
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.structures import (
     BoxArray,
@@ -64,7 +64,7 @@ MOVING_CODE, STOOD_CODE, UNKNOWN_CODE = 1, 2, 255
 """Values of the field ``moving``; 0 is background or parked."""
 FIELDS = {'label': (np.uint16, 0), 'instance': (np.uint16, 0), 'moving': (np.uint8, UNKNOWN_CODE)}
 """Fields of labelled clouds: types, and values of unknown points."""
-RECENT = 4
+RECENT_SWEEPS = 4
 """Sweeps whose labels are kept: the clouds of several LiDARs are not in the order of sweeps."""
 
 
@@ -185,7 +185,7 @@ class _Products:
         self._origin: Floats | None = None
         self._counts: Counter[str] = Counter()
         self._numbers: Numbers | None = None
-        self._labelled = lru_cache(RECENT)(self._label)
+        self._labelled = lru_cache(RECENT_SWEEPS)(self._label)
         self._done = 0
 
     def write(self) -> None:
@@ -311,7 +311,7 @@ class _Products:
         self, source: Recording, paths: Mapping[str, Path], provenance: Provenance | None
     ) -> None:
         """Write copies of a recording, by their kind."""
-        clouds: dict[tuple[str, int], tuple[int, Part]] = {}
+        clouds: dict[tuple[str, int], tuple[int, MergedCloud]] = {}
         for number, place in enumerate(self._sweeps.places):
             clouds |= {(part.topic, part.stamp_ns): (number, part) for part in place.parts}
         with ExitStack() as stack:
@@ -334,7 +334,7 @@ class _Products:
         raw: RawMessage,
         topic: str,
         source: Recording,
-        clouds: Mapping[tuple[str, int], tuple[int, Part]],
+        clouds: Mapping[tuple[str, int], tuple[int, MergedCloud]],
         kinds: Collection[str],
     ) -> Mapping[str, RawMessage]:
         """Return the message of a cloud for each kind of copy; none where it has no labels."""
@@ -359,7 +359,9 @@ class _Products:
             edited = {k: self._edit(k, message, finite, part, labelled) for k in kinds}
         return {k: raw._replace(data=source.encoded_cloud(cloud)) for k, cloud in edited.items()}
 
-    def _edit(self, kind: str, message: Any, finite: Ints, part: Part, labelled: _Labelled) -> Any:
+    def _edit(
+        self, kind: str, message: Any, finite: Ints, part: MergedCloud, labelled: _Labelled
+    ) -> Any:
         """
         Return the cloud of a message as a kind of copy has it.
 

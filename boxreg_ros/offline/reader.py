@@ -27,7 +27,7 @@ from boxreg_ros.offline.background import Background
 from boxreg_ros.offline.labelled_recording import label_frame_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
-from boxreg_ros.offline.stored_sweeps import Place, StoredSweeps
+from boxreg_ros.offline.stored_sweeps import StoredPlace, StoredSweeps
 from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from msg_adapters.clouds import POINTS_TYPE
@@ -132,7 +132,7 @@ class Findings(NamedTuple):
         Boxes of label files outside of the part that is read.
     warning, facts : str and dict
         Finding of the pose check, and origin of the ids.
-    places : list of Place
+    places : list of StoredPlace
         Of the stored sweeps; empty where none are stored.
     seconds : dict
         Time spent in each stage [s].
@@ -151,7 +151,7 @@ class Findings(NamedTuple):
     outside: int
     warning: str
     facts: dict[str, Any]
-    places: list[Place]
+    places: list[StoredPlace]
     seconds: dict[str, float]
 
 

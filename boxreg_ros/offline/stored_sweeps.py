@@ -13,7 +13,7 @@ from boxreg_ros.structures import Floats, Sweep
 import numpy as np
 
 
-class Part(NamedTuple):
+class MergedCloud(NamedTuple):
     """
     A cloud that a sweep was merged from.
 
@@ -53,11 +53,11 @@ class StoredSweep(NamedTuple):
     cloud: StoredCloud | None
 
 
-class Place(NamedTuple):
+class StoredPlace(NamedTuple):
     """Where a sweep begins in the file, and the clouds that it was merged from."""
 
     begin: int
-    parts: tuple[Part, ...]
+    parts: tuple[MergedCloud, ...]
 
 
 class StoredSweeps:
@@ -73,7 +73,7 @@ class StoredSweeps:
 
     Attributes
     ----------
-    places : list of Place
+    places : list of StoredPlace
         Of all sweeps, in the order of reading; the process that reads them hands them over.
 
     """
@@ -81,16 +81,16 @@ class StoredSweeps:
     def __init__(self, folder: Path | None, with_clouds: bool) -> None:
         self._file = TemporaryFile(dir=folder)  # noqa: SIM115  closed with the object
         self.with_clouds = with_clouds
-        self.places: list[Place] = []
+        self.places: list[StoredPlace] = []
 
     def add(self, item: MovedItem, items: FixedFrameItems, sensor_frame: str) -> None:
         """Store a sweep of `items`; label files have merged ones in `sensor_frame`."""
         cloud = items.stored_cloud(item, sensor_frame) if self.with_clouds else None
         moved = item.moved if isinstance(item.moved, Sweep) else None
-        self.places.append(Place(self._file.tell(), tuple(_parts(item, items))))
+        self.places.append(StoredPlace(self._file.tell(), tuple(_parts(item, items))))
         pickle.dump(StoredSweep(moved, cloud), self._file, pickle.HIGHEST_PROTOCOL)
 
-    def complete(self) -> list[Place]:
+    def complete(self) -> list[StoredPlace]:
         """Write what waits; return the places."""
         self._file.flush()
         return self.places
@@ -106,7 +106,7 @@ class StoredSweeps:
         return stored
 
 
-def _parts(item: MovedItem, items: FixedFrameItems) -> Iterator[Part]:
+def _parts(item: MovedItem, items: FixedFrameItems) -> Iterator[MergedCloud]:
     """Yield the clouds that an item was merged from."""
     first = 0
     for part in item.items:
@@ -117,4 +117,4 @@ def _parts(item: MovedItem, items: FixedFrameItems) -> Iterator[Part]:
         T = item.T_fixed_item
         if len(item.items) > 1:
             T = items.pose_of(cloud.frame_id, cloud.stamp_ns)
-        yield Part(cloud.topic, cloud.stamp_ns, rows, np.eye(3) if T is None else T[:3, :3])
+        yield MergedCloud(cloud.topic, cloud.stamp_ns, rows, np.eye(3) if T is None else T[:3, :3])

@@ -1,7 +1,7 @@
 """
 The scenarios of `boxreg simulate`.
 
-A street, a highway, articulated trucks in curves, and the paper's experiment.
+A street, a highway, articulated trucks in curves, rows of parked cars, and the paper's experiment.
 
 """
 
@@ -127,7 +127,13 @@ PARKED_ROW = (
 def street(rng: np.random.Generator, sweeps: int | None) -> SimulatedScene:
     """Return a street with parked rows and traffic in both directions."""
     count = sweeps or STREET_SWEEPS
-    actors = street_actors(rng, count)
+    return _along_the_street(street_actors(rng, count), count, rng)
+
+
+def _along_the_street(
+    actors: Sequence[Actor], count: int, rng: np.random.Generator
+) -> SimulatedScene:
+    """Return what a car sees that drives along the street."""
     ego = drive(count * SWEEP_PERIOD, (4, -1.75, 0), constant(6), zero)
     ego.poses[:, 2] = SENSOR_HEIGHT
     ego.poses[:, 4] = PITCH_AMPLITUDE * np.sin(2 * ego.times)
@@ -293,6 +299,29 @@ def _box_around(tractors: Floats, trailers: Floats) -> Floats:
     return np.column_stack([place, height / 2, high - low, height, flat, flat, np.unwrap(yaw)])
 
 
+BUMPER_GAP = 0.2
+"""Between parked cars [m]."""
+ROWS = ((-4.6, 0.0), (4.8, np.pi))
+"""y and yaw of the rows of parked cars [m, rad]."""
+SHAPES_OF_A_ROW = ('car', 'suv', 'van', 'car', 'suv', 'car', 'car', 'suv')
+
+
+def parked(rng: np.random.Generator, sweeps: int | None) -> SimulatedScene:
+    """Return two rows of cars that are parked bumper to bumper."""
+    count = sweeps or STREET_SWEEPS
+    actors: list[Actor] = []
+    for y, yaw in ROWS:
+        rear = 2.0
+        for shape in SHAPES_OF_A_ROW:
+            place = (0, y + rng.normal(0, 0.1), yaw + rng.normal(0, 0.02))
+            plan = ActorPlan('van' if shape == 'van' else 'car', shape, place, zero, zero)
+            actor = _actor(str(len(actors) + 1), plan, count, rng)
+            actor.motion.poses[:, 0] += rear + actor.extent[0] / 2
+            rear += actor.extent[0] + BUMPER_GAP
+            actors.append(actor)
+    return _along_the_street(actors, count, rng)
+
+
 def _actor(track_id: str, plan: ActorPlan, count: int, rng: np.random.Generator) -> Actor:
     """Return a road user with a random size, on its path for `count` sweeps."""
     extent = np.array(EXTENTS[plan.shape]) * rng.uniform(0.95, 1.05, 3)
@@ -456,6 +485,7 @@ SCENARIOS: dict[str, Callable[[np.random.Generator, int | None], SimulatedScene]
     'highway-sight': lambda rng, sweeps: highway(rng, sweeps, at_sight=True),
     'articulated': lambda rng, sweeps: articulated(rng, sweeps, is_joined=True),
     'articulated-parts': lambda rng, sweeps: articulated(rng, sweeps, is_joined=False),
+    'parked': parked,
     'paper': lambda rng, sweeps: paper(rng, sweeps, is_flat=False),
     'paper-bev': lambda rng, sweeps: paper(rng, sweeps, is_flat=True),
 }

@@ -179,6 +179,14 @@ def test_articulated_trucks_bend_in_curves():
             assert is_near(own, joined.truth.boxes[row], 0.5).all()
 
 
+def test_parked_cars_stand_bumper_to_bumper():
+    scene = simulate('parked', 1, 2)
+    boxes = np.array([boxes_of(actor, actor.motion.at(np.zeros(1)))[0] for actor in scene.actors])
+    for row in (boxes[:8], boxes[8:]):
+        ends = row[:, :1] + row[:, 3:4] / 2 * [-1, 1]
+        np.testing.assert_allclose(ends[1:, 0] - ends[:-1, 1], 0.2)
+
+
 def heading_of(boxes):
     return np.stack([np.cos(boxes[:, 8]), np.sin(boxes[:, 8])], axis=1)
 
