@@ -62,7 +62,7 @@ async function drawCharts() {
     risk: 'expected error of each box; click a point to go there',
     along: 'refined − input, in the axes of the box; band: ± 2σ',
     size: `${tinted(SIZES, SIZE_COLOURS)}; band: ± 2σ; dashed: input`,
-    faces: `outermost points off their face: ${tinted(FACES.map((face, k) => `${face} (${FACE_MARKS[k]})`), FACE_COLOURS)}`,
+    faces: `outermost points off their face: ${tinted(FACES.map((face, k) => face + (innerWidth > 900 ? ` (${FACE_MARKS[k]})` : '')), FACE_COLOURS)}`,
   };
   const layout = { ...LAYOUT(), margin: { l: 56, r: 8, t: 16, b: 34 }, xaxis: { ...AXIS(), title: { text: 'time [s]' }, anchor: 'y' + chartNumber('faces') }, annotations: [] };
   const gap = 0.035;
