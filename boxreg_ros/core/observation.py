@@ -207,10 +207,11 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> Obser
     """
     Return the observations of boxes in a sweep.
 
-    A point near several boxes belongs to the box it is deepest inside of, or least outside, so
-    that a neighbour's bumper is no evidence. It also belongs to boxes it is nearly as deep inside
-    of: two boxes of one object do not take points from each other. Points less than
-    `GROUND_CLEARANCE` above the road beside the box are left out; the height of the road is kept.
+    A point near several boxes belongs to the box it is deepest inside of, or least outside. It
+    also belongs to boxes it is nearly as deep inside of: two boxes of one object do not take
+    points from each other. Boxes beside each other are parted by the air between them (M10a).
+    Points less than `GROUND_CLEARANCE` above the road beside the box are left out; the height of
+    the road is kept.
 
     Parameters
     ----------

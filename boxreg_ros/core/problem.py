@@ -49,8 +49,9 @@ NO_PRIOR = (
     np.zeros(PRIOR),
     np.zeros((PRIOR, PRIOR)),
     np.zeros(4),
+    np.array([[np.inf] * 3, [-np.inf] * 3]),
 )
-"""State, step, information and extents of a prior without information."""
+"""State, step, information, extents and their range, of a prior without information."""
 
 
 SETTINGS_OF = {
@@ -325,7 +326,7 @@ def stack_windows(
         seen, rows = seen.take(rows), np.arange(len(rows))
     boxes, times, origins, ground, ring_heights = _stack_observations(seen, rows, valid)
     priors = [w.prior or _no_prior(w.observations[0].box[:3]) for w in windows]
-    base, state, step, information, extents = (
+    base, state, step, information, extents, _ = (
         np.array(part) for part in zip(*priors, strict=True)
     )
     pinned = np.zeros(valid.shape, bool)

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from itertools import repeat
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.articulation import changes_shape, extent_ranges, NO_RANGE
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import residuals_at
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, Solution
@@ -33,7 +34,7 @@ from boxreg_ros.structures import Floats, Ints, KEPT, POSE, REFINED, ROLL
 import numpy as np
 from numpy.typing import NDArray
 
-KEPT_REASONS = (Reason.NO_POINTS, Reason.NOT_FINITE, Reason.NO_GAIN)
+KEPT_REASONS = (Reason.NO_POINTS, Reason.NOT_FINITE, Reason.NO_GAIN, Reason.NOT_RIGID)
 """Why a box is kept, in the order of `_failed_tests`."""
 
 
@@ -138,8 +139,11 @@ def _accepted(
     found = np.concatenate([poses[..., :3], extent, wrap_angle(poses[..., 3:])], -1)
     is_finite = np.isfinite(found).all(-1) & (extent > 0).all(-1)
     is_finite &= np.isfinite(covariances).all((2, 3))
-    priors = _priors(base, problem, solution, is_finite.all(1))
-    failed = _failed_tests(problem, is_finite, held, max_lost_part)
+    past = [window.prior.extent_range if window.prior else NO_RANGE for window in windows]
+    ranges = extent_ranges(problem, np.array(past), config.window)
+    is_bent = changes_shape(ranges, problem.of_class['extent'])
+    priors = _priors(base, problem, solution, is_finite.all(1), ranges)
+    failed = _failed_tests(problem, is_finite, held, is_bent, max_lost_part)
     is_kept = failed.any(0)
     reasons = np.select(failed, KEPT_REASONS, '')
     status = np.where(is_kept, KEPT, REFINED)
@@ -159,14 +163,19 @@ def _accepted(
 
 
 def _failed_tests(
-    problem: Problem, is_finite: NDArray[np.bool_], held: Ints, max_lost_part: float
+    problem: Problem,
+    is_finite: NDArray[np.bool_],
+    held: Ints,
+    is_bent: NDArray[np.bool_],
+    max_lost_part: float,
 ) -> NDArray[np.bool_]:
     """
-    Return the acceptance tests that each refined box fails (M27), shape (3, B, N).
+    Return the acceptance tests that each refined box fails (M27), shape (4, B, N).
 
     The tests, in the order of `KEPT_REASONS`: the window has points; box and covariance are finite
     and the extent is positive; the refined box holds nearly as many points, `held` (B, N), as the
-    input box, which the objective does not require.
+    input box, which the objective does not require; the body keeps its shape, as the objective
+    assumes, and is not `is_bent` (B,).
 
     """
     before = problem.counts  # at most: counting those of the input boxes takes time
@@ -176,7 +185,7 @@ def _failed_tests(
         extent = np.ascontiguousarray(problem.boxes[..., 3:6])
         before = _held(problem, problem.boxes[..., POSE], extent)
         least = (1 - max_lost_part) * before - CONSTANTS.min_face_points
-    return np.stack([is_blind, ~is_finite, held < least])
+    return np.stack(np.broadcast_arrays(is_blind, ~is_finite, held < least, is_bent[:, None]))
 
 
 def _held(problem: Problem, poses: Floats, extent: Floats) -> Ints:
@@ -188,7 +197,11 @@ def _held(problem: Problem, poses: Floats, extent: Floats) -> Ints:
 
 
 def _priors(
-    base: Floats, problem: Problem, solution: Solution, is_solved: NDArray[np.bool_]
+    base: Floats,
+    problem: Problem,
+    solution: Solution,
+    is_solved: NDArray[np.bool_],
+    ranges: Floats,
 ) -> list[MarginalisationPrior | None]:
     """Return the marginalisation prior that each window leaves, if it leaves one."""
     state, step, information = solution[-3:]
@@ -198,7 +211,7 @@ def _priors(
     extents = problem.marginalised_extents + first
     has_prior = is_solved & np.isfinite(step).all(1)
     return [
-        MarginalisationPrior(base[b], state[b], step[b], information[b], extents[b])
+        MarginalisationPrior(base[b], state[b], step[b], information[b], extents[b], ranges[b])
         if has_prior[b]
         else None
         for b in range(len(base))

@@ -39,6 +39,8 @@ class MarginalisationPrior(NamedTuple):
         Hessian of the quadratic form.
     marginalised_extents : array, shape (4,)
         Sum of the input extents of marginalised observations [m], and their number.
+    extent_range : array, shape (2, 3)
+        Range of the input extents of all observations, see `articulation.extent_ranges`.
 
     """
 
@@ -47,6 +49,7 @@ class MarginalisationPrior(NamedTuple):
     step: Floats
     information: Floats
     marginalised_extents: Floats
+    extent_range: Floats
 
 
 class Window(NamedTuple):

@@ -37,8 +37,6 @@ class MovedItem(NamedTuple):
         As recorded: one, or the clouds of several LiDARs that were merged.
     moved : Sweep or BoxArray, or None
         In the fixed frame, boxes with their ids; None where no transform is known.
-    T_fixed_item : array, shape (4, 4), or None
-        Pose of the frame of a single item; None where unknown, and for merged clouds.
     restarts : bool
         True if time went back before it.
 
@@ -46,8 +44,12 @@ class MovedItem(NamedTuple):
 
     items: tuple[Item, ...]
     moved: Sweep | BoxArray | None
-    T_fixed_item: Floats | None
     restarts: bool
+
+    @property
+    def T_fixed_item(self) -> Floats | None:
+        """Return the pose of the frame of a single item; None if unknown, and of merged clouds."""
+        return self.items[0].T_fixed_item if len(self.items) == 1 else None
 
     @property
     def given(self) -> Sweep | BoxArray:
@@ -218,27 +220,23 @@ class FixedFrameItems:
         with self._stage('transform'):
             admitted = self.session.admit(item.content)
         self._count(item.content, admitted)
+        item = item._replace(T_fixed_item=admitted.T_fixed_item)
         if not self._is_merging or not isinstance(item.content, Sweep):
-            yield self._item((item,), admitted.moved, admitted.T_fixed_item)
+            yield self._item((item,), admitted.moved)
         elif isinstance(admitted.moved, Sweep):  # otherwise the other LiDARs go on
             with self._stage('transform'):
-                complete = self.session.merged(admitted.moved, (item, admitted.T_fixed_item))
+                complete = self.session.merged(admitted.moved, item)
             yield from map(self._merged, complete)
 
     def _merged(self, merged: MergedSweep) -> MovedItem:
         """Return a sweep of several LiDARs."""
         self.counts['sweeps'] += 1
-        parts = cast(tuple[tuple[Item, Floats], ...], merged.extras)
-        items = tuple(item for item, _ in parts)
-        T_fixed_item = parts[0][1] if len(parts) == 1 else None
-        return self._item(items, merged.sweep, T_fixed_item)
+        return self._item(cast(tuple[Item, ...], merged.extras), merged.sweep)
 
-    def _item(
-        self, items: tuple[Item, ...], moved: Sweep | BoxArray | None, T_fixed_item: Floats | None
-    ) -> MovedItem:
+    def _item(self, items: tuple[Item, ...], moved: Sweep | BoxArray | None) -> MovedItem:
         restarts = self._restarts
         self._restarts = False
-        return MovedItem(items, moved, T_fixed_item, restarts)
+        return MovedItem(items, moved, restarts)
 
     def _count(self, given: Sweep | BoxArray, admitted: Admitted) -> None:
         kind = 'sweeps' if isinstance(given, Sweep) else 'box_arrays'

@@ -1,8 +1,8 @@
 """
 Messages of Foxglove's schemas, as protobuf and as JSON.
 
-Clouds and transforms are converted to the corresponding ROS messages. A SceneUpdate stays as it
-is, because adapters read by attribute.
+Clouds, transforms and images are converted to the corresponding ROS messages. A SceneUpdate stays
+as it is, because adapters read by attribute.
 
 """
 
@@ -25,6 +25,9 @@ ROS_TYPES = {
     'foxglove.CompressedPointCloud': 'foxglove_msgs/msg/CompressedPointCloud',
     'foxglove.FrameTransform': 'tf2_msgs/msg/TFMessage',
     'foxglove.FrameTransforms': 'tf2_msgs/msg/TFMessage',
+    'foxglove.CompressedImage': 'sensor_msgs/msg/CompressedImage',
+    'foxglove.RawImage': 'sensor_msgs/msg/Image',
+    'foxglove.CameraCalibration': 'sensor_msgs/msg/CameraInfo',
 }
 DATATYPES = (0, 2, 1, 4, 3, 6, 5, 7, 8)
 """``PointField.datatype`` of ROS by Foxglove's number of the same type."""
@@ -46,6 +49,8 @@ _ENTITY = {
     'metadata': [{'key': str}],
 }  # fmt: skip
 _FIELD = {'name': str, 'offset': int, 'type': int}
+_IMAGE = {'timestamp': _TIME, 'frame_id': str, 'data': str}
+_SIZE = {'width': int, 'height': int}
 JSON_FIELDS: dict[str, Any] = {
     'foxglove.SceneUpdate': {'entities': [_ENTITY]},
     'foxglove.FrameTransform': _TRANSFORM,
@@ -56,6 +61,12 @@ JSON_FIELDS: dict[str, Any] = {
     },
     'foxglove.CompressedPointCloud': {
         'timestamp': _TIME, 'frame_id': str, 'pose?': _POSE, 'data': str, 'format': str,
+    },
+    'foxglove.CompressedImage': _IMAGE | {'format': str},
+    'foxglove.RawImage': _IMAGE | _SIZE | {'step': int, 'encoding': str},
+    'foxglove.CameraCalibration': {
+        'timestamp': _TIME, 'frame_id': str, 'distortion_model': str, **_SIZE,
+        **{key: [_NUMBER] for key in 'DKRP'},
     },
 }  # fmt: skip
 """
@@ -185,13 +196,13 @@ def _cloud(message: Any) -> Any:
     """Return a foxglove PointCloud as a PointCloud2."""
     data = _cloud_data(message)
     fields = [_field(field) for field in message.fields]
-    header = SimpleNamespace(stamp=time_of(message.timestamp), frame_id=message.frame_id)
     stride = message.point_stride
     if stride < 0:
         raise UnsupportedMessage(f'PointCloud.point_stride: expected 0 or more, got {stride}')
     return SimpleNamespace(
-        header=header, height=1, width=len(data) // stride if stride else 0, fields=fields,
-        is_bigendian=False, point_step=stride, row_step=len(data), data=data, is_dense=False,
+        header=_header(message), height=1, width=len(data) // stride if stride else 0,
+        fields=fields, is_bigendian=False, point_step=stride, row_step=len(data), data=data,
+        is_dense=False,
     )  # fmt: skip
 
 
@@ -213,12 +224,43 @@ def _cloud_data(message: Any) -> bytes:
                 'PointCloud: expected its pose to be that of its frame, got another; publish the '
                 'pose as a transform'
             )
+    return _bytes_of(message)
+
+
+def _bytes_of(message: Any) -> bytes:
+    """Return the data of a message, which are base64 in JSON."""
     if not isinstance(message.data, str):
         return bytes(message.data)
     try:
         return b64decode(message.data)
     except ValueError as error:
-        raise UnsupportedMessage(f'PointCloud.data: expected base64: {error}') from None
+        raise UnsupportedMessage(f'data: expected base64: {error}') from None
+
+
+def _compressed_image(message: Any) -> Any:
+    """Return a foxglove CompressedImage as the ROS message of that name."""
+    return SimpleNamespace(header=_header(message), format=message.format, data=_bytes_of(message))
+
+
+def _raw_image(message: Any) -> Any:
+    """Return a foxglove RawImage as an Image."""
+    return SimpleNamespace(
+        header=_header(message), height=message.height, width=message.width,
+        encoding=message.encoding, is_bigendian=False, step=message.step,
+        data=_bytes_of(message),
+    )  # fmt: skip
+
+
+def _header(message: Any) -> Any:
+    return SimpleNamespace(stamp=time_of(message.timestamp), frame_id=message.frame_id)
+
+
+def _calibration(message: Any) -> Any:
+    """Return a foxglove CameraCalibration as a CameraInfo."""
+    names = ('width', 'height', 'distortion_model')
+    own = {name: getattr(message, name) for name in names}
+    matrices = {name.lower(): getattr(message, name, ()) for name in 'DKRP'}
+    return SimpleNamespace(header=_header(message), **own, **matrices)
 
 
 def _field(field: Any) -> Any:
@@ -252,4 +294,7 @@ CONVERTERS = {
     'foxglove.CompressedPointCloud': _compressed_cloud,
     'foxglove.FrameTransform': _transforms,
     'foxglove.FrameTransforms': _transforms,
+    'foxglove.CompressedImage': _compressed_image,
+    'foxglove.RawImage': _raw_image,
+    'foxglove.CameraCalibration': _calibration,
 }

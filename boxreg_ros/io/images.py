@@ -17,8 +17,13 @@ from msg_adapters import clouds, pointcloud, poses
 import numpy as np
 from numpy.typing import NDArray
 
-RAW_TYPE = 'sensor_msgs/msg/Image'
-IMAGE_TYPES = (RAW_TYPE, 'sensor_msgs/msg/CompressedImage', 'foxglove_msgs/msg/CompressedImage')
+IMAGE_TYPES = tuple(
+    f'{package}/msg/{name}'
+    for package, name in (
+        ('sensor_msgs', 'Image'), ('sensor_msgs', 'CompressedImage'),
+        ('foxglove_msgs', 'RawImage'), ('foxglove_msgs', 'CompressedImage'),
+    )
+)  # fmt: skip
 INFO_TYPES = ('sensor_msgs/msg/CameraInfo', 'foxglove_msgs/msg/CameraCalibration')
 NEAR = (0.15, 1.5)
 """Images are looked for so far around a stamp [s]: first nearby, then at a slow camera."""
@@ -165,9 +170,10 @@ def _with_model(camera: ImageCamera, info: Any) -> ImageCamera:
         return np.asarray(getattr(info, name.upper()) if found is None else found, np.float64)
 
     is_rectified = 'rect' in camera.topic
-    matrix = values('p').reshape(3, 4) if is_rectified else np.zeros((3, 4))
-    if not is_rectified:
-        matrix[:, :3] = values('k').reshape(3, 3)
+    matrix = np.zeros((3, 4))
+    name, columns = ('p', 4) if is_rectified else ('k', 3)
+    if values(name).size == 3 * columns:  # lists of Foxglove may be empty
+        matrix[:, :columns] = values(name).reshape(3, columns)
     return camera._replace(
         size=(int(info.width), int(info.height)),
         matrix=matrix if matrix.any() else None,  # zeros: not calibrated
@@ -219,7 +225,7 @@ def _pixels(topic: str, message: Any, rows: NDArray[np.uint8], width: int) -> ND
     if encoding in (*GREY, *PATTERNS):
         if '16' not in encoding:
             return np.ascontiguousarray(rows[:, :width])
-        kind = '>u2' if message.is_bigendian else '<u2'
+        kind = '>u2' if getattr(message, 'is_bigendian', False) else '<u2'
         values = np.ascontiguousarray(rows[:, : 2 * width]).view(kind)
         return np.asarray(values / max(1, values.max()) * 255).astype(np.uint8)
     if encoding in ('yuv422', 'uyvy', 'yuv422_yuy2', 'yuyv'):  # the luminance

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.lidars import SensorPlacement
@@ -19,18 +19,22 @@ LOOKAHEAD_NS = 2 * 10**9
 
 class Item(NamedTuple):
     """
-    A decoded cloud or box array of a recording.
+    A decoded cloud or box array, on its way from a recording or a topic to the registrar.
 
     Attributes
     ----------
     received_ns : int
-        When it was received [ns].
+        When it was received [ns]; live by a clock that never jumps.
     content : Sweep or BoxArray
         In the frame of its message.
     intensities : array, shape (M,), or None
         Of the points of a cloud; None unless asked for and recorded.
     refined : RefinedBoxes or None
         Status and covariances of boxes that come from label files; else None.
+    message : message or None
+        As it was received, live; else None.
+    T_fixed_item : array, shape (4, 4), or None
+        Maps the frame of its message to the fixed frame; None where it is not known yet.
 
     """
 
@@ -38,6 +42,13 @@ class Item(NamedTuple):
     content: Sweep | BoxArray
     intensities: Floats | None = None
     refined: RefinedBoxes | None = None
+    message: Any = None
+    T_fixed_item: Floats | None = None
+
+    @property
+    def received(self) -> float:
+        """Return when it was received [s]."""
+        return self.received_ns / 1e9
 
 
 Stage = Callable[[str], AbstractContextManager[object]]

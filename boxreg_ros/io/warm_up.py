@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
-from boxreg_ros.core.follow import follow
-from boxreg_ros.core.following.stream import FollowedObjects
 from boxreg_ros.core.observation import observe
 from boxreg_ros.core.point_labels import ObjectTrack, PointLabeller
 from boxreg_ros.core.registrar import BoxRegistrar, Submit
@@ -44,6 +42,8 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
 
 def warm_up_follower(config: Config) -> None:
     """Follow a synthetic box through sweeps, there and back: its kernels are loaded."""
+    from boxreg_ros.core.follow import follow  # splines of SciPy: few runs need them
+
     sweeps, seeds = _passing_car()
     stamps_ns = np.array([sweep.stamp_ns for sweep in sweeps])
     follow(stamps_ns, [sweep.points for sweep in sweeps], [seeds[1], seeds[4]], config)
@@ -51,6 +51,8 @@ def warm_up_follower(config: Config) -> None:
 
 def warm_up_followed(config: Config) -> None:
     """Follow a synthetic box as the node does: its kernels are loaded."""
+    from boxreg_ros.core.following.stream import FollowedObjects
+
     sweeps, seeds = _passing_car()
     followed = FollowedObjects(config)
     followed.add(seeds[1])

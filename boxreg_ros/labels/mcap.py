@@ -12,6 +12,7 @@ shows both together.
 from __future__ import annotations
 
 from collections import Counter, deque
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -68,8 +69,8 @@ class Writer:
                 'with boxes, got labels from a file; choose another format'
             )
         self.dropped: Counter[str] = Counter()
-        self._copied = RecordingCopy(folder / OVERLAY, options.recording, provenance)
-        self._recording = self._copied.recording
+        self._recording = copy(options.recording).__enter__()
+        self._copied = RecordingCopy(folder / OVERLAY, self._recording, provenance)
         self._topic = self._recording.boxes_topic
         self._messages = self._copied.messages()
         self._next = next(self._messages, None)
@@ -90,6 +91,7 @@ class Writer:
         """Copy the remaining messages, and complete the file."""
         self._copy(is_end=True)
         self._copied.close()
+        self._recording.__exit__()
         for frames in self._waiting.values():
             self.dropped['no_message'] += sum(len(frame.refined.status) for frame in frames)
 

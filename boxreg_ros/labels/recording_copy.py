@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from contextlib import closing
-from copy import copy
 from dataclasses import asdict
 from heapq import merge
 from pathlib import Path
@@ -52,19 +51,14 @@ class RecordingCopy:
     path : Path
         File to write.
     recording : Recording
-        The source, open or closed.
+        The source, open.
     provenance : Provenance or None
         Written to the metadata of the file; None where the source has them.
-
-    Attributes
-    ----------
-    recording : Recording
-        The source, open until `close`.
 
     """
 
     def __init__(self, path: Path, recording: Recording, provenance: Provenance | None) -> None:
-        self.recording = copy(recording).__enter__()
+        self.recording = recording
         self._channels: dict[tuple[object, ...], int] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._writer = McapWriter(str(path))
@@ -82,7 +76,6 @@ class RecordingCopy:
 
     def close(self) -> None:
         """Complete the file."""
-        self.recording.__exit__()
         self._writer.finish()
 
     def add(self, raw: RawMessage) -> None:

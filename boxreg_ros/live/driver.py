@@ -16,6 +16,7 @@ from boxreg_ros.core.latency import LateBoxes, Latency, set_latency
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.input_models import disagreements, read_models
+from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import Lidars, MergedSweep, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.session import (
     covariances_to_write,
@@ -27,7 +28,7 @@ from boxreg_ros.io.session import (
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.budget import TickBudget
-from boxreg_ros.live.label_tap import CloudPart, LabelTap
+from boxreg_ros.live.label_tap import LabelTap
 from boxreg_ros.live.static_points import StaticPoints
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, COASTED, Floats, REFINED, RefinedBoxes, Sweep
@@ -56,26 +57,6 @@ After this time without clouds, boxes that have waited as long are published unr
 Five periods of a LiDAR of 10 Hz.
 
 """
-
-
-class ReceivedMessage(NamedTuple):
-    """
-    A decoded message.
-
-    Attributes
-    ----------
-    message : message
-        As it was received.
-    content : Sweep or BoxArray
-        In the frame of the message.
-    received : float
-        Time of a clock that never jumps [s].
-
-    """
-
-    message: Any
-    content: Sweep | BoxArray
-    received: float
 
 
 class Outgoing(NamedTuple):
@@ -211,10 +192,10 @@ class LiveRegistrar:
             self.static_points = StaticPoints(static_patience, self._registrar)
         self._late = LateBoxes()
         self._latency = Latency()
-        self._jumps = JumpConfirmation[ReceivedMessage]()
+        self._jumps = JumpConfirmation[Item]()
         self._held: deque[_Pending | _Passing] = deque()  # in order of arrival; first: pending
         self._detections: dict[str, _Detection] = {}  # by track id, while tracks may coast
-        self._seeds: list[ReceivedMessage] = []  # of `follow`, without their transforms yet
+        self._seeds: list[Item] = []  # of `follow`, without their transforms yet
         self._sources: dict[str, _Detection] = {}  # the box that each followed object began with
         self._following: dict[str, object] = {}
         self._made: list[Outgoing] = []  # survives an error while further messages are made
@@ -261,13 +242,13 @@ class LiveRegistrar:
         facts = {**self._session.facts, 'box latency': self._latency.text}
         return facts | self._following
 
-    def confirm(self, item: ReceivedMessage) -> tuple[list[ReceivedMessage], list[Outgoing]]:
+    def confirm(self, item: Item) -> tuple[list[Item], list[Outgoing]]:
         """
         Confirm the order of stamps before a message is processed.
 
         Returns
         -------
-        confirmed : list of ReceivedMessage
+        confirmed : list of Item
             The messages to process next, in order: none while this one is held.
         ready : list of Outgoing
             Everything that was held where time went back: tracks and transforms start anew.
@@ -289,14 +270,14 @@ class LiveRegistrar:
         self.tree.rewind(stamp_ns)
         return confirmed, ready
 
-    def release(self, now: float = inf) -> list[ReceivedMessage]:
+    def release(self, now: float = inf) -> list[Item]:
         """Return the message that no other has confirmed in time, if any: it is late."""
         held = self._jumps.held
         if held is None or now < held.received + CONFIRMATION_TIME:
             return []
         return self._jumps.release()
 
-    def is_ready(self, item: ReceivedMessage, now: float) -> bool:
+    def is_ready(self, item: Item, now: float) -> bool:
         """Return whether a message waits for no transforms and no info message any more."""
         content = item.content
         if now >= item.received + self.transform_timeout or is_placeholder(content):
@@ -333,7 +314,7 @@ class LiveRegistrar:
             self._unknown_frames.remove(frame)
         return frame in self._unknown_frames
 
-    def follow(self, item: ReceivedMessage) -> None:
+    def follow(self, item: Item) -> None:
         """Follow the object of each box of a message, as soon as its transform is known."""
         self._seeds.append(item)
 
@@ -376,7 +357,7 @@ class LiveRegistrar:
         if followed.track_ids or self._following or known:
             self._following = {'following': ', '.join(followed.track_ids) or 'none', **known}
 
-    def process(self, item: ReceivedMessage) -> list[Outgoing]:
+    def process(self, item: Item) -> list[Outgoing]:
         """Register a message; return the messages that are ready to be published."""
         content = item.content
         if is_placeholder(content):
@@ -386,14 +367,13 @@ class LiveRegistrar:
         if admitted.reason:
             self._report_missing_transform(content, admitted.reason, admitted.detail)
         moved = admitted.moved
+        item = item._replace(T_fixed_item=admitted.T_fixed_item)
         if isinstance(content, Sweep):
             if moved is None:
                 self._note_unknown(content)
                 return []
             assert isinstance(moved, Sweep)
-            assert admitted.T_fixed_item is not None
-            part = CloudPart(item.message, content, admitted.T_fixed_item, item.received)
-            return self._register(self._session.merged(moved, part))
+            return self._register(self._session.merged(moved, item))
         if moved is not None:
             assert isinstance(moved, BoxArray) and admitted.T_fixed_item is not None
             moved = self._in_time(moved)
@@ -520,13 +500,13 @@ class LiveRegistrar:
             file.write(to_text(drives))
         return '; '.join(disagreements(drives))
 
-    def abandon(self, item: ReceivedMessage | None) -> list[Outgoing]:
+    def abandon(self, item: Item | None) -> list[Outgoing]:
         """
         Start again after an internal error.
 
         Parameters
         ----------
-        item : ReceivedMessage or None
+        item : Item or None
             The message that was being processed.
 
         Returns
@@ -593,7 +573,7 @@ class LiveRegistrar:
             self._trouble(reason, detail, count)
 
     def _with_ticket(
-        self, item: ReceivedMessage, content: BoxArray, moved: BoxArray, T_fixed_item: Floats
+        self, item: Item, content: BoxArray, moved: BoxArray, T_fixed_item: Floats
     ) -> BoxArray | None:
         """Hold a message until its boxes are ready; None if the output frame is not reached."""
         T_output_fixed = inverse(T_fixed_item)

@@ -29,8 +29,8 @@ class Message(NamedTuple):
         ``points``, ``boxes`` or ``passing``.
     content : message
         As received.
-    received : float
-        Time of arrival (monotonic) [s].
+    received_ns : int
+        Time of arrival (monotonic) [ns].
     lidar : str
         Topic of a cloud, where those of several are merged.
 
@@ -39,7 +39,7 @@ class Message(NamedTuple):
     number: int
     topic: str
     content: Any
-    received: float
+    received_ns: int
     lidar: str = ''
 
 
@@ -87,7 +87,7 @@ class Inbox:
         with self._lock:
             self._number += 1
             queue = self._waiting[topic]
-            queue.append(Message(self._number, topic, content, time.monotonic(), lidar))
+            queue.append(Message(self._number, topic, content, time.monotonic_ns(), lidar))
             if len(queue) > self.capacity[topic]:
                 dropped = queue.popleft()
         self.wake_up.set()

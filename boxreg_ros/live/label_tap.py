@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
 
 from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.io.items import Item
 from boxreg_ros.io.label_feed import FinalBoxes
 from boxreg_ros.io.session import Session
 from boxreg_ros.io.stamp_order import kept, Slot, StampOrder
@@ -15,20 +15,6 @@ from boxreg_ros.io.transforms import boxes_to_frame
 from boxreg_ros.live.recorder_process import RawCloud, RecorderProcess
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 import numpy as np
-
-
-class CloudPart(NamedTuple):
-    """
-    A cloud of one LiDAR.
-
-    Its message, its sweep in its own frame with the pose of that, and when it arrived [s].
-
-    """
-
-    message: Any
-    sweep: Sweep
-    T_fixed_sweep: Floats
-    received: float = 0.0
 
 
 class LabelTap:
@@ -61,18 +47,19 @@ class LabelTap:
         self._cloud_stamps = deque(maxlen=recorder.settings.config.queue)
         self._is_finishing = False
 
-    def add_cloud(self, whole: Sweep, parts: Sequence[CloudPart]) -> None:
+    def add_cloud(self, whole: Sweep, parts: Sequence[Item]) -> None:
         """Hand on a cloud in the fixed frame that was merged from parts, if it is recorded."""
         if not parts:  # lost
             return
-        self._label_frame = self._label_frame or parts[0].sweep.frame_id  # as in `relabel`
+        self._label_frame = self._label_frame or parts[0].content.frame_id  # as in `relabel`
         recorder = self._recorder
         if recorder is None or not recorder.settings.with_points:
             return
         sweep, T_fixed_sweep = whole, np.eye(4)
         if len(parts) == 1:  # not moved, files get the numbers of the message
-            sweep, T_fixed_sweep = parts[0].sweep, parts[0].T_fixed_sweep
-            sweep = replace(sweep, times=whole.times)
+            given, T_fixed_given = parts[0].content, parts[0].T_fixed_item
+            assert isinstance(given, Sweep) and T_fixed_given is not None
+            sweep, T_fixed_sweep = replace(given, times=whole.times), T_fixed_given
         self._cloud_stamps.append(sweep.stamp_ns)
         needed_from_ns = min(self._cloud_stamps)
         if self._order.first_ns is not None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.point_labels import ObjectTrack, PointLabeller
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.live.label_tap import CloudPart
+from boxreg_ros.io.items import Item
 from boxreg_ros.structures import Floats, is_valid_box, REFINED, RefinedBoxes, Sweep
 from msg_adapters.cloud_edits import with_points
 from msg_adapters.pointcloud import finite_rows
@@ -49,7 +49,7 @@ class _Waiting(NamedTuple):
     """A cloud that waits for its boxes, with its parts and when it arrived [s]."""
 
     sweep: Sweep
-    parts: Sequence[CloudPart]
+    parts: Sequence[Item]
     received: float
 
 
@@ -85,7 +85,7 @@ class StaticPoints:
         self._array_stamps: deque[int] = deque(maxlen=100)
         self._ready: list[StaticCloud] = []
 
-    def add_cloud(self, sweep: Sweep, parts: Sequence[CloudPart]) -> None:
+    def add_cloud(self, sweep: Sweep, parts: Sequence[Item]) -> None:
         """Add a cloud in the fixed frame, merged from the parts."""
         if not parts:  # lost
             return
@@ -154,7 +154,8 @@ class StaticPoints:
         is_static = ~labeller.label(cloud.sweep).is_dynamic
         first = 0
         for part in cloud.parts:
-            count = len(part.sweep.points)
+            assert isinstance(part.content, Sweep)
+            count = len(part.content.points)
             own = is_static[first : first + count]
             first += count
             message = part.message

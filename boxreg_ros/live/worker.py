@@ -11,11 +11,12 @@ import time
 from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.io.items import Item
 from boxreg_ros.io.markers import MarkerBoard
 from boxreg_ros.io.session import is_placeholder
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
-from boxreg_ros.live.driver import LiveRegistrar, Outgoing, ReceivedMessage
+from boxreg_ros.live.driver import LiveRegistrar, Outgoing
 from boxreg_ros.live.inbox import Inbox, Message
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.structures import BoxArray, Sweep
@@ -117,7 +118,7 @@ class Worker:
         self._early: Publisher | None = None
         self._final: Publisher | None = None
         self._stopping = Event()
-        self._confirmed: deque[ReceivedMessage] = deque()
+        self._confirmed: deque[Item] = deque()
         self._logged_layouts: set[str] = set()
 
     def open_boxes(self, adapter: Adapter, early: Publisher, final: Publisher) -> None:
@@ -141,7 +142,7 @@ class Worker:
 
     def run(self) -> None:
         """Process messages until `stop`, each as soon as its transforms are available."""
-        item: ReceivedMessage | None = None
+        item: Item | None = None
         while True:
             self._inbox.wake_up.clear()  # before `_stopping` is read: `stop` sets both
             if self._stopping.is_set():
@@ -179,7 +180,7 @@ class Worker:
             lost = stamp_ns(header_of(message.content)), message.lidar
             self._inbox.put_event('lost', lost)
 
-    def _next(self) -> ReceivedMessage | None:
+    def _next(self) -> Item | None:
         """Return the next message decoded, or None if there is none to process now."""
         self._confirmed.extend(self._live.release(time.monotonic()))
         if not self._confirmed:
@@ -200,7 +201,7 @@ class Worker:
             if item is not None:
                 self._publish(self._guarded(partial(self._confirm, item)))
 
-    def _confirm(self, item: ReceivedMessage) -> list[Outgoing]:
+    def _confirm(self, item: Item) -> list[Outgoing]:
         """Queue a message for processing; return the messages that a time jump releases."""
         confirmed, ready = self._live.confirm(item)
         self._confirmed.extend(confirmed)
@@ -212,10 +213,10 @@ class Worker:
         if message.topic == 'boxes':
             patience *= BOXES_PATIENCE
         # What arrived while a transform was waited for may take as long again to be solved.
-        since = max(message.received, self._complete_at + self._waited)
+        since = max(message.received_ns / 1e9, self._complete_at + self._waited)
         return time.monotonic() > since + patience
 
-    def _decoded(self, message: Message) -> ReceivedMessage | None:
+    def _decoded(self, message: Message) -> Item | None:
         """Return a message decoded; boxes that cannot be decoded pass through."""
         content: Sweep | BoxArray
         try:
@@ -230,7 +231,7 @@ class Worker:
         except Exception as error:
             self._health.report_failure(error)
         else:
-            return ReceivedMessage(message.content, content, message.received)
+            return Item(message.received_ns, content, message=message.content)
         if message.topic == 'boxes':
             self._publish(self._live.passed_through(message.content))
         return None
@@ -261,7 +262,7 @@ class Worker:
             period = min(period, self._live.static_points.due(now))
         self._inbox.wake_up.wait(period)
 
-    def _release_boxes_without_cloud(self, item: ReceivedMessage | None) -> None:
+    def _release_boxes_without_cloud(self, item: Item | None) -> None:
         """Release boxes that have waited too long for a cloud, unless one is at hand."""
         is_cloud = item is not None and isinstance(item.content, Sweep)
         if is_cloud or self._inbox.sizes()['points_waiting']:
@@ -310,7 +311,7 @@ class Worker:
         except Exception as error:
             self._health.report_failure(error)
         else:
-            self._live.follow(ReceivedMessage(message, boxes, time.monotonic()))
+            self._live.follow(Item(time.monotonic_ns(), boxes, message=message))
 
     def _take_info(self, message: Any) -> None:
         try:
@@ -318,7 +319,7 @@ class Worker:
         except UnsupportedMessage as error:
             self._health.report(Reason.UNREADABLE, f'points_info: {error}')
 
-    def _process(self, item: ReceivedMessage) -> None:
+    def _process(self, item: Item) -> None:
         if isinstance(item.content, BoxArray):
             self._budget.add_arrival(item.received)
         self._budget.begin(max(item.received, self._complete_at))
@@ -347,7 +348,7 @@ class Worker:
         gc.collect(2 if is_full else 1)
 
     def _guarded(
-        self, task: Callable[[], list[Outgoing]], item: ReceivedMessage | None = None
+        self, task: Callable[[], list[Outgoing]], item: Item | None = None
     ) -> list[Outgoing]:
         """Return the messages of a task; after an error, all that are held, unrefined."""
         try:
@@ -403,7 +404,7 @@ class Worker:
                 reason = Reason.STATIC_UNCHANGED
                 self._health.report(reason, f'{reason.meaning}; {reason.remedy}')
 
-    def _finish(self, item: ReceivedMessage | None) -> None:
+    def _finish(self, item: Item | None) -> None:
         """Publish held boxes, and pass waiting messages through unsolved."""
         self._take_events()
         self._publish(self._guarded(self._live.flush))

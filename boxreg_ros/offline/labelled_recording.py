@@ -1,4 +1,4 @@
-"""Recordings with boxes from label files, and the sensor frame of label files."""
+"""Recordings with boxes from label files or without any, and the sensor frame of label files."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of
 from boxreg_ros.labels.merging import LabelMerger
+from boxreg_ros.structures import BoxArray
+import numpy as np
 
 
 class LabelledRecording(Recording):
@@ -60,6 +62,28 @@ class LabelledRecording(Recording):
             yield from merger.after(cloud.received_ns, cloud.content.stamp_ns)
         yield from merger.rest()
         self.outside = merger.outside
+
+
+class UnlabelledRecording(Recording):
+    """Clouds and motion of a recording, with an empty array of boxes at each cloud."""
+
+    has_boxes = False
+
+    def items(
+        self,
+        tree: TransformTree,
+        *,
+        with_clouds: bool = True,
+        with_intensities: bool = False,
+        stage: Stage = not_measured,
+    ) -> Iterator[Item]:
+        """Yield clouds and empty arrays; see `Recording.items`."""
+        for cloud in super().items(tree, with_intensities=with_intensities, stage=stage):
+            if with_clouds:
+                yield cloud
+            sweep = cloud.content
+            none = BoxArray(sweep.stamp_ns, sweep.frame_id, (), (), np.zeros(0), np.zeros((0, 9)))
+            yield Item(cloud.received_ns, none)
 
 
 def label_frame_of(

@@ -1,18 +1,14 @@
-"""`boxreg relabel --proposals`: objects that no box covers, by one more reading."""
+"""`boxreg relabel --proposals`: objects that no box covers, by the points of all sweeps."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from boxreg_ros.core.point_labels import PointLabeller
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.fixed_frame import FixedFrameItems
-from boxreg_ros.offline.point_products import object_tracks
-from boxreg_ros.offline.request import Request
-from boxreg_ros.review.changes import TrackChanges
-from boxreg_ros.structures import PROPOSED, Sweep
+from boxreg_ros.offline.stored_sweeps import StoredSweeps
+from boxreg_ros.structures import PROPOSED
 from boxreg_ros.tracks.proposals import Proposal, Proposer
 import numpy as np
 
@@ -21,9 +17,8 @@ PROPOSALS = 'proposals.csv'
 
 def write_proposals(
     folder: Path,
-    request: Request,
-    tracks: Sequence[TrackChanges],
-    array_stamps_ns: Sequence[int],
+    sweeps: StoredSweeps,
+    labeller: PointLabeller,
     fixed_frame: str,
 ) -> list[dict[str, Any]]:
     """
@@ -33,12 +28,10 @@ def write_proposals(
     ----------
     folder : Path
         Of the results.
-    request : Request
+    sweeps : StoredSweeps
+        Of the recording.
+    labeller : PointLabeller
         Of the run.
-    tracks : sequence of TrackChanges
-        Results of the run.
-    array_stamps_ns : sequence of int
-        Stamps of all box arrays [ns].
     fixed_frame : str
         That of the run.
 
@@ -48,18 +41,12 @@ def write_proposals(
         For ``summary.json``, longest first.
 
     """
-    objects = object_tracks(tracks)
-    margins = np.zeros((len(objects), 6))
-    known = PointLabeller(objects, np.array(array_stamps_ns, np.int64), request.config, margins)
     proposer = Proposer()
-    with request.recording() as recording:
-        items = FixedFrameItems(recording, request.config, request.convention, request.fixed_frame)
-        for item in items.read():
-            sweep = item.moved
-            if isinstance(sweep, Sweep) and known.knows(sweep.stamp_ns):
-                boxes = known.objects_at(sweep.stamp_ns).boxes
-                sweep = sweep.in_frame()
-                proposer.add(sweep.stamp_ns, sweep.points, sweep.origin, boxes)
+    for sweep, _ in sweeps:
+        if sweep is not None and labeller.knows(sweep.stamp_ns):
+            boxes = labeller.objects_at(sweep.stamp_ns).boxes
+            sweep = sweep.in_frame()
+            proposer.add(sweep.stamp_ns, sweep.points, sweep.origin, boxes)
     found = proposer.proposals()
     names = [f'missed-{number}' for number in range(1, len(found) + 1)]
     BoxTable(

@@ -9,7 +9,7 @@ core; see `reader`.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.latency import LateBoxes, Latency, set_latency
-from boxreg_ros.errors import RecordingError, TransferError
+from boxreg_ros.errors import ConfigError, RecordingError, TransferError
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
 from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.recording import Recording
@@ -27,8 +27,10 @@ from boxreg_ros.offline.background import Background
 from boxreg_ros.offline.labelled_recording import label_frame_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.offline.stored_sweeps import StoredPlace, StoredSweeps
 from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send
 from boxreg_ros.structures import BoxArray, Floats, Sweep
+from msg_adapters.clouds import POINTS_TYPE
 import numpy as np
 
 MESSAGES_AHEAD = 4
@@ -130,6 +132,8 @@ class Findings(NamedTuple):
         Boxes of label files outside of the part that is read.
     warning, facts : str and dict
         Finding of the pose check, and origin of the ids.
+    places : list of StoredPlace
+        Of the stored sweeps; empty where none are stored.
     seconds : dict
         Time spent in each stage [s].
 
@@ -147,6 +151,7 @@ class Findings(NamedTuple):
     outside: int
     warning: str
     facts: dict[str, Any]
+    places: list[StoredPlace]
     seconds: dict[str, float]
 
 
@@ -164,6 +169,8 @@ class RecordingReader:
         Measures the stages ``read``, ``decode`` and ``transform``.
     latency : Latency
         By which the boxes are corrected.
+    sweeps : StoredSweeps, optional
+        Where all sweeps are stored.
 
     Attributes
     ----------
@@ -178,9 +185,11 @@ class RecordingReader:
         request: Request,
         clock: Stopwatch,
         latency: Latency = Latency(),  # noqa: B008
+        sweeps: StoredSweeps | None = None,
     ) -> None:
         self._recording = recording
         self._clock = clock
+        self._sweeps = sweeps
         self._with_points = request.options.with_points
         self._with_times = request.config.sampling.deskew
         self._waits = request.config.estimate == 'track'
@@ -214,7 +223,12 @@ class RecordingReader:
 
     def _read(self) -> Iterator[ReadItem]:
         """Yield clouds and boxes, as they are."""
-        for item in self._items.read(with_intensities=self._with_points):
+        sweeps = self._sweeps
+        are_written = self._with_points or (sweeps is not None and sweeps.with_clouds)
+        for item in self._items.read(with_intensities=are_written):
+            if sweeps is not None and isinstance(item.given, Sweep):
+                with self._clock('points'):
+                    sweeps.add(item, self._items, self.source.sensor_frame)
             with self._clock('transform'):
                 read_item = self._trimmed(item)
             yield read_item
@@ -236,6 +250,7 @@ class RecordingReader:
             recording.outside,
             '; '.join(filter(None, (recording.finding, items.session.finding))),
             items.session.facts,
+            [] if self._sweeps is None else self._sweeps.complete(),
             self._clock.stages(),
         )
 
@@ -338,19 +353,22 @@ def _show(part: Request, late: LateBoxes) -> None:
 
 
 @contextmanager
-def reader(request: Request, latency: Latency | None = None) -> Iterator[Receive]:
+def reader(
+    request: Request, latency: Latency | None = None, sweeps: StoredSweeps | None = None
+) -> Iterator[Receive]:
     """
     Yield, for a block, a function that returns the next message for `ReadAhead`.
 
     The recording is read in a process of its own, or in this one where it may use one core only.
-    Without a `latency` that is known, it is estimated first.
+    Without a `latency` that is known, it is estimated first. All sweeps are added to `sweeps`.
 
     """
+    messages = partial(_messages, request, latency, sweeps)
     if uses_one_core(request.config):
-        with closing(_messages(request, latency)) as messages:
-            yield messages.__next__
+        with closing(messages()) as received:
+            yield received.__next__
         return
-    with run_in_worker(partial(_read, request, latency), 'reads the recording') as process:
+    with run_in_worker(partial(_read, messages), 'reads the recording') as process:
         yield process.receive
 
 
@@ -392,25 +410,42 @@ class ReadAhead:
             yield received
 
 
-def _read(request: Request, latency: Latency | None, _: Receive, send: Send) -> None:
+def _read(
+    messages: Callable[[], Iterator[Source | ReadItem | Findings]], _: Receive, send: Send
+) -> None:
     """Send the messages, in a thread that waits for the receiver while others are read."""
     background = Background(MESSAGES_AHEAD)
     try:
-        for message in _messages(request, latency):
+        for message in messages():
             background(send, message)
     finally:
         background.complete()  # an error is sent after the messages before it
 
 
 def _messages(
-    request: Request, latency: Latency | None
+    request: Request, latency: Latency | None, sweeps: StoredSweeps | None
 ) -> Generator[Source | ReadItem | Findings]:
     """Yield the source of a recording, all its items, and the findings."""
     latency = latency_of(request) if latency is None else latency
     with request.recording() as recording:
-        reading = RecordingReader(recording, request, Stopwatch(), latency)
+        _check_copies(request, recording)
+        reading = RecordingReader(recording, request, Stopwatch(), latency, sweeps)
         yield reading.source
         if isinstance(recording, Recording) and reading.source.seconds > LONG:
             recording.read_boxes_as_arrays()  # the main process goes on meanwhile
         yield from reading
         yield reading.findings()
+
+
+def _check_copies(request: Request, recording: ItemSource) -> None:
+    """Refuse, before the work begins, a source whose clouds cannot be copied and edited."""
+    kinds = {POINTS_TYPE}
+    if isinstance(recording, Recording):
+        kinds = {recording.topics[topic] for topic in recording.points_topics}
+    if not request.cloud_copies or (isinstance(recording, Recording) and kinds == {POINTS_TYPE}):
+        return
+    raise ConfigError(
+        f'clouds: expected a recording with {POINTS_TYPE}, which is copied with edited clouds, '
+        f'got {", ".join(sorted(kinds - {POINTS_TYPE})) or recording}; ask for --label-points or '
+        f'--clouds object alone'
+    )

@@ -16,6 +16,7 @@ from shutil import copyfile
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.io.session import hand_to_registrar
+from boxreg_ros.io.storage.urls import url_of
 from boxreg_ros.offline.every_sweep import Arrivals, with_empty_arrays
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.products import (
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from boxreg_ros.io.sweep_store import SweepStore
     from boxreg_ros.offline.completion import Completion, Moved
     from boxreg_ros.offline.resume import EstimateJournal
+    from boxreg_ros.offline.stored_sweeps import StoredSweeps
     from boxreg_ros.tracks.complete import CompletionPlan
 
 
@@ -91,8 +93,9 @@ def relabel(
     with claimed(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         survey = _survey(request, clock, shown, journal, corrections)
+        sweeps = _stored_sweeps(request, out)
         receive = workers.enter_context(
-            reader(request, None if survey is None else survey.latency)
+            reader(request, None if survey is None else survey.latency, sweeps)
         )
         # The recording is opened while this process imports numba, which takes half a second.
         from boxreg_ros.core.input_statistics import to_text
@@ -120,26 +123,14 @@ def relabel(
             for stage, seconds in recording.findings.seconds.items():
                 clock.add(stage, seconds)
             summary.fingerprint = fingerprint
-            summary.seconds = clock.seconds()
             tracks = sink.changes.tracks()
-            if request.proposals:
-                from boxreg_ros.offline.proposals import write_proposals
-
-                with clock('proposals'):
-                    stamps_ns, frame = sink.array_stamps_ns, summary.fixed_frame
-                    summary.proposals = write_proposals(folder, request, tracks, stamps_ns, frame)
+            if sweeps is not None:
+                sweeps.places = recording.findings.places
+                _write_points(folder, request, sweeps, sink, registrar, summary, clock)
             with clock('write'):
                 rows = write_track_tables(folder, tracks, plan, summary.proposals)
                 summary.rules, violated = checked(tracks, request.config)
-            if request.needs_point_labels:
-                from boxreg_ros.offline.point_products import write_point_products
-
-                with clock('points'):
-                    stamps_ns = sink.array_stamps_ns
-                    summary.points = write_point_products(
-                        folder, request, tracks, stamps_ns, registrar
-                    )
-                summary.seconds = clock.seconds()
+            summary.seconds = clock.seconds()
             if sink.points is not None:
                 sink.points.settle(registrar.box_time.resolved(request.config))
                 write_run_report(folder, out, request, summary, rows, violated, sink.points, clock)
@@ -155,6 +146,42 @@ def relabel(
             (folder / CONFIG).write_text(settings, encoding='utf-8')
             write_summary(folder, summary.as_json())
     return summary
+
+
+def _stored_sweeps(request: Request, out: Path) -> StoredSweeps | None:
+    """Return where the sweeps of a run are stored, on the disk of its results; None if nowhere."""
+    if not request.needs_sweeps:
+        return None
+    from boxreg_ros.offline.stored_sweeps import StoredSweeps
+
+    parent = out.resolve().parent if url_of(out) is None else None
+    return StoredSweeps(parent, with_clouds=bool(request.point_formats))
+
+
+def _write_points(
+    folder: Path,
+    request: Request,
+    sweeps: StoredSweeps,
+    sink: Sink,
+    registrar: BoxRegistrar,
+    summary: Summary,
+    clock: Stopwatch,
+) -> None:
+    """Look for objects without a box, and label the points, by the boxes of all tracks."""
+    from boxreg_ros.offline.point_products import labeller_of, write_point_products
+    from boxreg_ros.offline.proposals import write_proposals
+
+    frame = summary.fixed_frame
+    with clock('points'):
+        labeller = labeller_of(
+            sink.changes.tracks(), sink.array_stamps_ns, registrar, request.config
+        )
+    if request.proposals:
+        with clock('proposals'):
+            summary.proposals = write_proposals(folder, sweeps, labeller, frame)
+    if request.needs_point_labels:
+        with clock('points'):
+            summary.points = write_point_products(folder, request, sweeps, labeller, frame)
 
 
 def _journal(out: Path, fingerprint: str) -> EstimateJournal:

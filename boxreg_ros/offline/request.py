@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from boxreg_ros.datasets import SceneRecording
     from boxreg_ros.io.recording import Recording
 
+NO_TOPIC = 'none'
+"""In place of a topic of boxes: the drive has no boxes."""
 POINT_FORMATS = ('semantickitti', 'lidarseg')
 """Formats that ``--label-points`` writes."""
 
@@ -72,7 +74,10 @@ class Request:
     recordings: tuple[Path, ...]
     lidars: Lidars = SINGLE_LIDAR
     boxes: str | None = option(
-        None, 'topic of the boxes (default: found by type)', metavar='TOPIC'
+        None,
+        'topic of the boxes, or none for a drive without boxes, whose objects a person adds '
+        '(default: found by type)',
+        metavar='TOPIC',
     )
     odometry: str | None = option(
         None,
@@ -274,9 +279,20 @@ class Request:
         return tuple(dict.fromkeys(name for name in self.clouds if name != 'object'))
 
     @property
+    def cloud_copies(self) -> tuple[str, ...]:
+        """Return the kinds of copies of the recording whose clouds are edited."""
+        is_labelled = self.label_points and 'mcap' in self.formats
+        return (*('overlay',) * is_labelled, *self.maps, *('undistorted',) * self.undistort)
+
+    @property
     def needs_point_labels(self) -> bool:
-        """Return whether the recording is read again, to label its points."""
-        return bool(self.point_formats or self.clouds or self.undistort or self.label_points)
+        """Return whether the points are labelled."""
+        return bool(self.point_formats or self.clouds or self.undistort)
+
+    @property
+    def needs_sweeps(self) -> bool:
+        """Return whether all sweeps are stored until the boxes of all tracks are known."""
+        return self.proposals or self.needs_point_labels
 
     @property
     def completes(self) -> bool:

@@ -8,12 +8,15 @@ from pathlib import Path
 import subprocess
 import sys
 
-from boxreg_ros.errors import ConfigError
-from boxreg_ros.offline.arguments import add_options, Settings, words_of
-from boxreg_ros.offline.request import Request
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.storage.files import METADATA
+from boxreg_ros.offline.arguments import add_options, Settings, values_of, words_of
+from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.offline.result_folder import SUMMARY
 from boxreg_ros.offline.reviewed_drive import drive_of
+from boxreg_ros.offline.sources import scene_address
 from boxreg_ros.review.server import add_server_arguments, serve
+from msg_adapters import ADAPTERS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,15 +24,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'paths', type=Path, nargs='+', metavar='OUT|RECORDING',
         help='results of boxreg relabel --report, or recordings of one drive: these are '
-        'relabelled into --out first',
+        'relabelled into --out first; one that has clouds only begins with proposals',
     )  # fmt: skip
     parser.add_argument(
         '--progress', action='store_true',
         help='print how far the review of each result is, and the agreement of people, and end',
     )  # fmt: skip
     parser.add_argument(
-        '-o', '--out', type=Path, help='with recordings: result folder, as of boxreg relabel'
-    )
+        '-o', '--out', type=Path,
+        help='with recordings: result folder, as of boxreg relabel (default: the name of the '
+        'first one in this folder, with .labels)',
+    )  # fmt: skip
     add_server_arguments(parser)
     add_options(parser, Request)
     add_options(parser, Settings)
@@ -39,25 +44,41 @@ def run(args: argparse.Namespace) -> int:
     """Serve a result until interrupted; return the status of a run that fails before."""
     if args.progress:
         return _print_progress(args.paths)
-    if args.out is None:
-        is_result = [(path / SUMMARY).is_file() for path in args.paths]
-        if args.paths[0].is_file() or (len(args.paths) > 1 and not all(is_result)):
-            raise ConfigError(
-                '-o: expected the folder for the results of these recordings, got none; add -o OUT'
-            )
+    out = args.out or _out_of(args.paths)
+    if out is None:
         return _serve(args.paths, args)
     done = subprocess.run(
         [
             *(sys.executable, '-m', 'boxreg_ros.cli', 'relabel', *map(str, args.paths)),
-            *('-o', str(args.out), '--report', '--resume'),
+            *('-o', str(out), '--report', '--resume'),
             *words_of(args, Request),
             *words_of(args, Settings),
+            *(('--boxes', NO_TOPIC, '--proposals') if _has_no_boxes(args) else ()),
         ],
         check=False,
     )
     if done.returncode:
         return done.returncode
-    return _serve([args.out], args)
+    return _serve([out], args)
+
+
+def _out_of(paths: Sequence[Path]) -> Path | None:
+    """Return the folder for the results of recordings; None for paths that are results."""
+    first = paths[0]
+    if first.is_file() or (first / METADATA).is_file():
+        return Path(f'{first.stem}.labels')
+    return None
+
+
+def _has_no_boxes(args: argparse.Namespace) -> bool:
+    """Return whether recordings have clouds only, and no label files are given."""
+    values = values_of(args, Request)
+    if values['boxes'] or values['labels'] or scene_address(args.paths):
+        return bool(values['boxes'] == NO_TOPIC)
+    recording = Recording(args.paths, values['lidars'])
+    recording.has_boxes = False
+    with recording:
+        return ADAPTERS.keys().isdisjoint(recording.topics.values())
 
 
 def _serve(outs: Sequence[Path], args: argparse.Namespace) -> int:

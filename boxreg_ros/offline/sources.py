@@ -13,7 +13,8 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.offline.labelled_recording import LabelledRecording
+from boxreg_ros.offline.labelled_recording import LabelledRecording, UnlabelledRecording
+from boxreg_ros.offline.request import NO_TOPIC
 from boxreg_ros.structures import BoxArray
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
@@ -55,6 +56,8 @@ def source_of(
         return LabelledRecording(
             labels, paths, lidars=lidars, odometry=odometry, start=start, end=end
         )
+    if boxes == NO_TOPIC:
+        return UnlabelledRecording(paths, lidars=lidars, odometry=odometry, start=start, end=end)
     return Recording(paths, lidars, boxes, odometry, start, end, convention)
 
 

@@ -12,6 +12,7 @@ from typing import Any, Self, TYPE_CHECKING
 
 from boxreg_ros import __version__
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MISSING
+from boxreg_ros.offline.request import NO_TOPIC
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import HUMAN, REFINED
 
@@ -198,7 +199,7 @@ class Summary:
             first_unplaced=findings.first_unplaced,
             first_unreadable=findings.first_unreadable,
             warning='; '.join(filter(None, (findings.warning, source.latency.warning)))
-            or ('' if sink.boxes_in else NO_BOXES),
+            or ('' if sink.boxes_in or request.boxes == NO_TOPIC else NO_BOXES),
             **findings.facts,
             left_out_of_labels=sink.left_out(),
             unused_decisions=sink.corrections.unused(),

@@ -19,6 +19,10 @@ ROAD_CELL = 1.5
 """The lowest point of a cell of this size is of the road [m]; chosen."""
 FIT_CLEARANCE = 0.25
 """Points so far above the road are of objects [m]; chosen: curbs are lower."""
+PLANE_STEPS = 8
+"""Times that cells above the plane of the road are left out; chosen: it no longer changes."""
+MIN_ROAD_CELLS = 6
+"""Fewer cells do not show the slope of the road."""
 MAX_HEIGHT = 4.5
 """Points higher above the road are of bridges and trees [m]."""
 MAX_AWAY = 1.5
@@ -110,13 +114,36 @@ def fitted(
 
 
 def _road_below(points: Floats) -> Floats:
-    """Return the height of the road below each point (M,): the lowest of its cells around."""
+    """
+    Return the height of the road below each point (M,).
+
+    It is the lowest point of the cells around, or the plane of the lowest points of all cells
+    where that is clearly lower: beside the sensor the road below an object is not seen.
+
+    """
     if not len(points):
         return np.zeros(0)
     cells = ((points[:, :2] - points[:, :2].min(0)) / ROAD_CELL).astype(int)
     lowest = np.full(cells.max(0) + 1, np.inf)
     np.minimum.at(lowest, tuple(cells.T), points[:, 2])
-    return np.asarray(ndimage.minimum_filter(lowest, 3, mode='nearest')[tuple(cells.T)])
+    around = ndimage.minimum_filter(lowest, 3, mode='nearest')[tuple(cells.T)]
+    plane = _plane(lowest, cells)
+    return np.where(around - plane > FIT_CLEARANCE, plane, around)
+
+
+def _plane(lowest: Floats, cells: NDArray[np.int64]) -> Floats:
+    """Return the height at cells (M, 2) of the plane of the road, by the lowest points (n, m)."""
+    known = np.argwhere(np.isfinite(lowest))
+    heights = lowest[tuple(known.T)]
+    is_road = np.ones(len(heights), bool)
+    design = np.column_stack([known, np.ones(len(known))])
+    plane = np.array([0, 0, heights.min()])
+    for _ in range(PLANE_STEPS):
+        if is_road.sum() < MIN_ROAD_CELLS:
+            break
+        plane = np.linalg.lstsq(design[is_road], heights[is_road], rcond=None)[0]
+        is_road = heights - design @ plane < FIT_CLEARANCE
+    return np.asarray(cells @ plane[:2] + plane[2])
 
 
 def _touching(points: Floats, place: Floats) -> NDArray[np.bool_]:

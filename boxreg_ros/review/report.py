@@ -106,7 +106,8 @@ def write_report(
 
     """
     tracks = [row.track for row in found]
-    stamps_ns = np.unique(np.concatenate([np.zeros(0, np.int64), *(t.stamps_ns for t in tracks)]))
+    of_arrays = np.array(list(points.stamps_ns), np.int64)
+    stamps_ns = np.unique(np.concatenate([of_arrays, *(track.stamps_ns for track in tracks)]))
     begin_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
     max_points = points_per_box(sum(len(track.stamps_ns) for track in tracks))
     violations = _by_track(violated)

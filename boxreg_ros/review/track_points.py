@@ -50,9 +50,15 @@ class PointCollector:
     config : Config
         Settings of the run.
 
+    Attributes
+    ----------
+    stamps_ns : set of int
+        Of the box arrays, those without boxes included [ns].
+
     """
 
     def __init__(self, config: Config) -> None:
+        self.stamps_ns: set[int] = set()
         self._matcher = StampMatcher(config, Counter())
         self.settle(config)
         self._gathered: dict[tuple[int, str], _Gathered] = {}
@@ -69,6 +75,7 @@ class PointCollector:
             self._origins[item.stamp_ns] = item.origin
             pairs = self._matcher.add_sweep(item)
         else:
+            self.stamps_ns.add(item.stamp_ns)
             pairs = self._matcher.add_boxes(item)
         self._gather(pairs)
 

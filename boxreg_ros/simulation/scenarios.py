@@ -1,4 +1,9 @@
-"""The scenarios of `boxreg simulate`: a street, a highway, and the paper's experiment."""
+"""
+The scenarios of `boxreg simulate`.
+
+A street, a highway, articulated trucks in curves, rows of parked cars, and the paper's experiment.
+
+"""
 
 from __future__ import annotations
 
@@ -19,13 +24,14 @@ from boxreg_ros.simulation.raycast import (
     to_matrix,
 )
 from boxreg_ros.simulation.scene import boxes_of, is_near, make_scene, make_sweep, SimulatedScene
-from boxreg_ros.structures import Floats
+from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL, Sweep, YAW
 import numpy as np
 from numpy.typing import NDArray
 
 EXTENTS = {
     'car': (4.4, 1.8, 1.5), 'suv': (4.7, 1.92, 1.72), 'van': (5.4, 2.0, 2.3),
     'truck': (7.8, 2.45, 3.1), 'trailer': (8.0, 2.5, 3.4),
+    'tractor': (5.6, 2.45, 3.2),
     'pedestrian': (0.6, 0.65, 1.75), 'cyclist': (1.75, 0.6, 1.75),
 }  # fmt: skip
 """Length, width and height of each shape [m]."""
@@ -58,6 +64,25 @@ class ActorPlan(NamedTuple):
     place: StartPose
     speed: Rate
     yaw_rate: Rate
+
+
+class Scan(NamedTuple):
+    """
+    What a sensor sees of some road users.
+
+    Attributes
+    ----------
+    sweeps, owners, T_fixed_sensor
+        As in `SimulatedScene`.
+    true_boxes : array, shape (a, n, 9)
+        Of each road user at each sweep.
+
+    """
+
+    sweeps: list[Sweep]
+    owners: list[Ints]
+    T_fixed_sensor: Floats
+    true_boxes: Floats
 
 
 def zero(times: Floats) -> Floats:
@@ -102,7 +127,13 @@ PARKED_ROW = (
 def street(rng: np.random.Generator, sweeps: int | None) -> SimulatedScene:
     """Return a street with parked rows and traffic in both directions."""
     count = sweeps or STREET_SWEEPS
-    actors = street_actors(rng, count)
+    return _along_the_street(street_actors(rng, count), count, rng)
+
+
+def _along_the_street(
+    actors: Sequence[Actor], count: int, rng: np.random.Generator
+) -> SimulatedScene:
+    """Return what a car sees that drives along the street."""
     ego = drive(count * SWEEP_PERIOD, (4, -1.75, 0), constant(6), zero)
     ego.poses[:, 2] = SENSOR_HEIGHT
     ego.poses[:, 4] = PITCH_AMPLITUDE * np.sin(2 * ego.times)
@@ -169,6 +200,128 @@ def highway(
     return _scan(actors, ego, replace(sensor, stamp_at=1.0), count, rng, at_sight)
 
 
+CURVES = (
+    (10, 11, 0.0, 5.5, 0.30), (48, -1, np.pi, 4.5, -0.32), (24, -17, 0.0, 6.0, -0.28),
+    (-14, -12, 0.0, 4.5, -0.30), (-10, 6, np.pi / 2, 4.0, 0.36), (36, -11, np.pi, 5.0, 0.30),
+)  # fmt: skip
+"""Of each tractor: x, y and yaw, speed, and yaw rate after a second [m, rad, s]."""
+CARS_BESIDE = (
+    ('car', 2, -8, 0.0, 0.0), ('suv', 8, -8, 0.0, 0.0), ('van', 14, -7.9, 0.0, 0.0),
+    ('car', 6, 5.5, 0.1, 0.0), ('suv', 31, -7, np.pi, 0.0), ('car', 12, 2, 0.0, 4.0),
+)  # fmt: skip
+"""Shape, x, y and yaw, and speed of the cars among them."""
+KINGPIN = (-0.25, 0.4)
+"""Place of the joint ahead of the centre of tractor and trailer, as part of their lengths."""
+TRAILER_AXLE = 0.225
+"""Distance of the axle of a trailer behind its centre, as part of its length."""
+
+
+def articulated(rng: np.random.Generator, sweeps: int | None, is_joined: bool) -> SimulatedScene:
+    """
+    Return tractors with a trailer in curves, and a few cars.
+
+    With `is_joined` one box is around each tractor and its trailer: it heads from the rear of the
+    trailer to the front of the tractor, and its extents change in a curve. Else each has its own.
+
+    """
+    count = sweeps or STREET_SWEEPS
+    plans = [
+        ActorPlan('car', shape, (x, y, yaw), constant(speed), zero)
+        for shape, x, y, yaw, speed in CARS_BESIDE
+    ]
+    cars = [_actor(str(i + 1), plan, count, rng) for i, plan in enumerate(plans)]
+    tractors: list[Actor] = []
+    for x, y, yaw, speed, turn in CURVES:
+        turning = _after_a_second(turn)
+        plan = ActorPlan('truck', 'tractor', (x, y, yaw), constant(speed), turning)
+        tractors.append(_actor(str(len(cars) + len(tractors) + 1), plan, count, rng))
+    trailers = [_trailer(f'{tractor.track_id}b', tractor, rng) for tractor in tractors]
+    ego = drive(count * SWEEP_PERIOD, (0, -1.75, 0), constant(3), zero)
+    ego.poses[:, 2] = SENSOR_HEIGHT
+    sensor = Sensor(np.radians(np.linspace(-22, 3, 34)), columns=640)
+    parts = (*cars, *tractors, *trailers)
+    scan = _scanned(parts, ego, sensor, count, rng)
+    if is_joined:
+        scan = _joined(scan, len(cars), len(tractors))
+    return _with_detections(parts[: len(scan.true_boxes)], scan, rng)
+
+
+def _after_a_second(rate: float) -> Rate:
+    return lambda times: rate * (times > 1)
+
+
+def _trailer(track_id: str, tractor: Actor, rng: np.random.Generator) -> Actor:
+    """Return the trailer of a tractor, whose axle does not slip sideways."""
+    extent = np.array(EXTENTS['trailer']) * rng.uniform(0.95, 1.05, 3)
+    times, poses = tractor.motion.times, tractor.motion.poses
+    heading = np.stack([np.cos(poses[:, 5]), np.sin(poses[:, 5])], axis=1)
+    joint = poses[:, :2] + KINGPIN[0] * tractor.extent[0] * heading
+    to_axle = (KINGPIN[1] + TRAILER_AXLE) * extent[0]
+    yaw = poses[:, 5].copy()
+    for i, step in enumerate(np.diff(joint, axis=0)):
+        across = np.cos(yaw[i]) * step[1] - np.sin(yaw[i]) * step[0]
+        yaw[i + 1] = yaw[i] + across / to_axle
+    heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    center = joint - KINGPIN[1] * extent[0] * heading
+    flat = np.zeros_like(times)
+    up = flat + extent[2] / 2
+    motion = Motion(times, np.stack([*center.T, up, flat, flat, yaw], axis=1))
+    return Actor(track_id, 'trailer', 'trailer', extent, motion)
+
+
+def _joined(scan: Scan, first: int, count: int) -> Scan:
+    """Return a scan with one box around each tractor, from row `first` on, and its trailer."""
+    owners = [np.where(owner >= first + count, owner - count, owner) for owner in scan.owners]
+    boxes = scan.true_boxes[:-count].copy()
+    for row in range(first, first + count):
+        boxes[row] = _box_around(scan.true_boxes[row], scan.true_boxes[row + count])
+    return scan._replace(true_boxes=boxes, owners=owners)
+
+
+def _box_around(tractors: Floats, trailers: Floats) -> Floats:
+    """Return the boxes (n, 9) on the road around tractors and trailers (n, 9)."""
+    both = np.stack([tractors, trailers])  # (2, n, 9)
+    heading = np.stack([np.cos(both[..., YAW]), np.sin(both[..., YAW])], axis=-1)
+    half = both[..., LENGTH:ROLL] / 2
+    ends = both[..., :2] + heading * half[..., :1] * np.array([1, -1])[:, None, None]
+    front, rear = ends
+    yaw = np.arctan2(*(front - rear).T[::-1])
+    turn = np.abs(both[..., YAW] - yaw)
+    along, across = np.abs(np.cos(turn)), np.abs(np.sin(turn))
+    reach = np.stack([along, across], -1) * half[..., :1]
+    reach += np.stack([across, along], -1) * half[..., 1:2]
+    axes = matrix_from_rpy(np.outer(yaw, [0, 0, 1]))[:, :2, :2]  # columns are the box axes
+    center = np.einsum('nji,bnj->bni', axes, both[..., :2])
+    low, high = (center - reach).min(0), (center + reach).max(0)
+    height = 2 * half[..., 2].max(0)
+    place = np.einsum('nij,nj->ni', axes, (low + high) / 2)
+    flat = np.zeros_like(yaw)
+    return np.column_stack([place, height / 2, high - low, height, flat, flat, np.unwrap(yaw)])
+
+
+BUMPER_GAP = 0.2
+"""Between parked cars [m]."""
+ROWS = ((-4.6, 0.0), (4.8, np.pi))
+"""y and yaw of the rows of parked cars [m, rad]."""
+SHAPES_OF_A_ROW = ('car', 'suv', 'van', 'car', 'suv', 'car', 'car', 'suv')
+
+
+def parked(rng: np.random.Generator, sweeps: int | None) -> SimulatedScene:
+    """Return two rows of cars that are parked bumper to bumper."""
+    count = sweeps or STREET_SWEEPS
+    actors: list[Actor] = []
+    for y, yaw in ROWS:
+        rear = 2.0
+        for shape in SHAPES_OF_A_ROW:
+            place = (0, y + rng.normal(0, 0.1), yaw + rng.normal(0, 0.02))
+            plan = ActorPlan('van' if shape == 'van' else 'car', shape, place, zero, zero)
+            actor = _actor(str(len(actors) + 1), plan, count, rng)
+            actor.motion.poses[:, 0] += rear + actor.extent[0] / 2
+            rear += actor.extent[0] + BUMPER_GAP
+            actors.append(actor)
+    return _along_the_street(actors, count, rng)
+
+
 def _actor(track_id: str, plan: ActorPlan, count: int, rng: np.random.Generator) -> Actor:
     """Return a road user with a random size, on its path for `count` sweeps."""
     extent = np.array(EXTENTS[plan.shape]) * rng.uniform(0.95, 1.05, 3)
@@ -217,6 +370,29 @@ def _scan(
     at_sight: bool = False,
 ) -> SimulatedScene:
     """Return the scene of `count` revolutions of a sensor on `ego`; `at_sight` as of `highway`."""
+    scan = _scanned(actors, ego, sensor, count, rng, at_sight)
+    return _with_detections(actors, scan, rng)
+
+
+def _with_detections(
+    actors: Sequence[Actor], scan: Scan, rng: np.random.Generator
+) -> SimulatedScene:
+    """Return a scene with boxes as a detector reports them."""
+    return make_scene(
+        actors, scan.true_boxes, scan.sweeps, scan.owners, scan.T_fixed_sensor, detector_noise,
+        MISS_PROBABILITY, rng,
+    )  # fmt: skip
+
+
+def _scanned(
+    actors: Sequence[Actor],
+    ego: Motion,
+    sensor: Sensor,
+    count: int,
+    rng: np.random.Generator,
+    at_sight: bool = False,
+) -> Scan:
+    """Return what `count` revolutions of a sensor on `ego` see."""
     parts = [body(actor.shape, actor.extent) for actor in actors]
     stamps = np.arange(count) * SWEEP_PERIOD
     T_fixed_sensor = to_matrix(ego.at(stamps))
@@ -235,9 +411,7 @@ def _scan(
             for row in np.unique(owner[owner != ROAD]):
                 seen = actors[row].motion.at(stamp + times[owner == row].mean(keepdims=True))
                 true_boxes[row, i] = boxes_of(actors[row], seen)[0]
-    return make_scene(
-        actors, true_boxes, sweeps, owners, T_fixed_sensor, detector_noise, MISS_PROBABILITY, rng
-    )
+    return Scan(sweeps, owners, T_fixed_sensor, true_boxes)
 
 
 def paper(rng: np.random.Generator, sweeps: int | None, is_flat: bool) -> SimulatedScene:
@@ -309,6 +483,9 @@ SCENARIOS: dict[str, Callable[[np.random.Generator, int | None], SimulatedScene]
     'street': street,
     'highway': lambda rng, sweeps: highway(rng, sweeps),
     'highway-sight': lambda rng, sweeps: highway(rng, sweeps, at_sight=True),
+    'articulated': lambda rng, sweeps: articulated(rng, sweeps, is_joined=True),
+    'articulated-parts': lambda rng, sweeps: articulated(rng, sweeps, is_joined=False),
+    'parked': parked,
     'paper': lambda rng, sweeps: paper(rng, sweeps, is_flat=False),
     'paper-bev': lambda rng, sweeps: paper(rng, sweeps, is_flat=True),
 }

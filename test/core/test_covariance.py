@@ -14,17 +14,16 @@ from boxreg_ros.core.method.covariance import (
 )
 from boxreg_ros.core.method.residuals import TERMS
 from boxreg_ros.core.refine import refine
-from boxreg_ros.simulation.simulate import simulate
 import numpy as np
 import pytest
-from scenes import drive, shared_of, track_of
+from scenes import drive, shared_of, simulated, track_of
 
 RECORD = constants.CONSTANTS.with_settings(Config()).record()
 
 
 def refined_tracks():
     """Return refined tracks of a simulated street."""
-    return refine(simulate('street', 0).tracks()[:3], Config())
+    return refine(simulated('street', 0).tracks()[:3], Config())
 
 
 def test_the_model_errors_are_those_of_time_and_heading(set_constants):
@@ -78,7 +77,7 @@ def test_a_prior_that_holds_leaves_the_inverse_curvature():
 
 def test_fixed_extents_have_the_errors_of_the_input():
     np.testing.assert_allclose(extent_variances(0.05, 0.2, is_free=0.0), 0.2**2)
-    for track in refine(simulate('street', 0).tracks()[:2], Config(extent='fixed')):
+    for track in refine(simulated('street', 0).tracks()[:2], Config(extent='fixed')):
         deviations = np.sqrt(np.diagonal(track.extent_covariances, axis1=1, axis2=2))
         assert (deviations > 0.01 * track.boxes[:, 3:6]).all()
         assert (deviations < 0.2 * track.boxes[:, 3:6]).all()

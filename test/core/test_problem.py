@@ -1,6 +1,7 @@
 """Windows of observations, and batches of windows as padded arrays."""
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.articulation import NO_RANGE
 from boxreg_ros.core.method.arrays import PRIOR as PRIOR_SIZE
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.problem import group_windows, Problem, resolve_headings
@@ -37,7 +38,7 @@ def with_prior(window, yaw=0.0):
     step = np.random.default_rng(3).normal(size=PRIOR_SIZE)
     information = np.diag(1.0 + np.arange(PRIOR_SIZE))
     prior = MarginalisationPrior(
-        base, np.r_[pose.ravel(), shared], step, information, np.array([4, 2, 1, 1])
+        base, np.r_[pose.ravel(), shared], step, information, np.array([4, 2, 1, 1]), NO_RANGE
     )
     start = boxes[:-1] + 0.01 * np.eye(9)[8]
     return window._replace(num_new=1, start=start, prior=prior)

@@ -7,11 +7,10 @@ from boxreg_ros.core.metrics import iou_3d, iou_bev, pose_errors
 from boxreg_ros.errors import ConfigError, ShapeError
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.simulation.noise import detector_noise
-from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import is_valid_box
 import numpy as np
 import pytest
-from scenes import drive, stamps, track_of
+from scenes import drive, simulated, stamps, track_of
 from scipy.spatial.transform import Rotation
 import torch
 
@@ -52,7 +51,7 @@ def num_kept_at_start(estimate):
 def test_refine_beats_the_paper_in_its_experiment():
     # An SUV on the path of Eq. 10 with the initial errors of Table I: the input has a mean IoU
     # of about 0.6. The robust objective must exceed 0.8, and the paper's objective.
-    scene = simulate('paper', seed=1, sweeps=20)
+    scene = simulated('paper', 1, 20)
     (track,), truth = scene.tracks(), scene.truth.boxes
     few = {'sampling.points': 100}
     ours = iou_3d(only(track, Config().updated(few)).boxes, truth).mean()
@@ -412,7 +411,7 @@ def test_the_marginalisation_prior_improves_boxes(set_constants, estimate):
     # 60 sweeps of a street, windows of 10: the constant error of the input of a track is
     # estimated from all its observations, also marginalised ones. Over eight seeds the gain was
     # 0.002 to 0.006 of IoU (early) and 0.003 to 0.008 (final); half of the least is required.
-    scene = simulate('street', seed=0, sweeps=60)
+    scene = simulated('street', seed=0, sweeps=60)
     known = overlaps(scene, estimate).mean()
     set_constants(prior_decay=0.0)
     assert known - overlaps(scene, estimate).mean() > 0.001
@@ -420,9 +419,7 @@ def test_the_marginalisation_prior_improves_boxes(set_constants, estimate):
 
 def overlaps(scene, estimate):
     """Return the IoU of every refined box of a scene with its true box."""
-    table, tracks = scene.truth, scene.tracks()
-    keys = zip(table.stamps_ns.tolist(), table.track_ids, strict=True)
-    truth = dict(zip(keys, table.boxes, strict=True))
+    truth, tracks = truth_of(scene), scene.tracks()
     found = refine(tracks, Config(estimate=estimate))
     true = [[truth[s, t.track_id] for s in t.stamps_ns.tolist()] for t in tracks]
     pairs = zip(found, true, strict=True)
@@ -608,7 +605,7 @@ def normalised_errors(scenario, seeds):
     """Return the mean of e' C^-1 e / 6 over refined boxes, e the error and C its covariance."""
     values = []
     for seed in seeds:
-        scene = simulate(scenario, seed)
+        scene = simulated(scenario, seed)
         truth = truth_of(scene)
         tracks = scene.tracks()
         for track, refined in zip(tracks, refine(tracks), strict=True):
@@ -637,8 +634,8 @@ def test_track_estimates_beat_final_ones_at_half_the_rate():
     # At 5 Hz few tracks are long enough to estimate the errors of the input, and their temporal
     # correlation is half as strong between stamps.
     overlaps = []
-    for seed in range(4):
-        scene = simulate('street', seed)
+    for seed in range(2):
+        scene = simulated('street', seed)
         truth = truth_of(scene)
         tracks = [
             Track(

@@ -5,10 +5,9 @@ from boxreg_ros.core.method.arrays import BOX_POSE
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.residuals import TERMS
 from boxreg_ros.core.method.rigid_shape import agree, empty_shape_work
-from boxreg_ros.simulation.simulate import simulate
 import numpy as np
 import pytest
-from scenes import problem_of
+from scenes import problem_of, simulated
 
 BOX = [0.0, 0, 0, 4.0, 2.0, 2.0, 0, 0, 0]
 
@@ -95,7 +94,7 @@ def test_a_plane_gives_no_information_along_it():
 def test_rigid_shape_improves_relative_poses(seed):
     # A body of which each sweep shows a part: errors that are not common to all boxes fall by a
     # quarter at least, against faces alone.
-    scene = simulate('paper', seed)
+    scene = simulated('paper', seed)
     (track,) = scene.tracks()
 
     def spread(config):

@@ -13,6 +13,7 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage import chunks
 from boxreg_ros.io.storage.files import opened
 from boxreg_ros.io.storage.record import Record
+from boxreg_ros.io.storage.rosbag1 import CHUNK_MARK, SEARCH_BYTES
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Sweep
 from mcap.reader import make_reader
@@ -369,6 +370,20 @@ def test_a_chunk_of_a_bag_that_claims_too_much_is_left_out(tmp_path, bag):
     sweeps, boxes, damages = read(path)
     assert 40 < len(sweeps) + len(boxes) < 80
     assert [damage.reason for damage in damages] == ['damaged chunk (size of 1073741825 bytes)']
+
+
+@pytest.mark.parametrize('split', [0, 2])
+def test_a_chunk_of_a_bag_across_blocks_of_the_search_is_found(tmp_path, bag, split):
+    """A block of the search ends with the first `split` bytes of the mark, or before it."""
+    drive, path = bag
+    data = path.read_bytes()
+    chunk = data.index(CHUNK_MARK) - 8
+    # The search begins one byte behind the damage.
+    gap = SEARCH_BYTES + 1 - 8 - split
+    path.write_bytes(data[:chunk] + b'\xff' * gap + data[chunk:-1000])  # without an index
+    sweeps, boxes, damages = read(path)
+    assert sweeps[0] == boxes[0] == drive.stamps[0]
+    assert damages[0][2:4] == (chunk, chunk + gap)
 
 
 # Fuzzing ---------------------------------------------------------------------------------------

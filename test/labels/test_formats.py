@@ -43,7 +43,7 @@ from boxreg_ros.labels import (
 )
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
-from consumers import consumer, consumers
+from consumers import consumer
 import numpy as np
 import pytest
 
@@ -613,13 +613,12 @@ def test_nuscenes_devkit_reads_the_labels(tmp_path):
     sweep = Sweep(STAMP, 'lidar', POINTS)
     later = [14.0, *IN_FIXED[1:]]  # 1 m in 0.5 s
     frames = [frame_of(sweep=sweep), frame_of([later], stamp_ns=STAMP + 5 * 10**8)]
-    calls = []
-    for name, version in (('nuscenes', 'v1.0-boxreg'), ('t4', 'annotation')):
-        _, folder = written(name, tmp_path / name, frames, with_points=True)
-        calls.append(('nuscenes', folder, version))
-    for (first, second), channel in zip(
-        consumers(*calls), ('LIDAR_TOP', 'LIDAR_CONCAT'), strict=True
+    for name, version, channel in (
+        ('nuscenes', 'v1.0-boxreg', 'LIDAR_TOP'),
+        ('t4', 'annotation', 'LIDAR_CONCAT'),
     ):
+        _, folder = written(name, tmp_path / name, frames, with_points=True)
+        first, second = consumer('nuscenes', folder, version)
         assert first['channel'] == channel
         assert (first['name'], first['num_points']) == ('Car', 42)
         np.testing.assert_allclose(first['wlh'], [2.0, 4.0, 1.6])
@@ -651,8 +650,8 @@ def test_t4_devkit_reads_the_labels(tmp_path):
 def test_av2_reads_labels_pose_and_sweep(tmp_path):
     frames = [frame_of(sweep=Sweep(STAMP, 'lidar', POINTS))]
     _, folder = written('argoverse2', tmp_path, frames, with_points=True)
-    calls = ('av2', folder / 'annotations.feather'), ('av2_log', folder, STAMP)
-    (cuboid,), log = consumers(*calls)
+    (cuboid,) = consumer('av2', folder / 'annotations.feather')
+    log = consumer('av2_log', folder, STAMP)
     assert (cuboid['category'], cuboid['stamp_ns']) == ('Car', STAMP)
     np.testing.assert_allclose(cuboid['center'], [6, -3, 1], atol=1e-9)
     np.testing.assert_allclose(cuboid['lwh'], EXTENT)
@@ -699,9 +698,9 @@ def test_pykitti_reads_calibration_and_sweep(tmp_path):
 
 def test_pandas_reads_the_tables(tmp_path):
     folders = {name: written(name, tmp_path / name, drive())[1] for name in ('parquet', 'csv')}
-    calls = [('pandas', folder / f'boxes.{name}') for name, folder in folders.items()]
     expected = [frame.refined.boxes.boxes[0, 0] for frame in drive()]
-    for found in consumers(*calls):
+    for name, folder in folders.items():
+        found = consumer('pandas', folder / f'boxes.{name}')
         assert found['x of 7'] == pytest.approx(expected)
         assert found['stamps'] == [frame.refined.boxes.stamp_ns for frame in drive()]
         assert found['kinds'] == {'stamp_ns': 'int64', 'x': 'float64', 'num_points': 'int64'}

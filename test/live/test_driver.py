@@ -1,9 +1,10 @@
 """The driver of the node, without ROS: waiting, transforms, unchanged boxes, restarts."""
 
 from boxreg_ros.config import Config
+from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.transforms import matrix
-from boxreg_ros.live.driver import LiveRegistrar, ReceivedMessage, refined_to_frame
+from boxreg_ros.live.driver import LiveRegistrar, refined_to_frame
 from boxreg_ros.structures import BoxArray, COASTED, KEPT, REFINED, RefinedBoxes
 from lidar_drives import LidarDrive
 from msg_adapters import adapter_for, pointcloud, vision
@@ -50,7 +51,7 @@ class Live(LiveRegistrar):
 def received(topic, message, now=0.0, adapter=vision):
     """Return a message as the driver gets it, received at `now` [s]."""
     reader = pointcloud if topic == '/points' else adapter
-    return ReceivedMessage(message, reader.from_msg(message), now)
+    return Item(round(now * 1e9), reader.from_msg(message), message=message)
 
 
 def items_of(drive, topic):
@@ -494,7 +495,7 @@ def test_a_lidar_that_tf_does_not_know_holds_back_the_others_only_once():
             if topic == '/boxes'
             else live.placement.sweep_of(message, topic)
         )
-        item = ReceivedMessage(message, content, now)
+        item = Item(round(now * 1e9), content, message=message)
         not_ready += bool(live.fixed_frame) and not live.is_ready(item, now + 0.5)
         out += live.process(item)
     out += live.flush()
@@ -515,7 +516,7 @@ def test_a_concatenated_cloud_waits_for_its_info_while_there_are_infos():
             live.tree.add_transforms(message.transforms, topic == '/tf_static')
     infos = items_of(drive, '/points_info')
     clouds = [
-        ReceivedMessage(message, live.placement.sweep_of(message, '/points'), 0.0)
+        Item(0, live.placement.sweep_of(message, '/points'), message=message)
         for message in items_of(drive, '/points')
     ]
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 import subprocess
@@ -30,7 +30,7 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.reviewed_drive import drive_of
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import Floats, REJECTED, YAW
-from browser import opened_page
+from browser import end_shared_browser, opened_page
 from measure import print_json
 import numpy as np
 
@@ -40,6 +40,8 @@ RUN = 5
 """Wrong boxes that follow each other."""
 RIGHT = 0.5
 """3D IoU with the true box from which on a box is right; chosen: anyone sees a smaller one."""
+SEEN = 0.6
+"""The labeller corrects boxes below this one: what a run changes again leaves them right."""
 MIN_POINTS = 20
 """Objects with fewer points, by the median, get no errors and are not judged."""
 SECONDS = {'key': 0.28, 'click': 1.3, 'drag': 2.5}
@@ -153,7 +155,7 @@ def planted(truth: BoxTable, seed: int) -> BoxTable:
         begin = int(rng.integers(0, len(rows) - RUN))
         part = rows[begin : begin + RUN]
         sign = rng.choice([-1.0, 1.0])
-        boxes[part, :2] += sign * rng.uniform(1.6, 2.0, 2)
+        boxes[part, :2] += sign * rng.uniform(0.4, 0.5, 2) * boxes[part, 3:4].clip(3.6)
         boxes[part, YAW] += sign * 0.4
     columns = [keep.nonzero()[0]]
     table = replace(table, track_ids=tuple(names), boxes=boxes)
@@ -225,6 +227,14 @@ class Matches:
         overlap = float(iou_3d(box[None], boxes[nearest : nearest + 1])[0])
         return self._truth.track_ids[rows[nearest]], overlap, boxes[nearest]
 
+    def truth_of(self, names: Collection[str], stamp_ns: int, box: Floats) -> tuple[float, Floats]:
+        """Return the largest 3D IoU with some objects, and that true box; 1 if none is there."""
+        rows = [row for row in self._rows[stamp_ns] if self._truth.track_ids[row] in names]
+        boxes = self._truth.boxes[rows]
+        overlaps = iou_3d(np.repeat(box[None], len(rows), 0), boxes)
+        best = int(overlaps.argmax()) if rows else -1
+        return (float(overlaps[best]), boxes[best]) if rows else (1.0, box)
+
     def of_track(self, stamps_ns: Iterable[int], boxes: Floats) -> list[tuple[str, float, Floats]]:
         """Return the same of each box of a track."""
         return [self.of(stamp, box) for stamp, box in zip(stamps_ns, boxes, strict=True)]
@@ -249,7 +259,9 @@ def errors(table: BoxTable, truth: BoxTable) -> dict[str, int]:
         found['swapped'] += len(main) > 1
         for one in main & matches.judged:
             owners.setdefault(one, set()).add(name)
-        found['wrong'] += sum(one in matches.judged and iou < RIGHT for one, iou, _ in near)
+        for row in rows if main & matches.judged else ():
+            overlap, _ = matches.truth_of(main, int(table.stamps_ns[row]), table.boxes[row])
+            found['wrong'] += overlap < RIGHT
     names = {name for name in owners if len(owners[name]) > 1}
     found['broken'] = len([n for n in names if all(_is_pure(table, tracks[t], matches)
                                                    for t in owners[n])])  # fmt: skip
@@ -326,7 +338,7 @@ class Labeller:
 
     def _look(self) -> None:
         """Decide about the open track, and go on with the next one."""
-        near = self._near()
+        near = self._matches.of_track(*self._boxes())
         objects = [one for one, _, _ in near]
         if sum(not one for one in objects) > len(near) / 2:
             self._decide('ghost', 'key:d', 'isGone(current())')
@@ -359,16 +371,21 @@ class Labeller:
     def _correct(self) -> None:
         """Correct boxes of the open track until all that are judged are right."""
         for _ in range(RUN):
-            near = self._near(with_solved=True)
-            wrong = [k for k, (one, iou, _) in enumerate(near)
-                     if one in self._matches.judged and iou < RIGHT]  # fmt: skip
+            stamps_ns, boxes = self._boxes(with_solved=True)
+            near = self._matches.of_track(stamps_ns, boxes)
+            main = {Counter(one for one, _, _ in near).most_common(1)[0][0]}
+            if not main & self._matches.judged:
+                return
+            found = [self._matches.truth_of(main, *one)
+                     for one in zip(stamps_ns, boxes, strict=True)]  # fmt: skip
+            wrong = [k for k, (overlap, _) in enumerate(found) if overlap < SEEN]
             if not wrong:
                 return
             row = wrong[len(wrong) // 2]
             self._go(row)
             self.decided['wrong'] += 1
             self.key('e')
-            self._drag_to(near[row][2])
+            self._drag_to(found[row][1])
             self.key('Enter')
             self._page.wait_for_function('!view.edit && pinOf(view.row)')
             if self._page.evaluate('DATA.tracks[boxAt(view.row)[0]].added'):
@@ -378,39 +395,44 @@ class Labeller:
             self._page.wait_for_function('view.solved', timeout=120_000)
 
     def _drag_to(self, target: Floats) -> None:
-        """Drag the box, and the stroke at its front, to a true box."""
-        for _ in range(2):
-            off, turn, length, zoom, center, size = self._page.evaluate(
-                """target => {
-                  const box = moved(target, view.part.origin, -1), c = $('top');
-                  const here = toFrame(view.edit, view.frame, view.R);
-                  const there = toFrame(box, view.frame, view.R);
-                  const by = box[8] - view.edit[8], turn = Math.atan2(Math.sin(by), Math.cos(by));
-                  const size = [c.clientWidth, c.clientHeight];
-                  return [[here, there], turn, view.edit[3], c.zoom, view.center, size];
-                }""",
-                target.tolist(),
-            )
-            if abs(turn) > 0.1:
-                heading = self._page.evaluate('view.edit[8] - view.frame[8]')
-                reach = 0.58 * length
-                places = [np.array(off[0][:2]) + reach * np.array([np.cos(a), np.sin(a)])
-                          for a in (heading, heading + turn)]  # fmt: skip
-                self._drag(places, zoom, center, size)
-                continue
-            self._drag([np.array(one[:2]) for one in off], zoom, center, size)
-            return
+        """Drag the stroke at the front of the box, and the box in two views, to a true box."""
+        turn, length, heading = self._page.evaluate(
+            """target => {
+              const by = target[8] - view.edit[8];
+              return [Math.atan2(Math.sin(by), Math.cos(by)), view.edit[3],
+                      view.edit[8] - view.frame[8]]; }""",
+            target.tolist(),
+        )
+        if abs(turn) > 0.1:
+            here, _ = self._off(target)
+            tips = [here + 0.58 * length * np.array([np.cos(a), np.sin(a), 0])
+                    for a in (heading, heading + turn)]  # fmt: skip
+            self._drag('top', *tips)
+        for view, axes in (('top', [0, 1]), ('side', [0, 2])):
+            here, there = self._off(target)
+            if np.abs(there - here)[axes].max() > 0.1:
+                self._drag(view, here, there)
 
-    def _drag(self, places: Sequence[Floats], zoom: float, center: Sequence[float],
-              size: Sequence[float]) -> None:  # fmt: skip
-        """Drag in the top view, zoomed out as far as both places need it."""
+    def _off(self, target: Floats) -> tuple[Floats, Floats]:
+        """Return the centre of the box, and of a true box, in the axes of the views."""
+        here, there = self._page.evaluate(
+            """target => [view.edit, moved(target, view.part.origin, -1)]
+                 .map(box => toFrame(box, view.frame, view.R))""",
+            target.tolist(),
+        )
+        return np.array(here), np.array(there)
+
+    def _drag(self, view: str, *places: Floats) -> None:
+        """Drag from one place to another one in a view."""
         self.actions['drag'] += 1
-        bounds = self._page.locator('#top').bounding_box()
-        points = []
-        for place in places:
-            x = size[0] / 2 + zoom * (place[0] - center[0])
-            y = size[1] / 2 - zoom * (place[1] - center[1])
-            points.append((bounds['x'] + x, bounds['y'] + y))
+        points = self._page.evaluate(
+            """([name, places]) => {
+              const [right, up] = VIEWS[name], c = $(name), bounds = c.getBoundingClientRect();
+              return places.map(place => [
+                bounds.left + bounds.width / 2 + c.zoom * (place[right] - view.center[right]),
+                bounds.top + bounds.height / 2 - c.zoom * (place[up] - view.center[up])]); }""",
+            [view, [place.tolist() for place in places]],
+        )
         self._page.mouse.move(*points[0])
         self._page.mouse.down()
         self._page.mouse.move(*points[1], steps=4)
@@ -419,7 +441,7 @@ class Labeller:
 
     def _join(self) -> None:
         """Join the tracks of one object."""
-        for name in self._matches.judged:
+        for name in sorted(self._matches.judged):
             pieces = [one for one, near in self._all().items() if near == name]
             while len(pieces) > 1:
                 self._open(pieces[0])
@@ -503,8 +525,8 @@ class Labeller:
         while self._page.evaluate('view.row') != row:
             self.key('ArrowRight' if self._page.evaluate('view.row') < row else 'ArrowLeft')
 
-    def _near(self, with_solved: bool = False) -> list[tuple[str, float, Floats]]:
-        """Return what a person sees of the open track: its objects, and how well boxes fit."""
+    def _boxes(self, with_solved: bool = False) -> tuple[list[int], Floats]:
+        """Return stamps and boxes of the open track, as the page shows them."""
         stamps, boxes = self._page.evaluate(
             """isSolved => [view.part.stamps, view.part.usable.map((box, k) => {
               const pin = pinOf(k);
@@ -513,7 +535,7 @@ class Labeller:
             })]""",
             with_solved,
         )
-        return self._matches.of_track(map(int, stamps), np.array(boxes))
+        return list(map(int, stamps)), np.array(boxes)
 
     def _all(self) -> dict[str, str]:
         """Return the object of each track that is not deleted."""
@@ -547,5 +569,6 @@ def reviewed(out: Path, truth: BoxTable) -> Labeller:
     with opened_page(server.address, expected='409') as page:
         labeller = Labeller(page, truth)
         labeller.review()
+    end_shared_browser()
     server.shutdown()
     return labeller

@@ -1,5 +1,6 @@
 """`boxreg batch`: each drive once, failures isolated, a second run skips done drives."""
 
+from contextlib import suppress
 import csv
 from functools import partial
 import json
@@ -349,6 +350,15 @@ def test_a_drive_that_goes_on_has_no_limit_of_time(tmp_path, monkeypatch):
         os.close(end)
 
 
+def children_of(pid):
+    """Return the numbers of the processes that the threads of another one started."""
+    found = []
+    for task in Path(f'/proc/{pid}/task').iterdir():
+        with suppress(FileNotFoundError):  # a thread may end between both lines
+            found += (task / 'children').read_text().split()
+    return found
+
+
 def test_a_batch_that_is_killed_takes_its_processes_with_it(tmp_path):
     path = Drive(sweeps=60).write(tmp_path / 'one')
     out = tmp_path / 'out'
@@ -356,13 +366,11 @@ def test_a_batch_that_is_killed_takes_its_processes_with_it(tmp_path):
         [sys.executable, '-m', 'boxreg_ros.cli', 'batch', str(path), '-o', str(out)],
         stdout=subprocess.DEVNULL,
     )
-    children = Path(f'/proc/{batch.pid}/task')
     found = []
     while not found:
         assert batch.poll() is None
         time.sleep(0.05)
-        lists = [task / 'children' for task in children.iterdir()]
-        found = [child for text in lists for child in text.read_text().split()]
+        found = children_of(batch.pid)
     assert memory_bytes(batch.pid) > 0
     batch.kill()
     batch.wait()

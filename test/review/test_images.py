@@ -11,7 +11,7 @@ from boxreg_ros.review.server import review_server
 from browser import NEEDS_BROWSER, opened_page
 import numpy as np
 import pytest
-from ros_messages import Drive
+from ros_messages import Drive, SCENE
 
 pytest.importorskip('plotly')
 Picture = pytest.importorskip('PIL.Image')
@@ -136,6 +136,21 @@ def test_boxes_are_shown_in_the_nearest_image_of_the_best_camera(tmp_path):
           return [...c.getContext('2d').getImageData(x, y, 1, 1).data]; })()""")
         assert np.abs(np.subtract(shown, [0, 0, 200, 255])).max() < 6  # bgr8
     server.shutdown()
+
+
+@pytest.mark.parametrize('encoding', ['protobuf', 'json'])
+def test_images_of_foxglove_are_those_of_ros(tmp_path, encoding):
+    foxglove = pytest.importorskip('foxglove_recordings')
+    drive = with_cameras(Drive(boxes=SCENE))
+    encodings = {'/boxes': 'cdr', '/points': 'cdr', '/tf': encoding}
+    path = foxglove.write_foxglove_mcap(tmp_path / 'foxglove.mcap', drive, encodings)
+    with Recording([path]) as first, Recording([drive.write(tmp_path / 'ros')]) as second:
+        found, expected = first.images(), second.images()
+        assert len(found.cameras) == 2
+        for one, other in zip(found.cameras, expected.cameras, strict=True):
+            np.testing.assert_equal(one, other)
+            for stamp in drive.stamps:
+                assert found.nearest(one, stamp) == expected.nearest(other, stamp)
 
 
 @pytest.mark.parametrize('ros1', [False, True])

@@ -101,6 +101,8 @@ def test_several_drives_are_reviewed_under_one_address(outs):
     with opened_page(server.address, ready='#drives') as page:
         rows = page.locator('#drives tr').all_inner_texts()
         assert [row.split()[0] for row in rows[1:]] == [str(outs[1]), str(outs[0]), 'all']
+        found = pytest.importorskip('axe_playwright_python.sync_playwright').Axe().run(page)
+        assert found.violations_count == 0, found.generate_report()
         page.click('#drives a')
         page.wait_for_selector('html[data-ready]')
         page.click('#tab-tracks')

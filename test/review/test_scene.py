@@ -2,6 +2,9 @@
 
 from dataclasses import replace
 import math
+import signal
+import subprocess
+import sys
 from threading import Thread
 
 from boxreg_ros.cli import main
@@ -169,6 +172,85 @@ def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serv
     assert read_decisions(again / DECISIONS)[-1].kind == 'add'
 
 
+def click_on_points(page, box):
+    """Click a point of an object where the view shows it, and wait for its box."""
+    x, y = page.evaluate(
+        """box => {
+          const { points, origin } = scene.sweep, { to, depth } = sceneAxes(), own = [];
+          for (let i = 0; i < points.length; i += 3) {
+            const point = [0, 1, 2].map(k => points[i + k] + origin[k]);
+            const at = toFrame(point, box, rotation(box));
+            if (Math.abs(at[0]) < box[3] / 2 + 0.1 && Math.abs(at[1]) < box[4] / 2 + 0.1
+                && at[2] > 0) own.push(point);
+          }
+          own.sort((a, b) => depth(a) - depth(b));
+          const [x, y] = to(own[0]), bounds = $('scene-view').getBoundingClientRect();
+          return [bounds.left + x, bounds.top + y]; }""",
+        box.tolist(),
+    )
+    page.mouse.click(x, y)
+    page.wait_for_function('scene.fit', timeout=60_000)
+
+
+@NEEDS_BROWSER
+def test_a_drive_without_boxes_is_labelled_from_its_recording_alone(tmp_path):
+    drive = Drive(sweeps=NUM_SWEEPS)
+    drive.items = [item for item in drive.items if item[0] != '/boxes']
+    drive.write(tmp_path / 'drive')
+    command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', 'drive', '--port', '0']
+    command += [*FORMATS, *QUICK, '--who', 'anna']
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+        lines = [process.stdout.readline().strip() for _ in range(2)]
+        assert lines[0].startswith('drive.labels: 0 boxes in')
+        with opened_page(lines[1]) as page:
+            # There is nothing but the drive to look at.
+            page.wait_for_function(f'scene.sweep && DATA.stamps.length === {NUM_SWEEPS}')
+            page.click('#tab-tracks')
+            assert 'Objects are added in Drive' in page.inner_text('#rows-hint')
+            open_scene(page, 4)
+            page.locator('#scene-view').focus()
+            # In 3D, turned by dragging: the point that is clicked has a place on the road.
+            page.keyboard.press('v')
+            assert page.get_attribute('#scene-space', 'aria-pressed') == 'true'
+            bounds = page.locator('#scene-view').bounding_box()
+            turn, tilt = page.evaluate('[scene.turn, scene.tilt]')
+            page.keyboard.down('Shift')
+            page.mouse.move(bounds['x'] + 30, bounds['y'] + 30)
+            page.mouse.down()
+            page.mouse.move(bounds['x'] + 130, bounds['y'] + 10, steps=4)
+            page.mouse.up()
+            page.keyboard.up('Shift')
+            assert page.evaluate('[scene.turn, scene.tilt]') == pytest.approx(
+                [turn - 0.6, tilt + 0.12]
+            )
+            parked, moving = drive.truth[drive.stamps[4]]
+            page.keyboard.press('i')
+            click_on_points(page, parked)
+            offered = np.array(page.evaluate('scene.fit.box'))
+            assert np.linalg.norm(offered[:2] - parked[:2]) < 1.5
+            page.keyboard.press('Enter')
+            page.wait_for_function("!$('tracks').hidden && current()?.id === '1'")
+            # From a track, at its sweep.
+            page.wait_for_function('view.row === 4')
+            page.keyboard.press('i')
+            page.wait_for_function('scene.isAdding && scene.sweep.stamp === DATA.stamps[4]')
+            click_on_points(page, moving)
+            page.select_option('#scene-class', 'car')
+            page.wait_for_function("scene.fit?.class === 'car'")
+            page.click('#scene-follow')
+            page.wait_for_function("!$('tracks').hidden && current()?.id === '2'")
+            assert 'end of the recording' in page.inner_text('#title')
+            page.keyboard.press('Control+s')
+            page.wait_for_function("$('notice').textContent.includes('boxes in')", timeout=120_000)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+    assert process.returncode == 0
+    table = BoxTable.read(tmp_path / 'drive.labels.corrected' / 'boxes.csv')
+    assert {name: len(stamps_of(table, name)) for name in '12'} == dict.fromkeys('12', NUM_SWEEPS)
+    assert np.median(ious_with_truth(table, drive, '2')) > 0.6
+    assert len(list((tmp_path / 'drive.labels.corrected' / 'sustechpoints').rglob('*.json'))) > 0
+
+
 @NEEDS_BROWSER
 def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, out, serve):
     with opened_page(serve(out).address) as page:
@@ -266,6 +348,10 @@ def test_a_box_is_fitted_to_the_points_at_a_place():
     assert found.num_points > 550  # not the road below it, nor the post
     truth = np.array([*center, 0.75, *size, 0, 0, yaw])
     assert iou_3d(found.box[None], truth[None])[0] > 0.85
+    # Close to the sensor neither the road around it nor its lower half is seen.
+    upper = np.concatenate([road[np.abs(road[:, :2] - center).max(1) > 5], car[car[:, 2] > 0.8]])
+    beside = fitted(upper, car[0, :2], sensor, 0.0, {'car': size}).box
+    assert beside[2] - beside[5] / 2 == pytest.approx(0, abs=0.1)
     # By the heading of the sensor it is the other way round.
     turned = fitted(points, car[0, :2], sensor, math.pi, sizes).box[8]
     assert abs(math.cos(turned - yaw) + 1) < 0.01

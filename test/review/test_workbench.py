@@ -367,25 +367,39 @@ def test_one_key_accepts_and_opens_the_next_open_track(server):
         assert page.evaluate('current().id') == page.evaluate('timelineBars().shown[0].id')
 
 
-def test_axe_finds_nothing(server):
+@pytest.mark.parametrize(
+    'context',
+    [{}, {'color_scheme': 'dark', 'viewport': {'width': 390, 'height': 844}}],
+    ids=['wide', 'dark-narrow'],
+)
+def test_axe_finds_nothing(server, context):
     axe = pytest.importorskip('axe_playwright_python.sync_playwright').Axe()
-    with opened_page(server.address) as page:
+
+    def check(page):
+        found = axe.run(page)
+        assert found.violations_count == 0, found.generate_report()
+
+    with opened_page(server.address, **context) as page:
         for tab in ('overview', 'tracks', 'drive', 'run'):
             page.click(f'#tab-{tab}')
             page.wait_for_timeout(500)
-            found = axe.run(page)
-            assert found.violations_count == 0, found.generate_report()
+            check(page)
         page.click('#tab-tracks')
         page.keyboard.press('e')
-        found = axe.run(page)
-        assert found.violations_count == 0, found.generate_report()
+        check(page)
+        page.keyboard.press('Escape')
+        page.keyboard.press('j')
+        check(page)
+        page.keyboard.press('Escape')
+        page.keyboard.press('?')
+        check(page)
 
 
 def test_a_review_begins_with_a_recording(made, tmp_path, capfd):
     out = tmp_path / 'out'
-    command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', str(made / 'drive')]
-    assert main([*command[3:]]) == 1  # no result
+    assert main(['review', str(tmp_path)]) == 1
     assert 'expected a finished result' in capfd.readouterr().err
+    command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', str(made / 'drive')]
     command += ['-o', str(out), '--port', '0', *FORMATS, *QUICK]
     for word in ('boxes in', 'up to date'):
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

@@ -25,12 +25,13 @@ from boxreg_ros.simulation.raycast import (
     to_matrix,
 )
 from boxreg_ros.simulation.scenarios import EXTENTS
-from boxreg_ros.simulation.scene import boxes_of
+from boxreg_ros.simulation.scene import boxes_of, is_near
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import BoxArray, Sweep, YAW
 import numpy as np
 from paths import BAGS
 import pytest
+from scenes import simulated
 from scipy.optimize import linprog
 
 
@@ -41,7 +42,7 @@ def street():
 
 @pytest.fixture(scope='module')
 def paper():
-    return simulate('paper', seed=1)
+    return simulated('paper', 1)
 
 
 def run(*words):
@@ -133,7 +134,7 @@ def test_each_ray_gives_one_point(street):
 
 
 def test_street_has_parked_turning_and_reversing_cars(street):
-    whole = simulate('street', seed=0, sweeps=50).actors
+    whole = simulated('street', 0).actors
     times = np.arange(50) * 0.1
     boxes = [boxes_of(actor, actor.motion.at(times)) for actor in whole]
     for one, other in combinations(boxes, 2):
@@ -146,10 +147,48 @@ def test_street_has_parked_turning_and_reversing_cars(street):
     assert sum(np.abs(f).max() < 1e-9 for f in forward) >= 10, 'parked'
     assert sum(f.min() < -0.05 for f in forward) == 1, 'reversing'
     assert sum(np.ptp(b[:, 8]) > 1.5 for b in boxes) == 1, 'turning'
-    assert {actor.shape for actor in whole} == BODIES.keys() - {'trailer'}
+    assert {actor.shape for actor in whole} == BODIES.keys() - {'tractor', 'trailer'}
     returns = street.truth.num_points
     assert (returns == 0).sum() < len(returns) / 10
     assert (returns > 500).any()
+
+
+def test_articulated_trucks_bend_in_curves():
+    """A box around both holds the points of both; the axle of a trailer does not slip."""
+    joined, parts = (simulate(name, 2, 30) for name in ('articulated', 'articulated-parts'))
+    times = np.arange(30) * 0.1
+    boxes = {actor.track_id: boxes_of(actor, actor.motion.at(times)) for actor in parts.actors}
+    names = [actor.track_id for actor in joined.actors]
+    for name in (actor.track_id for actor in joined.actors if actor.class_name == 'truck'):
+        tractor, trailer = boxes[name], boxes[f'{name}b']
+        bend = np.abs(wrap_angle(tractor[:, 8] - trailer[:, 8]))
+        assert bend[:5].max() < 1e-9
+        assert 0.15 < bend.max() < 0.7
+        axle = trailer[:, :2] - 0.225 * trailer[:, 3:4] * heading_of(trailer)
+        steps = np.diff(axle, axis=0)
+        left = heading_of(trailer)[1:, ::-1] * [-1, 1]
+        across = (left * steps).sum(axis=1)
+        assert np.abs(across).max() < 0.02 * 0.7  # of 0.4 m and more
+        whole = joined.truth.boxes[np.array(joined.truth.track_ids) == name]
+        assert np.ptp(whole[:, 4]) > 0.5
+    for sweep, owner, T in zip(joined.sweeps, joined.owners, joined.T_fixed_sensor, strict=True):
+        at = np.flatnonzero(joined.truth.stamps_ns == sweep.stamp_ns)
+        points = sweep.points @ T[:3, :3].T + T[:3, 3]
+        for row in at:
+            own = points[owner == names.index(joined.truth.track_ids[row])]
+            assert is_near(own, joined.truth.boxes[row], 0.5).all()
+
+
+def test_parked_cars_stand_bumper_to_bumper():
+    scene = simulate('parked', 1, 2)
+    boxes = np.array([boxes_of(actor, actor.motion.at(np.zeros(1)))[0] for actor in scene.actors])
+    for row in (boxes[:8], boxes[8:]):
+        ends = row[:, :1] + row[:, 3:4] / 2 * [-1, 1]
+        np.testing.assert_allclose(ends[1:, 0] - ends[:-1, 1], 0.2)
+
+
+def heading_of(boxes):
+    return np.stack([np.cos(boxes[:, 8]), np.sin(boxes[:, 8])], axis=1)
 
 
 def test_detector_noise_has_the_documented_statistics():
@@ -184,7 +223,7 @@ def test_paper_path_follows_equation_ten(paper):
 
 
 def test_paper_noise_has_the_errors_of_table_one():
-    scenes = [simulate('paper', seed) for seed in range(4)]
+    scenes = [simulated('paper', seed) for seed in range(4)]
     scores, errors = [], []
     for scene in scenes:
         boxes = BoxTable.from_arrays(scene.fixed_detections())
@@ -253,7 +292,7 @@ def test_same_seed_gives_the_same_bytes(tmp_path):
 
 
 def test_wrong_arguments_are_refused(tmp_path):
-    expected = 'scenario: expected one of street, highway, highway-sight, paper, paper-bev'
+    expected = 'scenario: expected one of street, highway, highway-sight, articulated, '
     with pytest.raises(ConfigError, match=expected):
         simulate('moon')
     with pytest.raises(ConfigError, match='sweeps: expected 1 or more, got 0'):
@@ -274,7 +313,7 @@ def test_sample_recording_equals_the_street():
     """The committed recording is seed 0 of the street; compressed bytes may differ by version."""
     path = BAGS / 'street.mcap'
     assert path.stat().st_size < 5e6
-    first = simulate('street', seed=0, sweeps=50)
+    first = simulated('street', 0)
     truth = BoxTable.read(BAGS / 'street_truth.csv')
     errors = truth.boxes - first.truth.boxes
     errors[:, YAW] = wrap_angle(errors[:, YAW])  # pi and -pi are the same heading

@@ -30,6 +30,8 @@ const REVIEW_KEYS = {
   c: ['c', 'comment on the track; with Shift on this box', event => $(event.shiftKey ? 'comment-box' : 'comment').focus()],
   e: ['e', 'correct this box', () => edit()],
   o: ['o', 'solve the track again with its pinned boxes', () => solve()],
+  i: ['i', 'add an object: click its points in the drive, then Enter follows it both ways', () => inDrive(() => startAdding(true))],
+  p: ['p', 'the next object that the run proposes; Enter follows it', () => inDrive(nextProposal)],
   z: ['z', 'undo the last decision', () => undo()],
 };
 const SCENE_KEYS = {
@@ -41,8 +43,9 @@ const SCENE_KEYS = {
   '+': ['', '', () => zoomScene(ZOOM_STEP)],
   '-': ['', '', () => zoomScene(1 / ZOOM_STEP)],
   0: ['', '', () => { scene.offset = [0, 0]; scene.zoom = $('scene-view').clientWidth / SHOWN; drawScene(); }],
-  i: ['i', 'add an object: click its points, then Enter follows it both ways', () => startAdding()],
-  p: ['p', 'the next object that the run proposes; Enter follows it', () => nextProposal()],
+  v: ['v', 'the scene in 3D, or from above; dragging with Shift, or with the right button, turns it', () => toggleSpace()],
+  i: ['', '', () => startAdding()],
+  p: ['', '', () => nextProposal()],
   Enter: ['', '', () => keepFit()],
   Escape: ['', '', () => startAdding(false)],
   z: ['', '', () => undo()],
@@ -84,11 +87,12 @@ function onKey(event) {
   }
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   const target = event.target;
-  if (target.matches('input:not([type=range], [type=checkbox]), textarea, select')) {
+  const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  const plays = name === ' ' && target.matches('select, [type=number]');  // a space is no part of their values
+  if (target.matches('input:not([type=range], [type=checkbox]), textarea, select') && !plays) {
     if (event.key === 'Escape' || event.key === 'Enter') target.blur();
     return;
   }
-  const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   const isTracks = !$('tracks').hidden && view.part, isScene = !$('drive').hidden;
   if (name === 'Enter' && target.matches('button, a')) return;
   if (name === ' ' && target.matches('button, a, input') && !isTracks && !isScene) return;

@@ -111,6 +111,9 @@ function drawLines() {
   const first = Math.max(0, Math.floor(top / LINE) - SPARE_LINES);
   const last = Math.min(view.shown.length, Math.ceil((top + box.clientHeight) / LINE) + SPARE_LINES);
   const space = lines => (lines > 0 ? [element('tr', { 'aria-hidden': 'true' }, element('td', { class: 'space', colspan: found.length, style: `height: ${LINE * lines}px` }))] : []);
+  const hint = TRACKS.length ? '' : 'No boxes.' + (hasScene ? ' Objects are added in Drive: i, then a click on the points, or p for those that are proposed.' : '');
+  $('detail').hidden = Boolean(hint);
+  $('rows-hint').textContent = hint;
   fill(box.querySelector('tbody'), ...space(first), ...view.shown.slice(first, last).map(track => lineOf(track, found)), ...space(view.shown.length - last));
   box.querySelector('table').setAttribute('aria-rowcount', view.shown.length);
 }

@@ -44,9 +44,9 @@ async function openTrack(index, stamp = null, row = null, isLinked = false) {
   drawCharts();
 }
 
-function nearestRow(stamp) {
+function nearestRow(stamp, part = view.part) {
   let best = 0n, row = 0;
-  view.part.stamps.forEach((own, k) => {
+  part.stamps.forEach((own, k) => {
     const off = BigInt(own) - BigInt(/^\d+$/.test(stamp) ? stamp : 0);
     const away = off < 0n ? -off : off;
     if (k === 0 || away < best) { best = away; row = k; }
@@ -65,7 +65,7 @@ function drawTitle(track) {
   const ends = seeds.map(id => `added by a person. ${endsText(id)} ${(additions.get(id)?.problems ?? []).join(' ')}`);
   const origin = track.isWhole ? '' : `of ${[...new Set(track.pieces.map(({ s }) => DATA.tracks[s].id))].join(', ')}`;
   fill($('title'), element('b', {}, track.id || 'no id'), element('span', {}, track.class), ...(origin ? [element('span', { class: 'grey' }, origin)] : []),
-    element('span', {}, `risk ${number(track.risk)} m: `, ...reasonsOf(track), ' · ', element('a', { href: hashOf(track.id, track.riskiest), title: 'key g' }, 'riskiest box')),
+    element('span', {}, `risk ${number(track.risk)} m${track.why && ': '}`, ...reasonsOf(track), ' · ', element('a', { href: hashOf(track.id, track.riskiest), title: 'key g' }, 'riskiest box')),
     ...violations, ...ends.map(text => element('span', {}, text)), element('span', { class: 'grey' }, facts.filter(Boolean).join(' · ')));
 }
 
@@ -119,7 +119,7 @@ function showTab(name) {
     $(one).hidden = one !== name;
     $('tab-' + one).setAttribute('aria-selected', String(one === name));
   }
-  if (name === 'overview') drawTimeline();
+  if (name === 'overview') { drawOverview(); drawTimeline(); }
   if (name === 'overview' && !$('map').hasChildNodes()) setTimeout(() => { drawMap(); drawExample(); });
   if (name === 'tracks') drawLines();
   if (name === 'drive') showScene(scene.sweep ? scene.at : Math.max(0, view.part ? DATA.stamps.indexOf(view.part.stamps[view.row]) : 0), true);
@@ -140,13 +140,25 @@ async function followHash() {
     drawList();
     return openTrack((view.shown[0] ?? TRACKS[0]).index);
   }
-  if (!wanted.has('track')) return showTab('overview');
+  if (!wanted.has('track')) return showTab(TRACKS.length || !hasScene ? 'overview' : 'drive');
   const track = TRACKS.find(one => one.id === wanted.get('track'));
   if (!track) {
     showTab('overview');
     return fail(`No track ${wanted.get('track')} in this report.`);
   }
   await openTrack(track.index, wanted.get('stamp'), null, true);
+}
+
+// The drive at the box that is shown, in its middle; `act` adds objects there.
+async function inDrive(act) {
+  if (!hasScene) return say('Objects are added to results of boxreg relabel, which have a recording.');
+  if (isCorrecting()) return;
+  const box = view.part.usable[view.row];
+  showTab('drive');
+  await showScene(DATA.stamps.indexOf(view.part.stamps[view.row]), true);
+  if (box && scene.sweep) scene.offset = [0, 1].map(k => box[k] + view.part.origin[k] - scene.sweep.sensor[k]);
+  $('scene-view').focus({ preventScroll: true });
+  act();
 }
 
 function selectTab(name) {
@@ -200,7 +212,6 @@ async function main() {
     TRACKS = buildTracks();
   }
   setUpList();
-  drawOverview();
   setUpTimeline();
   setUpKeys();
   for (const name of Object.keys(VIEWS)) setUpDragging($(name));

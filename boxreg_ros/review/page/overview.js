@@ -23,7 +23,7 @@ function drawOverview() {
     [`cells of ${DATA.cell} m filled by the points of all sweeps`, 'cells', 0, 1, ''],
     .../** @type {[string, string, number, number, string][]} */ (DATA.has_truth ? [['3D IoU with the true boxes', 'iou', 3, 1, '']] : []),
   ];
-  fill($('quality'), element('tr', {}, element('td'), ...['input', 'refined', 'change'].map(t => element('th', { class: 'n', scope: 'col' }, t))),
+  if ($('quality')) fill($('quality'), element('tr', {}, element('td'), ...['input', 'refined', 'change'].map(t => element('th', { class: 'n', scope: 'col' }, t))),
     ...rows.map(([title, name, digits, scale, unit]) => {
       const [a, b] = [before[name], after[name]];
       const part = a && isKnown(a) && isKnown(b) ? 100 * (b / a - 1) : null;

@@ -1,11 +1,13 @@
-// The scene: the whole cloud of a sweep from above, all boxes, and objects that are missing ---------
+// The scene: the whole cloud of a sweep from above or in 3D, all boxes, and objects that are missing -
 
 const CLICK = 4;                   // a pointer that moves less has clicked [px]
 const LABELLED = 5;                // ids are written at this zoom and above [px/m]
 const ROAD = 0.4;                  // above the road: points of objects [m]
 const SHOWN = 90;                  // of the drive around the sensor [m]
+const PICKED = 6;                  // a click is on a point this near [px]
+const TILT = { usual: 1, most: 1.3, pace: 0.006 };  // of the view in 3D, from above [rad], and of a drag [rad/px]
 /** @type {{ [name: string]: any, sweep: Sweep, boxes: SceneBox[], fit: Fit, slim: Map<number, SlimPart> }} */
-const scene = { at: 0, zoom: 0, offset: [0, 0], sweep: null, boxes: [], isAdding: false, fit: null, proposals: [], proposal: -1, playing: 0, slim: new Map() };
+const scene = { at: 0, zoom: 0, offset: [0, 0], tilt: 0, turn: 0, sweep: null, boxes: [], isAdding: false, fit: null, proposals: [], proposal: -1, playing: 0, slim: new Map() };
 /** @type {Record<string, [string, number, number]>} */
 const LOOKS = { road: ['around', 0.45, 1], object: ['points', 0.9, 1.6] };  // colour, opacity, size [px]
 const sceneStamp = () => DATA.stamps[scene.at];
@@ -71,20 +73,42 @@ function roadOf({ points, sensor, origin }) {
   return heights.sort((a, b) => a - b)[heights.length / 10 | 0] ?? 0;
 }
 
-// From the fixed frame to the canvas, and back.
+// From the fixed frame to the canvas, and from there to the road. The view is orthogonal: turned about
+// the vertical, then tilted. `depth` is larger farther away.
 function sceneAxes() {
-  const canvas = $('scene-view'), { sensor } = scene.sweep, { zoom, offset } = scene;
+  const canvas = $('scene-view'), { sensor, origin } = scene.sweep, { zoom, offset, tilt, turn } = scene;
   const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-  const center = [sensor[0] + offset[0], sensor[1] + offset[1]];
+  const center = [sensor[0] + offset[0], sensor[1] + offset[1], origin[2] + scene.road];
+  const [c, s, flat, steep] = [Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt)];
+  const turned = (x, y) => [c * (x - center[0]) + s * (y - center[1]), c * (y - center[1]) - s * (x - center[0])];
   return {
     width, height,
     /** @type {(place: number[]) => [number, number]} */
-    to: ([x, y]) => [width / 2 + zoom * (x - center[0]), height / 2 - zoom * (y - center[1])],
+    to: ([x, y, z = center[2]]) => {
+      const [right, ahead] = turned(x, y);
+      return [width / 2 + zoom * right, height / 2 - zoom * (flat * ahead + steep * (z - center[2]))];
+    },
+    /** @type {(place: number[]) => number} */
+    depth: ([x, y, z]) => steep * turned(x, y)[1] - flat * (z - center[2]),
     from: event => {
       const bounds = canvas.getBoundingClientRect();
-      return [center[0] + (event.clientX - bounds.left - width / 2) / zoom, center[1] - (event.clientY - bounds.top - height / 2) / zoom];
+      const right = (event.clientX - bounds.left - width / 2) / zoom, ahead = (height / 2 - event.clientY + bounds.top) / zoom / flat;
+      return [center[0] + c * right - s * ahead, center[1] + s * right + c * ahead];
     },
   };
+}
+
+// The place on the road below the pointer, or below the foremost point of an object that it is on.
+function pickedPlace(event) {
+  const { to, depth, from } = sceneAxes(), { points, origin } = scene.sweep, bounds = $('scene-view').getBoundingClientRect();
+  const [x, y] = [event.clientX - bounds.left, event.clientY - bounds.top];
+  let best = null, least = Infinity;
+  for (let i = 0; i < points.length; i += 3) {
+    if (points[i + 2] <= scene.road + ROAD) continue;
+    const point = [points[i] + origin[0], points[i + 1] + origin[1], points[i + 2] + origin[2]], at = to(point);
+    if (Math.hypot(at[0] - x, at[1] - y) < PICKED && depth(point) < least) [best, least] = [point, depth(point)];
+  }
+  return best ? best.slice(0, 2) : from(event);
 }
 
 function drawScene() {
@@ -101,7 +125,7 @@ function drawScene() {
     context.globalAlpha = alpha;
     for (let i = 0; i < points.length; i += 3) {
       if (points[i + 2] > scene.road + ROAD !== isObject) continue;
-      const [x, y] = to([points[i] + origin[0], points[i + 1] + origin[1]]);
+      const [x, y] = to([points[i] + origin[0], points[i + 1] + origin[1], points[i + 2] + origin[2]]);
       if (x > 0 && y > 0 && x < width && y < height) context.fillRect(x - size / 2, y - size / 2, size, size);
     }
   }
@@ -121,16 +145,17 @@ function drawScene() {
 }
 
 function drawSceneBox(context, to, box, name, text, isDashed, isBold) {
-  const c = corners(box).map(to);
+  const space = corners(box), c = space.map(to), middle = k => (space[4][k] + space[6][k]) / 2;
+  const nose = [0, 1, 2].map(k => (space[4][k] + space[7][k]) / 2);
+  const lines = [...BOX_EDGES.map(edge => edge.map(k => c[k])), [nose, nose.map((v, k) => v + 0.25 * (v - middle(k)))].map(to)];
   context.strokeStyle = context.fillStyle = colour(name);
   context.lineWidth = isBold ? 2.5 : 1.5;
   context.setLineDash(isDashed ? [4, 4] : []);
   context.beginPath();
-  VIEWS.top[2].forEach((k, i) => context[i ? 'lineTo' : 'moveTo'](...c[k]));
-  context.closePath();
-  const nose = [0, 1].map(k => (c[4][k] + c[7][k]) / 2), middle = [0, 1].map(k => (c[4][k] + c[6][k]) / 2);
-  context.moveTo(...nose);
-  context.lineTo(...[0, 1].map(k => nose[k] + 0.25 * (nose[k] - middle[k])));
+  for (const [a, b] of lines) {
+    context.moveTo(...a);
+    context.lineTo(...b);
+  }
   context.stroke();
   context.setLineDash([]);
   if (scene.zoom >= LABELLED || isBold) context.fillText(text, Math.max(...c.map(p => p[0])) + 3, Math.min(...c.map(p => p[1])) + 9);
@@ -143,7 +168,7 @@ function drawSceneTools() {
   $('scene-fit').hidden = !scene.fit;
   drawProposals();
   $('scene-hint').textContent = scene.fit ? `${number(scene.fit.points, 0)} points, ${scene.fit.box.slice(3, 6).map(v => number(v, 1)).join(' × ')} m. Enter follows it both ways.`
-    : scene.isAdding ? 'Click the points of the object.' : 'Click a box to open its track.';
+    : scene.isAdding ? 'Click the points of the object.' : 'Click a box to open its track. Drag moves, the wheel zooms, a drag with Shift turns.';
 }
 
 function sceneBoxAt(place) {
@@ -180,10 +205,13 @@ async function fitAt(place, name = '') {
   offerFit({ ...found, stamp: scene.sweep.stamp, place });
 }
 
-// Proposals of the run that nobody has added yet.
+// Proposals of the run that no object of a person covers yet.
 function openProposals() {
-  const taken = new Set([...log.held.values()].filter(row => row.decision === 'add').map(row => row.box.slice(0, 2).map(v => v.toFixed(2)).join()));
-  return scene.proposals.filter(({ box }) => !taken.has(box.slice(0, 2).map(v => v.toFixed(2)).join()));
+  const added = DATA.tracks.filter(track => track.added && track.part && !track.withdrawn).map(track => track.part);
+  return scene.proposals.filter(({ stamp, box }) => !added.some(part => {
+    const own = part.usable[nearestRow(stamp, part)];
+    return own && numInside([box], moved(own, part.origin, 1)) > 0;
+  }));
 }
 
 function drawProposals() {
@@ -240,6 +268,16 @@ function playScene() {
   next();
 }
 
+// Tilt and turn the view; from above the drive is shown as on the map.
+function tiltScene(tilt, turn = 0) {
+  scene.tilt = Math.max(0, Math.min(TILT.most, tilt));
+  scene.turn = scene.tilt ? turn : 0;
+  $('scene-space').setAttribute('aria-pressed', String(scene.tilt > 0));
+  if (scene.sweep) drawScene();
+}
+
+const toggleSpace = () => (scene.tilt ? tiltScene(0) : tiltScene(TILT.usual, scene.sweep.sensor[3] - Math.PI / 2));
+
 function zoomScene(factor, event = null) {
   const place = event && sceneAxes().from(event);
   scene.zoom = Math.max(1, Math.min(120, scene.zoom * factor));
@@ -256,7 +294,7 @@ function setUpScene() {
   canvas.onpointerdown = event => {
     if (!scene.sweep) return;
     canvas.setPointerCapture(event.pointerId);
-    drag = { x: event.clientX, y: event.clientY, far: 0 };
+    drag = { place: sceneAxes().from(event), x: event.clientX, y: event.clientY, far: 0, turns: event.shiftKey || event.button > 0 };
   };
   canvas.onpointermove = event => {
     if (!drag) {
@@ -267,15 +305,17 @@ function setUpScene() {
     const [dx, dy] = [event.clientX - drag.x, event.clientY - drag.y];
     drag.far += Math.hypot(dx, dy);
     if (drag.far < CLICK) return;
-    scene.offset = [scene.offset[0] - dx / scene.zoom, scene.offset[1] + dy / scene.zoom];
     [drag.x, drag.y] = [event.clientX, event.clientY];
+    if (drag.turns) return tiltScene(scene.tilt - TILT.pace * dy, scene.turn - TILT.pace * dx);
+    const now = sceneAxes().from(event);
+    scene.offset = scene.offset.map((v, k) => v + drag.place[k] - now[k]);
     drawScene();
   };
   canvas.onpointerup = event => {
     const isClick = drag && drag.far < CLICK;
     drag = null;
     if (!isClick) return;
-    const place = sceneAxes().from(event);
+    const place = pickedPlace(event);
     if (scene.isAdding) return void fitAt(place);
     const found = sceneBoxAt(place);
     if (found) openTrack(found.track.index, sceneStamp());
@@ -288,6 +328,8 @@ function setUpScene() {
   $('camera-choice').onchange = drawCamera;
   $('scene-time').oninput = () => showScene(Number($('scene-time').value));
   $('scene-play').onclick = playScene;
+  canvas.oncontextmenu = event => event.preventDefault();
+  $('scene-space').onclick = toggleSpace;
   $('scene-proposals').onchange = event => showProposal(Number(event.target.value));
   $('scene-add').onclick = () => startAdding();
   $('scene-follow').onclick = keepFit;

@@ -69,6 +69,7 @@ function pathOf({ s, rows }) {
 async function rebuildTracks() {
   const shown = view.open?.members()[view.row];
   TRACKS = buildTracks();
+  $('map').replaceChildren();  // it is drawn again when it is shown
   if (!shown) return;
   const [s, k] = shown;
   const index = TRACKS.findIndex(track => track.members().some(([t, l]) => t === s && l === k));

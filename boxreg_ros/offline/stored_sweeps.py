@@ -1,0 +1,120 @@
+"""The sweeps of a recording, on disk until the boxes of all tracks are known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+import pickle
+from tempfile import TemporaryFile
+from typing import NamedTuple
+
+from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem, StoredCloud
+from boxreg_ros.structures import Floats, Sweep
+import numpy as np
+
+
+class MergedCloud(NamedTuple):
+    """
+    A cloud that a sweep was merged from.
+
+    Attributes
+    ----------
+    topic : str
+        Empty if there is only one topic of clouds.
+    stamp_ns : int
+        Of its header [ns].
+    rows : slice
+        Its points in the sweep.
+    R_fixed_cloud : array, shape (3, 3)
+        Rotation of its frame; the identity where unknown.
+
+    """
+
+    topic: str
+    stamp_ns: int
+    rows: slice
+    R_fixed_cloud: Floats
+
+
+class StoredSweep(NamedTuple):
+    """
+    A sweep of the recording.
+
+    Attributes
+    ----------
+    sweep : Sweep or None
+        In the fixed frame; None where no transform is known.
+    cloud : StoredCloud or None
+        The same for label files; None unless asked for.
+
+    """
+
+    sweep: Sweep | None
+    cloud: StoredCloud | None
+
+
+class StoredPlace(NamedTuple):
+    """Where a sweep begins in the file, and the clouds that it was merged from."""
+
+    begin: int
+    parts: tuple[MergedCloud, ...]
+
+
+class StoredSweeps:
+    """
+    Sweeps in a temporary file: written by the process that reads, then read by the other.
+
+    Parameters
+    ----------
+    folder : Path or None
+        Where the file lies, without a name; None for the folder of temporary files.
+    with_clouds : bool
+        Whether sweeps are stored for label files, too.
+
+    Attributes
+    ----------
+    places : list of StoredPlace
+        Of all sweeps, in the order of reading; the process that reads them hands them over.
+
+    """
+
+    def __init__(self, folder: Path | None, with_clouds: bool) -> None:
+        self._file = TemporaryFile(dir=folder)  # noqa: SIM115  closed with the object
+        self.with_clouds = with_clouds
+        self.places: list[StoredPlace] = []
+
+    def add(self, item: MovedItem, items: FixedFrameItems, sensor_frame: str) -> None:
+        """Store a sweep of `items`; label files have merged ones in `sensor_frame`."""
+        cloud = items.stored_cloud(item, sensor_frame) if self.with_clouds else None
+        moved = item.moved if isinstance(item.moved, Sweep) else None
+        self.places.append(StoredPlace(self._file.tell(), tuple(_parts(item, items))))
+        pickle.dump(StoredSweep(moved, cloud), self._file, pickle.HIGHEST_PROTOCOL)
+
+    def complete(self) -> list[StoredPlace]:
+        """Write what waits; return the places."""
+        self._file.flush()
+        return self.places
+
+    def __iter__(self) -> Iterator[StoredSweep]:
+        """Yield all sweeps."""
+        yield from map(self.__getitem__, range(len(self.places)))
+
+    def __getitem__(self, number: int, /) -> StoredSweep:
+        """Return a sweep."""
+        self._file.seek(self.places[number].begin)
+        stored: StoredSweep = pickle.load(self._file)
+        return stored
+
+
+def _parts(item: MovedItem, items: FixedFrameItems) -> Iterator[MergedCloud]:
+    """Yield the clouds that an item was merged from."""
+    first = 0
+    for part in item.items:
+        cloud = part.content
+        assert isinstance(cloud, Sweep)
+        rows = slice(first, first + len(cloud.points))
+        first = rows.stop
+        T = item.T_fixed_item
+        if len(item.items) > 1:
+            T = items.pose_of(cloud.frame_id, cloud.stamp_ns)
+        yield MergedCloud(cloud.topic, cloud.stamp_ns, rows, np.eye(3) if T is None else T[:3, :3])
