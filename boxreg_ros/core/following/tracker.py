@@ -8,9 +8,11 @@ two seeds there are two ways; each is tested where it arrives at the other seed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Self
 
+from boxreg_ros.core.following.extents import faces, MAX_GROWTH
 from boxreg_ros.core.following.kernels import motion, registration, surface
 from boxreg_ros.core.following.sweeps import Sweeps
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
@@ -88,6 +90,8 @@ MARGIN_LEARNT = 0.1
 """Points so far outside of the box are part of its surface [m]."""
 MAX_SWEEP_POINTS = 400
 """A sweep with more points around a box is thinned; swept: the poses are as good."""
+MAX_EXTENT_SWEEPS = 60
+"""Sweeps of a track whose points show the extents; chosen."""
 MAX_CELLS = 20_000
 """Of a surface: those of a bus of 12 m at 0.15 m."""
 
@@ -237,22 +241,30 @@ class Owned:
     def __init__(self) -> None:
         self._boxes: dict[int, tuple[Floats, int]] = {}  # by row of the sweep; rows in use
 
-    def add(self, rows: Ints, boxes: Floats) -> None:
-        """Add the boxes (N, 9) of an object in the sweeps `rows` (N,)."""
+    def add(self, rows: Ints, boxes: Floats, owner: int = -1) -> None:
+        """Add the boxes (N, 9) of the object `owner` in the sweeps `rows` (N,)."""
         for row, box in zip(rows.tolist(), boxes, strict=True):
-            known, count = self._boxes.get(row, (np.empty((8, 9)), 0))
+            known, count = self._boxes.get(row, (np.empty((8, 10)), 0))
             if count == len(known):
                 known = np.concatenate([known, np.empty_like(known)])
-            known[count] = box
+            known[count, :9] = box
+            known[count, 9] = owner
             self._boxes[row] = known, count + 1
 
-    def others(self, row: int, pose: Floats, half: Floats) -> Floats:
-        """Return boxes (n, 9) near a pose (4,); none whose centre is in it: that is the object."""
-        known, count = self._boxes.get(row, (np.empty((0, 9)), 0))
+    def others(self, row: int, pose: Floats, half: Floats, same: Sequence[int]) -> Floats:
+        """
+        Return boxes (n, 9) near a pose (4,).
+
+        None whose centre is in it, and none of the objects `same`: they are the object itself.
+        """
+        known, count = self._boxes.get(row, (np.empty((0, 10)), 0))
         boxes = known[:count]
         away = np.hypot(boxes[:, 0] - pose[0], boxes[:, 1] - pose[1])
         reach = np.hypot(half[0], half[1]) + np.hypot(boxes[:, LENGTH], boxes[:, WIDTH]) / 2 + 1.0
-        near: Floats = boxes[(half[1] < away) & (away < reach)]
+        is_near = (half[1] < away) & (away < reach)
+        for owner in same:
+            is_near &= boxes[:, 9] != owner
+        near: Floats = boxes[is_near, :9]
         return near
 
 
@@ -270,14 +282,19 @@ class Follower:
         One of `MOTIONS`.
     owned : Owned
         Boxes of other objects.
+    same : sequence of int
+        Those of them in `owned` that have a seed in one of this object.
 
     """
 
-    def __init__(self, sweeps: Sweeps, seeds: Seeds, kind: str, owned: Owned) -> None:
+    def __init__(
+        self, sweeps: Sweeps, seeds: Seeds, kind: str, owned: Owned, same: Sequence[int] = ()
+    ) -> None:
         self._sweeps = sweeps
         self._seeds = seeds
         self._kind = MOTIONS[kind]
         self._owned = owned
+        self._same = same
         self._half = seeds.boxes[:, BOX_EXTENT].mean(0) / 2
         self._tilt = matrix_from_rpy(np.append(seeds.boxes[0, [ROLL, PITCH]], 0.0))
         self._pivot = REAR_AXLE * 2 * self._half[0] if kind == 'vehicle' else 0.0
@@ -354,6 +371,20 @@ class Follower:
         box[YAW] = wrap_angle(box[YAW])
         box[:2] += travel * np.array([np.cos(box[YAW]), np.sin(box[YAW])])
         return box
+
+    def grown(self, rows: Ints, boxes: Floats) -> Floats:
+        """Return the boxes (n, 9) in sweeps `rows` (n,) with the extents that points show."""
+        some = np.unique(np.linspace(0, len(rows) - 1, MAX_EXTENT_SWEEPS).round().astype(int))
+        points = [
+            self._in_box(self._near(int(rows[i]), pose, MAX_GROWTH), pose, MAX_GROWTH)
+            for i, pose in zip(some, boxes[np.ix_(some, POSE4)], strict=True)
+        ]
+        low, high = faces(points, self._half)
+        grown = boxes.copy()
+        shift = (low + high) / 2
+        grown[:, :3] += matrix_from_rpy(boxes[:, ROLL:]) @ shift
+        grown[:, BOX_EXTENT] = high - low
+        return grown
 
     def jumps(self, seed: int) -> bool:
         """Return whether the next seed is farther away than such an object can move."""
@@ -484,7 +515,7 @@ class Follower:
         reach = np.hypot(self._half[0], self._half[1]) + 0.7 + margin
         box = np.array([reach, reach, self._half[2] + 0.6])
         points = registration.near(self._sweeps.points[row], pose[:3], box)
-        for other in self._owned.others(row, pose, self._half):
+        for other in self._owned.others(row, pose, self._half, self._same):
             tilt = matrix_from_rpy(np.append(other[[ROLL, PITCH]], 0.0))
             points = registration.outside(points, other[POSE4], tilt, other[BOX_EXTENT] / 2)
         near: Floats = points

@@ -2,8 +2,9 @@
 The surface of one object in its box frame: cells with the moments of their points.
 
 A map is a tuple of arrays. `slots` (nx, ny, nz) holds the number of the cell at a place plus one,
-0, or `FOREIGN` for points beside the box that a person has drawn; `moments` (S, 10) the count, the sums of x y z and of xx xy xz yy yz zz of its points;
-`normals` (S, 3) the direction of least spread around it; `used` (1,) the number of cells.
+0, or `FOREIGN` for points beside the box that a person has drawn; `moments` (S, 10) the count, the
+sums of x y z and of xx xy xz yy yz zz of its points; `normals` (S, 3) the direction of least
+spread around it; `used` (1,) the number of cells.
 
 """
 
