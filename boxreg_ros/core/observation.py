@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.field_of_view import FieldOfView
 from boxreg_ros.core.method import crop as crop_kernels
 from boxreg_ros.core.method.rings import ring_heights
 from boxreg_ros.core.tables import column
@@ -28,6 +29,9 @@ GOOD_POINTS = 5
 """Fewer points are no evidence of an object, or of the road beside it; chosen: clutter."""
 GROUND_CLEARANCE = 0.2
 """Points less than this above the road may be of the road [m]; chosen: below most bumpers."""
+UNKNOWN_TOP = 1e3
+"""Height of the ring above an object in the highest one [m]. Derived: any that gives its top no
+weight."""
 MIN_SENSOR_PART = 0.1
 """Least part of the points of an object by a sensor that sees it; chosen: fewer are stray."""
 FACE_TOLERANCE = 0.2
@@ -80,7 +84,8 @@ class Observations(NamedTuple):
     ground : array, shape (n,)
         Height of the road beside the box minus z of the centre [m]; NaN where not found.
     ring_heights : array, shape (n,)
-        Height between two rings of the LiDAR at the object [m]; 0 where unknown.
+        Height between two rings of the LiDAR at the object [m]; 0 where unknown, `UNKNOWN_TOP`
+        where no ring passes above.
     num_points : array, shape (n,)
         Sweep points inside the input box.
     sights : array, shape (n,)
@@ -203,7 +208,13 @@ class Observation(NamedTuple):
         return float(self.table.sights.item(self.row))
 
 
-def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> Observations:
+def observe(
+    sweep: Sweep,
+    boxes: Floats,
+    stamp_ns: int,
+    config: Config,
+    view: FieldOfView | None = None,
+) -> Observations:
     """
     Return the observations of boxes in a sweep.
 
@@ -223,6 +234,8 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> Obser
         Stamp of the observations [ns].
     config : Config
         Settings.
+    view : FieldOfView, optional
+        Of the LiDAR, from the sweeps before; without it all tops are in view.
 
     Returns
     -------
@@ -245,6 +258,13 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> Obser
     up = np.cos(boxes[:, ROLL:YAW]).prod(1)  # of the z axis of each box, in the fixed frame
     ground = (own.road - boxes[:, 5] / 2) / up.clip(0.1)  # along z of the fixed frame
     origins = _origins(sweep, rows, owner, centers)
+    heights = ring_heights(points, counts, origins)
+    if view is not None:
+        origin, places = (_among_points(sweep, at)[0] for at in (sweep.origin[None], centers))
+        is_hidden = view.hidden_tops(
+            sweep, origin[0], places, boxes[:, 3:6], own.row, own.owner, heights
+        )
+        heights[is_hidden] = UNKNOWN_TOP
     return Observations(
         stamps_ns=np.full(n, stamp_ns, np.int64),
         boxes=boxes,
@@ -253,7 +273,7 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> Obser
         counts=counts,
         origins=origins,
         ground=ground,
-        ring_heights=ring_heights(points, counts, origins),
+        ring_heights=heights,
         num_points=own.num_inside,
         sights=sights,
         is_pinned=np.zeros(n, bool),

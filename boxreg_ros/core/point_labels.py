@@ -13,8 +13,15 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.method import labelling
-from boxreg_ros.core.method.constants import CONSTANTS
-from boxreg_ros.core.motion import MOTION_SECONDS
+from boxreg_ros.core.method.labelling import (
+    MOVING,
+    Objects,
+    PARKED,
+    STOOD,
+    SURFACE_TOLERANCE,
+    UNCERTAIN_BAND,
+    UNKNOWN_MOTION,
+)
 from boxreg_ros.core.observation import crop_numbers, shapes_of
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import Floats, Ints, ROLL, Sweep, X, Y, YAW, Z
@@ -26,27 +33,6 @@ Mask = NDArray[np.bool_]
 
 BACKGROUND, UNKNOWN = -1, -2
 """Values of `PointLabels.track` without an object."""
-UNKNOWN_MOTION, PARKED, STOOD, MOVING = range(4)
-"""Motion of an object: never seen to move, stands now but moves at another time, moves."""
-
-# All of these are chosen; `test/measure/points.py` draws what they change.
-SURFACE_TOLERANCE = 0.12
-"""Points up to this far outside of the surface that the margins predict are of the object [m]."""
-BAND = 0.1
-"""Points up to this far outside of that are unknown: of the object or beside it [m]."""
-UNCERTAIN_BAND = 0.5
-"""The same of boxes that no points confirm: kept ones, and ones between those of a gap [m]."""
-LABEL_CLEARANCE = 0.06
-"""Points in a box this close to the road are of either [m]: above its noise, below a bumper."""
-MOTION = labelling.MotionNumbers(
-    seconds=MOTION_SECONDS,
-    min_seconds=0.25,  # shorter tracks have no known motion
-    speed=CONSTANTS.parked_speed,
-    distance=0.35,  # 3 deviations of a registered centre
-    deviations=5.0,  # boxes that jump once, as estimates that settle, do not move
-    way=1.0,  # farther than an estimate jumps
-)
-"""When an object moves."""
 CERTAIN_GAP = 0.6
 """Between boxes of a moving object that are further apart in time, its place is unknown [s]."""
 COAST_SECONDS = 0.5
@@ -76,38 +62,6 @@ class ObjectTrack(NamedTuple):
     stamps_ns: Ints
     boxes: Floats
     is_certain: Mask
-
-
-class Objects(NamedTuple):
-    """
-    The objects of one stamp.
-
-    Attributes
-    ----------
-    track : array, shape (k,)
-        Row of the track of each.
-    boxes : array, shape (k, 9)
-        At the stamp, in the fixed frame.
-    velocities : array, shape (k, 3)
-        Of the centres [m/s].
-    turn_rates : array, shape (k,)
-        Of the headings [rad/s].
-    motion : array, shape (k,)
-        `PARKED`, `STOOD`, `MOVING` or `UNKNOWN_MOTION`.
-    is_certain : array, shape (k,)
-        Whether the box is where the points are.
-    is_lost : array, shape (k,)
-        Whether the box is a guess: in a long gap of a moving object, and before and after it.
-
-    """
-
-    track: Ints
-    boxes: Floats
-    velocities: Floats
-    turn_rates: Floats
-    motion: Bytes
-    is_certain: Mask
-    is_lost: Mask
 
 
 class PointLabels(NamedTuple):
@@ -147,7 +101,7 @@ class PointLabels(NamedTuple):
 
     def at_stamp(self) -> Floats:
         """Return the points on an object, moved with it to the stamp, (L, 3), fixed frame [m]."""
-        boxes = self.objects.boxes
+        boxes: Floats = self.objects.boxes
         R = matrix_from_rpy(boxes[:, ROLL:])[self.owner]
         turned: Floats = np.einsum('lij,lj->li', R, self.local)
         return turned + boxes[self.owner, X : Z + 1]
@@ -201,7 +155,7 @@ class PointLabeller:
         self._order = self._stamps_ns - self._begin_ns + of_tracks * self._span_ns  # ascending
         t = (self._stamps_ns - self._begin_ns) * 1e-9
         values = np.ascontiguousarray(self._boxes[:, [X, Y, Z, YAW]])
-        self._rates, moves, is_known = labelling.motions(self._first, t, values, MOTION)
+        self._rates, moves, is_known = labelling.motions(self._first, t, values)
         self._moves = np.zeros(len(tracks), bool)
         np.logical_or.at(self._moves, of_tracks, moves)
         rests = np.where(self._moves[of_tracks], STOOD, PARKED)
@@ -214,23 +168,21 @@ class PointLabeller:
         times = np.zeros(0, np.float32)
         if sweep.times is not None and objects.velocities.any():
             times = sweep.times.astype(np.float32)
-        placed = labelling.Placed(
-            objects.velocities,
-            objects.turn_rates,
-            self._limits[objects.track],
-            np.where(objects.is_certain, BAND, UNCERTAIN_BAND),
-            objects.is_lost,
-            self._config.sampling.box_time == 'stamp',
-            objects.motion != PARKED,
-            LABEL_CLEARANCE,
-        )
         numbers = crop_numbers(self._config)
         margin = max(numbers.margin, SURFACE_TOLERANCE + UNCERTAIN_BAND)
         shapes = shapes_of(sweep, objects.boxes, margin)
         way = objects.velocities * np.abs(times).max(initial=0) * 2  # before or after the stamp
         shapes = shapes._replace(reach=shapes.reach + np.abs(way @ shapes.turn))
         columns = np.ascontiguousarray(sweep.points.T)
-        near, is_on, rows, local = labelling.label(columns, times, shapes, placed, numbers)
+        near, is_on, rows, local = labelling.label(
+            columns,
+            times,
+            shapes,
+            objects,
+            self._limits[objects.track],
+            self._config.sampling.box_time == 'stamp',
+            numbers,
+        )
         # The last entries are those of points that are near no object.
         elsewhere = BACKGROUND if self.knows(sweep.stamp_ns) else UNKNOWN
         tracks = np.full((2, n + 1), UNKNOWN, np.int32)

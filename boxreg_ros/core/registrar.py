@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
+from boxreg_ros.core.field_of_view import FieldOfView
 from boxreg_ros.core.following.stream import FollowedObjects
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_statistics import Drives
@@ -139,6 +140,7 @@ class BoxRegistrar:
         self._matcher = StampMatcher(config, self.counts)
         self._input_model = InputModel(config.faces, self._drives)
         self.box_time = BoxTimeEvidence()
+        self._view = FieldOfView()
         self.followed = FollowedObjects(config)
         self._pending = deque[PendingArray]()
         self._newest_ns = -inf
@@ -336,7 +338,7 @@ class BoxRegistrar:
             at_sweep[:, X : Z + 1] += offset * velocities
             if self.config.sampling.deskew:
                 motion = motion_to_sight(sweep, at_sweep, velocities)
-        table = observe(sweep, swept(at_sweep, motion), stamp_ns, self.config)
+        table = observe(sweep, swept(at_sweep, motion), stamp_ns, self.config, self._view)
         if offset or motion.any():
             table = table.relative_to(boxes, motion / 2)
         if given.pinned is not None:

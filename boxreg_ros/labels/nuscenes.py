@@ -220,65 +220,45 @@ class Writer(FolderWriter):
         held[key] = row
 
     def _closing_tables(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the tables that are written when all samples are known."""
-        return {
-            'category': [
-                {'token': token, 'name': name, 'description': ''}
-                for name, token in self._categories.items()
-            ],
-            'attribute': [],
-            'visibility': [{'token': 'unavailable', 'level': 'unavailable', 'description': ''}],
-            'instance': list(self._instances.values()),
-            **self._sensor_tables(),
-            **self._drive_tables(),
-        }
-
-    def _sensor_tables(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the tables of the LiDAR, whose frame is that of the vehicle here."""
-        sensor = self._token('sensor')
+        """Return the tables written at the end: one LiDAR, log and scene, and an empty map."""
+        sensor, log = self._token('sensor'), self._token('log')
+        recordings = ', '.join(self.about['recordings'])
+        samples = [self._token('sample', number) for number in (0, self.number - 1)]
+        first, last = samples if self.number else ('', '')
+        categories = [
+            {'token': token, 'name': name, 'description': ''}
+            for name, token in self._categories.items()
+        ]
         calibrated_sensor = {
             'token': self._token('calibrated_sensor'),
             'sensor_token': sensor,
-            'translation': [0.0, 0.0, 0.0],
+            'translation': [0.0, 0.0, 0.0],  # its frame is written as that of the vehicle
             'rotation': [1.0, 0.0, 0.0, 0.0],
             'camera_intrinsic': [],
             'camera_distortion': [],
         }
-        return {
-            'sensor': [{'token': sensor, 'channel': self.channel, 'modality': 'lidar'}],
-            'calibrated_sensor': [calibrated_sensor],
-        }
-
-    def _drive_tables(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the tables of the drive: one log, one scene and an empty map."""
-        log = self._token('log')
-        recordings = ', '.join(self.about['recordings'])
-        tool = f'{self.about["tool"]} {self.about["version"]}'
-        samples = [self._token('sample', number) for number in (0, self.number - 1)]
-        first, last = samples if self.number else ('', '')
-        log_row = {
-            'token': log,
-            'logfile': recordings,
-            'vehicle': '',
-            self.date_key: '',
-            'location': '',
-        }
-        scene_row = {
+        drive = {'logfile': recordings, 'vehicle': '', self.date_key: '', 'location': ''}
+        scene = {
             'token': self._token('scene'),
             'log_token': log,
             'nbr_samples': self.number,
             'first_sample_token': first,
             'last_sample_token': last,
             'name': 'scene-0001',
-            'description': f'{tool}: {recordings}',
+            'description': f'{self.about["tool"]} {self.about["version"]}: {recordings}',
         }
-        map_row = {
-            'token': self._token('map'),
-            'log_tokens': [log],
-            'category': '',
-            'filename': EMPTY_MAP,
+        area = {'log_tokens': [log], 'category': '', 'filename': EMPTY_MAP}
+        return {
+            'category': categories,
+            'attribute': [],
+            'visibility': [{'token': 'unavailable', 'level': 'unavailable', 'description': ''}],
+            'instance': list(self._instances.values()),
+            'sensor': [{'token': sensor, 'channel': self.channel, 'modality': 'lidar'}],
+            'calibrated_sensor': [calibrated_sensor],
+            'log': [{'token': log, **drive}],
+            'scene': [scene],
+            'map': [{'token': self._token('map'), **area}],
         }
-        return {'log': [log_row], 'scene': [scene_row], 'map': [map_row]}
 
     def _token(self, kind: str, key: object = '') -> str:
         """Return 32 digits that are the same in every run over the same recording."""

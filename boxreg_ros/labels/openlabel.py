@@ -25,9 +25,6 @@ from boxreg_ros.rotations import rpy_from_quaternion
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, is_valid_box, RefinedBoxes
 from msg_adapters.poses import quaternions_of
 import numpy as np
-from numpy.typing import NDArray
-
-Mask = NDArray[np.bool_]
 
 FORMAT = Format(
     name='openlabel',
@@ -79,14 +76,15 @@ class Writer:
 
     def write(self, frame: LabelFrame) -> None:
         """Add a frame."""
-        refined = frame.refined
+        rows = np.flatnonzero(is_valid_box(frame.refined.boxes.boxes)).tolist()
+        self.dropped[Reason.INVALID_BOX] += len(frame.refined.status) - len(rows)
+        refined = frame.refined.take(rows)
         boxes = refined.boxes
-        is_valid = is_valid_box(boxes.boxes)
-        self.dropped[Reason.INVALID_BOX] += int((~is_valid).sum())
         self._frame_ids.add(boxes.frame_id)
         objects: dict[int, Any] = {}
-        for row, cuboid in zip(np.flatnonzero(is_valid), _cuboids(refined, is_valid), strict=True):
-            number = self._number(boxes.track_ids[row], boxes.class_names[row], objects)
+        names = zip(boxes.track_ids, boxes.class_names, strict=True)
+        for name, cuboid in zip(names, _cuboids(refined), strict=True):
+            number = self._number(*name, objects)
             objects[number] = {'object_data': {'cuboid': [cuboid]}}
         properties: dict[str, Any] = {
             'timestamp': boxes.stamp_ns / 1e9,
@@ -155,19 +153,17 @@ class Writer:
         return number
 
 
-def _cuboids(refined: RefinedBoxes, is_valid: Mask) -> Iterator[dict[str, Any]]:
-    """Yield the valid boxes with their evidence as attributes."""
+def _cuboids(refined: RefinedBoxes) -> Iterator[dict[str, Any]]:
+    """Yield boxes with their evidence as attributes."""
     boxes = refined.boxes
     position = boxes.boxes[:, BOX_CENTER]
     extent = boxes.boxes[:, BOX_EXTENT]
     values = np.hstack([position, quaternions_of(boxes.boxes), extent])
     covariances = refined.covariances.reshape(-1, 36).round(COVARIANCE_DIGITS)
     extents = refined.extent_covariances.reshape(-1, 9).round(COVARIANCE_DIGITS)
-    columns = (is_valid, values, refined.num_points, boxes.scores, covariances, extents)
+    columns = (values, refined.num_points, boxes.scores, covariances, extents)
     rows = zip(refined.status, refined.reasons, *(c.tolist() for c in columns), strict=True)
-    for status, reason, is_box, value, num_points, score, covariance, extent_covariance in rows:
-        if not is_box:
-            continue
+    for status, reason, value, num_points, score, covariance, extent_covariance in rows:
         numbers = [{'name': 'num_points', 'val': num_points}]
         if isfinite(score):
             numbers.append({'name': 'score', 'val': score})

@@ -17,13 +17,12 @@ from pathlib import Path
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.config import Config, KINDS
+from boxreg_ros.core.method.labelling import MOVING, STOOD
 from boxreg_ros.core.point_labels import (
     BACKGROUND,
-    MOVING,
     ObjectTrack,
     PointLabeller,
     PointLabels,
-    STOOD,
     UNKNOWN,
 )
 from boxreg_ros.errors import UnsupportedMessage
@@ -63,6 +62,8 @@ MAP_VOXEL, OBJECT_VOXEL = 0.1, 0.02
 """Edges of the voxels of the map and of objects, one point each [m]; chosen."""
 MOVING_CODE, STOOD_CODE, UNKNOWN_CODE = 1, 2, 255
 """Values of the field ``moving``; 0 is background or parked."""
+FIELDS = {'label': (np.uint16, 0), 'instance': (np.uint16, 0), 'moving': (np.uint8, UNKNOWN_CODE)}
+"""Fields of labelled clouds: types, and values of unknown points."""
 RECENT_SWEEPS = 4
 """Sweeps whose labels are kept: the clouds of several LiDARs are not in the order of sweeps."""
 
@@ -348,16 +349,15 @@ class _Products:
         number, part = clouds.get((topic, stamp_ns), (-1, None))
         labelled = None if part is None else self._labelled(number)
         is_same = part is not None and len(finite) == part.rows.stop - part.rows.start
-        if part is None or labelled is None or not (count and is_same):
-            self._counts['clouds_copied_unchanged'] += len(kinds)
+        if not count:
             return {}
-        self._add_until(number + 1)
-        return {
-            kind: raw._replace(
-                data=source.encoded_cloud(self._edit(kind, message, finite, part, labelled))
-            )
-            for kind in kinds
-        }
+        if part is None or labelled is None or not is_same:
+            self._counts['clouds_copied_unchanged'] += len(kinds) - ('overlay' in kinds)
+            edited = {'overlay': with_fields(message, _columns(count))}
+        else:
+            self._add_until(number + 1)
+            edited = {k: self._edit(k, message, finite, part, labelled) for k in kinds}
+        return {k: raw._replace(data=source.encoded_cloud(cloud)) for k, cloud in edited.items()}
 
     def _edit(
         self, kind: str, message: Any, finite: Ints, part: MergedCloud, labelled: _Labelled
@@ -369,12 +369,10 @@ class _Products:
         without boxes is copied whole: what moves in it is not known.
 
         """
-        labels = labelled.labels
         n = message.width * message.height
         if kind == 'overlay':
-            columns = {}
-            for name, (values, default) in self._fields(labels).items():
-                columns[name] = np.full(n, default, values.dtype)
+            columns = _columns(n)
+            for name, values in self._fields(labelled.labels).items():
                 columns[name][finite] = values[part.rows]
             return with_fields(message, columns)
         if kind == 'undistorted':
@@ -382,11 +380,11 @@ class _Products:
             positions[finite] += _shift(labelled)[part.rows] @ part.R_fixed_cloud
             return with_positions(message, positions)
         is_kept = np.ones(n, bool)
-        is_kept[finite] = _is_kept(labels, kind)[part.rows] | (not labelled.is_known)
+        is_kept[finite] = _is_kept(labelled.labels, kind)[part.rows] | (not labelled.is_known)
         return with_points(message, is_kept)
 
-    def _fields(self, labels: PointLabels) -> dict[str, tuple[NDArray[Any], int]]:
-        """Return the fields of labels: their values, and that of points that are not finite."""
+    def _fields(self, labels: PointLabels) -> dict[str, NDArray[Any]]:
+        """Return the values of `FIELDS` of the points of a sweep, (M,) each."""
         if self._numbers is None:
             self._numbers = Numbers(labels)
         classes, instances = self._numbers.of(labels)
@@ -394,11 +392,12 @@ class _Products:
         codes[labels.motion == MOVING] = MOVING_CODE
         codes[labels.motion == STOOD] = STOOD_CODE
         codes[labels.track == UNKNOWN] = UNKNOWN_CODE
-        return {
-            'label': (classes, 0),
-            'instance': (instances, 0),
-            'moving': (codes, UNKNOWN_CODE),
-        }
+        return dict(zip(FIELDS, (classes, instances, codes), strict=True))
+
+
+def _columns(n: int) -> dict[str, NDArray[Any]]:
+    """Return the values of `FIELDS` of n unknown points."""
+    return {name: np.full(n, unknown, kind) for name, (kind, unknown) in FIELDS.items()}
 
 
 def _shift(labelled: _Labelled) -> Floats:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import NoReturn
 
 from boxreg_ros.config import Config
 from boxreg_ros.datasets import SceneRecording
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline import relabel_command
 from boxreg_ros.offline.arguments import values_of
@@ -18,12 +20,20 @@ from boxreg_ros.review.scene import DriveSource
 
 
 def drive_of(out: Path) -> DriveSource | None:
-    """Return the recording of a result; None for a result that no command has made."""
+    """
+    Return the recording of a result; None for a result that no command has made.
+
+    Raises
+    ------
+    RecordingError
+        If another version has made it, with options that this one does not have.
+
+    """
     summary = json.loads((out / SUMMARY).read_bytes())
     command, folder = summary.get('command', []), Path(summary.get('folder', '.'))
     if command[:1] != ['relabel']:
         return None
-    parser = argparse.ArgumentParser()
+    parser = _Parser()
     relabel_command.add_arguments(parser)
     args = parser.parse_args([*command[1:], '-o', str(out)])
     values = values_of(args, Request)
@@ -46,6 +56,17 @@ def drive_of(out: Path) -> DriveSource | None:
 
     config = Config.from_yaml(out / CONFIG)
     return DriveSource(source, values['convention'], summary['fixed_frame'], config)
+
+
+class _Parser(argparse.ArgumentParser):
+    """Refuse the command of a result that another version has made."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise RecordingError."""
+        raise RecordingError(
+            f'{SUMMARY}: expected a command of this version, got another one ({message}); make '
+            f'the result again with boxreg relabel RECORDING -o NEW --report'
+        )
 
 
 def _within(folder: Path, path: Path) -> Path:

@@ -21,7 +21,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.reasons import Reason, REASONS
-from boxreg_ros.review.changes import mean, TrackChanges
+from boxreg_ros.review.changes import mean, median
 from boxreg_ros.review.payload import (
     as_json,
     compressed,
@@ -139,7 +139,7 @@ def write_report(
         data=compressed(as_json(data)),
         parts=parts,
         **_of_summary(summary),
-        **_of_tracks(tracks),
+        **_of_tracks(found),
     )
     # File names need not be valid UTF-8.
     (folder / REPORT).write_text(page, encoding='utf-8', errors='backslashreplace')
@@ -179,11 +179,13 @@ def _of_summary(summary: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _of_tracks(tracks: Sequence[TrackChanges]) -> dict[str, Any]:
-    """Return the number of the tracks, and by how much their refined boxes changed."""
+def _of_tracks(found: Sequence[TrackRow]) -> dict[str, Any]:
+    """Return the number of the tracks, by how much their refined boxes changed, and their risk."""
+    tracks = [row.track for row in found]
     changes = np.concatenate([np.zeros((0, 4)), *(t.change[t.is_refined] for t in tracks)])
     return {
         'count': len(tracks),
+        'risk': median([row.risk.track for row in found]),
         'shift': mean(np.linalg.norm(changes[:, :3], axis=1)),
         'turn': float(np.degrees(mean(np.abs(changes[:, 3])))),
     }

@@ -226,6 +226,18 @@ def test_one_command_relabels_a_scene(tmp_path, name, capsys):
     assert main(['relabel', address, '-o', str(out), '--resume', '--formats=csv']) == 0
 
 
+def test_clouds_of_a_scene_are_labelled_but_not_copied(tmp_path, capsys):
+    """A copy is refused before the work; labels of points and clouds of objects need none."""
+    layouts.kitti_tracking(tmp_path / 'data')
+    command = ['relabel', f'kitti_tracking:{tmp_path / "data"}#0004', '-o', str(tmp_path / 'out')]
+    assert main([*command, '--clouds=static']) == 1
+    assert 'ask for --label-points or --clouds object alone' in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+    assert main([*command, '--clouds=object', '--formats=semantickitti']) == 0
+    written = {path.name for path in (tmp_path / 'out').iterdir()}
+    assert {'clouds', 'semantickitti'} <= written
+
+
 @pytest.mark.parametrize('name', CASES)
 def test_inspect_prints_the_command_for_a_scene(tmp_path, name, capsys):
     case = CASES[name]

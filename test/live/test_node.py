@@ -311,10 +311,10 @@ def wait_for_thirty_early_boxes(graph, early):
 
 
 def test_boxes_that_wait_too_long_are_published_unchanged(graph, tmp_path):
-    # Boxes wait ten times the backlog, 0.3 s. Each stamp takes some tenths of a second to solve by
+    # Boxes wait ten times the backlog, 0.3 s. Each stamp takes a tenth of a second to solve by
     # the paper's objective, while the boxes after it wait.
     drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
-    slow = ['objective:=paper', 'paper.multiplier_rounds:=20', 'paper.iterations:=200']
+    slow = ['objective:=paper', 'paper.multiplier_rounds:=5', 'paper.iterations:=100']
     options = [part for text in (*slow, 'backlog:=0.03') for part in ('-p', text)]
     node = graph.start(*RELIABLE, *options)
     graph.wait_until_connected()

@@ -4,15 +4,22 @@ from contextlib import closing
 import json
 
 from boxreg_ros import cli
+from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.fixed_frame import FixedFrameItems
+from boxreg_ros.io.lidars import Lidars
+from boxreg_ros.io.recording import Recording
 from boxreg_ros.labels import check_options, LabelOutput, Options, Provenance
 from boxreg_ros.labels.semantickitti import class_of
+from boxreg_ros.offline.point_products import object_tracks
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
+from boxreg_ros.review.changes import Changes
 from boxreg_ros.simulation.raycast import ROAD
 from boxreg_ros.simulation.scene import FIXED_FRAME
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.simulation.writer import write_recording
+from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 from consumers import consumer
 from mcap.reader import make_reader
 import numpy as np
@@ -239,6 +246,25 @@ def test_sweeps_without_boxes_are_unknown_and_copied_unchanged(scene, recording,
     ]
 
 
+def test_boxes_that_no_point_confirms_are_uncertain_and_rejected_ones_no_objects():
+    box = np.array([[10.0, 0, 1, 4, 2, 1.5, 0, 0, 0]])
+    found = [
+        ('refined', 9),
+        ('kept', 9),
+        ('interpolated', 9),
+        ('interpolated', 0),
+        ('rejected', 9),
+    ]
+    changes = Changes('odom')
+    for stamp, (status, points) in enumerate(found):
+        boxes = BoxArray(stamp, 'odom', ('1',), ('car',), np.array([np.nan]), box)
+        refined = RefinedBoxes(boxes, (status,), ('',), np.array([points]), np.eye(6)[None])
+        changes.add(boxes, refined, None, [])
+    (track,) = object_tracks(changes.tracks())
+    assert track.stamps_ns.tolist() == [0, 1, 2, 3]
+    assert track.is_certain.tolist() == [True, False, True, False]
+
+
 def test_clouds_of_several_lidars_are_copied_each_on_its_topic(tmp_path):
     path, out = tmp_path / 'truck.mcap', tmp_path / 'out'
     assert cli.main(['simulate', '-o', str(path), '--sensors=corners', '--sweeps=5']) == 0
@@ -257,6 +283,13 @@ def test_clouds_of_several_lidars_are_copied_each_on_its_topic(tmp_path):
         dropped += sum(map(len, before)) - sum(map(len, after))
     counts = json.loads((out / 'summary.json').read_text())['points']
     assert dropped == counts['points_dynamic'] > 0
+    # Each cloud has the labels of its own points: what is left are the points of the map.
+    with Recording((out / 'clouds' / 'static.mcap',), Lidars(tuple(topics))) as copy:
+        items = [item.moved for item in FixedFrameItems(copy, Config()).read()]
+    left = [item.in_frame().points for item in items if isinstance(item, Sweep)]
+    there = consumer('cloud', out / 'clouds' / 'static.ply')['rows']
+    cells = [set(map(tuple, np.floor(np.float64(one) / 0.1))) for one in (np.vstack(left), there)]
+    assert cells[0] == cells[1]
 
 
 def test_formats_of_points_are_of_relabel_alone(tmp_path):
@@ -271,9 +304,9 @@ def test_formats_of_points_are_of_relabel_alone(tmp_path):
 
 @pytest.mark.parametrize('storage', ['sqlite3', 'rosbag1'])
 def test_copies_keep_what_they_do_not_edit(tmp_path, storage):
-    """ROS 1 and rosbag2; points that are not finite stay in the clouds, as unknown ones."""
+    """ROS 1 and rosbag2; points without a place or a transform stay, as unknown ones."""
     drive = Drive(sweeps=6, ros1=storage == 'rosbag1')
-    with_nan = 3
+    with_nan, unplaced = 3, 4
 
     def spoil(message):
         step = message.point_step
@@ -281,6 +314,7 @@ def test_copies_keep_what_they_do_not_edit(tmp_path, storage):
         message.data[:step].view('<f4')[0] = np.nan
 
     drive.replace('/points', with_nan, spoil)
+    drive.replace('/points', unplaced, lambda msg: setattr(msg.header, 'frame_id', 'elsewhere'))
     path = drive.write(tmp_path / 'drive', storage)
     request = Request(
         (path,), config=QUICK, formats=('csv', 'mcap'), clouds=('static',), label_points=True,
@@ -306,8 +340,9 @@ def test_copies_keep_what_they_do_not_edit(tmp_path, storage):
         rows = fewer.data.reshape(fewer.width, -1)
         assert 0 < fewer.width <= given.width
         assert np.isnan(rows[:, :4].copy().view('<f4')).sum() == (number == with_nan)
-        if number == with_nan:
-            assert table[0, -5:].tolist() == [0, 0, 0, 0, 255]
+        unknown = (table[:, -5:] == [0, 0, 0, 0, 255]).all(axis=1)
+        assert unknown[0] == (number in (with_nan, unplaced))
+        assert unknown.all() == (number == unplaced)
 
 
 def all_of(path):

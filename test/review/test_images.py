@@ -1,6 +1,7 @@
 """Camera images in the page of `boxreg review`, read from real recordings, in a real browser."""
 
 from io import BytesIO
+import shutil
 from threading import Thread
 
 from boxreg_ros.cli import main
@@ -135,6 +136,44 @@ def test_boxes_are_shown_in_the_nearest_image_of_the_best_camera(tmp_path):
           const c = document.querySelectorAll('#drive-cameras canvas')[1], [x, y] = c.at([9, 9]);
           return [...c.getContext('2d').getImageData(x, y, 1, 1).data]; })()""")
         assert np.abs(np.subtract(shown, [0, 0, 200, 255])).max() < 6  # bgr8
+    server.shutdown()
+
+
+@NEEDS_BROWSER
+def test_missing_clouds_and_damaged_images_are_said_where_they_are(tmp_path):
+    drive = with_cameras(Drive())
+    recording, out = drive.write(tmp_path / 'drive'), tmp_path / 'out'
+    assert main(['relabel', str(recording), '-o', str(out), '--report', *QUICK]) == 0
+    # Since then, half of the clouds and the content of the images were lost.
+    last = drive.stamps[3]
+    drive.items = [item for item in drive.items if item[0] != '/points' or item[1] <= last]
+    for topic, _, message in drive.items:
+        if topic.startswith('/front/image'):
+            message.data = message.data[:40]
+        if topic.startswith('/rear/image'):
+            message.encoding = '64FC3'
+    shutil.rmtree(tmp_path / 'drive')
+    drive.write(tmp_path / 'drive')
+    server = review_server(out, 0, 'anna', drive_of(out))
+    Thread(target=server.serve_forever, daemon=True).start()
+    with opened_page(server.address + '#track=1', expected='400') as page:
+        page.wait_for_function("$('camera-text').textContent.includes('damaged')")
+        page.select_option('#camera-choice', '1')
+        page.wait_for_function("$('camera-text').textContent.includes('64FC3')")
+        page.evaluate('step(3)')
+        page.wait_for_function('view.cloud?.stamp === view.part.stamps[3]')
+        page.evaluate('step(7)')
+        page.wait_for_timeout(500)
+        assert page.evaluate('view.cloud.stamp === view.part.stamps[3]')  # none at the last stamp
+        page.click('#tab-drive')
+        page.wait_for_function(
+            "$('scene-clock').textContent.includes('no cloud here: that of 0.30')"
+        )
+        assert '64FC3' in page.inner_text('#drive-cameras')
+        page.click('#tab-tracks')
+        page.locator('#top').focus()
+        page.keyboard.press('a')
+        page.wait_for_function('log.count === 1')
     server.shutdown()
 
 

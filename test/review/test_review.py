@@ -319,8 +319,15 @@ def test_unfinished_result_is_refused(tmp_path, capsys):
         assert word in line
 
 
-def test_report_of_another_version_is_refused(result, tmp_path):
+def test_report_of_another_version_is_refused(result, tmp_path, capsys):
     out = shutil.copytree(result[1], tmp_path / 'out')
+    summary = json.loads((out / 'summary.json').read_text())
+    other = summary | {'command': [*summary['command'], '--gone=1']}
+    (out / 'summary.json').write_text(json.dumps(other))
+    assert boxreg('review', out) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'unrecognized arguments: --gone=1' in line and 'boxreg relabel' in line
+    (out / 'summary.json').write_text(json.dumps(summary))
     page = (out / 'report.html').read_text(encoding='utf-8')
     (out / 'report.html').write_text(page.replace(' data-page="2"', ''), encoding='utf-8')
     with pytest.raises(RecordingError, match='expected a report of this version, got one of'):

@@ -296,7 +296,8 @@ def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, out, serve):
     with opened_page(serve(out).address, expected='400') as page:
         page.click('#tab-drive')
         page.wait_for_selector('#failure:not([hidden])')
-        assert 'cannot be shown' in page.inner_text('#failure')
+        text = page.inner_text('#failure')
+        assert str(recording) in text and 'Put the recording back' in text
         page.click('#tab-tracks')
         page.keyboard.press('a')
         page.wait_for_function('log.count === 1')

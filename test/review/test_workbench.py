@@ -1,6 +1,8 @@
 """`boxreg review` as a workbench: tracks are edited, solved and written in a real browser."""
 
+from contextlib import contextmanager
 from pathlib import Path
+import resource
 import shutil
 import signal
 import subprocess
@@ -197,6 +199,63 @@ def test_labels_that_cannot_be_written_leave_all_as_it_was(server, made):
     assert [one.kind for one in read_decisions(server.log_paths[0])] == ['delete']
 
 
+@contextmanager
+def running(out, max_bytes=None):
+    """Yield the process of `boxreg review` and its address; no file may have more bytes."""
+
+    def limit():
+        if max_bytes is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, max_bytes))
+
+    command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', str(out), '--port', '0']
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=limit) as process:
+        yield process, process.stdout.readline().strip()
+        process.kill()
+
+
+def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path):
+    out = shutil.copytree(made / 'out', tmp_path / 'out')
+    log, again = out / DECISIONS, tmp_path / 'out.corrected'
+    with (
+        running(out, max_bytes=200_000) as (process, address),
+        opened_page(address + '#track=1', expected='Failed to load resource') as page,
+    ):
+        page.keyboard.press('d')
+        page.wait_for_function('isGone(current())')
+        page.keyboard.press('Control+s')  # the report is larger
+        page.wait_for_selector('#failure:not([hidden])', timeout=120_000)
+        text = page.inner_text('#failure')
+        assert 'the earlier ones are as they were' in text and 'too large' in text
+        assert sorted(path.name for path in tmp_path.iterdir()) == ['out']
+        # Killed while it decides: the page has what the file has, and says so.
+        page.evaluate("void (async () => { while (await judge('unsure', false)) ; })()")
+        page.wait_for_function('log.count > 5')
+        process.kill()
+        page.wait_for_selector('#failure:not([hidden])')
+        assert 'Check that boxreg review still runs' in page.inner_text('#failure')
+        known = page.evaluate('log.count')
+        assert 0 <= len(read_decisions(log)) - known <= 1  # the last one was not answered
+    with running(out) as (process, address), opened_page(address + '#track=1') as page:
+        assert page.evaluate('log.count') == len(read_decisions(log))
+        assert page.evaluate('isGone(current())')
+        page.keyboard.press('Control+s')
+        page.wait_for_function("$('notice').textContent.includes('Writing')")
+        page.wait_for_timeout(1500)
+        page.context.close()
+        process.kill()
+    # Its labels appear whole, or not at all, and can be written again.
+    with running(out) as (process, address), opened_page(address, expected='40') as page:
+        for _ in range(30):
+            page.keyboard.press('Control+s')
+            page.wait_for_function('!view.isSaving', timeout=120_000)
+            if 'boxes in' in page.inner_text('#notice'):
+                break
+            page.wait_for_timeout(1000)  # the command that was left is still at work
+    table = BoxTable.read(again / 'boxes.csv')
+    assert {status for _, status in boxes_of(table, '1', 'stamps_ns', 'status')} == {'rejected'}
+    assert not list(tmp_path.glob('.*'))
+
+
 def test_views_are_moved_zoomed_and_show_neighbours(server):
     with opened_page(server.address + '#track=1', bypass_csp=False) as page:
         page.wait_for_selector('#space canvas')
@@ -226,10 +285,11 @@ def test_views_are_moved_zoomed_and_show_neighbours(server):
         page.evaluate('new Promise(done => setTimeout(done, 300))')
         assert 'neighbours' in page.inner_text('#legend')
         # Space plays, wherever the focus is; Back goes to the track before.
-        page.locator(DO.format('accept')).focus()
-        page.keyboard.press(' ')
-        assert page.evaluate('[view.isPlaying, log.count]') == [True, 0]
-        page.keyboard.press(' ')
+        for selector in (DO.format('accept'), '#mode', '#time', '#f-points', '#top'):
+            page.locator(selector).focus()
+            page.keyboard.press(' ')
+            assert page.evaluate('[view.isPlaying, log.count]') == [True, 0], selector
+            page.keyboard.press(' ')
         page.keyboard.press('ArrowDown' if page.evaluate('view.place') == 0 else 'ArrowUp')
         page.evaluate('new Promise(done => setTimeout(done, 300))')
         assert page.evaluate('current().id') == '2'

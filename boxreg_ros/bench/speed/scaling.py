@@ -11,7 +11,7 @@ from boxreg_ros.bench.speed.streams import make_windows, shortest, SWEEP_PERIOD
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.method.constants import CONSTANTS
-from boxreg_ros.core.problem import Problem, stack_windows
+from boxreg_ros.core.problem import stack_windows
 from boxreg_ros.core.solver import solve
 
 BISECTIONS = 4
@@ -30,19 +30,22 @@ def scaling(config: Config, quick: bool) -> dict[str, list[tuple[int, float]]]:
         'length': [(n, 16, n, 128) for n in lengths],
         'points': [(n, 16, config.window, n) for n in points],
     }
-    table: dict[str, list[tuple[int, float]]] = {}
-    for name, rows in cases.items():
-        table[name] = []
-        for x, count, length, most in rows:
-            windows, _ = make_windows(min(count, 64), length, most, config)
-            windows = (windows * -(-count // len(windows)))[:count]
-            problem, _ = stack_windows(windows, config, CONSTANTS.prior_decay)
+    return {
+        name: [(x, _milliseconds(count, n, most, config) / count) for x, count, n, most in rows]
+        for name, rows in cases.items()
+    }
 
-            def once(problem: Problem = problem) -> object:
-                return solve(problem, config, InputModel(config.faces), is_warm=False)
 
-            table[name].append((x, 1e3 * shortest(once, config) / count))
-    return table
+def _milliseconds(count: int, length: int, points: int, config: Config) -> float:
+    """Return the time to solve `count` cold windows [ms]; 64 of them differ."""
+    windows, _ = make_windows(min(count, 64), length, points, config)
+    windows = (windows * -(-count // len(windows)))[:count]
+    problem, _ = stack_windows(windows, config, CONSTANTS.prior_decay)
+
+    def once() -> object:
+        return solve(problem, config, InputModel(config.faces), is_warm=False)
+
+    return 1e3 * shortest(once, config)
 
 
 def cores(config: Config, count: int) -> dict[str, float]:
@@ -64,14 +67,7 @@ def pinned(available: set[int], count: int) -> None:
     """Print the time of `count` cold windows [ms] on the cores `available` of this process."""
     os.sched_setaffinity(0, available)
     config = Config(estimate='final').updated({'solver.threads': len(available)})
-    windows, _ = make_windows(min(count, 64), config.window, 128, config)
-    windows = (windows * -(-count // len(windows)))[:count]
-    problem, _ = stack_windows(windows, config, CONSTANTS.prior_decay)
-
-    def once() -> object:
-        return solve(problem, config, InputModel(config.faces), is_warm=False)
-
-    print(1e3 * shortest(once, config))
+    print(_milliseconds(count, config.window, 128, config))
 
 
 def held_tracks(config: Config, points: int, most: int) -> int:

@@ -3,48 +3,75 @@
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.crop import candidates, offset_of, road_heights
 from boxreg_ros.core.method.selection import lower_median
 import numpy as np
 
 NOWHERE = -1
 """Value of `owner` of points that are neither on an object nor near one."""
+UNKNOWN_MOTION, PARKED, STOOD, MOVING = range(4)
+"""Motion of an object: never seen to move, stands now but moves at another time, moves."""
+
+# All of these are chosen.
+SURFACE_TOLERANCE = 0.12
+"""Points up to this far outside of the surface that the margins predict are of the object [m]."""
+BAND = 0.1
+"""Points up to this far outside of that are unknown: of the object or beside it [m]."""
+UNCERTAIN_BAND = 0.5
+"""The same of boxes that no points confirm: kept ones, and ones between those of a gap [m]."""
+CLEARANCE = 0.06
+"""
+Points in a box this close to the road are of either [m]: above its noise, below a bumper.
+
+They are of neither where the object moves, since they would stay behind in a map, and of the road
+where it is parked.
+
+"""
+SPEED_SECONDS = 1.0
+"""Time that the boxes of a speed span [s]."""
+MIN_SECONDS = 0.25
+"""Shorter tracks have no known motion [s]."""
+LEAST_WAY = 0.35
+"""Way of a moving object in `SPEED_SECONDS` at least [m]: 3 deviations of a registered centre."""
+SPEED_DEVIATIONS = 5.0
+"""Its speed in standard errors: boxes that jump once, as estimates that settle, do not move."""
+WAY_BETWEEN_RESTS = 1.0
+"""Its way between two rests [m]: farther than an estimate jumps."""
+PARKED_SPEED = CONSTANTS.parked_speed
 
 
-class Placed(NamedTuple):
+class Objects(NamedTuple):
     """
-    Objects as points are compared with them.
+    The objects of one stamp.
 
     Attributes
     ----------
-    velocities : array, shape (n, 3)
-        Of the centres, in the frame of the boxes [m/s].
-    turn_rates : array, shape (n,)
-        About the z axis of that frame [rad/s].
-    limits : array, shape (n, 4)
-        How far points are outside of the ends, sides, top and bottom at most [m].
-    bands : array, shape (n,)
-        Points up to this much further outside are on the object or beside it [m].
-    is_lost : array, shape (n,)
-        Whether the box is a guess: no point is known to be on it.
-    is_at_stamp : bool
-        Whether boxes are at the stamp, not where the sweep sees the object.
-    is_dynamic : array, shape (n,)
-        Whether it moves now or later, or may.
-    clearance : float
-        Points so little above or below the road are of the road or the object [m]: of neither
-        where it moves, since they would stay behind in a map, of the road where it is parked.
+    track : array, shape (k,)
+        Row of the track of each.
+    boxes : array, shape (k, 9)
+        At the stamp, in the fixed frame.
+    velocities : array, shape (k, 3)
+        Of the centres [m/s].
+    turn_rates : array, shape (k,)
+        Of the headings [rad/s].
+    motion : array, shape (k,)
+        `PARKED`, `STOOD`, `MOVING` or `UNKNOWN_MOTION`.
+    is_certain : array, shape (k,)
+        Whether the box is where the points are.
+    is_lost : array, shape (k,)
+        Whether the box is a guess, and no point known to be on it: in a long gap of a moving
+        object, and before and after it.
 
     """
 
+    track: Any
+    boxes: Any
     velocities: Any
     turn_rates: Any
-    limits: Any
-    bands: Any
+    motion: Any
+    is_certain: Any
     is_lost: Any
-    is_at_stamp: bool
-    is_dynamic: Any
-    clearance: float
 
 
 @loop
@@ -119,34 +146,34 @@ def surroundings(points, times, shapes, found, numbers):
 
 
 @loop
-def moved_back(placed, box, delay, x, y, z):
+def moved_back(objects, box, delay, x, y, z):
     """Return an offset from the centre of an object at a delay [s], as it is without [m]."""
-    x -= placed.velocities[box, 0] * delay
-    y -= placed.velocities[box, 1] * delay
-    z -= placed.velocities[box, 2] * delay
-    angle = placed.turn_rates[box] * delay
+    x -= objects.velocities[box, 0] * delay
+    y -= objects.velocities[box, 1] * delay
+    z -= objects.velocities[box, 2] * delay
+    angle = objects.turn_rates[box] * delay
     cos, sin = np.cos(angle), np.sin(angle)
     return cos * x + sin * y, cos * y - sin * x, z
 
 
 @loop
-def outside(shapes, placed, road, box, x, y, z):
+def outside(shapes, objects, limits, road, box, x, y, z):
     """Return how far a point is outside of a surface [m], inf if too far; whether it is on it."""
     u, v, w, high = inside_out(shapes, box, x, y, z)
-    ends, sides, top, bottom = placed.limits[box]
+    ends, sides, top, bottom = limits[box]
     excess = max(u - ends, v - sides)
     above = high - (road[box] if road[box] == road[box] else 0.0)
-    if abs(above) <= placed.clearance:
-        is_either = placed.is_dynamic[box] and excess < 0.0
+    if abs(above) <= CLEARANCE:
+        is_either = objects.motion[box] != PARKED and excess < 0.0
         return (excess if is_either else np.inf), False
     excess = max(excess, w - (top if high > shapes.half[box, 2] else bottom))
-    if above < 0.0 or excess >= placed.bands[box]:
+    if above < 0.0 or excess >= (BAND if objects.is_certain[box] else UNCERTAIN_BAND):
         return np.inf, False
-    return excess, excess <= 0.0 and not placed.is_lost[box]
+    return excess, excess <= 0.0 and not objects.is_lost[box]
 
 
 @kernel
-def label(points, times, shapes, placed, numbers):
+def label(points, times, shapes, objects, limits, is_at_stamp, numbers):
     """
     Find the object that each point is on, at the time of the point.
 
@@ -158,8 +185,12 @@ def label(points, times, shapes, placed, numbers):
         Of the points relative to the stamp [s]; empty where unknown.
     shapes : crop.Shapes
         Boxes at the stamp; their bounding boxes include where they go while the sweep takes place.
-    placed : Placed
-        The same objects.
+    objects : Objects
+        The same, with their motion in the frame of the boxes.
+    limits : array, shape (n, 4)
+        How far points are outside of the ends, sides, top and bottom at most [m].
+    is_at_stamp : bool
+        Whether boxes are at the stamp, not where the sweep sees the object.
     numbers : crop.CropNumbers
         Constants and settings of the road.
 
@@ -190,9 +221,9 @@ def label(points, times, shapes, placed, numbers):
             box = boxes[place]
             x, y, z = offset_of(points, i, shapes, box)
             if len(times):
-                delay = times[i] - (0.0 if placed.is_at_stamp else seen[box])
-                x, y, z = moved_back(placed, box, delay, x, y, z)
-            excess, is_sure = outside(shapes, placed, road, box, x, y, z)
+                delay = times[i] - (0.0 if is_at_stamp else seen[box])
+                x, y, z = moved_back(objects, box, delay, x, y, z)
+            excess, is_sure = outside(shapes, objects, limits, road, box, x, y, z)
             if is_sure < is_on[i] or (is_sure == is_on[i] and excess >= least):
                 continue
             owner[i], is_on[i], least = box, is_sure, excess
@@ -202,28 +233,6 @@ def label(points, times, shapes, placed, numbers):
         rows[L] = i
         L += is_on[i]
     return owner, is_on, rows[:L], local[:L]
-
-
-class MotionNumbers(NamedTuple):
-    """
-    When an object moves; `boxreg_ros.core.point_labels` describes the values.
-
-    Attributes
-    ----------
-    seconds, min_seconds : float
-        Time that the boxes of a speed span, and least duration of a track [s].
-    speed, distance, deviations, way : float
-        Least speed [m/s], least way in that time [m], least speed in standard errors, least way
-        between two rests [m].
-
-    """
-
-    seconds: float
-    min_seconds: float
-    speed: float
-    distance: float
-    deviations: float
-    way: float
 
 
 @loop
@@ -261,7 +270,7 @@ def slope(t, values, i, seconds, rate, error):
 
 
 @kernel
-def motions(first, t, values, numbers):
+def motions(first, t, values):
     """
     Find the motion at each box of T tracks, by the slope of the boxes around it.
 
@@ -273,8 +282,6 @@ def motions(first, t, values, numbers):
         Times [s].
     values : array, shape (N, 4)
         Centres and headings [m, rad]; half turns of the heading are taken back, in place.
-    numbers : MotionNumbers
-        Settings.
 
     Returns
     -------
@@ -291,17 +298,17 @@ def motions(first, t, values, numbers):
     rate, error = np.empty(4), np.empty(4)
     for track in range(len(first) - 1):
         a, b = first[track], first[track + 1]
-        if t[b - 1] - t[a] < numbers.min_seconds:
+        if t[b - 1] - t[a] < MIN_SECONDS:
             continue
         is_known[a:b] = True
         for i in range(a + 1, b):
             turns = np.floor((values[i, 3] - values[i - 1, 3]) / np.pi + 0.5)
             values[i, 3] -= turns * np.pi
         for i in range(b - a):
-            span = slope(t[a:b], values[a:b], i, numbers.seconds, rate, error)
+            span = slope(t[a:b], values[a:b], i, SPEED_SECONDS, rate, error)
             speed = np.hypot(rate[0], rate[1])
-            noise = numbers.deviations * np.hypot(error[0], error[1])
-            moves[a + i] = speed > max(numbers.speed, numbers.distance / span, noise)
+            noise = SPEED_DEVIATIONS * np.hypot(error[0], error[1])
+            moves[a + i] = speed > max(PARKED_SPEED, LEAST_WAY / span, noise)
         begin = a
         while begin < b:  # motions between two rests that lead nowhere
             end = begin + 1
@@ -310,9 +317,9 @@ def motions(first, t, values, numbers):
             if moves[begin] and begin > a and end < b:
                 x = values[end, 0] - values[begin - 1, 0]
                 y = values[end, 1] - values[begin - 1, 1]
-                moves[begin:end] = np.hypot(x, y) >= numbers.way
+                moves[begin:end] = np.hypot(x, y) >= WAY_BETWEEN_RESTS
             begin = end
         for i in range(b - a):
             if moves[a + i]:  # less smooth, for the place
-                slope(t[a:b], values[a:b], i, numbers.seconds / 2, rates[a + i], error)
+                slope(t[a:b], values[a:b], i, SPEED_SECONDS / 2, rates[a + i], error)
     return rates, moves, is_known

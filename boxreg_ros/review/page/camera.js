@@ -89,10 +89,7 @@ function drawImage(canvas, camera, found, boxes, focus) {
   const context = canvas.getContext('2d', { willReadFrequently: true });
   context.setTransform(scale, 0, 0, scale, 0, 0);
   context.clearRect(0, 0, width, height);
-  if (found.error) {
-    context.fillStyle = colour('grey');
-    return context.fillText(found.error, 8, height / 2, width - 16);
-  }
+  if (found.error) return;
   const { bitmap, pose } = found, whole = Math.min(width / bitmap.width, height / bitmap.height);
   let [zoom, middle] = [whole, [bitmap.width / 2, bitmap.height / 2]];
   const model = pose && camera.matrix ? camera : null;
@@ -150,7 +147,7 @@ async function drawCamera() {
   const late = found.error ? 0 : Number(BigInt(found.stamp) - BigInt(stamp)) * 1e-6;
   const isSeen = offMiddle(camera, center) < Infinity;
   const note = !camera.matrix ? 'no camera model recorded' : !(found.pose ?? camera.pose) ? 'no transform to this camera' : isSeen ? '' : 'the box is not in this image';
-  $('camera-text').textContent = [camera.topic, found.error ? '' : `${late > 0 ? '+' : ''}${number(late, 0)} ms`, note].filter(Boolean).join(' · ');
+  $('camera-text').textContent = [camera.topic, found.error ?? `${late > 0 ? '+' : ''}${number(late, 0)} ms`, note].filter(Boolean).join(' · ');
   const shift = boxAtTime(part, row, found.stamp ?? stamp).map((v, k) => v - center[k]);
   const boxes = currentBoxes().map(([name, box]) => ({ name, box: moved(box, part.origin, 1).map((v, k) => v + (k < 3 || k === 8 ? shift[k] : 0)), isBold: true }));
   drawImage($('camera-view'), camera, found, boxes, isSeen ? boxes.find(({ name }) => name !== 'input')?.box ?? center : null);
@@ -175,6 +172,7 @@ async function drawCameras() {
       if (stamp !== sceneStamp() || $('drive').hidden) return;
       const boxes = scene.boxes.filter(({ isGone: gone }) => !gone).map(({ track, box: one }) => ({ name: 'refined', box: one, isBold: track === view.open }));
       if (scene.fit) boxes.push({ name: 'human', box: scene.fit.box, isBold: true });
+      box.children[index].querySelector('figcaption').textContent = [camera.topic, found.error].filter(Boolean).join(' · ');
       drawImage(box.children[index].querySelector('canvas'), camera, found, boxes, null);
     });
   }

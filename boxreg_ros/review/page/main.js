@@ -173,7 +173,7 @@ function selectTab(name) {
 function redrawAll() {
   view.space = view.charts = false;
   $('map').replaceChildren();
-  if (!$('overview').hidden) { drawMap(); drawTimeline(); drawExample(); }
+  if (!$('overview').hidden) { drawMap(); drawOverview(); drawTimeline(); drawExample(); }
   if (view.part && !$('tracks').hidden) { drawViews(); drawCharts(); }
   drawScene();
 }
@@ -230,7 +230,7 @@ async function main() {
     drawScene();
     if (view.part && !$('tracks').hidden) { drawViews(); drawCursor(); }
   });
-  matchMedia('(prefers-color-scheme: dark)').addEventListener('change', redrawAll);
+  for (const media of ['(prefers-color-scheme: dark)', 'print']) matchMedia(media).addEventListener('change', redrawAll);
   await followHash();
   document.documentElement.dataset.ready = '';
 }

@@ -10,6 +10,7 @@ const MEANINGS = [                  // of words in the reasons of a risk
   ['kept as in the input', 'the input box was returned unchanged'],
   ['few points', 'median of the points per box'],
 ];
+const FIRST = 12;                  // tracks to open first
 const MIN_SHARP_POINTS = 30;        // of a box whose track is shown as an example
 
 function drawOverview() {
@@ -31,10 +32,13 @@ function drawOverview() {
       return element('tr', {}, element('td', {}, title), ...[a, b].map(v => element('td', { class: 'n' }, isKnown(v) ? number(scale * v, digits) + unit : '–')),
         element('td', { class: 'n ' + (part ? (isBetter ? 'better' : 'worse') : '') }, part === null ? '' : (part > 0 ? '+' : '') + number(part, 0) + ' %'));
     }));
-  fill($('first'), element('tr', {}, ...['track', 'class', 'risk', 'why'].map(t => element('th', { scope: 'col' }, t))),
-    ...TRACKS.slice(0, 12).map(track => element('tr', { class: 'link', onclick: () => openTrack(track.index, track.riskiest) },
+  const first = TRACKS.slice(0, FIRST);
+  fill($('first'), element('tr', {}, ...['', 'track', 'class', 'risk', 'why'].map(t => (t ? element('th', { scope: 'col' }, t) : element('td')))),
+    ...first.map((track, k) => element('tr', { class: 'link', onclick: () => openTrack(track.index, track.riskiest) },
+      element('td', {}, element('canvas', { id: `thumbnail-${k}`, role: 'img', 'aria-label': `Track ${track.id} from above` })),
       element('td', {}, element('a', { href: hashOf(track.id, track.riskiest) }, track.id || 'no id')), element('td', {}, track.class),
       element('td', { class: 'n' }, `${number(track.risk)} m`), element('td', {}, ...reasonsOf(track)))));
+  drawThumbnails(first);
 }
 
 // The reasons of a risk, each with its meaning as a tooltip.
@@ -54,19 +58,29 @@ async function drawExample() {
   $('example-text').textContent = `Track ${found.id} (${found.class}): all its points, in the boxes of the input and in the refined ones. Sharp edges show that the boxes follow the object. They fill ${number(-found.sharper, 0)} % fewer cells.`;
   $('example').onclick = () => openTrack(found.index);
   $('example').onkeydown = event => { if (event.key === 'Enter') openTrack(found.index); };
-  const saved = [view.local, view.lines, view.limits, view.frame, view.zoom, view.center];
-  view.limits = limitsOf(part);
-  [view.zoom, view.center] = [1, [0, 0, 0]];
-  const row = part.num_points.indexOf(Math.max(...part.num_points));
-  for (const mode of ['before', 'after']) {
-    const frame = frameBox(part, row, mode) ?? part.usable[row];
-    view.local = localPoints(part, row, mode);
-    view.frame = frame;
-    const box = { name: mode === 'before' ? 'input' : 'refined', dash: [], box: frame };
-    view.lines = [{ ...box, corners: corners(frame).map(c => toFrame(c, frame, rotation(frame))) }];
-    drawFlat($('example-' + mode), ...VIEWS.top);
+  drawPortrait($('example-before'), part, 'before');
+  drawPortrait($('example-after'), part, 'after');
+}
+
+// A box of a track from above, with the points of all sweeps: what the views show is put aside.
+function drawPortrait(canvas, part, mode) {
+  const saved = [view.local, view.lines, view.limits, view.frame, view.zoom, view.center, view.far];
+  const row = part.num_points.indexOf(Math.max(...part.num_points)), frame = frameBox(part, row, mode) ?? part.usable[row];
+  if (!frame) return;
+  [view.local, view.limits, view.frame, view.zoom, view.center, view.far] = [localPoints(part, row, mode), limitsOf(part), frame, 1, [0, 0, 0], []];
+  view.lines = [{ name: mode === 'before' ? 'input' : 'refined', dash: [], corners: corners(frame).map(c => toFrame(c, frame, rotation(frame))) }];
+  drawFlat(canvas, ...VIEWS.top);
+  [view.local, view.lines, view.limits, view.frame, view.zoom, view.center, view.far] = saved;
+}
+
+// The tracks of the list, one after the other: the page stays quick.
+async function drawThumbnails(shown) {
+  for (const [index, track] of shown.entries()) {
+    await painted();
+    const canvas = $('thumbnail-' + index);
+    if (!canvas || $('overview').hidden) return;
+    drawPortrait(canvas, await loadTrack(track), 'after');
   }
-  [view.local, view.lines, view.limits, view.frame, view.zoom, view.center] = saved;
 }
 
 const LAYOUT = () => ({

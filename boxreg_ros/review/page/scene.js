@@ -49,7 +49,7 @@ async function showScene(at, isNew = false) {
     sweep = await sweepAt(stamp);
   } catch (error) {
     $('scene-clock').textContent = '';
-    return fail(`The scene cannot be shown: ${error.message}`);
+    return failReading(error);
   }
   const boxes = await boxesAt(at);
   if (scene.at !== at) return;
@@ -57,7 +57,8 @@ async function showScene(at, isNew = false) {
   scene.zoom ||= $('scene-view').clientWidth / SHOWN;
   scene.road = roadOf(sweep);
   const count = sweep.points.length / 3;
-  $('scene-clock').textContent = `${number(DATA.times[at], 2)} s · ${number(count, 0)} points · ${boxes.length} boxes`;
+  const missing = isAway(sweep, stamp) ? `no cloud here: that of ${number(secondsOf(sweep.stamp), 2)} s` : '';
+  $('scene-clock').textContent = [`${number(DATA.times[at], 2)} s`, missing, `${number(count, 0)} points`, `${boxes.length} boxes`].filter(Boolean).join(' · ');
   clearTimeout(view.hashTimer);
   view.hashTimer = setTimeout(() => { if (!$('drive').hidden) history.replaceState(null, '', '#' + new URLSearchParams({ scene: stamp })); }, 200);
   drawScene();

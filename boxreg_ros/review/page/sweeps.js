@@ -1,6 +1,7 @@
 // Whole clouds of the recording, which the server reads when they are asked for -------------------
 
 const MAX_SWEEPS = 12;             // that stay read
+const AWAY = 0.15;                 // a sweep farther from a stamp is not that of its boxes [s]
 const HEAD = 64;                   // bytes before the points: stamp, origin, position and heading of the sensor
 const sweeps = new Map();          // by stamp, as promises
 let hasScene = false;              // whether the server knows the recording
@@ -24,6 +25,11 @@ async function readSweep(stamp) {
   return { stamp: String(new BigInt64Array(bytes, 0, 1)[0]), origin: [...head.subarray(0, 3)], sensor: [...head.subarray(3, 7)], points: new Float32Array(bytes, HEAD) };
 }
 
+// Whether a sweep, the nearest to a stamp, is too far from it: clouds are missing there.
+const isAway = (sweep, stamp) => Math.abs(secondsOf(sweep.stamp) - secondsOf(stamp)) > AWAY;
+
+const failReading = error => fail(`No whole clouds are shown: ${error.message}. Put the recording back where it was; decisions are saved without it.`);
+
 // The cloud around the box that is shown, in the axes of the track.
 async function loadCloud() {
   const track = view.open, stamp = view.part.stamps[view.row];
@@ -31,11 +37,11 @@ async function loadCloud() {
   let found;
   try {
     found = await sweepAt(stamp);
-  } catch {
+  } catch (error) {
     hasScene = false;  // the neighbours' points are shown instead
-    return fail('The recording cannot be read: whole clouds are not shown. Was it moved?');
+    return failReading(error);
   }
-  if (view.open !== track || view.part.stamps[view.row] !== stamp) return;
+  if (view.open !== track || view.part.stamps[view.row] !== stamp || isAway(found, stamp)) return;
   const box = view.part.usable[view.row];
   const shift = [0, 1, 2].map(k => found.origin[k] - view.part.origin[k]);
   const points = [];

@@ -4,6 +4,7 @@ const FRAME = 12;                  // time for the 3D view at 60 frames per seco
 const PAUSE = 120;                 // between two steps of one who stops to look [ms]
 const ZOOM_STEP = 1.25;            // of a key, or of a notch of the wheel
 const SLAB = 1.5;                  // around the object, of neighbours in the views from the side and the front [m]
+const RULED = 60;                  // views that are smaller have no ruler [px]
 const CLOSE = 8;                   // of neighbours in the 3D view [m]
 const ZOOM = { least: 0.1, most: 20 };
 // The axes to the right and upwards, by view, and the corners of the outline that is seen.
@@ -90,7 +91,7 @@ function drawFlat(canvas, right, up, outline) {
   const context = canvas.getContext('2d', { willReadFrequently: true });
   context.setTransform(scale, 0, 0, scale, 0, 0);
   context.clearRect(0, 0, width, height);
-  drawRuler(context, width, height, zoom, view.center[right]);
+  if (height > RULED) drawRuler(context, width, height, zoom, view.center[right]);
   const isDense = view.local.length > 1500;
   // Neighbours behind each other would hide the object in the views from the side and the front.
   const depth = 3 - right - up, reach = view.frame ? view.frame[3 + depth] / 2 + SLAB : 0;

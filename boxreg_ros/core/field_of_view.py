@@ -1,0 +1,92 @@
+"""The upper edge of the field of view of a LiDAR, which may hide the top of an object (M11)."""
+
+from boxreg_ros.structures import Floats, Ints, Sweep
+import numpy as np
+from numpy.typing import NDArray
+
+MIN_RETURNS = 5
+"""Fewer are no evidence of a ring; chosen: stray points."""
+POINT_STEP = 7
+"""Every n-th point of a sweep is looked at. Chosen: a ring of a thousand still has a hundred. No
+usual number of rings is a multiple: all are met where one column follows the other."""
+
+
+class FieldOfView:
+    """
+    The highest rays of one LiDAR, known from its sweeps so far.
+
+    The highest ring on an object is evidence of its top only if the next ring passes above. An
+    object that reaches up to the highest ring of the LiDAR may be of any height.
+
+    """
+
+    def __init__(self) -> None:
+        self._highest = -np.inf  # slope of the highest rays so far
+
+    def hidden_tops(
+        self,
+        sweep: Sweep,
+        origin: Floats,
+        centers: Floats,
+        extents: Floats,
+        row: Ints,
+        owner: Ints,
+        ring_heights: Floats,
+    ) -> NDArray[np.bool_]:
+        """
+        Return which of n objects reach up to the highest ring of the LiDAR, (n,).
+
+        That is, no ray of this sweep or those before it is higher, and rays to other objects end
+        at the same ring: a single high object is no evidence of an edge.
+
+        Parameters
+        ----------
+        sweep : Sweep
+            Of one LiDAR: with several at once no top is hidden.
+        origin, centers : array, shapes (3,) and (n, 3)
+            The sensor and the centres of the boxes in the frame of the points [m].
+        extents : array, shape (n, 3)
+            Of the boxes [m].
+        row, owner : array, shape (P,)
+            Point and object of each pair that belongs together.
+        ring_heights : array, shape (n,)
+            Height between two rings at each object [m].
+
+        """
+        is_hidden = np.zeros(len(centers), bool)
+        if sweep.origins is not None:
+            return is_hidden
+        slopes = _slopes(sweep.points[::POINT_STEP], origin)
+        self._highest = max(self._highest, _reached(slopes))
+        x, y, z = (centers - origin).T
+        run = np.hypot(x, y)
+        nearest = run - np.hypot(extents[:, 0], extents[:, 1]) / 2
+        may_reach = z + extents[:, 2] > self._highest * nearest  # half a height above its top
+        may_reach &= ring_heights > 0
+        ends = np.searchsorted(owner, np.arange(len(centers) + 1))
+        for k in np.flatnonzero(may_reach).tolist():
+            own = row[ends[k] : ends[k + 1]]
+            of_own = _slopes(sweep.points[own], origin)
+            top = of_own.max(initial=-np.inf)
+            half_ring = ring_heights[k] / run[k] / 2
+            if top > self._highest - half_ring:
+                others = np.count_nonzero(slopes > top - half_ring)
+                others -= np.count_nonzero(of_own[own % POINT_STEP == 0] > top - half_ring)
+                is_hidden[k] = others >= MIN_RETURNS
+        return is_hidden
+
+
+def _slopes(points: NDArray[np.float32], origin: Floats) -> NDArray[np.float32]:
+    """Return the rise of rays from the sensor to points (M, 3) over their run, (M,)."""
+    x, y, z = (points[:, k] - np.float32(origin[k]) for k in range(3))
+    with np.errstate(over='ignore', invalid='ignore'):
+        slopes: NDArray[np.float32] = z / np.sqrt(x * x + y * y).clip(1e-9)
+    slopes[~np.isfinite(slopes)] = -np.inf
+    return slopes
+
+
+def _reached(slopes: NDArray[np.float32]) -> float:
+    """Return the slope that `MIN_RETURNS` reach."""
+    if len(slopes) < MIN_RETURNS:
+        return -np.inf
+    return float(np.partition(slopes, -MIN_RETURNS)[-MIN_RETURNS])
