@@ -377,7 +377,7 @@ class Follower:
         some = np.unique(np.linspace(0, len(rows) - 1, MAX_EXTENT_SWEEPS).round().astype(int))
         points = [
             self._in_box(self._near(int(rows[i]), pose, MAX_GROWTH), pose, MAX_GROWTH)
-            for i, pose in zip(some, boxes[np.ix_(some, POSE4)], strict=True)
+            for i, pose in zip(some, boxes[:, POSE4][some], strict=True)
         ]
         low, high = faces(points, self._half)
         grown = boxes.copy()
