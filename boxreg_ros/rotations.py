@@ -119,16 +119,18 @@ def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:
 
 
 def quaternion_from_matrix(R: ArrayLike) -> Floats:
-    """Return unit quaternions (..., 4), x y z w with w >= 0, of R (..., 3, 3)."""
-    from scipy.spatial.transform import Rotation  # takes 0.3 s, which most commands do not need
-
+    """Return unit quaternions (..., 4), x y z w with w >= 0, of R (..., 3, 3); NaN of NaN."""
     R = np.asarray(R, float)
-    is_finite = np.isfinite(R).all((-2, -1))
-    quaternions = np.full((*R.shape[:-2], 4), np.nan)
-    if is_finite.any():  # versions of SciPy differ on empty arrays
-        found = Rotation.from_matrix(R[is_finite]).as_quat()
-        quaternions[is_finite] = np.where(found[..., 3:] < 0, -found, found)
-    return quaternions
+    products = np.empty((*R.shape[:-2], 4, 4))  # 4 q q^T; its longest row has the least error
+    diagonal = np.diagonal(R, axis1=-2, axis2=-1)
+    products[..., 3, 3] = 1 + diagonal.sum(-1)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        products[..., i, i] = 1 + 2 * diagonal[..., i] - diagonal.sum(-1)
+        products[..., i, j] = products[..., j, i] = R[..., i, j] + R[..., j, i]
+        products[..., i, 3] = products[..., 3, i] = R[..., k, j] - R[..., j, k]
+    longest = np.diagonal(products, axis1=-2, axis2=-1).argmax(-1)[..., None, None]
+    quaternions = _unit(np.take_along_axis(products, longest, -2)[..., 0, :])
+    return np.where(quaternions[..., 3:] < 0, -quaternions, quaternions)
 
 
 def rpy_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:

@@ -169,7 +169,6 @@ def _write_points(
 ) -> None:
     """Look for objects without a box, and label the points, by the boxes of all tracks."""
     from boxreg_ros.offline.point_products import labeller_of, write_point_products
-    from boxreg_ros.offline.proposals import write_proposals
 
     frame = summary.fixed_frame
     with clock('points'):
@@ -177,6 +176,8 @@ def _write_points(
             sink.changes.tracks(), sink.array_stamps_ns, registrar, request.config
         )
     if request.proposals:
+        from boxreg_ros.offline.proposals import write_proposals  # imports parts of SciPy
+
         with clock('proposals'):
             summary.proposals = write_proposals(folder, sweeps, labeller, frame)
     if request.needs_point_labels:

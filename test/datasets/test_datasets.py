@@ -229,8 +229,8 @@ def test_one_command_relabels_a_scene(tmp_path, name, capsys):
 def test_clouds_of_a_scene_are_labelled_but_not_copied(tmp_path, capsys):
     """A copy is refused before the work; labels of points and clouds of objects need none."""
     layouts.kitti_tracking(tmp_path / 'data')
-    command = ['relabel', f'kitti_tracking:{tmp_path / "data"}#0004', '-o', str(tmp_path / 'out')]
-    assert main([*command, '--clouds=static']) == 1
+    command = ['relabel', f'kitti-tracking:{tmp_path / "data"}#0004', '-o', str(tmp_path / 'out')]
+    assert main([*command, '--clouds=static']) == 2
     assert 'ask for --label-points or --clouds object alone' in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
     assert main([*command, '--clouds=object', '--formats=semantickitti']) == 0

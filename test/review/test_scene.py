@@ -1,5 +1,6 @@
 """The scene of `boxreg review`: whole clouds, and objects that a person adds."""
 
+from contextlib import ExitStack
 from dataclasses import replace
 import math
 import signal
@@ -199,7 +200,11 @@ def test_a_drive_without_boxes_is_labelled_from_its_recording_alone(tmp_path):
     drive.write(tmp_path / 'drive')
     command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', 'drive', '--port', '0']
     command += [*FORMATS, *QUICK, '--who', 'anna']
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as process,
+        ExitStack() as ending,
+    ):
+        ending.callback(process.kill)  # also where an assertion fails
         lines = [process.stdout.readline().strip() for _ in range(2)]
         assert lines[0].startswith('drive.labels: 0 boxes in')
         with opened_page(lines[1]) as page:

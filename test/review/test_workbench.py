@@ -209,8 +209,10 @@ def running(out, max_bytes=None):
 
     command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', str(out), '--port', '0']
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=limit) as process:
-        yield process, process.stdout.readline().strip()
-        process.kill()
+        try:
+            yield process, process.stdout.readline().strip()
+        finally:
+            process.kill()
 
 
 def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path):
