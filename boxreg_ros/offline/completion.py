@@ -239,7 +239,14 @@ class Completion:
         points = [self._counter.of(array) for array in self._to_register]
         registered = [self._results[index] for index in range(len(self._given))]
         results = self._plan.finished(self._given, registered, points)
-        return closed_onto_exact(self._given, results) if self._has_keyframes else results
+        if not self._has_keyframes:
+            return results
+        pairs = zip(self._given, self._to_register, strict=True)
+        keyframes = [
+            replace(given, boxes=registered.boxes[: len(given.track_ids)])
+            for given, registered in pairs
+        ]  # none of them is rejected
+        return closed_onto_exact(keyframes, results)
 
 
 def completed(
