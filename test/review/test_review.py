@@ -608,12 +608,13 @@ def test_narrow_page_does_not_overflow(result, scheme):
             page.click(f'#tab-{tab}')
             overflow = 'document.documentElement.scrollWidth - innerWidth'
             assert page.evaluate(overflow) <= 0
+        background = 'getComputedStyle(document.body).backgroundColor'
+        assert (page.evaluate(background) == 'rgb(255, 255, 255)') == (scheme == 'light')
         page.emulate_media(media='print')
         assert page.evaluate(overflow) <= 0
         assert page.locator('.tabs').is_hidden()
         assert page.locator('#quality').is_visible()
-        back = page.evaluate('getComputedStyle(document.body).backgroundColor')
-        assert (back == 'rgb(255, 255, 255)') == (scheme == 'light')
+        assert page.evaluate(background) == 'rgb(255, 255, 255)'  # as the paper
 
 
 @NEEDS_BROWSER
