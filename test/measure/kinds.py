@@ -26,6 +26,13 @@ from measure import print_json
 import numpy as np
 
 COMPARED = ('smoothing', 'ours')
+SCENARIOS = {
+    'street': 'streets',
+    'articulated': 'drives, tractor and trailer in one box',
+    'articulated-parts': 'drives, tractor and trailer in a box each',
+    'parked': 'streets, cars parked bumper to bumper',
+}
+"""What the simulated drives of each scenario are called."""
 FIRST_SEED = 1
 """Of the simulated streets; the sample recording, with which the method was made, has seed 0."""
 
@@ -43,8 +50,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--seeds', type=int, default=16, metavar='N',
-        help='number of simulated streets (default: 16)',
+        help='number of simulated drives (default: 16)',
     )  # fmt: skip
+    parser.add_argument(
+        '--scenario', choices=SCENARIOS, default='street', help='of these (default: street)'
+    )
     add_json_argument(parser)
 
 
@@ -78,8 +88,8 @@ def _drives(args: argparse.Namespace) -> Iterator[tuple[str, str, Drive]]:
         yield str(folder), folder.name, Drive.read(folder)
     if not args.data:
         for seed in range(FIRST_SEED, FIRST_SEED + args.seeds):
-            drive = Drive.from_scene(simulate('street', seed))
-            yield f'{args.seeds} simulated streets', str(seed), drive
+            drive = Drive.from_scene(simulate(args.scenario, seed))
+            yield f'{args.seeds} simulated {SCENARIOS[args.scenario]}', str(seed), drive
 
 
 def compared(drive: Drive) -> Iterator[tuple[Comparison, PairedBoxes]]:
