@@ -51,7 +51,7 @@ DATA = {
 """Title and content of each recording, in the order of the tables."""
 PAGES = {
     **dict.fromkeys(('kinds', 'points', 'highway', 'lidars', 'paper'), 'scenes'),
-    **dict.fromkeys(('covariance', 'review'), 'certainty'),
+    **dict.fromkeys(('covariance', 'review', 'labeller'), 'certainty'),
     **dict.fromkeys(('ablation', 'sensitivity'), 'ablation'),
     **dict.fromkeys(('speed', 'scale', 'report'), 'speed'),
     **dict.fromkeys(('node', 'load', 'kills'), 'node'),
@@ -588,6 +588,21 @@ def _review(results: Any) -> Iterable[str]:
     yield _table(header, pinned)
 
 
+def _labeller(results: Any) -> Iterable[str]:
+    """Yield the errors before and after the review of a planted drive, and what it takes."""
+    stages = (('planted', 'planted'), ('relabelled', 'after `boxreg relabel`'),
+              ('reviewed', 'after the review'))  # fmt: skip
+    kinds = list(results['planted'])
+    rows = [[title, *(str(results[stage][kind]) for kind in kinds)] for stage, title in stages]
+    yield _table(['errors', *kinds], rows)
+    kinds_of_actions = ', '.join(f'{count} {name}s' for name, count in results['kinds'].items())
+    yield (
+        f'{results["actions"]} actions ({kinds_of_actions}) and {results["seconds"]:.0f} s, of '
+        f'these {results["thinking"]:.0f} s of thought; {results["actions_before"]} actions '
+        f'where files are edited by hand.'
+    )
+
+
 def _covariance(results: Any) -> Iterable[str]:
     """Yield coverage and NEES of each variable, by estimate and class, one table per recording."""
     for recording, estimates in results.items():
@@ -777,6 +792,7 @@ TABLES: dict[str, Callable[[Any], Iterable[str]]] = {
     'lidars': _lidars,
     'covariance': _covariance,
     'review': _review,
+    'labeller': _labeller,
     'report': _figures,
     'speed': _figures,
     'load': _load,

@@ -2,8 +2,10 @@
 `boxreg bench follow`: whole tracks from a few boxes of each object, against interpolation.
 
 The boxes given are true ones with the error of a person. One box: the first with
-`MIN_SEED_RETURNS`, and every later box counts. Two: the first and the last with so many, and
-every tenth box: all between the first and the last that are given count.
+`MIN_SEED_RETURNS`, and every later box counts; of the size of its class, its corner nearest to the
+sensor stays. Two: the first and the last with so many, and keyframes: all boxes between the first
+and the last that are given count. Turning objects are those of the row above that turn by
+`MIN_TURN`. In `all boxes` the boxes of a person at every stamp are registered.
 
 """
 
@@ -11,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from boxreg_ros.bench.common import add_json_argument, line, print_json, progres
 from boxreg_ros.config import Config
 from boxreg_ros.core.follow import follow
 from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.core.refine import refine
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.completion import points_above_road
 from boxreg_ros.offline.drive import Drive
@@ -33,7 +36,21 @@ MIN_COUNTED_RETURNS = 10
 """`found` is the part of the true boxes with so many points that got a box."""
 HUMAN_POSITION, HUMAN_YAW, HUMAN_EXTENT = 0.03, np.radians(1.0), 0.03
 """Deviations of a box of a person: centre [m], yaw [rad] and extents [m]; measured on labels."""
-CASES = ('one box', 'two boxes', 'every 10th')
+KEYFRAMES = {'2 Hz': 0.5, '1 Hz': 1.0, 'every 3 s': 3.0}
+"""Periods of keyframes [s]."""
+ONE, ONE_OF_CLASS, TWO = 'one box', 'one of class size', 'two boxes'
+CASES = (ONE, ONE_OF_CLASS, TWO, *KEYFRAMES)
+CLASS_SIZES = {
+    'truck': np.array([8.0, 2.5, 3.2]),
+    'bus': np.array([12.0, 2.9, 3.4]),
+    'van': np.array([5.2, 2.0, 2.2]),
+    'vehicle': np.array([4.5, 1.9, 1.6]),
+    'cyclist': np.array([1.8, 0.7, 1.7]),
+    'pedestrian': np.array([0.7, 0.7, 1.75]),
+}
+"""Sizes that tools give a new box, by class or kind: length, width, height [m]."""
+MIN_TURN, MIN_TRAVEL = np.radians(20.0), 5.0
+"""Objects whose heading changes so much [rad] while they drive so far [m] turn."""
 COLUMN_TITLES = ('true', 'found', '>.5', '3D', '3D all')
 
 
@@ -96,11 +113,12 @@ def run(args: argparse.Namespace) -> int:
                 print(f'{folder}: {len(drive.truth.boxes):,} true boxes')
             for case in CASES:
                 given = list(_given(drive, case, args.seed, args.exact))
-                rows[case] = _scores(drive, case, given)
+                for title, scores in _scores(drive, case, given, args.seed).items():
+                    rows[title] = scores
+                    if not args.json:
+                        bar.clear()
+                        _print(title, scores)
                 bar.update()
-                if not args.json:
-                    bar.clear()
-                    _print(case, rows[case])
     if args.json:
         print_json(report)
     return 0
@@ -123,19 +141,24 @@ def _given(drive: Drive, case: str, seed: int, is_exact: bool) -> Iterator[Given
         rows = np.flatnonzero(ids == name)
         rows = rows[np.argsort(truth.stamps_ns[rows], kind='stable')]
         seen = np.flatnonzero(counts[rows] >= MIN_SEED_RETURNS)
-        if case == 'every 10th':
-            chosen = np.arange(0, len(rows), 10)
+        if case in KEYFRAMES:
+            seconds = (truth.stamps_ns[rows] - truth.stamps_ns[rows[0]]) * 1e-9
+            periods = np.floor(seconds / KEYFRAMES[case] + 0.01)
+            chosen = np.unique(periods, return_index=True)[1]
         else:
-            chosen = np.unique(
-                seen[:1] if case == 'one box' else seen[[0, -1]] if len(seen) else seen
-            )
+            chosen = np.unique(seen[[0, -1]] if case == TWO and len(seen) else seen[:1])
         if not len(chosen):
             continue
-        last = len(rows) if case == 'one box' else chosen[-1]
+        last = len(rows) if case in (ONE, ONE_OF_CLASS) else chosen[-1]
         counted = np.setdiff1d(np.arange(chosen[0] + 1, last), chosen)
         boxes = truth.boxes[rows[chosen]]
         if not is_exact:
             boxes = _of_a_person(boxes, rng)
+        if case == ONE_OF_CLASS:
+            [sweep] = drive.sweeps_at(truth.stamps_ns[rows[chosen]])
+            class_name = truth.class_names[rows[0]]
+            size = CLASS_SIZES.get(class_name.lower(), CLASS_SIZES[Config().kind(class_name)])
+            boxes = _of_size(boxes, size, sweep.origin)
         yield Given(
             name, truth.class_names[rows[0]], truth.stamps_ns[rows], truth.boxes[rows],
             counts[rows], chosen, boxes, counted,
@@ -162,16 +185,56 @@ def _of_a_person(boxes: Floats, rng: np.random.Generator) -> Floats:
     return noisy
 
 
-def _scores(drive: Drive, case: str, given: list[Given]) -> dict[str, dict[str, float]]:
-    """Return the scores of each method."""
+def _of_size(boxes: Floats, size: Floats, origin: Floats) -> Floats:
+    """Return boxes (n, 9) of another size; the lower corner nearest to the sensor stays."""
+    found = boxes.copy()
+    for box in found:
+        R = matrix_from_rpy(box[ROLL:])
+        corner = np.sign((origin - box[:3]) @ R) * [1, 1, 0] - [0, 0, 1]
+        box[:3] += R @ (corner * (box[BOX_EXTENT] - size) / 2)
+        box[BOX_EXTENT] = size
+    return found
+
+
+Scores = dict[str, dict[str, float]]
+
+
+def _scores(drive: Drive, case: str, given: list[Given], seed: int) -> dict[str, Scores]:
+    """Return the scores of each method, by the name of the objects that count."""
     methods = {'constant velocity': _constant_velocity}
-    if case != 'one box':
+    if case in (TWO, *KEYFRAMES):
         methods = {'linear': _linear, 'spline': _spline}
-    scores = {
-        name: _score(given, {one.track_id: method(one) for one in given})
-        for name, method in methods.items()
+    found = {
+        name: {one.track_id: method(one) for one in given} for name, method in methods.items()
     }
-    return scores | {'follow': _score(given, _followed(drive, given))}
+    if case in KEYFRAMES:
+        found['all boxes'] = _registered(drive, given, seed)
+    found['follow'] = _followed(drive, given)
+    groups = {case: given}
+    if case in KEYFRAMES:
+        groups[f'{case}, turning'] = [one for one in given if _turns(one)]
+    return {
+        title: {name: _score(group, boxes) for name, boxes in found.items()}
+        for title, group in groups.items()
+        if group
+    }
+
+
+def _turns(one: Given) -> bool:
+    """Return whether an object turns while it drives."""
+    yaw = np.unwrap(one.truth[:, YAW])
+    travel = np.linalg.norm(np.ptp(one.truth[:, :2], axis=0))
+    return bool(np.ptp(yaw) > MIN_TURN and travel > MIN_TRAVEL)
+
+
+def _registered(drive: Drive, given: list[Given], seed: int) -> dict[str, Floats]:
+    """Return the boxes (N, 9) of a person at every stamp, registered as those of a detector."""
+    rng = np.random.default_rng(seed)
+    boxes: list[BoxArray] = []
+    for one in given:
+        boxes += _arrays(one, one.stamps_ns, _of_a_person(one.truth, rng))
+    tracks = replace(drive, boxes=tuple(boxes)).tracks()
+    return {track.track_id: track.boxes for track in refine(tracks)}
 
 
 def _score(given: list[Given], found: Mapping[str, Floats]) -> dict[str, float]:
@@ -222,15 +285,15 @@ def _unwrapped(one: Given) -> Floats:
     return boxes
 
 
+def _arrays(one: Given, stamps_ns: Ints, boxes: Floats) -> Iterator[BoxArray]:
+    """Yield boxes (n, 9) of a track, one array each."""
+    for stamp_ns, box in zip(stamps_ns.tolist(), boxes, strict=True):
+        yield BoxArray(stamp_ns, '', (one.track_id,), (one.class_name,), np.ones(1), box[None])
+
+
 def _followed(drive: Drive, given: list[Given]) -> dict[str, Floats]:
     """Return the boxes (N, 9) of `follow` at the stamps of each track, NaN where it ended."""
-    seeds = [
-        BoxArray(
-            int(one.stamps_ns[row]), '', (one.track_id,), (one.class_name,), np.ones(1), box[None]
-        )
-        for one in given
-        for row, box in zip(one.rows, one.boxes, strict=True)
-    ]
+    seeds = [array for one in given for array in _arrays(one, one.stamps_ns[one.rows], one.boxes)]
     stamps = np.array([sweep.stamp_ns for sweep in drive.sweeps], np.int64)
     points = [sweep.in_frame().points for sweep in drive.sweeps]
     origins = np.array([sweep.origin for sweep in drive.sweeps])

@@ -151,15 +151,15 @@ def follow_points(
     objects = _overlapping(objects)
     owned = Owned()
     followers = [
-        Follower(sweeps, one.seeds, config.kind(one.class_name), owned) if len(one.seeds.rows)
-        else None
+        Follower(sweeps, one.seeds, config.kind(one.class_name), owned, one.same)
+        if len(one.seeds.rows) else None
         for one in objects
     ]  # fmt: skip
     found: dict[int, FollowedTrack] = {}
     counts = [0 if one is None else one.num_points for one in followers]
     for index in np.argsort(-np.array(counts, int), kind='stable').tolist():
         track = _followed(objects[index], followers[index], stamps_ns, times)
-        owned.add(track.rows, track.boxes)
+        owned.add(track.rows, track.boxes, index)
         found[index] = track
     return [found[index] for index in range(len(objects))]
 
@@ -171,6 +171,8 @@ class _Object(NamedTuple):
     class_name: str
     seeds: Seeds
     problems: tuple[str, ...]
+    same: tuple[int, ...] = ()
+    """Indices of the objects with a seed that is inside of one of this, or the other way."""
 
 
 class _Seed(NamedTuple):
@@ -250,6 +252,8 @@ def _followed(
         ends.append(End(int(stamps_ns[last]), reason))
     rows = np.array(sorted(poses), np.int64)
     boxes = _boxes(rows, np.array([poses[row] for row in rows.tolist()]), seeds)
+    if len(seeds.rows) == 1:
+        boxes = follower.grown(rows, boxes)
     words = tuple(status[row] for row in rows.tolist())
     return FollowedTrack(
         one.track_id, one.class_name, rows, stamps_ns[rows], boxes, words, tuple(ends), problems
@@ -271,16 +275,20 @@ def _overlapping(objects: Sequence[_Object]) -> list[_Object]:
         for row, box in zip(one.seeds.rows.tolist(), one.seeds.boxes, strict=True):
             by_row.setdefault(row, []).append((index, box))
     others: dict[int, str] = {}
+    same: list[set[int]] = [set() for _ in objects]
     for placed in by_row.values():
         boxes = np.array([box for _, box in placed])
         offsets = (boxes[:, :3] - boxes[:, None, :3]) @ matrix_from_rpy(boxes[:, ROLL:])
         is_inside = (np.abs(offsets) < boxes[:, None, BOX_EXTENT] / 2).all(2)
         np.fill_diagonal(is_inside, False)
         for outer, inner in np.argwhere(is_inside).tolist():
-            others[placed[inner][0]] = objects[placed[outer][0]].track_id
-    found = list(objects)
+            outer, inner = placed[outer][0], placed[inner][0]
+            others[inner] = objects[outer].track_id
+            same[outer].add(inner)
+            same[inner].add(outer)
+    found = [one._replace(same=(*same[index],)) for index, one in enumerate(objects)]
     for index, other in others.items():
-        one = objects[index]
+        one = found[index]
         line = f'seeds of track {one.track_id!r}: one is inside that of track {other!r}; both are'
         found[index] = one._replace(problems=(*one.problems, f'{line} followed: delete one'))
     return found

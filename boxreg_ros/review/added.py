@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from boxreg_ros.core.follow import FollowedTrack
+from boxreg_ros.review.box_risk import evidence
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.review.payload import TrackPart, TrackTruth
 from boxreg_ros.review.risk import assess
@@ -38,6 +40,9 @@ def added_track(scene: DriveScene, seeds: Sequence[BoxArray], begin_ns: int) -> 
     track = scene.follow(seeds)
     points = _Near(scene, track)
     changes = _changes(track, points)
+    near = points.points_of(changes)
+    faces = [evidence(*one)[0] for one in zip(near, changes.boxes, strict=True)]
+    changes = replace(changes, face_distances=np.nan_to_num(np.array(faces).reshape(-1, 6)))
     row = TrackRow(changes, assess(changes), '')
     n = len(track.rows)
     unknown = TrackTruth(np.full((n, 9), np.nan), np.full(n, np.nan), np.full(n, np.nan))

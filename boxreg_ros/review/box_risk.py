@@ -46,7 +46,7 @@ def risks_of_box(
     outside, sizes = part['usual']
     usual = Usual(outside, {} if sizes is None else {class_name: np.array(sizes)})
     before = _changes(part, class_name)
-    old, new = (_evidence(points, one) for one in (before.boxes[row], box))
+    old, new = (evidence(points, one) for one in (before.boxes[row], box))
     boxes, faces = before.boxes.copy(), before.face_distances.copy()
     near = before.near_points.copy()
     boxes[row] = box
@@ -60,8 +60,8 @@ def risks_of_box(
     return first, second
 
 
-def _evidence(points: Floats, box: Floats) -> tuple[Floats, float]:
-    """Return the distance of the outermost points from each face (6,), and the part outside."""
+def evidence(points: Floats, box: Floats) -> tuple[Floats, float]:
+    """Return how far the outermost points are off each face (6,) [m], and the part outside."""
     local = (points - box[: Z + 1]) @ matrix_from_rpy(box[None, ROLL:])[0]
     half = box[BOX_EXTENT] / 2
     is_above_road = local[:, 2] > 0.3 - half[2]

@@ -68,6 +68,8 @@ class PlannedArray:
         Reason by row.
     added : list
         Boxes to add.
+    moved : dict
+        Boxes to register in place of those of the input, by row.
 
     """
 
@@ -75,10 +77,12 @@ class PlannedArray:
     class_names: list[str]
     rejected: dict[int, str] = field(default_factory=dict)
     added: list[AddedBox] = field(default_factory=list)
+    moved: dict[int, Floats] = field(default_factory=dict)
 
     def to_register(self, given: BoxArray) -> BoxArray:
         """Return the boxes of an array without rejected ones, and with the added ones."""
         rows = [row for row in range(len(given.track_ids)) if row not in self.rejected]
+        boxes = np.array([self.moved.get(row, given.boxes[row]) for row in rows])
         of_person = np.array([added.status == HUMAN for added in self.added], bool)
         pinned = None
         if given.pinned is not None or of_person.any():
@@ -93,7 +97,7 @@ class PlannedArray:
             ),
             scores=np.append(given.scores[rows], [a.score for a in self.added]),
             boxes=np.concatenate(
-                [given.boxes[rows], np.array([a.box for a in self.added]).reshape(-1, 9)]
+                [boxes.reshape(-1, 9), np.array([a.box for a in self.added]).reshape(-1, 9)]
             ),
             pinned=pinned,
         )

@@ -45,11 +45,14 @@ def followed_plan(
         steps = TrackSteps(track.track_id, track.class_name)
         plan.tracks.append(steps)
         for stamp_ns, box, word in zip(track.stamps_ns, track.boxes, track.status, strict=True):
-            if word == HUMAN and has_seeds:
-                continue
             after = int(np.searchsorted(stamps[order], stamp_ns))
             near = order[max(0, after - 1) : after + 1]
             array = plan.arrays[int(near[np.abs(stamps[near] - stamp_ns).argmin()])]
+            if word == HUMAN and has_seeds:
+                if track.status.count(HUMAN) == 1 and track.track_id in array.track_ids:
+                    # The extents of a single one may have grown.
+                    array.moved[array.track_ids.index(track.track_id)] = box
+                continue
             array.added.append(
                 AddedBox(track.track_id, track.class_name, word, box, UNSUPPORTED, 1.0)
             )
@@ -69,7 +72,7 @@ def closed_onto_exact(
     Parameters
     ----------
     given : sequence of BoxArray
-        Keyframes, and empty arrays.
+        Keyframes as they were registered, and empty arrays.
     results : sequence of RefinedBoxes
         Of the same arrays, each with added boxes behind the keyframes.
 

@@ -72,6 +72,23 @@ def test_boxes_between_keyframes_are_better_than_a_line():
     assert iou_3d(track.boxes, truth).mean() > iou_3d(line, truth).mean() + 0.05
 
 
+def test_extents_grow_from_the_size_of_a_class_and_those_of_a_person_stay():
+    rng = np.random.default_rng(6)
+    truth = drive(N, speed=6.0, turn=0.3)
+    sweeps = scene(truth, rng)
+    small = seed(truth, 10)
+    forward = np.array([np.cos(truth[10, 8]), np.sin(truth[10, 8]), 0.0])
+    toward = np.sign(forward @ (np.array(ORIGIN) - truth[10, :3]))
+    small.boxes[0, 3] -= 0.6
+    small.boxes[0, :3] += toward * 0.3 * forward  # the near end stays
+    [track] = follow(stamps(N), sweeps, [small])
+    assert np.abs(track.boxes[:, 3:6] - truth[:, 3:6]).max() < 0.15
+    assert iou_3d(track.boxes, truth[track.rows]).mean() > 0.85
+    own = seed(truth, 10)
+    [track] = follow(stamps(N), sweeps, [own])
+    assert np.abs(track.boxes[:, 3:6] - own.boxes[:, 3:6]).max() < 5e-3  # of the solve
+
+
 def test_neighbour_and_road_do_not_pull_a_parked_car():
     rng = np.random.default_rng(4)
     truth = drive(N, speed=0.0, turn=0.0)

@@ -97,7 +97,8 @@ def measure(folder: Path, seed: int = 0) -> dict[str, Any]:
     out = folder / 'out'
     labels = f'csv:{folder / "planted.csv"}'
     command = ['relabel', str(STREET / 'street.mcap'), '-o', str(out), '--report']
-    subprocess.run([*BOXREG, *command, '--labels', labels, '--formats', 'csv'], check=True)
+    command += ['--labels', labels, '--formats', 'csv']
+    subprocess.run([*BOXREG, *command], stdout=subprocess.DEVNULL, check=True)
     begin = time.perf_counter()
     labeller = reviewed(out, truth)
     seconds = time.perf_counter() - begin

@@ -85,6 +85,58 @@ def test_keyframes_get_a_box_at_every_sweep(street, tmp_path, capsys):
     assert summary['sweeps_with_boxes'] == {'before': 4, 'after': SWEEPS + 1}
 
 
+def test_bad_keyframes_are_named_in_one_line_each_and_the_rest_is_done(street, tmp_path, capsys):
+    with open(street / 'truth.csv', newline='') as file:
+        rows = list(csv.DictReader(file))
+    stamps = sorted({int(row['stamp_ns']) for row in rows})
+    at = {(row['track_id'], stamps.index(int(row['stamp_ns']))): row for row in rows}
+
+    def key(of, step, name, **changes):
+        return at[of, step] | {'track_id': name} | {k: str(v) for k, v in changes.items()}
+
+    y = float(at['4', 6]['y'])
+    write(
+        tmp_path / 'bad.csv',
+        [
+            at['4', 1], at['4', 11],
+            key('9', 1, '9', stamp_ns=stamps[1] + 30_000_000), at['9', 11],  # a near stamp
+            key('4', 6, 'between', stamp_ns=stamps[6] + 10**12),
+            key('11', 1, 'twice'), key('11', 1, 'twice', z=3), key('11', 11, 'twice'),
+            key('16', 1, 'jumps'), key('16', 6, 'jumps', y=y + 90),
+            key('4', 6, 'road', y=y + 3.3),
+            key('4', 6, 'elsewhere', frame_id='nowhere'),
+            key('17', 3, 'outer'), key('17', 3, 'inner', length=1.5),
+            at['10', 6],  # a single one
+        ],
+    )  # fmt: skip
+    out = tmp_path / 'out'
+    words = ['relabel', f'{street}/drive.mcap', '--labels', f'csv:{tmp_path}/bad.csv']
+    assert main([*words, '--keyframes', '-o', str(out), '--formats', 'csv']) == 0
+    printed = capsys.readouterr().err.splitlines()
+    assert len([line for line in printed if 'transform' in line and 'nowhere' in line]) == 1
+    summary = json.loads((out / 'summary.json').read_text())
+    problems = {seed['track_id']: seed['problems'] for seed in summary['seeds']}
+    named = {
+        'between': 'the nearest is 999',
+        'twice': 'expected one box at a stamp; the first is used',
+        'jumps': 'too far apart',
+        'road': 'expected points in their boxes',
+    }
+    for name, words in named.items():
+        assert [line for line in problems[name] if words in line], (name, problems[name])
+    assert [line for line in problems['inner'] if 'one is inside that of track' in line]
+    lines = [line for of_track in problems.values() for line in of_track]
+    assert all('\n' not in line for line in lines)
+    assert sum(line.removeprefix('boxreg: ') in lines for line in printed) == min(len(lines), 5)
+    found = {name: set() for name in ('4', '9', '10', 'twice')}
+    for row in rows_of(out):
+        found.get(row['track_id'], set()).add(int(row['stamp_ns']))
+    assert set(stamps[1:12]) <= found['4'] and set(stamps[1:12]) <= found['twice']
+    assert set(stamps[2:12]) <= found['9'] and stamps[1] + 30_000_000 in found['9']
+    assert not problems['4'] and not problems['9'] and not problems['10']
+    assert len(found['10']) > 10
+
+
 def test_one_box_of_each_object_is_followed(street, tmp_path):
     out = tmp_path / 'out'
     words = ['follow', f'{street}/drive.mcap', f'{street}/seeds.csv', '-o', str(out)]

@@ -421,8 +421,11 @@ def test_one_key_accepts_and_opens_the_next_open_track(server):
         page.click(DO.format('next'))
         page.wait_for_function('log.count === 2')
         assert page.inner_text('#f-count') == '2 of 2 tracks, 2 decided'
-        # The timeline opens what is clicked.
+        # Each track of the overview has its picture; the timeline opens what is clicked.
         page.click('#tab-overview')
+        for number in range(2):
+            page.wait_for_function(f"""$('thumbnail-{number}').getContext('2d')
+              .getImageData(0, 0, 72, 32).data.some((v, i) => i % 4 === 3 && v > 0)""")
         bounds = page.locator('#timeline').bounding_box()
         page.mouse.click(bounds['x'] + bounds['width'] - 14, bounds['y'] + 4)
         page.wait_for_function(f'view.row === {NUM_SWEEPS - 1}')

@@ -8,9 +8,11 @@ two seeds there are two ways; each is tested where it arrives at the other seed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Self
 
+from boxreg_ros.core.following.extents import faces, MAX_GROWTH
 from boxreg_ros.core.following.kernels import motion, registration, surface
 from boxreg_ros.core.following.sweeps import Sweeps
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
@@ -28,6 +30,8 @@ ROAD_DEVIATION = 0.07
 """Of the height of the road beside a box [m]; swept: 0.05 and 0.1 are as good, 0.2 drifts."""
 CLIMB = 0.1
 """The height of a box changes by this in a second, as a random walk [m]; chosen."""
+PARKED_NOISE = 0.1
+"""Factor on the noise of the motion of a parked object; chosen."""
 STOPPED = 0.3
 """Slower objects count as parked where they are held through an occlusion [m/s]."""
 REAR_AXLE = 0.25
@@ -61,7 +65,13 @@ YOUNG = 1.0
 SPEED_AFTER_LOSS = 2.0
 """Deviation of the speed of a young way after a loss [m/s]."""
 SEARCH_STEP = 0.4
-"""Distance of the starts of a search along the heading [m]."""
+"""Distance of the starts of a search along the heading after a loss [m]."""
+SLIP_STEP = 0.15
+"""And while it is seen [m]: points further from the surface have hardly any weight."""
+SEARCH_BELOW = 0.85
+"""An object with a smaller part of its usual score is searched along the heading; chosen."""
+MIN_POINTS_TO_SEARCH = 30
+"""But not by fewer points, whose score is noise; chosen: as `registration.MOST`."""
 
 MAX_GAP = 0.3
 """A way has arrived at a seed if it is nearer than this [m]; swept in findings: 0.2 to 0.5."""
@@ -80,6 +90,8 @@ MARGIN_LEARNT = 0.1
 """Points so far outside of the box are part of its surface [m]."""
 MAX_SWEEP_POINTS = 400
 """A sweep with more points around a box is thinned; swept: the poses are as good."""
+MAX_EXTENT_SWEEPS = 60
+"""Sweeps of a track whose points show the extents; chosen."""
 MAX_CELLS = 20_000
 """Of a surface: those of a bus of 12 m at 0.15 m."""
 
@@ -165,16 +177,22 @@ class Walk:
 
 
 class _Found(NamedTuple):
-    """A registered pose, its covariance (4, 4), its fit, and why it is not accepted."""
+    """A registered pose, its covariance (4, 4), fit, jump, and why it is not accepted."""
 
     pose: Floats
     covariance: Floats
     fit: Floats
+    jump: float
     reason: str
 
     @property
     def score(self) -> float:
         return _score(self.fit)
+
+    @property
+    def rank(self) -> float:
+        """Score, less what the distance from the prediction costs."""
+        return self.score - 0.02 * min(self.jump, 10.0)
 
     @property
     def part(self) -> float:
@@ -223,22 +241,30 @@ class Owned:
     def __init__(self) -> None:
         self._boxes: dict[int, tuple[Floats, int]] = {}  # by row of the sweep; rows in use
 
-    def add(self, rows: Ints, boxes: Floats) -> None:
-        """Add the boxes (N, 9) of an object in the sweeps `rows` (N,)."""
+    def add(self, rows: Ints, boxes: Floats, owner: int = -1) -> None:
+        """Add the boxes (N, 9) of the object `owner` in the sweeps `rows` (N,)."""
         for row, box in zip(rows.tolist(), boxes, strict=True):
-            known, count = self._boxes.get(row, (np.empty((8, 9)), 0))
+            known, count = self._boxes.get(row, (np.empty((8, 10)), 0))
             if count == len(known):
                 known = np.concatenate([known, np.empty_like(known)])
-            known[count] = box
+            known[count, :9] = box
+            known[count, 9] = owner
             self._boxes[row] = known, count + 1
 
-    def others(self, row: int, pose: Floats, half: Floats) -> Floats:
-        """Return boxes (n, 9) near a pose (4,); none whose centre is in it: that is the object."""
-        known, count = self._boxes.get(row, (np.empty((0, 9)), 0))
+    def others(self, row: int, pose: Floats, half: Floats, same: Sequence[int]) -> Floats:
+        """
+        Return boxes (n, 9) near a pose (4,).
+
+        None whose centre is in it, and none of the objects `same`: they are the object itself.
+        """
+        known, count = self._boxes.get(row, (np.empty((0, 10)), 0))
         boxes = known[:count]
         away = np.hypot(boxes[:, 0] - pose[0], boxes[:, 1] - pose[1])
         reach = np.hypot(half[0], half[1]) + np.hypot(boxes[:, LENGTH], boxes[:, WIDTH]) / 2 + 1.0
-        near: Floats = boxes[(half[1] < away) & (away < reach)]
+        is_near = (half[1] < away) & (away < reach)
+        for owner in same:
+            is_near &= boxes[:, 9] != owner
+        near: Floats = boxes[is_near, :9]
         return near
 
 
@@ -256,14 +282,19 @@ class Follower:
         One of `MOTIONS`.
     owned : Owned
         Boxes of other objects.
+    same : sequence of int
+        Those of them in `owned` that have a seed in one of this object.
 
     """
 
-    def __init__(self, sweeps: Sweeps, seeds: Seeds, kind: str, owned: Owned) -> None:
+    def __init__(
+        self, sweeps: Sweeps, seeds: Seeds, kind: str, owned: Owned, same: Sequence[int] = ()
+    ) -> None:
         self._sweeps = sweeps
         self._seeds = seeds
         self._kind = MOTIONS[kind]
         self._owned = owned
+        self._same = same
         self._half = seeds.boxes[:, BOX_EXTENT].mean(0) / 2
         self._tilt = matrix_from_rpy(np.append(seeds.boxes[0, [ROLL, PITCH]], 0.0))
         self._pivot = REAR_AXLE * 2 * self._half[0] if kind == 'vehicle' else 0.0
@@ -272,6 +303,8 @@ class Follower:
         self.num_points = 0
         for row, pose in zip(seeds.rows.tolist(), seeds.boxes[:, POSE4], strict=True):
             points = self._near(row, pose)
+            around = self._in_box(points, pose, surface.RIM)
+            surface.insert_foreign(around, self._half, MARGIN_LEARNT, self._surface[0])
             self.num_points += self._learn(points, pose)
             if np.isnan(self._road):
                 self._road = self._road_below(points, pose)
@@ -297,7 +330,7 @@ class Follower:
         walk.row += walk.sign
         row = walk.row
         state = self._predicted(walk.state, times[row] - times[row - walk.sign])
-        found = self._find(row, state, bool(walk.reason))
+        found = self._find(row, state, walk)
         if walk.reason and not found.reason and found.score < MIN_SCORE_AGAIN * walk.usual:
             found = found._replace(reason='no_fit')
         if found.reason:
@@ -339,6 +372,20 @@ class Follower:
         box[:2] += travel * np.array([np.cos(box[YAW]), np.sin(box[YAW])])
         return box
 
+    def grown(self, rows: Ints, boxes: Floats) -> Floats:
+        """Return the boxes (n, 9) in sweeps `rows` (n,) with the extents that points show."""
+        some = np.unique(np.linspace(0, len(rows) - 1, MAX_EXTENT_SWEEPS).round().astype(int))
+        points = [
+            self._in_box(self._near(int(rows[i]), pose, MAX_GROWTH), pose, MAX_GROWTH)
+            for i, pose in zip(some, boxes[:, POSE4][some], strict=True)
+        ]
+        low, high = faces(points, self._half)
+        grown = boxes.copy()
+        shift = (low + high) / 2
+        grown[:, :3] += matrix_from_rpy(boxes[:, ROLL:]) @ shift
+        grown[:, BOX_EXTENT] = high - low
+        return grown
+
     def jumps(self, seed: int) -> bool:
         """Return whether the next seed is farther away than such an object can move."""
         rows, boxes = self._seeds.rows[seed : seed + 2], self._seeds.boxes[seed : seed + 2]
@@ -354,8 +401,8 @@ class Follower:
         ]
         return float(np.mean(scores)) if scores else 0.0
 
-    def _find(self, row: int, state: _State, is_lost: bool) -> _Found:
-        """Return the pose in a sweep, from several starts after a loss."""
+    def _find(self, row: int, state: _State, walk: Walk) -> _Found:
+        """Return the pose in a sweep, from several starts after a loss or where it fits badly."""
         prior, information = state.pose, state.information
         points = self._near(row, prior, 0.5)
         height = self._road_below(points, prior) - self._road
@@ -364,17 +411,20 @@ class Follower:
             prior[2] += height * weight / (information[2, 2] + weight)
             information[2, 2] += weight
         best = self._registered(points, prior, prior, information)
-        if not is_lost:
+        is_lost = bool(walk.reason)
+        slips = best.fit[0] > MIN_POINTS_TO_SEARCH and best.score < SEARCH_BELOW * walk.usual
+        if not (is_lost or slips):
             return best
+        step = SEARCH_STEP if is_lost else SLIP_STEP
         reach = 2.5 * np.sqrt(state.covariance[0, 0] + state.covariance[1, 1])
-        count = min(int(reach / SEARCH_STEP), 10)
-        for shift in SEARCH_STEP * np.arange(-count, count + 1):
+        count = min(int(reach / step), 10) if is_lost else 2
+        for shift in step * np.arange(-count, count + 1):
             start = prior + shift * np.array([np.cos(prior[3]), np.sin(prior[3]), 0.0, 0.0])
             near = self._near(row, start, 0.5)
             found = self._registered(near, start, prior, information)
-            if found.score > best.score + 0.02:
+            if found.rank > best.rank + 0.02:
                 best = found
-        if not best.reason and best.part < MIN_FIT_AGAIN:
+        if is_lost and not best.reason and best.part < MIN_FIT_AGAIN:
             return best._replace(reason='no_fit')
         return best
 
@@ -388,8 +438,8 @@ class Follower:
         )  # fmt: skip
         covariance = np.linalg.inv(of_points + information)
         difference = pose - prior
-        jump = difference @ information @ difference
-        return _Found(pose, covariance, fit, _reason(pose, covariance, fit, jump))
+        jump = float(difference @ information @ difference)
+        return _Found(pose, covariance, fit, jump, _reason(pose, covariance, fit, jump))
 
     def _start_speed(self, seed: int) -> float:
         """Return the speed at a seed [m/s]: by its neighbours in time, or searched."""
@@ -444,9 +494,7 @@ class Follower:
                 state = self._predicted(state, times[other] - times[other - sign])
                 prior, information = state.pose, state.information
                 found = self._registered(self._near(other, prior), prior, prior, information, 8)
-                step = found.pose - prior
-                jump = float(step @ information @ step)
-                total += (found.score - 0.02 * min(jump, 10.0)) / count
+                total += found.rank / count
                 weights += 1 / count
                 planar, covariance = motion.update(
                     state.planar, state.covariance, found.pose[[0, 1, 3]], found.covariance[PLANAR]
@@ -456,8 +504,9 @@ class Follower:
         return total / weights - _cost(speed), float(np.mean(found_speeds))
 
     def _predicted(self, state: _State, seconds: float) -> _State:
+        noise = self._kind.noise * (PARKED_NOISE if state.is_parked else 1.0)
         planar, covariance = motion.predict(
-            state.planar, state.covariance, seconds, self._kind.noise, self._pivot
+            state.planar, state.covariance, seconds, noise, self._pivot
         )
         return _State(planar, covariance, state.z, state.z_variance + CLIMB**2 * abs(seconds))
 
@@ -466,7 +515,7 @@ class Follower:
         reach = np.hypot(self._half[0], self._half[1]) + 0.7 + margin
         box = np.array([reach, reach, self._half[2] + 0.6])
         points = registration.near(self._sweeps.points[row], pose[:3], box)
-        for other in self._owned.others(row, pose, self._half):
+        for other in self._owned.others(row, pose, self._half, self._same):
             tilt = matrix_from_rpy(np.append(other[[ROLL, PITCH]], 0.0))
             points = registration.outside(points, other[POSE4], tilt, other[BOX_EXTENT] / 2)
         near: Floats = points
@@ -474,11 +523,15 @@ class Follower:
 
     def _learn(self, points: Floats, pose: Floats) -> int:
         """Add the points in the box to the surface; return their number."""
-        inside = registration.in_box(
-            points, pose, self._tilt, self._half, self._kind.clearance, MARGIN_LEARNT
-        )
+        inside = self._in_box(points, pose, MARGIN_LEARNT)
         surface.insert(inside, self._half, *self._surface)
         return len(inside)
+
+    def _in_box(self, points: Floats, pose: Floats, margin: float) -> Floats:
+        found: Floats = registration.in_box(
+            points, pose, self._tilt, self._half, self._kind.clearance, margin
+        )
+        return found
 
     def _road_below(self, points: Floats, pose: Floats) -> float:
         return float(registration.road_below(points, pose, self._tilt, self._half))

@@ -3,7 +3,9 @@
 // From top to bottom: name, unit, height.
 /** @type {[string, string, number][]} */
 const CHARTS = [['risk', 'm', 1], ['along', 'm', 1], ['across', 'm', 1], ['up', 'm', 1], ['yaw', '°', 1], ['size', 'm', 1.3], ['faces', 'm', 1.5]];
+const FACES = ['front', 'rear', 'left', 'right', 'top'];
 const SIZES = ['length', 'width', 'height'];
+const FACE_MARKS = ['circle', 'square', 'triangle-up', 'triangle-down', 'x'];
 const SIZE_COLOURS = ['refined', 'truth', 'human'];
 const FACE_COLOURS = ['refined', 'input', 'truth', 'human', 'points'];
 
@@ -46,10 +48,8 @@ function chartTraces() {
     traces.push({ ...line, y: part.given.map(box => box[3 + k]), line: { color: colour('input'), dash: 'dash', width: 1.2 } });
     traces.push({ ...line, y: size, line: { color: colour(SIZE_COLOURS[k]), width: 1.8 } });
   });
-  const marks = ['circle', 'square', 'triangle-up', 'triangle-down', 'x'];
-  part.residuals ??= part.usable.map((box, k) => faceResiduals(part, k, box));
-  FACES.forEach((face, k) => traces.push({ xaxis: 'x', yaxis: 'y' + chartNumber('faces'), name: face, x: part.times, y: part.residuals.map(r => r[k]), mode: 'lines+markers',
-                                           line: { width: 1, color: colour(FACE_COLOURS[k]) }, marker: { size: 4, symbol: marks[k], color: colour(FACE_COLOURS[k]) } }));
+  FACES.forEach((face, k) => traces.push({ xaxis: 'x', yaxis: 'y' + chartNumber('faces'), name: face, x: part.times, y: part.faces.map(one => one[k] || null), mode: 'lines+markers',
+                                           line: { width: 1, color: colour(FACE_COLOURS[k]) }, marker: { size: 4, symbol: FACE_MARKS[k], color: colour(FACE_COLOURS[k]) } }));
   return traces;
 }
 
@@ -62,7 +62,7 @@ async function drawCharts() {
     risk: 'expected error of each box; click a point to go there',
     along: 'refined − input, in the axes of the box; band: ± 2σ',
     size: `${tinted(SIZES, SIZE_COLOURS)}; band: ± 2σ; dashed: input`,
-    faces: `outermost points − face: ${tinted(FACES.map((f, k) => '●■▲▼✕'[k] + ' ' + f), FACE_COLOURS)}`,
+    faces: `outermost points off their face: ${tinted(FACES.map((face, k) => face + (innerWidth > 900 ? ` (${FACE_MARKS[k]})` : '')), FACE_COLOURS)}`,
   };
   const layout = { ...LAYOUT(), margin: { l: 56, r: 8, t: 16, b: 34 }, xaxis: { ...AXIS(), title: { text: 'time [s]' }, anchor: 'y' + chartNumber('faces') }, annotations: [] };
   const gap = 0.035;

@@ -1,9 +1,6 @@
 // Tracks as decided ------------------------------------------------------------------------------
 // A track of the page consists of boxes [s, k]: row k of track s of the report.
 
-const FACES = ['front', 'rear', 'left', 'right', 'top'];
-const MIN_FACE_POINTS = 5;         // fewer points do not show where a face is
-const OUTER_PART = 0.1;            // of the points near a face are its outermost points
 const MAX_AROUND = 12;             // neighbours that are drawn
 const REACH = 20;                  // of them [m]
 const MAX_CACHED = 64;             // parts of the file that stay read
@@ -133,7 +130,7 @@ function complete(part) {
   part.usable = part.boxes.map((box, k) => (box[0] === null ? (part.given[k][0] === null ? null : part.given[k]) : box));
 }
 
-const ROW_FIELDS = ['stamps', 'times', 'status', 'reasons', 'flipped', 'change', 'deviations', 'extent_deviations', 'risk', 'num_points', 'counts'];
+const ROW_FIELDS = ['stamps', 'times', 'status', 'reasons', 'flipped', 'change', 'deviations', 'extent_deviations', 'risk', 'faces', 'num_points', 'counts'];
 const BOX_FIELDS = ['given', 'boxes', 'truth', 'sensor'];
 
 async function loadTrack(track) {
@@ -208,25 +205,4 @@ function localPoints(part, row, mode) {
     for (const point of pointsAt(part, one)) local.push(toFrame(point, box, R));
   }
   return local;
-}
-
-// Distance of the outermost points from each face that is turned to the sensor [m].
-function faceResiduals(part, row, box) {
-  const none = FACES.map(() => null);
-  const sensor = part.sensor[row];
-  if (!box || sensor[0] === null) return none;
-  const R = rotation(box);
-  const from = toFrame(sensor, box, R);
-  const points = pointsAt(part, row).map(point => toFrame(point, box, R));
-  const half = [box[3] / 2, box[4] / 2, box[5] / 2];
-  const isNear = point => [0, 1, 2].every(a => Math.abs(point[a]) < half[a] + 0.3) && point[2] > -0.6 * half[2];
-  const near = points.filter(isNear);
-  return FACES.map((_, face) => {
-    const axis = face >> 1, sign = face % 2 ? -1 : 1;
-    if (sign * from[axis] < half[axis]) return null;
-    const outer = near.map(point => sign * point[axis] - half[axis]).filter(d => d > -0.5).sort((a, b) => b - a);
-    const count = Math.ceil(OUTER_PART * outer.length);
-    if (outer.length < MIN_FACE_POINTS) return null;
-    return outer.slice(0, count).reduce((a, b) => a + b) / count;
-  });
 }

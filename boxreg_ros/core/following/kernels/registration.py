@@ -1,6 +1,6 @@
 """Registration of the points of one sweep to the surface of one object."""
 
-from boxreg_ros.core.following.kernels.surface import nearest
+from boxreg_ros.core.following.kernels.surface import is_foreign, nearest
 from boxreg_ros.core.method.compile import kernel
 import numpy as np
 
@@ -92,7 +92,7 @@ def _system(points, pose, tilt, half, clearance, slots, moments, normals):
             out_x = abs(x) - half[0]
             out_y = abs(y) - half[1]
             r = max(out_x, out_y) - OUTSIDE_TOLERANCE
-            if r <= 0 or z > half[2]:
+            if r <= 0 or z > half[2] or is_foreign(x, y, z, slots):
                 continue
             nx, ny, nz = 0.0, 0.0, 0.0
             if out_x > out_y:
@@ -136,7 +136,7 @@ def fit(points, pose, tilt, half, clearance, surface):
             continue
         out = max(abs(x) - half[0], abs(y) - half[1])
         if out > OUTSIDE_TOLERANCE:
-            if out < MARGIN:
+            if out < MARGIN and not is_foreign(x, y, z, slots):
                 beside += 1
             continue
         inside += 1

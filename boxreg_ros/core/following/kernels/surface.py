@@ -2,8 +2,9 @@
 The surface of one object in its box frame: cells with the moments of their points.
 
 A map is a tuple of arrays. `slots` (nx, ny, nz) holds the number of the cell at a place plus one,
-or 0; `moments` (S, 10) the count, the sums of x y z and of xx xy xz yy yz zz of its points;
-`normals` (S, 3) the direction of least spread around it; `used` (1,) the number of cells.
+0, or `FOREIGN` for points beside the box that a person has drawn; `moments` (S, 10) the count, the
+sums of x y z and of xx xy xz yy yz zz of its points; `normals` (S, 3) the direction of least
+spread around it; `used` (1,) the number of cells.
 
 """
 
@@ -16,6 +17,7 @@ FULL = 60
 """A cell takes no more points than this."""
 RIM = 0.6
 """A map reaches this far outside of the box [m]."""
+FOREIGN = -1
 LINE = 0.02
 """A neighbourhood with less spread in its second direction is a line [m]."""
 FLAT = 0.05
@@ -45,7 +47,7 @@ def insert(points, half, slots, moments, normals, used):
             continue
         slot = slots[i, j, k] - 1
         if slot < 0:
-            if used[0] >= len(moments):
+            if slots[i, j, k] == FOREIGN or used[0] >= len(moments):
                 continue
             slot = used[0]
             used[0] += 1
@@ -58,6 +60,31 @@ def insert(points, half, slots, moments, normals, used):
         if touched[slot]:
             mean = moments[slot, 1:4] / moments[slot, 0]
             normals[slot] = normal_at(mean, half, slots, moments)
+
+
+@kernel
+def insert_foreign(points, half, margin, slots):
+    """Mark the places of points (n, 3) of the box frame that are further outside than `margin`."""
+    for n in range(len(points)):
+        x, y, z = points[n]
+        if max(abs(x) - half[0], abs(y) - half[1]) > margin:
+            i, j, k = cell_of(x, y, z, slots)
+            if i >= 0 and slots[i, j, k] == 0:
+                slots[i, j, k] = FOREIGN
+
+
+@kernel
+def is_foreign(x, y, z, slots):
+    """Return whether a place is foreign, or beside a foreign one."""
+    i, j, k = cell_of(x, y, z, slots)
+    if i < 0:
+        return False
+    for a in range(i - 1, i + 2):
+        for b in range(j - 1, j + 2):
+            for c in range(k - 1, k + 2):
+                if slots[a, b, c] == FOREIGN:
+                    return True
+    return False
 
 
 @kernel

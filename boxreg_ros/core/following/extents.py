@@ -1,0 +1,77 @@
+"""Growth of a box that was drawn too small, by the points along its track."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from boxreg_ros.structures import Floats
+import numpy as np
+
+MAX_GROWTH = 1.0
+"""A face moves by no more than this [m]; chosen: half the difference of a hatchback and a van."""
+MAX_PART = 0.25
+"""And no more than this part of the extent: farther points are of what stands beside; chosen."""
+MIN_GROWTH = 0.2
+"""A face nearer to the outermost points stays: the labelling margin and the error of a person [m];
+chosen."""
+MARGIN = 0.05
+"""Labelling margin of a face that moves [m]; as the settings of the classes."""
+MIN_SWEEPS, MIN_POINTS = 5, 50
+"""Fewer are no evidence for a face; chosen."""
+BIN = 0.1
+"""Width of the bins that show where the points of the object end [m]; chosen."""
+MIN_SHARE, MIN_SHARE_SWEEPS = 0.01, 0.3
+"""Bins with a smaller part of the points, or in a smaller part of the sweeps, are no part of the
+object: mirrors, and what it passes; chosen."""
+OUTERMOST = 0.98
+"""Quantile of the points that counts as the outermost one; chosen."""
+
+
+def faces(sweeps: Sequence[Floats], half: Floats) -> Floats:
+    """
+    Return the faces of an object by its points.
+
+    Parameters
+    ----------
+    sweeps : sequence of arrays, shape (n_i, 3)
+        Points within `MAX_GROWTH` of its box in the frame of the box, without the road [m].
+    half : array, shape (3,)
+        Half the extents of the box.
+
+    Returns
+    -------
+    faces : array, shape (2, 3)
+        Smallest and largest x y z of the object; -half and half where they need not grow.
+
+    """
+    found = np.stack([-half, half])
+    points = np.concatenate(sweeps)
+    owner = np.repeat(np.arange(len(sweeps)), [len(one) for one in sweeps])
+    is_within = np.abs(points) < half + MIN_GROWTH / 2
+    for axis, side in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1)):  # the bottom is on the road
+        others = [other for other in range(3) if other != axis]
+        sign = 2 * side - 1
+        own = is_within[:, others].all(1) & (sign * points[:, axis] > half[axis] / 2)
+        found[side, axis] = sign * _face(sign * points[own, axis], owner[own], float(half[axis]))
+    return found
+
+
+def _face(outwards: Floats, owner: Floats, half: float) -> float:
+    """Return where the points of a side end, by their distances (n,) from the centre."""
+    num_sweeps = len(np.unique(owner))
+    if len(outwards) < MIN_POINTS or num_sweeps < MIN_SWEEPS:
+        return half
+    edges = np.arange(half / 2, half + MAX_GROWTH, BIN)
+    row = np.searchsorted(edges, outwards) - 1
+    counts = np.bincount(row, minlength=len(edges))
+    seen = np.unique(np.stack([row, owner]), axis=1)
+    sweeps = np.bincount(seen[0], minlength=len(edges))
+    is_filled = (counts > MIN_SHARE * len(row)) & (sweeps > MIN_SHARE_SWEEPS * num_sweeps)
+    peak = int(counts.argmax())
+    empty = np.flatnonzero(~is_filled[peak:])
+    if not len(empty):  # it goes on: a wall, or what stands beside
+        return half
+    own = outwards[row < peak + empty[0]]
+    face = float(np.quantile(own, OUTERMOST)) + MARGIN if len(own) else half
+    grows = MIN_GROWTH < face - half < 2 * MAX_PART * half
+    return face if grows else half
