@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from boxreg_ros.config import Config, FaceConfig, KINDS
-from boxreg_ros.core.input_noise import add_past_noise, noise_of, set_noise
+from boxreg_ros.core.input_noise import noise_of, set_noise
 from boxreg_ros.core.input_statistics import (
     drive_of,
     Drives,
@@ -83,14 +83,12 @@ class InputModel:
         self.constants = constants.CONSTANTS
         self._estimates_margins = config.learn
         self._occlusion_insets = (config.inset_ends, config.inset_sides, 0.0, 0.0)
-        # Of each track of each kind: sums over its face observations, see `_add`; its last input
-        # residuals; its extent evidence.
+        # Of each track of each kind: what it shows, and its last input residuals.
         unknown = np.full((self.constants.max_fits, 9), np.nan)
-        self._faces = [TrackRows(np.zeros((3, 3, 6)), self.constants.max_tracks) for _ in KINDS]
+        self._tracks = [TrackRows(np.zeros((), TRACK), self.constants.max_tracks) for _ in KINDS]
         # What follows from the present sums, see `_margins_of`.
         self._margins: list[tuple[Floats, ...] | None] = [None] * len(KINDS)
         self._residuals = [TrackRows(unknown, self.constants.max_tracks) for _ in KINDS]
-        self._evidence = [TrackRows(np.zeros((3, 3)), self.constants.max_tracks) for _ in KINDS]
         self._noise = np.zeros(len(KINDS), NOISE)  # of whole tracks, whose residuals are not kept
         known = list((drives or {}).values())
         self._past = [
@@ -164,8 +162,8 @@ class InputModel:
         sums = np.moveaxis(np.stack([values * counts, counts, shares * counts], 1).sum(3), 2, 0)
         for k in set(kinds.tolist()):
             self._margins[k] = None
-            rows, kept = _kept(self._faces[k], track_ids, kinds == k)
-            self._faces[k].arrays[kept] += sums[rows]
+            rows, kept = _kept(self._tracks[k], track_ids, kinds == k)
+            self._tracks[k].arrays['sums'][kept] += sums[rows]
 
     def add_fits(
         self, track_ids: Sequence[str], kinds: Ints, residuals: Floats, evidence: Floats
@@ -190,8 +188,8 @@ class InputModel:
             known = self._residuals[k].arrays
             known[kept, :-1] = known[kept, 1:]
             known[kept, -1] = residuals[rows]
-            rows, kept = _kept(self._evidence[k], track_ids, kinds == k)
-            self._evidence[k].arrays[kept] = evidence[rows]
+            rows, kept = _kept(self._tracks[k], track_ids, kinds == k)
+            self._tracks[k].arrays['evidence'][kept] = evidence[rows]
 
     def inputs(self, config: Config, with_noise: bool = True) -> Inputs:
         """
@@ -214,44 +212,37 @@ class InputModel:
 
     def extent_evidence(self) -> tuple[Floats, Ints]:
         """Return the evidence of the extents of the last fit of each track, and their kinds."""
-        evidence, kinds = _of_all_kinds(self._evidence)
-        past = np.concatenate([tracks['evidence'] for tracks in self._past])
-        of_past = np.repeat(np.arange(len(KINDS)), list(map(len, self._past)))
-        has_any = past[:, 0].any(1)
-        return (
-            np.concatenate([past[has_any], evidence]),
-            np.concatenate([of_past[has_any], kinds]),
-        )
+        parts = [self._known(k)['evidence'] for k in range(len(KINDS))]
+        parts = [part[part[:, 0].any(1)] for part in parts]  # without tracks that have no fit yet
+        return np.concatenate(parts), np.repeat(np.arange(len(KINDS)), list(map(len, parts)))
+
+    def _known(self, kind: int) -> NDArray[np.void]:
+        """Return what the tracks of a kind show, those of other drives first, records `TRACK`."""
+        return np.concatenate([self._past[kind], self._tracks[kind].in_order])
 
     def set_noise(self, inputs: Inputs, residuals: Floats, kind: Ints) -> None:
         """Set the noise of tracks (B, N, 9) of a kind (B,), with that of other drives (M14)."""
-        set_noise(inputs, residuals, kind, self.constants)
-        add_past_noise(inputs, self._past_noise, self.constants)
+        set_noise(inputs, residuals, kind, self._past_noise, self.constants)
 
     def add_noise(self, residuals: Floats, kind: Ints) -> None:
         """Add the noise of whole tracks, by their residuals (B, N, 9), to the statistics."""
         for k in set(kind.tolist()):
-            found = _noise_record(residuals[kind == k], self.constants)
+            found = noise_of(residuals[kind == k], self.constants)
             self._noise[k] = pooled_noise([self._noise[k], found])
 
     def statistics(self, name: str = '') -> Drives:
         """Return what this drive has shown, for others to begin with, by a `name`."""
         kinds = []
         for k in range(len(KINDS)):
-            sums, evidence = self._faces[k].by_track, self._evidence[k].by_track
-            tracks = np.zeros(len(sums.keys() | evidence.keys()), TRACK)
-            for track, track_id in zip(tracks, {**sums, **evidence}, strict=True):
-                track['sums'] = sums.get(track_id, 0.0)
-                track['evidence'] = evidence.get(track_id, 0.0)
             noise = self._noise[k]
             if not noise['boxes']:
-                noise = _noise_record(self._residuals[k].in_order, self.constants)
-            kinds.append(KindStatistics(tracks, noise))
+                noise = noise_of(self._residuals[k].in_order, self.constants)
+            kinds.append(KindStatistics(self._tracks[k].in_order, noise))
         return drive_of(kinds, name)
 
     def _margins_of(self, kind: int) -> tuple[Floats, ...]:
         """Return margin corrections, insets and scatter of gaps for one kind, (6,) each."""
-        known = np.concatenate([self._past[kind]['sums'], self._faces[kind].in_order])
+        known = self._known(kind)['sums']
         none = (0.0,) * len(FACE_GROUPS)
         deviations = GAP_DEVIATIONS[KINDS[kind]]
         of_gaps = _means_of_groups(known[:, 0])
@@ -274,11 +265,11 @@ class InputModel:
 
     def _means_of_tracks(self, quantity: int, faces: Sequence[int]) -> list[Floats]:
         means = []
-        for sums in _of_all_kinds(self._faces)[0]:
-            total, count, share = sums[quantity][:, faces]
-            is_known = count >= MIN_HITS
-            if is_known.any():
-                means.append(total[is_known] / share[is_known])
+        for tracks in self._tracks:
+            for total, count, share in tracks.in_order['sums'][:, quantity][..., faces]:
+                is_known = count >= MIN_HITS
+                if is_known.any():
+                    means.append(total[is_known] / share[is_known])
         return means
 
     def _pooled(
@@ -326,13 +317,6 @@ def _means_of_groups(known: Floats) -> Means:
         order = np.argsort(means)
         found.append((means[order], count[is_known][order]))
     return found
-
-
-def _noise_record(residuals: Floats, numbers: constants.Constants) -> NDArray[np.void]:
-    """Return the noise of tracks (B, N, 9) as a record `NOISE`."""
-    noise = noise_of(residuals, numbers)
-    boxes = numbers.half_weight * noise.weight[0] / (1 - noise.weight[0])
-    return np.array((noise.deviation, noise.correlation, boxes), NOISE)
 
 
 def _of_all_kinds(known: Sequence[TrackRows]) -> tuple[Floats, Ints]:

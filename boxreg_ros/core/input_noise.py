@@ -5,10 +5,8 @@ docs/method.md, section Input model, has the formulas.
 
 """
 
-from itertools import chain
-from typing import NamedTuple
-
 from boxreg_ros.config import KINDS
+from boxreg_ros.core.input_statistics import NOISE, pooled_noise
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.method.noise import estimate
 from boxreg_ros.core.problem import Problem
@@ -17,83 +15,51 @@ from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, POSE
 import numpy as np
 from numpy.typing import NDArray
 
+LEAST_WEIGHT = 1e-9
+"""A smaller weight of a noise is none. Derived: rounding."""
 REPEATED_BOX_TOLERANCE = 1e-3
 """A box that differs from the one before by less repeats it [m, rad]. Chosen."""
 
 
-class InputNoise(NamedTuple):
-    """
-    Estimated errors of the input poses and extents, of tracks of one kind.
-
-    Attributes
-    ----------
-    deviation, correlation : array, shape (9,)
-        Robust standard deviation about the mean of a track, along the box axes: lon lat z roll
-        pitch yaw, and the extents; correlation from one observation to the next. In units of the
-        deviations of the settings.
-    weight : array, shape (1,)
-        Weight of the estimate against the settings: 0 without observations, 1/2 after
-        `half_weight`, near 1 after many.
-
-    """
-
-    deviation: Floats
-    correlation: Floats
-    weight: Floats
-
-
 def set_noise(
-    inputs: NDArray[np.void], residuals: Floats, kind: Ints, constants: Constants
+    inputs: NDArray[np.void],
+    residuals: Floats,
+    kind: Ints,
+    past: NDArray[np.void],
+    constants: Constants,
 ) -> None:
     """
-    Estimate the noise of each of `KINDS` from tracks (B, N, 9) of a `kind` (B,) (M14).
+    Set the noise of each of `KINDS` in records `INPUTS` (K,) (M14).
 
-    It is set in records `INPUTS` (K,).
-
-    Of `normalised_residuals`; NaN is left out. The noise of all other kinds together is the prior
-    of each: a kind of which few boxes were seen is expected to err as the others do, in proportion
-    to the settings of its kind.
+    Of `normalised_residuals` of tracks (B, N, 9) of a `kind` (B,), NaN is left out, and of other
+    drives, records `NOISE` (K,). The noise of all other kinds together is the prior of each: a
+    kind of which few boxes were seen is expected to err as the others do, in proportion to the
+    settings of its kind.
 
     """
-    seen = frozenset(kind.tolist())
-    # Often all tracks are of one kind, and the same set is needed for several kinds.
-    sets = [(seen & {k}, seen - {k}) for k in range(len(KINDS))]
-    unknown = InputNoise(np.zeros(9), np.zeros(9), np.zeros(1))
-    estimates = {frozenset[int](): unknown, seen: noise_of(residuals, constants)}
-    for kinds in set(chain.from_iterable(sets)) - estimates.keys():
-        rows = np.isin(kind, list(kinds))
-        estimates[kinds] = noise_of(residuals[rows], constants)
-    own, others = (
-        InputNoise(*map(np.stack, zip(*(estimates[kinds] for kinds in side), strict=True)))
-        for side in zip(*sets, strict=True)
-    )
-    weight = own.weight + (1 - own.weight) * others.weight
-    share = own.weight / weight.clip(1e-9)
-    inputs['deviation'] = others.deviation + share * (own.deviation - others.deviation)
-    inputs['correlation'] = others.correlation + share * (own.correlation - others.correlation)
-    inputs['weight'] = weight[:, 0]
+    by_kind = [
+        pooled_noise([past[k], noise_of(residuals[kind == k], constants)])
+        for k in range(len(KINDS))
+    ]
+    for k, own in enumerate(by_kind):
+        others = pooled_noise(by_kind[:k] + by_kind[k + 1 :])
+        of_own, of_others = (
+            known['boxes'] / (known['boxes'] + constants.half_weight) for known in (own, others)
+        )
+        weight = of_own + (1 - of_own) * of_others
+        share = of_own / np.maximum(weight, LEAST_WEIGHT)
+        for name in ('deviation', 'correlation'):
+            inputs[name][k] = others[name] + share * (own[name] - others[name])
+        inputs['weight'][k] = weight
 
 
-def add_past_noise(inputs: NDArray[np.void], past: NDArray[np.void], constants: Constants) -> None:
-    """Add the noise of other drives, records `NOISE` (K,), which counts by its boxes."""
-    if not past['boxes'].any():
-        return
-    boxes = constants.half_weight * inputs['weight'] / (1 - inputs['weight'])
-    together = (past['boxes'] + boxes)[:, None]
-    share = past['boxes'][:, None] / np.maximum(together, 1.0)
-    squares = np.square(inputs['deviation'])
-    inputs['deviation'] = np.sqrt(squares + share * (np.square(past['deviation']) - squares))
-    inputs['correlation'] += share * (past['correlation'] - inputs['correlation'])
-    inputs['weight'] = together[:, 0] / (together[:, 0] + constants.half_weight)
-
-
-def noise_of(residuals: Floats, constants: Constants) -> InputNoise:
-    """Estimate the noise of tracks (B, N, 9) of one kind (M14), shapes (9,) and (1,)."""
-    found = InputNoise(np.zeros(9), np.zeros(9), np.zeros(1))
-    total = estimate(
-        np.ascontiguousarray(residuals), constants.record(), found.deviation, found.correlation
-    )
-    found.weight[:] = total / (total + constants.half_weight)
+def noise_of(residuals: Floats, constants: Constants) -> NDArray[np.void]:
+    """Estimate the noise of tracks (B, N, 9) of one kind (M14), a record `NOISE`."""
+    found = np.zeros((), NOISE)
+    found['boxes'] = estimate(
+        np.ascontiguousarray(residuals), constants.record(), found['deviation'],
+        found['correlation'],
+    )  # fmt: skip
     return found
 
 
@@ -102,7 +68,7 @@ def normalised_residuals(problem: Problem, poses: Floats, extents: Floats) -> Fl
     Return input minus fit over the deviations of the settings, shape (B, N, 9).
 
     Along the axes of the boxes at `poses` (B, N, 6) of `extents` (B, 3), in the order of
-    `InputNoise`. NaN for boxes that repeat the one before, since boxes that a tracker holds have
+    `NOISE`. NaN for boxes that repeat the one before, since boxes that a tracker holds have
     no new error, and for those without points, since their fit follows the input.
 
     """

@@ -36,7 +36,15 @@ evidence
     Of its points about the extents, see `population_slopes`.
 """
 NOISE = np.dtype([('deviation', float, 9), ('correlation', float, 9), ('boxes', float)])
-"""Noise of one kind of a drive (M14), and the number of boxes that it is estimated from."""
+"""
+Noise of one kind of a drive (M14).
+
+deviation, correlation
+    Robust standard deviation about the mean of a track, along the box axes: lon lat z roll pitch
+    yaw, and the extents, in units of the settings; correlation from one observation to the next.
+boxes
+    That it is estimated from.
+"""
 TRACK_FIELDS = ('sums', 'evidence')
 NOISE_FIELDS = ('deviation', 'correlation', 'boxes')
 

@@ -219,7 +219,7 @@ def refine(tracks: Iterable[Track], config: Config | None = None) -> list[Refine
         for row, stamp_ns in enumerate(track.stamps_ns.tolist()):
             places.setdefault(stamp_ns, []).append(_Place(index, row))
 
-    registrar = BoxRegistrar(replace(config, tolerance=0.0))
+    registrar = BoxRegistrar(replace(config, tolerance=0.0), has_whole_sweeps=False)
     results: list[RefinedBoxes] = []
     for stamp_ns in sorted(places):
         results += registrar.add_sweep(_sweep(stamp_ns, tracks, places[stamp_ns]))

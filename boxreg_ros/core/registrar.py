@@ -70,6 +70,9 @@ class BoxRegistrar:
         are solved for it. Default: all are.
     drives : Drives, optional
         What other drives of the same detector have shown of its errors, to begin with.
+    has_whole_sweeps : bool
+        Whether sweeps have all points of the LiDAR. Points near objects alone are no evidence of
+        its field of view.
 
     Attributes
     ----------
@@ -126,12 +129,14 @@ class BoxRegistrar:
         submit: Submit | None = None,
         budget: Budget | None = None,
         drives: Drives | None = None,
+        has_whole_sweeps: bool = True,
     ) -> None:
         self.config = config
         self.counts: Counter[str] = Counter()
         self._submit = submit
         self._budget = budget
         self._drives = drives
+        self._has_whole_sweeps = has_whole_sweeps
         self.reset()
 
     def reset(self) -> None:
@@ -140,7 +145,7 @@ class BoxRegistrar:
         self._matcher = StampMatcher(config, self.counts)
         self._input_model = InputModel(config.faces, self._drives)
         self.box_time = BoxTimeEvidence()
-        self._view = FieldOfView()
+        self._view = FieldOfView() if self._has_whole_sweeps else None
         self.followed = FollowedObjects(config)
         self._pending = deque[PendingArray]()
         self._newest_ns = -inf

@@ -1,9 +1,11 @@
 """A table with one row for each of a limited number of tracks."""
 
 from collections.abc import Sequence
+from typing import Any
 
-from boxreg_ros.structures import Floats, Ints
+from boxreg_ros.structures import Ints
 import numpy as np
+from numpy.typing import NDArray
 
 
 class TrackRows:
@@ -27,21 +29,16 @@ class TrackRows:
 
     """
 
-    def __init__(self, fresh: Floats, capacity: int) -> None:
+    def __init__(self, fresh: NDArray[Any], capacity: int) -> None:
         self._fresh = fresh[None]
         self._capacity = capacity
         self._row_of = dict[str, int]()  # of each track, those seen last at the end
         self.arrays = self._fresh[:0]
 
     @property
-    def by_track(self) -> dict[str, Floats]:
-        """Return the array of each track, those seen last at the end."""
-        return {track_id: self.arrays[row] for track_id, row in self._row_of.items()}
-
-    @property
-    def in_order(self) -> Floats:
+    def in_order(self) -> NDArray[Any]:
         """Copy of the arrays of all tracks, (n, ...), those seen last at the end."""
-        copy: Floats = self.arrays[list(self._row_of.values())]
+        copy: NDArray[Any] = self.arrays[list(self._row_of.values())]
         return copy
 
     def seen(self, track_ids: Sequence[str]) -> tuple[Ints, Ints]:

@@ -188,7 +188,7 @@ def _errors_of_kind(
 def _deviations(residuals: Floats) -> Floats:
     """Return the deviations (5,) of all `ERRORS` but the extent, of residuals (B, N, 9)."""
     noise = noise_of(residuals, CONSTANTS)
-    lon, lat, z, roll, pitch, yaw = noise.deviation[:6].tolist()
+    lon, lat, z, roll, pitch, yaw = noise['deviation'][:6].tolist()
     return np.array([lon, lat, z, np.hypot(roll, pitch) / np.sqrt(2), yaw])
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.input_statistics import Drives
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.observation import crop
 from boxreg_ros.core.registrar import BoxRegistrar, Submit
@@ -127,6 +128,7 @@ def first_pass(
     config: Config,
     submit: Submit | None = None,
     fixed_frame: str | None = None,
+    drives: Drives | None = None,
 ) -> FirstPass:
     """
     Register a recording, and count the points in its boxes.
@@ -141,9 +143,11 @@ def first_pass(
         As of `BoxRegistrar`.
     fixed_frame : str, optional
         With it, sweeps without boxes get an empty array, see `Arrivals`.
+    drives : Drives, optional
+        As of `BoxRegistrar`.
 
     """
-    registrar = BoxRegistrar(config, submit)
+    registrar = BoxRegistrar(config, submit, drives=drives)
     counter = PointCounter(config)
     parts = [Arrivals()]
     count = 0

@@ -44,6 +44,7 @@ import yaml
 
 if TYPE_CHECKING:
     from boxreg_ros.core.follow import FollowedTrack
+    from boxreg_ros.core.input_statistics import Drives
     from boxreg_ros.core.latency import Latency
     from boxreg_ros.core.registrar import BoxRegistrar, Submit
     from boxreg_ros.io.sweep_store import SweepStore
@@ -100,12 +101,10 @@ def relabel(
         # The recording is opened while this process imports numba, which takes half a second.
         from boxreg_ros.core.input_statistics import to_text
         from boxreg_ros.core.registrar import BoxRegistrar
-        from boxreg_ros.io.input_models import disagreements, read_models
+        from boxreg_ros.io.input_models import disagreements
         from boxreg_ros.offline.registration_worker import registration_worker
 
-        name = request.drive_name()
-        drives = read_models(request.input_model)
-        drives.pop(name, None)  # it would count twice
+        drives = _other_drives(request)
         recording = ReadAhead(receive)
         if survey is None:
             clock.begun('start')
@@ -136,7 +135,7 @@ def relabel(
                 write_run_report(folder, out, request, summary, rows, violated, sink.points, clock)
             if request.decisions is not None:
                 copyfile(request.decisions, folder / DECISIONS)  # a review goes on from there
-            taught = registrar.statistics(name)
+            taught = registrar.statistics(request.drive_name())
             (folder / INPUT_MODEL).write_text(to_text(taught), encoding='utf-8')
             summary.input_model = {
                 'drives': len(drives),
@@ -272,7 +271,9 @@ def _survey(
             submit = workers.enter_context(
                 registration_worker(request.config, clock, progress.progress.announce)
             )
-            first = first_pass(items, request.config, _journaled(submit, journal), fixed_frame)
+            submit = _journaled(submit, journal)
+            drives = _other_drives(request)
+            first = first_pass(items, request.config, submit, fixed_frame, drives)
             plan, parts = first.plan(fixed_frame, request.config), first.parts
         else:
             parts = arrivals(items)
@@ -284,6 +285,15 @@ def _survey(
                 )
         completion = Completion(plan, request.config, has_keyframes=request.keyframes)
         return _Survey(plan, completion, parts, ends_of(tracks), recording.source.latency)
+
+
+def _other_drives(request: Request) -> Drives:
+    """Return what other drives have shown; this one, made before, would count twice."""
+    from boxreg_ros.io.input_models import read_models
+
+    drives = read_models(request.input_model)
+    drives.pop(request.drive_name(), None)
+    return drives
 
 
 def _corrected(item: Moved, corrections: Corrections) -> Moved:

@@ -3,10 +3,10 @@
 from boxreg_ros.config import Config
 from boxreg_ros.core.field_of_view import FieldOfView
 from boxreg_ros.core.observation import observe, UNKNOWN_TOP
+from boxreg_ros.core.refine import refine, Track
 from boxreg_ros.io.transforms import sweep_to_frame
 from boxreg_ros.structures import Sweep
 import numpy as np
-import pytest
 
 RINGS = np.radians([-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0])
 SENSOR = np.array([0.0, 0.0, 1.8])
@@ -64,9 +64,18 @@ def test_the_only_high_object_is_no_evidence_of_an_edge():
     assert hidden(FieldOfView(), truck, huge, wall(2.5, 30.0, 9.0), boxes=[TRUCK]) == [True]
 
 
-@pytest.mark.parametrize('count', [2])
-def test_several_sensors_hide_no_top(count):
+def test_points_near_objects_alone_hide_no_top(monkeypatch):
+    """`refine` has no other points: the tops of two vans beside each other are in one ring."""
+    seen = []
+    monkeypatch.setattr(FieldOfView, 'hidden_tops', lambda *args: seen.append(args))
+    points = [wall(np.pi / 2, 11.0, 2.4)] * 3
+    stamps = np.arange(3) * 10**8
+    refine([Track('1', 'van', stamps, np.array([VAN] * 3), points, np.array([SENSOR] * 3))])
+    assert not seen
+
+
+def test_several_sensors_hide_no_top():
     walls = wall(0.0, 8.0, 3.2), wall(2.5, 30.0, 9.0)
-    sensors = np.arange(sum(map(len, walls))) % count
-    more = {'origins': np.array([SENSOR] * count), 'sensors': sensors}
+    sensors = np.arange(sum(map(len, walls))) % 2
+    more = {'origins': np.array([SENSOR] * 2), 'sensors': sensors}
     assert hidden(FieldOfView(), *walls, boxes=[TRUCK], **more) == [False]

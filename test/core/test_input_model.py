@@ -4,6 +4,7 @@ from boxreg_ros.config import Config, FaceConfig, KINDS
 from boxreg_ros.core.input_model import GAP_DEVIATIONS, InputModel
 from boxreg_ros.core.input_noise import noise_of as estimate
 from boxreg_ros.core.input_noise import normalised_residuals, set_noise
+from boxreg_ros.core.input_statistics import NOISE
 from boxreg_ros.core.method.arrays import BOX_POSE, COMMON
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.expectation import fill_evidence, margin_variance, population_factor
@@ -34,7 +35,7 @@ def autoregressive(B, N, deviation, correlation, seed=0):
 
 
 def noise_of(residuals):
-    return estimate(np.array(residuals), CONSTANTS)
+    return estimate(np.array(residuals), CONSTANTS).view(np.recarray)
 
 
 @pytest.mark.parametrize('correlation', [0.0, 0.5, 0.8])
@@ -103,7 +104,7 @@ def test_constant_errors_are_correlated(tracks, correlation):
 
 def test_short_tracks_and_padding_are_left_out():
     values = autoregressive(3, 40, np.ones(9), 0.3)
-    assert noise_of(values[:, : MIN_OBSERVATIONS - 1]).weight == 0
+    assert noise_of(values[:, : MIN_OBSERVATIONS - 1]).boxes == 0
     known = noise_of(values[:2, :30])
     values[:2, 30:] = np.nan
     values[2] *= 100  # too short
@@ -111,7 +112,7 @@ def test_short_tracks_and_padding_are_left_out():
     found = noise_of(values)
     np.testing.assert_allclose(found.deviation, known.deviation)
     np.testing.assert_allclose(found.correlation, known.correlation)
-    assert found.weight == known.weight == 60 / (60 + HALF_WEIGHT)
+    assert found.boxes == known.boxes == 60
 
 
 def test_noise_of_a_kind_is_that_of_the_others_until_it_has_its_own():
@@ -120,21 +121,22 @@ def test_noise_of_a_kind_is_that_of_the_others_until_it_has_its_own():
     kind = np.array([0] * 30 + [2] * 30)
     values = autoregressive(60, 40, np.ones(9), 0.0)
     values[30:] *= 2
-    noise, pooled = no_inputs(), noise_of(values)
-    set_noise(noise, values, kind, CONSTANTS)
+    noise, past = no_inputs(), np.zeros(len(KINDS), NOISE)
+    set_noise(noise, values, kind, past, CONSTANTS)
     np.testing.assert_allclose(noise['deviation'][[0, 2]], [[1.0] * 9, [2.0] * 9], rtol=0.1)
-    np.testing.assert_array_equal(noise['deviation'][1], pooled.deviation)
-    np.testing.assert_array_equal(noise['weight'][1], pooled.weight[0])
+    squares = [noise_of(part).deviation ** 2 for part in (values[:30], values[30:])]
+    others = np.mean(squares, axis=0) ** 0.5
+    np.testing.assert_allclose(noise['deviation'][1], others)
+    assert noise['weight'][1] == 2400 / (2400 + HALF_WEIGHT)
     few = 3 * autoregressive(2, 40, np.ones(9), 0.0, seed=3)
     few[:, 30:] = np.nan
-    found, own = no_inputs(), noise_of(few)
-    set_noise(found, np.concatenate([values, few]), np.append(kind, [1, 1]), CONSTANTS)
-    assert own.weight == 60 / (60 + HALF_WEIGHT)
-    total = own.weight + (1 - own.weight) * pooled.weight
-    share = own.weight / total
-    known = share * own.deviation + (1 - share) * pooled.deviation
+    found = no_inputs()
+    set_noise(found, np.concatenate([values, few]), np.append(kind, [1, 1]), past, CONSTANTS)
+    own = 60 / (60 + HALF_WEIGHT)
+    total = own + (1 - own) * 2400 / (2400 + HALF_WEIGHT)
+    known = others + own / total * (noise_of(few).deviation - others)
     np.testing.assert_allclose(found['deviation'][1], known)
-    np.testing.assert_allclose(found['weight'][1], total[0])
+    np.testing.assert_allclose(found['weight'][1], total)
 
 
 def with_points(problem):
@@ -249,7 +251,7 @@ def test_more_tracks_at_once_than_are_kept_do_not_expel_each_other():
     for row in np.moveaxis(values, 1, 0):
         add_residuals(model, names, row)
     known = noise_of(values[:MAX_TRACKS])
-    assert known.weight > 0.9  # 200 tracks of five fits each against 14: 0.986
+    assert known.boxes == MAX_TRACKS * MIN_OBSERVATIONS
     np.testing.assert_allclose(of_vehicles(model)['deviation'], known.deviation)
 
 
@@ -366,9 +368,9 @@ def test_the_last_fit_of_a_track_is_its_extent_evidence():
     np.testing.assert_array_equal(evidence, np.full((2, 3, 3), 2.0))
     assert kind.tolist() == [0, 1]
     for i in range(MAX_TRACKS):
-        model.add_fits([str(i)], np.array([1]), nothing[:1], np.zeros((1, 3, 3)))
+        model.add_fits([str(i)], np.array([1]), nothing[:1], np.full((1, 3, 3), 3.0))
     evidence, kind = model.extent_evidence()
-    np.testing.assert_array_equal(evidence[kind == 1], np.zeros((MAX_TRACKS, 3, 3)))
+    np.testing.assert_array_equal(evidence[kind == 1], np.full((MAX_TRACKS, 3, 3), 3.0))
 
 
 def test_population_of_one_kind_does_not_correct_others():

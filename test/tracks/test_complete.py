@@ -6,10 +6,11 @@ from dataclasses import replace
 import json
 
 from boxreg_ros import cli
-from boxreg_ros.config import COMPLETE_STEPS, Config
+from boxreg_ros.config import COMPLETE_STEPS, Config, KINDS
+from boxreg_ros.core.input_statistics import drive_of, KindStatistics, NOISE, TRACK
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
-from boxreg_ros.offline.completion import completed, points_above_road
+from boxreg_ros.offline.completion import completed, first_pass, points_above_road
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.track_scores import track_scores
@@ -49,6 +50,23 @@ def test_broken_street_becomes_whole(street):
     assert after.ids_per_object < 1.05
     assert after.added > 80
     assert after.added_iou > 0.82
+
+
+def test_the_first_pass_begins_with_what_other_drives_have_shown():
+    # Fifty cars of another drive, whose labels are 0.1 m larger on every side than their points.
+    tracks = np.zeros(50, TRACK)
+    tracks['sums'][:, 0] = np.array([0.4, 4.0, 4.0])[:, None]
+    tracks['evidence'][:, 0] = np.log([4.0, 2.0, 1.5])
+    of_kinds = [
+        KindStatistics(tracks[:n], np.zeros((), NOISE)) for n in (50, *[0] * len(KINDS[1:]))
+    ]
+    cars = path((12.0, 4.0), (3.0, 0.0), 12)
+    items = [(item, False) for item in drive([[c] for c in cars], [[('a', c)] for c in cars])]
+    config, boxes = only(), []
+    for drives in (None, drive_of(of_kinds, 'other')):
+        ((*_, last),) = first_pass(items, config, drives=drives).results
+        boxes.append(last.boxes.boxes[0])
+    assert (boxes[1][3:6] > boxes[0][3:6] + 0.02).any()
 
 
 def test_ghosts_of_the_street_are_rejected_and_objects_are_kept(street):
