@@ -5,7 +5,7 @@ The boxes given are true ones with the error of a person. One box: the first wit
 `MIN_SEED_RETURNS`, and every later box counts; of the size of its class, its corner nearest to the
 sensor stays. Two: the first and the last with so many, and keyframes: all boxes between the first
 and the last that are given count. Turning objects are those of the row above that turn by
-`MIN_TURN`. In `all boxes` the boxes of a person at every stamp are registered.
+`TURN`. In `all boxes` the boxes of a person at every stamp are registered.
 
 """
 
@@ -49,7 +49,7 @@ CLASS_SIZES = {
     'pedestrian': np.array([0.7, 0.7, 1.75]),
 }
 """Sizes that tools give a new box, by class or kind: length, width, height [m]."""
-MIN_TURN, MIN_TRAVEL = np.radians(20.0), 5.0
+TURN, DISTANCE_OF_TURN = np.radians(20.0), 5.0
 """Objects whose heading changes so much [rad] while they drive so far [m] turn."""
 COLUMN_TITLES = ('true', 'found', '>.5', '3D', '3D all')
 
@@ -224,7 +224,7 @@ def _turns(one: Given) -> bool:
     """Return whether an object turns while it drives."""
     yaw = np.unwrap(one.truth[:, YAW])
     travel = np.linalg.norm(np.ptp(one.truth[:, :2], axis=0))
-    return bool(np.ptp(yaw) > MIN_TURN and travel > MIN_TRAVEL)
+    return bool(np.ptp(yaw) > TURN and travel > DISTANCE_OF_TURN)
 
 
 def _registered(drive: Drive, given: list[Given], seed: int) -> dict[str, Floats]:

@@ -9,14 +9,14 @@ import numpy as np
 
 MAX_GROWTH = 1.0
 """A face moves by no more than this [m]; chosen: half the difference of a hatchback and a van."""
-MAX_PART = 0.25
+MOST_GROWTH = 0.25
 """And no more than this part of the extent: farther points are of what stands beside; chosen."""
 MIN_GROWTH = 0.2
 """A face nearer to the outermost points stays: the labelling margin and the error of a person [m];
 chosen."""
-MARGIN = 0.05
+FACE_MARGIN = 0.05
 """Labelling margin of a face that moves [m]; as the settings of the classes."""
-MIN_SWEEPS, MIN_POINTS = 5, 50
+LEAST_SWEEPS, LEAST_POINTS = 5, 50
 """Fewer are no evidence for a face; chosen."""
 BIN = 0.1
 """Width of the bins that show where the points of the object end [m]; chosen."""
@@ -59,7 +59,7 @@ def faces(sweeps: Sequence[Floats], half: Floats) -> Floats:
 def _face(outwards: Floats, owner: Floats, half: float) -> float:
     """Return where the points of a side end, by their distances (n,) from the centre."""
     num_sweeps = len(np.unique(owner))
-    if len(outwards) < MIN_POINTS or num_sweeps < MIN_SWEEPS:
+    if len(outwards) < LEAST_POINTS or num_sweeps < LEAST_SWEEPS:
         return half
     edges = np.arange(half / 2, half + MAX_GROWTH, BIN)
     row = np.searchsorted(edges, outwards) - 1
@@ -72,6 +72,6 @@ def _face(outwards: Floats, owner: Floats, half: float) -> float:
     if not len(empty):  # it goes on: a wall, or what stands beside
         return half
     own = outwards[row < peak + empty[0]]
-    face = float(np.quantile(own, OUTERMOST)) + MARGIN if len(own) else half
-    grows = MIN_GROWTH < face - half < 2 * MAX_PART * half
+    face = float(np.quantile(own, OUTERMOST)) + FACE_MARGIN if len(own) else half
+    grows = MIN_GROWTH < face - half < 2 * MOST_GROWTH * half
     return face if grows else half
