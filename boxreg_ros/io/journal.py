@@ -14,6 +14,7 @@ import errno
 from functools import partial
 from io import BytesIO
 from itertools import count
+import os
 from pathlib import Path
 import pickle
 import sqlite3
@@ -152,7 +153,8 @@ class Journal:
     def _system_error(self, error: sqlite3.Error, content: bytes) -> OSError:
         """Return the error of the system behind one of SQLite: the same write has it again."""
         try:
-            with (self._log if self._log.exists() else self.path).open('ab') as file:
+            with (self._log if self._log.exists() else self.path).open('r+b') as file:
+                file.seek(0, os.SEEK_END)  # a file that was deleted is not made again
                 file.write(content)  # ignored there: it has no checksum
         except OSError as reason:
             return reason

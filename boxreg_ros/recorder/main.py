@@ -355,7 +355,8 @@ def _explained(error: OSError, folder: Path, has_begun: bool) -> RecordingError:
         )
     if os.path.isfile(folder):
         return RecordingError(f'{place}: expected a folder, got a file; choose another')
-    if os.path.exists(folder):  # False for a name that is too long
+    is_lost = has_begun and error.filename and not os.path.exists(error.filename)
+    if os.path.exists(folder) and not is_lost:  # False for a name that is too long
         return RecordingError(
             f'{place}: expected a folder that can be written to, got: {error.strerror} '
             f'({error.filename}); choose another, or change its owner or mode'
