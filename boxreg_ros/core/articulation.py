@@ -12,9 +12,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-NO_RANGE = np.array([[np.inf] * 3, [-np.inf] * 3])
-"""Range of the extents of a track before its first window is full."""
-
 
 def extent_ranges(problem: Problem, past: Floats, span: int) -> Floats:
     """
@@ -32,7 +29,7 @@ def extent_ranges(problem: Problem, past: Floats, span: int) -> Floats:
     Returns
     -------
     ranges : array, shape (B, 2, 3)
-        Least and largest logarithm of length, width and height; infinite before `span` boxes.
+        Least and largest logarithm of length, width and height; `NO_RANGE` before `span` boxes.
 
     """
     if problem.length < span:

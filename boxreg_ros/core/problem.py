@@ -42,14 +42,14 @@ VALUES_PER_POINT = 18
 """Values held per point while a batch is solved; estimated from the temporary arrays."""
 PRIOR_ANGLES = [3, 4, 5, 9, 10, 11]
 """Angles among the variables of the marginalisation prior: of its two poses."""
-
-
+NO_RANGE = np.array([[np.inf] * 3, [-np.inf] * 3])
+"""Range of the extents of a track before its first window is full."""
 NO_PRIOR = (
     np.full(PRIOR, np.nan),
     np.zeros(PRIOR),
     np.zeros((PRIOR, PRIOR)),
     np.zeros(4),
-    np.array([[np.inf] * 3, [-np.inf] * 3]),
+    NO_RANGE,
 )
 """State, step, information, extents and their range, of a prior without information."""
 

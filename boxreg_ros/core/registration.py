@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from itertools import repeat
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.articulation import changes_shape, extent_ranges, NO_RANGE
+from boxreg_ros.core.articulation import changes_shape, extent_ranges
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import residuals_at
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, Solution
@@ -24,7 +24,7 @@ from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.faces import count_held
 from boxreg_ros.core.observation import SIDE_NOISE
 from boxreg_ros.core.paper import solve_paper
-from boxreg_ros.core.problem import group_windows, Problem, stack_windows
+from boxreg_ros.core.problem import group_windows, NO_RANGE, Problem, stack_windows
 from boxreg_ros.core.solver import solve
 from boxreg_ros.core.threads import one_torch_thread, run, shared_between
 from boxreg_ros.core.track_window import Estimate, Estimates, MarginalisationPrior, Window

@@ -87,7 +87,8 @@ class StoredSweeps:
         """Store a sweep of `items`; label files have merged ones in `sensor_frame`."""
         cloud = items.stored_cloud(item, sensor_frame) if self.with_clouds else None
         moved = item.moved if isinstance(item.moved, Sweep) else None
-        self.places.append(StoredPlace(self._file.tell(), tuple(_parts(item, items))))
+        parts = tuple(_parts(item, items))
+        self.places.append(StoredPlace(self._file.tell(), parts))
         pickle.dump(StoredSweep(moved, cloud), self._file, pickle.HIGHEST_PROTOCOL)
 
     def complete(self) -> list[StoredPlace]:

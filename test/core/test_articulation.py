@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.articulation import changes_shape, extent_ranges, NO_RANGE
+from boxreg_ros.core.articulation import changes_shape, extent_ranges
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.core.problem import NO_RANGE
 from boxreg_ros.core.registration import register
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.reasons import Reason
@@ -67,7 +68,7 @@ def test_only_a_width_that_changes_alone_is_a_bend():
 
 
 def test_a_body_once_seen_to_bend_is_kept_by_later_windows():
-    """Each window has constant extents: only what came before shows that they change."""
+    """Each window has constant extents; the range of the windows before it shows the change."""
     track = track_of(drive(40), np.random.default_rng(0))
     boxes = track.boxes.copy()
     boxes[15:, 4] += 1.0

@@ -1,10 +1,9 @@
 """Windows of observations, and batches of windows as padded arrays."""
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.articulation import NO_RANGE
 from boxreg_ros.core.method.arrays import PRIOR as PRIOR_SIZE
 from boxreg_ros.core.method.constants import CONSTANTS
-from boxreg_ros.core.problem import group_windows, Problem, resolve_headings
+from boxreg_ros.core.problem import group_windows, NO_RANGE, Problem, resolve_headings
 from boxreg_ros.core.problem import stack_windows as stack
 from boxreg_ros.core.track_window import MarginalisationPrior
 from boxreg_ros.structures import POSE, ROLL, YAW
