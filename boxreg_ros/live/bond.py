@@ -8,6 +8,7 @@ from uuid import uuid4
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.live.topics import import_message
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.node import Node
 
 TOPIC = 'bond'
@@ -18,6 +19,8 @@ HEARTBEAT_TIMEOUT = 4.0
 """Silence after which the other end takes the bond for broken [s]; that of Nav2 by default."""
 DEPTH = 10
 """Queue size: a second of heartbeats."""
+ACKNOWLEDGEMENT_TIME = 1.0
+"""Longest wait for the other end to take the last message [s]; ten of its heartbeats."""
 
 
 class Bond:
@@ -59,9 +62,11 @@ class Bond:
 
     def end(self) -> None:
         """Announce the end of the bond, and publish no more."""
+        self._node.destroy_timer(self._timer)
         self._status.active = False
         self._publish()
-        self._node.destroy_timer(self._timer)
+        # A publisher that is destroyed takes along what was not acknowledged.
+        self._publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGEMENT_TIME))
         self._node.destroy_publisher(self._publisher)
 
     def _publish(self) -> None:

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
+import shutil
 from typing import NamedTuple
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lock import locked
+from boxreg_ros.io.whole_files import delete_partial_files
+from boxreg_ros.labels.cloud_spool import FOLDER as CLOUDS
 from boxreg_ros.recorder.segment import recover
 
 LOCK = '.lock'
@@ -26,6 +29,12 @@ class Recovery(NamedTuple):
 def lock_of(folder: Path) -> AbstractContextManager[None]:
     """Return a context that keeps other recordings out of a folder; see `locked`."""
     return locked(folder / LOCK, f'record_to {str(folder)!r}')
+
+
+def delete_remains(folder: Path) -> None:
+    """Delete the clouds and partial files of a locked folder; no segment is made from them."""
+    shutil.rmtree(folder / CLOUDS, ignore_errors=True)
+    delete_partial_files(folder)
 
 
 def recover_all(opened: Sequence[Path]) -> Recovery:

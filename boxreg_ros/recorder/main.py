@@ -30,9 +30,8 @@ from boxreg_ros.io.transforms import TIME_JUMP
 from boxreg_ros.io.whole_files import DISK_ERRORS
 from boxreg_ros.labels import FORMATS, import_format, LabelFrame, module_of
 from boxreg_ros.labels.camera import Camera
-from boxreg_ros.labels.cloud_spool import FOLDER as CLOUDS
 from boxreg_ros.labels.cloud_spool import Spool
-from boxreg_ros.recorder.folder import lock_of, recover_all, Recovery
+from boxreg_ros.recorder.folder import delete_remains, lock_of, recover_all, Recovery
 from boxreg_ros.recorder.segment import (
     journal_settings,
     next_number,
@@ -81,7 +80,7 @@ class Recorder:
         self._number = next_number(self._folder)
         self._segment: Segment | None = None
         self._spool: Spool | None = None
-        shutil.rmtree(self._folder / CLOUDS, ignore_errors=True)
+        delete_remains(self._folder)
         if settings.with_points:
             self._spool = Spool(self._folder, settings.config)
         self._thread = ThreadPoolExecutor(1)
@@ -115,7 +114,7 @@ class Recorder:
                 segment.abandon()
         if self._segment is not None:
             self._segment.abandon()
-        shutil.rmtree(self._folder / CLOUDS, ignore_errors=True)
+        delete_remains(self._folder)
 
     def status(self) -> RecorderStatus:
         """

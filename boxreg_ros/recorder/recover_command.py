@@ -8,7 +8,7 @@ import sys
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.segments import INDEX, read_index
-from boxreg_ros.recorder.folder import lock_of, recover_all
+from boxreg_ros.recorder.folder import delete_remains, lock_of, recover_all
 from boxreg_ros.recorder.segment import open_segments
 
 
@@ -26,6 +26,7 @@ def run(args: argparse.Namespace) -> int:
             f'segment that was cut off, got none; give the folder of record_to'
         )
     with lock_of(folder):
+        delete_remains(folder)
         recovery = recover_all(open_segments(folder))
     rows = read_index(folder)
     boxes = sum(row.boxes for row in rows)

@@ -262,6 +262,19 @@ def test_killed_recorder_loses_nothing_that_it_has_taken(tmp_path):
     assert len(stamps) <= taken
 
 
+def test_recovery_deletes_what_a_killed_recorder_was_writing(tmp_path):
+    record(settings_of(tmp_path), [final_boxes(0)])
+    partial = tmp_path / '.index.csv.1a2b3c4d.partial'
+    partial.write_text('segment,first_st')
+    (tmp_path / '.clouds').mkdir()
+    (tmp_path / '.clouds' / '0.npy').write_bytes(b'')
+    assert main(['recover', str(tmp_path)]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['index.csv', 'segment_000001']
+    partial.write_text('')
+    record(settings_of(tmp_path), [final_boxes(1)])
+    assert not partial.exists()
+
+
 def test_every_step_of_completion_may_be_the_last(tmp_path):
     """A segment that has its name but is not in the index is made again from its journal."""
     cut_off_segment(tmp_path, 3)
