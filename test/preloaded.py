@@ -16,6 +16,7 @@ from paths import ROOT
 BOXREG = 'boxreg_ros.cli:command'
 NODE = 'boxreg_ros.live.main:main'
 LIFECYCLE_NODE = 'boxreg_ros.live.main:lifecycle'
+IMPATIENT_NODE = 'preloaded:impatient_node'
 MODULES = ('boxreg_ros.live.process', 'warmed')
 
 context = get_context('forkserver')
@@ -61,6 +62,14 @@ class PreloadedProcess:
     def wait(self, timeout=None):
         self._process.join(timeout)
         return self._process.exitcode
+
+
+def impatient_node():
+    """Run a node that reports inputs without messages after 1 s in place of 10."""
+    from boxreg_ros.live import boxes_type, main, topics
+
+    boxes_type.PATIENCE = topics.PATIENCE = 1.0
+    return main.main()
 
 
 def _run(entry_point, arguments, environment, log):

@@ -2,6 +2,7 @@
 
 from boxreg_ros.live.topics import import_message, mismatches
 from diagnostic_msgs.msg import DiagnosticStatus
+from preloaded import IMPATIENT_NODE
 import pytest
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
@@ -113,7 +114,8 @@ def test_mistyped_remaps_are_reported_with_the_existing_topics(graph):
     graph.publisher(DETECTIONS, '/tracker/boxes')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     remaps = ('points:=/lidar/pionts', 'boxes:=/tracker/boxs', 'odom:=/odometry')
-    node = graph.start(*[part for text in remaps for part in ('-r', text)])
+    arguments = [part for text in remaps for part in ('-r', text)]
+    node = graph.start(*arguments, command=(IMPATIENT_NODE,))
     for name, candidate in (
         ('/lidar/pionts', '/lidar/points'),
         ('/tracker/boxs', '/tracker/boxes'),
@@ -131,7 +133,7 @@ def test_outputs_of_another_node_are_not_taken_for_inputs(graph):
     first = graph.start('-p', f'boxes_type:={DETECTIONS}')
     graph.wait(lambda: graph.node.count_publishers('/refined_boxes') == 1, 'the first node')
     mistyped = ('-r', '__ns:=/second', '-r', 'boxes:=/track', '-p', f'boxes_type:={DETECTIONS}')
-    second = graph.start(*mistyped)
+    second = graph.start(*mistyped, command=(IMPATIENT_NODE,))
     chained = ('-r', '__ns:=/third', '-r', 'boxes:=/refined_boxes')
     third = graph.start(*chained, '-r', '/diagnostics:=/third/diagnostics')
     parts = ('/refined_boxes', 'refined boxes of /boxreg_node', 'set boxes_type')
@@ -145,7 +147,7 @@ def test_outputs_of_another_node_are_not_taken_for_inputs(graph):
 def test_silent_publishers_are_reported_until_they_publish(graph):
     publisher = graph.publisher(POINTS, '/points')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    node = graph.start()
+    node = graph.start(command=(IMPATIENT_NODE,))
     parts = ('/points: nothing received yet from /neighbour',)
     assert '[WARN]' in reported(graph, node, diagnostics, *parts)
     cloud = import_message(POINTS)()
