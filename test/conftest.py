@@ -8,6 +8,7 @@ import tempfile
 
 from boxreg_ros.core.method import constants
 from browser import end_shared_browser
+from preloaded import PreloadedPython
 import pytest
 from ros_domain import next_domain
 import torch
@@ -46,6 +47,21 @@ def browser_of_the_module():
     """End the browser that the tests of a module share."""
     yield
     end_shared_browser()
+
+
+@pytest.fixture(scope='session')
+def preloaded_python(tmp_path_factory):
+    """Return an executable that starts `boxreg` in a process with all modules."""
+    path = tmp_path_factory.mktemp('bin') / 'python'
+    python = PreloadedPython(path)
+    yield str(path)
+    python.close()
+
+
+@pytest.fixture
+def quick_python(preloaded_python, monkeypatch):
+    """Let the drives of `boxreg batch` begin in processes with all modules."""
+    monkeypatch.setattr(sys, 'executable', preloaded_python)
 
 
 @pytest.fixture

@@ -590,7 +590,7 @@ command()
     ],
 )
 def test_a_run_that_ends_while_results_wait_to_be_written(
-    tmp_path, ending, status, line, when, earlier
+    tmp_path, preloaded_python, ending, status, line, when, earlier
 ):
     # All results come at once, at the end of the recording; a thread writes them one by one.
     recording = Drive(sweeps=40).write(tmp_path / 'drive')
@@ -599,7 +599,7 @@ def test_a_run_that_ends_while_results_wait_to_be_written(
         assert cli.main(['relabel', str(recording), '-o', str(out), *QUICK]) == 0
     before = {path.name: path.read_bytes() for path in out.glob('*.*')}
     done = subprocess.run(
-        [sys.executable, '-c', WRITER_THAT_FAILS, 'relabel', recording, '-o', out, *QUICK],
+        [preloaded_python, '-c', WRITER_THAT_FAILS, 'relabel', recording, '-o', out, *QUICK],
         cwd=ROOT, capture_output=True, text=True, timeout=60,
         env=os.environ | {'WHEN': when, 'ENDING': ending},
     )  # fmt: skip

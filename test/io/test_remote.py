@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 import socket
 import subprocess
-import sys
 from threading import Thread
 
 from boxreg_ros.cli import main
@@ -364,7 +363,7 @@ def test_an_interrupted_run_goes_on_from_the_journal_in_the_store(tmp_path, stor
     assert not any('.journal' in name for name in store.find('drives/interrupted'))
 
 
-def test_an_upload_that_is_killed_goes_on_at_the_next_run(whole, store, capsys):
+def test_an_upload_that_is_killed_goes_on_at_the_next_run(whole, store, preloaded_python, capsys):
     out = 's3://drives/results/one'
     command = ['relabel', str(whole), '-o', out, '--resume', QUICK[0], '--formats=sustechpoints']
     command += ['--end=1']
@@ -372,7 +371,7 @@ def test_an_upload_that_is_killed_goes_on_at_the_next_run(whole, store, capsys):
         names = set()
         if store.exists(out):
             store.rm(out, recursive=True)
-        process = subprocess.Popen([sys.executable, '-m', 'boxreg_ros.cli', *command])
+        process = subprocess.Popen([preloaded_python, '-m', 'boxreg_ros.cli', *command])
         while not names:
             assert process.poll() is None
             store.invalidate_cache()
@@ -396,6 +395,7 @@ def test_an_upload_that_is_killed_goes_on_at_the_next_run(whole, store, capsys):
     assert capsys.readouterr().out.count('20 boxes in') == 1
 
 
+@pytest.mark.usefixtures('quick_python')
 def test_batch_with_an_object_store(whole, store, capsys):
     store.put(str(whole), 'drives/one/whole.mcap')
     command = ['batch', 's3://drives/one/whole.mcap', '-o', 's3://drives/all']
@@ -445,6 +445,7 @@ def test_refused_credentials_of_an_object_store(tmp_path, whole, store, out, mon
         assert '1 of 2 drives done' in streams.out
 
 
+@pytest.mark.usefixtures('quick_python')
 def test_a_server_that_does_not_answer_fails_its_drive_only(tmp_path, monkeypatch, capsys):
     path = Drive(sweeps=6).write(tmp_path / 'drive')
     monkeypatch.setattr(urls, 'ANSWER_SECONDS', 0.5)

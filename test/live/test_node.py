@@ -18,7 +18,7 @@ from boxreg_ros.structures import BoxArray, COASTED, KEPT, REFINED, RefinedBoxes
 from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters import markers, vision
 import numpy as np
-from preloaded import NODE, PreloadedProcess
+from preloaded import CODE, NODE, PreloadedProcess
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
@@ -183,7 +183,7 @@ sys.exit(main())
 def test_two_signals_end_the_node_cleanly_under_load(graph, tmp_path):
     records = records_of(Drive(sweeps=30).write(tmp_path / 'drive'))
     publishers_for(graph, records)
-    node = graph.start(*RELIABLE, *QUICK, command=('-c', SLOW_EVENTS))
+    node = graph.start(*RELIABLE, *QUICK, command=(CODE, SLOW_EVENTS))
     graph.wait_until_connected()
     is_over = Event()
 

@@ -2,7 +2,7 @@
 
 from boxreg_ros.live.topics import import_message, mismatches
 from diagnostic_msgs.msg import DiagnosticStatus
-from preloaded import IMPATIENT_NODE
+from preloaded import CODE, IMPATIENT_NODE
 import pytest
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
@@ -213,7 +213,7 @@ def test_internal_errors_while_decoding_count_as_failed(graph, tmp_path):
     early = graph.collect(DETECTIONS, '/refined_boxes')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     options = ('--log-level', 'boxreg_node:=debug')
-    node = graph.start(*RELIABLE, *QUICK, *options, command=('-c', ADAPTER_WITH_A_BUG))
+    node = graph.start(*RELIABLE, *QUICK, *options, command=(CODE, ADAPTER_WITH_A_BUG))
     graph.wait_until_connected()
     play(graph, records, early)  # boxes are published unchanged
     graph.wait(lambda: values_of(diagnostics).get('failed') == '4', 'counters')

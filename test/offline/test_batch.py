@@ -19,6 +19,7 @@ from boxreg_ros.offline.job_process import JobRunner, memory_bytes
 from boxreg_ros.offline.result_folder import whole_folder
 from boxreg_ros.offline.time_limit import Watch, watched
 from paths import ROOT
+from preloaded import BOXREG, PreloadedProcess
 import pytest
 from ros_messages import Drive
 
@@ -32,6 +33,7 @@ def index_of(out):
         return {row['drive']: row for row in csv.DictReader(file)}
 
 
+@pytest.mark.usefixtures('quick_python')
 def test_failures_are_isolated_and_a_second_run_skips_done_drives(tmp_path, capsys):
     names = ('one', 'two', 'three')
     paths = [Drive(sweeps=6).write(tmp_path / name) for name in names]
@@ -75,6 +77,7 @@ def test_failures_are_isolated_and_a_second_run_skips_done_drives(tmp_path, caps
     assert page.index('0.75') < page.index('0.25')
 
 
+@pytest.mark.usefixtures('quick_python')
 def test_each_drive_begins_with_what_the_others_have_shown(tmp_path, capsys):
     paths = [Drive(sweeps=sweeps).write(tmp_path / name) for name, sweeps in (('a', 6), ('b', 8))]
     out = tmp_path / 'out'
@@ -166,6 +169,7 @@ def test_each_drive_has_a_name_of_its_own_in_any_order(tmp_path):
         jobs_of(paths)
 
 
+@pytest.mark.usefixtures('quick_python')
 def test_the_result_of_another_drive_is_not_replaced(tmp_path, capsys):
     out = tmp_path / 'out'
     first = Drive(sweeps=6).write(tmp_path / 'a' / 'drive')
@@ -187,17 +191,17 @@ def test_a_second_run_leaves_the_first_and_its_files_alone(tmp_path, capsys):
     paths = [Drive(sweeps=n).write(tmp_path / str(n)) for n in (6, 60)]
     out = tmp_path / 'out'
     command = ['batch', *map(str, paths), '-o', str(out), *QUICK]
-    with subprocess.Popen([sys.executable, '-m', 'boxreg_ros.cli', *command]) as first:
-        while not list(out.glob('.60.partial')):
-            assert first.poll() is None
-            time.sleep(0.02)
-        assert main(['batch', str(paths[0]), '-o', str(out), *QUICK]) == 1
-        assert main(['relabel', str(paths[1]), '-o', str(out / '60'), *QUICK]) == 1
-        batch, relabel = capsys.readouterr().err.splitlines()
+    first = PreloadedProcess(BOXREG, command, {}, tmp_path / 'log')
+    while not list(out.glob('.60.partial')):
+        assert first.poll() is None
+        time.sleep(0.02)
+    assert main(['batch', str(paths[0]), '-o', str(out), *QUICK]) == 1
+    assert main(['relabel', str(paths[1]), '-o', str(out / '60'), *QUICK]) == 1
+    batch, relabel = capsys.readouterr().err.splitlines()
     assert f"output '{out}': expected an output that no other process writes to" in batch
     assert f'in use by process {first.pid} on ' in batch
     assert f"output '{out / '60'}': expected an output that no other process" in relabel
-    assert first.returncode == 0
+    assert first.wait() == 0
     assert {row['status'] for row in index_of(out).values()} == {'done'}
     assert sorted(path.name for path in out.iterdir()) == [
         '6', '60', 'index.csv', 'jobs', 'report.html', 'summary.json',
@@ -216,6 +220,7 @@ def test_a_drive_without_progress_or_with_too_much_memory_is_ended(tmp_path, cap
     assert shown == {'jobs', 'index.csv', 'summary.json', 'report.html'}
 
 
+@pytest.mark.usefixtures('quick_python')
 def test_missing_and_repeated_drives_fail_and_the_others_go_on(tmp_path, capsys):
     path = Drive(sweeps=6).write(tmp_path / 'one')
     out = tmp_path / 'out'
@@ -233,6 +238,7 @@ def test_missing_and_repeated_drives_fail_and_the_others_go_on(tmp_path, capsys)
     )
 
 
+@pytest.mark.usefixtures('quick_python')
 def test_shards_of_the_recipe_for_slurm_are_merged_to_the_results_of_one_run(tmp_path, capsys):
     paths = [str(Drive(sweeps=n).write(tmp_path / name)) for n, name in ((5, '=5'), (6, '6'))]
     (tmp_path / 'drives.txt').write_text('\n'.join(paths))
@@ -338,14 +344,14 @@ def test_a_drive_that_goes_on_has_no_limit_of_time(tmp_path, monkeypatch):
     assert main(['relabel', str(path), '-o', str(tmp_path / 'alone'), *QUICK]) == 0
     assert len(os.read(reader, 100)) >= 5  # for each sweep behind the first
     script = tmp_path / 'python'
-    steps = 'os.write(int(os.environ["BOXREG_PROGRESS"]), b"."), time.sleep(0.2)'
+    steps = 'os.write(int(os.environ["BOXREG_PROGRESS"]), b"."), time.sleep(0.1)'
     script.write_text(f'#!{sys.executable}\nimport os, time\nfor _ in range(20): {steps}\n')
     script.chmod(0o755)
     monkeypatch.setattr('sys.executable', str(script))
     (job,) = jobs_of([path])
-    result = JobRunner(tmp_path / 'out', (), '', timeout=2.0)(job)
+    result = JobRunner(tmp_path / 'out', (), '', timeout=1.5)(job)
     assert (result.exit_status, result.status) == (0, 'done')
-    assert result.seconds > 2.0
+    assert result.seconds > 1.5
     for end in (reader, writer):
         os.close(end)
 

@@ -5,7 +5,6 @@ import os
 from pathlib import Path
 import signal
 import subprocess
-import sys
 import time
 
 from boxreg_ros.cli import main
@@ -56,12 +55,11 @@ def relabel_processes(out):
     return [pair for pair in found if pair[1] not in processes]  # without forked workers
 
 
-def test_lost_workers_and_drivers_lose_no_drive(tmp_path, address, capfd):
+def test_lost_workers_and_drivers_lose_no_drive(tmp_path, address, preloaded_python, capfd):
     paths = [Drive(sweeps=n).write(tmp_path / str(n)) for n in (5, 6, 7)]
     out = tmp_path / 'out'
     arguments = ['batch', *map(str, paths), '-o', str(out), '--engine=ray', f'--address={address}']
-    command = [sys.executable, '-m', 'boxreg_ros.cli', *arguments]
-    driver = subprocess.Popen(command)
+    driver = subprocess.Popen([preloaded_python, '-m', 'boxreg_ros.cli', *arguments])
     wait_until(lambda: relabel_processes(out), driver)
     os.kill(relabel_processes(out)[0][1], signal.SIGKILL)  # a worker of Ray; its job is lost
     states = out / 'jobs'
@@ -72,7 +70,7 @@ def test_lost_workers_and_drivers_lose_no_drive(tmp_path, address, capfd):
         time.sleep(0.05)
     done = {path: path.stat().st_mtime_ns for path in states.glob('*.json')}
     results = {path: path.stat().st_mtime_ns for path in out.glob('*/boxes.csv')}
-    assert subprocess.run(command).returncode == 0
+    assert main(arguments) == 0
     assert f'{out}: 3 of 3 drives done, {len(done)} of them earlier' in capfd.readouterr().out
     assert all(path.stat().st_mtime_ns == when for path, when in results.items())
     with (out / 'index.csv').open(newline='') as file:

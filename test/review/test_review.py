@@ -12,7 +12,6 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 from threading import Thread
 from time import sleep
 
@@ -335,14 +334,19 @@ def test_report_of_another_version_is_refused(result, tmp_path, capsys):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_ended_server_names_the_command_that_applies_its_decisions(result, tmp_path, number):
+def test_ended_server_names_the_command_that_applies_its_decisions(
+    result, tmp_path, preloaded_python, number
+):
     out = shutil.copytree(result[1], tmp_path / 'out')
     DecisionLog(out / DECISIONS).append([Decision('1', None, 'reject')])
-    command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', str(out), '--port', '0']
+    command = [preloaded_python, '-m', 'boxreg_ros.cli', 'review', str(out), '--port', '0']
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        lines = [process.stdout.readline().decode() for _ in range(2)]
-        process.send_signal(number)
-        rest, errors = process.communicate(timeout=60)
+        try:
+            lines = [process.stdout.readline().decode() for _ in range(2)]
+            process.send_signal(number)
+            rest, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
     assert 'http://127.0.0.1:' in lines[0]
     assert f'--decisions {out / DECISIONS}' in rest.decode()
     assert (process.returncode, errors) == (0, b'')

@@ -5,7 +5,6 @@ from dataclasses import replace
 import math
 import signal
 import subprocess
-import sys
 from threading import Thread
 
 from boxreg_ros.cli import main
@@ -194,11 +193,11 @@ def click_on_points(page, box):
 
 
 @NEEDS_BROWSER
-def test_a_drive_without_boxes_is_labelled_from_its_recording_alone(tmp_path):
+def test_a_drive_without_boxes_is_labelled_from_its_recording_alone(tmp_path, preloaded_python):
     drive = Drive(sweeps=NUM_SWEEPS)
     drive.items = [item for item in drive.items if item[0] != '/boxes']
     drive.write(tmp_path / 'drive')
-    command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', 'drive', '--port', '0']
+    command = [preloaded_python, '-m', 'boxreg_ros.cli', 'review', 'drive', '--port', '0']
     command += [*FORMATS, *QUICK, '--who', 'anna']
     with (
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as process,

@@ -460,17 +460,20 @@ def test_axe_finds_nothing(server, context):
         check(page)
 
 
-def test_a_review_begins_with_a_recording(made, tmp_path, capfd):
+def test_a_review_begins_with_a_recording(made, tmp_path, preloaded_python, capfd):
     out = tmp_path / 'out'
     assert main(['review', str(tmp_path)]) == 1
     assert 'expected a finished result' in capfd.readouterr().err
-    command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', str(made / 'drive')]
+    command = [preloaded_python, '-m', 'boxreg_ros.cli', 'review', str(made / 'drive')]
     command += ['-o', str(out), '--port', '0', *FORMATS, *QUICK]
     for word in ('boxes in', 'up to date'):
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            lines = [process.stdout.readline() for _ in range(2)]
-            process.send_signal(signal.SIGINT)
-            process.communicate(timeout=60)
+            try:
+                lines = [process.stdout.readline() for _ in range(2)]
+                process.send_signal(signal.SIGINT)
+                process.communicate(timeout=60)
+            finally:
+                process.kill()
         assert process.returncode == 0
         assert word in lines[0]
         assert lines[1].startswith('http://127.0.0.1:')
