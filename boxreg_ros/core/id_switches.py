@@ -57,21 +57,18 @@ def id_switches(tracks: Mapping[str, Centers]) -> list[Switch]:
     """
     known = {name: track for name, track in tracks.items() if len(track[0]) >= 2 * NUM_BOXES}
     names = sorted(known)
+    stamps = np.array([known[name][0][[0, -1]] for name in names]).reshape(-1, 2)
+    low = np.array([known[name][1].min(0) for name in names]).reshape(-1, 2)
+    high = np.array([known[name][1].max(0) for name in names]).reshape(-1, 2)
     found = []
     for i, first in enumerate(names):
-        for second in names[i + 1 :]:
-            if _are_near(known[first], known[second]):
-                found += _switches_of(first, second, known)
+        others = slice(i + 1, None)
+        gaps = np.maximum(low[i] - high[others], low[others] - high[i])
+        is_near = (gaps < MOST_APART).all(1)
+        is_near &= (stamps[i, 0] <= stamps[others, 1]) & (stamps[others, 0] <= stamps[i, 1])
+        for j in np.flatnonzero(is_near):
+            found += _switches_of(first, names[i + 1 + j], known)
     return sorted(found)
-
-
-def _are_near(first: Centers, second: Centers) -> bool:
-    """Return whether two tracks may have been near each other, by their bounds."""
-    (stamps, centers), (others, other_centers) = first, second
-    if stamps[-1] < others[0] or others[-1] < stamps[0]:
-        return False
-    gap = np.maximum(centers.min(0) - other_centers.max(0), other_centers.min(0) - centers.max(0))
-    return bool((gap < MOST_APART).all())
 
 
 def _switches_of(first: str, second: str, tracks: Mapping[str, Centers]) -> list[Switch]:

@@ -200,14 +200,14 @@ def test_labels_that_cannot_be_written_leave_all_as_it_was(server, made):
 
 
 @contextmanager
-def running(out, max_bytes=None):
+def running(out, python=sys.executable, max_bytes=None):
     """Yield the process of `boxreg review` and its address; no file may have more bytes."""
 
     def limit():
         if max_bytes is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, max_bytes))
 
-    command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', str(out), '--port', '0']
+    command = [python, '-m', 'boxreg_ros.cli', 'review', str(out), '--port', '0']
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=limit) as process:
         try:
             yield process, process.stdout.readline().strip()
@@ -215,7 +215,7 @@ def running(out, max_bytes=None):
             process.kill()
 
 
-def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path):
+def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path, preloaded_python):
     out = shutil.copytree(made / 'out', tmp_path / 'out')
     log, again = out / DECISIONS, tmp_path / 'out.corrected'
     with (
@@ -237,7 +237,10 @@ def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path):
         assert 'Check that boxreg review still runs' in page.inner_text('#failure')
         known = page.evaluate('log.count')
         assert 0 <= len(read_decisions(log)) - known <= 1  # the last one was not answered
-    with running(out) as (process, address), opened_page(address + '#track=1') as page:
+    with (
+        running(out, preloaded_python) as (process, address),
+        opened_page(address + '#track=1') as page,
+    ):
         assert page.evaluate('log.count') == len(read_decisions(log))
         assert page.evaluate('isGone(current())')
         page.keyboard.press('Control+s')
@@ -246,7 +249,10 @@ def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path):
         page.context.close()
         process.kill()
     # Its labels appear whole, or not at all, and can be written again.
-    with running(out) as (process, address), opened_page(address, expected='40') as page:
+    with (
+        running(out, preloaded_python) as (process, address),
+        opened_page(address, expected='40') as page,
+    ):
         for _ in range(30):
             page.keyboard.press('Control+s')
             page.wait_for_function('!view.isSaving', timeout=120_000)
