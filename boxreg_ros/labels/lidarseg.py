@@ -81,7 +81,8 @@ class Writer(nuscenes.Writer):
         assert frame.points is not None
         if self._codes is None:
             self._codes = codes_of(frame.points.tracks)
-        codes = self._codes[frame.points.track]
+            self._category_numbers = (self._codes // 1000).astype(np.uint8)
+        track = frame.points.track
         sweep = self._token('sample_data', self.number)
         for kind, suffix in (('lidarseg', 'bin'), ('panoptic', 'npz')):
             token = self._token(kind, self.number)
@@ -89,9 +90,9 @@ class Writer(nuscenes.Writer):
             row = {'token': token, 'sample_data_token': sweep, 'filename': path}
             self._rows[kind].append(row)
             if kind == 'lidarseg':
-                (codes // 1000).astype(np.uint8).tofile(self.folder / path)
+                self._category_numbers[track].tofile(self.folder / path)
             else:
-                np.savez(self.folder / path, data=codes)
+                np.savez(self.folder / path, data=self._codes[track])
 
     def _instance(self, key: str, track_id: str, class_name: str, annotation: str) -> str:
         """Return the token of an instance, of a category that the devkit knows."""

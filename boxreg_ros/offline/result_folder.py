@@ -240,8 +240,14 @@ def _changed_since(out: Path) -> str | None:
 
 def _sizes(folder: Path) -> dict[str, int]:
     """Return names and sizes [bytes] of all files of a result but its summary."""
-    files = {str(file.relative_to(folder)): file for file in folder.rglob('*') if file.is_file()}
-    return {name: file.stat().st_size for name, file in files.items() if name != SUMMARY}
+    sizes = {}
+    for parent, _, names in os.walk(folder):
+        prefix = os.path.relpath(parent, folder)
+        for name in names:
+            path = os.path.normpath(os.path.join(prefix, name))
+            sizes[path] = os.stat(os.path.join(parent, name)).st_size
+    sizes.pop(SUMMARY, None)
+    return sizes
 
 
 def _digest(path: Path) -> str:

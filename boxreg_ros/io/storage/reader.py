@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, contextmanager, ExitStack, suppress
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,6 +24,14 @@ MESSAGE_MARKS = ('__msgtype__', 'DESCRIPTOR', 'get_fields_and_field_types')
 """Class attributes of messages: of rosbags, of protobuf, of rclpy."""
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 """Begin of a message that rosbag2 has compressed; CDR begins with 0 and 0 to 3."""
+KEPT_TYPESTORES = 8
+"""
+Recordings whose types are kept, by their definitions.
+
+A recording is opened several times: to find the latency of its boxes, to read it, to copy it.
+Parsing the definitions and compiling the decoders takes six times as long as the rest.
+
+"""
 IDL_SEPARATOR = '=' * 80 + '\n'
 
 
@@ -65,8 +74,9 @@ class Reader:
                 raise RecordingError(
                     'recordings of ROS 1 and ROS 2 cannot be merged; relabel them one by one'
                 )
-            self.typestore = get_typestore(Stores.EMPTY)
-            _register(self.typestore, self.connections)
+            self.typestore = _typestore(
+                tuple((connection.msgdef, connection.msgtype) for connection in self.connections)
+            )
             self._opened = stack.pop_all()
 
     def close(self) -> None:
@@ -164,18 +174,20 @@ def _encoding(connection: Connection) -> str:
     return getattr(connection.ext, 'serialization_format', 'ros1')
 
 
-def _register(store: Typestore, connections: Sequence[Connection]) -> None:
+@lru_cache(KEPT_TYPESTORES)
+def _typestore(definitions: tuple[tuple[MessageDefinition, str], ...]) -> Typestore:
     """
-    Add the message definitions of connections to a store.
+    Return the types of message definitions and their names; the same for the same definitions.
 
     A definition that cannot be parsed is left out: messages of its type are unreadable then,
     unless the type is among the stock definitions.
 
     """
+    store = get_typestore(Stores.EMPTY)
     found: dict[str, Any] = {}
-    for connection in connections:
+    for definition, name in definitions:
         try:
-            found.update(_types_of(connection.msgdef, connection.msgtype))
+            found.update(_types_of(definition, name))
         except Exception:  # of the parsers, for any malformed definition
             continue
     try:
@@ -184,6 +196,7 @@ def _register(store: Typestore, connections: Sequence[Connection]) -> None:
         for name, fields in found.items():
             with suppress(Exception):
                 store.register({name: fields})
+    return store
 
 
 def _types_of(definition: MessageDefinition, name: str) -> Any:
