@@ -84,7 +84,6 @@ class Writer(FolderWriter):
         rows, boxes = frame.boxes_in('sensor', self.dropped)
         refined = frame.refined
         array = refined.boxes
-        evidence = evidence_of(refined)
         quaternions_wxyz = quaternions_of(boxes)[:, [3, 0, 1, 2]].tolist()
         for row, box, quaternion in zip(rows, boxes.tolist(), quaternions_wxyz, strict=True):
             self._annotations.add(
@@ -95,7 +94,7 @@ class Writer(FolderWriter):
                 *quaternion,
                 *box[BOX_CENTER],
                 int(refined.num_points[row]),
-                *evidence[row].values(),
+                *evidence_of(refined, row).values(),
             )
         if frame.T_fixed_sensor is not None:
             self._poses.add(array.stamp_ns, *_pose_values(frame.T_fixed_sensor))

@@ -114,9 +114,8 @@ class CuboidWriter(FolderWriter):
         """Yield the valid boxes of a frame in the sensor frame; the others are counted."""
         rows, boxes = frame.boxes_in('sensor', self.dropped)
         array = frame.refined.boxes
-        every = evidence_of(frame.refined)
         for row, box, angles in zip(rows.tolist(), boxes, xyz_angles(boxes), strict=True):
-            evidence = every[row]
+            evidence = evidence_of(frame.refined, row)
             yield Cuboid(
                 row,
                 array.track_ids[row],

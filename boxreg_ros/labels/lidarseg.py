@@ -20,7 +20,7 @@ from boxreg_ros.config import words_of
 from boxreg_ros.core.point_labels import BACKGROUND, ObjectTrack, UNKNOWN
 from boxreg_ros.labels import nuscenes
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
-from boxreg_ros.structures import Ints
+from boxreg_ros.structures import Ints, RefinedBoxes
 import numpy as np
 
 FORMAT = replace(
@@ -93,6 +93,10 @@ class Writer(nuscenes.Writer):
                 self._category_numbers[track].tofile(self.folder / path)
             else:
                 np.savez(self.folder / path, data=self._codes[track])
+
+    def _evidence(self, refined: RefinedBoxes, row: int) -> dict[str, Any]:
+        """Return the status: the covariance of a box between two stamps is not known."""
+        return {'status': refined.status[row]}
 
     def _instance(self, key: str, track_id: str, class_name: str, annotation: str) -> str:
         """Return the token of an instance, of a category that the devkit knows."""

@@ -160,7 +160,6 @@ class Writer(FolderWriter):
     ) -> None:
         refined = frame.refined
         array = refined.boxes
-        evidence = evidence_of(refined)
         num_points = refined.num_points.tolist()
         places = zip(
             rows,
@@ -193,13 +192,17 @@ class Writer(FolderWriter):
                 'num_radar_pts': 0,
                 'prev': '',
                 'next': '',
-                **evidence[row],
+                **self._evidence(refined, row),
                 'stamp_ns': array.stamp_ns,
             }
             if is_single:
                 self._streams['sample_annotation'].append(annotation)
             else:
                 self._link('sample_annotation', annotation, key)
+
+    def _evidence(self, refined: RefinedBoxes, row: int) -> dict[str, Any]:
+        """Return what an annotation states beside the columns of the devkit."""
+        return evidence_of(refined, row)
 
     def _instance(self, key: str, track_id: str, class_name: str, annotation: str) -> str:
         """Return the token of an instance, and count the annotation."""

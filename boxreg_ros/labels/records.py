@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import count
-from math import isfinite
 from typing import Any
 
 from boxreg_ros.labels.protocol import INPUT_STATUS
@@ -119,21 +118,20 @@ EVIDENCE_COLUMNS = {
 """Columns of `evidence_of` in tables of Arrow, which the kits of the data sets ignore."""
 
 
-def evidence_of(refined: RefinedBoxes) -> list[dict[str, Any]]:
-    """Return the values of `EVIDENCE_COLUMNS` of each box."""
-    columns = (
-        refined.status,
-        refined.reasons,
-        map(finite_or_none, refined.boxes.scores.tolist()),
-        refined.covariances.reshape(-1, 36).tolist(),
-        refined.extent_covariances.reshape(-1, 9).tolist(),
-    )
-    return [dict(zip(EVIDENCE_COLUMNS, row, strict=True)) for row in zip(*columns, strict=True)]
+def evidence_of(refined: RefinedBoxes, row: int) -> dict[str, Any]:
+    """Return the values of `EVIDENCE_COLUMNS` of a box."""
+    return {
+        'status': refined.status[row],
+        'reason': refined.reasons[row],
+        'score': finite_or_none(refined.boxes.scores[row]),
+        'covariance': refined.covariances[row].ravel().tolist(),
+        'extent_covariance': refined.extent_covariances[row].ravel().tolist(),
+    }
 
 
 def finite_or_none(value: float) -> float | None:
     """Return `value` as a float, or None if it is not finite."""
-    return float(value) if isfinite(value) else None
+    return float(value) if np.isfinite(value) else None
 
 
 class TrackNumbers:

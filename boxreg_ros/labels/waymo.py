@@ -91,7 +91,6 @@ class Writer(FolderWriter):
         rows, boxes = frame.boxes_in('sensor', self.dropped)
         refined = frame.refined
         array = refined.boxes
-        evidence = evidence_of(refined)
         key = (self._segment, round(array.stamp_ns / 1000))
         for row, box in zip(rows, boxes.tolist(), strict=True):
             self._boxes.add(
@@ -105,7 +104,7 @@ class Writer(FolderWriter):
                 *[None] * len(UNUSED_COLUMNS),
                 array.stamp_ns,
                 array.class_names[row],
-                *evidence[row].values(),
+                *evidence_of(refined, row).values(),
             )
         if frame.T_fixed_sensor is not None:
             self._poses.add(*key, frame.T_fixed_sensor.ravel().tolist())

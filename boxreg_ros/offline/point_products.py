@@ -348,4 +348,5 @@ class VoxelCloud:
         """Return the number of the voxel of each point, the same again after 2^21 voxels."""
         places = np.floor(points.T.astype(np.float64) / self._edge).astype(np.int64)
         x, y, z = places & (2**AXIS_BITS - 1)
-        return x << 2 * AXIS_BITS | y << AXIS_BITS | z
+        number: Ints = x << 2 * AXIS_BITS | y << AXIS_BITS | z
+        return number
