@@ -206,7 +206,9 @@ class Writer(FolderWriter):
 
     def _instance(self, key: str, track_id: str, class_name: str, annotation: str) -> str:
         """Return the token of an instance, and count the annotation."""
-        category = self._categories.setdefault(class_name, self._token('category', class_name))
+        if class_name not in self._categories:
+            self._categories[class_name] = self._token('category', class_name)
+        category = self._categories[class_name]
         if key not in self._instances:
             self._instances[key] = {
                 'token': self._token('instance', key),
