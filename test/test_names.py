@@ -5,8 +5,8 @@ from collections import defaultdict
 
 from paths import ROOT
 
-PROTOCOL = {'DATASET', 'FORMAT', 'REQUIRED_FIELDS', 'RULE', '__all__'}
-"""Names that each label format, data set, message adapter or rule defines for itself."""
+PROTOCOL = {'DATASET', 'FORMAT', 'REQUIRED_FIELDS', '__all__'}
+"""Names that each label format, data set or message adapter defines for itself."""
 KERNELS = ROOT / 'boxreg_ros' / 'core' / 'method'
 """Kernels number the variables that their torch twins have as slices of the same names."""
 

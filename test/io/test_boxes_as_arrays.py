@@ -1,6 +1,7 @@
 """Boxes of a recording, read as arrays by a compiled loop: the same as by objects."""
 
 from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.io.items import Wanted
 from boxreg_ros.io.recorded_type import RecordedType
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.record import Record
@@ -26,7 +27,7 @@ FLAWS = {
 
 def arrays_of(recording):
     """Return all box arrays of an open recording."""
-    items = recording.items(TransformTree(), with_clouds=False)
+    items = recording.items(TransformTree(), Wanted(clouds=False))
     return [item.content for item in items if isinstance(item.content, BoxArray)]
 
 

@@ -25,7 +25,7 @@ from boxreg_ros.offline.completion import completed, first_pass
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.overlap import overlaps
 from boxreg_ros.offline.track_scores import track_scores, TrackScores
-from boxreg_ros.review.rules.overlap import DUPLICATE_IOU
+from boxreg_ros.review.rules import DUPLICATE_IOU
 from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
 from boxreg_ros.structures import BoxArray, Ints, RefinedBoxes, REJECTED, Sweep
 from measure import print_json
