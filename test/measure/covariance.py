@@ -23,13 +23,10 @@ from boxreg_ros.structures import REFINED, RefinedBoxes
 from measure import print_json
 import numpy as np
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure covariance`."""
-    parser.add_argument(
-        'data', type=Path, nargs='+', metavar='DATA', help='folder: one recording and truth.csv'
-    )
-    add_json_argument(parser)
+ARGUMENTS = {
+    'data': (Path, 'folder: one recording and truth.csv', {'nargs': '+'}),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -29,15 +29,11 @@ MIN_SEEN_POINTS = 10
 """True boxes with fewer points are left out; chosen: there is little to register to."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure highway`."""
-    parser.add_argument(
-        '--seeds', type=int, default=3, metavar='N', help='number of drives (default: 3)'
-    )
-    parser.add_argument(
-        '--sweeps', type=int, default=60, metavar='N', help='sweeps of a drive (default: 60)'
-    )
-    add_json_argument(parser)
+ARGUMENTS = {
+    '--seeds': (3, 'number of drives'),
+    '--sweeps': (60, 'sweeps of a drive'),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:

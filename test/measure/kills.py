@@ -48,20 +48,13 @@ class LostArrays(NamedTuple):
     early: int
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure kills`."""
-    parser.add_argument(
-        '--kills', type=int, default=10, metavar='N', help='of each process (default: 10)'
-    )
-    parser.add_argument('--tracks', type=int, default=64, metavar='N', help='default: 64')
-    parser.add_argument(
-        '--points', type=int, default=130_000, metavar='N', help='per sweep (default: 130000)'
-    )
-    parser.add_argument(
-        '--record', default='openlabel,sustechpoints', metavar='FORMAT,...',
-        help='formats (default: openlabel,sustechpoints)',
-    )  # fmt: skip
-    add_json_argument(parser)
+ARGUMENTS = {
+    '--kills': (10, 'of each process'),
+    '--tracks': (64, ''),
+    '--points': (130000, 'per sweep'),
+    '--record': ('openlabel,sustechpoints', 'formats', {'metavar': 'FORMAT,...'}),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -42,20 +42,12 @@ Differences = dict[str, dict[str, dict[str, Difference]]]
 """By the same."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure kinds`."""
-    parser.add_argument(
-        'data', type=Path, nargs='*', metavar='DATA',
-        help='folder: one recording and truth.csv (default: simulated streets)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--seeds', type=int, default=16, metavar='N',
-        help='number of simulated drives (default: 16)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--scenario', choices=SCENARIOS, default='street', help='of these (default: street)'
-    )
-    add_json_argument(parser)
+ARGUMENTS = {
+    'data': (Path, 'recording and truth.csv (default: simulated streets)', {'nargs': '*'}),
+    '--seeds': (16, 'number of simulated drives'),
+    '--scenario': ('street', 'of these', {'choices': SCENARIOS}),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -65,10 +65,10 @@ BEFORE: Mapping[str, tuple[str, ...]] = {
 """What one error of each kind took in the page of the first release and in a text editor."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure labeller`."""
-    parser.add_argument('--seed', type=int, default=0, metavar='N', help='default: 0')
-    add_json_argument(parser)
+ARGUMENTS = {
+    '--seed': (0, ''),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:

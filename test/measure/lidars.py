@@ -40,13 +40,11 @@ MIN_POINTS = 100
 """True boxes with fewer points of all corners are left out, as in `boxreg bench real`."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure lidars`."""
-    parser.add_argument(
-        '--seeds', type=int, default=3, metavar='N', help='number of drives (default: 3)'
-    )
-    parser.add_argument('--sweeps', type=int, metavar='N', help='sweeps of a drive (default: 50)')
-    add_json_argument(parser)
+ARGUMENTS = {
+    '--seeds': (3, 'number of drives'),
+    '--sweeps': (int, 'sweeps of a drive'),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:

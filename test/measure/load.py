@@ -29,19 +29,12 @@ SHOWN = ('latency p50 [ms]', 'latency p99 [ms]', 'early IoU', 'final IoU', 'clou
 """Values that are printed for each number of tracks."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure load`."""
-    parser.add_argument(
-        '--tracks', type=int, nargs='+', default=[16, 64, 256, 1024], metavar='N',
-        help='default: 16 64 256 1024',
-    )  # fmt: skip
-    parser.add_argument(
-        '--points', type=int, default=130_000, metavar='N', help='per sweep (default: 130000)'
-    )
-    parser.add_argument(
-        '--seconds', type=float, default=15.0, metavar='S', help='seconds of data (default: 15)'
-    )
-    add_json_argument(parser)
+ARGUMENTS = {
+    '--tracks': ([16, 64, 256, 1024], '', {'nargs': '+'}),
+    '--points': (130000, 'per sweep'),
+    '--seconds': (15.0, 'seconds of data'),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -51,45 +51,25 @@ LAST_TIME = 30.0  # wait for the last messages, on a busy machine [s]
 SAMPLE_PERIOD = 1.0  # of memory, handles, threads and CPU time of the node [s]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure node`."""
-    parser.add_argument('--tracks', type=int, default=64, metavar='N', help='default: 64')
-    parser.add_argument(
-        '--points', type=int, default=130_000, metavar='N', help='per sweep (default: 130000)'
-    )
-    parser.add_argument(
-        '--rate', type=float, default=10.0, metavar='HZ', help='rate of the sensor (default: 10)'
-    )
-    parser.add_argument(
-        '--seconds', type=float, default=60.0, metavar='S', help='seconds of data (default: 60)'
-    )
-    parser.add_argument(
-        '--delay', type=float, default=0.05, metavar='S',
-        help='delay of the boxes after their cloud (default: 0.05)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--transport', choices=('large', 'default'), default='large',
-        help='large: shared memory sized for clouds (share/fastdds.xml); default: that of DDS',
-    )  # fmt: skip
-    parser.add_argument(
-        '--set', action='append', default=[], metavar='KEY:=VALUE', help='parameter of the node'
-    )
-    parser.add_argument(
-        '--record', metavar='FORMAT,...',
-        help='also record labels in these formats, with their clouds',
-    )  # fmt: skip
-    parser.add_argument(
-        '--compare', action='store_true',
-        help='alternate runs without and with --record, and divide their latencies',
-    )  # fmt: skip
-    parser.add_argument(
-        '--keep-gigabytes', type=float, default=float('inf'), metavar='N',
-        help='delete the oldest recorded segments beyond N GB, after they were counted (default: '
-        'none)',
-    )  # fmt: skip
-    add_json_argument(parser)
-    parser.add_argument('--role', choices=('publish',), help=argparse.SUPPRESS)
-    parser.add_argument('--log', type=Path, help=argparse.SUPPRESS)
+ARGUMENTS = {
+    '--tracks': (64, ''),
+    '--points': (130000, 'per sweep'),
+    '--rate': (10.0, 'rate of the sensor [Hz]'),
+    '--seconds': (60.0, 'seconds of data'),
+    '--delay': (0.05, 'delay of the boxes after their cloud'),
+    '--transport': (
+        'large',
+        'shared memory of share/fastdds.xml',
+        {'choices': ('large', 'default')},
+    ),
+    '--set': ([], 'parameter of the node', {'metavar': 'KEY:=VALUE', 'action': 'append'}),
+    '--record': (str, 'formats: also record labels in them, with their clouds'),
+    '--compare': (False, 'alternate runs without and with --record, and divide their latencies'),
+    '--keep-gigabytes': (float('inf'), 'delete the oldest segments beyond, once counted [GB]'),
+    '--json': add_json_argument,
+    '--role': (str, argparse.SUPPRESS, {'choices': ('publish',)}),
+    '--log': (Path, argparse.SUPPRESS),
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -112,18 +112,13 @@ class Truth(NamedTuple):
         return cls(ids, [track.class_name for track in tracks], owners, moves)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure points`."""
-    parser.add_argument('--scenario', choices=SCENARIOS, default='street', help='default: street')
-    parser.add_argument(
-        '--seeds', type=int, default=2, metavar='N', help='number of drives (default: 2)'
-    )
-    parser.add_argument('--sweeps', type=int, metavar='N', help='sweeps of a drive')
-    parser.add_argument(
-        'data', type=Path, nargs='*', metavar='FOLDER',
-        help='a recording with its exact truth.csv, instead of simulated drives',
-    )  # fmt: skip
-    add_json_argument(parser)
+ARGUMENTS = {
+    '--scenario': ('street', '', {'choices': SCENARIOS}),
+    '--seeds': (2, 'number of drives'),
+    '--sweeps': (int, 'sweeps of a drive'),
+    'data': (Path, 'recording and its exact truth.csv, not simulated drives', {'nargs': '*'}),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -27,12 +27,10 @@ NEAR = 1.0
 TITLES = ('tracks', 'proposed', '3D', 'false', 'false/min', 'ms')
 
 
-def add_arguments(parser):
-    """Declare the options."""
-    parser.add_argument(
-        'data', type=Path, nargs='+', metavar='DATA', help='folder: one recording and truth.csv'
-    )
-    add_json_argument(parser)
+ARGUMENTS = {
+    'data': (Path, 'folder: one recording and truth.csv', {'nargs': '+'}),
+    '--json': add_json_argument,
+}
 
 
 def run(args):

@@ -23,12 +23,10 @@ from paths import ROOT
 STORE = ROOT / 'docs' / 'results'
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure renew`."""
-    parser.add_argument('data', type=Path, metavar='DATA', help='folder with the recordings')
-    parser.add_argument(
-        '--only', default='*', metavar='NAMES', help="pattern, such as 'tracks_*' (default: all)"
-    )
+ARGUMENTS = {
+    'data': (Path, 'folder with the recordings'),
+    '--only': ('*', "pattern, such as 'tracks_*' (default: all)", {'metavar': 'NAMES'}),
+}
 
 
 def run(args: argparse.Namespace) -> int:

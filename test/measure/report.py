@@ -77,26 +77,13 @@ count => new Promise(done => {
 FIRST_PAINT = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure report`."""
-    parser.add_argument(
-        'recordings', type=Path, nargs='*', metavar='RECORDING',
-        help='recordings whose reports are measured',
-    )  # fmt: skip
-    parser.add_argument(
-        '--tracks', type=int, default=1000, metavar='N',
-        help='tracks of a synthetic stream whose report is measured too; 0 for none (default: '
-        '%(default)s)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--boxes', type=int, default=80, metavar='N',
-        help='boxes of each of its tracks (default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--points', type=int, default=130_000, metavar='N',
-        help='points of each of its sweeps (default: %(default)s)',
-    )  # fmt: skip
-    add_json_argument(parser)
+ARGUMENTS = {
+    'recordings': (Path, 'recordings whose reports are measured', {'nargs': '*'}),
+    '--tracks': (1000, 'tracks of a synthetic stream whose report is measured too; 0 for none'),
+    '--boxes': (80, 'boxes of each of its tracks'),
+    '--points': (130000, 'points of each of its sweeps'),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -43,12 +43,10 @@ PLANTED_ERRORS = ('size', 'yaw', 'shift', 'swap', 'drift')
 SEED = 0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure review`."""
-    parser.add_argument(
-        'data', type=Path, nargs='+', metavar='DATA', help='folder: one recording and truth.csv'
-    )
-    add_json_argument(parser)
+ARGUMENTS = {
+    'data': (Path, 'folder: one recording and truth.csv', {'nargs': '+'}),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -75,27 +75,14 @@ class Fleet:
     lost: float
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure scale`."""
-    parser.add_argument('recording', type=Path, metavar='RECORDING', help='MCAP file of ROS 2')
-    parser.add_argument(
-        '--drives', type=int, default=4, metavar='N',
-        help='copies that are relabelled by one and by two workers (default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--rounds', type=int, default=3, metavar='N',
-        help='how often one and two workers take turns (default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--large', type=float, metavar='GB',
-        help='also measure a recording of this size, made by repetition; the fleet is of such '
-        'drives then',
-    )  # fmt: skip
-    parser.add_argument(
-        '--price', type=float, default=PRICE, metavar='USD',
-        help='of a core for an hour (default: %(default)s)',
-    )  # fmt: skip
-    add_json_argument(parser)
+ARGUMENTS = {
+    'recording': (Path, 'MCAP file of ROS 2', {'metavar': 'RECORDING'}),
+    '--drives': (4, 'copies that are relabelled by one and by two workers'),
+    '--rounds': (3, 'how often one and two workers take turns'),
+    '--large': (float, 'size of a recording made by repetition; the fleet is of such drives [GB]'),
+    '--price': (PRICE, 'of a core for an hour', {'metavar': 'USD'}),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -322,24 +322,14 @@ def losses(
 # --------------------------------------------------------------------------------- command
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure sensitivity`."""
-    add_scope_arguments(parser)
-    add_estimate_argument(parser)
-    parser.add_argument(
-        '--objective',
-        choices=('robust', PAPER),
-        default='robust',
-        help='objective whose numbers are varied (default: robust)',
-    )
-    parser.add_argument(
-        '--only', nargs='+', default=['*'], metavar='PATTERN',
-        help="only settings and constants of these names, as in 'faces.*' or 'parked_*'",
-    )  # fmt: skip
-    parser.add_argument(
-        '--workers', type=int, default=2, metavar='N', help='runs at a time (default: 2)'
-    )
-    add_json_argument(parser)
+ARGUMENTS = {
+    'scope': add_scope_arguments,
+    '--estimate': add_estimate_argument,
+    '--objective': ('robust', 'that whose numbers are varied', {'choices': ('robust', PAPER)}),
+    '--only': (['*'], "names, as in 'faces.*' or 'parked_*'", {'nargs': '+'}),
+    '--workers': (2, 'runs at a time'),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:

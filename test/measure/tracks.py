@@ -61,34 +61,14 @@ class Row:
     by_kind: dict[str, TrackScores]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure tracks`."""
-    parser.add_argument(
-        'data', nargs='+', type=Path, metavar='FOLDER',
-        help='folder with one recording and truth.csv in the columns of boxes.csv',
-    )  # fmt: skip
-    parser.add_argument(
-        '--ghosts', type=float, default=0.0, metavar='N',
-        help='mean number of boxes per sweep that belong to no object (default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--far-misses',
-        action='store_true',
-        help='misses in runs, as likely as the square of the distance, like those of a detector '
-        'that has too few points; default: independent ones',
-    )
-    parser.add_argument(
-        '--coast', type=float, default=0.0, metavar='S',
-        help='rows of the live estimates, without and with this `coast`, instead of the steps',
-    )  # fmt: skip
-    parser.add_argument(
-        '--seed',
-        type=int,
-        default=0,
-        metavar='N',
-        help='seed of the breaks (default: 0)',
-    )
-    add_json_argument(parser)
+ARGUMENTS = {
+    'data': (Path, 'folder with one recording and truth.csv, as boxes.csv', {'nargs': '+'}),
+    '--ghosts': (0.0, 'mean number of boxes per sweep that belong to no object'),
+    '--far-misses': (False, 'misses in runs and far away, as of detectors, not independent ones'),
+    '--coast': (0.0, 'rows of the live estimates without and with it, not of the steps [s]'),
+    '--seed': (0, 'seed of the breaks'),
+    '--json': add_json_argument,
+}
 
 
 def run(args: argparse.Namespace) -> int:
