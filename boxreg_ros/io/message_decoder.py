@@ -34,13 +34,6 @@ class MessageDecoder:
     """
     Decode the messages of a recording by the definitions in it.
 
-    Parameters
-    ----------
-    reader : Reader
-        Open.
-    origin : str
-        Name of the recording, for errors.
-
     Attributes
     ----------
     origin : str

@@ -22,13 +22,6 @@ class LabelledRecording(Recording):
 
     `LabelMerger` states their order and their frame.
 
-    Parameters
-    ----------
-    labels : tuple of str and Path
-        Format and files.
-    paths, options
-        As those of `Recording`.
-
     """
 
     has_boxes = False

@@ -24,17 +24,7 @@ MAX_SCENE_BOXES = 20_000
 
 
 class SceneRoutes:
-    """
-    Answer the requests about a drive.
-
-    Parameters
-    ----------
-    source : DriveSource
-        Its recording.
-    frame_id : str
-        Fixed frame.
-
-    """
+    """Answer the requests about a drive."""
 
     def __init__(self, source: DriveSource, frame_id: str) -> None:
         self._scene = DriveScene(source)

@@ -30,11 +30,6 @@ class Reader:
     """
     Read the files of a recording as one.
 
-    Parameters
-    ----------
-    parts : sequence of Part
-        Files of each path.
-
     Attributes
     ----------
     connections : list of Connection
