@@ -26,7 +26,6 @@ from ros_graph import (
     DIAGNOSTICS,
     ended_cleanly,
     Graph,
-    graph_in,
     numbers_changed,
     play,
     publishers_for,
@@ -44,12 +43,6 @@ WITHOUT_TF2_MSGS = (
     'from boxreg_ros.live.main import main\n'
     'sys.exit(main())'
 )
-
-
-@pytest.fixture
-def graph(tmp_path):
-    with graph_in(tmp_path) as graph:
-        yield graph
 
 
 def test_odometry_replaces_tf(graph, tmp_path):
