@@ -25,6 +25,7 @@ import time
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
+from boxreg_ros.io.items import Wanted
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.record import Record
 from boxreg_ros.io.transforms import TransformTree
@@ -102,7 +103,7 @@ def read_recording(path):
     tree = TransformTree()
     with Recording([path]) as recording:
         recording.choose_fixed_frame(tree)
-        for _ in recording.items(tree, with_intensities=True):
+        for _ in recording.items(tree, Wanted(intensities=True)):
             pass
         recording.check_readable()
 

@@ -10,7 +10,7 @@ from typing import Self
 from boxreg_ros.datasets.protocol import Scene, SweepFile
 from boxreg_ros.datasets.registry import Address, module_of, open_scene, resolved, scene_files
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
-from boxreg_ros.io.items import Item, LOOKAHEAD_NS, not_measured, requested_part, Stage
+from boxreg_ros.io.items import EVERYTHING, Item, LOOKAHEAD_NS, requested_part, Wanted
 from boxreg_ros.io.lidars import SensorPlacement
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.transforms import TransformTree
@@ -150,14 +150,7 @@ class SceneRecording:
         self._add_poses(tree, 0, int(self._scene.pose_stamps_ns[0]))
         return (fixed_frame or frames.fixed_frame).lstrip('/')
 
-    def items(
-        self,
-        tree: TransformTree,
-        *,
-        with_clouds: bool = True,
-        with_intensities: bool = False,
-        stage: Stage = not_measured,
-    ) -> Iterator[Item]:
+    def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
         """Yield clouds and boxes in order while `tree` follows; see `Recording.items`."""
         self.unreadable.clear()
         self.first_errors.clear()
@@ -173,9 +166,9 @@ class SceneRecording:
             if not self.start_ns <= stamp_ns < self.end_ns:
                 continue
             num_poses = self._add_poses(tree, num_poses, stamp_ns + LOOKAHEAD_NS)
-            if with_clouds:
-                with stage('read'):
-                    item = self._item(sweep, sensor_frame, with_intensities)
+            if wanted.clouds:
+                with wanted.stage('read'):
+                    item = self._item(sweep, sensor_frame, wanted.intensities)
                 if item is not None:
                     yield item
             yield from merger.after(stamp_ns, stamp_ns)

@@ -17,7 +17,7 @@ from typing import cast, NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.items import Item, ItemSource, not_measured, Stage
+from boxreg_ros.io.items import Item, ItemSource, not_measured, Stage, Wanted
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MISSING, MergedSweep
 from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
 from boxreg_ros.io.transforms import inverse, sweep_to_frame, TransformTree
@@ -141,13 +141,8 @@ class FixedFrameItems:
         self, *, with_clouds: bool = True, with_intensities: bool = False
     ) -> Iterator[MovedItem]:
         """Yield clouds and boxes in the order they were received; see `Recording.items`."""
-        items = self._source.items(
-            self.tree,
-            with_clouds=with_clouds,
-            with_intensities=with_intensities,
-            stage=self._stage,
-        )
-        for item in items:
+        wanted = Wanted(with_clouds, with_intensities, self._stage)
+        for item in self._source.items(self.tree, wanted):
             confirmed, restarts = [item], False
             if not is_placeholder(item.content):
                 confirmed, restarts = self._jumps.add(item, item.content)

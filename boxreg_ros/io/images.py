@@ -73,19 +73,7 @@ class Image(NamedTuple):
 
 
 class RecordedImages:
-    """
-    The images of an open recording.
-
-    Parameters
-    ----------
-    topics : Topics
-        Of the recording.
-    reader : Reader
-        Of its files.
-    decoder : MessageDecoder
-        Of its messages.
-
-    """
+    """The images of an open recording."""
 
     def __init__(self, topics: Topics, reader: Reader, decoder: MessageDecoder) -> None:
         self._topics = topics

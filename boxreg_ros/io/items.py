@@ -60,6 +60,30 @@ def not_measured(stage: str) -> AbstractContextManager[object]:
     return nullcontext()
 
 
+class Wanted(NamedTuple):
+    """
+    What is read of a source.
+
+    Attributes
+    ----------
+    clouds : bool
+        False leaves the clouds out, and saves decoding them.
+    intensities : bool
+        Whether the intensities of the points are decoded, too.
+    stage : callable
+        Measures the stages ``read`` and ``decode``.
+
+    """
+
+    clouds: bool = True
+    intensities: bool = False
+    stage: Stage = not_measured
+
+
+EVERYTHING = Wanted()
+"""But intensities, which few need."""
+
+
 def requested_part(
     source: str, begin_ns: int, end_ns: int, start: float | None, end: float | None
 ) -> tuple[int, int]:
@@ -136,14 +160,7 @@ class ItemSource(Protocol):
     def choose_fixed_frame(self, tree: TransformTree, fixed_frame: str | None = None) -> str:
         """Return the frame to refine in; see `Recording.choose_fixed_frame`."""
 
-    def items(
-        self,
-        tree: TransformTree,
-        *,
-        with_clouds: bool = True,
-        with_intensities: bool = False,
-        stage: Stage = not_measured,
-    ) -> Iterator[Item]:
+    def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
         """Yield clouds and boxes in order while `tree` follows; see `Recording.items`."""
 
     def check_readable(self) -> None:

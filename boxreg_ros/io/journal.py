@@ -46,11 +46,6 @@ class Journal:
     """
     A journal in a file of this machine; the caller keeps other processes out.
 
-    Parameters
-    ----------
-    path : Path
-        The file; its folder exists.
-
     Raises
     ------
     RecordingError

@@ -132,15 +132,10 @@ class SensorPlacement:
 
     State: the newest info messages of concatenated clouds. Not thread-safe.
 
-    Parameters
-    ----------
-    lidars : Lidars
-        Topics and frames.
-
     Attributes
     ----------
     lidars : Lidars
-        As above.
+        Topics and frames.
     layouts : dict of str
         Layout of the first cloud of each topic, and how the times of its points are read.
 
@@ -467,15 +462,7 @@ class SweepMerger:
 
 
 def merged(sweeps: Sequence[Sweep]) -> Sweep:
-    """
-    Return one sweep of clouds that are in the same frame, with the stamp of the first.
-
-    Parameters
-    ----------
-    sweeps : sequence of Sweep
-        One or more.
-
-    """
+    """Return one sweep of clouds that are in the same frame, with the stamp of the first."""
     stamp_ns = sweeps[0].stamp_ns
     delays = [(sweep.stamp_ns - stamp_ns) * 1e-9 for sweep in sweeps]
     times = None

@@ -16,7 +16,7 @@ from typing import Any, cast, Self, TYPE_CHECKING
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.foxglove import encoded
 from boxreg_ros.io.images import RecordedImages
-from boxreg_ros.io.items import Item, LOOKAHEAD_NS, not_measured, requested_part, Stage
+from boxreg_ros.io.items import EVERYTHING, Item, LOOKAHEAD_NS, requested_part, Wanted
 from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder
 from boxreg_ros.io.recorded_motion import RecordedMotion
@@ -162,14 +162,7 @@ class Recording:
         """Return the paths."""
         return ', '.join(map(str, self._paths))
 
-    def items(
-        self,
-        tree: TransformTree,
-        *,
-        with_clouds: bool = True,
-        with_intensities: bool = False,
-        stage: Stage = not_measured,
-    ) -> Iterator[Item]:
+    def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
         """
         Yield clouds and box arrays in the order they were received.
 
@@ -180,25 +173,21 @@ class Recording:
         tree : TransformTree
             At each item it holds the transforms received up to `LOOKAHEAD_NS` later. Older ones
             are forgotten, so that memory does not grow with the recording.
-        with_clouds : bool
-            False yields box arrays only, and saves decoding the clouds.
-        with_intensities : bool
-            Decode the intensities of the points, too.
-        stage : callable, optional
-            Measures the stages ``read`` and ``decode``.
+        wanted : Wanted
+            Whether clouds and intensities are decoded, and what measures the stages.
 
         """
         self._decoder.reset()
         self._decoded_topics.clear()
-        topics = self.data_topics if with_clouds else {self.boxes_topic}
+        topics = self.data_topics if wanted.clouds else {self.boxes_topic}
         records = self._records(tree, topics)
         while True:
-            with stage('read'):
+            with wanted.stage('read'):
                 record = next(records, None)
             if record is None:
                 return
-            with stage('decode'):
-                item = self._item(record, with_intensities)
+            with wanted.stage('decode'):
+                item = self._item(record, wanted.intensities)
             if item is not None:
                 yield item
 

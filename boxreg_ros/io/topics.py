@@ -22,13 +22,6 @@ class Topics:
     """
     Topics of a recording.
 
-    Parameters
-    ----------
-    connections : sequence of Connection
-        Of all files.
-    origin : str
-        Name of the recording, for errors.
-
     Attributes
     ----------
     kinds : dict of str and str

@@ -192,17 +192,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
 
 def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
-    """
-    Yield the frames of a drive, by the stamps of the data set.
-
-    Parameters
-    ----------
-    path : Path
-        ``tracklet_labels.xml``, or the folder that contains it.
-    scene : SceneFrames
-        The drive.
-
-    """
+    """Yield the frames of a drive, by the stamps of the data set."""
     if path.is_dir():
         path = path / FILE
     boxes_by_frame = _read_boxes(path)

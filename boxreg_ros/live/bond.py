@@ -19,7 +19,7 @@ HEARTBEAT_TIMEOUT = 4.0
 """Silence after which the other end takes the bond for broken [s]; that of Nav2 by default."""
 DEPTH = 10
 """Queue size: a second of heartbeats."""
-ACKNOWLEDGEMENT_TIME = 1.0
+END_HEARD_TIME = 1.0
 """Longest wait for the other end to take the last message [s]; ten of its heartbeats."""
 
 
@@ -66,7 +66,7 @@ class Bond:
         self._status.active = False
         self._publish()
         # A publisher that is destroyed takes along what was not acknowledged.
-        self._publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGEMENT_TIME))
+        self._publisher.wait_for_all_acked(Duration(seconds=END_HEARD_TIME))
         self._node.destroy_publisher(self._publisher)
 
     def _publish(self) -> None:

@@ -28,19 +28,7 @@ def add_recordings(
     several: str = 'several are merged by time',
     count: str = '+',
 ) -> None:
-    """
-    Add the recordings.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Gets the argument.
-    several : str
-        Use of several recordings, for the help.
-    count : str
-        How many recordings are expected: ``+`` or ``*``.
-
-    """
+    """Add the recordings."""
     parser.add_argument(
         'recordings', nargs=count, type=Path, metavar='RECORDING',
         help=f'{RECORDINGS}; {several}',

@@ -11,8 +11,8 @@ from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.review.rules import RULES, violations
-from boxreg_ros.review.rules.protocol import ERROR, LabelTrack, Violation, WARNING
+from boxreg_ros.review.label_tracks import LabelTrack
+from boxreg_ros.review.rules import ERROR, RULES, Violation, violations, WARNING
 from boxreg_ros.structures import BoxArray, Floats, Ints
 import numpy as np
 

@@ -84,11 +84,6 @@ def inspect(args: argparse.Namespace) -> dict[str, Any]:
     """
     Return what is in a recording, as `boxreg inspect --json` prints it.
 
-    Parameters
-    ----------
-    args : Namespace
-        Arguments of the command line.
-
     Raises
     ------
     RecordingError

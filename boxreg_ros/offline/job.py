@@ -153,13 +153,6 @@ def names_of(
 
     The order of the drives does not matter.
 
-    Parameters
-    ----------
-    drives : collection of tuple of Path
-        Recordings of each drive.
-    known : mapping of str to sequence of str
-        As of `jobs_of`.
-
     Raises
     ------
     ConfigError

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.items import Item, ItemSource, not_measured, Stage
+from boxreg_ros.io.items import EVERYTHING, Item, ItemSource, Wanted
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of
@@ -22,13 +22,6 @@ class LabelledRecording(Recording):
 
     `LabelMerger` states their order and their frame.
 
-    Parameters
-    ----------
-    labels : tuple of str and Path
-        Format and files.
-    paths, options
-        As those of `Recording`.
-
     """
 
     has_boxes = False
@@ -38,14 +31,7 @@ class LabelledRecording(Recording):
         self._labels = labels
         self._is_part = any(options.get(name) is not None for name in ('start', 'end'))
 
-    def items(
-        self,
-        tree: TransformTree,
-        *,
-        with_clouds: bool = True,
-        with_intensities: bool = False,
-        stage: Stage = not_measured,
-    ) -> Iterator[Item]:
+    def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
         """
         Yield clouds and boxes; see `Recording.items`.
 
@@ -55,9 +41,8 @@ class LabelledRecording(Recording):
         merger = LabelMerger(
             frames_of(*self._labels), tree, self.sensor_frame(), self.start_ns, self._is_part
         )
-        clouds = super().items(tree, with_intensities=with_intensities, stage=stage)
-        for cloud in clouds:
-            if with_clouds:
+        for cloud in super().items(tree, wanted._replace(clouds=True)):
+            if wanted.clouds:
                 yield cloud
             yield from merger.after(cloud.received_ns, cloud.content.stamp_ns)
         yield from merger.rest()
@@ -69,17 +54,10 @@ class UnlabelledRecording(Recording):
 
     has_boxes = False
 
-    def items(
-        self,
-        tree: TransformTree,
-        *,
-        with_clouds: bool = True,
-        with_intensities: bool = False,
-        stage: Stage = not_measured,
-    ) -> Iterator[Item]:
+    def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
         """Yield clouds and empty arrays; see `Recording.items`."""
-        for cloud in super().items(tree, with_intensities=with_intensities, stage=stage):
-            if with_clouds:
+        for cloud in super().items(tree, wanted._replace(clouds=True)):
+            if wanted.clouds:
                 yield cloud
             sweep = cloud.content
             none = BoxArray(sweep.stamp_ns, sweep.frame_id, (), (), np.zeros(0), np.zeros((0, 9)))

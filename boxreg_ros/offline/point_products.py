@@ -114,19 +114,6 @@ def write_point_products(
     """
     Write the formats and clouds that a request asks for.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the results.
-    request : Request
-        Of the run.
-    sweeps : StoredSweeps
-        Of the recording.
-    labeller : PointLabeller
-        Of the run.
-    fixed_frame : str
-        That of the run.
-
     Returns
     -------
     counts : dict

@@ -15,12 +15,12 @@ from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.structures import Ints
-from boxreg_ros.tracks.track_steps import TrackSteps
+from boxreg_ros.tracks.effects import TrackSteps
 import numpy as np
 
 if TYPE_CHECKING:
     from boxreg_ros.review.changes import TrackChanges
-    from boxreg_ros.review.rules.protocol import Violation
+    from boxreg_ros.review.rules import Violation
     from boxreg_ros.review.tables import TrackRow
     from boxreg_ros.review.track_points import PointCollector
     from boxreg_ros.tracks.complete import CompletionPlan
@@ -64,8 +64,8 @@ def checked(
     tracks: Sequence[TrackChanges], config: Config
 ) -> tuple[dict[str, dict[str, int]], dict[str, list[Violation]]]:
     """Return the number of violations of each rule, ``before`` and ``after``, and those after."""
+    from boxreg_ros.review.label_tracks import LabelTrack
     from boxreg_ros.review.rules import counts, violations
-    from boxreg_ros.review.rules.protocol import LabelTrack
 
     before = []
     after = []

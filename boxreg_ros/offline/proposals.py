@@ -24,17 +24,6 @@ def write_proposals(
     """
     Find objects that no box covers, and write a box of each to `PROPOSALS`.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the results.
-    sweeps : StoredSweeps
-        Of the recording.
-    labeller : PointLabeller
-        Of the run.
-    fixed_frame : str
-        That of the run.
-
     Returns
     -------
     proposals : list of dict

@@ -381,11 +381,6 @@ class ReadAhead:
     """
     Iterate over the items that a `RecordingReader` yields, in another process a few ahead.
 
-    Parameters
-    ----------
-    receive : callable
-        From `reader`.
-
     Attributes
     ----------
     source : Source

@@ -13,7 +13,6 @@ from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem, StoredCloud
 from boxreg_ros.structures import Floats, Sweep
 import numpy as np
 
-
 ALIGNMENT = 16
 """Of arrays in the file [bytes]: numpy and compiled kernels are slower without."""
 

@@ -117,19 +117,7 @@ class SegmentFiles:
 
 
 class Segment:
-    """
-    A segment that is being recorded.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the recording.
-    number : int
-        Number of the segment.
-    settings : mapping of str to str
-        As of `journal_settings`.
-
-    """
+    """A segment that is being recorded."""
 
     def __init__(self, folder: Path, number: int, settings: Mapping[str, str]) -> None:
         self.name = f'segment_{number:06d}'

@@ -15,17 +15,7 @@ from boxreg_ros.structures import Floats
 
 
 class DriveImages:
-    """
-    The images of a recording; it is opened when they are first asked for, and stays open.
-
-    Parameters
-    ----------
-    source : DriveSource
-        The recording.
-    scene : DriveScene
-        Knows the poses of the cameras.
-
-    """
+    """The images of a recording; it is opened when they are first asked for, and stays open."""
 
     def __init__(self, source: DriveSource, scene: DriveScene) -> None:
         self._source = source

@@ -117,17 +117,6 @@ class TrackPart:
     """
     The points and figures of one track, as the report shows them.
 
-    Parameters
-    ----------
-    row : TrackRow
-        The track and its risk.
-    collector : TrackPoints
-        The points of the recording.
-    truth : TrackTruth
-        True boxes of the track.
-    usual : Usual
-        What is usual in the recording.
-
     Attributes
     ----------
     before, after : Quality

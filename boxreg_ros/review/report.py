@@ -32,8 +32,7 @@ from boxreg_ros.review.payload import (
 )
 from boxreg_ros.review.quality import CELL, Quality
 from boxreg_ros.review.risk import Usual
-from boxreg_ros.review.rules import RULES
-from boxreg_ros.review.rules.protocol import Rule, Violation
+from boxreg_ros.review.rules import Rule, RULES, Violation
 from boxreg_ros.review.tables import TrackRow
 from boxreg_ros.review.track_points import PointCollector
 from boxreg_ros.structures import HUMAN, REFINED

@@ -63,11 +63,6 @@ class DriveScene:
 
     They are read in a thread, into a temporary file; who asks for one waits for it.
 
-    Parameters
-    ----------
-    source : DriveSource
-        The recording.
-
     """
 
     def __init__(self, source: DriveSource) -> None:

@@ -32,13 +32,6 @@ class ReportParts:
     The points are those of the report, near the boxes of the track only. A run knows all of them
     and all other tracks: it is what decides.
 
-    Parameters
-    ----------
-    out : Path
-        Result folder: its settings hold.
-    page : bytes
-        The report.
-
     """
 
     def __init__(self, out: Path, page: bytes) -> None:

@@ -45,11 +45,6 @@ class PointCollector:
 
     The recording is read once: points are gathered before the boxes are refined.
 
-    Parameters
-    ----------
-    config : Config
-        Settings of the run.
-
     Attributes
     ----------
     stamps_ns : set of int

@@ -114,15 +114,6 @@ def write_truck(path: Path, scene: TruckScene, layout: str) -> None:
     """
     Write a recording of some LiDARs of the truck.
 
-    Parameters
-    ----------
-    path : Path
-        Ends in ``.mcap``.
-    scene : TruckScene
-        The drive.
-    layout : str
-        One of `TRUCK_SENSORS`.
-
     Raises
     ------
     RecordingError

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from boxreg_ros.cli import main
 from boxreg_ros.datasets import address_of, SceneRecording
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
-from boxreg_ros.io.items import ItemSource
+from boxreg_ros.io.items import EVERYTHING, ItemSource, Wanted
 from boxreg_ros.io.transforms import move_to_frame, TransformTree
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.structures import Sweep
@@ -108,14 +108,14 @@ def source_of(name, root, **options):
     return SceneRecording(address_of(Path(f'{name}:{root}')), **options)
 
 
-def read(source, **options):
+def read(source, wanted=EVERYTHING):
     """Return the sweeps and the boxes of a source in its fixed frame."""
     tree = TransformTree()
     sweeps, boxes = [], []
     with source:
         assert isinstance(source, ItemSource)
         fixed_frame = source.choose_fixed_frame(tree)
-        for item in source.items(tree, **options):
+        for item in source.items(tree, wanted):
             content = item.content
             T_fixed_item = tree.lookup(fixed_frame, content.frame_id, content.stamp_ns)
             moved = move_to_frame(content, T_fixed_item, fixed_frame)
@@ -131,7 +131,7 @@ def read(source, **options):
 def test_clouds_poses_and_boxes_are_those_of_the_drive(tmp_path, name):
     case = CASES[name]
     case.write(tmp_path)
-    sweeps, arrays = read(source_of(name, f'{tmp_path}#{case.scene}'), with_intensities=True)
+    sweeps, arrays = read(source_of(name, f'{tmp_path}#{case.scene}'), Wanted(intensities=True))
     stamps = case.stamps_ns()
     assert [sweep.stamp_ns for sweep in sweeps] == stamps
     for i, sweep in enumerate(sweeps):

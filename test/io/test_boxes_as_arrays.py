@@ -1,6 +1,7 @@
 """Boxes of a recording, read as arrays by a compiled loop: the same as by objects."""
 
 from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.io.items import Wanted
 from boxreg_ros.io.recorded_type import RecordedType
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.record import Record
@@ -26,7 +27,7 @@ FLAWS = {
 
 def arrays_of(recording):
     """Return all box arrays of an open recording."""
-    items = recording.items(TransformTree(), with_clouds=False)
+    items = recording.items(TransformTree(), Wanted(clouds=False))
     return [item.content for item in items if isinstance(item.content, BoxArray)]
 
 
@@ -65,13 +66,13 @@ def test_messages_that_rosbags_refuses_are_left_to_it(tmp_path, flaw):
             recording._decoder.message(bad_record)
 
 
-def test_other_recordings_are_read_by_objects(tmp_path):
+def test_other_recordings_are_read_by_objects(tmp_path, monkeypatch):
     for drive in (Drive(sweeps=2, ros1=True), Drive(sweeps=2, boxes=JSK)):
         storage = 'rosbag1' if drive.messages.ros1 else 'mcap'
         path = drive.write(tmp_path / storage, storage)
         with Recording([path], convention=ASSOCIATE) as recording:
             expected = arrays_of(recording)
-            del recording.typestore.fielddefs['std_msgs/msg/Header']
+            monkeypatch.delitem(recording.typestore.fielddefs, 'std_msgs/msg/Header')
             recording.read_boxes_as_arrays()
             assert recording._array_adapter is None
             assert_same(arrays_of(recording), expected)

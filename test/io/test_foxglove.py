@@ -9,6 +9,7 @@ from boxreg_ros.cli import main
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.foxglove import encoded
+from boxreg_ros.io.items import Wanted
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
 from foxglove_recordings import PointCloud, SceneUpdate, write_foxglove_mcap
@@ -139,7 +140,7 @@ def test_overlay_has_refined_boxes_in_the_same_encoding(tmp_path, encoding):
     overlay = tmp_path / 'out' / 'overlay.mcap'
     table = BoxTable.read(tmp_path / 'out' / 'boxes.csv')
     with Recording([overlay], boxes='/boxes_refined') as recording:
-        found = [item.content for item in recording.items(TransformTree(), with_clouds=False)]
+        found = [item.content for item in recording.items(TransformTree(), Wanted(clouds=False))]
     assert [boxes.stamp_ns for boxes in found] == drive.stamps
     for k, boxes in enumerate(found):  # the LiDAR moves 0.5 m along x per sweep, at z = 2 m
         expected = table.boxes[table.stamps_ns == boxes.stamp_ns] - [0.5 * k, 0, 2, *[0] * 6]

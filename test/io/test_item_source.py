@@ -1,7 +1,7 @@
 """Bags, MCAP files of Foxglove and label files are read through one protocol."""
 
 from boxreg_ros.cli import main
-from boxreg_ros.io.items import ItemSource
+from boxreg_ros.io.items import ItemSource, Wanted
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import move_to_frame, TransformTree
 from boxreg_ros.offline.labelled_recording import LabelledRecording
@@ -75,6 +75,8 @@ def test_each_source_yields_the_same_items(tmp_path, name):
 def test_each_source_may_leave_out_the_clouds(tmp_path, name):
     source = source_of(name, tmp_path)
     with source:
-        kinds = [type(item.content) for item in source.items(TransformTree(), with_clouds=False)]
+        kinds = [
+            type(item.content) for item in source.items(TransformTree(), Wanted(clouds=False))
+        ]
     assert len(kinds) == 6
     assert Sweep not in kinds

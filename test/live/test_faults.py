@@ -19,7 +19,6 @@ from ros_domain import next_domain
 from ros_graph import (
     DIAGNOSTICS,
     ended_cleanly,
-    graph_in,
     numbers_changed,
     play,
     play_in_time,
@@ -35,12 +34,6 @@ from ros_messages import DETECTIONS, Drive, POINTS, SECOND, START
 from std_srvs.srv import Trigger
 
 MARKERS = 'visualization_msgs/msg/MarkerArray'
-
-
-@pytest.fixture
-def graph(tmp_path):
-    with graph_in(tmp_path) as graph:
-        yield graph
 
 
 def shifted(drive, seconds):

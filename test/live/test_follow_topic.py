@@ -10,13 +10,11 @@ from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.simulation.writer import write_recording
 from msg_adapters import vision
 import numpy as np
-import pytest
 from rclpy.serialization import deserialize_message
 from ros_graph import (
     DIAGNOSTICS,
     ended_cleanly,
     Graph,
-    graph_in,
     play,
     publishers_for,
     QUICK,
@@ -29,12 +27,6 @@ from ros_messages import DETECTIONS
 ACTOR = 3
 """A car that drives past with 170 points and more."""
 SWEEPS, BOX_AT, GONE = 31, 2, 8
-
-
-@pytest.fixture
-def graph(tmp_path):
-    with graph_in(tmp_path) as graph:
-        yield graph
 
 
 def without(sweep, owner):

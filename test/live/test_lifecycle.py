@@ -7,7 +7,6 @@ from preloaded import LIFECYCLE_NODE
 import pytest
 from ros_graph import (
     ended_cleanly,
-    graph_in,
     numbers_changed,
     play,
     publishers_for,
@@ -20,12 +19,6 @@ from ros_messages import DETECTIONS, Drive
 
 COMMAND = (LIFECYCLE_NODE,)
 NODE = '/boxreg_node'
-
-
-@pytest.fixture
-def graph(tmp_path):
-    with graph_in(tmp_path) as made:
-        yield made
 
 
 class Manager:

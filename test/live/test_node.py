@@ -26,7 +26,6 @@ from ros_graph import (
     DIAGNOSTICS,
     ended_cleanly,
     Graph,
-    graph_in,
     numbers_changed,
     play,
     publishers_for,
@@ -44,12 +43,6 @@ WITHOUT_TF2_MSGS = (
     'from boxreg_ros.live.main import main\n'
     'sys.exit(main())'
 )
-
-
-@pytest.fixture
-def graph(tmp_path):
-    with graph_in(tmp_path) as graph:
-        yield graph
 
 
 def test_odometry_replaces_tf(graph, tmp_path):
@@ -310,13 +303,24 @@ def wait_for_thirty_early_boxes(graph, early):
     return values_of(diagnostics)
 
 
+SLOW_SOLVER = """
+import sys, time
+from boxreg_ros.core.registrar import BoxRegistrar
+add_sweep = BoxRegistrar.add_sweep
+def slowly(self, sweep):
+    time.sleep(0.1)
+    return add_sweep(self, sweep)
+BoxRegistrar.add_sweep = slowly
+from boxreg_ros.live.main import main
+sys.exit(main())
+"""
+
+
 def test_boxes_that_wait_too_long_are_published_unchanged(graph, tmp_path):
-    # Boxes wait ten times the backlog, 0.3 s. Each stamp takes a tenth of a second to solve by
-    # the paper's objective, while the boxes after it wait.
+    # Boxes wait ten times the backlog, 0.3 s. Each stamp takes a tenth of a second to solve,
+    # while the boxes after it wait.
     drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
-    slow = ['objective:=paper', 'paper.multiplier_rounds:=5', 'paper.iterations:=100']
-    options = [part for text in (*slow, 'backlog:=0.03') for part in ('-p', text)]
-    node = graph.start(*RELIABLE, *options)
+    node = graph.start(*RELIABLE, '-p', 'backlog:=0.03', command=(CODE, SLOW_SOLVER))
     graph.wait_until_connected()
     first = 1 + [record.boxes_stamp_ns for record in records].index(drive.stamps[3])
     play(graph, records[:first], early)
@@ -404,7 +408,7 @@ def test_busy_solver_delays_neither_diagnostics_nor_shutdown(graph, tmp_path):
     early = graph.collect(DETECTIONS, '/refined_boxes')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     # The paper's objective is minimised by torch: some tenths of a second for each box array.
-    slow = ['objective:=paper', 'paper.iterations:=300', 'window:=30']
+    slow = ['objective:=paper', 'paper.iterations:=100', 'window:=30']
     options = [part for text in (*slow, 'backlog:=60.0', 'queue:=100') for part in ('-p', text)]
     node = graph.start(*RELIABLE, *options)
     graph.wait_until_connected()

@@ -5,12 +5,10 @@ from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.simulation.writer import write_recording
 from msg_adapters import pointcloud
 import numpy as np
-import pytest
 from ros_graph import (
     DIAGNOSTICS,
     ended_cleanly,
     Graph,
-    graph_in,
     play,
     publishers_for,
     QUICK,
@@ -24,12 +22,6 @@ from ros_messages import DETECTIONS
 POINTS = 'sensor_msgs/msg/PointCloud2'
 SWEEPS, WITHOUT_BOXES = 10, 2
 STATIC = ('-p', 'static_points:=true', '-p', 'static_points_wait:=3.0')
-
-
-@pytest.fixture
-def graph(tmp_path):
-    with graph_in(tmp_path) as graph:
-        yield graph
 
 
 def test_static_points(graph: Graph, tmp_path):

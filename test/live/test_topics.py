@@ -9,7 +9,6 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 from ros_graph import (
     DIAGNOSTICS,
     ended_cleanly,
-    graph_in,
     play,
     publishers_for,
     QUICK,
@@ -20,12 +19,6 @@ from ros_graph import (
 from ros_messages import DETECTIONS, Drive, MARKERS, POINTS
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-@pytest.fixture
-def graph(tmp_path):
-    with graph_in(tmp_path) as graph:
-        yield graph
 
 
 def topics_status(diagnostics):

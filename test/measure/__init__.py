@@ -1,8 +1,8 @@
 """Measurements for the pages of results; users have those of `boxreg bench`."""
 
 import argparse
-from functools import partial
 from importlib import import_module
+import json
 from pathlib import Path
 import sys
 
@@ -28,11 +28,40 @@ MEASUREMENTS = {
     'kills': 'loss of recorded labels when a process is killed',
     'renew': 'run the command of each stored measurement again, and store its output',
 }
-"""Modules of this package, each with `add_arguments` and `run`, and their summaries."""
+"""Modules of this package, each with `ARGUMENTS` and `run`, and their summaries."""
+METAVARS = {int: 'N', float: 'S', Path: 'DATA'}
+"""Of arguments by type, where they state no other."""
 PROGRAM = 'python test/measure'
 MEASURE = (sys.executable, str(Path(__file__).parent))
 """The command in a process of its own, of this environment."""
-print_json = partial(common.print_json, program=PROGRAM)
+
+
+def add_arguments(parser, arguments):
+    """
+    Declare arguments of a measurement.
+
+    Each has a default, or its type where there is none; a help text, and further keywords of
+    argparse; or a function that declares it.
+
+    """
+    for name, stated in arguments.items():
+        if callable(stated):
+            stated(parser)
+            continue
+        default, text, *more = stated
+        if default is False:
+            parser.add_argument(name, action='store_true', help=text)
+            continue
+        keywords = dict(*more)
+        if isinstance(default, type):
+            kind = default
+        else:
+            kind = type((default or [0])[0]) if isinstance(default, list) else type(default)
+            text, keywords['default'] = f'{text} (default: %(default)s)'.strip(), default
+        if 'action' not in keywords:
+            keywords['type'] = kind
+        keywords.setdefault('metavar', METAVARS.get(kind))
+        parser.add_argument(name, help=text, **keywords)
 
 
 def main(words: list[str]) -> int:
@@ -44,12 +73,20 @@ def main(words: list[str]) -> int:
         return 0 if name in ('-h', '--help') else 2
     module = import_module(f'measure.{name}')
     parser = argparse.ArgumentParser(f'{PROGRAM} {name}', description=f'{MEASUREMENTS[name]}.')
-    module.add_arguments(parser)
+    add_arguments(parser, module.ARGUMENTS)
+    common.add_json_argument(parser)
     args = parser.parse_args(options)
     keep_freed_memory()
     collect_rarely()
     try:
-        return int(module.run(args))
+        results = module.run(args)
     except BoxregError as error:
         print(f'{PROGRAM} {name}: {error}', file=sys.stderr)
         return 1
+    if results is None:
+        return 0
+    if args.json:
+        common.print_json(results, PROGRAM)
+    else:
+        print(json.dumps(common.finite(results), indent=2))
+    return 0

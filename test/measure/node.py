@@ -23,11 +23,11 @@ from threading import Thread
 import time
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, BOXREG
+from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.errors import BoxregError, ConfigError
 from boxreg_ros.labels import module_of
 from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
-from measure import MEASURE, print_json
+from measure import MEASURE
 from measure.recorded import RecordedLabels
 import numpy as np
 from paths import SHARE
@@ -49,52 +49,29 @@ RECORDING_TURNS = 2  # runs without and with recording
 SETTLED_AFTER = 60.0  # queues, pools of memory and the heap have their size by then [s]
 LAST_TIME = 30.0  # wait for the last messages, on a busy machine [s]
 SAMPLE_PERIOD = 1.0  # of memory, handles, threads and CPU time of the node [s]
+ARGUMENTS = {
+    '--tracks': (64, ''),
+    '--points': (130000, 'per sweep'),
+    '--rate': (10.0, 'rate of the sensor [Hz]'),
+    '--seconds': (60.0, 'seconds of data'),
+    '--delay': (0.05, 'delay of the boxes after their cloud'),
+    '--transport': (
+        'large',
+        'shared memory of share/fastdds.xml',
+        {'choices': ('large', 'default')},
+    ),
+    '--set': ([], 'parameter of the node', {'metavar': 'KEY:=VALUE', 'action': 'append'}),
+    '--record': (str, 'formats: also record labels in them, with their clouds'),
+    '--compare': (False, 'alternate runs without and with --record, and divide their latencies'),
+    '--keep-gigabytes': (float('inf'), 'delete the oldest segments beyond, once counted [GB]'),
+    '--role': (str, argparse.SUPPRESS, {'choices': ('publish',)}),
+    '--log': (Path, argparse.SUPPRESS),
+}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `measure node`."""
-    parser.add_argument('--tracks', type=int, default=64, metavar='N', help='default: 64')
-    parser.add_argument(
-        '--points', type=int, default=130_000, metavar='N', help='per sweep (default: 130000)'
-    )
-    parser.add_argument(
-        '--rate', type=float, default=10.0, metavar='HZ', help='rate of the sensor (default: 10)'
-    )
-    parser.add_argument(
-        '--seconds', type=float, default=60.0, metavar='S', help='seconds of data (default: 60)'
-    )
-    parser.add_argument(
-        '--delay', type=float, default=0.05, metavar='S',
-        help='delay of the boxes after their cloud (default: 0.05)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--transport', choices=('large', 'default'), default='large',
-        help='large: shared memory sized for clouds (share/fastdds.xml); default: that of DDS',
-    )  # fmt: skip
-    parser.add_argument(
-        '--set', action='append', default=[], metavar='KEY:=VALUE', help='parameter of the node'
-    )
-    parser.add_argument(
-        '--record', metavar='FORMAT,...',
-        help='also record labels in these formats, with their clouds',
-    )  # fmt: skip
-    parser.add_argument(
-        '--compare', action='store_true',
-        help='alternate runs without and with --record, and divide their latencies',
-    )  # fmt: skip
-    parser.add_argument(
-        '--keep-gigabytes', type=float, default=float('inf'), metavar='N',
-        help='delete the oldest recorded segments beyond N GB, after they were counted (default: '
-        'none)',
-    )  # fmt: skip
-    add_json_argument(parser)
-    parser.add_argument('--role', choices=('publish',), help=argparse.SUPPRESS)
-    parser.add_argument('--log', type=Path, help=argparse.SUPPRESS)
-
-
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> object:
     """
-    Measure and print.
+    Return what was measured; a process with a role returns nothing.
 
     Raises
     ------
@@ -107,18 +84,10 @@ def run(args: argparse.Namespace) -> int:
     except ImportError as error:
         raise BoxregError(f'{error}: source a ROS 2 installation') from None
     if args.role:
-        publish(args)
-        return 0
+        return publish(args)
     if args.compare and args.record is None:
         raise ConfigError('--compare: expected --record with formats, got none; add it')
-    report = compare(args) if args.compare else measure(args)
-    if args.json:
-        print_json(report)
-        return 0
-    for name, value in report.items():
-        text = value if isinstance(value, (str, dict)) else f'{value:g}'
-        print(f'{name:28} {text}')
-    return 0
+    return compare(args) if args.compare else measure(args)
 
 
 # ---------------------------------------------------------------- process of the publisher

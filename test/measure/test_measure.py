@@ -30,20 +30,11 @@ def drive():
 @pytest.mark.parametrize('name', measure.MEASUREMENTS)
 def test_every_measurement_declares_options(name):
     parser = argparse.ArgumentParser()
-    import_module(f'measure.{name}').add_arguments(parser)
-    without_data = (
-        'highway',
-        'kills',
-        'lidars',
-        'load',
-        'node',
-        'report',
-        'kinds',
-        'points',
-        'labeller',
-    )
-    needs_data = name not in without_data
-    parser.parse_args(['folder'] if needs_data else [])
+    measure.add_arguments(parser, import_module(f'measure.{name}').ARGUMENTS)
+    is_simulated = name in (
+        'highway', 'kills', 'lidars', 'load', 'node', 'report', 'kinds', 'points', 'labeller',
+    )  # fmt: skip
+    parser.parse_args([] if is_simulated else ['folder'])
 
 
 def test_a_stored_measurement_is_renewed_by_its_command(tmp_path, monkeypatch, capfd):

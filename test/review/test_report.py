@@ -20,8 +20,7 @@ from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.quality import quality
 from boxreg_ros.review.report import write_report
-from boxreg_ros.review.rules import RULES
-from boxreg_ros.review.rules.protocol import Violation
+from boxreg_ros.review.rules import RULES, Violation
 from boxreg_ros.review.tables import assessed
 from boxreg_ros.review.track_points import PointCollector
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle

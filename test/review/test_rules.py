@@ -1,8 +1,8 @@
 """Rules on labels, each with labels of one known fault."""
 
 from boxreg_ros.config import Config
-from boxreg_ros.review.rules import counts, RULES, violations
-from boxreg_ros.review.rules.protocol import ERROR, LabelTrack, WARNING
+from boxreg_ros.review.label_tracks import LabelTrack
+from boxreg_ros.review.rules import counts, ERROR, RULES, violations, WARNING
 import numpy as np
 import pytest
 

@@ -24,25 +24,14 @@ MESSAGE_MARKS = ('__msgtype__', 'DESCRIPTOR', 'get_fields_and_field_types')
 """Class attributes of messages: of rosbags, of protobuf, of rclpy."""
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 """Begin of a message that rosbag2 has compressed; CDR begins with 0 and 0 to 3."""
-KEPT_TYPESTORES = 8
-"""
-Recordings whose types are kept, by their definitions.
-
-A recording is opened several times: to find the latency of its boxes, to read it, to copy it.
-Parsing the definitions and compiling the decoders takes six times as long as the rest.
-
-"""
 IDL_SEPARATOR = '=' * 80 + '\n'
+Definitions = tuple[tuple[str, MessageDefinition], ...]
+"""Names of types and their definitions; code is made of them for 50 ms."""
 
 
 class Reader:
     """
     Read the files of a recording as one.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Files of each path.
 
     Attributes
     ----------
@@ -74,14 +63,18 @@ class Reader:
                 raise RecordingError(
                     'recordings of ROS 1 and ROS 2 cannot be merged; relabel them one by one'
                 )
-            self.typestore = _typestore(
-                tuple((connection.msgdef, connection.msgtype) for connection in self.connections)
-            )
+            self.typestore = _typestore(_definitions(self.connections))
             self._opened = stack.pop_all()
 
     def close(self) -> None:
         """Close all files."""
         self._opened.close()
+
+    def complete_definitions(self, stock: Typestore) -> None:
+        """Add the definitions of `stock` that the recording does not have."""
+        own = _typestore.__wrapped__(_definitions(self.connections))  # not that of other readers
+        own.register({k: v for k, v in stock.fielddefs.items() if k not in own.fielddefs})
+        self.typestore = own
 
     @property
     def damages(self) -> list[Damage]:
@@ -174,10 +167,14 @@ def _encoding(connection: Connection) -> str:
     return getattr(connection.ext, 'serialization_format', 'ros1')
 
 
-@lru_cache(KEPT_TYPESTORES)
-def _typestore(definitions: tuple[tuple[MessageDefinition, str], ...]) -> Typestore:
+def _definitions(connections: Sequence[Connection]) -> Definitions:
+    return tuple((connection.msgtype, connection.msgdef) for connection in connections)
+
+
+@lru_cache(maxsize=8)
+def _typestore(definitions: Definitions) -> Typestore:
     """
-    Return the types of message definitions and their names; the same for the same definitions.
+    Return a store of message definitions, which readers of a recording share.
 
     A definition that cannot be parsed is left out: messages of its type are unreadable then,
     unless the type is among the stock definitions.
@@ -185,7 +182,7 @@ def _typestore(definitions: tuple[tuple[MessageDefinition, str], ...]) -> Typest
     """
     store = get_typestore(Stores.EMPTY)
     found: dict[str, Any] = {}
-    for definition, name in definitions:
+    for name, definition in definitions:
         try:
             found.update(_types_of(definition, name))
         except Exception:  # of the parsers, for any malformed definition

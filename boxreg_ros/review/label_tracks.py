@@ -1,8 +1,8 @@
-"""The protocol of the rules, and the labels that they read."""
+"""The labels that rules read: the boxes of tracks, their steps, and the pairs in one place."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -12,8 +12,6 @@ from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, Ints, is_valid_box, X
 import numpy as np
 
-ERROR = 'error'
-WARNING = 'warning'
 VEHICLE, CYCLIST, PEDESTRIAN = 'vehicle', 'cyclist', 'pedestrian'
 MAX_STEP = 1.0
 """Rates of change are not computed across longer gaps [s]."""
@@ -123,48 +121,6 @@ class Labels(tuple[LabelTrack, ...]):
     def near_pairs(self) -> Pairs:
         """Return the pairs of boxes whose bounding spheres intersect."""
         return _near_pairs(self)
-
-
-class Violation(NamedTuple):
-    """
-    A place where labels violate a rule.
-
-    Attributes
-    ----------
-    track_id : str
-        The track.
-    stamp_ns : int
-        The stamp [ns].
-    text : str
-        What was found, with its figures.
-
-    """
-
-    track_id: str
-    stamp_ns: int
-    text: str
-
-
-class Rule(NamedTuple):
-    """
-    A rule that labels should keep.
-
-    Attributes
-    ----------
-    rule_id, severity : str
-        Name, and `ERROR` or `WARNING`.
-    meaning, remedy : str
-        What is wrong, and what to do.
-    find : callable
-        Yields the violations of tracks; at most one per track and kind of finding.
-
-    """
-
-    rule_id: str
-    severity: str
-    meaning: str
-    remedy: str
-    find: Callable[[Labels], Iterator[Violation]]
 
 
 def _near_pairs(tracks: Sequence[LabelTrack]) -> Pairs:
