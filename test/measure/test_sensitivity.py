@@ -37,7 +37,7 @@ def test_constants_are_those_that_are_no_settings():
 def test_settings_stay_within_their_bounds():
     found = variations_of_settings(Config(), ['vehicle'])
     names = {item.name for item in found}
-    assert {'vehicle.position', 'solver.tolerance', 'faces.ends', 'window'} <= names
+    assert {'vehicle.position', 'faces.ends', 'window'} <= names
     assert not [name for name in names if name.startswith(('paper.', 'cyclist.'))]
     assert 'faces.learn' not in names  # a switch
     assert 'vehicle.gap_bottom' not in names  # 0 times anything is 0
