@@ -3,9 +3,9 @@
 
 The boxes given are true ones with the error of a person. One box: the first with
 `MIN_SEED_RETURNS`, and every later box counts; of the size of its class, its corner nearest to the
-sensor stays. Two: the first and the last with so many, and keyframes: all boxes between the first
-and the last that are given count. Turning objects are those of the row above that turn by
-`TURN`. In `all boxes` the boxes of a person at every stamp are registered.
+sensor stays. Two: the first and the last with so many, and keyframes: all boxes from the first to
+the last that are given count, and these too. Turning objects are those of the row above that turn
+by `TURN`. In `all boxes` the boxes of a person at every stamp are registered.
 
 """
 
@@ -149,8 +149,9 @@ def _given(drive: Drive, case: str, seed: int, is_exact: bool) -> Iterator[Given
             chosen = np.unique(seen[[0, -1]] if case == TWO and len(seen) else seen[:1])
         if not len(chosen):
             continue
-        last = len(rows) if case in (ONE, ONE_OF_CLASS) else chosen[-1]
-        counted = np.setdiff1d(np.arange(chosen[0] + 1, last), chosen)
+        counted = np.arange(chosen[0], chosen[-1] + 1)
+        if case in (ONE, ONE_OF_CLASS):
+            counted = np.arange(chosen[0] + 1, len(rows))
         boxes = truth.boxes[rows[chosen]]
         if not is_exact:
             boxes = _of_a_person(boxes, rng)

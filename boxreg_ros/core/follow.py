@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.following import person
 from boxreg_ros.core.following.between import between
 from boxreg_ros.core.following.sweeps import ascending, nearest, Points, Sweeps
 from boxreg_ros.core.following.tracker import (
@@ -19,7 +20,7 @@ from boxreg_ros.core.following.tracker import (
     Way,
 )
 from boxreg_ros.core.observation import GOOD_POINTS, NEARBY
-from boxreg_ros.core.refine import refine, Track
+from boxreg_ros.core.refine import RefinedTrack, registered, Track
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import (
@@ -33,12 +34,16 @@ from boxreg_ros.structures import (
     Ints,
     is_valid_box,
     LENGTH,
+    REFINED,
     ROLL,
     WIDTH,
     YAW,
 )
 import numpy as np
 from numpy.typing import NDArray
+
+MIN_SEEDS_OF_SAMPLE = 3
+"""Tracks with fewer seeds follow them, and show no deviation of theirs; chosen."""
 
 
 class End(NamedTuple):
@@ -328,27 +333,70 @@ def solved(
     origins: Floats | None,
 ) -> list[FollowedTrack]:
     """Return the tracks refined, the seeds as boxes of a person that evidence may move."""
-    given = [
-        Track(
-            track.track_id,
-            track.class_name,
-            track.stamps_ns,
-            track.boxes,
-            [_nearby(points[row], box) for row, box in zip(track.rows, track.boxes, strict=True)],
-            None if origins is None else origins[track.rows],
-            pinned=np.array([word == HUMAN for word in track.status], bool),
+    usual = keyframe_deviations(tracks, points, config, origins)
+    given = [_track(track, points, origins) for track in tracks if len(track.rows)]
+    found = registered(given, config, person.numbers(usual))
+    fits = [_fits(*pair) for pair in zip(given, found, strict=True)]
+    steps = np.zeros((0, 9))
+    if fits:
+        keys, solved_keys, spread = map(np.concatenate, zip(*fits, strict=True))
+        steps = person.corrections(keys, solved_keys, spread, usual)
+    boxes = {}
+    for track, refined in zip(given, found, strict=True):
+        keys = track.stamps_ns[_is_fit(track, refined)]
+        boxes[track.track_id] = person.moved(
+            track.stamps_ns, refined.boxes, keys, steps[: len(keys)]
         )
-        for track in tracks
-        if len(track.rows)
-    ]
-    refined = {track.track_id: track.boxes for track in refine(given, config)}
-    return [
-        FollowedTrack(
-            track.track_id, track.class_name, track.rows, track.stamps_ns,
-            refined.get(track.track_id, track.boxes), track.status, track.ends, track.problems,
-        )
-        for track in tracks
-    ]  # fmt: skip
+        steps = steps[len(keys) :]
+    return [replace(track, boxes=boxes.get(track.track_id, track.boxes)) for track in tracks]
+
+
+def keyframe_deviations(
+    tracks: Sequence[FollowedTrack], points: Points, config: Config, origins: Floats | None
+) -> Floats:
+    """Return the deviations (9,) of keyframes: the usual ones, or larger ones that some show."""
+    some, count = [], 0
+    for track in tracks:
+        seeds = track.status.count(HUMAN)
+        if count < person.SAMPLE and seeds >= MIN_SEEDS_OF_SAMPLE:
+            some.append(_track(track, points, origins))
+            count += seeds
+    usual = person.DEVIATIONS
+    if count < person.MIN_KEYFRAMES:
+        return usual
+    found = registered(some, config, person.numbers(usual))
+    fits = [_fits(*pair) for pair in zip(some, found, strict=True)]
+    keys, solved_keys, spread = map(np.concatenate, zip(*fits, strict=True))
+    larger: Floats = np.maximum(person.shown(keys, solved_keys, spread, usual), usual)
+    return larger
+
+
+def _is_fit(track: Track, refined: RefinedTrack) -> NDArray[np.bool_]:
+    """Return which boxes (N,) of a track are seeds that were refined."""
+    assert track.pinned is not None
+    is_refined = np.array([word == REFINED for word in refined.status], bool)
+    return np.asarray(track.pinned & is_refined, bool)
+
+
+def _fits(track: Track, refined: RefinedTrack) -> tuple[Floats, Floats, Floats]:
+    """Return the seeds (n, 9) of a track, their fits, and the variances of these."""
+    rows = _is_fit(track, refined)
+    spread = person.diagonals(refined.covariances[rows], refined.extent_covariances[rows])
+    return track.boxes[rows], refined.boxes[rows], spread
+
+
+def _track(track: FollowedTrack, points: Points, origins: Floats | None) -> Track:
+    """Return a track to be refined, with the points near its boxes."""
+    near = [_nearby(points[row], box) for row, box in zip(track.rows, track.boxes, strict=True)]
+    return Track(
+        track.track_id,
+        track.class_name,
+        track.stamps_ns,
+        track.boxes,
+        near,
+        None if origins is None else origins[track.rows],
+        pinned=np.array([word == HUMAN for word in track.status], bool),
+    )
 
 
 def _nearby(points: NDArray[np.floating], box: Floats) -> NDArray[np.floating]:

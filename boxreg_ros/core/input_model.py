@@ -71,6 +71,8 @@ class InputModel:
         Expected insets, and whether margins are estimated.
     drives : Drives, optional
         Of the same detector and labelling rule: their tracks count as those of this stream.
+    numbers : Constants, optional
+        Of the method, if others than the usual ones.
 
     Attributes
     ----------
@@ -79,8 +81,13 @@ class InputModel:
 
     """
 
-    def __init__(self, config: FaceConfig, drives: Drives | None = None) -> None:
-        self.constants = constants.CONSTANTS
+    def __init__(
+        self,
+        config: FaceConfig,
+        drives: Drives | None = None,
+        numbers: constants.Constants | None = None,
+    ) -> None:
+        self.constants = numbers or constants.CONSTANTS
         self._estimates_margins = config.learn
         self._occlusion_insets = (config.inset_ends, config.inset_sides, 0.0, 0.0)
         # Of each track of each kind: what it shows, and its last input residuals.

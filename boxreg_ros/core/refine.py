@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import ConfigError, ShapeError
 from boxreg_ros.reasons import Reason
@@ -211,6 +212,16 @@ def refine(tracks: Iterable[Track], config: Config | None = None) -> list[Refine
         config = Config()
     if not isinstance(config, Config):
         raise ConfigError(f'config: expected a Config, got {config!r}; see Config.from_dict')
+    return [
+        _with_pins(track, refined)
+        for track, refined in zip(tracks, registered(tracks, config), strict=True)
+    ]
+
+
+def registered(
+    tracks: Sequence[Track], config: Config, constants: Constants | None = None
+) -> list[RefinedTrack]:
+    """Refine tracks as `refine`, but pinned boxes as well; `constants` as of `BoxRegistrar`."""
     names = [track.track_id for track in tracks]
     if len(set(names)) < len(names):
         raise ShapeError(f'tracks: expected different track ids, got {sorted(map(str, names))}')
@@ -219,7 +230,9 @@ def refine(tracks: Iterable[Track], config: Config | None = None) -> list[Refine
         for row, stamp_ns in enumerate(track.stamps_ns.tolist()):
             places.setdefault(stamp_ns, []).append(_Place(index, row))
 
-    registrar = BoxRegistrar(replace(config, tolerance=0.0), has_whole_sweeps=False)
+    registrar = BoxRegistrar(
+        replace(config, tolerance=0.0), has_whole_sweeps=False, constants=constants
+    )
     results: list[RefinedBoxes] = []
     for stamp_ns in sorted(places):
         results += registrar.add_sweep(_sweep(stamp_ns, tracks, places[stamp_ns]))
@@ -283,11 +296,18 @@ def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> Refine
         )
         for row in np.flatnonzero(~is_valid):
             status[row] = INTERPOLATED
-    for row in np.flatnonzero(track.pinned) if track.pinned is not None else ():
-        boxes[row] = track.boxes[row]
-        status[row], reasons[row] = HUMAN, ''
     columns = tuple(status), tuple(reasons), covariances, extents
     return RefinedTrack(track.track_id, boxes, *columns)
+
+
+def _with_pins(track: Track, refined: RefinedTrack) -> RefinedTrack:
+    """Return a refined track with the pinned boxes as they were given."""
+    if track.pinned is None:
+        return refined
+    status = np.where(track.pinned, HUMAN, refined.status).tolist()
+    reasons = np.where(track.pinned, '', refined.reasons).tolist()
+    boxes = np.where(track.pinned[:, None], track.boxes, refined.boxes)
+    return replace(refined, boxes=boxes, status=tuple(status), reasons=tuple(reasons))
 
 
 def _interpolated(stamps_ns: Ints, boxes: Floats, wanted_ns: Ints) -> Floats:

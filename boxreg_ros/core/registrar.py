@@ -16,6 +16,7 @@ from boxreg_ros.core.following.stream import FollowedObjects
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_statistics import Drives
 from boxreg_ros.core.matching import Pair, StampMatcher
+from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.pending import BoxToObserve, ObservedTrack, PendingArray, PendingBox
 from boxreg_ros.core.problem import SETTINGS_OF
@@ -73,6 +74,8 @@ class BoxRegistrar:
     has_whole_sweeps : bool
         Whether sweeps have all points of the LiDAR. Points near objects alone are no evidence of
         its field of view.
+    constants : Constants, optional
+        Numbers of the method, if others than the usual ones, as for the boxes of a person.
 
     Attributes
     ----------
@@ -130,6 +133,7 @@ class BoxRegistrar:
         budget: Budget | None = None,
         drives: Drives | None = None,
         has_whole_sweeps: bool = True,
+        constants: Constants | None = None,
     ) -> None:
         self.config = config
         self.counts: Counter[str] = Counter()
@@ -137,13 +141,14 @@ class BoxRegistrar:
         self._budget = budget
         self._drives = drives
         self._has_whole_sweeps = has_whole_sweeps
+        self._constants = constants
         self.reset()
 
     def reset(self) -> None:
         """Discard tracks and box arrays that are held; keep the counts."""
         config = self.config
         self._matcher = StampMatcher(config, self.counts)
-        self._input_model = InputModel(config.faces, self._drives)
+        self._input_model = InputModel(config.faces, self._drives, self._constants)
         self.box_time = BoxTimeEvidence()
         self._view = FieldOfView() if self._has_whole_sweeps else None
         self.followed = FollowedObjects(config)

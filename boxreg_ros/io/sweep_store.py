@@ -29,6 +29,7 @@ class SweepStore:
     def __init__(self) -> None:
         self.stamps_ns: list[int] = []
         self.origin: Floats | None = None
+        self._origins: list[Floats] = []
         self._file = TemporaryFile()  # noqa: SIM115  closed with the store
         self._ends = [0]
         self._map: mmap.mmap | None = None
@@ -41,9 +42,16 @@ class SweepStore:
         if self.origin is None:
             self.origin = np.round(points[0]).astype(float) if len(points) else np.zeros(3)
         self.stamps_ns.append(sweep.stamp_ns)
+        origin = sweep.origin if sweep.origins is None else np.full(3, np.nan)
+        self._origins.append(origin - self.origin)
         relative = ascending((points - self.origin).astype(np.float32))
         self._file.write(relative.tobytes())
         self._ends.append(self._ends[-1] + len(relative))
+
+    @property
+    def sensor_origins(self) -> Floats:
+        """Return the position of the sensor of each sweep, as the points; NaN for several."""
+        return np.array(self._origins).reshape(-1, 3)
 
     def __len__(self) -> int:
         """Return the number of sweeps."""

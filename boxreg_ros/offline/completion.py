@@ -26,7 +26,7 @@ from boxreg_ros.structures import (
     Sweep,
 )
 from boxreg_ros.tracks.complete import complete, CompletionPlan
-from boxreg_ros.tracks.followed import closed_onto_exact
+from boxreg_ros.tracks.followed import with_evidence
 from boxreg_ros.tracks.track_steps import TrackSteps
 import numpy as np
 
@@ -198,14 +198,16 @@ class Completion:
         From the first pass over the same items.
     config : Config
         Settings.
-    has_keyframes : bool
-        Whether the input is of a person.
+    deviations : array, shape (9,), optional
+        Of the boxes, where the input is of a person, see `person.numbers`.
 
     """
 
-    def __init__(self, plan: CompletionPlan, config: Config, has_keyframes: bool = False) -> None:
+    def __init__(
+        self, plan: CompletionPlan, config: Config, deviations: Floats | None = None
+    ) -> None:
         self._plan = plan
-        self._has_keyframes = has_keyframes
+        self._deviations = deviations
         self._is_early = config.estimate == 'early'
         self._counter = PointCounter(config)
         self._given: list[BoxArray] = []
@@ -243,14 +245,14 @@ class Completion:
         points = [self._counter.of(array) for array in self._to_register]
         registered = [self._results[index] for index in range(len(self._given))]
         results = self._plan.finished(self._given, registered, points)
-        if not self._has_keyframes:
+        if self._deviations is None:
             return results
         pairs = zip(self._given, self._to_register, strict=True)
         keyframes = [
             replace(given, boxes=registered.boxes[: len(given.track_ids)])
             for given, registered in pairs
         ]  # none of them is rejected
-        return closed_onto_exact(keyframes, results)
+        return with_evidence(keyframes, results, self._deviations)
 
 
 def completed(

@@ -7,12 +7,18 @@ from dataclasses import replace
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.follow import End, follow_points, FollowedTrack
+from boxreg_ros.core.follow import (
+    End,
+    follow_points,
+    FollowedTrack,
+    keyframe_deviations,
+)
+from boxreg_ros.core.following.person import DEVIATIONS
 from boxreg_ros.io.sweep_store import SweepStore
 from boxreg_ros.offline.completion import Moved
 from boxreg_ros.offline.every_sweep import Arrivals
 from boxreg_ros.review.corrections import Corrections
-from boxreg_ros.structures import BoxArray, Sweep
+from boxreg_ros.structures import BoxArray, Floats, Sweep
 from boxreg_ros.tracks.complete import CompletionPlan
 from boxreg_ros.tracks.followed import followed_plan
 import numpy as np
@@ -20,7 +26,7 @@ import numpy as np
 
 def keyframes(
     items: Iterable[tuple[Moved, bool]], fixed_frame: str, config: Config
-) -> tuple[CompletionPlan, list[Arrivals], list[FollowedTrack]]:
+) -> tuple[CompletionPlan, list[Arrivals], list[FollowedTrack], Floats]:
     """
     Follow the boxes of a recording through its sweeps.
 
@@ -41,17 +47,23 @@ def keyframes(
         Of the recording between time jumps.
     tracks : list of FollowedTrack
         Of all parts.
+    deviations : array, shape (9,)
+        Of the keyframes, see `person.DEVIATIONS`.
 
     """
     stores: list[SweepStore] = []
     parts = arrivals(stored(items, stores))
     plan = CompletionPlan([], [])
     tracks: list[FollowedTrack] = []
+    deviations = DEVIATIONS
     for part, store in zip(parts, stores, strict=True):
         found = followed(part.arrays, store, config)
         plan.append(followed_plan(part.completed(fixed_frame), found))
         tracks += found
-    return plan, parts, tracks
+        own = [replace(track, boxes=_from_store(track.boxes, store, -1)) for track in found]
+        of_part = keyframe_deviations(own, store, config, store.sensor_origins)
+        deviations = np.maximum(deviations, of_part)
+    return plan, parts, tracks, deviations
 
 
 def stored(items: Iterable[tuple[Moved, bool]], stores: list[SweepStore]) -> Iterator[Any]:
@@ -129,11 +141,16 @@ def followed(arrays: Sequence[BoxArray], store: SweepStore, config: Config) -> l
     """Return the tracks of keyframes, in the fixed frame."""
     if not len(store) or not arrays:
         return []
-    assert store.origin is not None
-    offset = np.append(store.origin, np.zeros(6))
-    seeds = [replace(array, boxes=array.boxes - offset) for array in arrays]
+    seeds = [replace(array, boxes=_from_store(array.boxes, store, -1)) for array in arrays]
     found = follow_points(np.array(store.stamps_ns, np.int64), store, seeds, config)
-    return [replace(track, boxes=track.boxes + offset) for track in found]
+    return [replace(track, boxes=_from_store(track.boxes, store)) for track in found]
+
+
+def _from_store(boxes: Floats, store: SweepStore, sign: int = 1) -> Floats:
+    """Return boxes (N, 9) moved from the frame of a store, or into it."""
+    found = boxes.copy()
+    found[:, :3] += sign * (np.zeros(3) if store.origin is None else store.origin)
+    return found
 
 
 def ends_of(tracks: Sequence[FollowedTrack]) -> list[dict[str, Any]]:

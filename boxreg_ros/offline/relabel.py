@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from boxreg_ros.core.follow import FollowedTrack
     from boxreg_ros.core.input_statistics import Drives
     from boxreg_ros.core.latency import Latency
+    from boxreg_ros.core.method.constants import Constants
     from boxreg_ros.core.registrar import BoxRegistrar, Submit
     from boxreg_ros.io.sweep_store import SweepStore
     from boxreg_ros.offline.completion import Completion, Moved
@@ -111,7 +112,12 @@ def relabel(
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.announce)
         )
-        registrar = BoxRegistrar(request.config, _journaled(submit, journal), drives=drives)
+        registrar = BoxRegistrar(
+            request.config,
+            _journaled(submit, journal),
+            drives=drives,
+            constants=None if survey is None else survey.constants,
+        )
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock, corrections) as sink:
                 _register(recording, registrar, survey, sink, clock, shown)
@@ -223,6 +229,7 @@ class _Survey(NamedTuple):
     parts: list[Arrivals]
     ends: list[dict[str, Any]]
     latency: Latency
+    constants: Constants | None
 
 
 def _corrections(request: Request) -> Corrections:
@@ -242,6 +249,7 @@ def _survey(
         return None
     with ExitStack() as workers:
         receive = workers.enter_context(reader(request))
+        from boxreg_ros.core.following.person import numbers
         from boxreg_ros.offline.completion import Completion, first_pass
         from boxreg_ros.offline.keyframes import (
             add_objects,
@@ -262,9 +270,10 @@ def _survey(
         stores: list[SweepStore] = []
         items = stored(moved, stores) if corrections.adds else moved
         tracks: list[FollowedTrack] = []
+        deviations = None
         if request.keyframes:
             with clock('follow'):
-                plan, parts, tracks = keyframes(items, fixed_frame, request.config)
+                plan, parts, tracks, deviations = keyframes(items, fixed_frame, request.config)
         elif request.completes:
             from boxreg_ros.offline.registration_worker import registration_worker
 
@@ -283,8 +292,10 @@ def _survey(
                 tracks += add_objects(
                     plan, parts, stores, corrections, fixed_frame, request.config
                 )
-        completion = Completion(plan, request.config, has_keyframes=request.keyframes)
-        return _Survey(plan, completion, parts, ends_of(tracks), recording.source.latency)
+        completion = Completion(plan, request.config, deviations)
+        constants = None if deviations is None else numbers(deviations)
+        latency = recording.source.latency
+        return _Survey(plan, completion, parts, ends_of(tracks), latency, constants)
 
 
 def _other_drives(request: Request) -> Drives:

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from boxreg_ros.core.follow import FollowedTrack
-from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import BoxArray, Floats, HUMAN, RefinedBoxes, ROLL
+from boxreg_ros.core.following.person import corrections, diagonals, moved
+from boxreg_ros.structures import BoxArray, Floats, HUMAN, REFINED, RefinedBoxes
 from boxreg_ros.tracks.complete import AddedBox, CompletionPlan, unchanged_plan
 from boxreg_ros.tracks.track_steps import TrackSteps
 import numpy as np
 
 UNSUPPORTED = np.diag(np.square([0.5, 0.5, 0.2, 0.05, 0.05, 0.1]))
 """Covariance of added boxes without points: x y z [m] and roll pitch yaw [rad]; chosen."""
-
-EXACT = 0.006
-"""Median of the moves of keyframes by the solve, if they are exact [m]; swept: 0.003 of exact
-ones, 0.011 of those with the error of a person of 0.03."""
-MIN_KEYFRAMES = 20
-"""Fewer keyframes give no median; chosen."""
 
 
 def followed_plan(
@@ -59,15 +53,13 @@ def followed_plan(
     return plan
 
 
-def closed_onto_exact(
-    given: Sequence[BoxArray], results: Sequence[RefinedBoxes]
+def with_evidence(
+    given: Sequence[BoxArray], results: Sequence[RefinedBoxes], deviations: Floats
 ) -> list[RefinedBoxes]:
     """
-    Return results that go through the keyframes, if these are exact; otherwise the results.
+    Return results that are nearer to the keyframes if these show it, see `person.corrections`.
 
-    The solve has moved keyframes by their error and its own. Where it has moved half of them by
-    less than `EXACT`, which is its own, they are kept, and boxes between them are moved by the
-    difference, interpolated in time.
+    Boxes between keyframes are moved by the steps of these, interpolated in time.
 
     Parameters
     ----------
@@ -75,32 +67,34 @@ def closed_onto_exact(
         Keyframes as they were registered, and empty arrays.
     results : sequence of RefinedBoxes
         Of the same arrays, each with added boxes behind the keyframes.
+    deviations : array, shape (9,)
+        With which they were registered.
 
     """
-    moves = [
-        result.boxes.boxes[: len(array.track_ids)] - array.boxes
+    keyframes = [
+        (array.track_ids[row], array.stamp_ns, array.boxes[row], result.boxes.boxes[row],
+         diagonals(result.covariances[row], result.extent_covariances[row]))
         for array, result in zip(given, results, strict=True)
-    ]
-    moved = np.concatenate([np.zeros((0, 9)), *moves])
-    if len(moved) < MIN_KEYFRAMES or np.median(np.abs(moved[:, :3])) > EXACT:
+        for row in range(len(array.track_ids))
+        if result.status[row] == REFINED
+    ]  # fmt: skip
+    if not keyframes:
         return list(results)
-    steps: dict[str, tuple[list[int], list[Floats]]] = {}  # stamps, and differences of boxes
-    for array, result, move in zip(given, results, moves, strict=True):
-        for name, one in zip(result.boxes.track_ids, move, strict=False):
-            stamps, found = steps.setdefault(name, ([], []))
-            stamps.append(array.stamp_ns)
-            found.append(np.append(one[:ROLL], wrap_angle(one[ROLL:])))
-    return [_moved_back(result, steps) for result in results]
-
-
-def _moved_back(
-    result: RefinedBoxes, steps: Mapping[str, tuple[list[int], list[Floats]]]
-) -> RefinedBoxes:
-    """Return a result whose boxes are moved back by the differences of their tracks."""
-    boxes = result.boxes.boxes.copy()
-    for row, name in enumerate(result.boxes.track_ids):
-        stamps, found = steps[name]
-        for column, values in enumerate(np.transpose(found)):
-            boxes[row, column] -= np.interp(result.boxes.stamp_ns, stamps, values)
-    boxes[:, ROLL:] = wrap_angle(boxes[:, ROLL:])
-    return replace(result, boxes=replace(result.boxes, boxes=boxes))
+    names, stamps_ns, boxes, fits, spread = zip(*keyframes, strict=True)
+    steps = corrections(np.array(boxes), np.array(fits), np.array(spread), deviations)
+    if not steps.any():
+        return list(results)
+    rows_of: dict[str, list[int]] = {}
+    for row, name in enumerate(names):
+        rows_of.setdefault(name, []).append(row)
+    found = []
+    for result in results:
+        moved_boxes = result.boxes.boxes.copy()
+        for row, name in enumerate(result.boxes.track_ids):
+            if name in rows_of:
+                rows = rows_of[name]
+                at_ns = np.array(stamps_ns, np.int64)[rows]
+                at = np.array([result.boxes.stamp_ns])
+                moved_boxes[row] = moved(at, moved_boxes[row][None], at_ns, steps[rows])[0]
+        found.append(replace(result, boxes=replace(result.boxes, boxes=moved_boxes)))
+    return found

@@ -1,6 +1,8 @@
 """Following one object through sweeps from a few boxes of a person."""
 
 from boxreg_ros import follow, ShapeError
+from boxreg_ros.core.following import person
+from boxreg_ros.core.following.person import corrections, DEVIATIONS, EVIDENCE
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.structures import BoxArray, HUMAN, INTERPOLATED
 import numpy as np
@@ -86,7 +88,73 @@ def test_extents_grow_from_the_size_of_a_class_and_those_of_a_person_stay():
     assert iou_3d(track.boxes, truth[track.rows]).mean() > 0.85
     own = seed(truth, 10)
     [track] = follow(stamps(N), sweeps, [own])
-    assert np.abs(track.boxes[:, 3:6] - own.boxes[:, 3:6]).max() < 5e-3  # of the solve
+    assert np.abs(track.boxes[:, 3:6] - own.boxes[:, 3:6]).max() < 0.03  # a person's error
+
+
+def keyframes_of_a_drive(position, extent, yaw, num=6):
+    """Return the true boxes of some objects, and `follow` of keyframes with these errors."""
+    rng = np.random.default_rng(7)
+    truths = [drive(N, speed=5.0, turn=0.1) for _ in range(num)]
+    for i, truth in enumerate(truths):
+        truth[:, 1] += 9.0 * i - 20
+    sweeps = [
+        np.concatenate([one, *(returns(truth[row], rng, 150, ORIGIN) for truth in truths)])
+        for row, one in enumerate(scene(truths[0], rng, range(N)))
+    ]
+    deviations = np.repeat([position, extent, 0.0], 3)
+    deviations[8] = yaw
+    keys = []
+    for i, truth in enumerate(truths):
+        for row in range(0, N, 5):
+            box = truth[row] + rng.normal(0.0, 1.0, 9) * deviations
+            columns = (str(i),), ('car',), np.ones(1), box[None]
+            keys.append(BoxArray(int(stamps(N)[row]), '', *columns))
+    origins = np.tile(ORIGIN, (N, 1))
+    return np.array(truths), follow(stamps(N), sweeps, keys, None, origins), keys
+
+
+def test_keyframes_are_soft_by_the_error_that_they_show():
+    truths, exact, _ = keyframes_of_a_drive(0.0, 0.0, 0.0)
+    rows = np.arange(0, N, 5)
+    iou = [iou_3d(t.boxes[rows], truth[rows]) for t, truth in zip(exact, truths, strict=True)]
+    assert np.mean(iou) > 0.995
+    truths, soft, keys = keyframes_of_a_drive(0.03, 0.03, np.radians(1))
+    given = np.concatenate([key.boxes for key in keys])
+    true = truths[:, rows].reshape(-1, 9)
+    found = np.concatenate([track.boxes[rows] for track in soft])
+    assert all(track.status[row] == HUMAN for track in soft for row in rows)
+    assert iou_3d(found, true).mean() > iou_3d(given, true).mean() + 0.01
+    assert np.abs(found[:, :3] - given[:, :3]).mean() < 0.03
+
+
+def test_bad_keyframes_are_given_less_weight(monkeypatch):
+    ious = []
+    for evidence in (EVIDENCE, 1e9):  # without and with the usual deviations in any case
+        monkeypatch.setattr(person, 'EVIDENCE', evidence)
+        truths, tracks, _ = keyframes_of_a_drive(0.12, 0.1, np.radians(4))
+        found = [iou_3d(t.boxes, truth[t.rows]) for t, truth in zip(tracks, truths, strict=True)]
+        ious.append(np.concatenate(found).mean())
+    assert ious[0] > ious[1] + 0.01
+
+
+def test_deviations_of_keyframes_follow_from_their_residuals():
+    rng = np.random.default_rng(8)
+    others = 0.5 * DEVIATIONS  # errors of all else than the keyframe
+    fit_variance = 1 / (others**-2 + DEVIATIONS**-2)
+    weight = others**2 / (others**2 + DEVIATIONS**2)
+    truth = drive(200)
+    usual = truth + rng.normal(0.0, 1.0, truth.shape) * DEVIATIONS
+    for keys in (truth, usual):
+        fits = truth + rng.normal(0.0, 1.0, truth.shape) * others
+        fits += weight * (keys - fits)
+        steps = corrections(keys, fits, np.tile(fit_variance, (200, 1)), DEVIATIONS)
+        if keys is usual:
+            assert not steps.any()
+        else:
+            np.testing.assert_allclose(fits + steps, keys, atol=0.01)
+            assert np.abs(fits - keys).mean() > 2 * np.abs(fits + steps - keys).mean()
+        few = keys[:9], fits[:9], np.tile(fit_variance, (9, 1))
+        assert not corrections(*few, DEVIATIONS).any()
 
 
 def test_neighbour_and_road_do_not_pull_a_parked_car():

@@ -64,8 +64,8 @@ def _face(outwards: Floats, owner: Floats, half: float) -> float:
     edges = np.arange(half / 2, half + MAX_GROWTH, BIN)
     row = np.searchsorted(edges, outwards) - 1
     counts = np.bincount(row, minlength=len(edges))
-    seen = np.unique(np.stack([row, owner]), axis=1)
-    sweeps = np.bincount(seen[0], minlength=len(edges))
+    seen = np.unique(owner * len(edges) + row) % len(edges)
+    sweeps = np.bincount(seen, minlength=len(edges))
     is_filled = (counts > MIN_SHARE * len(row)) & (sweeps > MIN_SHARE_SWEEPS * num_sweeps)
     peak = int(counts.argmax())
     empty = np.flatnonzero(~is_filled[peak:])

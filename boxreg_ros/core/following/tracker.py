@@ -18,6 +18,7 @@ from boxreg_ros.core.following.sweeps import Sweeps
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
 import numpy as np
+from numpy.typing import NDArray
 
 POSE4 = [0, 1, 2, YAW]
 """Columns of a box that are followed; roll and pitch are those of the seed."""
@@ -37,19 +38,6 @@ STOPPED = 0.3
 REAR_AXLE = 0.25
 """Distance of the rear axle of a vehicle behind its centre, as part of the length."""
 
-# A pose is accepted if all of these hold.
-MIN_POINTS = 5
-"""Points that fit the surface."""
-MIN_FIT = 0.5
-"""Part of the points near the surface that fit it."""
-MIN_SEEN = 0.3
-"""Part of the points in the box that are near the surface."""
-MAX_DEVIATION = 0.35
-"""Deviation along the heading [m]."""
-MAX_YAW_DEVIATION = 0.12
-"""[rad]."""
-MAX_JUMP = 16.0
-"""Squared Mahalanobis distance from the prediction."""
 MIN_FIT_TO_LEARN = 0.7
 """Points of a sweep with a smaller part that fits are not added to the surface."""
 MIN_FIT_AGAIN = 0.6
@@ -70,6 +58,10 @@ SLIP_STEP = 0.15
 """And while it is seen [m]: points further from the surface have hardly any weight."""
 SEARCH_BELOW = 0.85
 """An object with a smaller part of its usual score is searched along the heading; chosen."""
+SLIPS = 2
+"""Starts in each direction while it is seen; chosen: half the reach of a registration."""
+MOST_STEPS = 10
+"""And after a loss, at most; chosen."""
 MIN_POINTS_TO_SEARCH = 30
 """But not by fewer points, whose score is noise; chosen: as `registration.MOST`."""
 
@@ -251,16 +243,18 @@ class Owned:
             known[count, 9] = owner
             self._boxes[row] = known, count + 1
 
-    def others(self, row: int, pose: Floats, half: Floats, same: Sequence[int]) -> Floats:
+    def others(
+        self, row: int, pose: Floats, half: Floats, margin: float, same: Sequence[int]
+    ) -> Floats:
         """
-        Return boxes (n, 9) near a pose (4,).
+        Return boxes (n, 9) within `margin` of a box at a pose (4,).
 
         None whose centre is in it, and none of the objects `same`: they are the object itself.
         """
         known, count = self._boxes.get(row, (np.empty((0, 10)), 0))
         boxes = known[:count]
         away = np.hypot(boxes[:, 0] - pose[0], boxes[:, 1] - pose[1])
-        reach = np.hypot(half[0], half[1]) + np.hypot(boxes[:, LENGTH], boxes[:, WIDTH]) / 2 + 1.0
+        reach = margin + np.hypot(*half[:2]) + np.hypot(boxes[:, LENGTH], boxes[:, WIDTH]) / 2
         is_near = (half[1] < away) & (away < reach)
         for owner in same:
             is_near &= boxes[:, 9] != owner
@@ -404,26 +398,29 @@ class Follower:
     def _find(self, row: int, state: _State, walk: Walk) -> _Found:
         """Return the pose in a sweep, from several starts after a loss or where it fits badly."""
         prior, information = state.pose, state.information
-        points = self._near(row, prior, 0.5)
+        is_lost = bool(walk.reason)
+        step, count = SLIP_STEP, SLIPS
+        if is_lost:
+            reach = 2.5 * np.sqrt(state.covariance[0, 0] + state.covariance[1, 1])
+            step, count = SEARCH_STEP, min(int(reach / SEARCH_STEP), MOST_STEPS)
+        around = self._near(row, prior, 0.5 + step * count)
+        points = self._part(around, prior, 0.5)
         height = self._road_below(points, prior) - self._road
         if np.isfinite(height):
             weight = ROAD_DEVIATION**-2
             prior[2] += height * weight / (information[2, 2] + weight)
             information[2, 2] += weight
         best = self._registered(points, prior, prior, information)
-        is_lost = bool(walk.reason)
         slips = best.fit[0] > MIN_POINTS_TO_SEARCH and best.score < SEARCH_BELOW * walk.usual
         if not (is_lost or slips):
             return best
-        step = SEARCH_STEP if is_lost else SLIP_STEP
-        reach = 2.5 * np.sqrt(state.covariance[0, 0] + state.covariance[1, 1])
-        count = min(int(reach / step), 10) if is_lost else 2
         for shift in step * np.arange(-count, count + 1):
             start = prior + shift * np.array([np.cos(prior[3]), np.sin(prior[3]), 0.0, 0.0])
-            near = self._near(row, start, 0.5)
-            found = self._registered(near, start, prior, information)
-            if found.rank > best.rank + 0.02:
-                best = found
+            part = self._part(around, start, 0.5)
+            if shift and len(part) >= registration.MIN_POINTS:
+                found = self._registered(part, start, prior, information)
+                if found.rank > best.rank + 0.02:
+                    best = found
         if is_lost and not best.reason and best.part < MIN_FIT_AGAIN:
             return best._replace(reason='no_fit')
         return best
@@ -432,14 +429,11 @@ class Follower:
         self, points: Floats, start: Floats, prior: Floats, information: Floats, steps: int = 12
     ) -> _Found:
         thinned = np.ascontiguousarray(points[:: 1 + len(points) // MAX_SWEEP_POINTS])
-        pose, of_points, fit = registration.register(
+        pose, covariance, fit, jump, reason = registration.registered(
             thinned, start, prior, information, self._tilt, self._half, self._kind.clearance,
             self._surface, steps,
         )  # fmt: skip
-        covariance = np.linalg.inv(of_points + information)
-        difference = pose - prior
-        jump = float(difference @ information @ difference)
-        return _Found(pose, covariance, fit, jump, _reason(pose, covariance, fit, jump))
+        return _Found(pose, covariance, fit, jump, registration.REASONS[reason])
 
     def _start_speed(self, seed: int) -> float:
         """Return the speed at a seed [m/s]: by its neighbours in time, or searched."""
@@ -473,7 +467,7 @@ class Follower:
             for other in around:
                 start = pose + speed * (times[other] - times[row]) * forward
                 points = self._near(other, start)
-                if len(points) >= MIN_POINTS:
+                if len(points) >= registration.MIN_POINTS:
                     scores[i] += self._registered(points, start, start, START_INFORMATION, 6).score
             scores[i] = scores[i] / len(around) - _cost(speed)
         likely = speeds[np.argsort(-scores, kind='stable')[:SPEEDS_TESTED]]
@@ -512,14 +506,18 @@ class Follower:
 
     def _near(self, row: int, pose: Floats, margin: float = 0.0) -> Floats:
         """Return the points (n, 3) around a pose that are not in the box of another object."""
-        reach = np.hypot(self._half[0], self._half[1]) + 0.7 + margin
-        box = np.array([reach, reach, self._half[2] + 0.6])
-        points = registration.near(self._sweeps.points[row], pose[:3], box)
-        for other in self._owned.others(row, pose, self._half, self._same):
+        points = self._part(self._sweeps.points[row], pose, margin)
+        for other in self._owned.others(row, pose, self._half, margin + 1.0, self._same):
             tilt = matrix_from_rpy(np.append(other[[ROLL, PITCH]], 0.0))
             points = registration.outside(points, other[POSE4], tilt, other[BOX_EXTENT] / 2)
-        near: Floats = points
-        return near
+        return points
+
+    def _part(self, points: NDArray[np.floating], pose: Floats, margin: float) -> Floats:
+        """Return the points (n, 3), which ascend by x, around a pose."""
+        reach = np.hypot(self._half[0], self._half[1]) + 0.7 + margin
+        box = np.array([reach, reach, self._half[2] + 0.6])
+        part: Floats = registration.near(points, pose[:3], box)
+        return part
 
     def _learn(self, points: Floats, pose: Floats) -> int:
         """Add the points in the box to the surface; return their number."""
@@ -555,17 +553,3 @@ def _score(fit: Floats) -> float:
         return 0.0
     part = fitting / (inside + beside)
     return float(2 * part * hit / max(part + hit, 1e-9))
-
-
-def _reason(pose: Floats, covariance: Floats, fit: Floats, jump: float) -> str:
-    """Return why a pose is not accepted; empty if it is."""
-    inside, fitting, _, _, _, matched = fit
-    if fitting < MIN_POINTS:
-        return 'few_points'
-    if fitting < MIN_FIT * matched or matched < MIN_SEEN * inside:
-        return 'no_fit'
-    forward = np.array([np.cos(pose[3]), np.sin(pose[3])])
-    along = forward @ covariance[:2, :2] @ forward
-    if along > MAX_DEVIATION**2 or covariance[3, 3] > MAX_YAW_DEVIATION**2:
-        return 'uncertain'
-    return 'jump' if jump > MAX_JUMP else ''

@@ -84,6 +84,8 @@ class Constants(NamedTuple):
     pin_deviations: tuple[float, ...] = (0.02, 0.02, 0.02, 0.005, 0.005, 0.005)
     """Deviations of a pinned pose x y z [m] and roll pitch yaw [rad]. Chosen: how well a person
     corrects a box."""
+    pin_extent: float = 0.01
+    """Deviation of the extents of a pinned box [m]. Chosen: practically held."""
     parked_speed: float = 0.3
     """Largest mean speed of a parked object [m/s]. Chosen."""
     parked_distance: float = 0.7

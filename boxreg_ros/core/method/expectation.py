@@ -23,7 +23,7 @@ LEAST_RATIO, MOST_RATIO = 0.02, 4.0
 LEAST_PART = 0.1
 """Least part of an error that is constant along a track. Chosen."""
 PINNED_DEVIATION = 0.01
-"""Deviation of the extents of a pinned box and of its bias [m, rad]: practically held. Chosen."""
+"""Deviation of the bias of a pinned box [m, rad]: practically held. Chosen."""
 CONSTANT_EXTENT_ERRORS = ((1.6, 2.9, 1.6), (1.9, 3.1, 2.0), (2.9, 3.2, 1.7))
 """
 Error of length, width and height that is constant along a track, over the one that changes.
@@ -134,7 +134,8 @@ def population_factor(k, mean, part, median, slopes, radius):
 def fill_expectation(b, problem, inputs, constants, work, common):
     """Write means and deviations of window `b`, given what `work` has of its input (M15)."""
     of_class = problem.of_class[b]
-    has_pin = problem.pinned[b].any()
+    pins = problem.pinned[b].sum()
+    has_pin = pins > 0
     usual, usual_extent = of_class.pose, of_class.extent
     shared, deviation, mean = common.shared, common.deviation, work.mean
     shared[:] = 0.0
@@ -151,7 +152,9 @@ def fill_expectation(b, problem, inputs, constants, work, common):
             k, mean, part, inputs.median, inputs.slopes, constants.population_radius
         )
         shared[EXTENT + k] = mean[k] if has_pin else mean[k] * factor
-        deviation[EXTENT + k] = PINNED_DEVIATION if has_pin else mean[k] * factor * part
+        deviation[EXTENT + k] = mean[k] * factor * part
+        if has_pin:
+            deviation[EXTENT + k] = constants.pin_extent / sqrt(float(pins))
     for face in range(6):
         shared[GAP + face] = of_class.gaps[face] + inputs.gap_correction[face]
         deviation[GAP + face] = usual_spread(of_class, work)

@@ -21,25 +21,43 @@ OUTSIDE_TOLERANCE = 0.1
 MOST = 30.0
 """Evidence of one sweep, in points: more points of one surface are not independent."""
 
+# A pose is accepted if all of these hold.
+REASONS = ('', 'few_points', 'no_fit', 'uncertain', 'jump')
+"""Why a pose is not accepted."""
+MIN_POINTS = 5
+"""Points that fit the surface."""
+MIN_FIT = 0.5
+"""Part of the points near the surface that fit it."""
+MIN_SEEN = 0.3
+"""Part of the points in the box that are near the surface."""
+MAX_DEVIATION = 0.35
+"""Deviation along the heading [m]."""
+MAX_YAW_DEVIATION = 0.12
+"""[rad]."""
+MAX_JUMP = 16.0
+"""Squared Mahalanobis distance from the prediction."""
+
 
 @kernel
-def register(points, start, prior, information, tilt, half, clearance, surface, iterations):
+def registered(points, start, prior, information, tilt, half, clearance, surface, iterations):
     """
-    Return the pose of a box (4,) x y z yaw that puts points on its surface, and statistics.
+    Return the pose of a box (4,) x y z yaw that puts points on its surface, and its tests.
 
     Parameters: `points` (n, 3) of the sweep, `start` and `prior` (4,) with the `information`
     (4, 4) of the prior, `tilt` (3, 3) the rotation by roll and pitch, `half` extents (3,), the
     height `clearance` above the bottom under which points are of the road, and the map `surface`.
 
-    Returned: pose (4,), information (4, 4) of the points alone, and: points in the box, those
-    that fit the surface, root mean square of their distance, parts of the surface that they hit.
+    Returned: pose (4,), covariance (4, 4), statistics as of `fit`, the squared Mahalanobis
+    distance from the prior, and the index of the reason in `REASONS`.
 
     """
-    slots, moments, normals, _ = surface
+    slots, _, means, normals, _ = surface
     pose = start.copy()
-    H = np.zeros((4, 4))
+    total = information.copy()
     for _ in range(iterations):
-        H, g = _system(points, pose, tilt, half, clearance, slots, moments, normals)
+        H, g, count = _system(points, pose, tilt, half, clearance, slots, means, normals)
+        if count < MIN_POINTS:
+            break
         total = H + information
         gradient = g + information @ (pose - prior)
         step = np.linalg.solve(total, gradient)
@@ -50,41 +68,54 @@ def register(points, start, prior, information, tilt, half, clearance, surface, 
         if size < 1e-3 and abs(step[3]) < 5e-4:
             break
     stats = fit(points, pose, tilt, half, clearance, surface)
-    return pose, H, stats
+    covariance = np.linalg.inv(total)
+    off = pose - prior
+    jump = off @ information @ off
+    return pose, covariance, stats, jump, _reason(pose, covariance, stats, jump)
 
 
 @kernel
-def _system(points, pose, tilt, half, clearance, slots, moments, normals):
-    """Return the normal equations (4, 4) and (4,) of the points at a pose."""
+def _reason(pose, covariance, stats, jump):
+    """Return why a pose is not accepted, an index of `REASONS`: 0 if it is."""
+    inside, fitting, matched = stats[0], stats[1], stats[5]
+    if fitting < MIN_POINTS:
+        return 1
+    if fitting < MIN_FIT * matched or matched < MIN_SEEN * inside:
+        return 2
+    c, s = np.cos(pose[3]), np.sin(pose[3])
+    along = c * c * covariance[0, 0] + s * s * covariance[1, 1] + 2 * c * s * covariance[0, 1]
+    if along > MAX_DEVIATION**2 or covariance[3, 3] > MAX_YAW_DEVIATION**2:
+        return 3
+    return 4 if jump > MAX_JUMP else 0
+
+
+@kernel
+def _system(points, pose, tilt, half, clearance, slots, means, normals):
+    """Return the normal equations (4, 4) and (4,) of the points at a pose, and their number."""
     H = np.zeros((4, 4))
     g = np.zeros(4)
-    c, s = np.cos(pose[3]), np.sin(pose[3])
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt
+    R = axes(pose, tilt)
     J = np.empty(4)
     weights = 0.0
     n_outside = 0.0
+    count = 0
     for n in range(len(points)):
         dx = points[n, 0] - pose[0]
         dy = points[n, 1] - pose[1]
         dz = points[n, 2] - pose[2]
-        x = R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz
-        y = R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz
-        z = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+        x, y, z = in_frame(dx, dy, dz, R)
         if abs(x) > half[0] + MARGIN or abs(y) > half[1] + MARGIN or z > half[2] + MARGIN:
             continue
         if z < clearance - half[2]:
             continue
-        slot = nearest(x, y, z, slots, moments, REACH)
+        count += 1
+        slot = nearest(x, y, z, slots, means, REACH)
         if slot >= 0:
             nx, ny, nz = normals[slot]
             if nx == 0 and ny == 0 and nz == 0:
                 continue
-            count = moments[slot, 0]
-            r = (
-                nx * (x - moments[slot, 1] / count)
-                + ny * (y - moments[slot, 2] / count)
-                + nz * (z - moments[slot, 3] / count)
-            )
+            mx, my, mz = means[slot]
+            r = nx * (x - mx) + ny * (y - my) + nz * (z - mz)
             robust = 1 / (1 + (r / OUTLIER) ** 2) ** 2
             w = robust / DEVIATION**2
             weights += robust
@@ -114,24 +145,21 @@ def _system(points, pose, tilt, half, clearance, slots, moments, normals):
     if total > MOST:
         H *= MOST / total
         g *= MOST / total
-    return H, g
+    return H, g, count
 
 
 @kernel
 def fit(points, pose, tilt, half, clearance, surface):
     """Return points in the box, those that fit, their distance (RMS), and the cells they hit."""
-    slots, moments, normals, used = surface
-    c, s = np.cos(pose[3]), np.sin(pose[3])
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt
+    slots, _, means, normals, used = surface
+    R = axes(pose, tilt)
     hit = np.zeros(used[0], np.bool_)
     inside, fitting, squares, beside, matched = 0.0, 0.0, 0.0, 0.0, 0.0
     for n in range(len(points)):
         dx = points[n, 0] - pose[0]
         dy = points[n, 1] - pose[1]
         dz = points[n, 2] - pose[2]
-        x = R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz
-        y = R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz
-        z = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+        x, y, z = in_frame(dx, dy, dz, R)
         if z < clearance - half[2] or z > half[2] + OUTSIDE_TOLERANCE:
             continue
         out = max(abs(x) - half[0], abs(y) - half[1])
@@ -140,18 +168,14 @@ def fit(points, pose, tilt, half, clearance, surface):
                 beside += 1
             continue
         inside += 1
-        slot = nearest(x, y, z, slots, moments, REACH)
+        slot = nearest(x, y, z, slots, means, REACH)
         if slot < 0:
             continue
         hit[slot] = True
         matched += 1
-        count = moments[slot, 0]
         nx, ny, nz = normals[slot]
-        r = (
-            nx * (x - moments[slot, 1] / count)
-            + ny * (y - moments[slot, 2] / count)
-            + nz * (z - moments[slot, 3] / count)
-        )
+        mx, my, mz = means[slot]
+        r = nx * (x - mx) + ny * (y - my) + nz * (z - mz)
         if abs(r) < FIT:
             fitting += 1
             squares += r * r
@@ -176,16 +200,36 @@ def near(points, center, reach):
 
 
 @kernel
+def in_frame(x, y, z, R):
+    """Return a vector in the axes of a box, the columns of R (3, 3)."""
+    return (
+        R[0, 0] * x + R[1, 0] * y + R[2, 0] * z,
+        R[0, 1] * x + R[1, 1] * y + R[2, 1] * z,
+        R[0, 2] * x + R[1, 2] * y + R[2, 2] * z,
+    )
+
+
+@kernel
+def axes(pose, tilt):
+    """Return the axes of a box as columns (3, 3)."""
+    c, s = np.cos(pose[3]), np.sin(pose[3])
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt
+
+
+@kernel
 def in_box(points, pose, tilt, half, clearance, margin):
     """Return points (n, 3) within `margin` of a box and above the road, in the box frame."""
-    c, s = np.cos(pose[3]), np.sin(pose[3])
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt
+    R = axes(pose, tilt)
     found = np.empty((len(points), 3))
     count = 0
     for n in range(len(points)):
-        q = R.T @ (points[n] - pose[:3])
-        if (np.abs(q) < half + margin).all() and q[2] > clearance - half[2]:
-            found[count] = q
+        x, y, z = in_frame(
+            points[n, 0] - pose[0], points[n, 1] - pose[1], points[n, 2] - pose[2], R
+        )
+        if abs(x) >= half[0] + margin or abs(y) >= half[1] + margin:
+            continue
+        if clearance - half[2] < z < half[2] + margin:
+            found[count, 0], found[count, 1], found[count, 2] = x, y, z
             count += 1
     return found[:count]
 
@@ -193,14 +237,15 @@ def in_box(points, pose, tilt, half, clearance, margin):
 @kernel
 def road_below(points, pose, tilt, half):
     """Return the height of the road above the bottom of a box; NaN without points of it [m]."""
-    c, s = np.cos(pose[3]), np.sin(pose[3])
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt
+    R = axes(pose, tilt)
     heights = np.empty(len(points))
     count = 0
     for n in range(len(points)):
-        q = R.T @ (points[n] - pose[:3])
-        out = max(abs(q[0]) - half[0], abs(q[1]) - half[1])
-        height = q[2] + half[2]
+        x, y, z = in_frame(
+            points[n, 0] - pose[0], points[n, 1] - pose[1], points[n, 2] - pose[2], R
+        )
+        out = max(abs(x) - half[0], abs(y) - half[1])
+        height = z + half[2]
         if 0.05 < out < 1.0 and abs(height) < 0.6:
             heights[count] = height
             count += 1
@@ -217,13 +262,14 @@ def road_below(points, pose, tilt, half):
 @kernel
 def outside(points, pose, tilt, half):
     """Return the points (n, 3) that are not in a box."""
-    c, s = np.cos(pose[3]), np.sin(pose[3])
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt
+    R = axes(pose, tilt)
     found = np.empty((len(points), 3))
     count = 0
     for n in range(len(points)):
-        q = R.T @ (points[n] - pose[:3])
-        if (np.abs(q) > half).any():
+        x, y, z = in_frame(
+            points[n, 0] - pose[0], points[n, 1] - pose[1], points[n, 2] - pose[2], R
+        )
+        if abs(x) > half[0] or abs(y) > half[1] or abs(z) > half[2]:
             found[count] = points[n]
             count += 1
     return found[:count]

@@ -2,9 +2,10 @@
 The surface of one object in its box frame: cells with the moments of their points.
 
 A map is a tuple of arrays. `slots` (nx, ny, nz) holds the number of the cell at a place plus one,
-0, or `FOREIGN` for points beside the box that a person has drawn; `moments` (S, 10) the count, the
-sums of x y z and of xx xy xz yy yz zz of its points; `normals` (S, 3) the direction of least
-spread around it; `used` (1,) the number of cells.
+0, or `FOREIGN` for points beside the box that a person has drawn; `moments` (S, 11) the count, the
+sums of x y z and of xx xy xz yy yz zz of its points, and the count at which the normal was found;
+`means` (S, 3) of its points; `normals` (S, 3) the direction of least spread around it; `used` (1,)
+the number of cells.
 
 """
 
@@ -37,9 +38,8 @@ def cell_of(x, y, z, slots):
 
 
 @kernel
-def insert(points, half, slots, moments, normals, used):
+def insert(points, half, slots, moments, means, normals, used):
     """Add points (n, 3) of the box frame to a map; update the normals of their cells."""
-    touched = np.zeros(len(moments), np.bool_)
     for n in range(len(points)):
         x, y, z = points[n]
         i, j, k = cell_of(x, y, z, slots)
@@ -52,14 +52,25 @@ def insert(points, half, slots, moments, normals, used):
             slot = used[0]
             used[0] += 1
             slots[i, j, k] = slot + 1
-        if moments[slot, 0] >= FULL:
+        of_cell = moments[slot]
+        if of_cell[0] >= FULL:
             continue
-        touched[slot] = True
-        moments[slot] += np.array([1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z])
+        of_cell[0] += 1.0
+        of_cell[1] += x
+        of_cell[2] += y
+        of_cell[3] += z
+        of_cell[4] += x * x
+        of_cell[5] += x * y
+        of_cell[6] += x * z
+        of_cell[7] += y * y
+        of_cell[8] += y * z
+        of_cell[9] += z * z
     for slot in range(used[0]):
-        if touched[slot]:
-            mean = moments[slot, 1:4] / moments[slot, 0]
-            normals[slot] = normal_at(mean, half, slots, moments)
+        count = moments[slot, 0]
+        if count > moments[slot, 10]:
+            means[slot] = moments[slot, 1:4] / count
+            normals[slot] = normal_at(means[slot], half, slots, moments)
+            moments[slot, 10] = count
 
 
 @kernel
@@ -101,7 +112,7 @@ def normal_at(mean, half, slots, moments):
     else:
         none[1] = np.sign(mean[1])
     i, j, k = cell_of(mean[0], mean[1], mean[2], slots)
-    total = np.zeros(10)
+    total = np.zeros(11)
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):
             for c in range(k - 1, k + 2):
@@ -131,7 +142,7 @@ def normal_at(mean, half, slots, moments):
 
 
 @kernel
-def nearest(x, y, z, slots, moments, limit):
+def nearest(x, y, z, slots, means, limit):
     """Return the cell with the nearest mean to a place, or -1 beyond `limit` [m]."""
     i, j, k = cell_of(x, y, z, slots)
     if i < 0:
@@ -144,10 +155,9 @@ def nearest(x, y, z, slots, moments, limit):
                 slot = slots[a, b, c] - 1
                 if slot < 0:
                     continue
-                n = moments[slot, 0]
-                dx = moments[slot, 1] / n - x
-                dy = moments[slot, 2] / n - y
-                dz = moments[slot, 3] / n - z
+                dx = means[slot, 0] - x
+                dy = means[slot, 1] - y
+                dz = means[slot, 2] - z
                 squared = dx * dx + dy * dy + dz * dz
                 if squared < best:
                     best = squared
@@ -160,7 +170,8 @@ def empty(half, cells):
     sides = (2 * np.ceil((half + RIM) / SURFACE_CELL) + 2).astype(np.int64)
     return (
         np.zeros(sides, np.int32),
-        np.zeros((cells, 10)),
+        np.zeros((cells, 11)),
+        np.zeros((cells, 3)),
         np.zeros((cells, 3)),
         np.zeros(1, np.int64),
     )

@@ -1,0 +1,111 @@
+"""
+The boxes of a person: how far they are from the object, and what the points say of that.
+
+Keyframes are solved with the deviations `DEVIATIONS`. Where those of a drive show larger ones,
+they are solved with these; where they show smaller ones, the solution moves toward them.
+
+"""
+
+from __future__ import annotations
+
+from boxreg_ros.core.method.constants import CONSTANTS, Constants
+from boxreg_ros.rotations import wrap_angle
+from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL
+import numpy as np
+
+POSITION, ANGLE, EXTENT = 0.03, np.radians(1.0), 0.03
+"""Deviations of a box that a person has drawn: centre [m], angles [rad], extents [m]."""
+DEVIATIONS = np.repeat([POSITION, EXTENT, ANGLE], 3)
+"""Of the columns of a box [m, rad]."""
+GROUPS = (([0, 1, 2],) * 2, ([3, 4, 5],) * 2, ([8], [6, 7, 8]))
+"""Columns of a box that show one deviation, and those it is of: position, extents, angles."""
+SAMPLE = 200
+"""Keyframes that show a larger deviation, before all are solved; chosen: 5 % of error."""
+MIN_KEYFRAMES = 20
+"""Fewer show no deviation; chosen: a fifth of the deviation is its own error."""
+EVIDENCE = 2.0
+"""Deviations that differ by less than this factor count as the usual ones; chosen: estimates from
+keyframes of the usual error, on five recordings, are 0.5 to 1.6 of it."""
+MEDIAN_TO_DEVIATION = 1.48
+"""Standard deviation over the median of absolute values. Derived: Gaussian."""
+
+
+def numbers(deviations: Floats) -> Constants:
+    """Return the numbers of the method for keyframes of some deviations (9,)."""
+    pose = tuple(deviations[[0, 1, 2, 6, 7, 8]].tolist())
+    return CONSTANTS._replace(pin_deviations=pose, pin_extent=float(deviations[LENGTH]))
+
+
+def shown(keyframes: Floats, fits: Floats, variances: Floats, usual: Floats) -> Floats:
+    """
+    Return the deviations (9,) that keyframes show; the `usual` ones where they show no others.
+
+    Parameters
+    ----------
+    keyframes, fits : array, shape (n, 9)
+        Boxes of a person, and as they were solved.
+    variances : array, shape (n, 9)
+        Of the fits.
+    usual : array, shape (9,)
+        Deviations with which they were solved.
+
+    Notes
+    -----
+    Of each variable the fit is the mean of the keyframe, of variance s0^2, and of all else, of
+    variance p^2, which follows from that of the fit. The residual has the variance (s^2 + p^2)
+    s0^4 / (s0^2 + p^2)^2 for keyframes of the deviation s, and gives s; zero if it is smaller than
+    that of exact keyframes.
+
+    """
+    found = usual.copy()
+    if len(keyframes) < MIN_KEYFRAMES:
+        return found
+    others = _variances_of_others(variances, usual)
+    errors = _residuals(keyframes, fits) * (1 + others / usual**2)
+    for columns, of_group in GROUPS:
+        variance = MEDIAN_TO_DEVIATION**2 * np.median(errors[:, columns] ** 2)
+        variance -= np.median(others[:, columns])
+        deviation = np.sqrt(max(variance, 0.0))
+        if not 1 / EVIDENCE < deviation / usual[of_group[0]] < EVIDENCE:
+            found[of_group] = deviation
+    return found
+
+
+def corrections(keyframes: Floats, fits: Floats, variances: Floats, usual: Floats) -> Floats:
+    """Return the steps (n, 9) from fits to those with smaller deviations, if `shown`."""
+    smaller = np.minimum(shown(keyframes, fits, variances, usual), usual)
+    others = _variances_of_others(variances, usual)
+    weight = others / (usual**2 + others)  # of the keyframe in the fit
+    better = others / (smaller**2 + others)
+    return _residuals(keyframes, fits) * (better - weight) / (1 - weight)
+
+
+def _residuals(keyframes: Floats, fits: Floats) -> Floats:
+    residuals: Floats = keyframes - fits
+    residuals[:, ROLL:] = wrap_angle(residuals[:, ROLL:])
+    return residuals
+
+
+def _variances_of_others(variances: Floats, usual: Floats) -> Floats:
+    """Return p^2 of `shown`, (n, 9)."""
+    of_fit = np.minimum(variances, 0.9 * usual**2)
+    found: Floats = 1 / (1 / of_fit - usual**-2)
+    return found
+
+
+def diagonals(pose: Floats, extent: Floats) -> Floats:
+    """Return the diagonals of two covariances, in the order of the columns of a box (..., 9)."""
+    of_pose = np.diagonal(pose, axis1=-2, axis2=-1)
+    of_extent = np.diagonal(extent, axis1=-2, axis2=-1)
+    return np.concatenate([of_pose[..., :3], of_extent, of_pose[..., 3:]], axis=-1)
+
+
+def moved(stamps_ns: Ints, boxes: Floats, at_ns: Ints, steps: Floats) -> Floats:
+    """Return boxes (N, 9) moved by the steps (n, 9) at stamps `at_ns`, interpolated in time."""
+    found = boxes.copy()
+    if not steps.any():
+        return found
+    for column, values in enumerate(steps.T):
+        found[:, column] += np.interp(stamps_ns - at_ns[0], at_ns - at_ns[0], values)
+    found[:, ROLL:] = wrap_angle(found[:, ROLL:])
+    return found
