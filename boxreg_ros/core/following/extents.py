@@ -15,6 +15,8 @@ MOST_GROWTH = 0.25
 MIN_GROWTH = 0.2
 """A face nearer to the outermost points stays: the labelling margin and the error of a person [m];
 chosen."""
+MIN_SHRINKAGE = 0.3
+"""The same inwards [m]; chosen: corners are round, and rays pass them."""
 FACE_MARGIN = 0.05
 """Labelling margin of a face that moves [m]; as the settings of the classes."""
 LEAST_SWEEPS, LEAST_POINTS = 5, 50
@@ -86,7 +88,7 @@ def freed(found: Floats, sweeps: Sequence[Floats], crossed: Floats, half: Floats
         outermost = float(np.quantile(sign * points[:, axis], OUTERMOST)) + FACE_MARGIN
         face = max(half[axis] - depth, outermost)
         has_grown = sign * found[side, axis] > half[axis]
-        if not has_grown and half[axis] - face > MIN_GROWTH:
+        if not has_grown and half[axis] - face > MIN_SHRINKAGE:
             faces[side, axis] = sign * face
     return faces
 

@@ -74,7 +74,7 @@ NEAR_SEEDS = 1.5
 """Seeds nearer in time give the speed [s]; chosen: acceleration changes it by less than 3 m/s."""
 SEARCH_SWEEPS = 5
 """Sweeps in each direction that a start speed is tested with."""
-SPEEDS_TESTED = 8
+SPEEDS_TESTED = 4
 """Most likely speeds by the first sweeps that are tested with `SEARCH_SWEEPS`."""
 START_INFORMATION = np.diag(np.array([0.5, 0.5, 0.1, 0.05]) ** -2.0)
 """Of the starts of a search for the speed: x y z [m] and yaw [rad]."""
