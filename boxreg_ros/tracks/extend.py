@@ -13,7 +13,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.support import is_owned, least_support
 from boxreg_ros.structures import EXTENDED, Floats, Ints
-from boxreg_ros.tracks.added import AddedBoxes
+from boxreg_ros.tracks.effects import AddedBoxes
 from boxreg_ros.tracks.fill import accelerations
 from boxreg_ros.tracks.prune import CONFIRMED_BOXES
 from boxreg_ros.tracks.tracklet import Tracklet

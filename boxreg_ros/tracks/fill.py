@@ -11,7 +11,7 @@ from __future__ import annotations
 from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.core.motion import motion_at
 from boxreg_ros.structures import Floats, INTERPOLATED, Ints
-from boxreg_ros.tracks.added import AddedBoxes
+from boxreg_ros.tracks.effects import AddedBoxes
 from boxreg_ros.tracks.tracklet import Tracklet
 from boxreg_ros.tracks.tracklet_motion import between, is_parked
 import numpy as np
