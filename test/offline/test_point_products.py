@@ -246,6 +246,13 @@ def test_sweeps_without_boxes_are_unknown_and_copied_unchanged(scene, recording,
     ]
 
 
+def test_points_of_a_drive_without_boxes_are_unknown(recording, tmp_path):
+    request = Request((recording,), boxes='none', config=QUICK, formats=('semantickitti',))
+    summary = relabel(request, tmp_path / 'out')
+    assert summary.points['sweeps_without_boxes'] == SWEEPS
+    assert summary.points['points_unknown'] == summary.points['points'] > 0
+
+
 def test_boxes_that_no_point_confirms_are_uncertain_and_rejected_ones_no_objects():
     box = np.array([[10.0, 0, 1, 4, 2, 1.5, 0, 0, 0]])
     found = [
