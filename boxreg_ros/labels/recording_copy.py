@@ -24,7 +24,7 @@ import yaml
 
 STATIC_SUFFIX = 'tf_static'
 """Topics with this suffix are copied from the whole recording, also if a part is requested."""
-COMPRESSIONS = {
+COMPRESSION_TYPES = {
     '': CompressionType.NONE,
     'lz4': CompressionType.LZ4,
     'zstd': CompressionType.ZSTD,
@@ -197,7 +197,7 @@ def _definition(connection: Connection, store: Typestore) -> Definition:
 def _compression_of(path: Path) -> CompressionType:
     """Return the compression that a copy of a file has: its own; of another format zstd."""
     with closing(opened(path)) as file:
-        return COMPRESSIONS[file.compression if isinstance(file, McapFile) else 'zstd']
+        return COMPRESSION_TYPES[file.compression if isinstance(file, McapFile) else 'zstd']
 
 
 def _copy_extras(path: Path, writer: McapWriter) -> None:
