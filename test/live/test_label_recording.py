@@ -3,6 +3,7 @@
 import csv
 from importlib.util import find_spec
 import os
+import re
 import signal
 import time
 
@@ -282,7 +283,11 @@ def test_a_recorder_that_died_is_started_again(tmp_path):
     assert 'ERROR' not in robot.node.output()
     assert len(robot.early) == 20
     rows = sorted(index_of(folder), key=lambda row: row['segment'])
-    assert [(row['frames'], row['recovered']) for row in rows] == [('7', '1'), ('13', '0')]
+    assert [row['recovered'] for row in rows] == ['1', '0']
+    # After 3 s of silence the node gives up the boxes that it holds: the kill may meet them.
+    (under_way,) = re.findall('up to ([0-9]+) box arrays under way', robot.node.output())
+    frames = [int(row['frames']) for row in rows]
+    assert frames[0] >= 7 and 20 - int(under_way) <= sum(frames) <= 20
 
 
 def test_two_nodes_another_clock_and_a_killed_node(tmp_path):
