@@ -214,10 +214,8 @@ class _State(NamedTuple):
 
     @property
     def information(self) -> Floats:
-        full = np.zeros((4, 4))
-        full[PLANAR] = self.covariance[:3, :3]
-        full[2, 2] = self.z_variance
-        return np.asarray(np.linalg.inv(full), np.float64)
+        found: Floats = motion.pose_information(self.covariance, self.z_variance)
+        return found
 
     @property
     def speed(self) -> float:
@@ -255,6 +253,8 @@ class Owned:
         """
         known, count = self._boxes.get(row, (np.empty((0, 10)), 0))
         boxes = known[:count]
+        if not count:
+            return boxes[:, :9]
         away = np.hypot(boxes[:, 0] - pose[0], boxes[:, 1] - pose[1])
         reach = margin + np.hypot(*half[:2]) + np.hypot(boxes[:, LENGTH], boxes[:, WIDTH]) / 2
         is_near = (half[1] < away) & (away < reach)
