@@ -175,7 +175,10 @@ def test_extents_shrink_where_rays_cross_the_box():
     angle, height = rng.uniform(0.0, 2 * np.pi, 20_000), rng.uniform(-2.0, 6.0, 20_000)
     wall = np.column_stack([60 * np.cos(angle), 60 * np.sin(angle), height])  # around the sensor
     sweeps = [
-        np.concatenate([unoccluded(wall, box), road(rng), returns(box, rng, 150, ORIGIN)])
+        np.concatenate(
+            [unoccluded(other, box) for other in (wall, road(rng))]
+            + [returns(box, rng, 150, ORIGIN)]
+        )
         for box in truth
     ]
     large = seed(truth, 10)

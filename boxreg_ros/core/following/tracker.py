@@ -378,16 +378,17 @@ class Follower:
         found = faces(points, self._half)
         origins = self._sweeps.origins
         if origins is not None:
-            crossed = np.array([
+            rays = [
                 free_space.crossings(
                     self._sweeps.points[int(rows[i])], origins[rows[i]], boxes[i, POSE4],
                     self._tilt, self._half,
                 )
                 for i in some[:: -(-len(some) // MAX_RAY_SWEEPS)]
                 if np.isfinite(origins[rows[i]]).all()
-            ])  # fmt: skip
-            if len(crossed):
-                found = freed(found, points, crossed, self._half)
+            ]  # fmt: skip
+            if rays:
+                crossed, through = zip(*rays, strict=True)
+                found = freed(found, points, np.array(crossed), sum(through), self._half)
         low, high = found
         grown = boxes.copy()
         shift = (low + high) / 2
