@@ -42,7 +42,7 @@ PAPER = 'paper'
 """The objective of the paper, and the group of settings that it alone reads."""
 
 UNLIKE = Config().updated(
-    {f'faces.{name}': 1.0 for name in ('outermost', 'ends', 'sides', 'top', 'bottom', 'outlier')}
+    {'faces.ends': 1.0, 'faces.sides': 1.0}
     | {f'ingredients.{name}': False for name in ('strips', 'robust_motion')}
 )
 """A configuration that differs from the default one in all that `with_settings` fills."""
@@ -191,11 +191,9 @@ def variations_of_constants() -> list[Variation]:
     of_settings = known.with_settings(UNLIKE)
     found = []
     for name, default in known._asdict().items():
-        if getattr(of_settings, name) != default:
-            continue
-        numbers = default if isinstance(default, tuple) else (default,)
-        for place, number in enumerate(numbers):
-            if isinstance(number, bool):
+        numbers, filled = np.atleast_1d(default), np.atleast_1d(getattr(of_settings, name))
+        for place, number in enumerate(numbers.tolist()):
+            if isinstance(number, bool) or filled[place] != number:
                 continue
             label = f'{name}[{place}]' if isinstance(default, tuple) else name
             for factor in FACTORS:
