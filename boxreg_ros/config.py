@@ -124,23 +124,11 @@ class SamplingConfig:
 class FaceConfig:
     """Face observations: the outermost points on each face, and their errors."""
 
-    outermost: float = setting(
-        0.05, 'part of the points of a box that makes one face observation', '', 1e-3, 1.0
-    )
     ends: float = setting(
         0.12, 'standard deviation of one observation of the front or rear face', 'm', 1e-3, 10.0
     )
     sides: float = setting(
-        0.08, 'standard deviation of one observation of the left or right face', 'm', 1e-3, 10.0
-    )
-    top: float = setting(
-        0.08, 'standard deviation of one observation of the top face', 'm', 1e-3, 10.0
-    )
-    bottom: float = setting(
-        0.05, 'standard deviation of one observation of the road under the box', 'm', 1e-3, 10.0
-    )
-    outlier: float = setting(
-        0.15, 'distance of a face from its points at which its weight is 1/4', 'm', 1e-3, 10.0
+        0.08, 'standard deviation of one observation of a side or of the top', 'm', 1e-3, 10.0
     )
     inset_ends: float = setting(
         0.36, 'expected inset of the surface behind an occluded front or rear face', 'm', 0.0, 2.0
@@ -163,13 +151,6 @@ class SolverConfig:
     iterations: int = setting(2, 'most L-BFGS iterations per round', '', 1, 10000)
     threads: int = setting(
         0, 'threads that share the windows of a batch; 0: one per core', '', 0, 256
-    )
-    tolerance: float = setting(
-        0.05,
-        'predicted relative decrease of the sum that ends the search of a round',
-        '',
-        0.0,
-        1.0,
     )
 
 
@@ -209,24 +190,11 @@ class ClassConfig:
     cornering: float = setting(
         4.0, 'standard deviation of the sideways acceleration', 'm/s^2', 1e-3, 1e3
     )
-    vertical: float = setting(
-        1.0, 'standard deviation of the vertical acceleration', 'm/s^2', 1e-3, 1e3
-    )
     turning: float = setting(
         0.8, 'standard deviation of the yaw acceleration', 'rad/s^2', 1e-3, 1e3
     )
-    tilting: float = setting(
-        0.2, 'standard deviation of the roll and pitch acceleration', 'rad/s^2', 1e-3, 1e3
-    )
     slip: float = setting(
         0.15, 'standard deviation of the sideways velocity of the pivot', 'm/s', 1e-3, 1e3
-    )
-    sideslip: float = setting(
-        0.01, 'standard deviation of the constant angle from the heading of a track to its path',
-        'rad', 1e-4, 1.0,
-    )  # fmt: skip
-    climb: float = setting(
-        0.25, 'standard deviation of the velocity along the z axis of the box', 'm/s', 1e-3, 1e3
     )
     pivot: float = setting(
         0.25, 'distance of the pivot (rear axle) behind the centre, as part of the length',
@@ -283,12 +251,6 @@ class CompleteConfig:
         2.0, 'longest gap between fragments of an object, and of a moving one that is filled',
         's', 0.0, 1e3,
     )  # fmt: skip
-    extend_time: float = setting(
-        1.0, 'longest extension of a moving object at each end', 's', 0.0, 1e3
-    )
-    extend_parked: float = setting(
-        4.0, 'longest extension of a parked object at each end', 's', 0.0, 1e3
-    )
 
     @property
     def steps(self) -> tuple[str, ...]:
@@ -331,7 +293,7 @@ class Ingredients:
     robust_motion: bool = True
     """Motion residuals are down-weighted beyond three deviations."""
     robust_weights: bool = True
-    """Input poses and labelling margins far from the expected ones are down-weighted."""
+    """Input poses, faces and labelling margins far from the expected ones are down-weighted."""
     without: tuple[str, ...] = ()
     """Names of `RESIDUALS` that are left out."""
 
@@ -424,12 +386,12 @@ class Config:
     )
     cyclist: ClassConfig = ClassConfig(
         names=('cyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'rider', 'scooter'),
-        acceleration=1.5, cornering=1.5, turning=1.0, slip=0.4, sideslip=1e-3, pivot=0.2,
+        acceleration=1.5, cornering=1.5, turning=1.0, slip=0.4, pivot=0.2,
         shape=0.15, heading=0.15, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
     pedestrian: ClassConfig = ClassConfig(
         names=('pedestrian', 'person', 'walker', 'people', 'child'),
-        acceleration=0.8, cornering=0.8, turning=1.0, slip=0.5, sideslip=1e-3, pivot=0.0,
+        acceleration=0.8, cornering=0.8, turning=1.0, slip=0.5, pivot=0.0,
         shape=0.2, heading=0.5, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
 

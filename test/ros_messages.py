@@ -1,5 +1,6 @@
 """Messages and recordings for tests, made with rosbags only."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ BOXES = 'vision_msgs/msg/BoundingBox3DArray'
 NUMBERS = {'i1': 1, 'u1': 2, 'i2': 3, 'u2': 4, 'i4': 5, 'u4': 6, 'f4': 7, 'f8': 8}
 
 
+@cache
 def typestore(stock=Stores.ROS2_JAZZY):
     """Return a typestore with the stock types and the packages in ``interfaces``."""
     store = get_typestore(stock)

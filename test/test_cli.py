@@ -22,8 +22,7 @@ from ros_messages import Drive
 
 QUICK = ['--set', 'solver.rounds=1', '--set', 'solver.iterations=3']
 SLOW = [
-    '--set', 'solver.rounds=100', '--set', 'solver.iterations=10000',
-    '--set', 'solver.tolerance=0', '--set', 'estimate=early',
+    '--set', 'objective=paper', '--set', 'paper.iterations=10000', '--set', 'estimate=early',
 ]  # fmt: skip
 
 GO_ON = '; a run with --resume goes on where it was interrupted'

@@ -31,7 +31,8 @@ def test_dictionary_and_yaml_round_trip(tmp_path):
             'objective': 'paper',
             'window': 7,
             'lag': 2,
-            'solver': {'rounds': 2, 'tolerance': 1e-6},
+            'solver': {'rounds': 2},
+            'paper': {'closeness': 1e-6},
             'pedestrian': {'names': ['human'], 'turning': 2.5},
         }
     )
@@ -60,8 +61,8 @@ def test_empty_file_means_defaults(tmp_path):
 
 def test_exponents_without_a_decimal_point_are_numbers(tmp_path):
     path = tmp_path / 'config.yaml'
-    path.write_text('solver: {tolerance: 1e-6}\n')
-    assert Config.from_yaml(path).solver.tolerance == 1e-6
+    path.write_text('paper: {closeness: 1e-6}\n')
+    assert Config.from_yaml(path).paper.closeness == 1e-6
 
 
 @pytest.mark.parametrize('text', ['[' * 5000, 'lag: 2026-13-45', 'lag: !!python/name:os.system'])

@@ -12,7 +12,7 @@ from msg_adapters import adapter_for, ADAPTERS
 import numpy as np
 from paths import ROOT
 import pytest
-from ros_messages import Drive
+from ros_messages import Drive, typestore
 from rosbags.typesys import get_types_from_msg
 
 TYPE = 'example_msgs/msg/ObstacleArray'
@@ -39,6 +39,7 @@ def drive(adapter):
     """Return a drive whose boxes are obstacles."""
     made = Drive(sweeps=7)
     types = get_types_from_msg(definition_of(OBSTACLE), OBSTACLE)
+    made.messages.store = typestore.__wrapped__()
     made.messages.store.register(types | get_types_from_msg(definition_of(TYPE), TYPE))
     made.items = [
         (topic, time, obstacles_of(made.messages, message) if topic == '/boxes' else message)

@@ -60,8 +60,7 @@ INGREDIENTS = {
     WHOLE: Ingredient('every ingredient is on', {}),
     'points': Ingredient(
         'faces and rigid shape have no weight: motion and input alone',
-        {f'faces.{name}': 10.0 for name in ('ends', 'sides', 'top', 'bottom')}
-        | _without('rigid shape'),
+        {'faces.ends': 10.0, 'faces.sides': 10.0} | _off('road') | _without('rigid shape'),
     ),
     'rigid shape': Ingredient(
         'points of a track are not tied to one rigid shape', _without('rigid shape')
@@ -101,9 +100,7 @@ INGREDIENTS = {
     ),
     'zero motion': Ingredient('parked objects have no zero-motion prior', _without('zero motion')),
     'heading sign': Ingredient('180° flips stay', _off('heading_sign')),
-    'robust weights': Ingredient(
-        'outliers have full weight', {'faces.outlier': 10.0} | _off('robust_weights')
-    ),
+    'robust weights': Ingredient('outliers have full weight', _off('robust_weights')),
 }
 
 

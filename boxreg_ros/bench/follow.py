@@ -2,10 +2,11 @@
 `boxreg bench follow`: whole tracks from a few boxes of each object, against interpolation.
 
 The boxes given are true ones with the error of a person. One box: the first with
-`MIN_SEED_RETURNS`, and every later box counts; of the size of its class, its corner nearest to the
-sensor stays. Two: the first and the last with so many, and keyframes: all boxes from the first to
-the last that are given count, and these too. Turning objects are those of the row above that turn
-by `TURN`. In `all boxes` the boxes of a person at every stamp are registered.
+`MIN_SEED_RETURNS`, and every later box counts; of another size, such as that of its class, the
+corner nearest to the sensor stays. Two: the first and the last with so many, and keyframes: all
+boxes from the first to the last that are given count, and these too. Turning objects are those of
+the row above that turn by `TURN`. In `all boxes` the boxes of a person at every stamp are
+registered.
 
 """
 
@@ -39,7 +40,9 @@ HUMAN_POSITION, HUMAN_YAW, HUMAN_EXTENT = 0.03, np.radians(1.0), 0.03
 KEYFRAMES = {'2 Hz': 0.5, '1 Hz': 1.0, 'every 3 s': 3.0}
 """Periods of keyframes [s]."""
 ONE, ONE_OF_CLASS, TWO = 'one box', 'one of class size', 'two boxes'
-CASES = (ONE, ONE_OF_CLASS, TWO, *KEYFRAMES)
+OFF_SIZE = {'one 15 % larger': 1.15, 'one 15 % smaller': 0.85}
+"""One box whose extents are those of the object by a factor."""
+CASES = (ONE, ONE_OF_CLASS, *OFF_SIZE, TWO, *KEYFRAMES)
 CLASS_SIZES = {
     'truck': np.array([8.0, 2.5, 3.2]),
     'bus': np.array([12.0, 2.9, 3.4]),
@@ -150,15 +153,17 @@ def _given(drive: Drive, case: str, seed: int, is_exact: bool) -> Iterator[Given
         if not len(chosen):
             continue
         counted = np.arange(chosen[0], chosen[-1] + 1)
-        if case in (ONE, ONE_OF_CLASS):
+        if case in (ONE, ONE_OF_CLASS, *OFF_SIZE):
             counted = np.arange(chosen[0] + 1, len(rows))
         boxes = truth.boxes[rows[chosen]]
         if not is_exact:
             boxes = _of_a_person(boxes, rng)
-        if case == ONE_OF_CLASS:
+        if case == ONE_OF_CLASS or case in OFF_SIZE:
             [sweep] = drive.sweeps_at(truth.stamps_ns[rows[chosen]])
             class_name = truth.class_names[rows[0]]
             size = CLASS_SIZES.get(class_name.lower(), CLASS_SIZES[Config().kind(class_name)])
+            if case in OFF_SIZE:
+                size = OFF_SIZE[case] * truth.boxes[rows[0], BOX_EXTENT]
             boxes = _of_size(boxes, size, sweep.origin)
         yield Given(
             name, truth.class_names[rows[0]], truth.stamps_ns[rows], truth.boxes[rows],

@@ -139,7 +139,7 @@ def follow(
     if sensor_origins is not None:
         sensor_origins = checked('sensor_origins', sensor_origins, (len(stamps), 3), 'x y z')
     ordered = [ascending(checked(f'points[{i}]', p, (None, 3))) for i, p in enumerate(points)]
-    tracks = follow_points(stamps.astype(np.int64), ordered, seeds, config)
+    tracks = follow_points(stamps.astype(np.int64), ordered, seeds, config, sensor_origins)
     return solved(tracks, ordered, config, sensor_origins)
 
 
@@ -148,10 +148,11 @@ def follow_points(
     points: Points,
     seeds: Sequence[BoxArray],
     config: Config,
+    origins: Floats | None = None,
 ) -> list[FollowedTrack]:
     """Follow as `follow` does, without the solve; `points` are those of `ascending`."""
     times = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
-    sweeps = Sweeps(times, points, len(times))
+    sweeps = Sweeps(times, points, len(times), origins=origins)
     objects = [_placed(name, rows, stamps_ns) for name, rows in _by_track(seeds).items()]
     objects = _overlapping(objects)
     owned = Owned()

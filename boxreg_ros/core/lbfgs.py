@@ -131,7 +131,8 @@ def minimize(
         is_running = best.status[search.rows] == Status.RUNNING
         is_over = search.has_moved & (best.iterations[search.rows] == iterations)
         search = select(search, (is_running & ~is_over).nonzero()[:, 0])
-        search = _with_new_directions(search, best, metric, tolerance)
+        if len(search.rows):
+            search = _with_new_directions(search, best, metric, tolerance)
         if not len(search.rows):
             break
         search = _after_trial(search, best, function, history)

@@ -55,13 +55,12 @@ NO_PRIOR = (
 
 
 SETTINGS_OF = {
-    'acceleration': ('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning'),
-    'slip': ('slip', 'climb'),
+    'motion': ('acceleration', 'cornering', 'turning'),
+    'slip': ('slip',),
     'drift': ('drift',),
     'pose': ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading'),
     'extent': ('extent',),
     'gap_spread': ('gap_spread',),
-    'sideslip': ('sideslip',),
     'roughness': ('shape',),
     'gaps': ('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom'),
     'pivot': ('pivot',),
@@ -69,16 +68,16 @@ SETTINGS_OF = {
 """
 Fields of `CLASS_SETTINGS`, and the settings of `ClassConfig` that make each.
 
-acceleration
-    Deviations of the accelerations along the axes of the body, (6,).
+motion
+    Deviations of the accelerations forward, sideways and of yaw, (3,) [m/s^2, rad/s^2].
 slip
-    Of the velocity of the pivot along the y and z axes, (2,) [m/s].
+    Of the sideways velocity of the pivot [m/s].
 drift
     Of the step of a parked box [m].
 pose, extent
     Of the input poses, (6,) [m, rad], and of the input extents, as part of each.
-gap_spread, sideslip
-    Of labelling margins [m], and of the angle from heading to path [rad].
+gap_spread
+    Of labelling margins [m].
 roughness
     How far the surface is from rigid [m].
 gaps

@@ -26,6 +26,9 @@ from numpy.typing import NDArray
 import torch
 from torch import Tensor
 
+TOLERANCE = 0.05
+"""Predicted relative decrease of the sum that ends the search of a round. Chosen: the next round
+renews the weights anyway."""
 NOISE_ROUNDS = 2
 """First rounds of a whole track whose residuals give the input noise. Chosen: later fits follow
 the input, and the noise would be estimated smaller in every round."""
@@ -198,7 +201,7 @@ def run_round(
     search, objective = config.solver, Objective(rows, free, sums)
     found = minimize(
         objective.value_and_gradient, torch.from_numpy(x), search.iterations, HISTORY,
-        search.tolerance, objective.metric,
+        TOLERANCE, objective.metric,
         (torch.from_numpy(value), torch.from_numpy(gradient)),
     )  # fmt: skip
     is_done = np.empty(b, bool)

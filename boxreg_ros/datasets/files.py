@@ -1,4 +1,4 @@
-"""Helpers of several data sets: read clouds, and check for missing files and LiDARs."""
+"""Helpers of several data sets: clouds, poses, and checks for missing files and LiDARs."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from boxreg_ros.datasets.protocol import Cloud
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.labels.clouds import BIN_COLUMNS
+from boxreg_ros.rotations import quaternion_from_matrix
 from boxreg_ros.structures import Floats
 import numpy as np
 from numpy.typing import NDArray
@@ -115,3 +116,12 @@ def require_lidar(asked: Sequence[str], names: Sequence[str], main: str = '') ->
             f'leave out all but one --points'
         )
     return found[0]
+
+
+def pose_rows(transforms: Sequence[Floats]) -> Floats:
+    """Return poses x y z qx qy qz qw, shape (P, 7), of P matrices (4, 4)."""
+    poses = np.zeros((len(transforms), 7))
+    for pose, T in zip(poses, transforms, strict=True):
+        pose[:3] = T[:3, 3]
+        pose[3:] = quaternion_from_matrix(T[:3, :3])
+    return poses

@@ -12,8 +12,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from boxreg_ros.datasets.files import read_bin, require
-from boxreg_ros.datasets.poses import pose_rows
+from boxreg_ros.datasets.files import pose_rows, read_bin, require
 from boxreg_ros.datasets.protocol import SweepFile
 from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.io.transforms import inverse

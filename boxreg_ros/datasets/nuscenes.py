@@ -13,8 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.datasets.files import read_bin, require, require_lidar
-from boxreg_ros.datasets.poses import pose_rows
+from boxreg_ros.datasets.files import pose_rows, read_bin, require, require_lidar
 from boxreg_ros.datasets.protocol import Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, SceneFrames

@@ -17,8 +17,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from boxreg_ros.datasets.files import finite_cloud, require, require_lidars
-from boxreg_ros.datasets.poses import pose_rows
+from boxreg_ros.datasets.files import finite_cloud, pose_rows, require, require_lidars
 from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.transforms import inverse

@@ -41,7 +41,7 @@ BOX_NAMESPACES = ('input', 'refined', 'heading', 'id', 'covariance')
 FINAL = 'final'
 RECORDING = 'recording'
 NAMESPACES = (*BOX_NAMESPACES, FINAL, RECORDING)
-DEVIATIONS = 2.0  # that the ellipse of a covariance reaches out to
+ELLIPSE_DEVIATIONS = 2.0  # that the ellipse of a covariance reaches out to
 TEXT_HEIGHT = 3.0
 """Height of the state of the recording above the sensor [m]; chosen."""
 TEXT_WIDTH = 30
@@ -241,7 +241,7 @@ def _arrow(m: Any, header: Any, number: int, box: Floats, quaternion_xyzw: Float
 def _ellipse(m: Any, header: Any, number: int, box: Floats, spread: Floats) -> Any:
     """Return the covariance (2, 2) of x and y as a disc on the roof; a dot where it is zero."""
     variances, axes = np.linalg.eigh(spread)
-    across, along = _plain(2 * DEVIATIONS * np.sqrt(variances.clip(0)) + 1e-3)
+    across, along = _plain(2 * ELLIPSE_DEVIATIONS * np.sqrt(variances.clip(0)) + 1e-3)
     half = 0.5 * np.arctan2(axes[1, 1], axes[0, 1])  # eigenvalues ascend
     above = box[BOX_CENTER].copy()
     above[Z] += 0.5 * box[HEIGHT]

@@ -53,8 +53,7 @@ class MessageDecoder:
         """Add the definitions that ROS 2 has of types that the recording does not define."""
         known = self._reader.typestore.fielddefs
         if not known.keys() >= {kind for kind in kinds if '/msg/' in kind}:
-            stock = stock_types().fielddefs
-            self._reader.typestore.register({k: v for k, v in stock.items() if k not in known})
+            self._reader.complete_definitions(stock_types())
 
     def message(self, record: Record) -> Any:
         """

@@ -26,8 +26,8 @@ from boxreg_ros.structures import (
     Sweep,
 )
 from boxreg_ros.tracks.complete import complete, CompletionPlan
+from boxreg_ros.tracks.effects import TrackSteps
 from boxreg_ros.tracks.followed import with_evidence
-from boxreg_ros.tracks.track_steps import TrackSteps
 import numpy as np
 
 ROAD_CLEARANCE = 0.3

@@ -142,7 +142,8 @@ def followed(arrays: Sequence[BoxArray], store: SweepStore, config: Config) -> l
     if not len(store) or not arrays:
         return []
     seeds = [replace(array, boxes=_from_store(array.boxes, store, -1)) for array in arrays]
-    found = follow_points(np.array(store.stamps_ns, np.int64), store, seeds, config)
+    stamps_ns = np.array(store.stamps_ns, np.int64)
+    found = follow_points(stamps_ns, store, seeds, config, store.sensor_origins)
     return [replace(track, boxes=_from_store(track.boxes, store)) for track in found]
 
 

@@ -15,7 +15,7 @@ from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.structures import Ints
-from boxreg_ros.tracks.track_steps import TrackSteps
+from boxreg_ros.tracks.effects import TrackSteps
 import numpy as np
 
 if TYPE_CHECKING:

@@ -257,11 +257,6 @@ class Request:
         )
 
     @property
-    def all_formats(self) -> tuple[str, ...]:
-        """Return the formats to write, each once, ``csv`` first."""
-        return tuple(dict.fromkeys(('csv', *self.box_formats, *self.point_formats)))
-
-    @property
     def box_formats(self) -> tuple[str, ...]:
         """Return the formats that are written while boxes are refined."""
         return tuple(name for name in self.formats if not labels_points(name))

@@ -18,7 +18,7 @@ from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, WITH_B
 from boxreg_ros.review.drives import drives_application
 from boxreg_ros.review.proposals import proposals_of
 from boxreg_ros.review.report import PAGE_VERSION, REPORT
-from boxreg_ros.review.requests import box_of, json_of, STAMP, stamp_of, text_of
+from boxreg_ros.review.requests import box_of, json_of, posted, STAMP, stamp_of, text_of
 from boxreg_ros.review.scene import DriveSource
 from boxreg_ros.review.scene_routes import SceneRoutes
 from boxreg_ros.review.solve import ReportParts
@@ -167,8 +167,8 @@ class _Review:
             Route('/decisions', self.decide, methods=['POST']),
             Route('/events', self.events),
             Route('/open', self.note_open, methods=['POST']),
-            Route('/solve', self.solve, methods=['POST']),
-            Route('/risk', self.risk, methods=['POST']),
+            Route('/solve', posted(self._parts.solved), methods=['POST']),
+            Route('/risk', posted(self._parts.risks), methods=['POST']),
             Route('/save', self.save, methods=['POST']),
         ]
         if self._source is not None:
@@ -218,20 +218,6 @@ class _Review:
         if track:
             self._open[page] = track, now
         return JSONResponse([known for one, (known, _) in self._open.items() if one != page])
-
-    async def solve(self, request: Request) -> Response:
-        """Return the boxes of a track, solved again with its pinned boxes."""
-        sent = await json_of(request)
-        return Response(
-            await run_in_threadpool(self._parts.solved, sent), media_type='application/json'
-        )
-
-    async def risk(self, request: Request) -> Response:
-        """Return the risk of a box as it is, and as a person drags it."""
-        sent = await json_of(request)
-        return Response(
-            await run_in_threadpool(self._parts.risks, sent), media_type='application/json'
-        )
 
     async def save(self, request: Request) -> Response:
         """Run the command of the result again with the decisions, into a folder beside it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 import re
 from typing import Any
 
@@ -11,8 +11,10 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.structures import Floats
 import numpy as np
 import orjson
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
+from starlette.responses import Response
 
 MAX_BODY = 2**23
 """Longest request [bytes]: one decision about a track whose id has 1 MB, several times over."""
@@ -48,6 +50,18 @@ async def json_of(request: Request) -> Mapping[str, Any]:
     if not isinstance(sent, dict):
         raise RecordingError('request: expected an object')
     return sent
+
+
+def posted(answer: Callable[[Mapping[str, Any]], bytes | Response]) -> Callable[[Request], Any]:
+    """Return the endpoint of requests whose object is answered in a thread, by JSON as bytes."""
+
+    async def endpoint(request: Request) -> Response:
+        found = await run_in_threadpool(answer, await json_of(request))
+        if isinstance(found, Response):
+            return found
+        return Response(found, media_type='application/json')
+
+    return endpoint
 
 
 def text_of(sent: Mapping[str, Any], name: str) -> str:

@@ -10,7 +10,7 @@ from boxreg_ros.review.added import added_track
 from boxreg_ros.review.fit import fitted, USUAL_EXTENTS
 from boxreg_ros.review.images import DriveImages
 from boxreg_ros.review.payload import as_json
-from boxreg_ros.review.requests import box_of, json_of, numbers_of, stamp_of, text_of
+from boxreg_ros.review.requests import box_of, numbers_of, posted, stamp_of, text_of
 from boxreg_ros.review.scene import DriveScene, DriveSource, thinned
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box
 import numpy as np
@@ -35,29 +35,17 @@ class SceneRoutes:
         """Return the routes."""
         return [
             Route('/sweep', self.sweep),
-            Route('/fit', self.fit, methods=['POST']),
-            Route('/follow', self.follow, methods=['POST']),
+            Route('/fit', posted(self._fit), methods=['POST']),
+            Route('/follow', posted(self._follow), methods=['POST']),
             Route('/cameras', self.cameras),
             Route('/image', self.image),
-            Route('/accumulated', self.accumulated, methods=['POST']),
+            Route('/accumulated', posted(self._accumulated), methods=['POST']),
         ]
 
     async def sweep(self, request: Request) -> Response:
         """Return the sweep nearest to a stamp: stamp, origin, sensor, points."""
         stamp_ns = _needed_stamp(request.query_params)
         return await run_in_threadpool(self._sweep, stamp_ns)
-
-    async def fit(self, request: Request) -> Response:
-        """Return the box of the object at a place."""
-        return await run_in_threadpool(self._fit, await json_of(request))
-
-    async def follow(self, request: Request) -> Response:
-        """Return the track of an object from its boxes."""
-        return await run_in_threadpool(self._follow, await json_of(request))
-
-    async def accumulated(self, request: Request) -> Response:
-        """Return the points of all sweeps in the boxes of a track."""
-        return await run_in_threadpool(self._accumulated, await json_of(request))
 
     async def cameras(self, request: Request) -> Response:
         """Return the cameras, with their poses at a stamp."""
@@ -80,7 +68,8 @@ class SceneRoutes:
         head = np.int64(found_ns).tobytes() + np.concatenate([origin, sensor]).tobytes()
         return _bytes(head + points.tobytes())
 
-    def _fit(self, sent: Mapping[str, Any]) -> Response:
+    def _fit(self, sent: Mapping[str, Any]) -> bytes:
+        """Return the box of the object at a place."""
         place = numbers_of(sent.get('place'), 'place', 2)
         extents = _extents_of(sent.get('extents'))
         name = text_of(sent, 'class')
@@ -92,19 +81,20 @@ class SceneRoutes:
         )
         box = found.box + np.append(origin, np.zeros(6))
         answer = {'box': box, 'class': found.class_name, 'points': found.num_points}
-        return Response(as_json(answer), media_type='application/json')
+        return as_json(answer)
 
-    def _follow(self, sent: Mapping[str, Any]) -> Response:
+    def _follow(self, sent: Mapping[str, Any]) -> bytes:
+        """Return the track of an object from its boxes."""
         names = (text_of(sent, 'id'),), (text_of(sent, 'class'),)
         begin_ns = stamp_of(sent, 'begin_ns') or 0
         seeds = []
         for seed in _objects_of(sent.get('seeds'), 'seeds'):
             box = box_of(seed.get('box'))[None]
             seeds.append(BoxArray(_needed_stamp(seed), self._frame_id, *names, np.ones(1), box))
-        answer = added_track(self._scene, seeds, begin_ns)
-        return Response(as_json(answer), media_type='application/json')
+        return as_json(added_track(self._scene, seeds, begin_ns))
 
     def _accumulated(self, sent: Mapping[str, Any]) -> Response:
+        """Return the points of all sweeps in the boxes of a track."""
         rows = _objects_of(sent.get('boxes'), 'boxes')
         stamps_ns = [_needed_stamp(row) for row in rows]
         boxes = np.array([box_of(row.get('box')) for row in rows])

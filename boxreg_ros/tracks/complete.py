@@ -30,13 +30,12 @@ from boxreg_ros.structures import (
     REJECTED,
     Y,
 )
-from boxreg_ros.tracks.added import AddedBoxes
+from boxreg_ros.tracks.effects import AddedBoxes, TrackSteps
 from boxreg_ros.tracks.extend import extend, num_free, num_supported, points_at_end
 from boxreg_ros.tracks.fill import fill
 from boxreg_ros.tracks.prune import duplicates, ghosts
 from boxreg_ros.tracks.static import join_static
 from boxreg_ros.tracks.stitch import stitch
-from boxreg_ros.tracks.track_steps import TrackSteps
 from boxreg_ros.tracks.tracklet import Tracklet, tracklets_of
 import numpy as np
 from numpy.typing import NDArray

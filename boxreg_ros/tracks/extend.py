@@ -13,12 +13,16 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.support import is_owned, least_support
 from boxreg_ros.structures import EXTENDED, Floats, Ints
-from boxreg_ros.tracks.added import AddedBoxes
+from boxreg_ros.tracks.effects import AddedBoxes
 from boxreg_ros.tracks.fill import accelerations
 from boxreg_ros.tracks.prune import CONFIRMED_BOXES
 from boxreg_ros.tracks.tracklet import Tracklet
 from boxreg_ros.tracks.tracklet_motion import end_motion, is_parked
 import numpy as np
+
+MOVING_REACH, PARKED_REACH = 1.0, 4.0
+"""Longest extension of a moving and of a parked object at each end [s]. Chosen: motion is known
+for a second. Literature: MS3D extends parked objects by 4 s."""
 
 
 def extend(tracklet: Tracklet, array_stamps_ns: Ints, config: Config) -> list[AddedBoxes]:
@@ -32,14 +36,12 @@ def extend(tracklet: Tracklet, array_stamps_ns: Ints, config: Config) -> list[Ad
     array_stamps_ns : array, shape (a,)
         Stamps at which the input has boxes of any object, ascending [ns].
     config : Config
-        `complete.extend_time` of moving and `complete.extend_parked` of parked objects.
+        Settings.
 
     """
     if len(tracklet.stamps_ns) < CONFIRMED_BOXES:
         return []
-    settings = config.complete
-    parked = is_parked(tracklet.boxes)
-    reach_ns = (settings.extend_parked if parked else settings.extend_time) * 1e9
+    reach_ns = (PARKED_REACH if is_parked(tracklet.boxes) else MOVING_REACH) * 1e9
     before_ns = tracklet.first_ns - array_stamps_ns
     after_ns = array_stamps_ns - tracklet.last_ns
     earlier = array_stamps_ns[(before_ns > 0) & (before_ns <= reach_ns)]

@@ -9,9 +9,10 @@ the box on the motion model stays, with a covariance that grows with the distanc
 from __future__ import annotations
 
 from boxreg_ros.config import ClassConfig, Config
+from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.motion import motion_at
 from boxreg_ros.structures import Floats, INTERPOLATED, Ints
-from boxreg_ros.tracks.added import AddedBoxes
+from boxreg_ros.tracks.effects import AddedBoxes
 from boxreg_ros.tracks.tracklet import Tracklet
 from boxreg_ros.tracks.tracklet_motion import between, is_parked
 import numpy as np
@@ -71,5 +72,5 @@ def accelerations(model: ClassConfig) -> Floats:
     """Return usual accelerations of x y z [m/s^2] and roll pitch yaw [rad/s^2], shape (6,)."""
     horizontal = max(model.acceleration, model.cornering)
     return np.array(
-        [horizontal, horizontal, model.vertical, model.tilting, model.tilting, model.turning]
+        [horizontal, horizontal, CONSTANTS.vertical, *[CONSTANTS.tilting] * 2, model.turning]
     )

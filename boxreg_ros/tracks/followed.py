@@ -9,7 +9,7 @@ from boxreg_ros.core.follow import FollowedTrack
 from boxreg_ros.core.following.person import corrections, diagonals, moved
 from boxreg_ros.structures import BoxArray, Floats, HUMAN, REFINED, RefinedBoxes
 from boxreg_ros.tracks.complete import AddedBox, CompletionPlan, unchanged_plan
-from boxreg_ros.tracks.track_steps import TrackSteps
+from boxreg_ros.tracks.effects import TrackSteps
 import numpy as np
 
 UNSUPPORTED = np.diag(np.square([0.5, 0.5, 0.2, 0.05, 0.05, 0.1]))

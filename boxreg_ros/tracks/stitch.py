@@ -10,6 +10,7 @@ as good, none is made.
 from __future__ import annotations
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.motion import EndMotion
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, X, Y, YAW, Z
@@ -83,7 +84,7 @@ def _cost(before: EndMotion, after: EndMotion) -> float:
     backward = _position_cost(after, before)
     distance, log_det = max(forward, backward)
     seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
-    up = HEIGHT_DEVIATION + before.model.vertical * seconds**2 / 2
+    up = HEIGHT_DEVIATION + CONSTANTS.vertical * seconds**2 / 2
     distance += (after.box[Z] - before.box[Z]) ** 2 / up**2
     extents = BOX_EXTENT
     ratios = np.log(after.box[extents] / before.box[extents])

@@ -119,13 +119,13 @@ def on_faces(inside, n=40, faces=(0, 2, 4)):
 
 
 def supported(problem, gap=0.0, outermost=0.05, depths=0.0, distant=0.0):
-    config = CONFIG.updated({'faces.outermost': outermost})
+    constants = CONSTANTS._replace(outermost=outermost)
     terms = np.zeros(problem.counts.shape, TERMS)
     B = len(problem.boxes)
     observe_faces(
         0, B, problem, np.ascontiguousarray(problem.boxes[..., BOX_POSE]),
         shared_of(B=B, GAP=[gap] * 6), no_inputs(occlusion_inset=depths, range_inset=distant),
-        CONSTANTS.with_settings(config).record(), terms,
+        constants.record(), terms,
     )  # fmt: skip
     return terms
 

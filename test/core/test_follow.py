@@ -4,6 +4,7 @@ from boxreg_ros import follow, ShapeError
 from boxreg_ros.core.following import person
 from boxreg_ros.core.following.person import corrections, DEVIATIONS, EVIDENCE
 from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BoxArray, HUMAN, INTERPOLATED
 import numpy as np
 import pytest
@@ -155,6 +156,41 @@ def test_deviations_of_keyframes_follow_from_their_residuals():
             assert np.abs(fits - keys).mean() > 2 * np.abs(fits + steps - keys).mean()
         few = keys[:9], fits[:9], np.tile(fit_variance, (9, 1))
         assert not corrections(*few, DEVIATIONS).any()
+
+
+def unoccluded(points, box):
+    """Return the points whose rays from `ORIGIN` do not cross a box."""
+    to_box = matrix_from_rpy(box[6:]).T
+    start = to_box @ (np.array(ORIGIN) - box[:3])
+    steps = (points - ORIGIN) @ to_box.T
+    with np.errstate(divide='ignore'):
+        at = np.sort([(-box[3:6] / 2 - start) / steps, (box[3:6] / 2 - start) / steps], axis=0)
+    is_crossed = (at[0].max(1) < at[1].min(1)) & (at[0].max(1) < 1) & (at[1].min(1) > 0)
+    return points[~is_crossed]
+
+
+def test_extents_shrink_where_rays_cross_the_box():
+    rng = np.random.default_rng(9)
+    truth = drive(N, speed=6.0, turn=0.3)
+    angle, height = rng.uniform(0.0, 2 * np.pi, 20_000), rng.uniform(-2.0, 6.0, 20_000)
+    wall = np.column_stack([60 * np.cos(angle), 60 * np.sin(angle), height])  # around the sensor
+    sweeps = [
+        np.concatenate([unoccluded(wall, box), road(rng), returns(box, rng, 150, ORIGIN)])
+        for box in truth
+    ]
+    large = seed(truth, 10)
+    forward = np.array([np.cos(truth[10, 8]), np.sin(truth[10, 8]), 0.0])
+    toward = np.sign(forward @ (np.array(ORIGIN) - truth[10, :3]))
+    large.boxes[0, 3] += 0.6
+    large.boxes[0, :3] -= toward * 0.3 * forward  # the near end stays
+    origins = np.tile(ORIGIN, (N, 1))
+    own = seed(truth, 10)
+    for given, error in ((large, 0.25), (own, 0.05)):
+        [track] = follow(stamps(N), sweeps, [given], None, origins)
+        assert np.abs(track.boxes[:, 3:6] - truth[:, 3:6]).max() < error
+        assert iou_3d(track.boxes, truth[track.rows]).mean() > 0.85
+    [track] = follow(stamps(N), sweeps, [large])  # no rays without the place of the sensor
+    assert track.boxes[0, 3] - truth[0, 3] > 0.5
 
 
 def test_neighbour_and_road_do_not_pull_a_parked_car():

@@ -189,9 +189,9 @@ def test_weights_of_input_and_motion_by_hand():
     terms, _ = weighed(problem, common)
     W = {name: terms['W'][:, i] for i, name in enumerate(RESIDUAL_NAMES)}
     np.testing.assert_allclose(W['input'][:5], [common['widened_deviation'] ** -2.0] * 5)
-    motion = [car.acceleration, car.cornering, car.vertical, car.tilting, car.tilting, car.turning]
+    motion = [car.acceleration, car.cornering, 1.0, 0.2, 0.2, car.turning]
     np.testing.assert_allclose(W['acceleration'][:3], [np.array(motion) ** -2.0] * 3)
-    np.testing.assert_allclose(W['slip'][:4, :2], [[car.slip**-2, car.climb**-2]] * 4)
+    np.testing.assert_allclose(W['slip'][:4, :2], [[car.slip**-2, 0.25**-2]] * 4)
     assert not W['input'][5:].any() and not W['acceleration'][3:].any()
     assert not W['slip'][4:].any() and not W['zero motion'].any()
     rest, _ = weighed(car_problem(np.repeat(drive(1)[None], 6, axis=1)), common)

@@ -66,13 +66,13 @@ def test_messages_that_rosbags_refuses_are_left_to_it(tmp_path, flaw):
             recording._decoder.message(bad_record)
 
 
-def test_other_recordings_are_read_by_objects(tmp_path):
+def test_other_recordings_are_read_by_objects(tmp_path, monkeypatch):
     for drive in (Drive(sweeps=2, ros1=True), Drive(sweeps=2, boxes=JSK)):
         storage = 'rosbag1' if drive.messages.ros1 else 'mcap'
         path = drive.write(tmp_path / storage, storage)
         with Recording([path], convention=ASSOCIATE) as recording:
             expected = arrays_of(recording)
-            del recording.typestore.fielddefs['std_msgs/msg/Header']
+            monkeypatch.delitem(recording.typestore.fielddefs, 'std_msgs/msg/Header')
             recording.read_boxes_as_arrays()
             assert recording._array_adapter is None
             assert_same(arrays_of(recording), expected)

@@ -2,16 +2,19 @@
 
 from boxreg_ros.core.input_statistics import from_text
 from paths import BAGS
-from ros_graph import ended_cleanly, graph_in, play, publishers_for, QUICK, records_of, RELIABLE
+from ros_graph import (
+    ended_cleanly,
+    first_sweeps,
+    graph_in,
+    play,
+    publishers_for,
+    QUICK,
+    records_of,
+    RELIABLE,
+)
 from ros_messages import DETECTIONS
 
 SWEEPS = 12
-
-
-def first_sweeps(records, count):
-    """Return the records up to the boxes of a number of sweeps."""
-    ends = [i + 1 for i, record in enumerate(records) if record.boxes_stamp_ns is not None]
-    return records[: ends[count - 1]]
 
 
 def test_a_drive_is_added_to_the_file_of_the_drives_before(tmp_path):

@@ -422,7 +422,7 @@ def test_busy_solver_delays_neither_diagnostics_nor_shutdown(graph, tmp_path):
 def test_calibrated_settings_are_read_as_parameters(graph, tmp_path):
     """Settings of every type that `boxreg calibrate` writes reach the running node."""
     changes = {
-        'max_gap': 2, 'window': 8, 'solver.tolerance': 1e-5, 'sampling.deskew': True,
+        'max_gap': 2, 'window': 8, 'paper.closeness': 1e-5, 'sampling.deskew': True,
         'mode': 'bev', 'vehicle.names': ['ute'], 'lag': 7,
     }  # fmt: skip
     gap = Measured(value=0.25, spread=0.01, tracks=9)

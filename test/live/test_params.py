@@ -150,7 +150,7 @@ def test_written_file_is_read_by_nodes_of_any_name_and_by_relabel(make_node, tmp
             'window': 7,
             'lag': 5,
             'vehicle.names': ['ute', 'car'],
-            'solver.tolerance': 1e-5,
+            'paper.closeness': 1e-5,
             'mode': 'bev',
         }
     )

@@ -1,8 +1,8 @@
 """Measurements for the pages of results; users have those of `boxreg bench`."""
 
 import argparse
-from functools import partial
 from importlib import import_module
+import json
 from pathlib import Path
 import sys
 
@@ -34,7 +34,6 @@ METAVARS = {int: 'N', float: 'S', Path: 'DATA'}
 PROGRAM = 'python test/measure'
 MEASURE = (sys.executable, str(Path(__file__).parent))
 """The command in a process of its own, of this environment."""
-print_json = partial(common.print_json, program=PROGRAM)
 
 
 def add_arguments(parser, arguments):
@@ -75,11 +74,19 @@ def main(words: list[str]) -> int:
     module = import_module(f'measure.{name}')
     parser = argparse.ArgumentParser(f'{PROGRAM} {name}', description=f'{MEASUREMENTS[name]}.')
     add_arguments(parser, module.ARGUMENTS)
+    common.add_json_argument(parser)
     args = parser.parse_args(options)
     keep_freed_memory()
     collect_rarely()
     try:
-        return int(module.run(args))
+        results = module.run(args)
     except BoxregError as error:
         print(f'{PROGRAM} {name}: {error}', file=sys.stderr)
         return 1
+    if results is None:
+        return 0
+    if args.json:
+        common.print_json(results, PROGRAM)
+    else:
+        print(json.dumps(common.finite(results), indent=2))
+    return 0

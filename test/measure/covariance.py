@@ -12,42 +12,33 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES
-from boxreg_ros.bench.common import add_json_argument, progress_bar
+from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance
 from boxreg_ros.offline.box_scores import match
-from boxreg_ros.offline.consistency import Consistency, consistency, table
+from boxreg_ros.offline.consistency import Consistency, consistency
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.structures import REFINED, RefinedBoxes
-from measure import print_json
 import numpy as np
 
 ARGUMENTS = {
     'data': (Path, 'folder: one recording and truth.csv', {'nargs': '+'}),
-    '--json': add_json_argument,
 }
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print coverage and normalised squared errors of each estimate, per recording."""
+def run(args: argparse.Namespace) -> object:
+    """Return coverage and normalised squared errors of each estimate, per recording."""
     report: dict[str, Any] = {}
     with progress_bar(len(args.data), args) as bar:
         for folder in args.data:
             found = measure(Drive.read(folder))
             bar.update()
-            if not args.json:
-                bar.clear()
-                for estimate, groups in found.items():
-                    print(f'{folder}, {estimate}')
-                    print(table(groups))
             report[str(folder)] = {
                 estimate: {name: group._asdict() for name, group in groups.items()}
                 for estimate, groups in found.items()
             }
-    if args.json:
-        print_json(report)
-    return 0
+    return report
 
 
 def measure(drive: Drive) -> dict[str, dict[str, Consistency]]:

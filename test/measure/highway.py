@@ -12,12 +12,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 
-from boxreg_ros.bench.common import add_json_argument, line, progress_bar
+from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.scenarios import highway
-from measure import print_json
 import numpy as np
 
 SPEEDS = (5.0, 30.0)
@@ -27,17 +26,14 @@ CONVENTIONS = ('stamp', 'sight')
 COMPARED = ('smoothing', 'ours')
 MIN_SEEN_POINTS = 10
 """True boxes with fewer points are left out; chosen: there is little to register to."""
-
-
 ARGUMENTS = {
     '--seeds': (3, 'number of drives'),
     '--sweeps': (60, 'sweeps of a drive'),
-    '--json': add_json_argument,
 }
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print the mean 3D IoU of each method by speed, one table for each time of the boxes."""
+def run(args: argparse.Namespace) -> object:
+    """Return the mean 3D IoU of each method by speed and time of the boxes."""
     results: dict[str, dict[str, dict[str, float]]] = {}
     count = len(CONVENTIONS) * len(SPEEDS) * args.seeds
     with progress_bar(count, args) as bar:
@@ -47,14 +43,7 @@ def run(args: argparse.Namespace) -> int:
                 for name, iou in _mean_ious(args, convention, speed, bar.update).items():
                     table.setdefault(name, {})[f'{speed:g} m/s'] = iou
             results[convention] = table
-    if args.json:
-        print_json(results)
-        return 0
-    for convention, table in results.items():
-        print(line(f'boxes of the time of {convention}', [f'{speed:g} m/s' for speed in SPEEDS]))
-        for name, found in table.items():
-            print(line(name, list(found.values())))
-    return 0
+    return results
 
 
 def _mean_ious(

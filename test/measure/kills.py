@@ -19,9 +19,8 @@ from tempfile import TemporaryDirectory
 import time
 from typing import Any, NamedTuple
 
-from boxreg_ros.bench.common import add_json_argument, BOXREG
+from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.errors import BoxregError
-from measure import print_json
 from measure.node import (
     children_of,
     COMPLETION_TIME,
@@ -53,13 +52,12 @@ ARGUMENTS = {
     '--tracks': (64, ''),
     '--points': (130000, 'per sweep'),
     '--record': ('openlabel,sustechpoints', 'formats', {'metavar': 'FORMAT,...'}),
-    '--json': add_json_argument,
 }
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> object:
     """
-    Measure and print.
+    Return the loss of each kind when a process is killed.
 
     Raises
     ------
@@ -75,12 +73,7 @@ def run(args: argparse.Namespace) -> int:
             name = f'{victim} killed: {kind} boxes lost'
             report[f'{name}, mean [s]'] = float(np.mean(counts)) / RATE
             report[f'{name}, most [s]'] = max(counts) / RATE
-    if args.json:
-        print_json(report)
-        return 0
-    for name, value in report.items():
-        print(f'{name:44} {value:.2f}')
-    return 0
+    return report
 
 
 def _killed(args: argparse.Namespace, victim: str, seconds: float) -> LostArrays:

@@ -14,15 +14,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES, print_comparison
-from boxreg_ros.bench.common import add_json_argument, progress_bar
+from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES
+from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.bench.differences import Difference, paired, PairedBoxes, REFERENCE_METHODS
 from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.simulate import simulate
-from measure import print_json
 import numpy as np
 
 COMPARED = ('smoothing', 'ours')
@@ -40,18 +39,15 @@ Comparison = tuple[str, str, str]
 """Class of the true boxes, method, and the method that it is compared with."""
 Differences = dict[str, dict[str, dict[str, Difference]]]
 """By the same."""
-
-
 ARGUMENTS = {
     'data': (Path, 'recording and truth.csv (default: simulated streets)', {'nargs': '*'}),
     '--seeds': (16, 'number of simulated drives'),
     '--scenario': ('street', 'of these', {'choices': SCENARIOS}),
-    '--json': add_json_argument,
 }
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print the differences of each class: a table per recording, or one of all streets."""
+def run(args: argparse.Namespace) -> object:
+    """Return the differences of each class: of each recording, or of all streets."""
     measured: dict[str, dict[Comparison, dict[str, PairedBoxes]]] = {}  # by table; pairs by drive
     with progress_bar(len(args.data) or args.seeds, args) as bar:
         for table, name, drive in _drives(args):
@@ -60,18 +56,7 @@ def run(args: argparse.Namespace) -> int:
                 comparisons.setdefault(comparison, {})[name] = pairs
             bar.update()
     tables = {table: _differences(comparisons) for table, comparisons in measured.items()}
-    if args.json:
-        print_json(_plain(tables))
-        return 0
-    for table, classes in tables.items():
-        print(table)
-        for class_name, methods in classes.items():
-            boxes = methods['ours, track']['input'].boxes
-            print(f'{class_name}: {boxes} true boxes with points')
-            for method, found in methods.items():
-                print_comparison(f'{method}, minus', found)
-        print()
-    return 0
+    return _plain(tables)
 
 
 def _drives(args: argparse.Namespace) -> Iterator[tuple[str, str, Drive]]:

@@ -22,7 +22,7 @@ from threading import Thread
 import time
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, BOXREG
+from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
@@ -31,7 +31,6 @@ from boxreg_ros.offline.reviewed_drive import drive_of
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import Floats, REJECTED, YAW
 from browser import end_shared_browser, opened_page
-from measure import print_json
 import numpy as np
 
 STREET = Path(__file__).parents[2] / 'bags'
@@ -63,30 +62,13 @@ BEFORE: Mapping[str, tuple[str, ...]] = {
     'apply': ('terminal', 'command', 'Enter'),
 }  # fmt: skip
 """What one error of each kind took in the page of the first release and in a text editor."""
+ARGUMENTS = {'--seed': (0, '')}
 
 
-ARGUMENTS = {
-    '--seed': (0, ''),
-    '--json': add_json_argument,
-}
-
-
-def run(args: argparse.Namespace) -> int:
-    """Plant, relabel, review, and print actions and errors."""
+def run(args: argparse.Namespace) -> object:
+    """Plant, relabel, review, and return actions and errors."""
     with TemporaryDirectory() as folder:
-        found = measure(Path(folder), args.seed)
-    if args.json:
-        print_json(found)
-        return 0
-    print('errors    ' + '  '.join(f'{name:>8}' for name in found['planted']))
-    for name in ('planted', 'relabelled', 'reviewed'):
-        print(f'{name:10}' + '  '.join(f'{count:8}' for count in found[name].values()))
-    print(f'actions   {found["actions"]} ({found["kinds"]}), before {found["actions_before"]}')
-    print(
-        f'seconds   {found["seconds"]:.0f} of a person (keystroke-level model), of these '
-        f'{found["thinking"]:.0f} of thought; the script took {found["script_seconds"]:.0f}'
-    )
-    return 0
+        return measure(Path(folder), args.seed)
 
 
 def measure(folder: Path, seed: int = 0) -> dict[str, Any]:

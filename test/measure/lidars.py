@@ -14,7 +14,7 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, line, progress_bar
+from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
@@ -24,7 +24,6 @@ from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
 from boxreg_ros.simulation.truck import CORNER_LIDARS, truck_scene, write_truck
-from measure import print_json
 import numpy as np
 
 CLASSES = ('car', 'van', 'truck')
@@ -38,33 +37,23 @@ WAYS = {
 """Name -> layout of `TRUCK_SENSORS`, and how it is read."""
 MIN_POINTS = 100
 """True boxes with fewer points of all corners are left out, as in `boxreg bench real`."""
-
-
 ARGUMENTS = {
     '--seeds': (3, 'number of drives'),
     '--sweeps': (int, 'sweeps of a drive'),
-    '--json': add_json_argument,
 }
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print the mean IoU of the input and of each way to record the LiDARs."""
+def run(args: argparse.Namespace) -> object:
+    """Return the mean IoU of the input and of each way to record the LiDARs."""
     rows: dict[str, list[tuple[float, float]]] = {name: [] for name in ('input', *WAYS)}
     with progress_bar(args.seeds * len(WAYS), args) as bar:
         for seed in range(args.seeds):
             for name, ious in measured(seed, args.sweeps, bar.update).items():
                 rows[name].append(ious)
-    results = {
+    return {
         name: dict(zip(('bev', '3d'), np.mean(ious, axis=0).tolist(), strict=True))
         for name, ious in rows.items()
     }
-    if args.json:
-        print_json(results)
-        return 0
-    print(line('', ('BEV', '3D')))
-    for name, found in results.items():
-        print(line(name, list(found.values())))
-    return 0
 
 
 def measured(seed: int, sweeps: int | None, done: Any) -> dict[str, tuple[float, float]]:

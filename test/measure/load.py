@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import argparse
 
-from boxreg_ros.bench.common import add_json_argument
 from boxreg_ros.core.metrics import iou_3d
-from measure import print_json
 from measure.node import BOX_ERRORS, CIRCLE_PERIOD, measure, true_boxes
 from msg_adapters import markers
 import numpy as np
@@ -25,21 +23,17 @@ POLICIES = {
     'dropping clouds': ['deadline:=3600.0', 'backlog:=0.1'],
 }
 """Parameters of the node for each way to treat overload; 0.1 s is a period of the sensor."""
-SHOWN = ('latency p50 [ms]', 'latency p99 [ms]', 'early IoU', 'final IoU', 'clouds dropped')
-"""Values that are printed for each number of tracks."""
-
-
+LATENCIES = ('latency p50 [ms]', 'latency p99 [ms]')
 ARGUMENTS = {
     '--tracks': ([16, 64, 256, 1024], '', {'nargs': '+'}),
     '--points': (130000, 'per sweep'),
     '--seconds': (15.0, 'seconds of data'),
-    '--json': add_json_argument,
 }
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> object:
     """
-    Measure and print.
+    Return latency and accuracy by policy and number of tracks.
 
     Raises
     ------
@@ -47,23 +41,14 @@ def run(args: argparse.Namespace) -> int:
         If the node or the publisher ends early.
 
     """
-    report = {
+    return {
         policy: {str(tracks): _measured(args, tracks, settings) for tracks in args.tracks}
         for policy, settings in POLICIES.items()
     }
-    if args.json:
-        print_json(report)
-        return 0
-    for policy, rows in report.items():
-        print(f'{policy:16} {"".join(f"{name:>18}" for name in ("input IoU", *SHOWN))}')
-        for tracks, row in rows.items():
-            cells = [row[name] for name in ('input IoU', *SHOWN)]
-            print(f'{tracks:>16} {"".join(f"{value:18.3f}" for value in cells)}')
-    return 0
 
 
 def _measured(args: argparse.Namespace, tracks: int, settings: list[str]) -> dict[str, float]:
-    """Return the values of `SHOWN` for a number of tracks and parameters of the node."""
+    """Return latency, accuracy and losses for a number of tracks and parameters of the node."""
     scope = argparse.Namespace(
         tracks=tracks, points=args.points, rate=10.0, seconds=args.seconds, delay=0.05,
         transport='large', set=settings, record=None, keep_gigabytes=0.0,
@@ -73,7 +58,7 @@ def _measured(args: argparse.Namespace, tracks: int, settings: list[str]) -> dic
     overlap = {f'{name} IoU': _mean_iou(scope, messages[name]) for name in ('early', 'final')}
     dropped = float(report['counters'].get('points_queue_full', 0))
     nan = float('nan')  # no message was published
-    latencies = {name: report.get(name, nan) for name in SHOWN if 'latency' in name}
+    latencies = {name: report.get(name, nan) for name in LATENCIES}
     return {**latencies, 'input IoU': _input_iou(scope), **overlap, 'clouds dropped': dropped}
 
 

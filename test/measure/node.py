@@ -23,11 +23,11 @@ from threading import Thread
 import time
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, BOXREG
+from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.errors import BoxregError, ConfigError
 from boxreg_ros.labels import module_of
 from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
-from measure import MEASURE, print_json
+from measure import MEASURE
 from measure.recorded import RecordedLabels
 import numpy as np
 from paths import SHARE
@@ -49,8 +49,6 @@ RECORDING_TURNS = 2  # runs without and with recording
 SETTLED_AFTER = 60.0  # queues, pools of memory and the heap have their size by then [s]
 LAST_TIME = 30.0  # wait for the last messages, on a busy machine [s]
 SAMPLE_PERIOD = 1.0  # of memory, handles, threads and CPU time of the node [s]
-
-
 ARGUMENTS = {
     '--tracks': (64, ''),
     '--points': (130000, 'per sweep'),
@@ -66,15 +64,14 @@ ARGUMENTS = {
     '--record': (str, 'formats: also record labels in them, with their clouds'),
     '--compare': (False, 'alternate runs without and with --record, and divide their latencies'),
     '--keep-gigabytes': (float('inf'), 'delete the oldest segments beyond, once counted [GB]'),
-    '--json': add_json_argument,
     '--role': (str, argparse.SUPPRESS, {'choices': ('publish',)}),
     '--log': (Path, argparse.SUPPRESS),
 }
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> object:
     """
-    Measure and print.
+    Return what was measured; a process with a role returns nothing.
 
     Raises
     ------
@@ -87,18 +84,10 @@ def run(args: argparse.Namespace) -> int:
     except ImportError as error:
         raise BoxregError(f'{error}: source a ROS 2 installation') from None
     if args.role:
-        publish(args)
-        return 0
+        return publish(args)
     if args.compare and args.record is None:
         raise ConfigError('--compare: expected --record with formats, got none; add it')
-    report = compare(args) if args.compare else measure(args)
-    if args.json:
-        print_json(report)
-        return 0
-    for name, value in report.items():
-        text = value if isinstance(value, (str, dict)) else f'{value:g}'
-        print(f'{name:28} {text}')
-    return 0
+    return compare(args) if args.compare else measure(args)
 
 
 # ---------------------------------------------------------------- process of the publisher

@@ -18,7 +18,6 @@ from pathlib import Path
 import time
 from typing import NamedTuple
 
-from boxreg_ros.bench.common import add_json_argument, line
 from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.point_labels import MOVING, ObjectTrack, PointLabeller
@@ -30,7 +29,6 @@ from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.scene import SimulatedScene
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL
-from measure import print_json
 import numpy as np
 from numpy.typing import NDArray
 
@@ -117,24 +115,16 @@ ARGUMENTS = {
     '--seeds': (2, 'number of drives'),
     '--sweeps': (int, 'sweeps of a drive'),
     'data': (Path, 'recording and its exact truth.csv, not simulated drives', {'nargs': '*'}),
-    '--json': add_json_argument,
 }
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print the IoU of labels by method: of instances, of "moving" and by distance."""
+def run(args: argparse.Namespace) -> object:
+    """Return the IoU of labels by method: of instances, of "moving" and by distance."""
     counts: dict[str, Counter[str]] = {name: Counter() for name in METHODS}
     for drive, truth in drives(args):
         for name, found in measured(drive, truth).items():
             counts[name] += found
-    results = {name: scores(found) for name, found in counts.items()}
-    if args.json:
-        print_json(results)
-        return 0
-    print(line('', list(results)))
-    for score in dict.fromkeys(score for found in results.values() for score in found):
-        print(line(score, [found.get(score, np.nan) for found in results.values()]))
-    return 0
+    return {name: scores(found) for name, found in counts.items()}
 
 
 def drives(args: argparse.Namespace) -> Iterator[tuple[Drive, Truth]]:

@@ -10,12 +10,10 @@ label an object twice. A proposal that is near no true box is a false alarm.
 from pathlib import Path
 import time
 
-from boxreg_ros.bench.common import add_json_argument, line
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.offline.completion import points_above_road
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.tracks.proposals import Proposer
-from measure import print_json
 import numpy as np
 
 PARTS = 3
@@ -24,27 +22,14 @@ OVERLAP = 0.1
 """3D IoU from which a box is of the same object."""
 NEAR = 1.0
 """And distance of the centres, up to which it is [m]."""
-TITLES = ('tracks', 'proposed', '3D', 'false', 'false/min', 'ms')
-
-
 ARGUMENTS = {
     'data': (Path, 'folder: one recording and truth.csv', {'nargs': '+'}),
-    '--json': add_json_argument,
 }
 
 
 def run(args):
-    """Print one row per recording."""
-    report = {}
-    if not args.json:
-        print(line('', TITLES))
-    for folder in args.data:
-        report[str(folder)] = row = _row(Drive.read(folder))
-        if not args.json:
-            print(line(folder.name, row.values()))
-    if args.json:
-        print_json(report)
-    return 0
+    """Return one row per recording."""
+    return {str(folder): _row(Drive.read(folder)) for folder in args.data}
 
 
 def _row(drive):

@@ -21,15 +21,13 @@ from measure import MEASURE, PROGRAM
 from paths import ROOT
 
 STORE = ROOT / 'docs' / 'results'
-
-
 ARGUMENTS = {
     'data': (Path, 'folder with the recordings'),
     '--only': ('*', "pattern, such as 'tracks_*' (default: all)", {'metavar': 'NAMES'}),
 }
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """
     Write each chosen file anew, whole or not at all.
 
@@ -49,7 +47,6 @@ def run(args: argparse.Namespace) -> int:
             raise RecordingError(f'{command}: ended with exit status {done.returncode}')
         document = json.loads(done.stdout) | {'command': command}
         path.write_text(f'{json.dumps(document)}\n', encoding='utf-8')
-    return 0
 
 
 def resolved(command: str) -> list[str]:

@@ -18,12 +18,11 @@ import subprocess
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, BOXREG
+from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.bench.speed.recordings import write_traffic
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.review.report import REPORT
 from browser import launched
-from measure import print_json
 import numpy as np
 
 COMPOSITORS = {'processor': ('--disable-gpu-compositing',), 'emulated GPU': ()}
@@ -75,19 +74,16 @@ count => new Promise(done => {
 """
 """Script that changes one line of text per frame, as a reference; it returns when frames began."""
 FIRST_PAINT = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
-
-
 ARGUMENTS = {
     'recordings': (Path, 'recordings whose reports are measured', {'nargs': '*'}),
     '--tracks': (1000, 'tracks of a synthetic stream whose report is measured too; 0 for none'),
     '--boxes': (80, 'boxes of each of its tracks'),
     '--points': (130000, 'points of each of its sweeps'),
-    '--json': add_json_argument,
 }
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure and print."""
+def run(args: argparse.Namespace) -> object:
+    """Return first paint and frame times of reports."""
     report: dict[str, Any] = {
         'load before': os.getloadavg()[0],
         'page of one number': {
@@ -104,12 +100,7 @@ def run(args: argparse.Namespace) -> int:
             write_traffic(drive, args.tracks, args.points, args.boxes)
             title = f'{args.tracks:,} tracks of {args.boxes} boxes'
             report[title] = measure(drive, folder / 'out', *QUICK)
-    if args.json:
-        print_json(report)
-    else:
-        for title, found in report.items():
-            print(f'{title}: {found}')
-    return 0
+    return report
 
 
 def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:

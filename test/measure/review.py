@@ -16,7 +16,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, line, progress_bar
+from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import iou_3d, pose_errors, PoseErrors
 from boxreg_ros.core.registrar import BoxRegistrar
@@ -30,7 +30,6 @@ from boxreg_ros.review.decisions import Decision
 from boxreg_ros.review.risk import assess, Usual
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Sweep, X, YAW, Z
-from measure import print_json
 import numpy as np
 
 CUTS = (0.01, 0.05, 0.1, 0.2)
@@ -41,16 +40,13 @@ PLANTED_PART = 0.2
 """Part of the tracks that get an error; chosen: enough of each kind of error."""
 PLANTED_ERRORS = ('size', 'yaw', 'shift', 'swap', 'drift')
 SEED = 0
-
-
 ARGUMENTS = {
     'data': (Path, 'folder: one recording and truth.csv', {'nargs': '+'}),
-    '--json': add_json_argument,
 }
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print the share of bad tracks at the top of each list, per recording and input."""
+def run(args: argparse.Namespace) -> object:
+    """Return the share of bad tracks at the top of each list, per recording and input."""
     report: dict[str, Any] = {}
     with progress_bar(2 * len(args.data), args) as bar:
         for folder in args.data:
@@ -59,12 +55,7 @@ def run(args: argparse.Namespace) -> int:
             for name, given in (('own boxes', drive), ('planted errors', planted(drive))):
                 report[str(folder)][name] = measure(given)
                 bar.update()
-                if not args.json:
-                    bar.clear()
-                    _print(f'{folder}, {name}', report[str(folder)][name])
-    if args.json:
-        print_json(report)
-    return 0
+    return report
 
 
 def measure(drive: Drive) -> dict[str, Any]:
@@ -291,17 +282,3 @@ def _shares(is_bad: Any, values: Sequence[float]) -> list[float]:
 def _first(cut: float, count: int) -> int:
     """Return the number of tracks in the first part of a list, at least one."""
     return max(1, math.ceil(cut * count))
-
-
-def _print(title: str, found: dict[str, Any]) -> None:
-    """Print one table."""
-    print(f'{title}: {found["tracks"]} tracks, worst {found["bad"]} by 3D IoU')
-    print(line('share of these in the', [f'{cut:.0%}' for cut in CUTS]))
-    for name, shares in found['shares'].items():
-        print(line(name, shares))
-    pins = found['pins']
-    names = ('before', 'after', 'gained', 'constant')
-    print(line('3D IoU, pinned', [pins[name] for name in names]))
-    print('(before and after; part gained of 1 - IoU, and at most, without constant errors)')
-    print(line('constant errors', list(pins['left'])))
-    print(line('left [m, rad]', list(pins['left'].values())))

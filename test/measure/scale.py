@@ -23,14 +23,13 @@ from tempfile import TemporaryDirectory
 import time
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, BOXREG
+from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.offline.job_process import JobRunner
 from boxreg_ros.structures import Floats
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
-from measure import print_json
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
@@ -81,12 +80,11 @@ ARGUMENTS = {
     '--rounds': (3, 'how often one and two workers take turns'),
     '--large': (float, 'size of a recording made by repetition; the fleet is of such drives [GB]'),
     '--price': (PRICE, 'of a core for an hour', {'metavar': 'USD'}),
-    '--json': add_json_argument,
 }
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure, simulate and print."""
+def run(args: argparse.Namespace) -> object:
+    """Measure, and simulate a fleet."""
     report: dict[str, Any] = {'recording': args.recording.name, 'load': os.getloadavg()[0]}
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -106,12 +104,7 @@ def run(args: argparse.Namespace) -> int:
         'usd': core_hours * args.price,
         **{name: getattr(fleet, name) for name in Fleet.__slots__},
     }
-    if args.json:
-        print_json(report)
-    else:
-        for name, value in report.items():
-            print(f'{name}: {value}')
-    return 0
+    return report
 
 
 def simulated(

@@ -24,10 +24,8 @@ from typing import Any
 
 from boxreg_ros.bench.common import (
     add_estimate_argument,
-    add_json_argument,
     add_scope_arguments,
     class_words,
-    line,
     progress_bar,
 )
 from boxreg_ros.config import Config, KINDS, Setting
@@ -36,7 +34,6 @@ from boxreg_ros.errors import ConfigError
 from boxreg_ros.offline.box_scores import match, summarise
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.structures import BoxArray
-from measure import print_json
 import numpy as np
 import torch
 
@@ -45,7 +42,7 @@ PAPER = 'paper'
 """The objective of the paper, and the group of settings that it alone reads."""
 
 UNLIKE = Config().updated(
-    {f'faces.{name}': 1.0 for name in ('outermost', 'ends', 'sides', 'top', 'bottom', 'outlier')}
+    {'faces.ends': 1.0, 'faces.sides': 1.0}
     | {f'ingredients.{name}': False for name in ('strips', 'robust_motion')}
 )
 """A configuration that differs from the default one in all that `with_settings` fills."""
@@ -194,11 +191,9 @@ def variations_of_constants() -> list[Variation]:
     of_settings = known.with_settings(UNLIKE)
     found = []
     for name, default in known._asdict().items():
-        if getattr(of_settings, name) != default:
-            continue
-        numbers = default if isinstance(default, tuple) else (default,)
-        for place, number in enumerate(numbers):
-            if isinstance(number, bool):
+        numbers, filled = np.atleast_1d(default), np.atleast_1d(getattr(of_settings, name))
+        for place, number in enumerate(numbers.tolist()):
+            if isinstance(number, bool) or filled[place] != number:
                 continue
             label = f'{name}[{place}]' if isinstance(default, tuple) else name
             for factor in FACTORS:
@@ -320,21 +315,18 @@ def losses(
 
 
 # --------------------------------------------------------------------------------- command
-
-
 ARGUMENTS = {
     'scope': add_scope_arguments,
     '--estimate': add_estimate_argument,
     '--objective': ('robust', 'that whose numbers are varied', {'choices': ('robust', PAPER)}),
     '--only': (['*'], "names, as in 'faces.*' or 'parked_*'", {'nargs': '+'}),
     '--workers': (2, 'runs at a time'),
-    '--json': add_json_argument,
 }
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> object:
     """
-    Print the loss of mean IoU by each variation.
+    Return the loss of mean IoU by each variation.
 
     Raises
     ------
@@ -366,18 +358,12 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f'--only {" ".join(args.only)}: matches none of {names}')
     baseline, outcomes = run_all(drives, measurement, chosen, args)
     found = losses(chosen, baseline, outcomes)
-    if args.json:
-        print_json(
-            {
-                'objective': args.objective,
-                'estimate': args.estimate,
-                'baseline': {name: asdict(outcome) for name, outcome in baseline.items()},
-                'losses': [asdict(loss) for loss in found],
-            }
-        )
-    else:
-        print('\n'.join(table(baseline, found, args.estimate)))
-    return 0
+    return {
+        'objective': args.objective,
+        'estimate': args.estimate,
+        'baseline': {name: asdict(outcome) for name, outcome in baseline.items()},
+        'losses': [asdict(loss) for loss in found],
+    }
 
 
 def kinds_of(arrays: Sequence[BoxArray], config: Config) -> list[str]:
@@ -387,23 +373,3 @@ def kinds_of(arrays: Sequence[BoxArray], config: Config) -> list[str]:
         for class_name in array.class_names:
             counts[config.kind(class_name)] += 1
     return [kind for kind, _ in counts.most_common()]
-
-
-def table(baseline: Mapping[str, Outcome], found: Sequence[Loss], estimate: str) -> list[str]:
-    """Return the lines of the printed table."""
-    lines = [line(f'estimate {estimate}', ('BEV', '3D'))]
-    lines += [line(name, (outcome.iou_bev, outcome.iou_3d)) for name, outcome in baseline.items()]
-    width = max(len('loss of mean IoU by'), *(len(loss.name) for loss in found))
-    lines += ['', f'{"loss of mean IoU by":{width}} {"factor":>7} {"value":>9}{"BEV":>9}{"3D":>9}']
-    for loss in found:
-        start = f'{loss.name:{width}} {loss.factor:>7g} {loss.value:>9.3g}'
-        if loss.failure:
-            lines.append(f'{start}  failed: {loss.failure}')
-        else:
-            lines.append(f'{start}{_signed(loss.bev):>9}{_signed(loss.volume):>9}')
-    return lines
-
-
-def _signed(loss: float) -> str:
-    """Return a loss with four digits after the point, without a negative zero."""
-    return f'{round(loss, 4) + 0.0:+.4f}'

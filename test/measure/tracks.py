@@ -10,13 +10,13 @@ first row is a reference: the tracks before they were broken, registered.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 import math
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, line, progress_bar
+from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.config import COMPLETE_STEPS, Config, KINDS
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.box_table import BoxTable
@@ -28,10 +28,8 @@ from boxreg_ros.offline.track_scores import track_scores, TrackScores
 from boxreg_ros.review.rules import DUPLICATE_IOU
 from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
 from boxreg_ros.structures import BoxArray, Ints, RefinedBoxes, REJECTED, Sweep
-from measure import print_json
 import numpy as np
 
-TITLES = ('recall', 'prec.', 'ids/obj', 'HOTA', 'IDF1', 'added', '3D added', 'ghosts', 'lost')
 ONE_LABEL = 'with one label'
 """Objects of the truth without a second label at their place."""
 UNBROKEN = 'unbroken, refined'
@@ -67,22 +65,17 @@ ARGUMENTS = {
     '--far-misses': (False, 'misses in runs and far away, as of detectors, not independent ones'),
     '--coast': (0.0, 'rows of the live estimates without and with it, not of the steps [s]'),
     '--seed': (0, 'seed of the breaks'),
-    '--json': add_json_argument,
 }
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print the scores after each step, one table per recording."""
+def run(args: argparse.Namespace) -> object:
+    """Return the scores after each step, by recording."""
     report: dict[str, Any] = {}
     rows_per_drive = 4 if args.coast else 3 + len(COMPLETE_STEPS)
     with progress_bar(len(args.data) * rows_per_drive, args) as bar:
         for folder in args.data:
             whole = Drive.read(folder)
             drive = broken(whole, args.seed, args.ghosts, args.far_misses)
-            if not args.json:
-                bar.clear()
-                print(f'{folder}: {len(drive.truth.boxes)} true boxes')
-                print(line('', TITLES))
             rows = {}
             for name, row in _rows(whole, drive, args.coast):
                 rows[name] = asdict(row.scores) | {
@@ -91,15 +84,8 @@ def run(args: argparse.Namespace) -> int:
                     'by_kind': {kind: asdict(scores) for kind, scores in row.by_kind.items()},
                 }
                 bar.update()
-                if not args.json:
-                    print(line(name, _cells(row)))
-            if not args.json:
-                _print_kinds(UNBROKEN, rows[UNBROKEN]['by_kind'])
-                _print_kinds(name, rows[name]['by_kind'])
             report[str(folder)] = rows
-    if args.json:
-        print_json(report)
-    return 0
+    return report
 
 
 def broken(drive: Drive, seed: int, ghosts: float, far_misses: bool = False) -> Drive:
@@ -204,26 +190,3 @@ def table_of(results: Sequence[RefinedBoxes]) -> BoxTable:
     table = BoxTable.from_arrays([result.boxes for result in results])
     table = replace(table, status=tuple(word for r in results for word in r.status))
     return table.rows(np.array([status != REJECTED for status in table.status], bool))
-
-
-def _print_kinds(name: str, by_kind: Mapping[str, Mapping[str, float]]) -> None:
-    """Print the scores of each kind of object in the row of a `name`."""
-    print(line(name, ('recall', 'prec.', 'ids/obj', 'added', '3D added', '3D others')))
-    for kind, s in by_kind.items():
-        found = (s['recall'], s['precision'], s['ids_per_object'])
-        print(line(kind, (*found, str(s['added']), s['added_iou'], s['given_iou'])))
-
-
-def _cells(row: Row) -> tuple[float | str, ...]:
-    scores = row.scores
-    return (
-        scores.recall,
-        scores.precision,
-        scores.ids_per_object,
-        scores.hota,
-        scores.idf1,
-        str(scores.added),
-        scores.added_iou,
-        row.ghosts,
-        row.lost,
-    )

@@ -23,9 +23,10 @@ from ros_messages import (
     OBJECTS_WITH_COVARIANCE,
     SCENE,
     TRACKED,
+    typestore,
     write_recording,
 )
-from rosbags.typesys import get_types_from_msg
+from rosbags.typesys import get_types_from_msg, Stores
 from scipy.spatial.transform import Rotation
 
 STAMP = 1_700_000_000_123_456_789
@@ -297,6 +298,7 @@ int32[] histogram
 
 def test_forks_of_jsk_boxes_are_read_by_the_definition_in_the_recording(tmp_path):
     messages = Messages(ros1=True)
+    messages.store = typestore.__wrapped__(Stores.ROS1_NOETIC)
     box = 'jsk_recognition_msgs/msg/BoundingBox'
     for name in (box, JSK):
         del messages.store.fielddefs[name], messages.store.types[name]

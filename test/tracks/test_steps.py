@@ -3,7 +3,7 @@
 from boxreg_ros.config import Config
 from boxreg_ros.core.motion import motion_at
 from boxreg_ros.io.stamp_order import kept
-from boxreg_ros.tracks.extend import extend, num_free, num_supported
+from boxreg_ros.tracks.extend import extend, MOVING_REACH, num_free, num_supported
 from boxreg_ros.tracks.fill import fill
 from boxreg_ros.tracks.links import best_links
 from boxreg_ros.tracks.prune import duplicates, ghosts
@@ -218,7 +218,7 @@ def test_long_gaps_are_filled_for_parked_objects_only():
 def test_extension_follows_the_motion_from_the_track_outwards():
     boxes = path((0, 0), (8, 1), 60)
     before, after = extend(tracklet('a', boxes[20:40], 20), STAMPS[:60], CONFIG)
-    reach = round(CONFIG.complete.extend_time / 0.1)
+    reach = round(MOVING_REACH / 0.1)
     assert before.stamps_ns.tolist() == STAMPS[19 : 19 - reach : -1].tolist()
     np.testing.assert_allclose(after.boxes, boxes[40 : 40 + reach], atol=1e-6)
     np.testing.assert_allclose(before.boxes, boxes[19 : 19 - reach : -1], atol=1e-6)

@@ -1,9 +1,10 @@
-"""Growth of a box that was drawn too small, by the points along its track."""
+"""Extents of a box that was drawn too small or too large, by the points along its track."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from boxreg_ros.core.following.kernels.free_space import BIN
 from boxreg_ros.structures import Floats
 import numpy as np
 
@@ -14,15 +15,17 @@ MOST_GROWTH = 0.25
 MIN_GROWTH = 0.2
 """A face nearer to the outermost points stays: the labelling margin and the error of a person [m];
 chosen."""
+MIN_SHRINKAGE = 0.3
+"""The same inwards [m]; chosen: corners are round, and rays pass them."""
 FACE_MARGIN = 0.05
 """Labelling margin of a face that moves [m]; as the settings of the classes."""
 LEAST_SWEEPS, LEAST_POINTS = 5, 50
 """Fewer are no evidence for a face; chosen."""
-BIN = 0.1
-"""Width of the bins that show where the points of the object end [m]; chosen."""
 MIN_SHARE, MIN_SHARE_SWEEPS = 0.01, 0.3
 """Bins with a smaller part of the points, or in a smaller part of the sweeps, are no part of the
 object: mirrors, and what it passes; chosen."""
+LEAST_RAYS, LEAST_RAY_SWEEPS = 50, 3
+"""Rays through a layer that show that nothing is there, and sweeps of these; chosen."""
 OUTERMOST = 0.98
 """Quantile of the points that counts as the outermost one; chosen."""
 
@@ -54,6 +57,40 @@ def faces(sweeps: Sequence[Floats], half: Floats) -> Floats:
         own = is_within[:, others].all(1) & (sign * points[:, axis] > half[axis] / 2)
         found[side, axis] = sign * _face(sign * points[own, axis], owner[own], float(half[axis]))
     return found
+
+
+def freed(found: Floats, sweeps: Sequence[Floats], crossed: Floats, half: Floats) -> Floats:
+    """
+    Return faces (2, 3) moved inwards, past the space that rays have crossed.
+
+    Parameters
+    ----------
+    found : array, shape (2, 3)
+        Faces, see `faces`.
+    sweeps : sequence of arrays, shape (n_i, 3)
+        Points in the box and beside it, as of `faces`.
+    crossed : array, shape (m, 3, 2, LAYERS)
+        Rays of some sweeps through the layers behind each face, see `free_space.crossings`.
+    half : array, shape (3,)
+        Half the extents of the box.
+
+    """
+    points = np.concatenate(sweeps)
+    points = points[(np.abs(points) < half + MIN_GROWTH / 2).all(1)]
+    faces = found.copy()
+    if len(points) < LEAST_POINTS:
+        return faces
+    is_free = (crossed.sum(0) >= LEAST_RAYS) & ((crossed > 0).sum(0) >= LEAST_RAY_SWEEPS)
+    for axis, side in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1)):
+        sign = 2 * side - 1
+        layers = is_free[axis, side]
+        depth = BIN * (len(layers) if layers.all() else int(np.argmin(layers)))
+        outermost = float(np.quantile(sign * points[:, axis], OUTERMOST)) + FACE_MARGIN
+        face = max(half[axis] - depth, outermost)
+        has_grown = sign * found[side, axis] > half[axis]
+        if not has_grown and half[axis] - face > MIN_SHRINKAGE:
+            faces[side, axis] = sign * face
+    return faces
 
 
 def _face(outwards: Floats, owner: Floats, half: float) -> float:

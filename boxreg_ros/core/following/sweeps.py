@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-from boxreg_ros.structures import Ints
+from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +30,8 @@ class Sweeps(NamedTuple):
     points: Points
     stop: int
     first: int = 0
+    origins: Floats | None = None
+    """Positions of the sensor by row (S, 3), NaN if unknown [m]."""
 
     def has(self, row: int) -> bool:
         """Return whether there is such a row."""

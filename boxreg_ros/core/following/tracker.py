@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Self
 
-from boxreg_ros.core.following.extents import faces, MAX_GROWTH
-from boxreg_ros.core.following.kernels import motion, registration, surface
+from boxreg_ros.core.following.extents import faces, freed, MAX_GROWTH
+from boxreg_ros.core.following.kernels import free_space, motion, registration, surface
 from boxreg_ros.core.following.sweeps import Sweeps
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
@@ -74,7 +74,7 @@ NEAR_SEEDS = 1.5
 """Seeds nearer in time give the speed [s]; chosen: acceleration changes it by less than 3 m/s."""
 SEARCH_SWEEPS = 5
 """Sweeps in each direction that a start speed is tested with."""
-SPEEDS_TESTED = 8
+SPEEDS_TESTED = 4
 """Most likely speeds by the first sweeps that are tested with `SEARCH_SWEEPS`."""
 START_INFORMATION = np.diag(np.array([0.5, 0.5, 0.1, 0.05]) ** -2.0)
 """Of the starts of a search for the speed: x y z [m] and yaw [rad]."""
@@ -84,6 +84,8 @@ MAX_SWEEP_POINTS = 400
 """A sweep with more points around a box is thinned; swept: the poses are as good."""
 MAX_EXTENT_SWEEPS = 60
 """Sweeps of a track whose points show the extents; chosen."""
+MAX_RAY_SWEEPS = 20
+"""Sweeps whose rays show free space; chosen: all of their points are looked at."""
 MAX_CELLS = 20_000
 """Of a surface: those of a bus of 12 m at 0.15 m."""
 
@@ -373,7 +375,20 @@ class Follower:
             self._in_box(self._near(int(rows[i]), pose, MAX_GROWTH), pose, MAX_GROWTH)
             for i, pose in zip(some, boxes[:, POSE4][some], strict=True)
         ]
-        low, high = faces(points, self._half)
+        found = faces(points, self._half)
+        origins = self._sweeps.origins
+        if origins is not None:
+            crossed = np.array([
+                free_space.crossings(
+                    self._sweeps.points[int(rows[i])], origins[rows[i]], boxes[i, POSE4],
+                    self._tilt, self._half,
+                )
+                for i in some[:: -(-len(some) // MAX_RAY_SWEEPS)]
+                if np.isfinite(origins[rows[i]]).all()
+            ])  # fmt: skip
+            if len(crossed):
+                found = freed(found, points, crossed, self._half)
+        low, high = found
         grown = boxes.copy()
         shift = (low + high) / 2
         grown[:, :3] += matrix_from_rpy(boxes[:, ROLL:]) @ shift

@@ -9,6 +9,7 @@ from data; all others are *chosen*, and `make results` halves and doubles each o
 from math import inf
 from typing import Any, NamedTuple
 
+from boxreg_ros.core.method.arrays import BOTTOM
 from boxreg_ros.core.method.residuals import RESIDUALS
 import numpy as np
 
@@ -17,7 +18,7 @@ RESIDUAL_NAMES = tuple(row.name for row in RESIDUALS)
 
 class Constants(NamedTuple):
     """
-    The numbers of the method; the last ones are settings, filled once a batch by `with_settings`.
+    The numbers of the method; `with_settings` fills in those of the settings, once a batch.
 
     Deviations are standard deviations. Lengths are in metres, angles in radians, times in seconds.
 
@@ -52,7 +53,22 @@ class Constants(NamedTuple):
     occluded_weight: float = 0.25
     """Weight of a face that is turned away from the sensor. Chosen."""
     face_outlier: float = 0.15
-    """Distance at which the points of a face have weight 1/4 [m]: setting `faces.outlier`."""
+    """Distance of a face from its points at which it has weight 1/4 [m]. Chosen."""
+    outermost: float = 0.05
+    """Part of the points of a box that makes a face observation. Chosen."""
+    face_deviations: tuple[float, ...] = (0.12, 0.12, 0.08, 0.08, 0.08, 0.05)
+    """Deviation of one observation of each face [m]: settings, but for the road. Chosen."""
+
+    # Motion (M7), (M23)
+    vertical: float = 1.0
+    """Deviation of the vertical acceleration [m/s^2]. Chosen: roads are smooth."""
+    tilting: float = 0.2
+    """Deviation of the roll and pitch acceleration [rad/s^2]. Chosen: as `vertical`."""
+    climb: float = 0.25
+    """Deviation of the velocity along the z axis of a box [m/s]. Chosen: as `vertical`."""
+    sideslip: float = 0.01
+    """Deviation of the angle from the heading of a track to its path [rad]. Measured: between that
+    of the labels of Argoverse 2 and of PandaSet."""
 
     # Weights (M21) to (M25)
     outlier: float = 3.0
@@ -168,11 +184,7 @@ class Constants(NamedTuple):
     heading_deviation: float = 0.01
     """Angle from the heading of a label to its surface [rad]. Measured, see `sideslip`."""
 
-    # Settings
-    outermost: float = 0.05
-    """Part of the points of a box that makes a face observation: `faces.outermost`."""
-    face_deviations: tuple[float, ...] = (0.12, 0.12, 0.08, 0.08, 0.08, 0.05)
-    """Deviation of one observation of each face [m]: `faces.ends` and so on."""
+    # Switches of a round
     uses_shape: bool = True
     """Whether the observations of a window are tied by the rigid shape of their track."""
     residuals: tuple[bool, ...] = (True,) * len(RESIDUALS)
@@ -181,11 +193,10 @@ class Constants(NamedTuple):
     def with_settings(self, config: Any) -> 'Constants':
         """Return these numbers with the settings of a `Config`."""
         faces, parts = config.faces, config.ingredients
-        of_faces = faces.ends, faces.ends, faces.sides, faces.sides, faces.top, faces.bottom
+        road = self.face_deviations[BOTTOM]
         return self._replace(
-            outermost=faces.outermost,
-            face_outlier=faces.outlier,
-            face_deviations=of_faces,
+            face_deviations=(*[faces.ends] * 2, *[faces.sides] * 3, road),
+            face_outlier=self.face_outlier if parts.robust_weights else inf,
             strips=self.strips if parts.strips else 1,
             occluded_weight=self.occluded_weight if parts.occluded_faces else 0.0,
             max_range_share=self.max_range_share if parts.range_inset else 0.0,

@@ -161,7 +161,7 @@ def fill_expectation(b, problem, inputs, constants, work, common):
     shared[PIVOT] = mean[0] * of_class.pivot
     deviation[PIVOT] = mean[0] * constants.pivot_deviation
     deviation[ANCHOR:SIDESLIP] = 1.0
-    deviation[SIDESLIP] = of_class.sideslip
+    deviation[SIDESLIP] = constants.sideslip
 
 
 @kernel

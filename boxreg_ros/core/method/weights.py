@@ -64,8 +64,10 @@ def rigid_shape_weight(n, r, window, constants, w):
 @loop
 def acceleration_weight(n, r, window, constants, w):
     """Write the weight of an acceleration along the axes of the body (M23)."""
-    for k in range(POSE):
-        w[k] = 1 / window.of_class.acceleration[k] ** 2
+    forward, sideways, turning = window.of_class.motion
+    w[0], w[1], w[2] = forward**-2, sideways**-2, constants.vertical**-2
+    w[3] = w[4] = constants.tilting**-2
+    w[5] = turning**-2
 
 
 @loop
@@ -79,8 +81,7 @@ def zero_motion_weight(n, r, window, constants, w):
 @loop
 def slip_weight(n, r, window, constants, w):
     """Write the weight of the velocity of the pivot across the path and upward (M7)."""
-    for k in range(2):
-        w[k] = 1 / window.of_class.slip[k] ** 2
+    w[0], w[1] = window.of_class.slip**-2, constants.climb**-2
 
 
 @loop

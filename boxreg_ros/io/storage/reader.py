@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, contextmanager, ExitStack, suppress
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -24,6 +25,8 @@ MESSAGE_MARKS = ('__msgtype__', 'DESCRIPTOR', 'get_fields_and_field_types')
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 """Begin of a message that rosbag2 has compressed; CDR begins with 0 and 0 to 3."""
 IDL_SEPARATOR = '=' * 80 + '\n'
+Definitions = tuple[tuple[str, MessageDefinition], ...]
+"""Names of types and their definitions; code is made of them for 50 ms."""
 
 
 class Reader:
@@ -60,13 +63,18 @@ class Reader:
                 raise RecordingError(
                     'recordings of ROS 1 and ROS 2 cannot be merged; relabel them one by one'
                 )
-            self.typestore = get_typestore(Stores.EMPTY)
-            _register(self.typestore, self.connections)
+            self.typestore = _typestore(_definitions(self.connections))
             self._opened = stack.pop_all()
 
     def close(self) -> None:
         """Close all files."""
         self._opened.close()
+
+    def complete_definitions(self, stock: Typestore) -> None:
+        """Add the definitions of `stock` that the recording does not have."""
+        own = _typestore.__wrapped__(_definitions(self.connections))  # not that of other readers
+        own.register({k: v for k, v in stock.fielddefs.items() if k not in own.fielddefs})
+        self.typestore = own
 
     @property
     def damages(self) -> list[Damage]:
@@ -159,18 +167,24 @@ def _encoding(connection: Connection) -> str:
     return getattr(connection.ext, 'serialization_format', 'ros1')
 
 
-def _register(store: Typestore, connections: Sequence[Connection]) -> None:
+def _definitions(connections: Sequence[Connection]) -> Definitions:
+    return tuple((connection.msgtype, connection.msgdef) for connection in connections)
+
+
+@lru_cache(maxsize=8)
+def _typestore(definitions: Definitions) -> Typestore:
     """
-    Add the message definitions of connections to a store.
+    Return a store of message definitions, which readers of a recording share.
 
     A definition that cannot be parsed is left out: messages of its type are unreadable then,
     unless the type is among the stock definitions.
 
     """
+    store = get_typestore(Stores.EMPTY)
     found: dict[str, Any] = {}
-    for connection in connections:
+    for name, definition in definitions:
         try:
-            found.update(_types_of(connection.msgdef, connection.msgtype))
+            found.update(_types_of(definition, name))
         except Exception:  # of the parsers, for any malformed definition
             continue
     try:
@@ -179,6 +193,7 @@ def _register(store: Typestore, connections: Sequence[Connection]) -> None:
         for name, fields in found.items():
             with suppress(Exception):
                 store.register({name: fields})
+    return store
 
 
 def _types_of(definition: MessageDefinition, name: str) -> Any:
