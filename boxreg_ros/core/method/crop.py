@@ -235,31 +235,19 @@ def flat_height(heights, quantiles, flatness, min_points):
 
 
 @kernel
-def grouped(values, owner, is_used, n):
-    """
-    Return the used ones of P values box by box.
-
-    Those of box b, one of `n`, are values[first[b]:first[b + 1]]; `first` is the other result.
-
-    """
+def road_heights(owner, height, is_beside, n, numbers):
+    """Return the height of the road beside each of n boxes (n,); NaN where not found [m]."""
     first = np.zeros(n + 1, np.int64)
     for k in range(len(owner)):
-        first[owner[k] + 1] += is_used[k]
+        first[owner[k] + 1] += is_beside[k]
     for box in range(n):
         first[box + 1] += first[box]
     place = first[:-1].copy()
-    found = np.empty(first[-1], values.dtype)
+    levels = np.empty(first[-1])
     for k in range(len(owner)):
-        if is_used[k]:
-            found[place[owner[k]]] = values[k]
+        if is_beside[k]:
+            levels[place[owner[k]]] = height[k]
             place[owner[k]] += 1
-    return found, first
-
-
-@kernel
-def road_heights(owner, height, is_beside, n, numbers):
-    """Return the height of the road beside each of n boxes (n,); NaN where not found [m]."""
-    levels, first = grouped(height, owner, is_beside, n)
     road = np.empty(n)
     for box in range(n):
         road[box] = flat_height(
@@ -334,41 +322,32 @@ def separated(a, b, shapes, margin, normal, faces):
 
 
 @kernel
-def may_touch(shapes, a, b):
-    """Return whether the bounding boxes of two boxes touch along x and y."""
-    is_near = True
-    for k in range(2):
-        away = abs(shapes.centers[a, k] - shapes.centers[b, k])
-        is_near &= away < shapes.reach[a, k] + shapes.reach[b, k]
-    return is_near
-
-
-@kernel
 def neighbours(shapes, margin):
     """Return the boxes beside each other, see `separated`."""
     n = len(shapes.half)
     number = np.full((n, n), np.int32(-1))
-    near = 0
-    for a in range(n):
-        for b in range(a + 1, n):
-            near += may_touch(shapes, a, b)
-    found = Neighbours(
-        number, np.empty(near, np.int64), np.empty(near, np.int64), np.empty((near, 3)),
-        np.empty((near, 2)),
-    )  # fmt: skip
+    normal, faces = np.empty(3), np.empty(2)
     count = 0
     for a in range(n):
         for b in range(a + 1, n):
-            if may_touch(shapes, a, b) and separated(
-                a, b, shapes, margin, found.normal[count], found.faces[count]
-            ):
-                found.first[count], found.second[count] = a, b
+            is_near = True
+            for k in range(2):
+                away = abs(shapes.centers[a, k] - shapes.centers[b, k])
+                is_near &= away < shapes.reach[a, k] + shapes.reach[b, k]
+            if is_near and separated(a, b, shapes, margin, normal, faces):
                 number[a, b] = number[b, a] = count
                 count += 1
-    return Neighbours(
-        number, found.first[:count], found.second[:count], found.normal[:count],
-        found.faces[:count],
+    found = Neighbours(
+        number, np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, 3)),
+        np.empty((count, 2)),
     )  # fmt: skip
+    for a in range(n):
+        for b in range(a + 1, n):
+            pair = number[a, b]
+            if pair >= 0:
+                found.first[pair], found.second[pair] = a, b
+                separated(a, b, shapes, margin, found.normal[pair], found.faces[pair])
+    return found
 
 
 @kernel
@@ -380,51 +359,33 @@ def along(points, i, shapes, pairs, pair):
 
 
 @kernel
-def middle_of_widest_gap(places, low, high):
-    """
-    Return the middle of the widest gap between `low`, n places above it and `high`.
-
-    It is as wide as one of n + 1 equal cells, or wider: only gaps between cells are looked at.
-
-    """
-    cells = len(places) + 1
-    least, most = np.full(cells + 1, high), np.full(cells + 1, low)
-    most[cells] = high
-    for place in places:
-        cell = min(int((place - low) / (high - low) * cells), cells - 1)
-        least[cell], most[cell] = min(least[cell], place), max(most[cell], place)
-    before, widest, middle = low, 0.0, low
-    for cell in range(cells + 1):
-        if most[cell] > low:  # not empty
-            if least[cell] - before > widest:
-                widest, middle = least[cell] - before, (least[cell] + before) / 2
-            before = most[cell]
-    return middle
-
-
-@kernel
-def borders(points, shapes, pairs, margin, row, owner, is_owned):
+def borders(points, shapes, pairs, margin, row, owner):
     """
     Return where the air between the boxes of each pair is, along its normal (m,) [m].
 
-    That is the middle of the widest gap between the points of both, the owned ones of `row` and
-    `owner` (P,), from `margin` before the first of their faces to as far behind the second.
+    That is the middle of the widest gap between the points of both, `row` and `owner` (P,), from
+    `margin` before the first of their faces to as far behind the second.
 
     """
-    rows, first = grouped(row, owner, is_owned, len(pairs.number))
     border = np.empty(len(pairs.first))
-    places = np.empty(len(rows))
+    places = np.empty(2 * len(row) + 2)
     for pair in range(len(border)):
         low = pairs.faces[pair].min() - margin
         high = pairs.faces[pair].max() + margin
-        count = 0
-        for box in (pairs.first[pair], pairs.second[pair]):
-            for i in rows[first[box] : first[box + 1]]:
-                place = along(points, i, shapes, pairs, pair)
+        places[0], places[1] = low, high
+        count = 2
+        for k in range(len(row)):
+            if owner[k] == pairs.first[pair] or owner[k] == pairs.second[pair]:
+                place = along(points, row[k], shapes, pairs, pair)
                 if low < place < high:
                     places[count] = place
                     count += 1
-        border[pair] = middle_of_widest_gap(places[:count], low, high)
+        ordered = np.sort(places[:count])
+        widest = 0.0
+        for k in range(1, count):
+            if ordered[k] - ordered[k - 1] > widest:
+                widest = ordered[k] - ordered[k - 1]
+                border[pair] = (ordered[k] + ordered[k - 1]) / 2
     return border
 
 
@@ -440,7 +401,8 @@ def fill_owned(points, shapes, numbers, row, owner, depth, is_owned):
     pairs = neighbours(shapes, numbers.own_margin)
     border = np.empty(0)
     if len(pairs.first):
-        border = borders(points, shapes, pairs, numbers.own_margin, row, owner, is_owned)
+        kept = np.flatnonzero(is_owned)
+        border = borders(points, shapes, pairs, numbers.own_margin, row[kept], owner[kept])
     start = 0
     while start < len(row):
         end = start
