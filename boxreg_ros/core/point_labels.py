@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-BACKGROUND, UNKNOWN = -1, -2
+BACKGROUND, UNKNOWN = labelling.BACKGROUND, labelling.UNKNOWN
 """Values of `PointLabels.track` without an object."""
 CERTAIN_GAP = 0.6
 """Between boxes of a moving object that are further apart in time, its place is unknown [s]."""
@@ -164,7 +164,6 @@ class PointLabeller:
     def label(self, sweep: Sweep) -> PointLabels:
         """Return the labels of a sweep in the fixed frame; its times are used where known."""
         objects = self.objects_at(sweep.stamp_ns)
-        n = len(objects.track)
         times = np.zeros(0, np.float32)
         if sweep.times is not None and objects.velocities.any():
             times = sweep.times.astype(np.float32)
@@ -174,31 +173,18 @@ class PointLabeller:
         way = objects.velocities * np.abs(times).max(initial=0) * 2  # before or after the stamp
         shapes = shapes._replace(reach=shapes.reach + np.abs(way @ shapes.turn))
         columns = np.ascontiguousarray(sweep.points.T)
-        near, is_on, rows, local = labelling.label(
+        elsewhere = BACKGROUND if self.knows(sweep.stamp_ns) else UNKNOWN
+        track, motion, rows, owner, local = labelling.label(
             columns,
             times,
             shapes,
             objects,
             self._limits[objects.track],
             self._config.sampling.box_time == 'stamp',
+            elsewhere,
             numbers,
         )
-        # The last entries are those of points that are near no object.
-        elsewhere = BACKGROUND if self.knows(sweep.stamp_ns) else UNKNOWN
-        tracks = np.full((2, n + 1), UNKNOWN, np.int32)
-        tracks[1, :n] = objects.track
-        tracks[:, n] = elsewhere
-        motion = np.append(objects.motion, UNKNOWN_MOTION).astype(np.uint8)
-        return PointLabels(
-            tracks[is_on.view(np.uint8), near],
-            motion[near],
-            rows,
-            local,
-            near[rows],
-            objects,
-            self.tracks,
-            self._moves,
-        )
+        return PointLabels(track, motion, rows, local, owner, objects, self.tracks, self._moves)
 
     def knows(self, stamp_ns: int) -> bool:
         """Return whether the boxes of the input say what is there at a stamp."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+import ctypes
 import errno
 from io import StringIO
 import os
@@ -17,6 +18,12 @@ from boxreg_ros.io.storage.urls import url_of, write_text
 
 DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 """Disk full, file larger than the limit of the process, quota used up."""
+MANY_FILES = 100
+"""
+From so many files on, the whole file system is synchronised instead: measured with 500 new files
+of 80 kB, 2 ms of CPU in 0.1 s instead of 90 ms in 2.5 s; files of others wait, too.
+
+"""
 
 
 @contextmanager
@@ -83,3 +90,25 @@ def store(paths: Iterable[Path]) -> None:
             os.fsync(opened)
         finally:
             os.close(opened)
+
+
+def store_folder(folder: Path) -> None:
+    """Wait until a folder and all that is in it is on the disk itself."""
+    paths = [*folder.rglob('*'), folder]
+    if len(paths) < MANY_FILES or not _synchronised(folder):
+        store(paths)
+
+
+def _synchronised(folder: Path) -> bool:
+    """Synchronise the file system of a folder; return whether the system can, as Linux does."""
+    synchronise = getattr(ctypes.CDLL(None, use_errno=True), 'syncfs', None)
+    if synchronise is None:
+        return False
+    opened = os.open(folder, os.O_RDONLY)
+    try:
+        if synchronise(opened) != 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number))
+    finally:
+        os.close(opened)
+    return True

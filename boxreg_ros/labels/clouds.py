@@ -69,7 +69,7 @@ def write_cloud(
         table[:, 3] = intensities
     with path.open('wb') as file:
         file.write(_header(suffix, names, len(points)).encode())
-        file.write(table.tobytes())
+        file.write(table.data)
 
 
 def _header(suffix: str, names: list[str], points: int) -> str:

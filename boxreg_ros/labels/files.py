@@ -33,7 +33,11 @@ def require_single(found: Sequence[Path], path: Path, what: str) -> Path:
 
 def to_json(value: Any) -> str:
     """Return `value` as standard JSON: NaN and infinity become null, text is not escaped."""
-    return orjson.dumps(value, option=JSON_OPTIONS).decode()
+    return _json_bytes(value).decode()
+
+
+def _json_bytes(value: Any) -> bytes:
+    return orjson.dumps(value, option=JSON_OPTIONS)
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -117,23 +121,22 @@ class JsonList:
     """
 
     def __init__(self, path: Path, head: Mapping[str, Any] | None = None, name: str = '') -> None:
-        self._file = path.open('w', encoding='utf-8')
+        self._file = path.open('wb')
         begin = '' if head is None else f'{to_json(head)[:-1]},\n"{name}": '
-        self._separator = f'{begin}[\n'
+        self._separator = f'{begin}[\n'.encode()
 
     def append(self, item: Any) -> None:
         """Add an item on a line of its own."""
-        self._file.write(self._separator + to_json(item))
-        self._separator = ',\n'
+        self._file.write(self._separator + _json_bytes(item))
+        self._separator = b',\n'
 
     def close(self, tail: Mapping[str, Any] | None = None) -> None:
         """Close the list and the file; `tail` are members of the object after the list."""
-        is_empty = self._separator != ',\n'
-        self._file.write(f'{self._separator[:-1]}]' if is_empty else '\n]')
+        is_empty = self._separator != b',\n'
+        end = f'{self._separator[:-1].decode()}]' if is_empty else '\n]'
         if tail is not None:
-            members = ''.join(f',\n"{name}": {to_json(item)}' for name, item in tail.items())
-            self._file.write(f'{members}}}')
-        self._file.write('\n')
+            end += ''.join(f',\n"{name}": {to_json(item)}' for name, item in tail.items()) + '}'
+        self._file.write(f'{end}\n'.encode())
         self._file.close()
 
 

@@ -20,7 +20,7 @@ from boxreg_ros.config import words_of
 from boxreg_ros.core.point_labels import BACKGROUND, ObjectTrack, UNKNOWN
 from boxreg_ros.labels import nuscenes
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
-from boxreg_ros.structures import Ints
+from boxreg_ros.structures import Ints, RefinedBoxes
 import numpy as np
 
 FORMAT = replace(
@@ -81,7 +81,8 @@ class Writer(nuscenes.Writer):
         assert frame.points is not None
         if self._codes is None:
             self._codes = codes_of(frame.points.tracks)
-        codes = self._codes[frame.points.track]
+            self._category_numbers = (self._codes // 1000).astype(np.uint8)
+        track = frame.points.track
         sweep = self._token('sample_data', self.number)
         for kind, suffix in (('lidarseg', 'bin'), ('panoptic', 'npz')):
             token = self._token(kind, self.number)
@@ -89,9 +90,13 @@ class Writer(nuscenes.Writer):
             row = {'token': token, 'sample_data_token': sweep, 'filename': path}
             self._rows[kind].append(row)
             if kind == 'lidarseg':
-                (codes // 1000).astype(np.uint8).tofile(self.folder / path)
+                self._category_numbers[track].tofile(self.folder / path)
             else:
-                np.savez(self.folder / path, data=codes)
+                np.savez(self.folder / path, data=self._codes[track])
+
+    def _evidence(self, refined: RefinedBoxes, row: int) -> dict[str, Any]:
+        """Return the status: the covariance of a box between two stamps is not known."""
+        return {'status': refined.status[row]}
 
     def _instance(self, key: str, track_id: str, class_name: str, annotation: str) -> str:
         """Return the token of an instance, of a category that the devkit knows."""

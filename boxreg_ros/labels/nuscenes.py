@@ -84,6 +84,7 @@ class Writer(FolderWriter):
         self._held_annotations: dict[str, dict[str, Any]] = {}  # by instance key
         self._instances: dict[str, dict[str, Any]] = {}
         self._categories: dict[str, str] = {}
+        self._drive = f'{self.about["recordings"]} {self.about["config_hash"]}'
         self._num_single = 0  # annotations that are an instance of their own
 
     def add(self, frame: LabelFrame) -> None:
@@ -159,9 +160,16 @@ class Writer(FolderWriter):
     ) -> None:
         refined = frame.refined
         array = refined.boxes
-        quaternions_wxyz = quaternions_of(boxes)[:, [3, 0, 1, 2]].tolist()
+        num_points = refined.num_points.tolist()
+        places = zip(
+            rows,
+            boxes[:, BOX_CENTER].tolist(),
+            boxes[:, [WIDTH, LENGTH, HEIGHT]].tolist(),
+            quaternions_of(boxes)[:, [3, 0, 1, 2]].tolist(),
+            strict=True,
+        )
         keys_in_sample: set[str] = set()
-        for row, box, quaternion in zip(rows, boxes, quaternions_wxyz, strict=True):
+        for row, centre, size, quaternion in places:
             track_id = array.track_ids[row]
             class_name = array.class_names[row]
             key = f'{track_id}\0{class_name}'
@@ -177,14 +185,14 @@ class Writer(FolderWriter):
                 'instance_token': self._instance(key, track_id, class_name, token),
                 'attribute_tokens': [],
                 'visibility_token': 'unavailable',
-                'translation': box[BOX_CENTER].tolist(),
-                'size': box[[WIDTH, LENGTH, HEIGHT]].tolist(),
+                'translation': centre,
+                'size': size,
                 'rotation': quaternion,
-                'num_lidar_pts': int(refined.num_points[row]),
+                'num_lidar_pts': num_points[row],
                 'num_radar_pts': 0,
                 'prev': '',
                 'next': '',
-                **evidence_of(refined, row),
+                **self._evidence(refined, row),
                 'stamp_ns': array.stamp_ns,
             }
             if is_single:
@@ -192,9 +200,15 @@ class Writer(FolderWriter):
             else:
                 self._link('sample_annotation', annotation, key)
 
+    def _evidence(self, refined: RefinedBoxes, row: int) -> dict[str, Any]:
+        """Return what an annotation states beside the columns of the devkit."""
+        return evidence_of(refined, row)
+
     def _instance(self, key: str, track_id: str, class_name: str, annotation: str) -> str:
         """Return the token of an instance, and count the annotation."""
-        category = self._categories.setdefault(class_name, self._token('category', class_name))
+        if class_name not in self._categories:
+            self._categories[class_name] = self._token('category', class_name)
+        category = self._categories[class_name]
         if key not in self._instances:
             self._instances[key] = {
                 'token': self._token('instance', key),
@@ -262,8 +276,7 @@ class Writer(FolderWriter):
 
     def _token(self, kind: str, key: object = '') -> str:
         """Return 32 digits that are the same in every run over the same recording."""
-        about = self.about
-        text = f'{about["recordings"]} {about["config_hash"]} {kind} {key}'
+        text = f'{self._drive} {kind} {key}'
         return hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()
 
 

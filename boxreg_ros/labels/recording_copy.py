@@ -15,6 +15,7 @@ from boxreg_ros.io.storage.mcap import McapFile
 from boxreg_ros.io.storage.record import Definition
 from boxreg_ros.labels.protocol import Provenance
 from mcap.records import Attachment
+from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat
 from rosbags.rosbag2.metadata import dump_qos_v9
@@ -23,6 +24,11 @@ import yaml
 
 STATIC_SUFFIX = 'tf_static'
 """Topics with this suffix are copied from the whole recording, also if a part is requested."""
+COMPRESSIONS = {
+    '': CompressionType.NONE,
+    'lz4': CompressionType.LZ4,
+    'zstd': CompressionType.ZSTD,
+}
 _T = TypeVar('_T')
 
 
@@ -44,7 +50,8 @@ class RecordingCopy:
     Copy a recording message by message; attachments and metadata of MCAP files too.
 
     Sources are MCAP files, rosbag2 folders, ``.db3`` files and ROS 1 bags. Messages of ROS 1 are
-    not converted: Foxglove and mcap read such a file, ``ros2 bag play`` does not.
+    not converted: Foxglove and mcap read such a file, ``ros2 bag play`` does not. Chunks are
+    compressed as those of an MCAP file; of the others by zstd.
 
     Parameters
     ----------
@@ -61,7 +68,7 @@ class RecordingCopy:
         self.recording = recording
         self._channels: dict[tuple[object, ...], int] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
-        self._writer = McapWriter(str(path))
+        self._writer = McapWriter(str(path), compression=_compression_of(recording.files[0]))
         self._writer.start('ros2' if self.recording.is2 else 'ros1')
         if provenance is not None:
             origin = asdict(provenance) | {'recordings': ', '.join(provenance.recordings)}
@@ -185,6 +192,12 @@ def _definition(connection: Connection, store: Typestore) -> Definition:
             'md5sum': connection.digest or '',
         }
     return Definition((kind, language, text.encode()), encoding, tuple(metadata.items()))
+
+
+def _compression_of(path: Path) -> CompressionType:
+    """Return the compression that a copy of a file has: its own; of another format zstd."""
+    with closing(opened(path)) as file:
+        return COMPRESSIONS[file.compression if isinstance(file, McapFile) else 'zstd']
 
 
 def _copy_extras(path: Path, writer: McapWriter) -> None:

@@ -86,7 +86,7 @@ class Writer(FolderWriter):
             self._numbers = Numbers(frame.points)
             names = [track.track_id for track in frame.points.tracks]
             self.about['tracks'] = {str(i + 1): name for i, name in enumerate(names)}
-        labels = np.column_stack(self._numbers.of(frame.points)).astype('<u2', copy=False)
+        labels = self._numbers.of(frame.points)
         labels.tofile(self._sequence / 'labels' / f'{self.number:06d}.label')
 
 
@@ -108,13 +108,15 @@ class Numbers:
         classes = [class_of(track.class_name, moves) for track, moves in pairs]
         # The last two entries are those of the track numbers -2 and -1.
         assert (UNKNOWN, BACKGROUND) == (-2, -1)
-        self._classes = np.array([*classes, UNLABELED, OTHER_OBJECT], np.uint16)
         instances = np.append(np.arange(1, len(classes) + 1), [0, 0])
-        self._instances = np.where(instances > MAX_INSTANCE, 0, instances).astype(np.uint16)
+        instances[instances > MAX_INSTANCE] = 0
+        numbers = np.array([*classes, UNLABELED, OTHER_OBJECT]) | instances << 16
+        self._numbers = numbers.astype('<u4')
 
-    def of(self, points: PointLabels) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-        """Return the class and the instance of each point, (M,) each."""
-        return self._classes[points.track], self._instances[points.track]
+    def of(self, points: PointLabels) -> NDArray[np.uint32]:
+        """Return the class of each point, and its instance in the upper 16 bits, (M,)."""
+        numbers: NDArray[np.uint32] = self._numbers[points.track]
+        return numbers
 
 
 def class_of(class_name: str, moves: bool) -> int:

@@ -2,22 +2,21 @@
 Labels of points, and clouds without what moves.
 
 The boxes of all tracks are known by then. Each stored sweep is labelled, in the order of reading;
-formats of points, the accumulated map and the objects are written from it. Copies of the recording
-take the labels of the sweep that their cloud is a part of.
+formats of points, the accumulated map and the objects are written from it.
 
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import closing, ExitStack
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.config import Config, KINDS
-from boxreg_ros.core.method.labelling import MOVING, STOOD
+from boxreg_ros.core.method.labelling import MOVING
+from boxreg_ros.core.method.voxels import add_new, FREE
 from boxreg_ros.core.point_labels import (
     BACKGROUND,
     ObjectTrack,
@@ -25,16 +24,11 @@ from boxreg_ros.core.point_labels import (
     PointLabels,
     UNKNOWN,
 )
-from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.fixed_frame import StoredCloud
-from boxreg_ros.io.recording import Recording
 from boxreg_ros.labels import LabelFrame, LabelWriter, Options, Provenance, writer_for
 from boxreg_ros.labels.clouds import write_cloud
-from boxreg_ros.labels.mcap import OVERLAY
-from boxreg_ros.labels.recording_copy import RawMessage, RecordingCopy
-from boxreg_ros.labels.semantickitti import Numbers
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.stored_sweeps import MergedCloud, StoredSweeps
+from boxreg_ros.offline.stored_sweeps import StoredSweeps
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.structures import (
     BoxArray,
@@ -48,9 +42,6 @@ from boxreg_ros.structures import (
     REJECTED,
     Sweep,
 )
-from msg_adapters import pointcloud
-from msg_adapters.cloud_edits import with_fields, with_points, with_positions
-from msg_adapters.poses import stamp_ns as stamp_ns_of
 import numpy as np
 from numpy.typing import NDArray
 
@@ -60,10 +51,10 @@ if TYPE_CHECKING:
 CLOUDS_FOLDER = 'clouds'
 MAP_VOXEL, OBJECT_VOXEL = 0.1, 0.02
 """Edges of the voxels of the map and of objects, one point each [m]; chosen."""
-MOVING_CODE, STOOD_CODE, UNKNOWN_CODE = 1, 2, 255
-"""Values of the field ``moving``; 0 is background or parked."""
-FIELDS = {'label': (np.uint16, 0), 'instance': (np.uint16, 0), 'moving': (np.uint8, UNKNOWN_CODE)}
-"""Fields of labelled clouds: types, and values of unknown points."""
+AXIS_BITS = 21
+"""Of the number of a voxel, per axis: 210 km in a map, 42 km in an object."""
+FIRST_ENTRIES = 2**10
+"""Entries of the first table of known voxels; at most half of them are used."""
 RECENT_SWEEPS = 4
 """Sweeps whose labels are kept: the clouds of several LiDARs are not in the order of sweeps."""
 
@@ -134,7 +125,7 @@ def write_point_products(
     return products.summary()
 
 
-class _Labelled(NamedTuple):
+class LabelledSweep(NamedTuple):
     """A sweep in the fixed frame, its labels, and whether boxes state what is there."""
 
     sweep: Sweep
@@ -171,13 +162,13 @@ class _Products:
             self._clouds.mkdir()
         self._origin: Floats | None = None
         self._counts: Counter[str] = Counter()
-        self._numbers: Numbers | None = None
         self._labelled = lru_cache(RECENT_SWEEPS)(self._label)
         self._done = 0
 
     def write(self) -> None:
         """Label all sweeps and write all files."""
-        self._write_copies()
+        if self._request.cloud_copies:
+            self._write_copies()
         self._add_until(len(self._sweeps.places))
         for writer in self._writers.values():
             writer.close()
@@ -197,13 +188,13 @@ class _Products:
             facts['map_origin'] = self._origin.tolist()
         return facts
 
-    def _label(self, number: int) -> _Labelled | None:
+    def _label(self, number: int) -> LabelledSweep | None:
         """Return a sweep with its labels; None where it has no transform."""
         sweep, cloud = self._sweeps[number]
         if sweep is None:
             return None
         is_known = self._labeller.knows(sweep.stamp_ns)
-        return _Labelled(sweep, cloud, self._labeller.label(sweep), is_known)
+        return LabelledSweep(sweep, cloud, self._labeller.label(sweep), is_known)
 
     def _add_until(self, number: int) -> None:
         """Write what depends on the sweeps before a number, each once."""
@@ -222,7 +213,7 @@ class _Products:
                 self._collect_objects(labelled.labels)
         self._done = max(self._done, number)
 
-    def _count(self, labelled: _Labelled) -> None:
+    def _count(self, labelled: LabelledSweep) -> None:
         labels = labelled.labels
         self._counts['sweeps_without_boxes'] += not labelled.is_known
         self._counts['points'] += len(labels.track)
@@ -263,14 +254,14 @@ class _Products:
         for writer in self._writers.values():
             writer.write(frame)
 
-    def _accumulate(self, labelled: _Labelled) -> None:
+    def _accumulate(self, labelled: LabelledSweep) -> None:
         """Add the points of a sweep to the maps."""
         points = labelled.sweep.in_frame().points
         if self._origin is None:
             far = bool(len(points)) and np.abs(points[0]).max() > FLOAT32_RANGE
             self._origin = np.round(points[0]).astype(float) if far else np.zeros(3)
         for name, cloud in self._maps.items():
-            cloud.add(points[_is_kept(labelled.labels, name)])
+            cloud.add(points[is_kept(labelled.labels, name)])
 
     def _collect_objects(self, labels: PointLabels) -> None:
         of_points = labels.track[labels.rows]
@@ -279,125 +270,20 @@ class _Products:
             cloud.add(labels.local[of_points == row])
 
     def _write_copies(self) -> None:
-        """Copy the recording, and the overlay in its place, with their clouds edited."""
-        request = self._request
-        paths = {name: self._clouds / f'{name}.mcap' for name in request.cloud_copies}
-        overlay = self._folder / OVERLAY
-        if paths.pop('overlay', None):
-            whole = overlay.replace(overlay.with_name(f'.{OVERLAY}'))
-            source = Recording((whole,), request.lidars, odometry=request.odometry)
-            source.has_boxes = False
-            self._copy(source, {'overlay': overlay}, None)
-            whole.unlink()
-        if paths:
-            recording = request.recording()
-            assert isinstance(recording, Recording)  # checked on reading
-            self._copy(recording, paths, self._provenance)
+        """Write the copies of the recording; sweeps are added as their clouds are reached."""
+        from boxreg_ros.offline.cloud_copies import CloudCopies  # imports the writer of MCAP
 
-    def _copy(
-        self, source: Recording, paths: Mapping[str, Path], provenance: Provenance | None
-    ) -> None:
-        """Write copies of a recording, by their kind."""
-        clouds: dict[tuple[str, int], tuple[int, MergedCloud]] = {}
-        for number, place in enumerate(self._sweeps.places):
-            clouds |= {(part.topic, part.stamp_ns): (number, part) for part in place.parts}
-        with ExitStack() as stack:
-            stack.enter_context(source)
-            copies = {
-                kind: stack.enter_context(closing(RecordingCopy(path, source, provenance)))
-                for kind, path in paths.items()
-            }
-            several = len(source.points_topics) > 1
-            for raw in next(iter(copies.values())).messages():
-                edited: Mapping[str, RawMessage] = {}
-                if raw.topic in source.points_topics:
-                    topic = raw.topic if several else ''
-                    edited = self._edited(raw, topic, source, clouds, copies)
-                for kind, copied in copies.items():
-                    copied.add(edited.get(kind, raw))
+        copies = CloudCopies(self._request, self._sweeps.places, self._added)
+        copies.write(self._folder, self._clouds, self._provenance)
+        if copies.unchanged:
+            self._counts['clouds_copied_unchanged'] = copies.unchanged
 
-    def _edited(
-        self,
-        raw: RawMessage,
-        topic: str,
-        source: Recording,
-        clouds: Mapping[tuple[str, int], tuple[int, MergedCloud]],
-        kinds: Collection[str],
-    ) -> Mapping[str, RawMessage]:
-        """Return the message of a cloud for each kind of copy; none where it has no labels."""
-        try:
-            message = source.cloud_message(raw.topic, raw.data)
-            stamp_ns = stamp_ns_of(message.header)
-            rows = pointcloud.finite_rows(message)
-        except UnsupportedMessage:
-            return {}  # counted by the run itself
-        count = message.width * message.height
-        finite = np.arange(count) if rows is None else rows
-        number, part = clouds.get((topic, stamp_ns), (-1, None))
-        labelled = None if part is None else self._labelled(number)
-        is_same = part is not None and len(finite) == part.rows.stop - part.rows.start
-        if not count:
-            return {}
-        if part is None or labelled is None or not is_same:
-            self._counts['clouds_copied_unchanged'] += len(kinds) - ('overlay' in kinds)
-            edited = {'overlay': with_fields(message, _columns(count))}
-        else:
-            self._add_until(number + 1)
-            edited = {k: self._edit(k, message, finite, part, labelled) for k in kinds}
-        return {k: raw._replace(data=source.encoded_cloud(cloud)) for k, cloud in edited.items()}
-
-    def _edit(
-        self, kind: str, message: Any, finite: Ints, part: MergedCloud, labelled: _Labelled
-    ) -> Any:
-        """
-        Return the cloud of a message as a kind of copy has it.
-
-        `finite` has the rows of its finite points, which the labels are of. A cloud of a sweep
-        without boxes is copied whole: what moves in it is not known.
-
-        """
-        n = message.width * message.height
-        if kind == 'overlay':
-            columns = _columns(n)
-            for name, values in self._fields(labelled.labels).items():
-                columns[name][finite] = values[part.rows]
-            return with_fields(message, columns)
-        if kind == 'undistorted':
-            positions = pointcloud.positions(message)
-            positions[finite] += _shift(labelled)[part.rows] @ part.R_fixed_cloud
-            return with_positions(message, positions)
-        is_kept = np.ones(n, bool)
-        is_kept[finite] = _is_kept(labelled.labels, kind)[part.rows] | (not labelled.is_known)
-        return with_points(message, is_kept)
-
-    def _fields(self, labels: PointLabels) -> dict[str, NDArray[Any]]:
-        """Return the values of `FIELDS` of the points of a sweep, (M,) each."""
-        if self._numbers is None:
-            self._numbers = Numbers(labels)
-        classes, instances = self._numbers.of(labels)
-        codes = np.zeros(len(labels.track), np.uint8)
-        codes[labels.motion == MOVING] = MOVING_CODE
-        codes[labels.motion == STOOD] = STOOD_CODE
-        codes[labels.track == UNKNOWN] = UNKNOWN_CODE
-        return dict(zip(FIELDS, (classes, instances, codes), strict=True))
+    def _added(self, number: int) -> LabelledSweep | None:
+        self._add_until(number + 1)
+        return self._labelled(number)
 
 
-def _columns(n: int) -> dict[str, NDArray[Any]]:
-    """Return the values of `FIELDS` of n unknown points."""
-    return {name: np.full(n, unknown, kind) for name, (kind, unknown) in FIELDS.items()}
-
-
-def _shift(labelled: _Labelled) -> Floats:
-    """Return how far each point of a moving object goes until the stamp, (M, 3), fixed frame."""
-    labels = labelled.labels
-    moves = labels.motion[labels.rows] == MOVING
-    moved = labels.rows[moves]
-    shift = np.zeros((len(labels.track), 3))
-    shift[moved] = labels.at_stamp()[moves] - labelled.sweep.in_frame().points[moved]
-    return shift
-
-
-def _is_kept(labels: PointLabels, name: str) -> NDArray[np.bool_]:
+def is_kept(labels: PointLabels, name: str) -> NDArray[np.bool_]:
     """Return which points the map ``static`` or ``background`` keeps, (M,)."""
     if name == 'static':
         return ~labels.is_dynamic
@@ -425,26 +311,29 @@ class VoxelCloud:
     def __init__(self, edge: float) -> None:
         self._edge = edge
         self._parts: list[Floats] = []
-        self._waiting = 0
-        self._settled = 0
+        self._known = np.full(FIRST_ENTRIES, FREE)
+        self._count = 0
 
     def add(self, points: NDArray[np.floating]) -> None:
         """Add points (M, 3) [m]; memory grows with the voxels."""
-        self._parts.append(np.asarray(points, np.float64))
-        self._waiting += len(points)
-        if self._waiting > max(self._settled, 10**6):
-            self.points()
+        size = len(self._known)
+        while size < 2 * (self._count + len(points)):
+            size *= 2
+        if size > len(self._known):
+            known = self._known[self._known != FREE]
+            self._known = np.full(size, FREE)
+            add_new(known, self._known)
+        kept = points[add_new(self._voxels(points), self._known)]
+        self._parts.append(kept)
+        self._count += len(kept)
 
     def points(self) -> Floats:
         """Return their positions, shape (n, 3) [m]."""
-        every = np.concatenate([np.zeros((0, 3)), *self._parts])
-        cells = np.floor(every / self._edge).astype(np.int64)
-        cells -= cells.min(axis=0, initial=0)
-        span = cells.max(axis=0, initial=0) + 1
-        keys = (cells[:, 0] * span[1] + cells[:, 1]) * span[2] + cells[:, 2]
-        _, first = np.unique(keys, return_index=True)
-        kept = every[np.sort(first)]
-        self._parts = [kept]
-        self._settled = len(kept)
-        self._waiting = 0
-        return kept
+        return np.concatenate([np.zeros((0, 3)), *self._parts])
+
+    def _voxels(self, points: NDArray[np.floating]) -> Ints:
+        """Return the number of the voxel of each point, the same again after 2^21 voxels."""
+        places = np.floor(points.T.astype(np.float64) / self._edge).astype(np.int64)
+        x, y, z = places & (2**AXIS_BITS - 1)
+        number: Ints = x << 2 * AXIS_BITS | y << AXIS_BITS | z
+        return number

@@ -94,6 +94,8 @@ def relabel(
     shown = _Passes(progress, 1 + (request.completes or corrections.adds))
     with claimed(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
+        if request.cloud_copies:
+            _parse_definitions(request)
         survey = _survey(request, clock, shown, journal, corrections)
         sweeps = _stored_sweeps(request, out)
         receive = workers.enter_context(
@@ -151,6 +153,12 @@ def relabel(
             (folder / CONFIG).write_text(settings, encoding='utf-8')
             write_summary(folder, summary.as_json())
     return summary
+
+
+def _parse_definitions(request: Request) -> None:
+    """Open the recording once before the process that reads it begins: both need its types."""
+    with request.recording():
+        pass
 
 
 def _stored_sweeps(request: Request, out: Path) -> StoredSweeps | None:

@@ -15,7 +15,7 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.lock import locked
 from boxreg_ros.io.storage.urls import names_of, read_text, sizes_of, UPLOAD, upload, url_of
-from boxreg_ros.io.whole_files import DISK_ERRORS, store, temporary_folder
+from boxreg_ros.io.whole_files import DISK_ERRORS, store, store_folder, temporary_folder
 from boxreg_ros.offline.progress import advanced
 
 REFUSED_ERRORS = (
@@ -25,6 +25,8 @@ REFUSED_ERRORS = (
 SUMMARY = 'summary.json'
 CONFIG = 'config.yaml'
 INPUT_MODEL = 'input_model.json'
+BLOCK_BYTES = 2**18
+"""Part of a file that is read at a time for its SHA-256 [bytes]."""
 FILES = 'files'
 """Field of the summary: size and SHA-256 of each other file, by name."""
 
@@ -156,7 +158,7 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
         with writing(out):
             partial.mkdir(parents=True)
             yield partial
-            store([*partial.rglob('*'), partial])
+            store_folder(partial)
             if out.exists():
                 os.replace(out, earlier)
             os.replace(partial, out)
@@ -240,14 +242,23 @@ def _changed_since(out: Path) -> str | None:
 
 def _sizes(folder: Path) -> dict[str, int]:
     """Return names and sizes [bytes] of all files of a result but its summary."""
-    files = {str(file.relative_to(folder)): file for file in folder.rglob('*') if file.is_file()}
-    return {name: file.stat().st_size for name, file in files.items() if name != SUMMARY}
+    sizes = {}
+    for parent, _, names in os.walk(folder):
+        prefix = os.path.relpath(parent, folder)
+        for name in names:
+            path = os.path.normpath(os.path.join(prefix, name))
+            sizes[path] = os.stat(os.path.join(parent, name)).st_size
+    sizes.pop(SUMMARY, None)
+    return sizes
 
 
 def _digest(path: Path) -> str:
     """Return the SHA-256 of a file."""
-    with path.open('rb') as file:
-        return hashlib.file_digest(file, 'sha256').hexdigest()
+    digest = hashlib.sha256()
+    with path.open('rb', buffering=0) as file:
+        while block := file.read(BLOCK_BYTES):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def _beside(out: Path, suffix: str) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import accumulate
 from pathlib import Path
 import pickle
 from tempfile import TemporaryFile
@@ -11,6 +12,9 @@ from typing import NamedTuple
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem, StoredCloud
 from boxreg_ros.structures import Floats, Sweep
 import numpy as np
+
+ALIGNMENT = 16
+"""Of arrays in the file [bytes]: numpy and compiled kernels are slower without."""
 
 
 class MergedCloud(NamedTuple):
@@ -54,9 +58,23 @@ class StoredSweep(NamedTuple):
 
 
 class StoredPlace(NamedTuple):
-    """Where a sweep begins in the file, and the clouds that it was merged from."""
+    """
+    Where a sweep is in the file, and the clouds that it was merged from.
+
+    Attributes
+    ----------
+    begin : int
+        First byte.
+    sizes : list of int
+        Bytes of its arrays, one after the other, and of what describes them; each begins at a
+        multiple of `ALIGNMENT`.
+    parts : tuple of MergedCloud
+        The clouds.
+
+    """
 
     begin: int
+    sizes: list[int]
     parts: tuple[MergedCloud, ...]
 
 
@@ -88,8 +106,15 @@ class StoredSweeps:
         cloud = items.stored_cloud(item, sensor_frame) if self.with_clouds else None
         moved = item.moved if isinstance(item.moved, Sweep) else None
         parts = tuple(_parts(item, items))
-        self.places.append(StoredPlace(self._file.tell(), parts))
-        pickle.dump(StoredSweep(moved, cloud), self._file, pickle.HIGHEST_PROTOCOL)
+        arrays: list[pickle.PickleBuffer] = []
+        # The arrays are written as they are, without copies of them.
+        described = pickle.dumps(StoredSweep(moved, cloud), 5, buffer_callback=arrays.append)
+        blocks = [*(array.raw() for array in arrays), memoryview(described)]
+        begin = self._file.tell()
+        for block in blocks:
+            self._file.write(block)
+            self._file.write(bytes(-block.nbytes % ALIGNMENT))
+        self.places.append(StoredPlace(begin, [block.nbytes for block in blocks], parts))
 
     def complete(self) -> list[StoredPlace]:
         """Write what waits; return the places."""
@@ -102,8 +127,13 @@ class StoredSweeps:
 
     def __getitem__(self, number: int, /) -> StoredSweep:
         """Return a sweep."""
-        self._file.seek(self.places[number].begin)
-        stored: StoredSweep = pickle.load(self._file)
+        begin, sizes, _ = self.places[number]
+        *starts, end = accumulate((size + -size % ALIGNMENT for size in sizes), initial=0)
+        content = memoryview(bytearray(end))
+        self._file.seek(begin)
+        self._file.readinto(content)
+        blocks = [content[a : a + size] for a, size in zip(starts, sizes, strict=True)]
+        stored: StoredSweep = pickle.loads(blocks[-1], buffers=blocks[:-1])
         return stored
 
 

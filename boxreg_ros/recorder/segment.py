@@ -12,7 +12,7 @@ import shutil
 from boxreg_ros.config import Config
 from boxreg_ros.io.journal import Journal
 from boxreg_ros.io.label_feed import RecorderSettings
-from boxreg_ros.io.whole_files import store
+from boxreg_ros.io.whole_files import store, store_folder
 from boxreg_ros.labels import LabelFrame, LabelOutput, Options, Provenance
 from boxreg_ros.labels.output import with_csv
 from boxreg_ros.labels.protocol import absolute
@@ -110,7 +110,7 @@ class SegmentFiles:
             target.name, first_ns, last_ns, self.frames, self.boxes, self.clouds, self.left_out,
             self.size, int(recovered),
         )  # fmt: skip
-        store([*self.folder.rglob('*'), self.folder])
+        store_folder(self.folder)
         os.rename(self.folder, target)
         write_index(target.parent, [*read_index(target.parent), row])
         store([target.parent / INDEX, target.parent])

@@ -8,8 +8,8 @@ from boxreg_ros.core.method.crop import candidates, offset_of, road_heights
 from boxreg_ros.core.method.selection import lower_median
 import numpy as np
 
-NOWHERE = -1
-"""Value of `owner` of points that are neither on an object nor near one."""
+BACKGROUND, UNKNOWN = -1, -2
+"""In place of the track of a point: it is on no object, or on one or beside it."""
 UNKNOWN_MOTION, PARKED, STOOD, MOVING = range(4)
 """Motion of an object: never seen to move, stands now but moves at another time, moves."""
 
@@ -173,7 +173,7 @@ def outside(shapes, objects, limits, road, box, x, y, z):
 
 
 @kernel
-def label(points, times, shapes, objects, limits, is_at_stamp, numbers):
+def label(points, times, shapes, objects, limits, is_at_stamp, elsewhere, numbers):
     """
     Find the object that each point is on, at the time of the point.
 
@@ -191,32 +191,36 @@ def label(points, times, shapes, objects, limits, is_at_stamp, numbers):
         How far points are outside of the ends, sides, top and bottom at most [m].
     is_at_stamp : bool
         Whether boxes are at the stamp, not where the sweep sees the object.
+    elsewhere : int
+        `BACKGROUND`, or `UNKNOWN` where boxes do not state what is there.
     numbers : crop.CropNumbers
         Constants and settings of the road.
 
     Returns
     -------
-    owner : array, shape (M,)
-        Object that the point is on or next to; `NOWHERE` for the others.
-    is_on : array, shape (M,)
-        Whether it is on it. Of several objects, it is the one that it is deepest inside of.
-    rows : array, shape (L,)
-        Points on an object, ascending.
+    track : array, shape (M,)
+        Track of the object that the point is on, of several the one that it is deepest inside of;
+        `UNKNOWN` next to one, and `elsewhere` of the others.
+    motion : array, shape (M,)
+        Motion of the object that the point is on or next to; `UNKNOWN_MOTION` of the others.
+    rows, owner : array, shape (L,)
+        Points on an object, ascending, and these objects.
     local : array, shape (L, 3)
-        These in the frame of the box at their own time [m].
+        These points in the frame of the box at their own time [m].
 
     """
     found = candidates(points, shapes)
     near, cells, first, boxes, _ = found
     road, seen = surroundings(points, times, shapes, found, numbers)
-    owner = np.full(points.shape[1], NOWHERE, np.int32)
-    is_on = np.zeros(points.shape[1], np.bool_)
+    track = np.full(points.shape[1], elsewhere, np.int32)
+    motion = np.zeros(points.shape[1], np.uint8)
     rows = np.empty(len(near), np.int64)
+    owner = np.empty(len(near), np.int32)
     local = np.empty((len(near), 3))
     L = 0
     for k in range(len(near)):
         i = near[k]
-        least = np.inf
+        best, is_on, least = -1, False, np.inf
         for place in range(first[cells[k]], first[cells[k] + 1]):
             box = boxes[place]
             x, y, z = offset_of(points, i, shapes, box)
@@ -224,15 +228,18 @@ def label(points, times, shapes, objects, limits, is_at_stamp, numbers):
                 delay = times[i] - (0.0 if is_at_stamp else seen[box])
                 x, y, z = moved_back(objects, box, delay, x, y, z)
             excess, is_sure = outside(shapes, objects, limits, road, box, x, y, z)
-            if is_sure < is_on[i] or (is_sure == is_on[i] and excess >= least):
+            if is_sure < is_on or (is_sure == is_on and excess >= least):
                 continue
-            owner[i], is_on[i], least = box, is_sure, excess
+            best, is_on, least = box, is_sure, excess
             R = shapes.rotations[box]
             for axis in range(3):
                 local[L, axis] = R[0, axis] * x + R[1, axis] * y + R[2, axis] * z
-        rows[L] = i
-        L += is_on[i]
-    return owner, is_on, rows[:L], local[:L]
+        if best >= 0:
+            track[i] = objects.track[best] if is_on else UNKNOWN
+            motion[i] = objects.motion[best]
+        rows[L], owner[L] = i, best
+        L += is_on
+    return track, motion, rows[:L], owner[:L], local[:L]
 
 
 @loop
