@@ -23,7 +23,9 @@ LIFECYCLE_NODE = 'boxreg_ros.live.main:lifecycle'
 IMPATIENT_NODE = 'preloaded:impatient_node'
 CODE = 'preloaded:run_code'
 """Runs its first argument, which may change the modules before it calls an entry point."""
-MODULES = ('boxreg_ros.live.process', 'warmed')
+MODULES = (
+    'boxreg_ros.live.process', 'boxreg_ros.offline.relabel', 'boxreg_ros.review.report', 'warmed',
+)  # fmt: skip
 
 context = get_context('forkserver')
 context.set_forkserver_preload([*MODULES, __name__])

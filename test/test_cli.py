@@ -526,7 +526,7 @@ def test_a_signal_during_the_import_of_torch_ends_the_process_at_once(tmp_path, 
         'boxreg_ros.review.report:_page',
     ],
 )
-def test_a_run_that_is_interrupted_in_a_step_leaves_no_files(tmp_path, step):
+def test_a_run_that_is_interrupted_in_a_step_leaves_no_files(tmp_path, preloaded_python, step):
     # SIGINT is sent as the step begins: reading, ranking, drawing of a track and of the page.
     pytest.importorskip('plotly')
     recording = Drive(sweeps=8).write(tmp_path / 'drive')
@@ -545,7 +545,17 @@ def test_a_run_that_is_interrupted_in_a_step_leaves_no_files(tmp_path, step):
         'c.command()\n'
     )
     out = tmp_path / 'r' / 'out'
-    command = [sys.executable, '-c', program, 'relabel', recording, '-o', out, '--report', *QUICK]
+    command = [
+        preloaded_python,
+        '-c',
+        program,
+        'relabel',
+        recording,
+        '-o',
+        out,
+        '--report',
+        *QUICK,
+    ]
     done = subprocess.run(
         [*map(str, command)], cwd=ROOT, capture_output=True, text=True, timeout=60
     )

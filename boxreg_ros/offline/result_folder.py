@@ -25,7 +25,7 @@ REFUSED_ERRORS = (
 SUMMARY = 'summary.json'
 CONFIG = 'config.yaml'
 INPUT_MODEL = 'input_model.json'
-BLOCK_BYTES = 2**18
+HASHED_BYTES = 2**18
 """Part of a file that is read at a time for its SHA-256 [bytes]."""
 FILES = 'files'
 """Field of the summary: size and SHA-256 of each other file, by name."""
@@ -256,7 +256,7 @@ def _digest(path: Path) -> str:
     """Return the SHA-256 of a file."""
     digest = hashlib.sha256()
     with path.open('rb', buffering=0) as file:
-        while block := file.read(BLOCK_BYTES):
+        while block := file.read(HASHED_BYTES):
             digest.update(block)
     return digest.hexdigest()
 
