@@ -68,7 +68,7 @@ class RecordingCopy:
         self.recording = recording
         self._channels: dict[tuple[object, ...], int] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
-        self._writer = McapWriter(str(path), compression=_compression_of(recording.files[0]))
+        self._writer = McapWriter(str(path), compression=compression_of(recording.files[0]))
         self._writer.start('ros2' if self.recording.is2 else 'ros1')
         if provenance is not None:
             origin = asdict(provenance) | {'recordings': ', '.join(provenance.recordings)}
@@ -194,7 +194,7 @@ def _definition(connection: Connection, store: Typestore) -> Definition:
     return Definition((kind, language, text.encode()), encoding, tuple(metadata.items()))
 
 
-def _compression_of(path: Path) -> CompressionType:
+def compression_of(path: Path) -> CompressionType:
     """Return the compression that a copy of a file has: its own; of another format zstd."""
     with closing(opened(path)) as file:
         return COMPRESSION_TYPES[file.compression if isinstance(file, McapFile) else 'zstd']

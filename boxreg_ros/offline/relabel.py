@@ -27,7 +27,7 @@ from boxreg_ros.offline.products import (
 )
 from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.reader import ReadAhead, reader, ReadItem
-from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.offline.result_folder import (
     claimed,
     CONFIG,
@@ -184,16 +184,17 @@ def _write_points(
     from boxreg_ros.offline.point_products import labeller_of, write_point_products
 
     frame = summary.fixed_frame
+    tracks = sink.changes.tracks()
     with clock('points'):
-        labeller = labeller_of(
-            sink.changes.tracks(), sink.array_stamps_ns, registrar, request.config
-        )
+        labeller = labeller_of(tracks, sink.array_stamps_ns, registrar, request.config)
     if request.proposals:
         from boxreg_ros.offline.proposals import write_proposals  # imports parts of SciPy
 
         with clock('proposals'):
             summary.proposals = write_proposals(folder, sweeps, labeller, frame)
     if request.needs_point_labels:
+        if request.boxes == NO_TOPIC and not tracks:  # nothing states what is there
+            labeller = labeller_of(tracks, (), registrar, request.config)
         with clock('points'):
             summary.points = write_point_products(folder, request, sweeps, labeller, frame)
 

@@ -9,7 +9,9 @@ from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.storage.mcap import McapFile
 from boxreg_ros.labels import check_options, LabelOutput, Options, Provenance
+from boxreg_ros.labels.recording_copy import compression_of, COMPRESSION_TYPES
 from boxreg_ros.labels.semantickitti import class_of
 from boxreg_ros.offline.point_products import object_tracks
 from boxreg_ros.offline.relabel import relabel
@@ -22,6 +24,7 @@ from boxreg_ros.simulation.writer import write_recording
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 from consumers import consumer
 from mcap.reader import make_reader
+from mcap.writer import Writer
 import numpy as np
 import pytest
 from relabel_results import QUICK
@@ -246,6 +249,13 @@ def test_sweeps_without_boxes_are_unknown_and_copied_unchanged(scene, recording,
     ]
 
 
+def test_points_of_a_drive_without_boxes_are_unknown(recording, tmp_path):
+    request = Request((recording,), boxes='none', config=QUICK, formats=('semantickitti',))
+    summary = relabel(request, tmp_path / 'out')
+    assert summary.points['sweeps_without_boxes'] == SWEEPS
+    assert summary.points['points_unknown'] == summary.points['points'] > 0
+
+
 def test_boxes_that_no_point_confirms_are_uncertain_and_rejected_ones_no_objects():
     box = np.array([[10.0, 0, 1, 4, 2, 1.5, 0, 0, 0]])
     found = [
@@ -300,6 +310,21 @@ def test_formats_of_points_are_of_relabel_alone(tmp_path):
     request = Request((tmp_path,), formats=('csv', 'lidarseg'))
     assert (request.box_formats, request.point_formats) == (('csv',), ('lidarseg',))
     assert not Request((tmp_path,)).needs_point_labels
+
+
+@pytest.mark.parametrize('compression', list(COMPRESSION_TYPES))
+def test_copies_have_the_compression_of_their_source(tmp_path, compression):
+    source = tmp_path / 'source.mcap'
+    with source.open('wb') as file:
+        writer = Writer(file, compression=COMPRESSION_TYPES[compression])
+        writer.start('ros2')
+        schema = writer.register_schema('sensor_msgs/msg/PointCloud2', 'ros2msg', b'')
+        channel = writer.register_channel('/points', 'cdr', schema)
+        writer.add_message(channel, 1, bytes(100), 1)
+        writer.finish()
+    with closing(McapFile(source)) as file:
+        assert file.compression == compression
+    assert compression_of(source) is COMPRESSION_TYPES[compression]
 
 
 @pytest.mark.parametrize('storage', ['sqlite3', 'rosbag1'])
