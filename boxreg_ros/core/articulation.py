@@ -35,7 +35,8 @@ def extent_ranges(problem: Problem, past: Floats, span: int) -> Floats:
     if problem.length < span:
         return past
     logs = np.log(problem.boxes[..., 3:6])
-    medians = np.median(sliding_window_view(logs, span, axis=1), axis=-1)  # (B, N - span + 1, 3)
+    ordered = np.sort(sliding_window_view(logs, span, axis=1), axis=-1)
+    medians = (ordered[..., (span - 1) // 2] + ordered[..., span // 2]) / 2  # (B, N - span + 1, 3)
     is_valid = problem.valid[:, span - 1 :, None]
     least = np.where(is_valid, medians, np.inf).min(1)
     largest = np.where(is_valid, medians, -np.inf).max(1)

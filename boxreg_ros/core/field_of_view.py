@@ -57,7 +57,9 @@ class FieldOfView:
         if sweep.origins is not None:
             return is_hidden
         slopes = _slopes(sweep.points[::POINT_STEP], origin)
-        self._highest = max(self._highest, _reached(slopes))
+        higher = slopes[slopes > self._highest]
+        if len(higher) >= MIN_RETURNS:
+            self._highest = float(np.partition(higher, -MIN_RETURNS)[-MIN_RETURNS])
         x, y, z = (centers - origin).T
         run = np.hypot(x, y)
         nearest = run - np.hypot(extents[:, 0], extents[:, 1]) / 2
@@ -80,13 +82,6 @@ def _slopes(points: NDArray[np.float32], origin: Floats) -> NDArray[np.float32]:
     """Return the rise of rays from the sensor to points (M, 3) over their run, (M,)."""
     x, y, z = (points[:, k] - np.float32(origin[k]) for k in range(3))
     with np.errstate(over='ignore', invalid='ignore'):
-        slopes: NDArray[np.float32] = z / np.sqrt(x * x + y * y).clip(1e-9)
+        slopes: NDArray[np.float32] = z / np.maximum(np.sqrt(x * x + y * y), np.float32(1e-9))
     slopes[~np.isfinite(slopes)] = -np.inf
     return slopes
-
-
-def _reached(slopes: NDArray[np.float32]) -> float:
-    """Return the slope that `MIN_RETURNS` reach."""
-    if len(slopes) < MIN_RETURNS:
-        return -np.inf
-    return float(np.partition(slopes, -MIN_RETURNS)[-MIN_RETURNS])

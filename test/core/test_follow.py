@@ -172,10 +172,16 @@ def unoccluded(points, box):
 def test_extents_shrink_where_rays_cross_the_box():
     rng = np.random.default_rng(9)
     truth = drive(N, speed=6.0, turn=0.3)
-    angle, height = rng.uniform(0.0, 2 * np.pi, 20_000), rng.uniform(-2.0, 6.0, 20_000)
-    wall = np.column_stack([60 * np.cos(angle), 60 * np.sin(angle), height])  # around the sensor
+    truth[:, 0] -= 13.0  # it passes, and both ends are seen
+    angle, height = rng.uniform(0.0, 2 * np.pi, 20_000), rng.uniform(-9.0, 1.0, 20_000)
+    wall = np.column_stack(
+        [60 * np.cos(angle), 60 * np.sin(angle), height]
+    )  # all around, in a valley
     sweeps = [
-        np.concatenate([unoccluded(wall, box), road(rng), returns(box, rng, 150, ORIGIN)])
+        np.concatenate(
+            [unoccluded(other, box) for other in (wall, road(rng))]
+            + [returns(box, rng, 150, ORIGIN)]
+        )
         for box in truth
     ]
     large = seed(truth, 10)

@@ -26,6 +26,8 @@ MIN_SHARE, MIN_SHARE_SWEEPS = 0.01, 0.3
 object: mirrors, and what it passes; chosen."""
 LEAST_RAYS, LEAST_RAY_SWEEPS = 50, 3
 """Rays through a layer that show that nothing is there, and sweeps of these; chosen."""
+MOST_THROUGH = 0.1
+"""Rays through the core as part of those through a layer that is free; chosen."""
 OUTERMOST = 0.98
 """Quantile of the points that counts as the outermost one; chosen."""
 
@@ -59,7 +61,9 @@ def faces(sweeps: Sequence[Floats], half: Floats) -> Floats:
     return found
 
 
-def freed(found: Floats, sweeps: Sequence[Floats], crossed: Floats, half: Floats) -> Floats:
+def freed(
+    found: Floats, sweeps: Sequence[Floats], crossed: Floats, through: int, half: Floats
+) -> Floats:
     """
     Return faces (2, 3) moved inwards, past the space that rays have crossed.
 
@@ -71,6 +75,8 @@ def freed(found: Floats, sweeps: Sequence[Floats], crossed: Floats, half: Floats
         Points in the box and beside it, as of `faces`.
     crossed : array, shape (m, 3, 2, LAYERS)
         Rays of some sweeps through the layers behind each face, see `free_space.crossings`.
+    through : int
+        Rays of all of them through the core.
     half : array, shape (3,)
         Half the extents of the box.
 
@@ -80,7 +86,8 @@ def freed(found: Floats, sweeps: Sequence[Floats], crossed: Floats, half: Floats
     faces = found.copy()
     if len(points) < LEAST_POINTS:
         return faces
-    is_free = (crossed.sum(0) >= LEAST_RAYS) & ((crossed > 0).sum(0) >= LEAST_RAY_SWEEPS)
+    least = max(LEAST_RAYS, through / MOST_THROUGH)
+    is_free = (crossed.sum(0) >= least) & ((crossed > 0).sum(0) >= LEAST_RAY_SWEEPS)
     for axis, side in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1)):
         sign = 2 * side - 1
         layers = is_free[axis, side]

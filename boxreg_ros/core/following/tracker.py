@@ -214,10 +214,8 @@ class _State(NamedTuple):
 
     @property
     def information(self) -> Floats:
-        full = np.zeros((4, 4))
-        full[PLANAR] = self.covariance[:3, :3]
-        full[2, 2] = self.z_variance
-        return np.asarray(np.linalg.inv(full), np.float64)
+        found: Floats = motion.pose_information(self.covariance, self.z_variance)
+        return found
 
     @property
     def speed(self) -> float:
@@ -255,6 +253,8 @@ class Owned:
         """
         known, count = self._boxes.get(row, (np.empty((0, 10)), 0))
         boxes = known[:count]
+        if not count:
+            return boxes[:, :9]
         away = np.hypot(boxes[:, 0] - pose[0], boxes[:, 1] - pose[1])
         reach = margin + np.hypot(*half[:2]) + np.hypot(boxes[:, LENGTH], boxes[:, WIDTH]) / 2
         is_near = (half[1] < away) & (away < reach)
@@ -378,16 +378,17 @@ class Follower:
         found = faces(points, self._half)
         origins = self._sweeps.origins
         if origins is not None:
-            crossed = np.array([
+            rays = [
                 free_space.crossings(
                     self._sweeps.points[int(rows[i])], origins[rows[i]], boxes[i, POSE4],
                     self._tilt, self._half,
                 )
                 for i in some[:: -(-len(some) // MAX_RAY_SWEEPS)]
                 if np.isfinite(origins[rows[i]]).all()
-            ])  # fmt: skip
-            if len(crossed):
-                found = freed(found, points, crossed, self._half)
+            ]  # fmt: skip
+            if rays:
+                crossed, through = zip(*rays, strict=True)
+                found = freed(found, points, np.array(crossed), sum(through), self._half)
         low, high = found
         grown = boxes.copy()
         shift = (low + high) / 2

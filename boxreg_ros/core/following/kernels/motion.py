@@ -65,6 +65,18 @@ def predict(state, covariance, dt, noise, pivot):
 
 
 @kernel
+def pose_information(covariance, z_variance):
+    """Return the information (4, 4) of x y z yaw, by the covariance of a state and of z."""
+    full = np.zeros((4, 4))
+    full[2, 2] = 1 / z_variance
+    planar = np.linalg.inv(covariance[:3, :3].copy())
+    for i, a in ((0, 0), (1, 1), (2, 3)):
+        for j, b in ((0, 0), (1, 1), (2, 3)):
+            full[a, b] = planar[i, j]
+    return full
+
+
+@kernel
 def update(state, covariance, pose, pose_covariance):
     """
     Return state and covariance for the estimate `pose` (3,) of x y yaw and its covariance (3, 3).
