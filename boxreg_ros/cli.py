@@ -63,7 +63,9 @@ WRONG_USAGE = 2
 SIGNALLED = 128
 """Added to the number of the signal that ended a run, as shells do."""
 ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
-LOSING_FILES = ('weakref.py', '<frozen importlib._bootstrap>')
+LOSING_FILES = (
+    'weakref.py', '<frozen importlib._bootstrap>', 'llvmlite/binding/executionengine.py',
+)  # fmt: skip
 """Code between whose frames an exception is printed and ignored, or breaks a module for good."""
 RETRY_SECONDS = 0.02
 """Time after which a signal is tried again that could not be raised [s]; chosen: not felt."""
@@ -224,7 +226,7 @@ def _is_importing_torch() -> bool:
 
 
 def _loses_exceptions(frame: FrameType | None) -> bool:
-    """Return whether a frame lies in a destructor, or in the import of compiled code."""
+    """Return whether a frame lies in a destructor, an import or a callback of compiled code."""
     while frame is not None:
         code = frame.f_code
         if code.co_name == '__del__' or code.co_filename.endswith(LOSING_FILES):

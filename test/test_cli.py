@@ -469,11 +469,18 @@ if os.environ['WHERE'] == 'destructor':
         Destroyed()
         return begun(*args)
     risk.assess = assess
+if os.environ['WHERE'] == 'callback':
+    from numba.core.codegen import JITCodeLibrary
+    load = JITCodeLibrary._object_getbuffer_hook
+    def hook(module):
+        os.kill(os.getpid(), signal.SIGINT)
+        return load(module)
+    JITCodeLibrary._object_getbuffer_hook = hook
 command()
 """
 
 
-@pytest.mark.parametrize('where', ['llvmlite.binding.common', 'destructor', 'fork'])
+@pytest.mark.parametrize('where', ['llvmlite.binding.common', 'destructor', 'fork', 'callback'])
 def test_a_signal_where_an_exception_would_be_lost_is_raised_afterwards(tmp_path, where):
     recording = Drive(sweeps=40).write(tmp_path / 'drive')
     workers = 2 if where == 'fork' else 1
