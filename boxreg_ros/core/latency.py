@@ -9,7 +9,7 @@ track are where it should be.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import replace
 from itertools import islice
 from typing import Any, NamedTuple
@@ -64,6 +64,8 @@ FACE_DEPTH = 0.35
 """Distances from a face beyond this are no worse [m]."""
 FULL_WEIGHT = 5
 """Comparisons by which a track has its whole weight."""
+OBJECTS_COMPARED = 16
+"""Objects of a sweep that are compared, of more those that were compared least often."""
 MAX_SAMPLES = 600
 """Comparisons that are kept: the newest, so that the estimate follows a latency that changes."""
 TRACK_SECONDS = 3.0
@@ -231,19 +233,23 @@ class LateBoxes:
         return whole
 
     def _compare(self, sweep: Sweep) -> None:
-        """Compare the points of a sweep with the boxes of the moving objects."""
+        """Compare the points of a sweep with the boxes of moving objects."""
         times_ns = sweep.stamp_ns + np.round(CANDIDATES * 1e9).astype(np.int64)
-        for track_id, path in self._tracks.items():
-            if track_id and path.covers(times_ns):
-                boxes = path.smoothed(times_ns)
-                duration = CANDIDATES[-1] - CANDIDATES[0]
-                velocity = (boxes[-1, : Z + 1] - boxes[0, : Z + 1]) / duration
-                speed = float(np.linalg.norm(velocity))
-                if speed > MIN_SPEED:
-                    costs = _costs(sweep, boxes, velocity)
-                    if costs is not None:
-                        self._has_new_samples = True
-                        self._samples.append(_Sample(sweep.stamp_ns, track_id, speed, costs))
+        paths = {k: path for k, path in self._tracks.items() if k and path.covers(times_ns)}
+        compared = Counter(sample.track_id for sample in self._samples)
+        found = 0
+        for track_id in sorted(paths, key=compared.__getitem__):
+            boxes = paths[track_id].smoothed(times_ns)
+            duration = CANDIDATES[-1] - CANDIDATES[0]
+            velocity = (boxes[-1, : Z + 1] - boxes[0, : Z + 1]) / duration
+            speed = float(np.linalg.norm(velocity))
+            costs = _costs(sweep, boxes, velocity) if speed > MIN_SPEED else None
+            if costs is not None:
+                self._has_new_samples = True
+                self._samples.append(_Sample(sweep.stamp_ns, track_id, speed, costs))
+                found += 1
+            if found == OBJECTS_COMPARED:
+                break
 
 
 class _Path:

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from boxreg_ros.core.latency import LateBoxes, NOTABLE
+from boxreg_ros.core.latency import LateBoxes, NOTABLE, OBJECTS_COMPARED
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.drive import Drive
@@ -48,6 +48,22 @@ def test_one_latency_is_found_and_none_where_there_is_none(sample_drive):
         assert found.deviation < 0.03
         assert found.seconds == (0.0 if seconds < NOTABLE else found.estimated)
         assert bool(found.warning) == (seconds > NOTABLE)
+
+
+def test_of_many_objects_every_one_is_evidence(sample_drive):
+    # Of a sweep 16 are compared at most: they take turns.
+    one = estimated(sample_drive.sweeps, late(sample_drive.boxes, 0.3))
+    crowd = [
+        replace(
+            array, track_ids=tuple(f'{k} {name}' for k in range(10) for name in array.track_ids),
+            class_names=10 * array.class_names, scores=np.tile(array.scores, 10),
+            boxes=np.tile(array.boxes, (10, 1)),
+        )
+        for array in sample_drive.boxes
+    ]  # fmt: skip
+    found = estimated(sample_drive.sweeps, late(crowd, 0.3))
+    assert found.tracks == 10 * one.tracks > 2 * OBJECTS_COMPARED
+    assert found.estimated == pytest.approx(0.3, abs=0.02)
 
 
 def test_a_stream_is_corrected_from_its_first_seconds_on(sample_drive):
