@@ -337,18 +337,14 @@ def solved(
     usual = keyframe_deviations(tracks, points, config, origins)
     given = [_track(track, points, origins) for track in tracks if len(track.rows)]
     found = registered(given, config, person.numbers(usual))
-    fits = [_fits(*pair) for pair in zip(given, found, strict=True)]
-    steps = np.zeros((0, 9))
-    if fits:
-        keys, solved_keys, spread = map(np.concatenate, zip(*fits, strict=True))
-        steps = person.corrections(keys, solved_keys, spread, usual)
+    steps = person.corrections(*_fits(given, found), usual)
     boxes = {}
+    first = 0
     for track, refined in zip(given, found, strict=True):
-        keys = track.stamps_ns[_is_fit(track, refined)]
-        boxes[track.track_id] = person.moved(
-            track.stamps_ns, refined.boxes, keys, steps[: len(keys)]
-        )
-        steps = steps[len(keys) :]
+        at_ns = track.stamps_ns[_is_fit(track, refined)]
+        own = steps[first : first + len(at_ns)]
+        boxes[track.track_id] = person.moved(track.stamps_ns, refined.boxes, at_ns, own)
+        first += len(at_ns)
     return [replace(track, boxes=boxes.get(track.track_id, track.boxes)) for track in tracks]
 
 
@@ -366,9 +362,7 @@ def keyframe_deviations(
     if count < person.MIN_KEYFRAMES:
         return usual
     found = registered(some, config, person.numbers(usual))
-    fits = [_fits(*pair) for pair in zip(some, found, strict=True)]
-    keys, solved_keys, spread = map(np.concatenate, zip(*fits, strict=True))
-    larger: Floats = np.maximum(person.shown(keys, solved_keys, spread, usual), usual)
+    larger: Floats = np.maximum(person.shown(*_fits(some, found), usual), usual)
     return larger
 
 
@@ -379,11 +373,17 @@ def _is_fit(track: Track, refined: RefinedTrack) -> NDArray[np.bool_]:
     return np.asarray(track.pinned & is_refined, bool)
 
 
-def _fits(track: Track, refined: RefinedTrack) -> tuple[Floats, Floats, Floats]:
-    """Return the seeds (n, 9) of a track, their fits, and the variances of these."""
-    rows = _is_fit(track, refined)
-    spread = person.diagonals(refined.covariances[rows], refined.extent_covariances[rows])
-    return track.boxes[rows], refined.boxes[rows], spread
+def _fits(
+    tracks: Sequence[Track], refined: Sequence[RefinedTrack]
+) -> tuple[Floats, Floats, Floats]:
+    """Return the seeds (n, 9) of all tracks, their fits, and the variances of these."""
+    seeds, fits, variances = [np.zeros((0, 9))], [np.zeros((0, 9))], [np.zeros((0, 9))]
+    for track, found in zip(tracks, refined, strict=True):
+        rows = _is_fit(track, found)
+        seeds.append(track.boxes[rows])
+        fits.append(found.boxes[rows])
+        variances.append(person.diagonals(found.covariances[rows], found.extent_covariances[rows]))
+    return np.concatenate(seeds), np.concatenate(fits), np.concatenate(variances)
 
 
 def _track(track: FollowedTrack, points: Points, origins: Floats | None) -> Track:

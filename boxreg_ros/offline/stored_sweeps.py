@@ -63,8 +63,8 @@ class StoredPlace(NamedTuple):
 
     Attributes
     ----------
-    begin : int
-        First byte.
+    first_byte : int
+        Where its arrays begin.
     sizes : list of int
         Bytes of its arrays, one after the other, and of what describes them; each begins at a
         multiple of `ALIGNMENT`.
@@ -73,7 +73,7 @@ class StoredPlace(NamedTuple):
 
     """
 
-    begin: int
+    first_byte: int
     sizes: list[int]
     parts: tuple[MergedCloud, ...]
 
@@ -110,11 +110,11 @@ class StoredSweeps:
         # The arrays are written as they are, without copies of them.
         described = pickle.dumps(StoredSweep(moved, cloud), 5, buffer_callback=arrays.append)
         blocks = [*(array.raw() for array in arrays), memoryview(described)]
-        begin = self._file.tell()
+        first_byte = self._file.tell()
         for block in blocks:
             self._file.write(block)
             self._file.write(bytes(-block.nbytes % ALIGNMENT))
-        self.places.append(StoredPlace(begin, [block.nbytes for block in blocks], parts))
+        self.places.append(StoredPlace(first_byte, [block.nbytes for block in blocks], parts))
 
     def complete(self) -> list[StoredPlace]:
         """Write what waits; return the places."""
@@ -127,10 +127,10 @@ class StoredSweeps:
 
     def __getitem__(self, number: int, /) -> StoredSweep:
         """Return a sweep."""
-        begin, sizes, _ = self.places[number]
+        first_byte, sizes, _ = self.places[number]
         *starts, end = accumulate((size + -size % ALIGNMENT for size in sizes), initial=0)
         content = memoryview(bytearray(end))
-        self._file.seek(begin)
+        self._file.seek(first_byte)
         self._file.readinto(content)
         blocks = [content[a : a + size] for a, size in zip(starts, sizes, strict=True)]
         stored: StoredSweep = pickle.loads(blocks[-1], buffers=blocks[:-1])

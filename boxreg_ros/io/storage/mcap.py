@@ -143,10 +143,11 @@ class McapFile(ChunkedFile):
     @property
     def compression(self) -> str:
         """Return the compression of the first chunk, one of `COMPRESSIONS`; '' without chunks."""
-        for chunk in self._chunks[:1]:
-            head = self._chunk_head_at(_Place(Opcode.CHUNK, chunk.first_byte, chunk.end_byte))
-            return '' if head is None else head.compression
-        return ''
+        if not self._chunks:
+            return ''
+        chunk = self._chunks[0]
+        head = self._chunk_head_at(_Place(Opcode.CHUNK, chunk.first_byte, chunk.end_byte))
+        return '' if head is None else head.compression
 
     def extras(self) -> Iterator[records.Attachment | records.Metadata]:
         """Yield the attachments and the metadata; damaged ones are noted and left out."""
