@@ -145,6 +145,17 @@ def test_every_page_of_the_site_is_there_and_needs_no_network(site):
         assert 'class="arithmatex"' not in text and 'class="mermaid"' not in text, page
 
 
+def test_the_site_folds_all_tables_of_the_measurements(site):
+    pages = {path: path.read_text(encoding='utf-8') for path in (DOCS / 'results').glob('*.md')}
+    folded = {path: text.count('All tables: `python') for path, text in pages.items()}
+    for path, count in folded.items():
+        html = (site / path.relative_to(DOCS).with_suffix('.html')).read_text(encoding='utf-8')
+        blocks = re.findall('<details.*?</details>', html, re.DOTALL)
+        assert len(blocks) == count, path
+        assert all('<table>' in block and 'json' in block for block in blocks)
+    assert sum(folded.values()) > 10
+
+
 @NEEDS_BROWSER
 def test_formulas_and_diagrams_are_visible_without_a_network(site):
     with launched() as browser:
