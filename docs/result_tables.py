@@ -79,6 +79,11 @@ def origin(document: Any) -> str:
     return f'    $ {document["command"]}{suffix}\n'
 
 
+def plain(value: float) -> str:
+    """Return a number with four digits, large ones as integers."""
+    return f'{value:,.0f}' if value >= 1e4 else f'{value:.4g}'
+
+
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], alignment: str = '---:') -> str:
     """Return a table whose columns but the first have an alignment, by default to the right."""
     lines = [header, ['---', *[alignment] * (len(header) - 1)], *rows]
@@ -559,7 +564,7 @@ def _named(results: Any, prefix: str = '') -> Iterable[tuple[str, str]]:
         if isinstance(value, dict):
             yield from _named(value, f'{prefix}{name}: ')
         elif isinstance(value, float):
-            yield f'{prefix}{name}', f'{value:,.0f}' if value >= 1e4 else f'{value:.4g}'
+            yield f'{prefix}{name}', plain(value)
         else:
             yield f'{prefix}{name}', str(value)
 

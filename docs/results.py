@@ -37,6 +37,7 @@ from result_tables import (
     DATA,
     measurements,
     number,
+    plain,
     signed,
     table,
     TABLES,
@@ -485,7 +486,7 @@ def _node(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
             if figure in figures and 'recorder' not in run and not run.endswith('2'):
                 runs.setdefault(run or data.replace('_', ' '), {})[figure] = value
     rows = [
-        [figure, *(f'{run[figure]:,.4g}' if figure in run else '-' for run in runs.values())]
+        [figure, *(plain(run[figure]) if figure in run else '-' for run in runs.values())]
         for figure in figures
     ]
     yield table(['', *runs], rows)
