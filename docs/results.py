@@ -36,6 +36,7 @@ from result_tables import (
     consistent,
     DATA,
     measurements,
+    MIN_TRACKS,
     number,
     plain,
     signed,
@@ -64,7 +65,7 @@ MAIN_METHODS = (
     'ours, early', 'ours, final', 'ours, track',
 )  # fmt: skip
 """Methods of the overview: those that all recordings have."""
-SHOWN_NUMBERS = 12
+SHOWN_NUMBERS = 8
 """Numbers of the method that the page of the sensitivity shows."""
 
 
@@ -268,13 +269,13 @@ def _times(store: Path) -> Iterable[str]:
 
 
 def _accuracy(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
-    """Yield the scores of the main methods on each recording, and the gains over tracks."""
+    """Yield the scores on each recording, and the gains over tracks."""
     header = 'BEV 3D R@0.7 R@0.8 ATE ASE AOE flips jitter'
     gains = []
     for data, document in documents:
         for methods in document['results'].values():
             rows = []
-            for name in MAIN_METHODS:
+            for name in ('input', 'smoothing only', 'ours, final', 'ours, track'):
                 row = methods[name]
                 ious = (row['iou_bev'], row['iou_3d'], *row['recall_3d'][1:])
                 others = (row[key] for key in ('ate', 'ase', 'aoe', 'flips', 'jitter'))
@@ -295,7 +296,7 @@ def _accuracy(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
 
 
 def _kinds_of_objects(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
-    """Yield what each class gains over the input and over smoothing, in one table."""
+    """Yield the gain of each class over input and smoothing: that has some tracks, or a loss."""
     rows = []
     for data, document in documents:
         if not data:
@@ -307,6 +308,8 @@ def _kinds_of_objects(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
                     final['input'], final['smoothing, final'],
                     track['input'], track['smoothing only'],
                 )  # fmt: skip
+                if final['input']['tracks'] < MIN_TRACKS and all(g['iou_3d'] > 0 for g in found):
+                    continue
                 start = f'{data.replace("_", " ")}: {name} ({final["input"]["boxes"]})'
                 rows.append([start, *(with_error(gain, 'iou_3d') for gain in found)])
     columns = ('final - input', 'final - smoothing', 'track - input', 'track - smoothing')
@@ -407,14 +410,15 @@ def _points(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
 
 
 def _covariance(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
-    """Yield coverage and NEES of all objects, and the count of cells within the band."""
+    """Yield the NEES of all objects, and the count of cells within the band."""
     ((_, document),) = documents
     results = document['results']
     rows, counts = [], []
     low, high = CONSISTENT_NEES
     for recording, estimates in results.items():
         for estimate, groups in estimates.items():
-            rows.append([f'{recording}, {estimate}', *consistent(groups['all'])])
+            found = (cell.partition(', ')[2] for cell in consistent(groups['all']))
+            rows.append([f'{recording}, {estimate}', *found])
         cells = cells_of_kinds(estimates)
         nees = [group['nees'][variable] for _, group, variable in cells]
         band = (
@@ -422,7 +426,7 @@ def _covariance(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
             sum(value < low for value in nees), sum(value > high for value in nees),
         )  # fmt: skip
         counts.append([recording, str(len(cells)), *map(str, band)])
-    yield table(['coverage, NEES', *CONSISTENCY_VARIABLES], rows)
+    yield table(['NEES', *CONSISTENCY_VARIABLES], rows)
     yield table(['cells of kinds', 'cells', f'NEES {low:g} to {high:g}', 'less', 'more'], counts)
     yield cells_and_chance(results)
 
