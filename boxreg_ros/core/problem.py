@@ -16,7 +16,7 @@ from boxreg_ros.config import ClassConfig, Config, KINDS
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, GAP, PIVOT, POSE, PRIOR, SHARED
 from boxreg_ros.core.observation import Observations
 from boxreg_ros.core.tables import joined
-from boxreg_ros.core.track_window import MarginalisationPrior, Window
+from boxreg_ros.core.window import MarginalisationPrior, Window
 from boxreg_ros.structures import Floats, Ints, ROLL, YAW
 import numpy as np
 from numpy.typing import NDArray
