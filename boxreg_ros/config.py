@@ -114,9 +114,6 @@ class SamplingConfig:
         high=2.0,
         choices=('auto', 'stamp', 'sight'),
     )
-    margin: float = setting(
-        0.6, 'points up to this distance outside a box are used', 'm', 0.05, 5.0
-    )
     points: int = setting(128, 'maximum number of points per box', '', 8, 100000)
 
 
@@ -166,8 +163,6 @@ class PaperConfig:
     alignment: float = setting(
         0.3, 'weight of the alignment constraint, Eq. 7, and its first multiplier', '', 0.0, 1e6
     )
-    nearest: int = setting(8, 'K, the closest points per visible face in Eq. 4', '', 1, 10000)
-    multiplier_rounds: int = setting(5, 'updates of the two Lagrange multipliers', '', 1, 100)
     iterations: int = setting(60, 'most L-BFGS iterations per update', '', 1, 10000)
 
 
@@ -196,17 +191,9 @@ class ClassConfig:
     slip: float = setting(
         0.15, 'standard deviation of the sideways velocity of the pivot', 'm/s', 1e-3, 1e3
     )
-    pivot: float = setting(
-        0.25, 'distance of the pivot (rear axle) behind the centre, as part of the length',
-        '', 0.0, 0.5,
-    )  # fmt: skip
     shape: float = setting(
         0.03, 'standard deviation of the surface from one rigid shape per track', 'm', 1e-3, 1.0
     )
-    drift: float = setting(
-        0.02, 'standard deviation of the step of a parked box (drift of the fixed frame)',
-        'm', 1e-4, 1.0,
-    )  # fmt: skip
     position: float = setting(
         0.14, 'standard deviation of the input centre along the heading', 'm', 1e-3, 10.0
     )
@@ -354,9 +341,6 @@ class Config:
         0.0,
         10.0,
     )
-    tolerance: float = setting(
-        0.02, 'time offset up to which boxes and sweep are paired at once', 's', 0.0, 10.0
-    )
     reach: float = setting(
         0.06,
         'maximum time offset between a box array and a sweep; points are motion-compensated to '
@@ -386,12 +370,12 @@ class Config:
     )
     cyclist: ClassConfig = ClassConfig(
         names=('cyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'rider', 'scooter'),
-        acceleration=1.5, cornering=1.5, turning=1.0, slip=0.4, pivot=0.2,
+        acceleration=1.5, cornering=1.5, turning=1.0, slip=0.4,
         shape=0.15, heading=0.15, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
     pedestrian: ClassConfig = ClassConfig(
         names=('pedestrian', 'person', 'walker', 'people', 'child'),
-        acceleration=0.8, cornering=0.8, turning=1.0, slip=0.5, pivot=0.0,
+        acceleration=0.8, cornering=0.8, turning=1.0, slip=0.5,
         shape=0.2, heading=0.5, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
 

@@ -177,7 +177,7 @@ class Reason(StrEnum):
     NO_SWEEP = (
         'no_sweep',
         'box',
-        'no cloud within `tolerance` or `reach` of its stamp',
+        'no cloud within `reach` of its stamp',
         'copy the stamp of the cloud to its boxes; check the counters of clouds; raise `queue` if '
         'boxes arrive more than `queue` clouds late',
     )

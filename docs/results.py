@@ -1,14 +1,15 @@
 """
 Write the tables of `docs/results.md` and `docs/results/` from the stored measurements.
 
-    python docs/results.py            write the pages
-    python docs/results.py --check    exit with status 1 if a page is not what would be written
+    python docs/results.py               write the pages
+    python docs/results.py --check       exit with status 1 if a page is not what would be written
+    python docs/results.py --all KIND    print all tables of a kind of measurements
 
 A measurement is the output of ``boxreg bench`` or of ``test/measure``, stored as
 ``KIND_DATA.json``, for example ``real_pandaset_002_a.json`` of ``boxreg bench real pandaset_002_a
---json``. The tables of a kind are in ``KIND.md`` beside it, or on the page that `PAGES` has for
-it, between two marks; the text around the marks is written by hand. `docs/results.md` has the main
-figures of each kind.
+--json``. A page has the rows that a reader decides by, between two marks; the text around them is
+written by hand. The page of a kind is ``KIND.md``, or the one that `PAGES` has for it.
+`docs/results.md` has the main figures of each kind. `result_tables` has all tables.
 
 """
 
@@ -16,39 +17,41 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Sequence
-import json
-import math
 from pathlib import Path
-import re
-from statistics import NormalDist
 import sys
 from typing import Any
 
 from boxreg_ros import __version__
 from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE
 from boxreg_ros.bench.speed.report import WANTED, WANTED_TICKS, WANTED_TIMES, WANTED_TRACKS
-from boxreg_ros.config import KINDS
 from boxreg_ros.offline.consistency import (
     CONSISTENCY_VARIABLES,
     CONSISTENT_NEES,
-    SIGNIFICANT,
 )
 from generate import between_marks
+from result_tables import (
+    all_tables,
+    cells_and_chance,
+    cells_of_kinds,
+    consistent,
+    DATA,
+    measurements,
+    MIN_TRACKS,
+    number,
+    plain,
+    signed,
+    table,
+    TABLES,
+    title_of,
+    with_error,
+)
 
 DOCS = Path(__file__).resolve().parent
 STORE = DOCS / 'results'
 OVERVIEW = DOCS / 'results.md'
-MIN_TRACKS = 3
-"""Fewest tracks of a cell whose standard error is trusted."""
+FOLDED = 'All tables: `python docs/results.py --all {}`'
+"""The site folds all tables of a kind in place of this line."""
 
-DATA = {
-    'resim_3bffdcff': ('Real drive', 'real surfaces, exact truth, detector noise'),
-    'resim_7fab2350': ('Busier street', 'real surfaces, exact truth, detector noise'),
-    'pandaset_002_a': ('PandaSet 002', 'human labels, detector noise'),
-    'kitti_raw_0001': ('KITTI raw 0001', 'human labels, detector noise'),
-    'street': ('Sample', 'simulated'),
-}
-"""Title and content of each recording, in the order of the tables."""
 PAGES = {
     **dict.fromkeys(('kinds', 'points', 'highway', 'lidars', 'paper'), 'scenes'),
     **dict.fromkeys(('covariance', 'review', 'labeller'), 'certainty'),
@@ -57,21 +60,24 @@ PAGES = {
     **dict.fromkeys(('node', 'load', 'kills'), 'node'),
 }
 """Page of the kinds of measurements that share one; the others have a page of their name."""
-PART_OF_RUN = re.compile(' (?:at the start|in the middle|at the end)')
-SHOWN_LOSS = 0.001
-"""Smaller changes of mean IoU are within the scatter of noise seeds."""
 MAIN_METHODS = (
     'input', 'smoothing only', 'ICP on box points', 'paper, track',
     'ours, early', 'ours, final', 'ours, track',
 )  # fmt: skip
 """Methods of the overview: those that all recordings have."""
+SHOWN_NUMBERS = 8
+"""Numbers of the method that the page of the sensitivity shows."""
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Write the pages or check them, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1] if __doc__ else None)
     parser.add_argument('--check', action='store_true', help='write nothing; 1 if out of date')
+    parser.add_argument('--all', metavar='KIND', choices=TABLES, help='print all tables of a kind')
     args = parser.parse_args(words)
+    if args.all:
+        print('\n'.join(all_tables(STORE, args.all)))
+        return 0
     stale = [
         (path, text)
         for path, text in pages(STORE).items()
@@ -90,7 +96,7 @@ def pages(store: Path) -> dict[Path, str]:
     parts = [(OVERVIEW, '', _overview(store))]
     for kind in TABLES:
         page = STORE / f'{PAGES.get(kind, kind)}.md'
-        parts.append((page, kind if kind in PAGES else '', _tables(store, kind)))
+        parts.append((page, kind if kind in PAGES else '', _deciding(store, kind)))
     written: dict[Path, str] = {}
     for page, section, lines in parts:
         text = written.get(page) or page.read_text(encoding='utf-8')
@@ -98,62 +104,19 @@ def pages(store: Path) -> dict[Path, str]:
     return written
 
 
-def _tables(store: Path, kind: str) -> Iterable[str]:
-    """Yield for each measurement of a kind its title, its command and its tables."""
-    if kind == 'ablation':
-        yield f'{_ingredients()}\n'
-    for data, document in _measurements(store, kind):
-        title = _title(data)
-        if title:
-            yield f'{"###" if kind in PAGES else "##"} {title}\n'
-        yield _origin(document)
-        yield from (f'{part}\n' for part in TABLES[kind](document['results']))
-
-
-def _measurements(store: Path, kind: str) -> list[tuple[str, Any]]:
-    """Return data name and document of each measurement of a kind, in the order of `DATA`."""
-    found = {
-        path.stem.removeprefix(kind).removeprefix('_'): path
-        for path in sorted(store.glob(f'{kind}*.json'))
-    }
-    names = [name for data in DATA for name in found if name.startswith(data)]
-    names += [name for name in found if name not in names]
-    return [(name, json.loads(found[name].read_text(encoding='utf-8'))) for name in names]
-
-
-def _title(data: str) -> str:
-    """Return the title of the measurements of some data, '' if they have none."""
-    for name, (title, _) in DATA.items():
-        if data.startswith(name):
-            with_suffix = data.removeprefix(name).replace('_', ', with ')
-            return f'{title}{with_suffix}'
-    return ''
-
-
-def _origin(document: Any) -> str:
-    suffix = '' if document['version'] == __version__ else f'    # version {document["version"]}'
-    return f'    $ {document["command"]}{suffix}\n'
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]], alignment: str = '---:') -> str:
-    """Return a table whose columns but the first have an alignment, by default to the right."""
-    lines = [header, ['---', *[alignment] * (len(header) - 1)], *rows]
-    return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
-
-
-def _number(value: float | None, digits: int = 3) -> str:
-    return '-' if value is None else f'{value:.{digits}f}'
-
-
-def _signed(value: float, digits: int) -> str:
-    """Return a number with its sign, and zero without a minus."""
-    return f'{round(value, digits) + 0.0:+.{digits}f}'
+def _deciding(store: Path, kind: str) -> Iterable[str]:
+    """Yield the rows of a kind to decide by, and the place of all tables; these where few."""
+    if kind in DECIDING:
+        yield from (f'{part}\n' for part in DECIDING[kind](measurements(store, kind)))
+        yield FOLDED.format(kind)
+    else:
+        yield from all_tables(store, kind)
 
 
 def _overview(store: Path) -> Iterable[str]:
     """Yield the main tables of `docs/results.md`."""
     recordings = [[f'`{name}`', *texts] for name, texts in DATA.items()]
-    yield _table(['recording', 'title', 'content'], recordings, '---')
+    yield table(['recording', 'title', 'content'], recordings, '---')
     yield f'\nMeasured by version {__version__}, where no other one is named.'
     yield ''
     for section in (_mean_ious, _gains, _completion, _coverage, _ranking, _times):
@@ -161,24 +124,18 @@ def _overview(store: Path) -> Iterable[str]:
 
 
 def _mean_ious(store: Path) -> Iterable[str]:
-    """Yield the mean 3D and BEV IoU of the main methods on each recording."""
+    """Yield the mean 3D IoU of the main methods on each recording."""
     yield '## Accuracy'
     yield (
-        'Mean IoU on each recording (number of true boxes). '
-        '[Accuracy](results/real.md) has all scores and methods, '
+        'Mean 3D IoU (number of true boxes). [Accuracy](results/real.md) has the other scores, '
         '[Ablation](results/ablation.md) the loss without each ingredient.'
     )
-    scored = [
-        (f'`{data}` ({methods["input"]["boxes"]})', methods)
-        for data, document in _measurements(store, 'real')
-        for methods in document['results'].values()
-    ]
-    for key, title in (('iou_3d', '3D IoU'), ('iou_bev', 'BEV IoU')):
-        rows = [
-            [name, *(_number(methods[method][key]) for method in MAIN_METHODS)]
-            for name, methods in scored
-        ]
-        yield _table([title, *MAIN_METHODS], rows)
+    rows = []
+    for data, document in measurements(store, 'real'):
+        for methods in document['results'].values():
+            ious = (number(methods[method]['iou_3d']) for method in MAIN_METHODS)
+            rows.append([f'`{data}` ({methods["input"]["boxes"]})', *ious])
+    yield table(['3D IoU', *MAIN_METHODS], rows)
 
 
 def _gains(store: Path) -> Iterable[str]:
@@ -186,9 +143,9 @@ def _gains(store: Path) -> Iterable[str]:
     yield '## Classes'
     yield (
         'Mean 3D IoU minus that of the input and of smoothing, with standard errors over tracks. '
-        '[Gain of each class](results/scenes.md) has BEV IoU and the other recordings.'
+        '[Gain of each class](results/scenes.md) has the other recordings.'
     )
-    document = dict(_measurements(store, 'kinds'))['']
+    document = dict(measurements(store, 'kinds'))['']
     for drives, classes in document['results'].items():
         rows = []
         for name, methods in classes.items():
@@ -197,34 +154,35 @@ def _gains(store: Path) -> Iterable[str]:
                 final['input'], final['smoothing, final'], track['input'], track['smoothing only'],
             )  # fmt: skip
             boxes = track['input']['boxes']
-            rows.append([f'{name} ({boxes})', *(_with_error(gain, 'iou_3d') for gain in gains)])
+            rows.append([f'{name} ({boxes})', *(with_error(gain, 'iou_3d') for gain in gains)])
         columns = ('final - input', 'final - smoothing', 'track - input', 'track - smoothing')
-        yield _table([f'{drives}: class (boxes)', *columns], rows)
+        yield table([f'{drives}: class (boxes)', *columns], rows)
 
 
 def _completion(store: Path) -> Iterable[str]:
     """Yield the scores of broken tracks, of completed ones, and of tracks never broken."""
     yield '## Completed tracks'
     yield (
-        'Scores of broken tracks as they are given, with `--complete`, and of the same tracks '
-        'refined before they were broken, which is the best that completion can restore. '
-        '[Completed tracks](results/tracks.md) has each step, ghosts, distant misses and the node.'
+        'Broken tracks as they are given -> with `--complete`; in brackets those of the same '
+        'tracks before they were broken, the best that completion can restore. '
+        '[Completed tracks](results/tracks.md) has ghosts, distant misses and the node.'
     )
-    keys = ('recall', 'precision', 'ids_per_object', 'hota', 'idf1', 'added_iou')
     rows = []
-    for data, document in _measurements(store, 'tracks'):
-        if data not in DATA:
-            continue  # with other breaks
-        for steps in document['results'].values():
-            unbroken, *_, completed = steps.values()
-            rows += [
-                [f'`{data}`: {name}', *(_number(scores[key]) for key in keys)]
-                for name, scores in (
-                    ('input', steps['input']), ('completed', completed), ('unbroken', unbroken),
-                )
-            ]  # fmt: skip
-    titles = ('recall', 'precision', 'ids per object', 'HOTA', 'IDF1', '3D IoU of added')
-    yield _table(['', *titles], rows)
+    for data, document in measurements(store, 'tracks'):
+        if data in DATA:  # without other breaks
+            for steps in document['results'].values():
+                unbroken, *_, completed = steps.values()
+                scores = [
+                    f'{_change(steps["input"], completed, key)} ({number(unbroken[key])})'
+                    for key in ('recall', 'ids_per_object', 'hota')
+                ]
+                rows.append([f'`{data}`', *scores, number(completed['added_iou'])])
+    yield table(['', 'recall', 'ids per object', 'HOTA', '3D IoU of added'], rows)
+
+
+def _change(before: Any, after: Any, key: str, digits: int = 3) -> str:
+    """Return two values of a score."""
+    return f'{number(before[key], digits)} -> {number(after[key], digits)}'
 
 
 def _coverage(store: Path) -> Iterable[str]:
@@ -232,16 +190,16 @@ def _coverage(store: Path) -> Iterable[str]:
     yield '## Covariances'
     yield (
         'Part of the errors of whole tracks within two standard deviations; 0.95 is consistent. '
-        '[Covariances](results/certainty.md) has squared errors, the other estimates and classes.'
+        '[Covariances](results/certainty.md) has squared errors and the other estimates.'
     )
     rows = []
-    for _, document in _measurements(store, 'covariance'):
+    for _, document in measurements(store, 'covariance'):
         for recording, estimates in document['results'].items():
             coverage = estimates['track']['all']['coverage']
             rows.append(
-                [f'`{recording}`', *(_number(coverage[key], 2) for key in CONSISTENCY_VARIABLES)]
+                [f'`{recording}`', *(number(coverage[key], 2) for key in CONSISTENCY_VARIABLES)]
             )
-    yield _table(['', *CONSISTENCY_VARIABLES], rows)
+    yield table(['', *CONSISTENCY_VARIABLES], rows)
 
 
 def _ranking(store: Path) -> Iterable[str]:
@@ -253,13 +211,13 @@ def _ranking(store: Path) -> Iterable[str]:
         'parts of the lists, and the gain of one corrected box.'
     )
     rows = []
-    for _, document in _measurements(store, 'review'):
+    for _, document in measurements(store, 'review'):
         for recording, inputs in document['results'].items():
             for name, found in inputs.items():
                 shares = found['shares']
                 start = f'`{recording}`, {name} ({found["bad"]} of {found["tracks"]})'
-                rows.append([start, *(_number(share[-1], 2) for share in shares.values())])
-    yield _table(['', *shares], rows)
+                rows.append([start, *(number(share[-1], 2) for share in shares.values())])
+    yield table(['', *shares], rows)
 
 
 def _times(store: Path) -> Iterable[str]:
@@ -270,8 +228,8 @@ def _times(store: Path) -> Iterable[str]:
         '[The live node under load](results/node.md#under-load) latencies, '
         '[Scale](results/speed.md#scale) core-hours of a fleet.'
     )
-    ((_, speed),) = _measurements(store, 'speed')
-    ((_, load),) = _measurements(store, 'load')
+    ((_, speed),) = measurements(store, 'speed')
+    ((_, load),) = measurements(store, 'load')
     found = speed['results']
     relabel, solver, ticks = found['relabel'], found['solver'], found['ticks']
     crop, latency = found['crop'], load['results']['deadline']
@@ -307,480 +265,257 @@ def _times(store: Path) -> Iterable[str]:
             for tracks, row in latency.items()
         ),
     ]
-    yield _table(['', 'measured', 'aim'], rows)
+    yield table(['', 'measured', 'aim'], rows)
 
 
-def _accuracy(results: Any) -> Iterable[str]:
-    """Yield the table of scores of each recording, and 3D IoU by range and number of points."""
-    for methods in results.values():
-        measured = {name: row for name, row in methods.items() if not isinstance(row, str)}
-        skipped = {name: row for name, row in methods.items() if isinstance(row, str)}
-        header = f'BEV 3D {" ".join(f"R@{x}" for x in (0.5, 0.7, 0.8))} ATE ASE AOE flips jitter'
-        keys = ('ate', 'ase', 'aoe', 'flips', 'jitter')
-        rows = []
-        for name, row in measured.items():
-            values = [row['iou_bev'], row['iou_3d'], *row['recall_3d'], *(row[k] for k in keys)]
-            rows.append([name, *map(_number, values)])
-        yield f'{measured["input"]["boxes"]} true boxes.'
-        yield _table(['', *header.split()], rows)
-        yield _table(*_parts(measured, '3D IoU'))
-        if 'by_class' in measured['input']:
-            yield _classes(measured)
-        yield from _compared(measured)
-        for name, reason in skipped.items():
-            yield f'{name}: {reason}.'
+def _accuracy(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the scores on each recording, and the gains over tracks."""
+    header = 'BEV 3D R@0.7 R@0.8 ATE ASE AOE flips jitter'
+    gains = []
+    for data, document in documents:
+        for methods in document['results'].values():
+            rows = []
+            for name in ('input', 'smoothing only', 'ours, final', 'ours, track'):
+                row = methods[name]
+                ious = (row['iou_bev'], row['iou_3d'], *row['recall_3d'][1:])
+                others = (row[key] for key in ('ate', 'ase', 'aoe', 'flips', 'jitter'))
+                rows.append([name, *map(number, (*ious, *others))])
+            yield table([title_of(data), *header.split()], rows)
+            of = {name: methods[name]['differences']['all'] for name in MAIN_METHODS[-2:]}
+            pairs = (
+                ('ours, final', 'input'), ('ours, final', 'smoothing, final'),
+                ('ours, track', 'input'), ('ours, track', 'smoothing only'),
+            )  # fmt: skip
+            cells = [
+                f'{with_error(of[a][b], "iou_3d")}, {of[a][b]["tracks_ahead"]}' for a, b in pairs
+            ]
+            start = f'`{data}` ({of["ours, track"]["input"]["tracks"]})'
+            gains.append([start, *cells])
+    columns = ('final - input', 'final - smoothing', 'track - input', 'track - smoothing')
+    yield table(['3D IoU (tracks), tracks ahead', *columns], gains)
 
 
-def _parts(measured: Any, iou: str) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows of the IoU by range, by number of points and of moving objects."""
-    header = [iou]
-    rows = {name: [name] for name, row in measured.items() if 'by_range' in row}
-    for key, unit in (('by_range', 'm'), ('by_points', 'points')):
-        labels = list(dict.fromkeys(part for name in rows for part in measured[name][key]))
-        if len(labels) < 2:  # the same as the mean of all boxes
-            continue
-        header += [f'{label} {unit}' for label in labels]
-        for name, row in rows.items():
-            row += [_number(measured[name][key].get(label)) for label in labels]
-    moving = {name: measured[name]['moving'] for name in rows if 'moving' in measured[name]}
-    if moving:
-        header += [f'moving ({moving["input"]["boxes"]}): BEV', '3D', 'yaw [degrees]']
-    for name, found in moving.items():
-        rows[name] += [_number(found['iou_bev']), _number(found['iou_3d'])]
-        rows[name].append(_number(found['yaw_degrees'], 2))
-    return header, list(rows.values())
-
-
-def _compared(measured: Any) -> Iterable[str]:
-    """Yield the table of the differences between methods."""
-    rows = [
-        [f'{name} - {other}', scope, *_difference(found)]
-        for name, row in measured.items()
-        for scope, others in row.get('differences', {}).items()
-        for other, found in others.items()
-    ]
-    if rows:
-        yield _table(['difference', 'objects', 'BEV', '3D', 'tracks', 'ahead'], rows)
-
-
-def _difference(found: Any) -> Iterable[str]:
-    """Yield both differences with their standard errors, and the numbers of tracks."""
-    yield from _gain(found)
-    yield str(found['tracks'])
-    yield str(found['tracks_ahead'])
-
-
-def _gain(found: Any) -> Iterable[str]:
-    """Yield both differences with their standard errors."""
-    for key in ('iou_bev', 'iou_3d'):
-        yield _with_error(found, key)
-
-
-def _with_error(found: Any, key: str) -> str:
-    """Return a difference with its standard error."""
-    return f'{_signed(found[key], 4)}±{_number(found[f"{key}_error"], 4)}'
-
-
-def _classes(measured: Any) -> str:
-    """Return the table of BEV and 3D IoU of each class, of all its boxes with points."""
-    names = measured['input']['by_class']
-    header = [f'{name} ({row["boxes"]})' for name, row in names.items()]
+def _kinds_of_objects(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the gain of each class over input and smoothing: that has some tracks, or a loss."""
     rows = []
-    for method, scores in measured.items():
-        found = [scores['by_class'][name] for name in names]
-        pairs = [f'{_number(row["iou_bev"])}/{_number(row["iou_3d"])}' for row in found]
-        rows.append([method, *pairs])
-    return _table(['BEV / 3D IoU by class (boxes)', *header], rows)
+    for data, document in documents:
+        if not data:
+            continue  # the streets, on the overview
+        for classes in document['results'].values():
+            for name, methods in classes.items():
+                final, track = methods['ours, final'], methods['ours, track']
+                found = (
+                    final['input'], final['smoothing, final'],
+                    track['input'], track['smoothing only'],
+                )  # fmt: skip
+                if final['input']['tracks'] < MIN_TRACKS and all(g['iou_3d'] > 0 for g in found):
+                    continue
+                start = f'{data.replace("_", " ")}: {name} ({final["input"]["boxes"]})'
+                rows.append([start, *(with_error(gain, 'iou_3d') for gain in found)])
+    columns = ('final - input', 'final - smoothing', 'track - input', 'track - smoothing')
+    yield table(['3D IoU: class (boxes)', *columns], rows)
 
 
-def _kinds_of_objects(results: Any) -> Iterable[str]:
-    """Yield what each class gains over the input and over smoothing, one table per recording."""
-    for drives, found in results.items():
-        rows = []
-        for name, methods in found.items():
-            for method, others in methods.items():
-                start = [f'{name} ({others["input"]["boxes"]})', method.removeprefix('ours, ')]
-                smoother = next(key for key in others if key.startswith('smoothing'))
-                rows.append([*start, *_gain(others['input']), *_gain(others[smoother])])
-        columns = ('BEV - input', '3D - input', 'BEV - smoothing', '3D - smoothing')
-        yield _table([f'{drives}: class (boxes)', 'estimate', *columns], rows)
+def _tracks(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the scores before and after completion for each kind of breaks, in one table."""
+    rows = []
+    for data, document in documents:
+        for steps in document['results'].values():
+            before, (*_, after) = steps['input'], steps.values()
+            scores = [
+                _change(before, after, key)
+                for key in ('recall', 'precision', 'ids_per_object', 'hota')
+            ]
+            others = (number(after[key]) for key in ('added_iou', 'ghosts_rejected', 'lost'))
+            rows.append([title_of(data), *scores, f'{after["added"]}', *others])
+    scores = ['recall', 'precision', 'ids per object', 'HOTA']
+    yield table(
+        ['', *scores, 'added', '3D IoU of added', 'ghosts rejected', 'others rejected'], rows
+    )
 
 
-def _paper(results: Any) -> Iterable[str]:
-    """Yield Table I of each mode."""
-    for mode, methods in results.items():
-        measured = {name: row for name, row in methods.items() if not isinstance(row, str)}
+def _paper(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the main rows of Table I of each mode."""
+    ((_, document),) = documents
+    for mode, methods in document['results'].items():
         pose = ['x', 'y', 'z', 'roll', 'pitch', 'yaw'] if mode == '3d' else ['x', 'y', 'yaw']
-        columns = (*pose, 'iou', 'iou_first', 'iou_last', 'iou_full')
-        rows = [
-            [name, *(_number(row.get(column)) for column in columns)]
-            for name, row in measured.items()
-        ]
-        iou = '3D IoU' if mode == '3d' else 'BEV IoU'
-        titles = (iou, *(f'{iou}, {part}' for part in ('first', 'last', 'full windows')))
-        yield _table([f'mode: {mode}', *pose, *titles], rows)
-        yield _table(*_parts(measured, iou))
+        names = (
+            'initial, published', 'refined, published', 'input', 'smoothing only',
+            'CTRA smoothing', 'paper, track', 'ours, final', 'ours, track', 'held extents, final',
+        )  # fmt: skip
+        rows = [[name, *(number(methods[name].get(c)) for c in (*pose, 'iou'))] for name in names]
+        yield table([f'mode: {mode}', *pose, '3D IoU' if mode == '3d' else 'BEV IoU'], rows)
 
 
-def _ingredients() -> str:
-    """Return the table of the ingredients that are switched off."""
-    rows = [[name, item.meaning] for name, item in INGREDIENTS.items() if name != WHOLE]
-    return _table(['without', 'the change'], rows, '---')
+def _ablation(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the losses of 3D IoU without each ingredient on all recordings, the largest first."""
+    losses: dict[str, list[list[float]]] = {name: [] for name in INGREDIENTS if name != WHOLE}
+    titles = []
+    for data, document in documents:
+        estimates = document['results'][data].values()
+        titles.append(title_of(data))
+        for name, found in losses.items():
+            found.append([rows[WHOLE]['iou_3d'] - rows[name]['iou_3d'] for rows in estimates])
+    rows = [
+        [f'{name}: {INGREDIENTS[name].meaning}', *(' / '.join(map(_loss, pair)) for pair in found)]
+        for name, found in sorted(losses.items(), key=lambda item: -max(map(max, item[1])))
+    ]
+    yield table(['without', *titles], rows)
 
 
-def _ablation(results: Any) -> Iterable[str]:
-    """Yield for each recording the losses without an ingredient, the largest first."""
-    order = results.pop('greedy', [])
-    for found in results.values():
-        parts = ('3D', 'loss', 'R@0.8 loss')
-        titles = [f'{estimate}: {part}' for estimate in found for part in parts]
-        best = {estimate: rows['nothing'] for estimate, rows in found.items()}
-        names = sorted(
-            next(iter(found.values())),
-            key=lambda name: min(
-                rows[name]['iou_3d'] - best[e]['iou_3d'] for e, rows in found.items()
-            ),
-        )
-        rows = []
-        for name in ['nothing', *(name for name in names if name != 'nothing')]:
-            cells = []
-            for estimate, of in found.items():
-                own, whole = of[name], best[estimate]
-                cells += [
-                    _number(own['iou_3d']),
-                    _signed(whole['iou_3d'] - own['iou_3d'], 4),
-                    _signed(whole['recall_3d'][-1] - own['recall_3d'][-1], 3),
-                ]
-            rows.append([name, *cells])
-        yield _table(['without', *titles], rows)
-    if order:
-        yield _table(['without all of', 'largest loss'], [[a, _signed(b, 4)] for a, b in order])
+def _loss(value: float) -> str:
+    """Return a loss of IoU in thousandths."""
+    return signed(1000 * value, 0)
 
 
-def _sensitivity(results: Any) -> Iterable[str]:
-    """Yield the loss of every setting and constant, largest first; those without one as a list."""
-    baseline = results['baseline']
-    rows = [[name, _number(o['iou_bev']), _number(o['iou_3d'])] for name, o in baseline.items()]
-    yield _table([f'estimate: {results["estimate"]}', 'BEV', '3D'], rows)
-    largest: dict[str, float] = {}
+def _sensitivity(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the numbers with the largest losses on all recordings."""
+    names: list[str] = []
+    found: dict[tuple[str, str], dict[str, float]] = {}
+    for data, document in documents:
+        names.append(title_of(data))
+        for loss in document['results']['losses']:
+            if not loss['failure']:
+                key = (f'`{loss["name"]}`', f'{loss["factor"]:g}')
+                found.setdefault(key, {})[names[-1]] = loss['volume']
+    largest = sorted(found.items(), key=lambda item: -max(map(abs, item[1].values())))
+    rows = [
+        [*key, *(_loss(losses[name]) if name in losses else '-' for name in names)]
+        for key, losses in largest[:SHOWN_NUMBERS]
+    ]
+    yield table(['setting or constant', 'factor', *names], rows)
+
+
+def _highway(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the accuracy of each method by the time of the boxes and the speed."""
+    ((_, document),) = documents
+    results = document['results']
+    columns = [f'{time}, {speed}' for time, rows in results.items() for speed in rows['input']]
+    rows = [
+        [name, *(number(value) for of in results.values() for value in of[name].values())]
+        for name in next(iter(results.values()))
+    ]
+    yield table(['3D IoU', *columns], rows)
+
+
+def _points(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the main scores of labels of points, with boxes of the input and refined ones."""
+    scores = ('IoU moving', 'IoU vehicle instances', 'unknown', 'shadows in the map')
     rows = []
-    failures = []
-    for loss in results['losses']:
-        name = f'`{loss["name"]}`'
-        start = [name, f'{loss["factor"]:g}', f'{loss["value"]:.3g}']
-        if loss['failure']:
-            largest[name] = float('inf')
-            failures.append(f'{name} = {loss["value"]:.3g}')
-            continue
-        size = max(abs(loss['bev']), abs(loss['volume']))
-        largest[name] = max(largest.get(name, 0.0), size)
-        if size >= SHOWN_LOSS:
-            rows.append([*start, _signed(loss['bev'], 4), _signed(loss['volume'], 4)])
-    yield _table(['setting or constant', 'factor', 'value', 'BEV loss', '3D loss'], rows)
-    without = sorted(name for name, size in largest.items() if size < SHOWN_LOSS)
-    yield f'Less than {SHOWN_LOSS} either way: {", ".join(without)}.'
-    if failures:
-        yield f'Not possible, since the value is an index or a quantile: {", ".join(failures)}.'
+    for data, document in documents:
+        found = document['results']
+        cells = [_change(found['input'], found['ours, track'], score) for score in scores]
+        rows.append([title_of(data) or data.replace('_', ' '), *cells])
+    yield table(['', *scores], rows)
 
 
-def _tracks(results: Any) -> Iterable[str]:
-    """Yield the scores after each completing step, one table per recording."""
-    keys = (
-        ('recall', 'recall'),
-        ('precision', 'precision'),
-        ('ids per object', 'ids_per_object'),
-        ('HOTA', 'hota'),
-        ('IDF1', 'idf1'),
-        ('added', 'added'),
-        ('3D IoU of added', 'added_iou'),
-        ('ghosts rejected', 'ghosts_rejected'),
-        ('others rejected', 'lost'),
-    )
-    for rows in results.values():
-        lines = [
-            [name, *(_number(row[key], 0 if key == 'added' else 3) for _, key in keys)]
-            for name, row in rows.items()
-        ]
-        yield _table(['', *(title for title, _ in keys)], lines)
-        yield from _kinds(rows)
-
-
-def _kinds(rows: Any) -> Iterable[str]:
-    """Yield the scores by kind of object: of the tracks before they were broken, and at last."""
-    first, *_, last = rows
-    keys = ('recall', 'precision', 'ids_per_object', 'added', 'added_iou', 'given_iou')
-    lines = [
-        [f'{name}: {kind}', *(_number(scores[key], 0 if key == 'added' else 3) for key in keys)]
-        for name in (first, last)
-        for kind, scores in rows[name]['by_kind'].items()
-    ]
-    found = ('recall', 'precision', 'ids per object')
-    titles = (*found, 'added', '3D IoU of added', '3D IoU of others')
-    yield _table(['by kind', *titles], lines)
-
-
-def _figures(results: Any) -> Iterable[str]:
-    """Yield a plain table of names and values."""
-    yield _table(['', ''], _flat(results))
-
-
-def _node(results: Any) -> Iterable[str]:
-    """Yield the figures of one run, or of several runs side by side."""
-    runs: dict[str, dict[str, str]] = {}
-    for name, value in _flat(results):
-        run, _, figure = name.partition(': ')
-        if not run.endswith(('recording 1', 'recording 2')):
-            run, figure = '', name
-        runs.setdefault(run, {})[figure] = value
-    alone = runs.pop('', {})
-    if runs:
-        figures = list(dict.fromkeys(figure for run in runs.values() for figure in run))
-        rows = [[figure, *(run.get(figure, '-') for run in runs.values())] for figure in figures]
-        yield _table(['', *runs], rows)
-    yield _table(['', ''], alone.items())
-
-
-def _lidars(results: Any) -> Iterable[str]:
-    """Yield the accuracy of each way to record several LiDARs."""
-    rows = [[name, _number(found['bev']), _number(found['3d'])] for name, found in results.items()]
-    yield _table(['recorded', 'BEV', '3D'], rows)
-
-
-def _highway(results: Any) -> Iterable[str]:
-    """Yield the accuracy of each method by speed, one table per time of the boxes."""
-    for convention, found in results.items():
-        speeds = next(iter(found.values()))
-        rows = [[name, *map(_number, values.values())] for name, values in found.items()]
-        yield _table([f'boxes of the time of {convention}', *speeds], rows)
-
-
-def _points(results: Any) -> Iterable[str]:
-    """Yield the scores of labels of points, one column for each kind of boxes."""
-    scores = dict.fromkeys(score for found in results.values() for score in found)
-    rows = [
-        [score, *(_number(found.get(score)) for found in results.values())] for score in scores
-    ]
-    yield _table(['', *results], rows)
-
-
-def _review(results: Any) -> Iterable[str]:
-    """Yield the share of bad tracks at the top of each list, per recording and input, and pins."""
-    pinned = []
-    for recording, inputs in results.items():
-        for name, found in inputs.items():
-            rows = [[order, *map(_number, shares)] for order, shares in found['shares'].items()]
-            head = f'{recording}, {name}: worst {found["bad"]} of {found["tracks"]}'
-            yield _table([head, '1 %', '5 %', '10 %', '20 %'], rows)
-            pins = found['pins']
-            pinned.append(
-                [
-                    f'{recording}, {name}',
-                    *(_number(pins[key]) for key in ('before', 'after')),
-                    *(f'{pins[key]:.0%}' for key in ('gained', 'constant')),
-                    *(_number(pins['left'][key], 2) for key in ('along', 'across', 'up')),
-                    _number(pins['left']['yaw']),
-                ]
-            )
-    header = (
-        'one box of each pinned', '3D IoU before', 'after', 'of 1 - IoU removed',
-        'constant along a track', 'left: along [m]', 'across', 'up', 'yaw [rad]',
-    )  # fmt: skip
-    yield _table(header, pinned)
-
-
-def _labeller(results: Any) -> Iterable[str]:
-    """Yield the errors before and after the review of a planted drive, and what it takes."""
-    stages = (('planted', 'planted'), ('relabelled', 'after `boxreg relabel`'),
-              ('reviewed', 'after the review'))  # fmt: skip
-    kinds = list(results['planted'])
-    rows = [[title, *(str(results[stage][kind]) for kind in kinds)] for stage, title in stages]
-    yield _table(['errors', *kinds], rows)
-    kinds_of_actions = ', '.join(f'{count} {name}s' for name, count in results['kinds'].items())
-    yield (
-        f'{results["actions"]} actions ({kinds_of_actions}) and {results["seconds"]:.0f} s, of '
-        f'these {results["thinking"]:.0f} s of thought; {results["actions_before"]} actions '
-        f'where files are edited by hand.'
-    )
-
-
-def _covariance(results: Any) -> Iterable[str]:
-    """Yield coverage and NEES of each variable, by estimate and class, one table per recording."""
+def _covariance(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the NEES of all objects, and the count of cells within the band."""
+    ((_, document),) = documents
+    results = document['results']
+    rows, counts = [], []
+    low, high = CONSISTENT_NEES
     for recording, estimates in results.items():
-        rows = [
-            [f'{estimate}, {name}', f'{group["boxes"]} of {group["tracks"]}', *_consistent(group)]
-            for estimate, groups in estimates.items()
-            for name, group in _different(groups).items()
-        ]
-        variables = next(iter(next(iter(estimates.values())).values()))['nees']
-        yield _table([recording, 'boxes of tracks', *variables], rows)
-    low, high = CONSISTENT_NEES
-    header = (
-        'cells of kinds: along, across, up, yaw', 'cells', 'covered 90 to 98 %', 'more', 'less',
-        f'NEES {low:g} to {high:g}', 'less', 'more', f'more by {SIGNIFICANT:g} standard errors',
-    )  # fmt: skip
-    yield _table(header, [[name, *_consistent_cells(of)] for name, of in results.items()])
-    yield _cells_and_chance(results)
+        for estimate, groups in estimates.items():
+            found = (cell.partition(', ')[2] for cell in consistent(groups['all']))
+            rows.append([f'{recording}, {estimate}', *found])
+        cells = cells_of_kinds(estimates)
+        nees = [group['nees'][variable] for _, group, variable in cells]
+        band = (
+            sum(low <= value <= high for value in nees),
+            sum(value < low for value in nees), sum(value > high for value in nees),
+        )  # fmt: skip
+        counts.append([recording, str(len(cells)), *map(str, band)])
+    yield table(['NEES', *CONSISTENCY_VARIABLES], rows)
+    yield table(['cells of kinds', 'cells', f'NEES {low:g} to {high:g}', 'less', 'more'], counts)
+    yield cells_and_chance(results)
 
 
-def _different(groups: Any) -> dict[str, Any]:
-    """Return the groups of objects without those that have the same boxes as an earlier one."""
-    found: dict[str, Any] = {}
-    for name, group in groups.items():
-        if group not in found.values():
-            found[name] = group
-    return found
+def _review(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield what one pinned box of each of the worst tracks changes."""
+    ((_, document),) = documents
+    rows = []
+    for recording, inputs in document['results'].items():
+        for name, found in inputs.items():
+            pins = found['pins']
+            cells = (_change(pins | {'3d': pins['before']}, {'3d': pins['after']}, '3d'),
+                     f'{pins["gained"]:.0%}')  # fmt: skip
+            rows.append([f'{recording}, {name}', *cells])
+    yield table(['one box of each pinned', '3D IoU', 'of 1 - IoU removed'], rows)
 
 
-def _consistent(group: Any) -> Iterable[str]:
-    for name, nees in group['nees'].items():
-        error = group['nees_error'][name]
-        spread = '' if error is None else f'±{error:.1f}'
-        yield f'{group["coverage"][name]:.2f}, {nees:.1f}{spread}'
-
-
-def _cells_of_kinds(estimates: Any) -> list[tuple[str, Any, str]]:
-    """Return the cells of the kinds along, across, up and in yaw: name, group and variable."""
-    return [
-        (f'{estimate} {kind} {variable}', group, variable)
-        for estimate, groups in estimates.items()
-        for kind, group in groups.items()
-        if kind in {f'{kind}s' for kind in KINDS}
-        for variable in CONSISTENCY_VARIABLES[:4]
-    ]
-
-
-def _consistent_cells(estimates: Any) -> Iterable[str]:
-    """Yield how many cells of the kinds are consistent, and which are not."""
-    cells = _cells_of_kinds(estimates)
-    low, high = CONSISTENT_NEES
-    coverage = [group['coverage'][variable] for _, group, variable in cells]
-    nees = [group['nees'][variable] for _, group, variable in cells]
-    overconfident = [
-        f'{name} {value:.1f}±{group["nees_error"][variable]:.1f}'
-        for (name, group, variable), value in zip(cells, nees, strict=True)
-        if value - high > SIGNIFICANT * (group['nees_error'][variable] or math.inf)
-    ]
-    for count in (
-        len(cells),
-        sum(0.9 <= part <= 0.98 for part in coverage),
-        sum(part > 0.98 for part in coverage),
-        sum(part < 0.9 for part in coverage),
-        sum(low <= value <= high for value in nees),
-        sum(value < low for value in nees),
-        sum(value > high for value in nees),
-    ):
-        yield str(count)
-    yield ', '.join(overconfident) or 'none'
-
-
-def _cells_and_chance(results: Any) -> str:
-    """Return how many cells of all recordings are consistent, and what chance leaves of that."""
-    every = [cell for estimates in results.values() for cell in _cells_of_kinds(estimates)]
-    of_many = [
-        (group['nees'][variable], group['nees_error'][variable])
-        for _, group, variable in every
-        if group['tracks'] >= MIN_TRACKS
-    ]
-    low, high = CONSISTENT_NEES
-    exact = sum(
-        NormalDist(1.0, error / value).cdf(high) - NormalDist(1.0, error / value).cdf(low)
-        for value, error in of_many
-    )
-    return (
-        f'All recordings: {sum(low <= g["nees"][v] <= high for _, g, v in every)} of {len(every)} '
-        f'cells are {low:g} to {high:g}, of those with {MIN_TRACKS} tracks or more '
-        f'{sum(low <= value <= high for value, _ in of_many)} of {len(of_many)}. If all '
-        f'covariances were exact, and tracks differed as much, {exact:.0f} of these would be. '
-        f'Less by over {SIGNIFICANT:g} standard errors are '
-        f'{sum(low - value > SIGNIFICANT * error for value, error in of_many)}, more '
-        f'{sum(value - high > SIGNIFICANT * error for value, error in of_many)}.'
-    )
-
-
-def _scale(results: Any) -> Iterable[str]:
-    """Yield the main figures with their meaning, and all figures."""
-    job, large, workers, fleet = (results[name] for name in ('job', 'large', 'workers', 'fleet'))
-    used = [workers[name]['cores_used'] for name in ('one', 'two')]
+def _report(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield how smoothly a report of 1,000 tracks moves, by both ways to draw."""
+    ((_, document),) = documents
+    (page,) = (of for name, of in document['results'].items() if name.startswith('1,000 tracks'))
+    ways = {name: of for name, of in page.items() if isinstance(of, dict)}
     rows = [
-        (
-            'job.hours_per_core_hour',
-            f'{job["hours_per_core_hour"]:.2f}',
-            f'hours of recording; {_recording_size(job)}',
-        ),
-        ('job.peak_mb', f'{job["peak_mb"]:,.0f} MB', 'memory of the job'),
-        (
-            'workers.speedup',
-            f'{workers["speedup"]:.2f}',
-            f'two workers by one; they used {used[1]:.2f} cores and {used[0]:.2f}',
-        ),
-        (
-            'large.hours_per_core_hour',
-            f'{large["hours_per_core_hour"]:.2f}',
-            f'hours of recording; {_recording_size(large)}',
-        ),
-        ('large.peak_mb', f'{large["peak_mb"]:,.0f} MB', f'memory for {large["gb"]:.1f} GB'),
-        ('large.inspect_s', f'{large["inspect_s"]:.1f} s', '`boxreg inspect` of it'),
-        (
-            'fleet.core_hours',
-            f'{fleet["core_hours"]:,.0f}',
-            f'10,000 hours of recording as `{fleet["basis"]}`',
-        ),
-        (
-            'fleet.usd',
-            f'{fleet["usd"]:,.0f} USD',
-            f'the same, at {fleet["usd_per_core_hour"]:.2f} USD a core-hour',
-        ),
-        (
-            'fleet.hours',
-            f'{fleet["hours"]:.2f} h',
-            f'10,000 jobs on 500 cores; {fleet["least_hours"]:.2f} h without losses or idle cores',
-        ),
-        ('fleet.used', f'{fleet["used"]:.0%}', 'part of the time that the cores have jobs'),
-        ('fleet.lost', f'{fleet["lost"]:.2%}', 'part of the work that is done twice'),
+        [figure, *(f'{of[figure]:.3g}' for of in ways.values())]
+        for figure in next(iter(ways.values()))
     ]
-    named = [[f'`{name}`', *cells] for name, *cells in rows]
-    yield _table(['figure', 'value', 'of'], named, '---')
-    shown = {name for name, *_ in rows}
-    others = [row for row in _flat(results) if row[0].replace(': ', '.') not in shown]
-    yield _table(['', ''], others)
+    yield table(['1,000 tracks of 80 boxes', *ways], rows)
 
 
-def _recording_size(measured: Any) -> str:
-    """Return the size of a recording."""
-    return (
-        f'{measured["recording_s"]:,.0f} s, {measured["sweeps"]:,} sweeps of '
-        f'{measured["points_per_sweep"]:,} points, {measured["boxes"]:,} boxes'
-    )
+def _speed(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the parts of a tick and of a run."""
+    ((_, document),) = documents
+    found = document['results']
+    tick = found['tick']
+    stages = ('decode', 'transform', 'crop and sample', 'solve', 'encode', 'total', 'longest')
+    yield table(['a sweep of 64 tracks', *stages],
+                [['[ms]', *(number(tick[name], 2) for name in stages)]])  # fmt: skip
+    solver = found['solver']
+    ways = ('refine', 'refine, track', 'cold', 'warm', 'reference')
+    yield table(['a window', *ways], [['[ms]', *(number(solver[name], 2) for name in ways)]])
 
 
-def _load(results: Any) -> Iterable[str]:
-    """Yield latency and accuracy by number of tracks, one table per way to treat overload."""
-    for policy, rows in results.items():
-        names = list(next(iter(rows.values())))
-        lines = [[tracks, *(_number(row[name]) for name in names)] for tracks, row in rows.items()]
-        yield _table([f'{policy}: tracks', *names], lines)
+def _scale(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the main figures with their meaning."""
+    ((_, document),) = documents
+    yield next(iter(TABLES['scale'](document['results'])))
 
 
-def _flat(results: Any) -> Iterable[list[str]]:
-    """Yield names and values; those of the start, the middle and the end of a run in one row."""
-    rows: dict[str, list[str]] = {}
-    for name, value in _named(results):
-        rows.setdefault(PART_OF_RUN.sub(': start, middle, end', name), []).append(value)
-    for name, values in rows.items():
-        yield [name, ', '.join(values)]
+def _node(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the main figures of the node in each run, side by side."""
+    figures = (
+        'early published [%]', 'final published [%]', 'latency p50 [ms]', 'latency p99 [ms]',
+        'latency max [ms]', 'memory at the start [MB]', 'memory at the end [MB]',
+        'handles at the start', 'handles at the end', 'cores used', 'recorded [MB]',
+        'box arrays not recorded',
+    )  # fmt: skip
+    runs: dict[str, Any] = {}
+    for data, document in documents:
+        for name, value in document['results'].items():
+            run, _, figure = name.rpartition(': ')
+            if figure in figures and 'recorder' not in run and not run.endswith('2'):
+                runs.setdefault(run or data.replace('_', ' '), {})[figure] = value
+    rows = [
+        [figure, *(plain(run[figure]) if figure in run else '-' for run in runs.values())]
+        for figure in figures
+    ]
+    yield table(['', *runs], rows)
 
 
-def _named(results: Any, prefix: str = '') -> Iterable[tuple[str, str]]:
-    for name, value in results.items():
-        if isinstance(value, dict):
-            yield from _named(value, f'{prefix}{name}: ')
-        elif isinstance(value, float):
-            yield f'{prefix}{name}', f'{value:,.0f}' if value >= 1e4 else f'{value:.4g}'
-        else:
-            yield f'{prefix}{name}', str(value)
+def _load(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield latency and accuracy by number of tracks with the default deadline."""
+    ((_, document),) = documents
+    yield next(iter(TABLES['load']({'deadline': document['results']['deadline']})))
 
 
-TABLES: dict[str, Callable[[Any], Iterable[str]]] = {
+def _kills(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+    """Yield the time of the boxes that are lost with each process."""
+    ((_, document),) = documents
+    killed: dict[str, dict[str, str]] = {}
+    for name, value in document['results'].items():
+        process, of_process, figure = name.partition(': ')
+        if of_process:
+            killed.setdefault(process, {})[figure] = f'{value:.2g}'
+    rows = [[process, *found.values()] for process, found in killed.items()]
+    figures = list(next(iter(killed.values())))
+    yield table(['', *figures], rows)
+
+
+DECIDING: dict[str, Callable[[Iterable[tuple[str, Any]]], Iterable[str]]] = {
     'real': _accuracy,
     'kinds': _kinds_of_objects,
     'tracks': _tracks,
@@ -789,18 +524,16 @@ TABLES: dict[str, Callable[[Any], Iterable[str]]] = {
     'sensitivity': _sensitivity,
     'highway': _highway,
     'points': _points,
-    'lidars': _lidars,
     'covariance': _covariance,
     'review': _review,
-    'labeller': _labeller,
-    'report': _figures,
-    'speed': _figures,
-    'load': _load,
+    'report': _report,
+    'speed': _speed,
     'scale': _scale,
-    'kills': _figures,
     'node': _node,
+    'load': _load,
+    'kills': _kills,
 }
-"""The tables of one measurement, for each kind of measurements."""
+"""The rows to decide by of all measurements of a kind; the other kinds have few rows."""
 
 
 if __name__ == '__main__':

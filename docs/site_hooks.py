@@ -1,10 +1,17 @@
-"""Formulas and diagrams of the documentation: mkdocs draws them, a reader needs no network."""
+"""
+What mkdocs draws for the documentation: formulas, diagrams and tables of measurements.
+
+A reader needs no network.
+
+"""
 
 from __future__ import annotations
 
 from html import unescape
 from pathlib import Path
 import re
+import sys
+from textwrap import indent
 from typing import Any
 
 from latex2mathml.converter import convert
@@ -13,9 +20,15 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 import ziamath
 
+sys.path.insert(0, str(Path(__file__).parent))
+from result_tables import all_tables
+from results import FOLDED, STORE
+
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.+?)\\[)\]]</\1>', re.DOTALL)
 """A formula as pymdownx.arithmatex marks it, in a line or in a block of its own."""
 DIAGRAM = re.compile(r'<pre class="mermaid"><code>(.+?)</code></pre>', re.DOTALL)
+TABLES = re.compile(re.escape(FOLDED).replace(r'\{\}', r'(\w+)'))
+"""The place of all tables of a kind of measurements."""
 FONT = Path(ziamath.__file__).parent / 'fonts' / 'STIXTwoMath-Regular.ttf'
 """Without a font for mathematics browsers place indices and fractions badly."""
 
@@ -24,6 +37,16 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the font that `assets/site.css` names."""
     files.append(File.generated(config, f'assets/{FONT.name}', abs_src_path=str(FONT)))
     return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Return the text of a page with all tables of its measurements, folded."""
+    return TABLES.sub(_folded, markdown)
+
+
+def _folded(found: re.Match[str]) -> str:
+    tables = indent('\n'.join(all_tables(STORE, found[1])), '    ')
+    return f'??? info "All tables"\n\n{tables}'
 
 
 def on_page_content(html: str, **_: Any) -> str:

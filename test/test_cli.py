@@ -68,7 +68,7 @@ def test_options_are_used_by_the_run(tmp_path, capsys):
     options = [
         '--points', '/points', '--boxes', '/boxes', '--odometry', '/odom', '--fixed-frame', 'odom',
         '--config', config, '--set', 'solver.iterations=3', '--set', 'estimate=final',
-        '--set', 'sampling.margin=0.5', '--formats', 'csv', '--start', '0.1', '--end', '0.6',
+        '--set', 'faces.sides=0.07', '--formats', 'csv', '--start', '0.1', '--end', '0.6',
         '--workers', '1',
     ]  # fmt: skip
     out = tmp_path / 'out'
@@ -78,7 +78,7 @@ def test_options_are_used_by_the_run(tmp_path, capsys):
     used = Config.from_yaml(out / 'config.yaml')
     assert (used.window, used.lag, used.estimate) == (4, 2, 'final')
     assert (used.solver.rounds, used.solver.iterations) == (1, 3)
-    assert used.sampling.margin == 0.5
+    assert used.faces.sides == 0.07
     assert not (out / 'openlabel').exists()
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 from boxreg_ros.cli import parser
+from boxreg_ros.core.method.residuals import RESIDUALS
 from boxreg_ros.reasons import Reason
 from browser import launched, NEEDS_BROWSER
 import generate
@@ -106,6 +107,30 @@ def test_named_files_exist(path):
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
 
 
+def test_labels_that_the_code_quotes_are_those_of_the_method():
+    text = ''.join((DOCS / page).read_text('utf-8') for page in ('method.md', 'method-tracks.md'))
+    tagged = re.findall(r'\\tag\{(M\d+[a-z]?)\}', text)  # a formula
+    titled = re.findall(
+        r'^(?:\| |\*\*[^*(]+)\((M\d+[a-z]?)\)', text, re.MULTILINE
+    )  # a row, a title
+    labels = {*tagged, *titled}
+    assert len(labels) > 25 and len(tagged) == len(set(tagged))
+    for path in [*(ROOT / 'boxreg_ros').rglob('*.py'), *(ROOT / 'test').rglob('*.py')]:
+        if path.name != 'test_example_residual.py':  # its label is a new one
+            quoted = set(re.findall(r'\((M\d+[a-z]?)\)', path.read_text(encoding='utf-8')))
+            assert quoted <= labels, (path, quoted - labels)
+    for page in PAGES:
+        quoted = set(re.findall(r'\((M\d+[a-z]?)\)', page.read_text(encoding='utf-8')))
+        assert page.stem == 'add-a-residual' or quoted <= labels, (page, quoted - labels)
+
+
+def test_every_residual_is_a_row_of_the_method():
+    text = (DOCS / 'method.md').read_text(encoding='utf-8')
+    for row in RESIDUALS:
+        number = re.search(r'\((M\d+)\)', row.function.__doc__)[1]
+        assert re.search(rf'^\| \({number}\) \|.*`{row.function.__name__}`', text, re.MULTILINE)
+
+
 def test_readme_is_short():
     text = README.read_text(encoding='utf-8')
     assert len(text.splitlines()) <= 200
@@ -143,6 +168,17 @@ def test_every_page_of_the_site_is_there_and_needs_no_network(site):
         loaded = re.findall(r'<(?:script|img|link|iframe)\b[^>]* (?:src|href)="([^"]+)"', text)
         assert [url for url in loaded if url.startswith(('http', '//'))] == [], page
         assert 'class="arithmatex"' not in text and 'class="mermaid"' not in text, page
+
+
+def test_the_site_folds_all_tables_of_the_measurements(site):
+    pages = {path: path.read_text(encoding='utf-8') for path in (DOCS / 'results').glob('*.md')}
+    folded = {path: text.count('All tables: `python') for path, text in pages.items()}
+    for path, count in folded.items():
+        html = (site / path.relative_to(DOCS).with_suffix('.html')).read_text(encoding='utf-8')
+        blocks = re.findall('<details.*?</details>', html, re.DOTALL)
+        assert len(blocks) == count, path
+        assert all('<table>' in block and 'json' in block for block in blocks)
+    assert sum(folded.values()) > 10
 
 
 @NEEDS_BROWSER

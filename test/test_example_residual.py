@@ -33,9 +33,9 @@ def copy(tmp_path):
     row = re.search(r'`(Residual\(rise, .*\))`', PAGE.read_text(encoding='utf-8'))[1]
     insert(method / 'residuals.py', '    Residual(slip, ', f'    {row},\n')
     setting = re.search(r'```python\n(    rise: float = .*?)```', PAGE.read_text(), re.DOTALL)[1]
-    insert(tmp_path / 'boxreg_ros' / 'config.py', '    pivot: float = setting(', setting)
+    insert(tmp_path / 'boxreg_ros' / 'config.py', '    shape: float = setting(', setting)
     field = "    'rise': ('rise',),\n"
-    insert(tmp_path / 'boxreg_ros' / 'core' / 'problem.py', "    'drift': ('drift',),\n", field)
+    insert(tmp_path / 'boxreg_ros' / 'core' / 'problem.py', "    'extent': ('extent',),\n", field)
     return tmp_path
 
 

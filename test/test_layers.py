@@ -1,6 +1,7 @@
 """The rooms of docs/architecture.md: which package may import which; the core knows no ROS."""
 
 import ast
+import re
 import subprocess
 import sys
 
@@ -83,6 +84,19 @@ def test_every_package_is_a_room():
     packages = {path.parent.name for path in ROOT.glob('boxreg_ros/*/__init__.py')}
     assert packages == set(MAY_IMPORT) - {BASE, 'msg_adapters'}
     assert {path.name for path in ROOT.glob('test/*') if path.name in packages} == packages
+
+
+def test_the_picture_of_the_house_has_the_same_arrows():
+    page = (ROOT / 'docs' / 'architecture.md').read_text(encoding='utf-8')
+    picture = page[page.index('```mermaid') : page.index('```\n\n|')]
+    downstairs = {room: set() for room in MAY_IMPORT}
+    for above, below in re.findall(r'^ +([\w &]+) --> ([\w &]+)$', picture, re.MULTILINE):
+        for room in above.split(' & '):
+            downstairs[room] |= set(below.split(' & '))
+    for _ in MAY_IMPORT:  # whatever can be reached
+        for rooms in downstairs.values():
+            rooms |= set().union(*(downstairs[room] for room in rooms))
+    assert downstairs == MAY_IMPORT
 
 
 @pytest.mark.parametrize(

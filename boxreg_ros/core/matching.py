@@ -11,6 +11,10 @@ from boxreg_ros.errors import ShapeError
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Sweep
 
+AT_ONCE = 0.02
+"""Boxes take a sweep this near in time without waiting for a nearer one [s]. Chosen: a fifth of
+the period of a LiDAR."""
+
 
 class Pair(NamedTuple):
     """A box array and its sweep, None where there is none."""
@@ -23,7 +27,7 @@ class StampMatcher:
     """
     Pair sweeps with box arrays; pairs are returned in the order of the box arrays' stamps.
 
-    A box array takes the nearest sweep within `tolerance` at once. A sweep within `reach` is taken
+    A box array takes the nearest sweep within `AT_ONCE` at once. A sweep within `reach` is taken
     as soon as a younger sweep than the boxes is known: no later one can be nearer, whichever kind
     arrives first. A sweep may be paired with several box arrays. A box array whose sweep was
     dropped is returned without one. At most `queue` sweeps and `queue` box arrays are held.
@@ -31,15 +35,15 @@ class StampMatcher:
     Parameters
     ----------
     config : Config
-        Its `tolerance`, `reach` and `queue` are used.
+        Its `reach` and `queue` are used.
     counts : Counter
         Counts dropped sweeps by reason.
 
     """
 
     def __init__(self, config: Config, counts: Counter[str]) -> None:
-        self._tolerance_ns = round(config.tolerance * 1e9)
-        self._reach_ns = round(max(config.reach, config.tolerance) * 1e9)
+        self._reach_ns = round(config.reach * 1e9)
+        self._at_once_ns = min(round(AT_ONCE * 1e9), self._reach_ns)
         self._capacity = config.queue
         self._counts = counts
         self._sweeps: list[Sweep] = []  # ascending by stamp
@@ -81,7 +85,7 @@ class StampMatcher:
             offset_ns = self._reach_ns + 1
             if sweep is not None:
                 offset_ns = abs(sweep.stamp_ns - stamp_ns)
-            is_decided = offset_ns <= self._tolerance_ns or self._newest_ns >= stamp_ns
+            is_decided = offset_ns <= self._at_once_ns or self._newest_ns >= stamp_ns
             is_over_capacity = len(self._boxes) > self._capacity
             if not (is_decided or is_over_capacity or is_flush):
                 return

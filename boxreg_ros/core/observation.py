@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 NEARBY = 1.0
 """How far beside a box its road, its time and its points are looked for [m]; chosen: a lane has
 about as much free."""
+MARGIN = 0.6
+"""Points up to this far outside of a box may be of its object [m]; chosen: four deviations of the
+error of an input box."""
 SIDE_NOISE = 0.05
 """Points up to so far outside of a box may be on its sides: it holds them, and they are not of the
 road beside it [m]; chosen."""
@@ -353,8 +356,8 @@ class OwnPoints(NamedTuple):
 def crop_numbers(config: Config) -> crop_kernels.CropNumbers:
     """Return what the kernels need to know to find points and the road."""
     return crop_kernels.CropNumbers(
-        margin=max(NEARBY, config.sampling.margin),
-        own_margin=config.sampling.margin,
+        margin=NEARBY,
+        own_margin=MARGIN,
         ownership_tolerance=FACE_TOLERANCE if config.ingredients.point_ownership else np.inf,
         clearance=GROUND_CLEARANCE,
         has_road=config.ingredients.road,

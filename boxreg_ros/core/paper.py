@@ -31,6 +31,10 @@ STATIONARITY = 1e-9
 """Relative decrease of the objective that ends the search of one multiplier round. Chosen."""
 FULL_STEP = 0.1
 """Step from which on its direction counts in full in Eq. 7 [m]. Chosen."""
+NEAREST = 8
+"""K, the closest points of each visible face in Eq. 4. Chosen: the paper does not state it."""
+MULTIPLIER_ROUNDS = 5
+"""Updates of the two Lagrange multipliers. Chosen: see `ROUNDING_DECAY`."""
 PADDING_POSITION = 1e6
 """Coordinate of padding points [m]. Derived: near no box, and finite in float32."""
 
@@ -169,7 +173,7 @@ def total(
     constraints = [term(boxes, valid, rounding) for term in (smoothness, alignment)]
     violation = torch.stack(constraints, -1)
     penalty = violation.new_tensor([weights.smoothness, weights.alignment])
-    loss = weights.closeness * closeness(boxes, points, mask, weights.nearest)
+    loss = weights.closeness * closeness(boxes, points, mask, NEAREST)
     loss = loss + weights.enclosure * enclosure(boxes, points, mask)
     return loss + (multipliers * violation + penalty * violation**2 / 2).sum(-1), violation
 
@@ -203,7 +207,7 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
         pose = x.unflatten(1, (length, 6))
         return torch.cat([pose[..., :3], extent[rows], pose[..., 3:]], -1)
 
-    for turn in range(settings.multiplier_rounds):
+    for turn in range(MULTIPLIER_ROUNDS):
         rounding = max(INITIAL_ROUNDING * ROUNDING_DECAY**turn, EPSILON)
 
         def function(

@@ -141,7 +141,7 @@ class PointLabeller:
         self._config = config
         self._array_stamps_ns = np.unique(array_stamps_ns)
         self._limits = SURFACE_TOLERANCE - margins[:, [0, 2, 4, 5]]  # ends, sides, top, bottom
-        self._reach_ns = round(max(config.reach, config.tolerance) * 1e9)
+        self._reach_ns = round(config.reach * 1e9)
         self._gap_ns = round(config.max_gap * 1e9)
         empty = np.zeros(0, np.int64), np.zeros((0, 9)), np.zeros(0, bool)
         columns = [track[2:] for track in tracks] or [empty]

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config, KINDS
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, GAP, PIVOT, POSE, PRIOR, SHARED
+from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.observation import Observations
 from boxreg_ros.core.tables import joined
 from boxreg_ros.core.track_window import MarginalisationPrior, Window
@@ -57,13 +58,11 @@ NO_PRIOR = (
 SETTINGS_OF = {
     'motion': ('acceleration', 'cornering', 'turning'),
     'slip': ('slip',),
-    'drift': ('drift',),
     'pose': ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading'),
     'extent': ('extent',),
     'gap_spread': ('gap_spread',),
     'roughness': ('shape',),
     'gaps': ('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom'),
-    'pivot': ('pivot',),
 }
 """
 Fields of `CLASS_SETTINGS`, and the settings of `ClassConfig` that make each.
@@ -72,8 +71,6 @@ motion
     Deviations of the accelerations forward, sideways and of yaw, (3,) [m/s^2, rad/s^2].
 slip
     Of the sideways velocity of the pivot [m/s].
-drift
-    Of the step of a parked box [m].
 pose, extent
     Of the input poses, (6,) [m, rad], and of the input extents, as part of each.
 gap_spread
@@ -82,8 +79,6 @@ roughness
     How far the surface is from rigid [m].
 gaps
     Expected labelling margins, (6,) [m].
-pivot
-    Distance of the pivot behind the centre, as part of the length.
 """
 CLASS_SETTINGS = np.dtype(
     [
@@ -253,7 +248,7 @@ class Problem(NamedTuple):
         shared = np.zeros((len(self.boxes), SHARED))
         shared[:, EXTENT:BIAS] = self.mean_extents()
         shared[:, GAP:PIVOT] = self.of_class['gaps'] + inputs['gap_correction'][self.kind]
-        shared[:, PIVOT] = shared[:, EXTENT] * self.of_class['pivot']
+        shared[:, PIVOT] = shared[:, EXTENT] * CONSTANTS.pivot
         return shared
 
     def free_variables(self, config: Config) -> Floats:

@@ -231,7 +231,7 @@ def registered(
             places.setdefault(stamp_ns, []).append(_Place(index, row))
 
     registrar = BoxRegistrar(
-        replace(config, tolerance=0.0), has_whole_sweeps=False, constants=constants
+        replace(config, reach=0.0), has_whole_sweeps=False, constants=constants
     )
     results: list[RefinedBoxes] = []
     for stamp_ns in sorted(places):

@@ -92,8 +92,7 @@ def _update_margins(
     new = [row for row, part in enumerate(columns) if part]
     if not new:
         return
-    coarse = model.constants.coarse_points
-    problem = problem.part(new, [columns[row] for row in new]).thinned(coarse)
+    problem = problem.part(new, [columns[row] for row in new])
     poses = np.concatenate([problem.boxes[..., :3], problem.start[..., ROLL:]], axis=-1)
     model.observe_margins([windows[row].track_id for row in new], problem, poses, config)
 

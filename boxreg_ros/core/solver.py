@@ -7,7 +7,6 @@ minimised. How many rounds there are, and what they use, is a `SolverPlan`, chos
 """
 
 from dataclasses import dataclass, replace
-from math import inf
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
@@ -43,8 +42,6 @@ class SolverPlan:
     ----------
     rounds : int
         Most rounds.
-    coarse_points : float
-        Points per box until the boxes are settled; then all.
     starts_from_fit : bool
         Whether the start is the fit of the tick before: faces are judged by its extents, and its
         motion is good enough for robust weights in the first round.
@@ -58,25 +55,22 @@ class SolverPlan:
     """
 
     rounds: int
-    coarse_points: float
     starts_from_fit: bool = False
     uses_rigid_shape: bool = False
     estimates_noise: bool = False
     marginalises: bool = False
 
     @classmethod
-    def choose(cls, config: Config, is_warm: bool, coarse_points: int) -> 'SolverPlan':
+    def choose(cls, config: Config, is_warm: bool) -> 'SolverPlan':
         """
         Return the plan for windows that are warm: all but their newest box have been solved.
 
-        A warm window takes one round with all points, a cold one as many as it needs. For whole
-        tracks noise comes from the batch: the model has one residual a window of theirs, seconds
-        apart, from which no correlation can be estimated.
+        A warm window takes one round, a cold one as many as it needs. For whole tracks noise comes
+        from the batch: the model has one residual a window of theirs, seconds apart, from which no
+        correlation can be estimated.
 
         """
-        plan = cls(1, inf, starts_from_fit=True)
-        if not is_warm:
-            plan = cls(config.solver.rounds, coarse_points)
+        plan = cls(1, starts_from_fit=True) if is_warm else cls(config.solver.rounds)
         if config.estimate == 'track':
             return replace(plan, uses_rigid_shape=True, estimates_noise=True)
         return replace(plan, marginalises=True)
@@ -131,20 +125,17 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
 
     """
     constants = model.constants.with_settings(config)
-    plan = SolverPlan.choose(config, is_warm, constants.coarse_points)
+    plan = SolverPlan.choose(config, is_warm)
     inputs = model.inputs(config, with_noise=not plan.estimates_noise)
     batch = start(problem, config, plan, inputs)
-    every = np.arange(len(batch.free))
-    rows, turn, points = every, 0, plan.coarse_points
+    rows, turn = np.arange(len(batch.free)), 0
     with shared_between(config.solver.threads):
         while len(rows):
-            is_done = run_round(batch, inputs, rows, points, plan, turn, config, constants)
+            is_done = run_round(batch, inputs, rows, plan, turn, config, constants)
             rows = rows[~is_done]
             turn += 1
             if plan.estimates_noise:
                 inputs = _from_batch(batch, inputs, model, turn, config)
-            if not len(rows) and 2 * points <= problem.width:
-                rows, points = every, inf  # settled on few points: once more with all
     return batch.solution
 
 
@@ -174,7 +165,6 @@ def run_round(
     batch: Batch,
     inputs: Inputs,
     rows: Ints,
-    points: float,
     plan: SolverPlan,
     turn: int,
     config: Config,
@@ -187,8 +177,7 @@ def run_round(
     those have covariances and, if they are full, a prior for the next window.
 
     """
-    _, free, sums, solution = batch
-    problem = batch.problem.thinned(points)
+    problem, free, sums, solution = batch
     uses_shape = plan.uses_rigid_shape and turn > 0
     is_smooth = turn > 0 or plan.starts_from_fit
     record = constants.in_round(uses_shape, is_smooth).record()

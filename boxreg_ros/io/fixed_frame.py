@@ -79,7 +79,7 @@ class FixedFrameItems:
     source : ItemSource
         Open.
     config : Config
-        `max_gap`, `tolerance` and `merge_span` are used.
+        `max_gap` and `merge_span` are used.
     convention : Convention
         Convention of the boxes, and whether ids are to be assigned.
     fixed_frame : str, optional

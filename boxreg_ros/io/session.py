@@ -14,6 +14,7 @@ from collections import Counter
 from typing import Generic, NamedTuple, TYPE_CHECKING, TypeVar
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.matching import AT_ONCE
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.id_assignment import Tracker
 from boxreg_ros.io.lidars import ignore, MergedSweep, Report, SensorPlacement, SweepMerger
@@ -131,7 +132,7 @@ class Session:
         Convention of the box poses and sizes, and whether ids are to be assigned. Adapters have
         applied the convention already; the pose check compares it with the others.
     config : Config
-        `max_gap`, `tolerance` and `merge_span` are used.
+        `max_gap` and `merge_span` are used.
     fixed_frame : str
         Frame to refine in; empty to choose it with `require_fixed_frame`.
     placement : SensorPlacement, optional
@@ -173,7 +174,7 @@ class Session:
 
     @property
     def config(self) -> Config:
-        """Return the settings; `max_gap` may change at any time, `tolerance` at a restart."""
+        """Return the settings; `max_gap` may change at any time."""
         return self._config
 
     @config.setter
@@ -184,7 +185,7 @@ class Session:
 
     def restart(self) -> None:
         """Forget all but the transforms; ids that were assigned are not used again."""
-        self._pose_check = PoseCheck(self._convention, self._config.tolerance)
+        self._pose_check = PoseCheck(self._convention, AT_ONCE)
         if self._merger is not None:
             self._merger.reset()
         if self._tracker is not None:

@@ -31,7 +31,7 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
     quick = Config(
         objective=config.objective, mode=config.mode, estimate=config.estimate,
         window=4, lag=3, solver=SolverConfig(rounds=2, iterations=2),
-        paper=PaperConfig(multiplier_rounds=1, iterations=2),
+        paper=PaperConfig(iterations=2),
     )  # fmt: skip
     registrar = BoxRegistrar(quick, submit)
     for sweep, boxes in zip(*_passing_car(), strict=True):

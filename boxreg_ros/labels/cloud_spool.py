@@ -31,7 +31,7 @@ class Spool:
 
     def __init__(self, folder: Path, config: Config) -> None:
         self._folder = folder / FOLDER
-        self._max_offset_ns = round(max(config.reach, config.tolerance) * 1e9)
+        self._max_offset_ns = round(config.reach * 1e9)
         self._frames: dict[int, tuple[str, Floats]] = {}  # stamp -> frame id, T_fixed_sweep
         self._stamps: list[int] = []  # ascending
         self._folder.mkdir()

@@ -442,7 +442,7 @@ class LiveRegistrar:
             return []
         ready = self._register(self._session.unmerged())
         # Beyond the reach of these boxes: a cloud that arrived before them may still be theirs.
-        reach = max(self.config.reach, self.config.tolerance)
+        reach = self.config.reach
         return ready + self.lose(max(overdue) + round(reach * 1e9) + 1)
 
     @property

@@ -221,7 +221,7 @@ def numbers_as_declared(node: Node, parameters: list[Parameter]) -> list[Paramet
     """
     Return parameters with numbers converted where the node declares a real or a text.
 
-    ``ros2 param set NODE sampling.margin 1`` sends an integer.
+    ``ros2 param set NODE vehicle.shape 1`` sends an integer.
 
     """
     converted = []

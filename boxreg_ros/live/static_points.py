@@ -106,7 +106,7 @@ class StaticPoints:
                 history.append(_Box(boxes.stamp_ns, name, boxes.boxes[row], is_certain))
         self._forget(boxes.stamp_ns - round(HISTORY_SECONDS * 1e9))
         config = self._registrar.config
-        reach_ns = round(max(config.reach, config.tolerance) * 1e9)
+        reach_ns = round(config.reach * 1e9)
         while self._waiting and self._waiting[0].sweep.stamp_ns <= boxes.stamp_ns + reach_ns:
             self._label(self._waiting.popleft())
 

@@ -18,6 +18,7 @@ from typing import Any
 from boxreg_ros.config import Config, KINDS, Setting, settings
 from boxreg_ros.core.input_model import FACE_GROUPS, InputModel
 from boxreg_ros.core.input_noise import noise_of, normalised_residuals
+from boxreg_ros.core.matching import AT_ONCE
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.noise import MAD_TO_DEVIATION
 from boxreg_ros.core.observation import Observation, Observations, observe
@@ -282,7 +283,7 @@ def run(args: argparse.Namespace) -> int:
     truth = true_boxes(args.truth)
     recording = request.recording()
     recording.has_boxes = not args.no_boxes
-    drive = Drive.of(recording, truth, config.tolerance, config)
+    drive = Drive.of(recording, truth, AT_ONCE, config)
     if drive.left_out:
         print(f'boxreg: {drive.left_out}', file=sys.stderr)
     measured = labelling_margins(drive, config)
@@ -329,7 +330,7 @@ def _true_windows(drive: Drive, config: Config) -> list[Window]:
     classes: dict[str, str] = {}
     for stamp_ns in np.unique(truth.stamps_ns[rows]).tolist() if drive.sweeps else ():
         (sweep,) = drive.sweeps_at(np.array([stamp_ns]))
-        if abs(sweep.stamp_ns - stamp_ns) > config.tolerance * 1e9:
+        if abs(sweep.stamp_ns - stamp_ns) > AT_ONCE * 1e9:
             continue
         here = rows[truth.stamps_ns[rows] == stamp_ns]
         found = observe(sweep, truth.boxes[here], stamp_ns, config)

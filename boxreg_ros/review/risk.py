@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.observation import MARGIN
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.structures import ADDED, BOX_EXTENT, Floats, KEPT, LENGTH, WIDTH, X, Y, YAW
 import numpy as np
@@ -32,8 +33,6 @@ KEPT_LOSS = 0.25
 USUAL_OUTSIDE = 0.1
 """Part of the points in and near a box that are of other things, where too few tracks are known
 to measure it. Chosen."""
-NEAR_MARGIN = 0.6
-"""How far outside of a box points count as near [m]: the default of `sampling.margin`."""
 USUAL_FILL = 0.34
 """Part of its volume with that margin that a car fills; smaller objects fill less. Derived."""
 SWITCH_SPEED = 10.0
@@ -245,7 +244,7 @@ def _left_outside(track: TrackChanges, extents: Floats, usual: float) -> Floats:
     of_track = (outside.sum() + FEW_POINTS * usual) / (total.sum() + FEW_POINTS)
     part = (outside + FEW_POINTS * of_track) / (total + FEW_POINTS)
     excess = (part - usual).clip(0)
-    fill = (extents / (extents + 2 * NEAR_MARGIN)).prod(axis=1) / USUAL_FILL
+    fill = (extents / (extents + 2 * MARGIN)).prod(axis=1) / USUAL_FILL
     shift = excess * fill.clip(max=1.0)
     return np.asarray(2 * shift / (1 + shift))
 

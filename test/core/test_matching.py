@@ -11,7 +11,8 @@ from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest
 
-TOLERANCE_NS, REACH_NS = 20, 60
+MS = 1_000_000
+AT_ONCE, REACH = 20, 60
 
 
 def sweep(stamp_ns, is_dropped=False):
@@ -24,21 +25,20 @@ def boxes(stamp_ns):
 
 class Feed:
     """
-    A matcher whose input and output are written as stamps.
+    A matcher whose input and output are written as stamps in milliseconds.
 
     ``'s100'`` is a sweep, ``'b105'`` a box array, ``'d100'`` a dropped sweep.
 
     """
 
-    def __init__(self, capacity=10, reach=TOLERANCE_NS):
+    def __init__(self, capacity=10, reach=AT_ONCE):
         self.counts = Counter()
-        config = Config(tolerance=TOLERANCE_NS * 1e-9, reach=reach * 1e-9, queue=capacity)
-        self.matcher = StampMatcher(config, self.counts)
+        self.matcher = StampMatcher(Config(reach=reach * 1e-3, queue=capacity), self.counts)
 
     def add(self, *items):
         pairs = []
         for item in items:
-            stamp_ns = int(item[1:])
+            stamp_ns = int(item[1:]) * MS
             if item[0] in 'sd':
                 pairs += self.matcher.add_sweep(sweep(stamp_ns, is_dropped=item[0] == 'd'))
             else:
@@ -51,7 +51,7 @@ class Feed:
 
 def stamps_of(pairs):
     return [
-        (pair.boxes.stamp_ns, None if pair.sweep is None else pair.sweep.stamp_ns)
+        (pair.boxes.stamp_ns // MS, None if pair.sweep is None else pair.sweep.stamp_ns // MS)
         for pair in pairs
     ]
 
@@ -94,7 +94,7 @@ def test_boxes_between_sweeps_are_paired_when_a_younger_sweep_arrives(late):
     # 150 is 45 from 105, 55 from 205: within reach of both, the tolerance of neither.
     items = ['s105', 's205']
     items.insert(late, 'b150')
-    feed = Feed(reach=REACH_NS)
+    feed = Feed(reach=REACH)
     assert feed.add(*items) == [(150, 105)]
     assert feed.add('b210') == [(210, 205)]
     assert feed.add('b266') == []
@@ -105,14 +105,14 @@ def test_boxes_between_sweeps_are_paired_when_a_younger_sweep_arrives(late):
 
 
 def test_boxes_at_twice_the_rate_share_sweeps():
-    feed = Feed(reach=REACH_NS)
+    feed = Feed(reach=REACH)
     pairs = feed.add('s100', 'b100', 'b150', 's200', 'b200', 'b250', 's300', 'b300')
     assert pairs == [(100, 100), (150, 100), (200, 200), (250, 200), (300, 300)]
     assert feed.counts == {}
 
 
 def test_boxes_of_a_dropped_sweep_are_returned_without_one():
-    feed = Feed(reach=REACH_NS)
+    feed = Feed(reach=REACH)
     assert feed.add('s100', 'd150', 'b150') == [(150, None)]  # at once, and not with 100
     assert feed.add('b200', 'd200') == [(200, None)]
 

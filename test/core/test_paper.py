@@ -182,7 +182,7 @@ PAPER = {
     'enclosure': lambda b, p: paper.enclosure(b, *p[:2]),
     'smoothness': lambda b, p: paper.smoothness(b, p.valid),
     'alignment': lambda b, p: paper.alignment(b, p.valid),
-    'total': lambda b, p: paper.total(b, p, PaperConfig(nearest=5), MULTIPLIERS, EPSILON)[0],
+    'total': lambda b, p: paper.total(b, p, PaperConfig(), MULTIPLIERS, EPSILON)[0],
 }
 MULTIPLIERS = tensor([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
 each_term = pytest.mark.parametrize('term', PAPER.values(), ids=PAPER)
@@ -252,11 +252,11 @@ def test_duplicates_do_not_matter(name):
 def test_total_is_the_weighted_sum_with_multipliers():
     # Eq. 8 with c the two constraints: closeness and enclosure weighted, m c + w c^2 / 2.
     boxes, seen = seen_of(random_problem())
-    weights = PaperConfig(closeness=2.0, enclosure=3.0, smoothness=0.5, alignment=0.7, nearest=5)
+    weights = PaperConfig(closeness=2.0, enclosure=3.0, smoothness=0.5, alignment=0.7)
     boxes = boxes + 0.1
     loss, violation = paper.total(boxes, seen, weights, MULTIPLIERS, EPSILON)
     c = [paper.smoothness(boxes, seen.valid), paper.alignment(boxes, seen.valid)]
-    known = 2 * paper.closeness(boxes, *seen[:2], 5)
+    known = 2 * paper.closeness(boxes, *seen[:2], paper.NEAREST)
     known += 3 * paper.enclosure(boxes, *seen[:2])
     known += MULTIPLIERS[:, 0] * c[0] + 0.5 * c[0] ** 2 / 2
     known += MULTIPLIERS[:, 1] * c[1] + 0.7 * c[1] ** 2 / 2

@@ -461,7 +461,7 @@ def test_a_window_that_fails_leaves_no_prior(estimate):
         now_ns = boxes.stamp_ns if i < 8 else whole[8][1].stamp_ns + i
         now_ns = boxes.stamp_ns if i >= 16 else now_ns
         with_tiny_steps.append((replace(sweep, stamp_ns=now_ns), replace(boxes, stamp_ns=now_ns)))
-    registrar = BoxRegistrar(config_with(estimate, tolerance=0.0, reach=0.0))
+    registrar = BoxRegistrar(config_with(estimate, reach=0.0))
     has_prior, status = [], []
     for pair in with_tiny_steps:
         early = [r for r in fed(registrar, [pair]) if not r.is_final]

@@ -55,7 +55,7 @@ def test_means_of_shared_variables_by_hand():
     boxes[..., 4:6] = [2.0, 1.5]
     gaps = [1, 1, 3, 3, 5, 7]
     problem = car_problem(boxes, lengths=[3], marginalised_extents=[[8.6, 4.0, 3.0, 2.0]])
-    problem.of_class['gaps'], problem.of_class['pivot'] = gaps, 0.25
+    problem.of_class['gaps'] = gaps
     beyond = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     found = expected_of(problem, no_inputs(gap_correction=beyond))['shared']
     known = np.zeros(23)
@@ -195,8 +195,7 @@ def test_weights_of_input_and_motion_by_hand():
     assert not W['input'][5:].any() and not W['acceleration'][3:].any()
     assert not W['slip'][4:].any() and not W['zero motion'].any()
     rest, _ = weighed(car_problem(np.repeat(drive(1)[None], 6, axis=1)), common)
-    drift = car.drift * np.array([1.0, 1.0, 0.5, 0.15, 0.15, 0.15])
-    known = [drift**-2.0] * 5 + [np.zeros(6)]
+    known = [np.array(CONSTANTS.drift) ** -2.0] * 5 + [np.zeros(6)]
     np.testing.assert_allclose(rest['W'][:, RESIDUAL_NAMES.index('zero motion')], known)
 
 

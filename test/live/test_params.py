@@ -72,7 +72,7 @@ def test_every_setting_is_a_described_parameter(make_node):
 def test_integers_are_accepted_for_reals_at_start_up(make_node):
     node = make_node(
         **{
-            'sampling.margin': 1,
+            'vehicle.shape': 1,
             'window': 7,
             'lag': 6,
             'vehicle.names': ['ute'],
@@ -81,9 +81,9 @@ def test_integers_are_accepted_for_reals_at_start_up(make_node):
     )
     config, options = declare(node)
     assert config == Config(estimate='final').updated(
-        {'sampling.margin': 1.0, 'window': 7, 'lag': 6, 'vehicle.names': ['ute']}
+        {'vehicle.shape': 1.0, 'window': 7, 'lag': 6, 'vehicle.names': ['ute']}
     )
-    assert type(node.get_parameter('sampling.margin').value) is float
+    assert type(node.get_parameter('vehicle.shape').value) is float
     assert type(options.transform_timeout) is float
     assert options.transform_timeout == 2.0
 
@@ -185,9 +185,9 @@ def test_integers_are_accepted_for_reals_at_run_time(make_node):
     node = make_node()
     declare(node)
     node.add_pre_set_parameters_callback(lambda given: numbers_as_declared(node, given))
-    result = node.set_parameters_atomically([Parameter('sampling.margin', value=1)])
+    result = node.set_parameters_atomically([Parameter('vehicle.shape', value=1)])
     assert result.successful, result.reason
-    assert node.get_parameter('sampling.margin').value == 1.0
+    assert node.get_parameter('vehicle.shape').value == 1.0
     result = node.set_parameters_atomically([Parameter('sampling.box_time', value=0.3)])
     assert result.successful, result.reason
     assert node.get_parameter('sampling.box_time').value == '0.3'

@@ -9,6 +9,7 @@ import measure
 from measure.sensitivity import variations_of_constants
 from paths import ROOT
 import pytest
+import result_tables
 import results
 
 STORE = ROOT / 'docs' / 'results'
@@ -30,12 +31,21 @@ def test_pages_follow_the_measurements(tmp_path):
     (methods,) = document['results'].values()
     before = results.pages(store)
     assert f'| ours, track | {methods["ours, track"]["iou_bev"]:.3f} |' in before[pages[1]]
-    methods['ours, track']['iou_bev'] = 0.12345
+    methods['ours, track'] |= {'iou_bev': 0.12345, 'iou_3d': 0.23456}
     path.write_text(json.dumps(document), encoding='utf-8')
     after = results.pages(store)
     assert '| ours, track | 0.123 |' in after[pages[1]]
-    assert ' | 0.123 |' in after[pages[0]]
+    assert ' | 0.235 |' in after[pages[0]]
     assert {page for page in after if after[page] != before[page]} == set(pages)
+
+
+@pytest.mark.parametrize('kind', results.TABLES)
+def test_all_tables_of_a_kind_are_printed(kind, capsys):
+    assert results.main(['--all', kind]) == 0
+    printed = capsys.readouterr().out
+    page = (STORE / f'{results.PAGES.get(kind, kind)}.md').read_text(encoding='utf-8')
+    assert printed.count('    $ ') == len(result_tables.measurements(STORE, kind)) > 0
+    assert results.FOLDED.format(kind) in page or printed.strip() in page
 
 
 def test_check_finds_a_stale_page(tmp_path, monkeypatch, capsys):
@@ -90,7 +100,7 @@ def test_cells_within_chance_by_hand():
         kind: {'tracks': tracks, 'nees': nees, 'nees_error': {v: e * nees[v] for v in nees}}
         for kind, tracks, e in (('vehicles', 9, 0.01), ('cyclists', 3, 0.5), ('pedestrians', 2, 1))
     }
-    said = results._cells_and_chance({'drive': {'track': groups}})
+    said = result_tables.cells_and_chance({'drive': {'track': groups}})
     assert '6 of 12 cells are 0.7 to 1.5' in said
     assert 'with 3 tracks or more 4 of 8' in said
     assert f'{4 + 4 * (1 - 0.159 - 0.274):.0f} of these would be' in said

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from boxreg_ros import cli
 from boxreg_ros.config import Config
+from boxreg_ros.core.matching import AT_ONCE
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.calibrate import (
@@ -262,7 +263,7 @@ def test_margins_of_a_recording_without_boxes(street, scene, tmp_path, capsys):
 def test_sweeps_without_labels_are_not_kept(street, scene):
     few = scene.truth.stamps_ns[[0, -1]]
     truth = replace(scene.truth, stamps_ns=np.where(scene.truth.stamps_ns < few[1], *few))
-    drive = Drive.of(Recording([street]), truth, Config().tolerance)
+    drive = Drive.of(Recording([street]), truth, AT_ONCE)
     assert [sweep.stamp_ns for sweep in drive.sweeps] == few.tolist()
     assert len(drive.boxes) == len(scene.detections)
 

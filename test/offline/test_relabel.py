@@ -610,7 +610,7 @@ def test_earlier_result_is_replaced_only_by_success(tmp_path):
 
 
 def test_spool_returns_clouds_within_the_maximum_time_offset(tmp_path):
-    spool = Spool(tmp_path, Config(tolerance=0.02, reach=0.06))
+    spool = Spool(tmp_path, Config(reach=0.06))
     spool.add(Sweep(START, 'lidar', np.ones((1, 3))), np.eye(4))
     assert spool.take(START - SECOND * 50 // 1000, 'lidar', np.eye(4))[0] is not None
     assert spool.take(START - SECOND * 70 // 1000, 'lidar', np.eye(4))[0] is None

@@ -94,7 +94,7 @@ class _Fit:
 
     def __init__(self, problem: Problem, config: Config) -> None:
         model = InputModel(config.faces)
-        plan = SolverPlan.choose(config, False, CONSTANTS.coarse_points)
+        plan = SolverPlan.choose(config, False)
         constants = CONSTANTS.with_settings(config).in_round(uses_shape=False, is_smooth=False)
         self.constants = constants.record()
         self.inputs = model.inputs(config)

@@ -9,7 +9,7 @@ from typing import Any
 from boxreg_ros.bench.speed.streams import cloud_message, shortest, traffic
 from boxreg_ros.config import Config
 from boxreg_ros.core import observation as sampling
-from boxreg_ros.core.observation import observe
+from boxreg_ros.core.observation import MARGIN, observe
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, sweep_to_frame
 from boxreg_ros.rotations import matrix_from_rpy
@@ -66,18 +66,17 @@ def crop(config: Config, tracks: int, points: int) -> dict[str, Any]:
 
     """
     ((_, _, cloud, boxes),) = traffic(tracks, points, 1)
-    margin = config.sampling.margin
     rotations = matrix_from_rpy(boxes.boxes[:, ROLL:])
     sweep = Sweep(0, 'lidar', cloud)
 
     def one_by_one() -> None:
         for box, R in zip(boxes.boxes, rotations, strict=True):
             local = np.abs((cloud - box[:3].astype(np.float32)) @ R.astype(np.float32))
-            cloud[(local < box[3:6] / 2 + margin).all(1)]
+            cloud[(local < box[3:6] / 2 + MARGIN).all(1)]
 
     def ours() -> None:
-        index, owner, _, outside = sampling.crop(sweep, boxes.boxes, margin)
-        is_in = outside.max(0) < margin
+        index, owner, _, outside = sampling.crop(sweep, boxes.boxes, MARGIN)
+        is_in = outside.max(0) < MARGIN
         cloud.take(index[is_in], 0), owner[is_in]
 
     result: dict[str, Any] = {
@@ -90,7 +89,7 @@ def crop(config: Config, tracks: int, points: int) -> dict[str, Any]:
         return {**result, 'Open3D, box by box': None, 'reason': f'{NO_OPEN3D} ({error})'}
     whole = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.astype(np.float64)))
     turned = [
-        open3d.geometry.OrientedBoundingBox(box[:3], R, box[3:6] + 2 * margin)
+        open3d.geometry.OrientedBoundingBox(box[:3], R, box[3:6] + 2 * MARGIN)
         for box, R in zip(boxes.boxes, rotations, strict=True)
     ]
     result['Open3D, box by box'] = 1e3 * shortest(

@@ -8,6 +8,7 @@ they are solved with these; where they show smaller ones, the solution moves tow
 
 from __future__ import annotations
 
+from boxreg_ros.core.method.arrays import BOX_POSE
 from boxreg_ros.core.method.constants import CONSTANTS, Constants
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL
@@ -32,8 +33,7 @@ MEDIAN_TO_DEVIATION = 1.48
 
 def numbers(deviations: Floats) -> Constants:
     """Return the numbers of the method for keyframes of some deviations (9,)."""
-    pose = tuple(deviations[[0, 1, 2, 6, 7, 8]].tolist())
-    return CONSTANTS._replace(pin_deviations=pose, pin_extent=float(deviations[LENGTH]))
+    return CONSTANTS._replace(pin_deviations=tuple(deviations[[*BOX_POSE, LENGTH]].tolist()))
 
 
 def shown(keyframes: Floats, fits: Floats, variances: Floats, usual: Floats) -> Floats:

@@ -45,6 +45,7 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     folder = Path(function.__code__.co_filename).parent
     function.__qualname__ += f'_{sources_digest(folder)}'
     options |= {'nogil': True, 'error_model': 'numpy', 'fastmath': REORDER}
+    options['no_cfunc_wrapper'] = True  # for calls from C: a fifteenth of the time to compile
     try:
         dispatcher = numba.njit(function, cache=True, **options)
     except RuntimeError as error:  # no folder for the cache can be written

@@ -81,11 +81,9 @@ class Constants(NamedTuple):
     """The same for the prior of a labelling margin, weight 1/2. Chosen."""
     is_robust: bool = True
     """Whether motion residuals are robust: not from a start that is as noisy as the input."""
-    pin_deviations: tuple[float, ...] = (0.02, 0.02, 0.02, 0.005, 0.005, 0.005)
-    """Deviations of a pinned pose x y z [m] and roll pitch yaw [rad]. Chosen: how well a person
-    corrects a box."""
-    pin_extent: float = 0.01
-    """Deviation of the extents of a pinned box [m]. Chosen: practically held."""
+    pin_deviations: tuple[float, ...] = (0.02, 0.02, 0.02, 0.005, 0.005, 0.005, 0.01)
+    """Deviations of a pinned pose x y z [m] and roll pitch yaw [rad], and of pinned extents [m].
+    Chosen: how well a person corrects a box; extents are practically held."""
     parked_speed: float = 0.3
     """Largest mean speed of a parked object [m/s]. Chosen."""
     parked_distance: float = 0.7
@@ -96,9 +94,9 @@ class Constants(NamedTuple):
     driving_span: int = 5
     """Boxes in these medians; steps before such a one, and after it, that have no zero-motion
     prior either. Chosen."""
-    drift_ratios: tuple[float, ...] = (1.0, 1.0, 0.5, 0.15, 0.15, 0.15)
-    """Deviation of the steps of a parked box x y z [m] and roll pitch yaw [rad], over the setting
-    `drift`. Chosen."""
+    drift: tuple[float, ...] = (0.02, 0.02, 0.01, 0.003, 0.003, 0.003)
+    """Deviation of the steps of a parked box x y z [m] and roll pitch yaw [rad], by the drift of
+    the fixed frame. Chosen."""
 
     # Rigid shape (M4)
     cells: tuple[int, ...] = (8, 3, 3)
@@ -113,8 +111,6 @@ class Constants(NamedTuple):
     # Solver
     settled_step: float = 0.1
     """A window is settled when its boxes move less in a round [errors of the input]. Chosen."""
-    coarse_points: int = 256
-    """Points of each box in all rounds but the last ones. Chosen."""
     shape_points: int = 64
     """Points of each box that make the rigid shape of its track. Chosen."""
     prior_decay: float = 0.97
@@ -144,8 +140,9 @@ class Constants(NamedTuple):
     slope_deviation: float = 240.0
     """Prior deviation of the slope of extent corrections, per squared error. Derived: 0.6 for
     input whose extents err by 5 %, 0.6 / 0.05^2."""
-    pivot_deviation: float = 0.25
-    """Deviation of the pivot, as part of the length. Chosen."""
+    pivot: float = 0.25
+    """Distance of the pivot, such as a rear axle, behind the centre, and its deviation, as part of
+    the length. Chosen: between the centre and the rear."""
     min_extent_gain: float = 0.2
     """Least part of the information about an extent that points provide as evidence. Chosen."""
 

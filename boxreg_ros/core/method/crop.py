@@ -235,19 +235,35 @@ def flat_height(heights, quantiles, flatness, min_points):
 
 
 @kernel
-def road_heights(owner, height, is_beside, n, numbers):
-    """Return the height of the road beside each of n boxes (n,); NaN where not found [m]."""
+def grouped(values, owner, n):
+    """
+    Return the values (P,) of each of n owners, in their order.
+
+    Those of owner b are values[first[b]:first[b + 1]]; `first` is the other result.
+
+    """
     first = np.zeros(n + 1, np.int64)
     for k in range(len(owner)):
-        first[owner[k] + 1] += is_beside[k]
-    for box in range(n):
-        first[box + 1] += first[box]
+        first[owner[k] + 1] += 1
+    for b in range(n):
+        first[b + 1] += first[b]
     place = first[:-1].copy()
-    levels = np.empty(first[-1])
+    ordered = np.empty_like(values)
     for k in range(len(owner)):
-        if is_beside[k]:
-            levels[place[owner[k]]] = height[k]
-            place[owner[k]] += 1
+        ordered[place[owner[k]]] = values[k]
+        place[owner[k]] += 1
+    return ordered, first
+
+
+@kernel
+def road_heights(owner, height, n, numbers):
+    """
+    Return the height of the road beside each of n boxes (n,); NaN where not found [m].
+
+    Points beside them are at `height` (P,) above the bottom of box `owner` (P,).
+
+    """
+    levels, first = grouped(height, owner, n)
     road = np.empty(n)
     for box in range(n):
         road[box] = flat_height(
@@ -367,16 +383,17 @@ def borders(points, shapes, pairs, margin, row, owner):
     `margin` before the first of their faces to as far behind the second.
 
     """
+    rows, first = grouped(row, owner, len(pairs.number))
     border = np.empty(len(pairs.first))
-    places = np.empty(2 * len(row) + 2)
+    places = np.empty(len(row) + 2)
     for pair in range(len(border)):
         low = pairs.faces[pair].min() - margin
         high = pairs.faces[pair].max() + margin
         places[0], places[1] = low, high
         count = 2
-        for k in range(len(row)):
-            if owner[k] == pairs.first[pair] or owner[k] == pairs.second[pair]:
-                place = along(points, row[k], shapes, pairs, pair)
+        for box in (pairs.first[pair], pairs.second[pair]):
+            for i in rows[first[box] : first[box + 1]]:
+                place = along(points, i, shapes, pairs, pair)
                 if low < place < high:
                     places[count] = place
                     count += 1
@@ -487,10 +504,11 @@ def own_points(points, shapes, numbers):
     x = np.empty(capacity)
     depth = np.empty(capacity)  # outside of the face that the point is least inside of
     height = np.empty(capacity)  # above the bottom of the box, along its z axis
-    is_beside = np.empty(capacity, np.bool_)
+    beside = np.empty(capacity, np.int32)
+    level = np.empty(capacity)
     num_inside = np.zeros(n, np.int64)
     square = np.hypot(half[:, 0], half[:, 1]) + numbers.road_width
-    P = 0
+    P, B = 0, 0  # without branches: the next pair replaces one too far
     for k in range(len(near)):
         for place in range(first[cells[k]], first[cells[k] + 1]):
             i, box = near[k], boxes[place]
@@ -505,17 +523,18 @@ def own_points(points, shapes, numbers):
             high = half[box, 2] + up
             row[P], owner[P] = i, box
             x[P], depth[P], height[P] = dx, deep, high
-            is_beside[P] = (
+            beside[B], level[B] = box, high
+            B += (
                 (aside > numbers.road_gap)
                 & (deep < numbers.road_width)
                 & (abs(high) < numbers.road_range)
                 & (max(abs(dx), abs(dy)) < square[box])
             )
             num_inside[box] += deep <= 0.0
-            P += deep < numbers.margin  # without a branch: the next pair replaces one too far
+            P += deep < numbers.margin
     road = np.full(n, np.nan)
     if numbers.has_road:
-        road = road_heights(owner[:P], height[:P], is_beside[:P], n, numbers)
+        road = road_heights(beside[:B], level[:B], n, numbers)
     is_owned = np.empty(P, np.bool_)
     for k in range(P):
         ground = road[owner[k]] if road[owner[k]] == road[owner[k]] else 0.0

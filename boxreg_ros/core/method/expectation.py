@@ -154,12 +154,11 @@ def fill_expectation(b, problem, inputs, constants, work, common):
         shared[EXTENT + k] = mean[k] if has_pin else mean[k] * factor
         deviation[EXTENT + k] = mean[k] * factor * part
         if has_pin:
-            deviation[EXTENT + k] = constants.pin_extent / sqrt(float(pins))
+            deviation[EXTENT + k] = constants.pin_deviations[POSE] / sqrt(float(pins))
     for face in range(6):
         shared[GAP + face] = of_class.gaps[face] + inputs.gap_correction[face]
         deviation[GAP + face] = usual_spread(of_class, work)
-    shared[PIVOT] = mean[0] * of_class.pivot
-    deviation[PIVOT] = mean[0] * constants.pivot_deviation
+    shared[PIVOT] = deviation[PIVOT] = mean[0] * constants.pivot
     deviation[ANCHOR:SIDESLIP] = 1.0
     deviation[SIDESLIP] = constants.sideslip
 

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.constants import CONSTANTS
-from boxreg_ros.core.method.crop import candidates, offset_of, road_heights
+from boxreg_ros.core.method.crop import candidates, grouped, offset_of, road_heights
 from boxreg_ros.core.method.selection import lower_median
 import numpy as np
 
@@ -88,16 +88,7 @@ def inside_out(shapes, box, x, y, z):
 @kernel
 def medians(owner, values, n):
     """Return the lower median of the values (P,) of each of n owners; 0 for one without any."""
-    first = np.zeros(n + 1, np.int64)
-    for k in range(len(owner)):
-        first[owner[k] + 1] += 1
-    for row in range(n):
-        first[row + 1] += first[row]
-    place = first[:-1].copy()
-    ordered = np.empty_like(values)
-    for k in range(len(owner)):
-        ordered[place[owner[k]]] = values[k]
-        place[owner[k]] += 1
+    ordered, first = grouped(values, owner, n)
     found = np.zeros(n)
     for row in range(n):
         if first[row] < first[row + 1]:
@@ -118,7 +109,6 @@ def surroundings(points, times, shapes, found, numbers):
     n = len(shapes.half)
     owner = np.empty(capacity, np.int32)
     height = np.empty(capacity)
-    is_beside = np.ones(capacity, np.bool_)
     inner = np.empty(capacity, np.int32)
     delays = np.empty(capacity if len(times) else 0, np.float32)
     square = np.hypot(shapes.half[:, 0], shapes.half[:, 1]) + numbers.road_width
@@ -141,7 +131,7 @@ def surroundings(points, times, shapes, found, numbers):
                 inside += max(aside, w) <= 0.0
     road = np.full(n, np.nan)
     if numbers.has_road:
-        road = road_heights(owner[:P], height[:P], is_beside[:P], n, numbers)
+        road = road_heights(owner[:P], height[:P], n, numbers)
     return road, medians(inner[:inside], delays[:inside], n)
 
 

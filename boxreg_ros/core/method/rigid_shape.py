@@ -45,7 +45,7 @@ def fill_planes(sums, roughness, constants, planes, thickness):
         if number < constants.min_cell_points:
             continue
         mean = sums[cell, :3, 3] / number
-        covariance = sums[cell, :3, :3] / number - np.outer(mean, mean)
+        covariance = sums[cell, :3, :3] / number - mean * mean.reshape(3, 1)
         power, axes = np.linalg.eigh(covariance)
         thick = max(power[0], 0.0) + roughness**2
         if power[1] > constants.min_flatness * thick:

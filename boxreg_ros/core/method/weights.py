@@ -74,8 +74,7 @@ def acceleration_weight(n, r, window, constants, w):
 def zero_motion_weight(n, r, window, constants, w):
     """Write the weight of the step of a parked object; zero where it drives (M25)."""
     for k in range(POSE):
-        deviation = window.of_class.drift * constants.drift_ratios[k]
-        w[k] = 1 / deviation**2 if window.parked[n] else 0.0
+        w[k] = constants.drift[k] ** -2 if window.parked[n] else 0.0
 
 
 @loop

@@ -1,0 +1,592 @@
+"""
+All tables of the stored measurements, one function for each kind of measurements.
+
+`docs/results.py` writes the rows to decide by into the pages; the site folds these tables below
+them (`docs/site_hooks.py`), and ``python docs/results.py --all KIND`` prints them.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+import json
+import math
+from pathlib import Path
+import re
+from statistics import NormalDist
+from typing import Any
+
+from boxreg_ros import __version__
+from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE
+from boxreg_ros.config import KINDS
+from boxreg_ros.offline.consistency import (
+    CONSISTENCY_VARIABLES,
+    CONSISTENT_NEES,
+    SIGNIFICANT,
+)
+
+MIN_TRACKS = 3
+"""Fewest tracks of a cell whose standard error is trusted."""
+
+DATA = {
+    'resim_3bffdcff': ('Real drive', 'real surfaces, exact truth, detector noise'),
+    'resim_7fab2350': ('Busier street', 'real surfaces, exact truth, detector noise'),
+    'pandaset_002_a': ('PandaSet 002', 'human labels, detector noise'),
+    'kitti_raw_0001': ('KITTI raw 0001', 'human labels, detector noise'),
+    'street': ('Sample', 'simulated'),
+}
+"""Title and content of each recording, in the order of the tables."""
+PART_OF_RUN = re.compile(' (?:at the start|in the middle|at the end)')
+SHOWN_LOSS = 0.001
+"""Smaller changes of mean IoU are within the scatter of noise seeds."""
+
+
+def all_tables(store: Path, kind: str) -> Iterable[str]:
+    """Yield for each measurement of a kind its title, its command and its tables."""
+    if kind == 'ablation':
+        yield f'{_ingredients()}\n'
+    for data, document in measurements(store, kind):
+        title = title_of(data)
+        if title:
+            yield f'**{title}**\n'
+        yield origin(document)
+        yield from (f'{part}\n' for part in TABLES[kind](document['results']))
+
+
+def measurements(store: Path, kind: str) -> list[tuple[str, Any]]:
+    """Return data name and document of each measurement of a kind, in the order of `DATA`."""
+    found = {
+        path.stem.removeprefix(kind).removeprefix('_'): path
+        for path in sorted(store.glob(f'{kind}*.json'))
+    }
+    names = [name for data in DATA for name in found if name.startswith(data)]
+    names += [name for name in found if name not in names]
+    return [(name, json.loads(found[name].read_text(encoding='utf-8'))) for name in names]
+
+
+def title_of(data: str) -> str:
+    """Return the title of the measurements of some data, '' if they have none."""
+    for name, (title, _) in DATA.items():
+        if data.startswith(name):
+            with_suffix = data.removeprefix(name).replace('_', ', with ')
+            return f'{title}{with_suffix}'
+    return ''
+
+
+def origin(document: Any) -> str:
+    """Return the command of a measurement, with its version if that is an older one."""
+    suffix = '' if document['version'] == __version__ else f'    # version {document["version"]}'
+    return f'    $ {document["command"]}{suffix}\n'
+
+
+def plain(value: float) -> str:
+    """Return a number with four digits, large ones as integers."""
+    return f'{value:,.0f}' if value >= 1e4 else f'{value:.4g}'
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]], alignment: str = '---:') -> str:
+    """Return a table whose columns but the first have an alignment, by default to the right."""
+    lines = [header, ['---', *[alignment] * (len(header) - 1)], *rows]
+    return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return a number with some digits, '-' without one."""
+    return '-' if value is None else f'{value:.{digits}f}'
+
+
+def signed(value: float, digits: int) -> str:
+    """Return a number with its sign, and zero without a minus."""
+    return f'{round(value, digits) + 0.0:+.{digits}f}'
+
+
+def _accuracy(results: Any) -> Iterable[str]:
+    """Yield the table of scores of each recording, and 3D IoU by range and number of points."""
+    for methods in results.values():
+        measured = {name: row for name, row in methods.items() if not isinstance(row, str)}
+        skipped = {name: row for name, row in methods.items() if isinstance(row, str)}
+        header = f'BEV 3D {" ".join(f"R@{x}" for x in (0.5, 0.7, 0.8))} ATE ASE AOE flips jitter'
+        keys = ('ate', 'ase', 'aoe', 'flips', 'jitter')
+        rows = []
+        for name, row in measured.items():
+            values = [row['iou_bev'], row['iou_3d'], *row['recall_3d'], *(row[k] for k in keys)]
+            rows.append([name, *map(number, values)])
+        yield f'{measured["input"]["boxes"]} true boxes.'
+        yield table(['', *header.split()], rows)
+        yield table(*_parts(measured))
+        if 'by_class' in measured['input']:
+            yield _classes(measured)
+        yield from _compared(measured)
+        for name, reason in skipped.items():
+            yield f'{name}: {reason}.'
+
+
+def _parts(measured: Any) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows of the IoU by range, by number of points and of moving objects."""
+    header = ['3D IoU']
+    rows = {name: [name] for name, row in measured.items() if 'by_range' in row}
+    for key, unit in (('by_range', 'm'), ('by_points', 'points')):
+        labels = list(dict.fromkeys(part for name in rows for part in measured[name][key]))
+        if len(labels) < 2:  # the same as the mean of all boxes
+            continue
+        header += [f'{label} {unit}' for label in labels]
+        for name, row in rows.items():
+            row += [number(measured[name][key].get(label)) for label in labels]
+    moving = {name: measured[name]['moving'] for name in rows if 'moving' in measured[name]}
+    if moving:
+        header += [f'moving ({moving["input"]["boxes"]}): BEV', '3D', 'yaw [degrees]']
+    for name, found in moving.items():
+        rows[name] += [number(found['iou_bev']), number(found['iou_3d'])]
+        rows[name].append(number(found['yaw_degrees'], 2))
+    return header, list(rows.values())
+
+
+def _compared(measured: Any) -> Iterable[str]:
+    """Yield the table of the differences between methods."""
+    rows = [
+        [f'{name} - {other}', scope, *_difference(found)]
+        for name, row in measured.items()
+        for scope, others in row.get('differences', {}).items()
+        for other, found in others.items()
+    ]
+    if rows:
+        yield table(['difference', 'objects', 'BEV', '3D', 'tracks', 'ahead'], rows)
+
+
+def _difference(found: Any) -> Iterable[str]:
+    """Yield both differences with their standard errors, and the numbers of tracks."""
+    yield from _gain(found)
+    yield str(found['tracks'])
+    yield str(found['tracks_ahead'])
+
+
+def _gain(found: Any) -> Iterable[str]:
+    """Yield both differences with their standard errors."""
+    for key in ('iou_bev', 'iou_3d'):
+        yield with_error(found, key)
+
+
+def with_error(found: Any, key: str) -> str:
+    """Return a difference with its standard error, where there are tracks enough for one."""
+    error = found[f'{key}_error']
+    return signed(found[key], 4) + ('' if error is None else f'±{number(error, 4)}')
+
+
+def _classes(measured: Any) -> str:
+    """Return the table of BEV and 3D IoU of each class, of all its boxes with points."""
+    names = measured['input']['by_class']
+    header = [f'{name} ({row["boxes"]})' for name, row in names.items()]
+    rows = []
+    for method, scores in measured.items():
+        found = [scores['by_class'][name] for name in names]
+        pairs = [f'{number(row["iou_bev"])}/{number(row["iou_3d"])}' for row in found]
+        rows.append([method, *pairs])
+    return table(['BEV / 3D IoU by class (boxes)', *header], rows)
+
+
+def _kinds_of_objects(results: Any) -> Iterable[str]:
+    """Yield what each class gains over the input and over smoothing, one table per recording."""
+    for drives, found in results.items():
+        rows = []
+        for name, methods in found.items():
+            for method, others in methods.items():
+                start = [f'{name} ({others["input"]["boxes"]})', method.removeprefix('ours, ')]
+                smoother = next(key for key in others if key.startswith('smoothing'))
+                rows.append([*start, *_gain(others['input']), *_gain(others[smoother])])
+        columns = ('BEV - input', '3D - input', 'BEV - smoothing', '3D - smoothing')
+        yield table([f'{drives}: class (boxes)', 'estimate', *columns], rows)
+
+
+def _paper(results: Any) -> Iterable[str]:
+    """Yield Table I of each mode."""
+    for mode, methods in results.items():
+        measured = {name: row for name, row in methods.items() if not isinstance(row, str)}
+        pose = ['x', 'y', 'z', 'roll', 'pitch', 'yaw'] if mode == '3d' else ['x', 'y', 'yaw']
+        columns = (*pose, 'iou', 'iou_first', 'iou_last', 'iou_full')
+        rows = [
+            [name, *(number(row.get(column)) for column in columns)]
+            for name, row in measured.items()
+        ]
+        iou = '3D IoU' if mode == '3d' else 'BEV IoU'
+        titles = (iou, *(f'{iou}, {part}' for part in ('first', 'last', 'full windows')))
+        yield table([f'mode: {mode}', *pose, *titles], rows)
+
+
+def _ingredients() -> str:
+    """Return the table of the ingredients that are switched off."""
+    rows = [[name, item.meaning] for name, item in INGREDIENTS.items() if name != WHOLE]
+    return table(['without', 'the change'], rows, '---')
+
+
+def _ablation(results: Any) -> Iterable[str]:
+    """Yield for each recording the losses without an ingredient, the largest first."""
+    order = results.pop('greedy', [])
+    for found in results.values():
+        parts = ('3D', 'loss', 'R@0.8 loss')
+        titles = [f'{estimate}: {part}' for estimate in found for part in parts]
+        best = {estimate: rows['nothing'] for estimate, rows in found.items()}
+        names = sorted(
+            next(iter(found.values())),
+            key=lambda name: min(
+                rows[name]['iou_3d'] - best[e]['iou_3d'] for e, rows in found.items()
+            ),
+        )
+        rows = []
+        for name in ['nothing', *(name for name in names if name != 'nothing')]:
+            cells = []
+            for estimate, of in found.items():
+                own, whole = of[name], best[estimate]
+                cells += [
+                    number(own['iou_3d']),
+                    signed(whole['iou_3d'] - own['iou_3d'], 4),
+                    signed(whole['recall_3d'][-1] - own['recall_3d'][-1], 3),
+                ]
+            rows.append([name, *cells])
+        yield table(['without', *titles], rows)
+    if order:
+        yield table(['without all of', 'largest loss'], [[a, signed(b, 4)] for a, b in order])
+
+
+def _sensitivity(results: Any) -> Iterable[str]:
+    """Yield the loss of every setting and constant, largest first; those without one as a list."""
+    baseline = results['baseline']
+    rows = [[name, number(o['iou_bev']), number(o['iou_3d'])] for name, o in baseline.items()]
+    yield table([f'estimate: {results["estimate"]}', 'BEV', '3D'], rows)
+    largest: dict[str, float] = {}
+    rows = []
+    failures = []
+    for loss in results['losses']:
+        name = f'`{loss["name"]}`'
+        start = [name, f'{loss["factor"]:g}', f'{loss["value"]:.3g}']
+        if loss['failure']:
+            largest[name] = float('inf')
+            failures.append(f'{name} = {loss["value"]:.3g}')
+            continue
+        size = max(abs(loss['bev']), abs(loss['volume']))
+        largest[name] = max(largest.get(name, 0.0), size)
+        if size >= SHOWN_LOSS:
+            rows.append([*start, signed(loss['bev'], 4), signed(loss['volume'], 4)])
+    yield table(['setting or constant', 'factor', 'value', 'BEV loss', '3D loss'], rows)
+    without = sorted(name for name, size in largest.items() if size < SHOWN_LOSS)
+    yield f'Less than {SHOWN_LOSS} either way: {", ".join(without)}.'
+    if failures:
+        yield f'Not possible, since the value is an index or a quantile: {", ".join(failures)}.'
+
+
+def _tracks(results: Any) -> Iterable[str]:
+    """Yield the scores after each completing step, one table per recording."""
+    keys = (
+        ('recall', 'recall'),
+        ('precision', 'precision'),
+        ('ids per object', 'ids_per_object'),
+        ('HOTA', 'hota'),
+        ('IDF1', 'idf1'),
+        ('added', 'added'),
+        ('3D IoU of added', 'added_iou'),
+        ('ghosts rejected', 'ghosts_rejected'),
+        ('others rejected', 'lost'),
+    )
+    for rows in results.values():
+        lines = [
+            [name, *(number(row[key], 0 if key == 'added' else 3) for _, key in keys)]
+            for name, row in rows.items()
+        ]
+        yield table(['', *(title for title, _ in keys)], lines)
+        yield from _kinds(rows)
+
+
+def _kinds(rows: Any) -> Iterable[str]:
+    """Yield the scores by kind of object: of the tracks before they were broken, and at last."""
+    first, *_, last = rows
+    keys = ('recall', 'precision', 'ids_per_object', 'added', 'added_iou', 'given_iou')
+    lines = [
+        [f'{name}: {kind}', *(number(scores[key], 0 if key == 'added' else 3) for key in keys)]
+        for name in (first, last)
+        for kind, scores in rows[name]['by_kind'].items()
+    ]
+    found = ('recall', 'precision', 'ids per object')
+    titles = (*found, 'added', '3D IoU of added', '3D IoU of others')
+    yield table(['by kind', *titles], lines)
+
+
+def _figures(results: Any) -> Iterable[str]:
+    """Yield a plain table of names and values."""
+    yield table(['', ''], flat(results))
+
+
+def _node(results: Any) -> Iterable[str]:
+    """Yield the figures of one run, or of several runs side by side."""
+    runs: dict[str, dict[str, str]] = {}
+    for name, value in flat(results):
+        run, _, figure = name.partition(': ')
+        if not run.endswith(('recording 1', 'recording 2')):
+            run, figure = '', name
+        runs.setdefault(run, {})[figure] = value
+    alone = runs.pop('', {})
+    if runs:
+        figures = list(dict.fromkeys(figure for run in runs.values() for figure in run))
+        rows = [[figure, *(run.get(figure, '-') for run in runs.values())] for figure in figures]
+        yield table(['', *runs], rows)
+    yield table(['', ''], alone.items())
+
+
+def _lidars(results: Any) -> Iterable[str]:
+    """Yield the accuracy of each way to record several LiDARs."""
+    rows = [[name, number(found['bev']), number(found['3d'])] for name, found in results.items()]
+    yield table(['recorded', 'BEV', '3D'], rows)
+
+
+def _highway(results: Any) -> Iterable[str]:
+    """Yield the accuracy of each method by speed, one table per time of the boxes."""
+    for convention, found in results.items():
+        speeds = next(iter(found.values()))
+        rows = [[name, *map(number, values.values())] for name, values in found.items()]
+        yield table([f'boxes of the time of {convention}', *speeds], rows)
+
+
+def _points(results: Any) -> Iterable[str]:
+    """Yield the scores of labels of points, one column for each kind of boxes."""
+    scores = dict.fromkeys(score for found in results.values() for score in found)
+    rows = [[score, *(number(found.get(score)) for found in results.values())] for score in scores]
+    yield table(['', *results], rows)
+
+
+def _review(results: Any) -> Iterable[str]:
+    """Yield the share of bad tracks at the top of each list, per recording and input, and pins."""
+    pinned = []
+    for recording, inputs in results.items():
+        for name, found in inputs.items():
+            rows = [[order, *map(number, shares)] for order, shares in found['shares'].items()]
+            head = f'{recording}, {name}: worst {found["bad"]} of {found["tracks"]}'
+            yield table([head, '1 %', '5 %', '10 %', '20 %'], rows)
+            pins = found['pins']
+            pinned.append(
+                [
+                    f'{recording}, {name}',
+                    *(number(pins[key]) for key in ('before', 'after')),
+                    *(f'{pins[key]:.0%}' for key in ('gained', 'constant')),
+                    *(number(pins['left'][key], 2) for key in ('along', 'across', 'up')),
+                    number(pins['left']['yaw']),
+                ]
+            )
+    header = (
+        'one box of each pinned', '3D IoU before', 'after', 'of 1 - IoU removed',
+        'constant along a track', 'left: along [m]', 'across', 'up', 'yaw [rad]',
+    )  # fmt: skip
+    yield table(header, pinned)
+
+
+def _labeller(results: Any) -> Iterable[str]:
+    """Yield the errors before and after the review of a planted drive, and what it takes."""
+    stages = (('planted', 'planted'), ('relabelled', 'after `boxreg relabel`'),
+              ('reviewed', 'after the review'))  # fmt: skip
+    kinds = list(results['planted'])
+    rows = [[title, *(str(results[stage][kind]) for kind in kinds)] for stage, title in stages]
+    yield table(['errors', *kinds], rows)
+    kinds_of_actions = ', '.join(f'{count} {name}s' for name, count in results['kinds'].items())
+    yield (
+        f'{results["actions"]} actions ({kinds_of_actions}) and {results["seconds"]:.0f} s, of '
+        f'these {results["thinking"]:.0f} s of thought; {results["actions_before"]} actions '
+        f'where files are edited by hand.'
+    )
+
+
+def _covariance(results: Any) -> Iterable[str]:
+    """Yield coverage and NEES of each variable, by estimate and class, one table per recording."""
+    for recording, estimates in results.items():
+        rows = [
+            [f'{estimate}, {name}', f'{group["boxes"]} of {group["tracks"]}', *consistent(group)]
+            for estimate, groups in estimates.items()
+            for name, group in _different(groups).items()
+        ]
+        variables = next(iter(next(iter(estimates.values())).values()))['nees']
+        yield table([recording, 'boxes of tracks', *variables], rows)
+    low, high = CONSISTENT_NEES
+    header = (
+        'cells of kinds: along, across, up, yaw', 'cells', 'covered 90 to 98 %', 'more', 'less',
+        f'NEES {low:g} to {high:g}', 'less', 'more', f'more by {SIGNIFICANT:g} standard errors',
+    )  # fmt: skip
+    yield table(header, [[name, *_consistent_cells(of)] for name, of in results.items()])
+    yield cells_and_chance(results)
+
+
+def _different(groups: Any) -> dict[str, Any]:
+    """Return the groups of objects without those that have the same boxes as an earlier one."""
+    found: dict[str, Any] = {}
+    for name, group in groups.items():
+        if group not in found.values():
+            found[name] = group
+    return found
+
+
+def consistent(group: Any) -> Iterable[str]:
+    """Yield coverage and NEES of each variable, with the standard error over the tracks."""
+    for name, nees in group['nees'].items():
+        error = group['nees_error'][name]
+        spread = '' if error is None else f'±{error:.1f}'
+        yield f'{group["coverage"][name]:.2f}, {nees:.1f}{spread}'
+
+
+def cells_of_kinds(estimates: Any) -> list[tuple[str, Any, str]]:
+    """Return the cells of the kinds along, across, up and in yaw: name, group and variable."""
+    return [
+        (f'{estimate} {kind} {variable}', group, variable)
+        for estimate, groups in estimates.items()
+        for kind, group in groups.items()
+        if kind in {f'{kind}s' for kind in KINDS}
+        for variable in CONSISTENCY_VARIABLES[:4]
+    ]
+
+
+def _consistent_cells(estimates: Any) -> Iterable[str]:
+    """Yield how many cells of the kinds are consistent, and which are not."""
+    cells = cells_of_kinds(estimates)
+    low, high = CONSISTENT_NEES
+    coverage = [group['coverage'][variable] for _, group, variable in cells]
+    nees = [group['nees'][variable] for _, group, variable in cells]
+    overconfident = [
+        f'{name} {value:.1f}±{group["nees_error"][variable]:.1f}'
+        for (name, group, variable), value in zip(cells, nees, strict=True)
+        if value - high > SIGNIFICANT * (group['nees_error'][variable] or math.inf)
+    ]
+    for count in (
+        len(cells),
+        sum(0.9 <= part <= 0.98 for part in coverage),
+        sum(part > 0.98 for part in coverage),
+        sum(part < 0.9 for part in coverage),
+        sum(low <= value <= high for value in nees),
+        sum(value < low for value in nees),
+        sum(value > high for value in nees),
+    ):
+        yield str(count)
+    yield ', '.join(overconfident) or 'none'
+
+
+def cells_and_chance(results: Any) -> str:
+    """Return how many cells of all recordings are consistent, and what chance leaves of that."""
+    every = [cell for estimates in results.values() for cell in cells_of_kinds(estimates)]
+    of_many = [
+        (group['nees'][variable], group['nees_error'][variable])
+        for _, group, variable in every
+        if group['tracks'] >= MIN_TRACKS
+    ]
+    low, high = CONSISTENT_NEES
+    exact = sum(
+        NormalDist(1.0, error / value).cdf(high) - NormalDist(1.0, error / value).cdf(low)
+        for value, error in of_many
+    )
+    return (
+        f'All recordings: {sum(low <= g["nees"][v] <= high for _, g, v in every)} of {len(every)} '
+        f'cells are {low:g} to {high:g}, of those with {MIN_TRACKS} tracks or more '
+        f'{sum(low <= value <= high for value, _ in of_many)} of {len(of_many)}. If all '
+        f'covariances were exact, and tracks differed as much, {exact:.0f} of these would be. '
+        f'Less by over {SIGNIFICANT:g} standard errors are '
+        f'{sum(low - value > SIGNIFICANT * error for value, error in of_many)}, more '
+        f'{sum(value - high > SIGNIFICANT * error for value, error in of_many)}.'
+    )
+
+
+def _scale(results: Any) -> Iterable[str]:
+    """Yield the main figures with their meaning, and all figures."""
+    job, large, workers, fleet = (results[name] for name in ('job', 'large', 'workers', 'fleet'))
+    used = [workers[name]['cores_used'] for name in ('one', 'two')]
+    rows = [
+        (
+            'job.hours_per_core_hour',
+            f'{job["hours_per_core_hour"]:.2f}',
+            f'hours of recording; {recording_size(job)}',
+        ),
+        ('job.peak_mb', f'{job["peak_mb"]:,.0f} MB', 'memory of the job'),
+        (
+            'workers.speedup',
+            f'{workers["speedup"]:.2f}',
+            f'two workers by one; they used {used[1]:.2f} cores and {used[0]:.2f}',
+        ),
+        (
+            'large.hours_per_core_hour',
+            f'{large["hours_per_core_hour"]:.2f}',
+            f'hours of recording; {recording_size(large)}',
+        ),
+        ('large.peak_mb', f'{large["peak_mb"]:,.0f} MB', f'memory for {large["gb"]:.1f} GB'),
+        ('large.inspect_s', f'{large["inspect_s"]:.1f} s', '`boxreg inspect` of it'),
+        (
+            'fleet.core_hours',
+            f'{fleet["core_hours"]:,.0f}',
+            f'10,000 hours of recording as `{fleet["basis"]}`',
+        ),
+        (
+            'fleet.usd',
+            f'{fleet["usd"]:,.0f} USD',
+            f'the same, at {fleet["usd_per_core_hour"]:.2f} USD a core-hour',
+        ),
+        (
+            'fleet.hours',
+            f'{fleet["hours"]:.2f} h',
+            f'10,000 jobs on 500 cores; {fleet["least_hours"]:.2f} h without losses or idle cores',
+        ),
+        ('fleet.used', f'{fleet["used"]:.0%}', 'part of the time that the cores have jobs'),
+        ('fleet.lost', f'{fleet["lost"]:.2%}', 'part of the work that is done twice'),
+    ]
+    named = [[f'`{name}`', *cells] for name, *cells in rows]
+    yield table(['figure', 'value', 'of'], named, '---')
+    shown = {name for name, *_ in rows}
+    others = [row for row in flat(results) if row[0].replace(': ', '.') not in shown]
+    yield table(['', ''], others)
+
+
+def recording_size(measured: Any) -> str:
+    """Return the size of a recording."""
+    return (
+        f'{measured["recording_s"]:,.0f} s, {measured["sweeps"]:,} sweeps of '
+        f'{measured["points_per_sweep"]:,} points, {measured["boxes"]:,} boxes'
+    )
+
+
+def _load(results: Any) -> Iterable[str]:
+    """Yield latency and accuracy by number of tracks, one table per way to treat overload."""
+    for policy, rows in results.items():
+        names = list(next(iter(rows.values())))
+        lines = [[tracks, *(number(row[name]) for name in names)] for tracks, row in rows.items()]
+        yield table([f'{policy}: tracks', *names], lines)
+
+
+def flat(results: Any) -> Iterable[list[str]]:
+    """Yield names and values; those of the start, the middle and the end of a run in one row."""
+    rows: dict[str, list[str]] = {}
+    for name, value in _named(results):
+        rows.setdefault(PART_OF_RUN.sub(': start, middle, end', name), []).append(value)
+    for name, values in rows.items():
+        yield [name, ', '.join(values)]
+
+
+def _named(results: Any, prefix: str = '') -> Iterable[tuple[str, str]]:
+    for name, value in results.items():
+        if isinstance(value, dict):
+            yield from _named(value, f'{prefix}{name}: ')
+        elif isinstance(value, float):
+            yield f'{prefix}{name}', plain(value)
+        else:
+            yield f'{prefix}{name}', str(value)
+
+
+TABLES: dict[str, Callable[[Any], Iterable[str]]] = {
+    'real': _accuracy,
+    'kinds': _kinds_of_objects,
+    'tracks': _tracks,
+    'paper': _paper,
+    'ablation': _ablation,
+    'sensitivity': _sensitivity,
+    'highway': _highway,
+    'points': _points,
+    'lidars': _lidars,
+    'covariance': _covariance,
+    'review': _review,
+    'labeller': _labeller,
+    'report': _figures,
+    'speed': _figures,
+    'load': _load,
+    'scale': _scale,
+    'kills': _figures,
+    'node': _node,
+}
+"""The tables of one measurement, for each kind of measurements."""
