@@ -44,13 +44,13 @@ class Sweeps(NamedTuple):
     @classmethod
     def of_drive(cls, times: Floats, points: Points, origins: Floats | None) -> Self:
         """Return all sweeps of a drive."""
-        by_azimuth = None
-        if origins is not None:
+        if origins is None:
+            return cls(times, points, len(times))
 
-            @lru_cache(KEPT_SWEEPS)
-            def by_azimuth(row: int) -> tuple[Ints, Ints]:
-                found: tuple[Ints, Ints] = free_space.by_azimuth(points[row], origins[row])
-                return found
+        @lru_cache(KEPT_SWEEPS)
+        def by_azimuth(row: int) -> tuple[Ints, Ints]:
+            found: tuple[Ints, Ints] = free_space.by_azimuth(points[row], origins[row])
+            return found
 
         return cls(times, points, len(times), 0, origins, by_azimuth)
 

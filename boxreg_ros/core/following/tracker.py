@@ -90,9 +90,6 @@ MOTIONS = {
 }
 
 
-NO_BOXES = np.empty((0, 16))
-
-
 class Seeds(NamedTuple):
     """Boxes (N, 9) of a person in the sweeps `rows` (N,), ascending."""
 
@@ -235,7 +232,7 @@ class Owned:
 
     def __getitem__(self, row: int, /) -> Floats:
         """Return those in a sweep, as `registration.near` takes them."""
-        boxes, count = self._boxes.get(row, (NO_BOXES, 0))
+        boxes, count = self._boxes.get(row, (np.empty((0, 16)), 0))
         return boxes[:count]
 
 
