@@ -20,7 +20,7 @@ from boxreg_ros.core.method.residuals import RESIDUALS, TERMS
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.problem import CLASS_SETTINGS, Problem, SETTINGS_OF
 from boxreg_ros.core.refine import Track
-from boxreg_ros.core.track_window import Window
+from boxreg_ros.core.window import Window
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np

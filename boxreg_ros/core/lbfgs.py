@@ -8,7 +8,7 @@ result does not depend on the other rows. See docs/decisions.md.
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -130,7 +130,7 @@ def minimize(
     for _ in range(iterations * MAX_BACKTRACKS):
         is_running = best.status[search.rows] == Status.RUNNING
         is_over = search.has_moved & (best.iterations[search.rows] == iterations)
-        search = select(search, (is_running & ~is_over).nonzero()[:, 0])
+        search = _select(search, (is_running & ~is_over).nonzero()[:, 0])
         if len(search.rows):
             search = _with_new_directions(search, best, metric, tolerance)
         if not len(search.rows):
@@ -149,7 +149,7 @@ def _with_new_directions(
 
     """
     moved = search.has_moved.nonzero()[:, 0]
-    rows, _, value, gradient, *_, pairs = select(search, moved)
+    rows, _, value, gradient, *_, pairs = _select(search, moved)
     direction = -_two_loop(gradient, pairs, rows, metric)
     slope = (gradient * direction).sum(1)
     is_uphill = ~(slope < 0)
@@ -168,8 +168,7 @@ def _with_new_directions(
         step=torch.where(search.has_moved, 1.0, search.step),
         tries=torch.where(search.has_moved, 0, search.tries) + 1,
     )
-    running: _Search = select(search, (best.status[search.rows] == Status.RUNNING).nonzero()[:, 0])
-    return running
+    return _select(search, (best.status[search.rows] == Status.RUNNING).nonzero()[:, 0])
 
 
 def _after_trial(search: _Search, best: Minimum, function: Function, history: int) -> _Search:
@@ -230,16 +229,10 @@ def _two_loop(
     return q
 
 
-def select(part: Any, rows: Tensor) -> Any:
-    """
-    Return `rows`, ascending, of all tensors (B, ...) in nested tuples and lists.
-
-    If `rows` are all B rows, the tensors themselves are returned, not copies.
-
-    """
-    if isinstance(part, Tensor):
-        return part[rows] if len(rows) < len(part) else part
-    if isinstance(part, tuple | list):
-        parts = [select(inner, rows) for inner in part]
-        return type(part)(*parts) if hasattr(part, '_fields') else type(part)(parts)
-    return part
+def _select(search: _Search, rows: Tensor) -> _Search:
+    """Return `rows`, ascending, of a search; if they are all its rows, the search itself."""
+    if len(rows) == len(search.rows):
+        return search
+    *parts, pairs = search
+    chosen = [(s[rows], y[rows], rho[rows]) for s, y, rho in pairs]
+    return _Search._make([*(part[rows] for part in parts), chosen])

@@ -17,7 +17,7 @@ from boxreg_ros.core.motion import motion_at
 from boxreg_ros.core.observation import Observation, Observations
 from boxreg_ros.core.support import MIN_HITS, points_to_confirm
 from boxreg_ros.core.tables import by_table, column, joined
-from boxreg_ros.core.track_window import Estimate, Estimates, MarginalisationPrior, PRIOR_POSES
+from boxreg_ros.core.window import Estimate, Estimates, MarginalisationPrior, PRIOR_POSES
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import (
     BoxArray,

@@ -17,7 +17,7 @@ from boxreg_ros.core.method.arrays import BIAS, EXTENT, GAP, PIVOT, POSE, PRIOR,
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.observation import Observations
 from boxreg_ros.core.tables import joined
-from boxreg_ros.core.track_window import MarginalisationPrior, Window
+from boxreg_ros.core.window import MarginalisationPrior, Window
 from boxreg_ros.structures import Floats, Ints, ROLL, YAW
 import numpy as np
 from numpy.typing import NDArray
@@ -276,14 +276,15 @@ def group_windows(windows: Sequence[Window], config: Config) -> list[list[int]]:
     """
     lengths = [len(window.observations) for window in windows]
     rows = [row for row, length in enumerate(lengths) if length >= config.min_observations]
-    rows.sort(key=lambda row: (windows[row].is_warm, lengths[row], row))
+    is_warm = [window.is_warm for window in windows]
+    rows.sort(key=lambda row: (is_warm[row], lengths[row], row))
     groups: list[list[int]] = []
     for row in rows:
         length = lengths[row]
         hessian = (6 * length + SHARED) ** 2
         points = length * config.sampling.points * VALUES_PER_POINT
         is_full = not groups or (len(groups[-1]) + 1) * max(hessian, points) > MAX_BATCH_VALUES
-        if is_full or windows[groups[-1][0]].is_warm != windows[row].is_warm:
+        if is_full or is_warm[groups[-1][0]] != is_warm[row]:
             groups.append([])
         groups[-1].append(row)
     return groups

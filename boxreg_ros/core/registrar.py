@@ -22,7 +22,7 @@ from boxreg_ros.core.pending import BoxToObserve, ObservedTrack, PendingArray, P
 from boxreg_ros.core.problem import SETTINGS_OF
 from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import column, joined
-from boxreg_ros.core.track_window import Estimate, PRIOR_POSES, Window
+from boxreg_ros.core.window import Estimate, PRIOR_POSES, Window
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, RefinedBoxes, Sweep, X, Z
 import numpy as np

@@ -27,7 +27,7 @@ from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.problem import group_windows, NO_RANGE, Problem, stack_windows
 from boxreg_ros.core.solver import solve
 from boxreg_ros.core.threads import one_torch_thread, run, shared_between
-from boxreg_ros.core.track_window import Estimate, Estimates, MarginalisationPrior, Window
+from boxreg_ros.core.window import Estimate, Estimates, MarginalisationPrior, Window
 from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, Ints, KEPT, POSE, REFINED, ROLL

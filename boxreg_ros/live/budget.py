@@ -12,7 +12,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.registrar import GetEstimates
 from boxreg_ros.core.registration import register
-from boxreg_ros.core.track_window import Estimate, Window
+from boxreg_ros.core.window import Estimate, Window
 
 PART_OF_PERIOD = 0.8
 """Part of the period of the boxes that is the default deadline; chosen: the rest is for decoding

@@ -17,9 +17,9 @@ from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
-from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.label_recording import LabelRecording
+from boxreg_ros.live.live_registrar import LiveRegistrar
 from boxreg_ros.live.params import changed, declare, numbers_as_declared, parameters_yaml
 from boxreg_ros.live.recorder_process import check_recording
 from boxreg_ros.live.topics import import_message, NodeTopics

@@ -16,8 +16,8 @@ from boxreg_ros.io.markers import MarkerBoard
 from boxreg_ros.io.session import is_placeholder
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
-from boxreg_ros.live.driver import LiveRegistrar, Outgoing
 from boxreg_ros.live.inbox import Inbox, Message
+from boxreg_ros.live.live_registrar import LiveRegistrar, Outgoing
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.structures import BoxArray, Sweep
 from msg_adapters import Adapter

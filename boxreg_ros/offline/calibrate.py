@@ -23,7 +23,7 @@ from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.noise import MAD_TO_DEVIATION
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.problem import group_windows, stack_windows
-from boxreg_ros.core.track_window import Window
+from boxreg_ros.core.window import Window
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.arguments import (

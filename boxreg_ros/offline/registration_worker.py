@@ -20,7 +20,7 @@ from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.observation import Observation, Observations
 from boxreg_ros.core.registrar import GetEstimates, Submit, submit_locally
 from boxreg_ros.core.tables import joined
-from boxreg_ros.core.track_window import Estimate, Window
+from boxreg_ros.core.window import Estimate, Window
 from boxreg_ros.io.compilation import announced_compilation
 from boxreg_ros.io.warm_up import warm_up, warm_up_crop
 from boxreg_ros.offline.reader import uses_one_core

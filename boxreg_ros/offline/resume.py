@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from boxreg_ros.config import Config
     from boxreg_ros.core.input_model import InputModel
     from boxreg_ros.core.registrar import GetEstimates, Submit
-    from boxreg_ros.core.track_window import Estimate, Window
+    from boxreg_ros.core.window import Estimate, Window
 
 
 class EstimateJournal:

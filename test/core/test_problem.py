@@ -5,7 +5,7 @@ from boxreg_ros.core.method.arrays import PRIOR as PRIOR_SIZE
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.problem import group_windows, NO_RANGE, Problem, resolve_headings
 from boxreg_ros.core.problem import stack_windows as stack
-from boxreg_ros.core.track_window import MarginalisationPrior
+from boxreg_ros.core.window import MarginalisationPrior
 from boxreg_ros.structures import POSE, ROLL, YAW
 import numpy as np
 import pytest

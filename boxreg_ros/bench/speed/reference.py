@@ -21,7 +21,7 @@ from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.problem import Problem, stack_windows
 from boxreg_ros.core.refine import refine, Track
 from boxreg_ros.core.solver import Batch, Objective, solve, SolverPlan, start
-from boxreg_ros.core.track_window import Window
+from boxreg_ros.core.window import Window
 from boxreg_ros.structures import BOX_EXTENT, Floats, POSE
 import numpy as np
 import torch

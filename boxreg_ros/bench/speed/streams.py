@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.observation import Observation, observe
-from boxreg_ros.core.track_window import Window
+from boxreg_ros.core.window import Window
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 import numpy as np

@@ -4,7 +4,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.transforms import matrix
-from boxreg_ros.live.driver import LiveRegistrar, refined_to_frame
+from boxreg_ros.live.live_registrar import LiveRegistrar, refined_to_frame
 from boxreg_ros.structures import BoxArray, COASTED, KEPT, REFINED, RefinedBoxes
 from lidar_drives import LidarDrive
 from msg_adapters import adapter_for, pointcloud, vision
