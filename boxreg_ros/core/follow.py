@@ -152,7 +152,7 @@ def follow_points(
 ) -> list[FollowedTrack]:
     """Follow as `follow` does, without the solve; `points` are those of `ascending`."""
     times = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
-    sweeps = Sweeps(times, points, len(times), origins=origins)
+    sweeps = Sweeps.of_drive(times, points, origins)
     objects = [_placed(name, rows, stamps_ns) for name, rows in _by_track(seeds).items()]
     objects = _overlapping(objects)
     owned = Owned()

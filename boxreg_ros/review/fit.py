@@ -31,7 +31,7 @@ MIN_POINTS = 5
 """Fewer points do not show an object."""
 ANGLES = np.radians(np.arange(0, 90, 1.5))
 """Headings that are tried [rad]."""
-NEAREST = 0.05
+LEAST_DISTANCE = 0.05
 """Distances to a side below this count the same [m]: range noise."""
 MISSING = np.array([0.3, 0.5, 0.7])
 """Weights of length, width and height that are not seen; chosen: the width is seen more often."""
@@ -166,7 +166,7 @@ def _heading(points: Floats) -> float:
     for yaw in ANGLES:
         local = _turned(points, -yaw)
         to_sides = np.minimum(local - local.min(0), local.max(0) - local).min(1)
-        scores.append((1 / to_sides.clip(NEAREST)).sum())
+        scores.append((1 / to_sides.clip(LEAST_DISTANCE)).sum())
     return float(ANGLES[int(np.argmax(scores))])
 
 

@@ -87,14 +87,19 @@ def with_evidence(
     rows_of: dict[str, list[int]] = {}
     for row, name in enumerate(names):
         rows_of.setdefault(name, []).append(row)
-    found = []
-    for result in results:
-        moved_boxes = result.boxes.boxes.copy()
+    places: dict[str, list[tuple[int, int]]] = {name: [] for name in rows_of}
+    for index, result in enumerate(results):
         for row, name in enumerate(result.boxes.track_ids):
-            if name in rows_of:
-                rows = rows_of[name]
-                at_ns = np.array(stamps_ns, np.int64)[rows]
-                at = np.array([result.boxes.stamp_ns])
-                moved_boxes[row] = moved(at, moved_boxes[row][None], at_ns, steps[rows])[0]
-        found.append(replace(result, boxes=replace(result.boxes, boxes=moved_boxes)))
-    return found
+            if name in places:
+                places[name].append((index, row))
+    found = [result.boxes.boxes.copy() for result in results]
+    for name, rows in rows_of.items():
+        at = np.array([results[index].boxes.stamp_ns for index, _ in places[name]], np.int64)
+        own = np.array([found[index][row] for index, row in places[name]])
+        own = moved(at, own, np.array(stamps_ns, np.int64)[rows], steps[rows])
+        for (index, row), box in zip(places[name], own, strict=True):
+            found[index][row] = box
+    return [
+        replace(result, boxes=replace(result.boxes, boxes=own))
+        for result, own in zip(results, found, strict=True)
+    ]

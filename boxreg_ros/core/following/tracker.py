@@ -16,19 +16,14 @@ from boxreg_ros.core.following.extents import faces, freed, MAX_GROWTH
 from boxreg_ros.core.following.kernels import free_space, motion, registration, surface
 from boxreg_ros.core.following.sweeps import Sweeps
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
-from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
+from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, PITCH, ROLL, YAW
 import numpy as np
-from numpy.typing import NDArray
 
 POSE4 = [0, 1, 2, YAW]
 """Columns of a box that are followed; roll and pitch are those of the seed."""
-PLANAR = np.ix_([0, 1, 3], [0, 1, 3])
-"""x y yaw of the covariance of a followed pose."""
 
 SEED_DEVIATIONS = np.array([0.03, 0.03, 0.03, 0.02])
 """Of x y z [m] and yaw [rad] of a box that a person has drawn."""
-ROAD_DEVIATION = 0.07
-"""Of the height of the road beside a box [m]; swept: 0.05 and 0.1 are as good, 0.2 drifts."""
 CLIMB = 0.1
 """The height of a box changes by this in a second, as a random walk [m]; chosen."""
 PARKED_NOISE = 0.1
@@ -40,12 +35,6 @@ REAR_AXLE = 0.25
 
 MIN_FIT_TO_LEARN = 0.7
 """Points of a sweep with a smaller part that fits are not added to the surface."""
-MIN_FIT_AGAIN = 0.6
-"""Part of the points that fit, to find an object again after a loss."""
-
-MIN_SCORE_AGAIN = 0.5
-"""And of their score before the loss, as a running mean."""
-
 HOLD, HOLD_PARKED = 2.0, 5.0
 """An object that is not found for so long is lost [s]."""
 YOUNG = 1.0
@@ -56,14 +45,10 @@ SEARCH_STEP = 0.4
 """Distance of the starts of a search along the heading after a loss [m]."""
 SLIP_STEP = 0.15
 """And while it is seen [m]: points further from the surface have hardly any weight."""
-SEARCH_BELOW = 0.85
-"""An object with a smaller part of its usual score is searched along the heading; chosen."""
 SLIPS = 2
 """Starts in each direction while it is seen; chosen: half the reach of a registration."""
 MOST_STEPS = 10
 """And after a loss, at most; chosen."""
-MIN_POINTS_TO_SEARCH = 30
-"""But not by fewer points, whose score is noise; chosen: as `registration.MOST`."""
 
 MAX_GAP = 0.3
 """A way has arrived at a seed if it is nearer than this [m]; swept in findings: 0.2 to 0.5."""
@@ -80,8 +65,6 @@ START_INFORMATION = np.diag(np.array([0.5, 0.5, 0.1, 0.05]) ** -2.0)
 """Of the starts of a search for the speed: x y z [m] and yaw [rad]."""
 MARGIN_LEARNT = 0.1
 """Points so far outside of the box are part of its surface [m]."""
-MAX_SWEEP_POINTS = 400
-"""A sweep with more points around a box is thinned; swept: the poses are as good."""
 MAX_EXTENT_SWEEPS = 60
 """Sweeps of a track whose points show the extents; chosen."""
 MAX_RAY_SWEEPS = 20
@@ -177,45 +160,46 @@ class _Found(NamedTuple):
     covariance: Floats
     fit: Floats
     jump: float
-    reason: str
+    reason: int
+    """Of `registration.REASONS`; 0 if it is accepted."""
 
     @property
     def score(self) -> float:
-        return _score(self.fit)
-
-    @property
-    def rank(self) -> float:
-        """Score, less what the distance from the prediction costs."""
-        return self.score - 0.02 * min(self.jump, 10.0)
+        return float(self.fit[3])
 
     @property
     def part(self) -> float:
         """Part of the points near the surface that fit it."""
-        return float(self.fit[1] / max(self.fit[5], 1.0))
+        return float(self.fit[1] / max(self.fit[2], 1.0))
 
 
 class _State(NamedTuple):
-    """State and covariance of `motion`, height and its variance, and the time of the sweep."""
+    """State and covariance of `motion`, height, its variance, and the information of the pose."""
 
     planar: Floats
     covariance: Floats
     z: float
     z_variance: float
+    information: Floats
 
     @classmethod
     def at_seed(cls, pose: Floats, speed: float) -> Self:
         deviations = [*SEED_DEVIATIONS[[0, 1, 3]], 1.0, 0.1]
         planar = np.array([pose[0], pose[1], pose[3], speed, 0.0])
-        return cls(planar, np.diag(np.square(deviations)), pose[2], SEED_DEVIATIONS[2] ** 2)
+        covariance = np.diag(np.square(deviations))
+        return cls(planar, covariance, pose[2], SEED_DEVIATIONS[2] ** 2, START_INFORMATION)
+
+    def updated(self, found: _Found) -> Self:
+        """Return the state with a registered pose."""
+        planar, covariance = motion.update(
+            self.planar, self.covariance, found.pose, found.covariance
+        )
+        z, z_variance = found.pose[2], found.covariance[2, 2]
+        return type(self)(planar, covariance, z, z_variance, self.information)
 
     @property
     def pose(self) -> Floats:
         return np.array([self.planar[0], self.planar[1], self.z, self.planar[2]])
-
-    @property
-    def information(self) -> Floats:
-        found: Floats = motion.pose_information(self.covariance, self.z_variance)
-        return found
 
     @property
     def speed(self) -> float:
@@ -235,33 +219,21 @@ class Owned:
 
     def add(self, rows: Ints, boxes: Floats, owner: int = -1) -> None:
         """Add the boxes (N, 9) of the object `owner` in the sweeps `rows` (N,)."""
-        for row, box in zip(rows.tolist(), boxes, strict=True):
-            known, count = self._boxes.get(row, (np.empty((8, 10)), 0))
-            if count == len(known):
-                known = np.concatenate([known, np.empty_like(known)])
-            known[count, :9] = box
-            known[count, 9] = owner
-            self._boxes[row] = known, count + 1
+        known = np.empty((len(boxes), 16))
+        known[:, :3], known[:, 3:6] = boxes[:, :3], boxes[:, BOX_EXTENT] / 2
+        known[:, 6:15] = matrix_from_rpy(boxes[:, ROLL:]).reshape(-1, 9)
+        known[:, 15] = owner
+        for row, box in zip(rows.tolist(), known, strict=True):
+            of_row, count = self._boxes.get(row, (np.empty((8, 16)), 0))
+            if count == len(of_row):
+                of_row = np.concatenate([of_row, np.empty_like(of_row)])
+            of_row[count] = box
+            self._boxes[row] = of_row, count + 1
 
-    def others(
-        self, row: int, pose: Floats, half: Floats, margin: float, same: Sequence[int]
-    ) -> Floats:
-        """
-        Return boxes (n, 9) within `margin` of a box at a pose (4,).
-
-        None whose centre is in it, and none of the objects `same`: they are the object itself.
-        """
-        known, count = self._boxes.get(row, (np.empty((0, 10)), 0))
-        boxes = known[:count]
-        if not count:
-            return boxes[:, :9]
-        away = np.hypot(boxes[:, 0] - pose[0], boxes[:, 1] - pose[1])
-        reach = margin + np.hypot(*half[:2]) + np.hypot(boxes[:, LENGTH], boxes[:, WIDTH]) / 2
-        is_near = (half[1] < away) & (away < reach)
-        for owner in same:
-            is_near &= boxes[:, 9] != owner
-        near: Floats = boxes[is_near, :9]
-        return near
+    def __getitem__(self, row: int, /) -> Floats:
+        """Return those in a sweep, as `registration.near` takes them."""
+        boxes, count = self._boxes.get(row, (np.empty((0, 16)), 0))
+        return boxes[:count]
 
 
 class Follower:
@@ -290,12 +262,13 @@ class Follower:
         self._seeds = seeds
         self._kind = MOTIONS[kind]
         self._owned = owned
-        self._same = same
+        self._same = np.array(same, np.float64)
         self._half = seeds.boxes[:, BOX_EXTENT].mean(0) / 2
         self._tilt = matrix_from_rpy(np.append(seeds.boxes[0, [ROLL, PITCH]], 0.0))
         self._pivot = REAR_AXLE * 2 * self._half[0] if kind == 'vehicle' else 0.0
         self._surface = surface.empty(self._half, MAX_CELLS)
         self._road = np.nan
+        self._start_speeds: dict[int, float] = {}
         self.num_points = 0
         for row, pose in zip(seeds.rows.tolist(), seeds.boxes[:, POSE4], strict=True):
             points = self._near(row, pose)
@@ -316,9 +289,11 @@ class Follower:
         """Return a way of no step yet from a seed, forwards or backwards."""
         row = int(self._seeds.rows[seed])
         pose = self._seeds.boxes[seed, POSE4]
-        state = _State.at_seed(pose, self._start_speed(seed))
+        if seed not in self._start_speeds:
+            self._start_speeds[seed] = self._start_speed(seed)
+        state = _State.at_seed(pose, self._start_speeds[seed])
         time = self._sweeps.times[row]
-        return Walk(row, sign, state, time, time, _score(self._fit(self._near(row, pose), pose)))
+        return Walk(row, sign, state, time, time, self._score(row, pose))
 
     def step(self, walk: Walk) -> None:
         """Follow the object to the next sweep of a way."""
@@ -326,9 +301,7 @@ class Follower:
         walk.row += walk.sign
         row = walk.row
         state = self._predicted(walk.state, times[row] - times[row - walk.sign])
-        found = self._find(row, state, walk)
-        if walk.reason and not found.reason and found.score < MIN_SCORE_AGAIN * walk.usual:
-            found = found._replace(reason='no_fit')
+        points, found = self._find(row, state, walk)
         if found.reason:
             if not walk.reason and abs(walk.last_seen - walk.begin) < YOUNG:
                 state.covariance[3, 3] += SPEED_AFTER_LOSS**2
@@ -337,19 +310,15 @@ class Follower:
             if not walk.is_over:
                 walk.poses[row] = state.pose
             walk.state = state
-            walk.reason = found.reason
+            walk.reason = registration.REASONS[found.reason]
             return
-        planar, covariance = motion.update(
-            state.planar, state.covariance, found.pose[[0, 1, 3]], found.covariance[PLANAR]
-        )
-        walk.state = _State(planar, covariance, found.pose[2], found.covariance[2, 2])
+        walk.state = state.updated(found)
         walk.reason = ''
         walk.poses[row] = found.pose
         walk.seen.add(row)
         walk.last_seen = times[row]
         walk.usual += (found.score - walk.usual) / 5
         if found.part > MIN_FIT_TO_LEARN:
-            points = self._near(row, found.pose)
             self._learn(points, found.pose)
             if np.isnan(self._road):
                 self._road = self._road_below(points, found.pose)
@@ -376,14 +345,14 @@ class Follower:
             for i, pose in zip(some, boxes[:, POSE4][some], strict=True)
         ]
         found = faces(points, self._half)
-        origins = self._sweeps.origins
-        if origins is not None:
+        origins, by_azimuth = self._sweeps.origins, self._sweeps.by_azimuth
+        if origins is not None and by_azimuth is not None:
             rays = [
                 free_space.crossings(
-                    self._sweeps.points[int(rows[i])], origins[rows[i]], boxes[i, POSE4],
-                    self._tilt, self._half,
+                    self._sweeps.points[int(rows[i])], *by_azimuth(int(rows[i])),
+                    origins[rows[i]], boxes[i, POSE4], self._tilt, self._half,
                 )
-                for i in some[:: -(-len(some) // MAX_RAY_SWEEPS)]
+                for i in np.flatnonzero(rows % -(-len(rows) // MAX_RAY_SWEEPS) == 0)
                 if np.isfinite(origins[rows[i]]).all()
             ]  # fmt: skip
             if rays:
@@ -405,51 +374,30 @@ class Follower:
 
     def fit_of(self, rows: Ints, poses: Floats) -> float:
         """Return the mean score of poses (n, 4) in sweeps `rows` (n,)."""
-        scores = [
-            _score(self._fit(self._near(row, pose), pose))
-            for row, pose in zip(rows.tolist(), poses, strict=True)
-        ]
+        scores = [self._score(row, pose) for row, pose in zip(rows.tolist(), poses, strict=True)]
         return float(np.mean(scores)) if scores else 0.0
 
-    def _find(self, row: int, state: _State, walk: Walk) -> _Found:
-        """Return the pose in a sweep, from several starts after a loss or where it fits badly."""
-        prior, information = state.pose, state.information
+    def _find(self, row: int, state: _State, walk: Walk) -> tuple[Floats, _Found]:
+        """Return the points around a prediction, and the pose by them."""
         is_lost = bool(walk.reason)
         step, count = SLIP_STEP, SLIPS
         if is_lost:
             reach = 2.5 * np.sqrt(state.covariance[0, 0] + state.covariance[1, 1])
             step, count = SEARCH_STEP, min(int(reach / SEARCH_STEP), MOST_STEPS)
-        around = self._near(row, prior, 0.5 + step * count)
-        points = self._part(around, prior, 0.5)
-        height = self._road_below(points, prior) - self._road
-        if np.isfinite(height):
-            weight = ROAD_DEVIATION**-2
-            prior[2] += height * weight / (information[2, 2] + weight)
-            information[2, 2] += weight
-        best = self._registered(points, prior, prior, information)
-        slips = best.fit[0] > MIN_POINTS_TO_SEARCH and best.score < SEARCH_BELOW * walk.usual
-        if not (is_lost or slips):
-            return best
-        for shift in step * np.arange(-count, count + 1):
-            start = prior + shift * np.array([np.cos(prior[3]), np.sin(prior[3]), 0.0, 0.0])
-            part = self._part(around, start, 0.5)
-            if shift and len(part) >= registration.MIN_POINTS:
-                found = self._registered(part, start, prior, information)
-                if found.rank > best.rank + 0.02:
-                    best = found
-        if is_lost and not best.reason and best.part < MIN_FIT_AGAIN:
-            return best._replace(reason='no_fit')
-        return best
-
-    def _registered(
-        self, points: Floats, start: Floats, prior: Floats, information: Floats, steps: int = 12
-    ) -> _Found:
-        thinned = np.ascontiguousarray(points[:: 1 + len(points) // MAX_SWEEP_POINTS])
-        pose, covariance, fit, jump, reason = registration.registered(
-            thinned, start, prior, information, self._tilt, self._half, self._kind.clearance,
-            self._surface, steps,
+        points = self._near(row, state.pose, registration.AROUND + step * count)
+        found = registration.find(
+            points, state.pose, state.information, step, count, is_lost, walk.usual, self._road,
+            self._tilt, self._half, self._kind.clearance, *self._surface[:4],
         )  # fmt: skip
-        return _Found(pose, covariance, fit, jump, registration.REASONS[reason])
+        return points, _Found(*found)
+
+    def _registered(self, row: int, start: Floats, information: Floats, iterations: int) -> _Found:
+        """Return the pose in a sweep from one start."""
+        found = registration.registered(
+            self._near(row, start), start, start, information, self._tilt, self._half,
+            self._kind.clearance, *self._surface[:4], iterations,
+        )  # fmt: skip
+        return _Found(*found)
 
     def _start_speed(self, seed: int) -> float:
         """Return the speed at a seed [m/s]: by its neighbours in time, or searched."""
@@ -482,9 +430,7 @@ class Follower:
         for i, speed in enumerate(speeds):
             for other in around:
                 start = pose + speed * (times[other] - times[row]) * forward
-                points = self._near(other, start)
-                if len(points) >= registration.MIN_POINTS:
-                    scores[i] += self._registered(points, start, start, START_INFORMATION, 6).score
+                scores[i] += self._registered(other, start, START_INFORMATION, 6).score
             scores[i] = scores[i] / len(around) - _cost(speed)
         likely = speeds[np.argsort(-scores, kind='stable')[:SPEEDS_TESTED]]
         tested = [self._tested_speed(row, pose, speed) for speed in likely]
@@ -502,44 +448,35 @@ class Follower:
                 if not self._sweeps.has(other):
                     break
                 state = self._predicted(state, times[other] - times[other - sign])
-                prior, information = state.pose, state.information
-                found = self._registered(self._near(other, prior), prior, prior, information, 8)
-                total += found.rank / count
+                found = self._registered(other, state.pose, state.information, 8)
+                total += registration.rank(found.score, found.jump) / count
                 weights += 1 / count
-                planar, covariance = motion.update(
-                    state.planar, state.covariance, found.pose[[0, 1, 3]], found.covariance[PLANAR]
-                )
-                state = state._replace(planar=planar, covariance=covariance)
+                z, z_variance = state.z, state.z_variance
+                state = state.updated(found)._replace(z=z, z_variance=z_variance)
             found_speeds.append(state.planar[3])
         return total / weights - _cost(speed), float(np.mean(found_speeds))
 
     def _predicted(self, state: _State, seconds: float) -> _State:
         noise = self._kind.noise * (PARKED_NOISE if state.is_parked else 1.0)
-        planar, covariance = motion.predict(
-            state.planar, state.covariance, seconds, noise, self._pivot
+        planar, covariance, z_variance, information = motion.predict(
+            state.planar, state.covariance, state.z_variance, seconds, noise, CLIMB**2, self._pivot
         )
-        return _State(planar, covariance, state.z, state.z_variance + CLIMB**2 * abs(seconds))
+        return _State(planar, covariance, state.z, z_variance, information)
 
     def _near(self, row: int, pose: Floats, margin: float = 0.0) -> Floats:
         """Return the points (n, 3) around a pose that are not in the box of another object."""
-        points = self._part(self._sweeps.points[row], pose, margin)
-        for other in self._owned.others(row, pose, self._half, margin + 1.0, self._same):
-            tilt = matrix_from_rpy(np.append(other[[ROLL, PITCH]], 0.0))
-            points = registration.outside(points, other[POSE4], tilt, other[BOX_EXTENT] / 2)
-        return points
-
-    def _part(self, points: NDArray[np.floating], pose: Floats, margin: float) -> Floats:
-        """Return the points (n, 3), which ascend by x, around a pose."""
-        reach = np.hypot(self._half[0], self._half[1]) + 0.7 + margin
-        box = np.array([reach, reach, self._half[2] + 0.6])
-        part: Floats = registration.near(points, pose[:3], box)
-        return part
+        near: Floats = registration.near(
+            self._sweeps.points[row], pose, self._half, margin, self._owned[row], self._same
+        )
+        return near
 
     def _learn(self, points: Floats, pose: Floats) -> int:
         """Add the points in the box to the surface; return their number."""
-        inside = self._in_box(points, pose, MARGIN_LEARNT)
-        surface.insert(inside, self._half, *self._surface)
-        return len(inside)
+        count: int = registration.learn(
+            points, pose, self._tilt, self._half, self._kind.clearance, MARGIN_LEARNT,
+            *self._surface,
+        )  # fmt: skip
+        return count
 
     def _in_box(self, points: Floats, pose: Floats, margin: float) -> Floats:
         found: Floats = registration.in_box(
@@ -550,22 +487,15 @@ class Follower:
     def _road_below(self, points: Floats, pose: Floats) -> float:
         return float(registration.road_below(points, pose, self._tilt, self._half))
 
-    def _fit(self, points: Floats, pose: Floats) -> Floats:
-        fit: Floats = registration.fit(
-            points, pose, self._tilt, self._half, self._kind.clearance, self._surface
-        )
-        return fit
+    def _score(self, row: int, pose: Floats) -> float:
+        """Return how well the points of a sweep fit a pose, see `registration.fit`."""
+        fit = registration.fit(
+            self._near(row, pose), pose, self._tilt, self._half, self._kind.clearance,
+            *self._surface[:4],
+        )  # fmt: skip
+        return float(fit[3])
 
 
 def _cost(speed: float) -> float:
     """Return how much better the score of a speed has to be than that of a parked object."""
     return 0.03 * (abs(speed) > 0.7) + 0.1 * (speed < -0.7) + 0.002 * abs(speed)
-
-
-def _score(fit: Floats) -> float:
-    """Return the harmonic mean of the parts of the points that fit, and of the surface hit."""
-    inside, fitting, _, hit, beside, _ = fit
-    if inside < 3:
-        return 0.0
-    part = fitting / (inside + beside)
-    return float(2 * part * hit / max(part + hit, 1e-9))

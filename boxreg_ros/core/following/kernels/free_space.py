@@ -4,6 +4,8 @@ from boxreg_ros.core.following.kernels.registration import axes, in_frame
 from boxreg_ros.core.method.compile import kernel
 import numpy as np
 
+SECTORS = 720
+"""By azimuth, that the points of a sweep are sorted into; chosen: half a degree."""
 BIN = 0.1
 """Thickness of the layers behind each face [m]; chosen: the noise of a range is less."""
 LAYERS = 30
@@ -22,13 +24,35 @@ CORE = np.array([[-0.5, 0.5], [-0.5, 0.5], [-0.45, -0.15]])
 
 
 @kernel
-def crossings(points, origin, pose, tilt, half):
+def by_azimuth(points, origin):
+    """Return the rows (n,) of points (n, 3) by sector around an origin, and where each begins."""
+    sectors = np.empty(len(points), np.int32)
+    ends = np.zeros(SECTORS + 1, np.int64)
+    for n in range(len(points)):
+        sectors[n] = _sector(points[n, 0] - origin[0], points[n, 1] - origin[1])
+        ends[sectors[n] + 1] += 1
+    ends = np.cumsum(ends)
+    rows = np.empty(len(points), np.int32)
+    filled = ends.copy()
+    for n in range(len(points)):
+        rows[filled[sectors[n]]] = n
+        filled[sectors[n]] += 1
+    return rows, ends
+
+
+@kernel
+def _sector(x, y):
+    return int((np.arctan2(y, x) / (2 * np.pi) + 0.5) * SECTORS) % SECTORS
+
+
+@kernel
+def crossings(points, rows, ends, origin, pose, tilt, half):
     """
     Return how many rays cross the layers behind each face, (3, 2, LAYERS), and the core.
 
-    Of `points` (n, 3) measured from `origin` (3,), for a box at a `pose` (4,) with the rotation
-    `tilt` by roll and pitch and `half` extents. Faces are ordered by axis, the lower first; layers
-    from the face inwards.
+    Of `points` (n, 3) measured from `origin` (3,), with `rows` and `ends` of `by_azimuth`, for a
+    box at a `pose` (4,) with the rotation `tilt` by roll and pitch and `half` extents. Faces are
+    ordered by axis, the lower first; layers from the face inwards.
 
     """
     counts = np.zeros((3, 2, LAYERS))
@@ -38,53 +62,72 @@ def crossings(points, origin, pose, tilt, half):
     o[0], o[1], o[2] = in_frame(origin[0] - pose[0], origin[1] - pose[1], origin[2] - pose[2], R)
     away = np.hypot(o[0], o[1])
     radius = np.hypot(half[0], half[1])
+    reach = SECTORS // 2
+    if away > radius:
+        reach = int(np.arcsin(radius / away) / (2 * np.pi) * SECTORS) + 1
+    middle = _sector(pose[0] - origin[0], pose[1] - origin[1])
+    layers = _layers(half)
+    core = (CORE * half.reshape(3, 1)).T.copy()
+    box = np.stack((-half, half))
     d = np.empty(3)
-    for n in range(len(points)):
-        x, y, z = in_frame(
-            points[n, 0] - pose[0], points[n, 1] - pose[1], points[n, 2] - pose[2], R
-        )
-        d[0], d[1], d[2] = x - o[0], y - o[1], z - o[2]
-        flat = np.hypot(d[0], d[1])
-        if flat < away - radius or abs(o[0] * d[1] - o[1] * d[0]) > radius * flat:
-            continue
-        if o[0] * d[0] + o[1] * d[1] > 0 and away > radius:
-            continue
-        length = np.sqrt(flat * flat + d[2] * d[2])
-        if length < BEFORE:
-            continue
-        stop = 1 - BEFORE / length
-        low, high = CORE[:, 0] * half, CORE[:, 1] * half
-        t0, t1 = _span(o, d, stop, low, high)
-        through += t0 < t1
-        for axis in range(3):
-            for side in range(2):
-                _cross(o, d, stop, half, axis, side, counts[axis, side])
+    for k in range(middle - reach, middle + min(reach + 1, SECTORS - reach)):
+        sector = k % SECTORS
+        for n in rows[ends[sector] : ends[sector + 1]]:
+            d[0], d[1], d[2] = in_frame(
+                points[n, 0] - origin[0], points[n, 1] - origin[1], points[n, 2] - origin[2], R
+            )
+            length = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+            if length < max(away - radius, BEFORE):
+                continue
+            stop = 1 - BEFORE / length
+            if not _crosses(o, d, stop, box):
+                continue
+            through += _crosses(o, d, stop, core)
+            for axis in range(3):
+                for side in range(2):
+                    _cross(o, d, stop, half, axis, side, layers[axis, side], counts[axis, side])
     return counts, through
 
 
 @kernel
-def _span(o, d, stop, low, high):
-    """Return the part, from and to, of a ray o + t d, t up to `stop`, that is within bounds."""
+def _layers(half):
+    """Return the bounds (3, 2, 2, 3), lowest and highest, of the layers behind each face."""
+    bounds = np.empty((3, 2, 2, 3))
+    for axis in range(3):
+        depth = min(half[axis] / 2, LAYERS * BIN)
+        for side in range(2):
+            for k in range(3):
+                bounds[axis, side, :, k] = CROSS_SECTIONS[axis, k] * half[k]
+            bounds[axis, side, 0, axis] = half[axis] - depth if side else -half[axis]
+            bounds[axis, side, 1, axis] = bounds[axis, side, 0, axis] + depth
+    return bounds
+
+
+@kernel
+def _crosses(o, d, stop, bounds):
+    t0, t1 = _span(o, d, stop, bounds)
+    return t0 < t1
+
+
+@kernel
+def _span(o, d, stop, bounds):
+    """Return the part, from and to, of a ray o + t d, t up to `stop`, within bounds (2, 3)."""
     t0, t1 = 0.0, stop
     for k in range(3):
         if abs(d[k]) < 1e-9:
-            if o[k] < low[k] or o[k] > high[k]:
+            if o[k] < bounds[0, k] or o[k] > bounds[1, k]:
                 return 0.0, 0.0
             continue
-        a, b = (low[k] - o[k]) / d[k], (high[k] - o[k]) / d[k]
+        a, b = (bounds[0, k] - o[k]) / d[k], (bounds[1, k] - o[k]) / d[k]
         t0, t1 = max(t0, min(a, b)), min(t1, max(a, b))
     return t0, t1
 
 
 @kernel
-def _cross(o, d, stop, half, axis, side, counts):
+def _cross(o, d, stop, half, axis, side, bounds, counts):
     """Add a ray to the layers behind a face that it crosses."""
     sign = 2.0 * side - 1.0
-    depth = min(half[axis] / 2, LAYERS * BIN)
-    low, high = CROSS_SECTIONS[axis, :, 0] * half, CROSS_SECTIONS[axis, :, 1] * half
-    low[axis] = half[axis] - depth if sign > 0 else -half[axis]
-    high[axis] = low[axis] + depth
-    t0, t1 = _span(o, d, stop, low, high)
+    t0, t1 = _span(o, d, stop, bounds)
     if t0 >= t1:
         return
     a = (half[axis] - sign * (o[axis] + t0 * d[axis])) / BIN

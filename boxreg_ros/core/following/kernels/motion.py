@@ -10,6 +10,8 @@ from boxreg_ros.core.method.compile import kernel
 import numpy as np
 
 STATE = 5
+PLANAR = ((0, 0), (1, 1), (2, 3))
+"""Columns of x y yaw in a state, and in a pose x y z yaw."""
 STEP = 1e-5
 """Step of the numerical derivative of the motion [m, rad, ...]; derived: float64 rounding."""
 
@@ -29,12 +31,13 @@ def moved(state, dt, pivot):
 
 
 @kernel
-def predict(state, covariance, dt, noise, pivot):
+def predict(state, covariance, z_variance, dt, noise, climb, pivot):
     """
-    Return state (5,) and covariance (5, 5) after `dt` seconds, which may be negative.
+    Return state (5,), covariance (5, 5) and the variance of z after `dt` seconds, or before.
 
-    `noise` are the densities of acceleration [m^2/s^3], of angular acceleration [rad^2/s^3], and
-    of sideways slip [m^2/s] and turning [rad^2/s] that the motion does not explain.
+    And the information (4, 4) of x y z yaw. `noise` are the densities of acceleration [m^2/s^3],
+    of angular acceleration [rad^2/s^3], and of sideways slip [m^2/s] and turning [rad^2/s] that
+    the motion does not explain, `climb` that of z [m^2/s].
 
     """
     F = np.empty((STATE, STATE))
@@ -61,7 +64,8 @@ def predict(state, covariance, dt, noise, pivot):
     out[2, 4] += sign * noise[1] * t**2 / 2
     out[4, 2] += sign * noise[1] * t**2 / 2
     out[4, 4] += noise[1] * t
-    return moved(state, dt, pivot), out
+    z_variance += climb * t
+    return moved(state, dt, pivot), out, z_variance, pose_information(out, z_variance)
 
 
 @kernel
@@ -70,8 +74,8 @@ def pose_information(covariance, z_variance):
     full = np.zeros((4, 4))
     full[2, 2] = 1 / z_variance
     planar = np.linalg.inv(covariance[:3, :3].copy())
-    for i, a in ((0, 0), (1, 1), (2, 3)):
-        for j, b in ((0, 0), (1, 1), (2, 3)):
+    for i, a in PLANAR:
+        for j, b in PLANAR:
             full[a, b] = planar[i, j]
     return full
 
@@ -79,7 +83,7 @@ def pose_information(covariance, z_variance):
 @kernel
 def update(state, covariance, pose, pose_covariance):
     """
-    Return state and covariance for the estimate `pose` (3,) of x y yaw and its covariance (3, 3).
+    Return state and covariance for the estimate `pose` (4,) of x y z yaw, its covariance (4, 4).
 
     The estimate includes the prior from `state`: it replaces the pose, and speed and turn rate
     follow by their regression on the pose.
@@ -88,8 +92,11 @@ def update(state, covariance, pose, pose_covariance):
     gain = np.ascontiguousarray(covariance[:, :3]) @ np.linalg.inv(
         covariance[:3, :3].copy()
     )  # (5, 3)
-    step = pose - state[:3]
+    step, change = np.empty(3), np.empty((3, 3))
+    for i, a in PLANAR:
+        step[i] = pose[a] - state[i]
+        for j, b in PLANAR:
+            change[i, j] = covariance[i, j] - pose_covariance[a, b]
     out = state + gain @ step
-    change = covariance[:3, :3] - pose_covariance
     found = covariance - gain @ change @ gain.T
     return out, (found + found.T) / 2

@@ -2,10 +2,10 @@
 The surface of one object in its box frame: cells with the moments of their points.
 
 A map is a tuple of arrays. `slots` (nx, ny, nz) holds the number of the cell at a place plus one,
-0, or `FOREIGN` for points beside the box that a person has drawn; `moments` (S, 11) the count, the
-sums of x y z and of xx xy xz yy yz zz of its points, and the count at which the normal was found;
-`means` (S, 3) of its points; `normals` (S, 3) the direction of least spread around it; `used` (1,)
-the number of cells.
+0, or `FOREIGN` for points beside the box that a person has drawn; `means` (S, 3) of its points;
+`normals` (S, 3) the direction of least spread around it; `used` (1,) the number of cells;
+`moments` (S, 11) the count, the sums of x y z and of xx xy xz yy yz zz of its points, and the
+count at which the normal was found.
 
 """
 
@@ -19,6 +19,8 @@ FULL = 60
 RIM = 0.6
 """A map reaches this far outside of the box [m]."""
 FOREIGN = -1
+NORMAL_AGAIN = 1.1
+"""The normal of a cell is found again after it got so many times its points; chosen."""
 LINE = 0.02
 """A neighbourhood with less spread in its second direction is a line [m]."""
 FLAT = 0.05
@@ -38,7 +40,7 @@ def cell_of(x, y, z, slots):
 
 
 @kernel
-def insert(points, half, slots, moments, means, normals, used):
+def insert(points, half, slots, means, normals, used, moments):
     """Add points (n, 3) of the box frame to a map; update the normals of their cells."""
     for n in range(len(points)):
         x, y, z = points[n]
@@ -67,7 +69,7 @@ def insert(points, half, slots, moments, means, normals, used):
         of_cell[9] += z * z
     for slot in range(used[0]):
         count = moments[slot, 0]
-        if count > moments[slot, 10]:
+        if count > NORMAL_AGAIN * moments[slot, 10]:
             means[slot] = moments[slot, 1:4] / count
             normals[slot] = normal_at(means[slot], half, slots, moments)
             moments[slot, 10] = count
@@ -204,8 +206,8 @@ def empty(half, cells):
     sides = (2 * np.ceil((half + RIM) / SURFACE_CELL) + 2).astype(np.int64)
     return (
         np.zeros(sides, np.int32),
-        np.zeros((cells, 11)),
         np.zeros((cells, 3)),
         np.zeros((cells, 3)),
         np.zeros(1, np.int64),
+        np.zeros((cells, 11)),
     )
