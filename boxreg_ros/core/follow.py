@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -139,7 +140,7 @@ def follow(
     if sensor_origins is not None:
         sensor_origins = checked('sensor_origins', sensor_origins, (len(stamps), 3), 'x y z')
     ordered = [ascending(checked(f'points[{i}]', p, (None, 3))) for i, p in enumerate(points)]
-    tracks = follow_points(stamps.astype(np.int64), ordered, seeds, config, sensor_origins)
+    tracks = follow_points(stamps.astype(np.int64), ordered, seeds, config)
     return solved(tracks, ordered, config, sensor_origins)
 
 
@@ -148,13 +149,12 @@ def follow_points(
     points: Points,
     seeds: Sequence[BoxArray],
     config: Config,
-    origins: Floats | None = None,
 ) -> list[FollowedTrack]:
     """Follow as `follow` does, without the solve; `points` are those of `ascending`."""
     times = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
-    sweeps = Sweeps.of_drive(times, points, origins)
+    sweeps = Sweeps(times, points, len(times))
     objects = [_placed(name, rows, stamps_ns) for name, rows in _by_track(seeds).items()]
-    objects = _overlapping(objects)
+    objects = _of_class(_overlapping(objects))
     owned = Owned()
     followers = [
         Follower(sweeps, one.seeds, config.kind(one.class_name), owned, one.same)
@@ -179,6 +179,8 @@ class _Object(NamedTuple):
     problems: tuple[str, ...]
     same: tuple[int, ...] = ()
     """Indices of the objects with a seed that is inside of one of this, or the other way."""
+    is_of_class: bool = False
+    """Whether another object has the same size: no person draws the same box twice."""
 
 
 class _Seed(NamedTuple):
@@ -259,7 +261,7 @@ def _followed(
     rows = np.array(sorted(poses), np.int64)
     boxes = _boxes(rows, np.array([poses[row] for row in rows.tolist()]), seeds)
     if len(seeds.rows) == 1:
-        boxes = follower.grown(rows, boxes)
+        boxes = follower.grown(rows, boxes, one.is_of_class)
     words = tuple(status[row] for row in rows.tolist())
     return FollowedTrack(
         one.track_id, one.class_name, rows, stamps_ns[rows], boxes, words, tuple(ends), problems
@@ -298,6 +300,19 @@ def _overlapping(objects: Sequence[_Object]) -> list[_Object]:
         line = f'seeds of track {one.track_id!r}: one is inside that of track {other!r}; both are'
         found[index] = one._replace(problems=(*one.problems, f'{line} followed: delete one'))
     return found
+
+
+def _of_class(objects: Sequence[_Object]) -> list[_Object]:
+    """Return the objects; those with the size of another are said to have that of a class."""
+    sizes = [
+        {(one.class_name, *size) for size in one.seeds.boxes[:, BOX_EXTENT].round(3).tolist()}
+        for one in objects
+    ]
+    counts = Counter(size for own in sizes for size in own)
+    return [
+        one._replace(is_of_class=any(counts[size] > 1 for size in own))
+        for one, own in zip(objects, sizes, strict=True)
+    ]
 
 
 def _without_points(one: _Object, count: int) -> str:

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import lru_cache
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Protocol
 
-from boxreg_ros.core.following.kernels import free_space
-from boxreg_ros.structures import Floats, Ints
+from boxreg_ros.structures import Ints
 import numpy as np
 from numpy.typing import NDArray
-
-KEPT_SWEEPS = 64
-"""Sweeps whose order by azimuth is kept; chosen: 50 MB for clouds of 200,000 points."""
 
 
 class Points(Protocol):
@@ -36,23 +30,6 @@ class Sweeps(NamedTuple):
     points: Points
     stop: int
     first: int = 0
-    origins: Floats | None = None
-    """Positions of the sensor by row (S, 3), NaN if unknown [m]."""
-    by_azimuth: Callable[[int], tuple[Ints, Ints]] | None = None
-    """As of `free_space.by_azimuth`, of a sweep by its row; None without positions."""
-
-    @classmethod
-    def of_drive(cls, times: Floats, points: Points, origins: Floats | None) -> Self:
-        """Return all sweeps of a drive."""
-        if origins is None:
-            return cls(times, points, len(times))
-
-        @lru_cache(KEPT_SWEEPS)
-        def by_azimuth(row: int) -> tuple[Ints, Ints]:
-            found: tuple[Ints, Ints] = free_space.by_azimuth(points[row], origins[row])
-            return found
-
-        return cls(times, points, len(times), 0, origins, by_azimuth)
 
     def has(self, row: int) -> bool:
         """Return whether there is such a row."""
