@@ -49,16 +49,29 @@ def test_a_caller_is_compiled_again_when_a_called_kernel_of_another_module_chang
     assert result_and_cache_hits(2) == ['2', '0']
 
 
-def test_the_digest_depends_on_every_source_of_the_folder(tmp_path):
-    (tmp_path / 'a.py').write_text('A = 1')
-    (tmp_path / 'b.py').write_text('B = 1')
-    before = sources_digest.__wrapped__(tmp_path)
-    (tmp_path / 'b.py').write_text('B = 2')
-    assert sources_digest.__wrapped__(tmp_path) != before
+def test_the_digest_depends_on_every_source_that_is_imported(tmp_path):
+    # a imports b, b imports c and a again; d is beside them.
+    texts = {
+        'a': 'from package.folder.b import B',
+        'b': 'from package.folder.c import (\n    C,\n)\nfrom package.folder.a import A',
+        'c': 'from os.path import join\nC = 1',
+        'd': 'D = 1',
+    }
+    for name, text in texts.items():
+        (tmp_path / f'{name}.py').write_text(text)
+    digest = sources_digest.__wrapped__
+    before = digest(tmp_path / 'a.py')
+    (tmp_path / 'd.py').write_text('D = 2')
+    assert digest(tmp_path / 'a.py') == before
+    for name in 'cba':
+        with (tmp_path / f'{name}.py').open('a') as file:
+            file.write('\n')
+        assert digest(tmp_path / 'a.py') != before
+        before = digest(tmp_path / 'a.py')
 
 
 def test_kernels_take_nothing_of_the_package_from_outside_of_their_folder():
-    # The digest in the name of a cache file covers the sources of this folder only.
+    # The digest in the name of a cache file covers imports from this folder only.
     folder = ROOT / 'boxreg_ros' / 'core' / 'method'
     for path in folder.glob('*.py'):
         for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):

@@ -1,7 +1,9 @@
 """The latency of input boxes: found by points, and corrected along the tracks."""
 
+from collections import Counter
 from dataclasses import replace
 
+from boxreg_ros.core import latency
 from boxreg_ros.core.latency import LateBoxes, NOTABLE, OBJECTS_COMPARED
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
@@ -50,8 +52,15 @@ def test_one_latency_is_found_and_none_where_there_is_none(sample_drive):
         assert bool(found.warning) == (seconds > NOTABLE)
 
 
-def test_of_many_objects_every_one_is_evidence(sample_drive):
+def test_of_many_objects_every_one_is_evidence(sample_drive, monkeypatch):
     # Of a sweep 16 are compared at most: they take turns.
+    compared, of_sweep = Counter(), latency._costs
+
+    def counted(sweep, *rest):
+        costs = of_sweep(sweep, *rest)
+        compared[sweep.stamp_ns] += costs is not None
+        return costs
+
     one = estimated(sample_drive.sweeps, late(sample_drive.boxes, 0.3))
     crowd = [
         replace(
@@ -61,7 +70,10 @@ def test_of_many_objects_every_one_is_evidence(sample_drive):
         )
         for array in sample_drive.boxes
     ]  # fmt: skip
-    found = estimated(sample_drive.sweeps, late(crowd, 0.3))
+    with monkeypatch.context() as patch:
+        patch.setattr(latency, '_costs', counted)
+        found = estimated(sample_drive.sweeps, late(crowd, 0.3))
+    assert max(compared.values()) == OBJECTS_COMPARED
     assert found.tracks == 10 * one.tracks > 2 * OBJECTS_COMPARED
     assert found.estimated == pytest.approx(0.3, abs=0.02)
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+import re
 from typing import Any
 from warnings import warn
 
@@ -11,6 +12,9 @@ import numba
 
 REORDER = {'contract', 'reassoc'}
 """Sums may be reordered for vector instructions; NaN and infinity are handled as usual."""
+
+IMPORTED = re.compile(r'^from [\w.]*?(\w+) import', re.MULTILINE)
+"""The last name of a module that a source imports from."""
 
 DIGEST_LENGTH = 12
 """Letters of the digest of the sources. Chosen: 48 bits."""
@@ -38,12 +42,12 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     -----
     Numba compiles the kernels that a kernel calls into its cache file, but compares the file with
     the source of the caller only. The qualified name, which numba puts into the name of the cache
-    file, therefore gets a digest of all sources in the folder. Modules of kernels import functions
-    and constants from their own folder only.
+    file, therefore gets a digest of all sources that the caller imports. Modules of kernels import
+    functions and constants from their own folder only.
 
     """
-    folder = Path(function.__code__.co_filename).parent
-    function.__qualname__ += f'_{sources_digest(folder)}'
+    source = Path(function.__code__.co_filename)
+    function.__qualname__ += f'_{sources_digest(source)}'
     options |= {'nogil': True, 'error_model': 'numpy', 'fastmath': REORDER}
     options['no_cfunc_wrapper'] = True  # for calls from C: a fifteenth of the time to compile
     try:
@@ -111,9 +115,14 @@ FIRST_KERNEL = 'fill_rotation'
 
 
 @cache
-def sources_digest(folder: Path) -> str:
-    """Return a digest of all Python sources that lie directly in a folder."""
+def sources_digest(source: Path) -> str:
+    """Return a digest of a source and of all that it imports from its folder, one by another."""
+    sources = [source]
+    for path in sources:  # which grows
+        modules = IMPORTED.findall(path.read_text(encoding='utf-8'))
+        known = (source.with_name(f'{module}.py') for module in modules)
+        sources += {path for path in known if path.is_file() and path not in sources}
     digest = sha256()
-    for path in sorted(folder.glob('*.py')):
+    for path in sorted(sources):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:DIGEST_LENGTH]
