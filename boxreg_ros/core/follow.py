@@ -10,7 +10,7 @@ from typing import NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core.following import person
 from boxreg_ros.core.following.between import between
-from boxreg_ros.core.following.sweeps import ascending, nearest, Points, Sweeps
+from boxreg_ros.core.following.sweeps import ascending, nearest, Points, SightLimits, Sweeps
 from boxreg_ros.core.following.tracker import (
     ARRIVED,
     END_OF_SWEEPS,
@@ -140,7 +140,7 @@ def follow(
     if sensor_origins is not None:
         sensor_origins = checked('sensor_origins', sensor_origins, (len(stamps), 3), 'x y z')
     ordered = [ascending(checked(f'points[{i}]', p, (None, 3))) for i, p in enumerate(points)]
-    tracks = follow_points(stamps.astype(np.int64), ordered, seeds, config)
+    tracks = follow_points(stamps.astype(np.int64), ordered, seeds, config, sensor_origins)
     return solved(tracks, ordered, config, sensor_origins)
 
 
@@ -149,10 +149,12 @@ def follow_points(
     points: Points,
     seeds: Sequence[BoxArray],
     config: Config,
+    origins: Floats | None = None,
 ) -> list[FollowedTrack]:
     """Follow as `follow` does, without the solve; `points` are those of `ascending`."""
     times = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
-    sweeps = Sweeps(times, points, len(times))
+    tops = None if origins is None else SightLimits(points, origins)
+    sweeps = Sweeps(times, points, len(times), tops=tops)
     objects = [_placed(name, rows, stamps_ns) for name, rows in _by_track(seeds).items()]
     objects = _of_class(_overlapping(objects))
     owned = Owned()

@@ -143,7 +143,7 @@ def followed(arrays: Sequence[BoxArray], store: SweepStore, config: Config) -> l
         return []
     seeds = [replace(array, boxes=_from_store(array.boxes, store, -1)) for array in arrays]
     stamps_ns = np.array(store.stamps_ns, np.int64)
-    found = follow_points(stamps_ns, store, seeds, config)
+    found = follow_points(stamps_ns, store, seeds, config, store.sensor_origins)
     return [replace(track, boxes=_from_store(track.boxes, store)) for track in found]
 
 

@@ -191,11 +191,19 @@ def test_boxes_of_the_same_size_have_that_of_their_class():
     for one in seeds:
         one.boxes[0, 5] += 0.2  # as much as a person may err
         one.boxes[0, 2] += 0.1
-    alone = follow(stamps(N), sweeps, seeds[:1])[0]
-    assert abs(alone.boxes[0, 5] - seeds[0].boxes[0, 5]) < 0.05
-    both = follow(stamps(N), sweeps, seeds)
-    for track, truth in zip(both, truths, strict=True):
-        assert abs(track.boxes[0, 5] - truth[0, 5]) < 0.1
+    tree = np.column_stack([rng.uniform(39, 41, (50, 2)), np.linspace(0.0, 12.0, 50)])
+    wooded = [np.concatenate([one, tree]) for one in sweeps]
+    origins = np.tile(ORIGIN, (N, 1))
+
+    def heights(points, given, *more):
+        return [t.boxes[0, 5] for t in follow(stamps(N), points, given, None, *more)]
+
+    height, given = truths[0][0, 5], seeds[0].boxes[0, 5]
+    np.testing.assert_allclose(heights(wooded, seeds[:1], origins), given, atol=0.05)
+    np.testing.assert_allclose(heights(wooded, seeds, origins), height, atol=0.1)
+    # The points may end at the limit of the field of view.
+    np.testing.assert_allclose(heights(sweeps, seeds, origins), given, atol=0.05)
+    np.testing.assert_allclose(heights(wooded, seeds), given, atol=0.05)
 
 
 def test_neighbour_and_road_do_not_pull_a_parked_car():

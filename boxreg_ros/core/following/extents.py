@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
+from numpy.typing import NDArray
 
 MAX_GROWTH = 1.0
 """A face moves outwards by no more than this [m]; chosen: half the difference of a hatchback and a
@@ -13,7 +14,7 @@ van."""
 MOST_CHANGE = 0.5
 """And no face by more than this part of half the extent: farther points are of what stands beside;
 chosen."""
-ERROR, ERROR_OF_CLASS = 0.3, 0.1
+PERSON_ERROR, EDGE_ERROR = 0.3, 0.1
 """Faces nearer to the edge of the points stay [m]; chosen: the error of a person, the labelling
 margin, and the error of the edge, 0.1. Of boxes with the size of a class the last alone: they are
 known by another object of the same size, or by one face that is farther off."""
@@ -37,7 +38,9 @@ OUTERMOST = 0.98
 """Quantile of the points beside an edge that counts as the outermost one; chosen."""
 
 
-def faces(sweeps: Sequence[Floats], half: Floats, is_of_class: bool) -> Floats:
+def faces(
+    sweeps: Sequence[Floats], half: Floats, is_of_class: bool, sees_top: NDArray[np.bool_]
+) -> Floats:
     """
     Return the faces of a rigid object by the edges of its points.
 
@@ -49,6 +52,9 @@ def faces(sweeps: Sequence[Floats], half: Floats, is_of_class: bool) -> Floats:
         Half the extents of the box.
     is_of_class : bool
         Whether it is known that a tool gave it the size of its class.
+    sees_top : array, shape (m,)
+        Whether the sensor sees points above the box, by sweep: points of the others end at the
+        limit of its field of view.
 
     Returns
     -------
@@ -65,11 +71,13 @@ def faces(sweeps: Sequence[Floats], half: Floats, is_of_class: bool) -> Floats:
         others = [other for other in range(3) if other != axis]
         sign = 2 * side - 1
         own = is_within[:, others].all(1) & (sign * points[:, axis] > 0)
+        if axis == 2:
+            own &= sees_top[owner]
         edge = _edge(sign * points[own, axis], owner[own], float(half[axis]))
         if abs(edge - half[axis]) < MOST_CHANGE * half[axis]:
             steps[side, axis] = edge - half[axis]
-    is_of_class = is_of_class or bool((np.abs(steps) > ERROR).any())
-    steps[np.abs(steps) <= (ERROR_OF_CLASS if is_of_class else ERROR)] = 0.0
+    is_of_class = is_of_class or bool((np.abs(steps) > PERSON_ERROR).any())
+    steps[np.abs(steps) <= (EDGE_ERROR if is_of_class else PERSON_ERROR)] = 0.0
     return found + np.array([[-1.0], [1.0]]) * steps
 
 
@@ -80,7 +88,7 @@ def _edge(outwards: Floats, owner: Ints, half: float) -> float:
     num_bins = int(np.ceil((half + MAX_GROWTH) / BIN))
     row = (outwards / BIN).astype(int)
     counts = np.bincount(row, minlength=num_bins + BESIDE_EDGE)
-    peak = int(counts[:num_bins].argmax())
+    peak = int(counts[: int(half / BIN) + 2].argmax())  # what stands beside may be denser
     for edge in range(max(peak + 1, BESIDE_EDGE), num_bins):
         inside = counts[edge - BESIDE_EDGE : edge].mean()
         if counts[edge : edge + BESIDE_EDGE].mean() < EMPTY * inside:

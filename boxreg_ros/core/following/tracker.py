@@ -349,12 +349,21 @@ class Follower:
             self._in_box(self._near(int(rows[i]), pose, MAX_GROWTH), pose, MAX_GROWTH)
             for i, pose in zip(some, boxes[:, POSE4][some], strict=True)
         ]
-        low, high = faces(points, self._half, is_of_class)
+        sees_top = [self._sees_top(int(rows[i]), boxes[i, POSE4]) for i in some]
+        low, high = faces(points, self._half, is_of_class, np.array(sees_top))
         grown = boxes.copy()
         shift = (low + high) / 2
         grown[:, :3] += matrix_from_rpy(boxes[:, ROLL:]) @ shift
         grown[:, BOX_EXTENT] = high - low
         return grown
+
+    def _sees_top(self, row: int, pose: Floats) -> bool:
+        """Return whether the sensor would see points above the box."""
+        tops = self._sweeps.tops
+        if tops is None:
+            return False
+        top = pose[2] + self._half[2] + MARGIN_LEARNT
+        return bool(tops.height(row, pose, float(np.hypot(*self._half[:2]))) > top)
 
     def jumps(self, seed: int) -> bool:
         """Return whether the next seed is farther away than such an object can move."""
