@@ -60,9 +60,9 @@ def on_page_content(html: str, **_: Any) -> str:
 def _mathml(found: re.Match[str]) -> str:
     latex = re.sub(r'\\tag\{(.+?)\}', r'\\qquad \\text{(\1)}', unescape(found[3]))
     mathml = convert(latex, display='block' if found[2] == '[' else 'inline')
-    # The bars of a norm would grow with its indices, an overline would be too short.
+    # The bars of a norm would grow with its indices; of the lines above U+203E alone stretches.
     mathml = mathml.replace('<mo>&#x02016;</mo>', '<mo stretchy="false">&#x02016;</mo>')
-    return mathml.replace('<mo accent="true">&#x02015;</mo>', '<mo stretchy="true">&#x000AF;</mo>')
+    return mathml.replace('<mo accent="true">&#x02015;</mo>', '<mo stretchy="true">&#x0203E;</mo>')
 
 
 def _svg(source: str, number: int) -> str:

@@ -41,8 +41,8 @@ def test_example_reduces_the_position_error_as_its_page_shows(name):
     assert max(errors.values()) < 0.5 * given
     page = PAGE.read_text(encoding='utf-8')
     source = example(name).read_text(encoding='utf-8')
-    if name == 'stream':
-        source = source[source.index('registrar = ') : source.index("\nprint('counts")]
+    start = {'refine_tracks': 'track = ', 'stream': 'registrar = '}[name]
+    source = source[source.index(f'\n{start}') + 1 : source.index("\nprint('")]
     assert f'```python\n{source}```\n' in page
     shown = block_after(page[page.index(source) :], '```text\n')
     # Digits may differ between processors; names and counts may not.
