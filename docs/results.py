@@ -213,11 +213,13 @@ def _ranking(store: Path) -> Iterable[str]:
     rows = []
     for _, document in measurements(store, 'review'):
         for recording, inputs in document['results'].items():
-            for name, found in inputs.items():
-                shares = found['shares']
-                start = f'`{recording}`, {name} ({found["bad"]} of {found["tracks"]})'
-                rows.append([start, *(number(share[-1], 2) for share in shares.values())])
-    yield table(['', *shares], rows)
+            orders = next(iter(inputs.values()))['shares']
+            cells = (
+                ' / '.join(number(found['shares'][order][-1], 2) for found in inputs.values())
+                for order in orders
+            )
+            rows.append([f'`{recording}`', *cells])
+    yield table([' / '.join(inputs), *orders], rows)
 
 
 def _times(store: Path) -> Iterable[str]:
