@@ -16,6 +16,7 @@ from boxreg_ros.core.method.arrays import (
     SIDESLIP,
 )
 from boxreg_ros.core.method.arrays import EXTENT as LENGTH
+from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.residuals import RESIDUALS, TERMS
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.problem import CLASS_SETTINGS, Problem, SETTINGS_OF
@@ -215,6 +216,9 @@ def settings_of(kind):
 def no_inputs(**parts):
     """Return records `INPUTS` (K,) without any evidence, with some fields changed."""
     inputs = np.zeros(len(KINDS), INPUTS)
+    inputs['deviation'] = inputs['extent_error'] = inputs['spread'] = 1.0
+    inputs['low_noise'] = 1.0
+    inputs['correlation'] = CONSTANTS.typical_correlation
     for name, value in parts.items():
         inputs[name] = value
     return inputs

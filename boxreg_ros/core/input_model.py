@@ -1,12 +1,13 @@
 """
-The input model: labelling margins (M18), noise and population of the input of a stream.
+The input model: labelling margins, noise and population of the input of a stream.
 
 docs/method.md, section Input model, has the formulas.
 
 """
 
 from collections.abc import Sequence
-from typing import Any
+from math import sqrt
+from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config, FaceConfig, KINDS
 from boxreg_ros.core.input_noise import noise_of, set_noise
@@ -20,10 +21,11 @@ from boxreg_ros.core.input_statistics import (
 )
 from boxreg_ros.core.method import constants
 from boxreg_ros.core.method.arrays import INPUTS
+from boxreg_ros.core.method.expectation import constant_part, SIZE
 from boxreg_ros.core.method.faces import observe_faces
 from boxreg_ros.core.method.residuals import TERMS
-from boxreg_ros.core.population import set_population
-from boxreg_ros.core.problem import Problem
+from boxreg_ros.core.population import population_slopes
+from boxreg_ros.core.problem import Problem, settings_of_kinds
 from boxreg_ros.core.support import MIN_HITS
 from boxreg_ros.core.threads import run
 from boxreg_ros.core.track_rows import TrackRows
@@ -31,24 +33,58 @@ from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from numpy.typing import NDArray
 
-QUARTILES_TO_DEVIATION = 0.74
-"""Standard deviation over interquartile range. Derived: 1 / 1.349 for a Gaussian."""
-MIDMEAN_FACTOR = 1.1
-"""Error of the mean of the middle half over that of the mean. Derived: sqrt(1.2), the efficiency
-of the midmean of a Gaussian."""
 Inputs = NDArray[np.void]
-MARGIN_FIELDS = (
-    'gap_correction', 'occlusion_inset', 'range_inset', 'gap_variance', 'gap_tracks', 'gap_noise',
-)  # fmt: skip
-"""Fields of `INPUTS` that follow from face observations."""
 FACE_GROUPS = ([0, 1], [2, 3], [4], [5])
 """Faces with one labelling margin: ends, sides, top, bottom."""
+MARGIN_FIELDS = ('margin', 'margin_variance', 'spread', 'occlusion_inset', 'range_inset')
+"""Fields of `INPUTS` that follow from face observations."""
+QUARTILES_TO_DEVIATION = 0.74
+"""Standard deviation over interquartile range. Derived: 1 / 1.349 for a Gaussian."""
+MIDMEAN_FACTOR = 1.2
+"""Variance of the mean of the middle half over that of the mean. Derived: for a Gaussian."""
 GAP_DEVIATIONS = {
     'vehicle': (0.05, 0.05, 0.05, 0.15),
     'cyclist': (0.15, 0.15, 0.15, 0.15),
     'pedestrian': (0.15, 0.15, 0.15, 0.15),
 }
 """Prior deviation of each margin from the one of the settings of its kind [m]. Chosen."""
+
+
+class Pooled(NamedTuple):
+    """
+    A quantity that differs from track to track: its normal-inverse-chi-squared distribution (M15).
+
+    Attributes
+    ----------
+    mean, variance : float
+        Of the mean over all tracks [m], and the variance of this estimate [m^2].
+    between : float
+        Variance between tracks [m^2].
+
+    """
+
+    mean: float
+    variance: float
+    between: float
+
+    def given(self, values: Floats, prior_tracks: float) -> 'Pooled':
+        """
+        Return the posterior, by one value of each track, robustly.
+
+        The variance of the prior counts as that of `prior_tracks`.
+
+        """
+        n = len(values)
+        if n < MIN_HITS:
+            return self
+        values = np.sort(values)
+        deviation = QUARTILES_TO_DEVIATION * (values[n - 1 - n // 4] - values[n // 4])
+        between = (prior_tracks * self.between + n * deviation**2) / (prior_tracks + n)
+        information = n / (MIDMEAN_FACTOR * between)
+        variance = 1 / (1 / self.variance + information)
+        middle = values[n // 4 : n - n // 4].mean()
+        mean = variance * (self.mean / self.variance + information * middle)
+        return Pooled(float(mean), float(variance), float(between))
 
 
 class InputModel:
@@ -60,17 +96,15 @@ class InputModel:
 
     A labelling margin is the gap between a face of the label and its outermost points. Each track
     gives one value per face: the mean over its observations of the gap, less the one expected of
-    its class. The mean of the middle half of all tracks is weighed against a correction of zero
-    (M18). Errors of the boxes that exceed the margin do not matter if they have no preferred
-    direction. Faces beyond 45 m give the range inset; it is estimated even where the margins are
-    set, since a common error of all boxes cancels in the difference.
+    its class (M15). Faces beyond 45 m give the range inset; it is estimated even where the margins
+    are set, since a common error of all boxes cancels in the difference.
 
     Parameters
     ----------
     config : FaceConfig
         Expected insets, and whether margins are estimated.
     drives : Drives, optional
-        Of the same detector and labelling rule: their tracks count as those of this stream.
+        Of the same detector and labelling rule: what they have shown is the prior of this model.
     numbers : Constants, optional
         Of the method, if others than the usual ones.
 
@@ -93,8 +127,6 @@ class InputModel:
         # Of each track of each kind: what it shows, and its last input residuals.
         unknown = np.full((self.constants.max_fits, 9), np.nan)
         self._tracks = [TrackRows(np.zeros((), TRACK), self.constants.max_tracks) for _ in KINDS]
-        # What follows from the present sums, see `_margins_of`.
-        self._margins: list[tuple[Floats, ...] | None] = [None] * len(KINDS)
         self._residuals = [TrackRows(unknown, self.constants.max_tracks) for _ in KINDS]
         self._noise = np.zeros(len(KINDS), NOISE)  # of whole tracks, whose residuals are not kept
         known = list((drives or {}).values())
@@ -105,10 +137,6 @@ class InputModel:
         self._past_noise = np.array(
             [pooled_noise([drive[k].noise for drive in known]) for k in range(len(KINDS))], NOISE
         )
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what was observed; margins that follow from it are computed again."""
-        return {**vars(self), '_margins': [None] * len(KINDS)}
 
     def observe_margins(
         self, track_ids: Sequence[str], problem: Problem, poses: Floats, config: Config
@@ -145,8 +173,8 @@ class InputModel:
         numbers = self.constants
         distance, weight = terms['distance'], terms['visibility']
         occluded, distant = np.moveaxis(terms['inset_shares'], 2, 0)
-        gap_correction, occlusion_inset, range_inset = (
-            inputs[name][kinds][:, None] for name in MARGIN_FIELDS[:3]
+        margin, occlusion_inset, range_inset = (
+            inputs[name][kinds][:, None] for name in ('margin', *MARGIN_FIELDS[3:])
         )
         occluded = occluded * (occlusion_inset > 0)  # the bottom is observed by the road
         is_visible = occluded < numbers.min_share / 2
@@ -163,14 +191,15 @@ class InputModel:
         values = np.stack([
             0 * occluded, occluded * occlusion_inset, distant * range_inset
         ]) - distance  # fmt: skip
-        values[::2] += gap_correction  # an occlusion inset is counted from the present gap
+        values[::2] += margin  # an occlusion inset is counted from the present gap
         shares = np.stack([np.ones_like(distance), occluded, distant])
         # (B, 3 quantities, 3 sums: value, count, share; 6 faces)
         sums = np.moveaxis(np.stack([values * counts, counts, shares * counts], 1).sum(3), 2, 0)
+        logarithms = np.log(problem.mean_extents())
         for k in set(kinds.tolist()):
-            self._margins[k] = None
             rows, kept = _kept(self._tracks[k], track_ids, kinds == k)
             self._tracks[k].arrays['sums'][kept] += sums[rows]
+            self._tracks[k].arrays['evidence'][kept, 0] = logarithms[rows]
 
     def add_fits(
         self, track_ids: Sequence[str], kinds: Ints, residuals: Floats, evidence: Floats
@@ -198,41 +227,86 @@ class InputModel:
             rows, kept = _kept(self._tracks[k], track_ids, kinds == k)
             self._tracks[k].arrays['evidence'][kept] = evidence[rows]
 
-    def inputs(self, config: Config, with_noise: bool = True) -> Inputs:
+    def inputs(
+        self,
+        config: Config,
+        with_noise: bool = True,
+        fits: tuple[Floats, Floats, Ints] | None = None,
+    ) -> Inputs:
         """
         Return what is known of the errors of the input, records `INPUTS` (K,).
 
-        As far as the method of `config` uses it; without noise, that of the settings.
+        As far as the method of `config` uses it.
+
+        Parameters
+        ----------
+        config : Config
+            Settings.
+        with_noise : bool
+            Whether the noise is estimated; else it is that of the settings.
+        fits : tuple of arrays, shapes (B, N, 9), (B, 3, 3) and (B,)
+            Residuals, extent evidence and kinds of whole tracks: their noise is used in place of
+            that of the model, their evidence in addition to it.
 
         """
         inputs = np.zeros(len(KINDS), INPUTS)
+        residuals, kinds = _of_all_kinds(self._residuals)
+        more, of_fits = np.zeros((0, 3, 3)), np.zeros(0, int)
+        if fits:
+            residuals, more, of_fits = fits
+            kinds = of_fits
+        if not (with_noise and config.ingredients.noise_estimation):
+            residuals, kinds = residuals[:0], kinds[:0]
+        set_noise(inputs, residuals, kinds, self._past_noise, self.constants)
+        inputs['spread'] = 1.0
+        for faces, inset in zip(FACE_GROUPS, self._occlusion_insets, strict=True):
+            inputs['occlusion_inset'][:, faces] = inset
+        settings = settings_of_kinds(config)
+        of_faces = self.constants.with_settings(config).face_deviations
         for k in range(len(KINDS)):
-            margins = self._margins[k] or self._margins_of(k)
-            self._margins[k] = margins
-            for name, column in zip(MARGIN_FIELDS, margins, strict=True):
-                inputs[name][k] = column
-        if with_noise and config.ingredients.noise_estimation:
-            self.set_noise(inputs, *_of_all_kinds(self._residuals))
-        if config.ingredients.population_extents:
-            set_population(inputs, *self.extent_evidence(), self.constants)
+            tracks = np.concatenate([self._past[k], self._tracks[k].in_order])
+            evidence = np.concatenate([tracks['evidence'], more[of_fits == k]])
+            if config.ingredients.population_extents and len(evidence):
+                found = population_slopes(evidence, self.constants)
+                inputs['median'][k], inputs['slopes'][k] = found
+            if len(tracks):
+                deviations = GAP_DEVIATIONS[KINDS[k]]
+                self._set_margins(inputs[k], tracks, settings[k], deviations, of_faces)
         return inputs
 
-    def extent_evidence(self) -> tuple[Floats, Ints]:
-        """Return the evidence of the extents of the last fit of each track, and their kinds."""
-        parts = [self._known(k)['evidence'] for k in range(len(KINDS))]
-        parts = [part[part[:, 0].any(1)] for part in parts]  # without tracks that have no fit yet
-        return np.concatenate(parts), np.repeat(np.arange(len(KINDS)), list(map(len, parts)))
-
-    def _known(self, kind: int) -> NDArray[np.void]:
-        """Return what the tracks of a kind show, those of other drives first, records `TRACK`."""
-        return np.concatenate([self._past[kind], self._tracks[kind].in_order])
-
-    def set_noise(self, inputs: Inputs, residuals: Floats, kind: Ints) -> None:
-        """Set the noise of tracks (B, N, 9) of a kind (B,), with that of other drives (M14)."""
-        set_noise(inputs, residuals, kind, self._past_noise, self.constants)
+    def _set_margins(
+        self,
+        inputs: Any,
+        tracks: NDArray[np.void],
+        settings: Any,
+        deviations: Sequence[float],
+        face_deviations: Sequence[float],
+    ) -> None:
+        """Set margins and insets of one kind, by its `tracks`, noise and settings (M15)."""
+        extents = np.exp(np.median(tracks['evidence'][:, 0], axis=0))
+        parts = np.array([constant_part(c, 1.0) for c in inputs['correlation'].tolist()])
+        bias = settings['pose'][:SIZE] * inputs['deviation'][:SIZE] * parts[:SIZE]
+        half_extent = settings['extent'] * inputs['extent_error'] * parts[-SIZE:] * extents / 2
+        along_axes = settings['gap_spread'] ** 2 + bias**2 + half_extent**2
+        sums, strength = tracks['sums'], self.constants.half_weight
+        margin, variance, spread, occluded, distant = (inputs[name] for name in MARGIN_FIELDS)
+        for faces, deviation, inset in zip(
+            FACE_GROUPS, deviations, self._occlusion_insets, strict=True
+        ):
+            of_face = max(face_deviations[faces[0]], settings['roughness'])
+            prior = Pooled(0.0, deviation**2, along_axes[faces[0] // 2] + of_face**2)
+            gaps = prior.given(_means(sums[:, 0], faces), strength)
+            beyond = sums[:, 2].copy()
+            beyond[:, 0] -= gaps.mean * beyond[:, 1]
+            distant[faces] = prior.given(_means(beyond, faces), strength).mean
+            if self._estimates_margins:
+                margin[faces], variance[faces] = gaps.mean, gaps.variance
+                spread[faces] = sqrt(gaps.between / prior.between)
+                of_insets = prior._replace(mean=inset)
+                occluded[faces] = of_insets.given(_means(sums[:, 1], faces), strength).mean
 
     def add_noise(self, residuals: Floats, kind: Ints) -> None:
-        """Add the noise of whole tracks, by their residuals (B, N, 9), to the statistics."""
+        """Add the noise of whole tracks, by their residuals (B, N, 9) (M16)."""
         for k in set(kind.tolist()):
             found = noise_of(residuals[kind == k], self.constants)
             self._noise[k] = pooled_noise([self._noise[k], found])
@@ -246,21 +320,6 @@ class InputModel:
                 noise = noise_of(self._residuals[k].in_order, self.constants)
             kinds.append(KindStatistics(self._tracks[k].in_order, noise))
         return drive_of(kinds, name)
-
-    def _margins_of(self, kind: int) -> tuple[Floats, ...]:
-        """Return margin corrections, insets and scatter of gaps for one kind, (6,) each."""
-        known = self._known(kind)['sums']
-        none = (0.0,) * len(FACE_GROUPS)
-        deviations = GAP_DEVIATIONS[KINDS[kind]]
-        of_gaps = _means_of_groups(known[:, 0])
-        gaps = self._pooled(of_gaps, none, deviations)
-        known[:, 2, 0] -= gaps * known[:, 2, 1]
-        range_insets = self._pooled(_means_of_groups(known[:, 2]), none, deviations)
-        used = known if self._estimates_margins else known[:0]
-        of_insets = _means_of_groups(used[:, 1])
-        occlusion_insets = self._pooled(of_insets, self._occlusion_insets, deviations)
-        scatter = self._scatter(of_gaps) * self._estimates_margins
-        return self._estimates_margins * gaps, occlusion_insets, range_insets, *scatter
 
     def gaps_of_tracks(self, faces: Sequence[int]) -> list[Floats]:
         """Return gap corrections of some `faces` [m], one array per track that has any."""
@@ -279,51 +338,12 @@ class InputModel:
                     means.append(total[is_known] / share[is_known])
         return means
 
-    def _pooled(
-        self, means: 'Means', expected: Sequence[float], deviations: Sequence[float]
-    ) -> Floats:
-        """Weigh the means of a quantity against its prior (M18), (6,)."""
-        values = np.zeros(6)
-        parts = zip(FACE_GROUPS, means, expected, deviations, strict=True)
-        for faces, (of_tracks, _), prior, deviation in parts:
-            values[faces] = self._posterior_mean(of_tracks, prior, deviation)
-        return values
 
-    def _posterior_mean(self, means: Floats, prior: float, deviation: float) -> float:
-        """Weigh the midmean of sorted `means` against a prior with its deviation (M18)."""
-        n = len(means)
-        if n < MIN_HITS:
-            return prior
-        middle, spread = _midmean(means)
-        error = MIDMEAN_FACTOR * (spread + self.constants.min_gap_deviation)
-        weight = deviation**2 / (deviation**2 + error**2 / n)
-        return float(prior + weight * (middle - prior))
-
-    def _scatter(self, means: 'Means') -> Floats:
-        """Return variance, number and noise of the gaps of one kind, see `Inputs`, (3, 6)."""
-        columns = np.zeros((3, 6))
-        for faces, (of_tracks, counts) in zip(FACE_GROUPS, means, strict=True):
-            if len(of_tracks):
-                columns[0, faces] = _clipped_variance(of_tracks, self.constants.gate)
-                columns[1, faces] = len(of_tracks)
-                columns[2, faces] = (1 / counts).mean()
-        return columns
-
-
-Means = list[tuple[Floats, Floats]]
-"""Of each of `FACE_GROUPS`: the means of all tracks, sorted, and their numbers of observations."""
-
-
-def _means_of_groups(known: Floats) -> Means:
-    """Return the means of a quantity by the tracks' sums (n, 3, 6)."""
-    found = []
-    for faces in FACE_GROUPS:
-        total, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)
-        is_known = count >= MIN_HITS
-        means = total[is_known] / share[is_known]
-        order = np.argsort(means)
-        found.append((means[order], count[is_known][order]))
-    return found
+def _means(sums: Floats, faces: Sequence[int]) -> Floats:
+    """Return the mean of a quantity over some faces, of each track that shows it (n, 3, 6)."""
+    total, count, share = sums[..., faces].sum(-1).T
+    is_known = count >= MIN_HITS
+    return np.asarray(total[is_known] / share[is_known])
 
 
 def _of_all_kinds(known: Sequence[TrackRows]) -> tuple[Floats, Ints]:
@@ -339,17 +359,3 @@ def _kept(
     of_kind = np.flatnonzero(is_of_kind)
     places, rows = known.seen([track_ids[i] for i in of_kind.tolist()])
     return of_kind[places], rows
-
-
-def _midmean(means: Floats) -> tuple[float, float]:
-    """Return the mean of the middle half of sorted `means`, and their robust deviation."""
-    n = len(means)
-    spread = means[n - 1 - n // 4] - means[n // 4]
-    return float(means[n // 4 : n - n // 4].mean()), QUARTILES_TO_DEVIATION * float(spread)
-
-
-def _clipped_variance(means: Floats, gate: float) -> float:
-    """Return the variance of sorted `means` about their midmean, within `gate` deviations."""
-    middle, deviation = _midmean(means)
-    off = (means - middle).clip(-gate * deviation, gate * deviation)
-    return float((off**2).sum() / max(len(means) - 1, 1))

@@ -1,5 +1,5 @@
 """
-The errors of the input poses and extents, estimated from their residuals (M14).
+The errors of the input poses and extents, estimated from their residuals (M16).
 
 docs/method.md, section Input model, has the formulas.
 
@@ -8,6 +8,7 @@ docs/method.md, section Input model, has the formulas.
 from boxreg_ros.config import KINDS
 from boxreg_ros.core.input_statistics import NOISE, pooled_noise
 from boxreg_ros.core.method.constants import Constants
+from boxreg_ros.core.method.expectation import SIZE
 from boxreg_ros.core.method.noise import estimate
 from boxreg_ros.core.problem import Problem
 from boxreg_ros.rotations import matrix_from_rpy
@@ -19,6 +20,16 @@ LEAST_WEIGHT = 1e-9
 """A smaller weight of a noise is none. Derived: rounding."""
 REPEATED_BOX_TOLERANCE = 1e-3
 """A box that differs from the one before by less repeats it [m, rad]. Chosen."""
+EXTENT_ERRORS = ((0.9, 0.9, 0.9), (0.8, 1.6, 0.65), (2.7, 1.6, 0.65))
+"""Error of extents that is constant along a track, over the one of the settings, of vehicles,
+cyclists and pedestrians. Measured of PointRCNN on KITTI, widths of the latter two on PandaSet."""
+LOW_NOISE = 0.5
+"""Input whose centres err by less than this part of the settings is low-noise input, such as human
+labels: fits follow it more closely. Chosen."""
+DETECTED = [0, 1, 2, 5]
+"""Variables of a pose that detectors estimate, with one correlation: x, y, z, yaw."""
+LEAST_RATIO = 0.02
+"""Least estimated error over the one of the settings. Chosen."""
 
 
 def set_noise(
@@ -29,32 +40,33 @@ def set_noise(
     constants: Constants,
 ) -> None:
     """
-    Set the noise of each of `KINDS` in records `INPUTS` (K,) (M14).
+    Set the errors of each of `KINDS` in records `INPUTS` (K,) (M16), (M17).
 
     Of `normalised_residuals` of tracks (B, N, 9) of a `kind` (B,), NaN is left out, and of other
-    drives, records `NOISE` (K,). The noise of all other kinds together is the prior of each: a
-    kind of which few boxes were seen is expected to err as the others do, in proportion to the
-    settings of its kind.
+    drives, records `NOISE` (K,). The settings are the prior of all kinds together, and these of
+    each: a kind that was seen in few boxes errs as the others do, in proportion to its settings.
 
     """
-    by_kind = [
+    own = [
         pooled_noise([past[k], noise_of(residuals[kind == k], constants)])
         for k in range(len(KINDS))
     ]
-    for k, own in enumerate(by_kind):
-        others = pooled_noise(by_kind[:k] + by_kind[k + 1 :])
-        of_own, of_others = (
-            known['boxes'] / (known['boxes'] + constants.half_weight) for known in (own, others)
-        )
-        weight = of_own + (1 - of_own) * of_others
-        share = of_own / np.maximum(weight, LEAST_WEIGHT)
-        for name in ('deviation', 'correlation'):
-            inputs[name][k] = others[name] + share * (own[name] - others[name])
-        inputs['weight'][k] = weight
+    for k in range(len(KINDS)):
+        logarithms, correlation = np.zeros(9), np.full(9, constants.typical_correlation)
+        for known in (pooled_noise(own[:k] + own[k + 1 :]), own[k]):
+            share = known['boxes'] / (known['boxes'] + constants.half_weight)
+            logarithms += share * (np.log(known['deviation'].clip(LEAST_RATIO)) - logarithms)
+            correlation += share * (known['correlation'] - correlation)
+        correlation[DETECTED] = correlation[DETECTED].mean()
+        inputs['deviation'][k], inputs['correlation'][k] = np.exp(logarithms), correlation
+    of_centres = np.exp(np.log(inputs['deviation'][:, :SIZE]).mean(1))
+    inputs['low_noise'] = (of_centres / LOW_NOISE).clip(max=1.0)
+    # Trackers may hold the extents: no residual shows their errors. Those of the centre do.
+    inputs['extent_error'] = EXTENT_ERRORS * inputs['low_noise'][:, None]
 
 
 def noise_of(residuals: Floats, constants: Constants) -> NDArray[np.void]:
-    """Estimate the noise of tracks (B, N, 9) of one kind (M14), a record `NOISE`."""
+    """Estimate the noise of tracks (B, N, 9) of one kind (M16), a record `NOISE`."""
     found = np.zeros((), NOISE)
     found['boxes'] = estimate(
         np.ascontiguousarray(residuals), constants.record(), found['deviation'],

@@ -37,7 +37,7 @@ evidence
 """
 NOISE = np.dtype([('deviation', float, 9), ('correlation', float, 9), ('boxes', float)])
 """
-Noise of one kind of a drive (M14).
+Noise of one kind of a drive (M16).
 
 deviation, correlation
     Robust standard deviation about the mean of a track, along the box axes: lon lat z roll pitch

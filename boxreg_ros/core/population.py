@@ -1,33 +1,17 @@
 """
-The population of tracks: how the input errs in extents that differ from the usual ones (M16).
+The population of tracks: how the input errs in extents that differ from the usual ones (M18).
 
 docs/method.md, section Input model, has the formulas.
 
 """
 
 from boxreg_ros.core.method.constants import Constants
-from boxreg_ros.structures import Floats, Ints
+from boxreg_ros.structures import Floats
 import numpy as np
-from numpy.typing import NDArray
 
 CROSS_SLOPE_INFORMATION = 4.0
 """Prior information of slopes over the other two extents. Chosen: half the deviation of the own
 one."""
-
-
-def set_population(
-    inputs: NDArray[np.void], evidence: Floats, kind: Ints, constants: Constants
-) -> None:
-    """
-    Set the `population_slopes` of each of K kinds in records `INPUTS` (K,).
-
-    Of the `evidence` (n, 3, 3) of tracks of a `kind` (n,).
-
-    """
-    for k in set(kind.tolist()):
-        inputs['median'][k], inputs['slopes'][k] = population_slopes(
-            evidence[kind == k], constants
-        )
 
 
 def population_slopes(evidence: Floats, constants: Constants) -> tuple[Floats, Floats]:

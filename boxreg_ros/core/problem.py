@@ -247,7 +247,7 @@ class Problem(NamedTuple):
         """
         shared = np.zeros((len(self.boxes), SHARED))
         shared[:, EXTENT:BIAS] = self.mean_extents()
-        shared[:, GAP:PIVOT] = self.of_class['gaps'] + inputs['gap_correction'][self.kind]
+        shared[:, GAP:PIVOT] = self.of_class['gaps'] + inputs['margin'][self.kind]
         shared[:, PIVOT] = shared[:, EXTENT] * CONSTANTS.pivot
         return shared
 
@@ -457,17 +457,21 @@ def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, 
     return minimum, np.asarray((half_turns % 2 == 0).all(1))
 
 
+def settings_of_kinds(config: Config) -> NDArray[np.void]:
+    """Return the settings of each of `KINDS`, records `CLASS_SETTINGS` (K,)."""
+    numbers = np.array([numbers_of(getattr(config, name)) for name in KINDS], dtype=np.float64)
+    found = np.zeros(len(KINDS), CLASS_SETTINGS)
+    for field, names in SETTINGS_OF.items():
+        columns = [CLASS_NUMBERS.index(name) for name in names]
+        found[field] = numbers[:, columns].reshape(found[field].shape)
+    return found
+
+
 def _of_classes(windows: Sequence[Window], config: Config) -> tuple[Ints, NDArray[np.void]]:
     """Return kind (B,) and settings of the class of each window."""
     kinds = {name: config.kind(name) for name in {window.class_name for window in windows}}
     kind = np.array([KINDS.index(kinds[window.class_name]) for window in windows])
-    numbers = np.array([numbers_of(getattr(config, name)) for name in KINDS], dtype=np.float64)
-
-    found = np.zeros(len(kind), CLASS_SETTINGS)
-    for field, names in SETTINGS_OF.items():
-        columns = [CLASS_NUMBERS.index(name) for name in names]
-        found[field] = numbers[kind][:, columns].reshape(found[field].shape)
-    return kind, found
+    return kind, settings_of_kinds(config)[kind]
 
 
 def resolve_headings(

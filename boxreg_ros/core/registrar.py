@@ -220,7 +220,7 @@ class BoxRegistrar:
         kinds = [getattr(self.config, kind) for kind in KINDS]
         of_settings = np.array([[getattr(kind, name) for name in names] for kind in kinds])
         inputs = self._input_model.inputs(self.config, with_noise=False)
-        margins: Floats = of_settings + inputs['gap_correction']
+        margins: Floats = of_settings + inputs['margin']
         return margins
 
     def statistics(self, name: str = '') -> Drives:

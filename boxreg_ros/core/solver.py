@@ -16,7 +16,6 @@ from boxreg_ros.core.lbfgs import HISTORY, minimize
 from boxreg_ros.core.method import round as method
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, Posterior, PRIOR, SHARED, Solution
 from boxreg_ros.core.method.constants import Constants
-from boxreg_ros.core.population import set_population
 from boxreg_ros.core.problem import Problem
 from boxreg_ros.core.threads import run, shared_between
 from boxreg_ros.structures import Floats, Ints, POSE
@@ -135,7 +134,14 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
             rows = rows[~is_done]
             turn += 1
             if plan.estimates_noise:
-                inputs = _from_batch(batch, inputs, model, turn, config)
+                if turn <= NOISE_ROUNDS:
+                    extents = batch.solution.shared[:, EXTENT:BIAS]
+                    residuals = normalised_residuals(problem, batch.solution.poses, extents)
+                if turn == NOISE_ROUNDS:
+                    model.add_noise(residuals, problem.kind)
+                inputs = model.inputs(
+                    config, fits=(residuals, batch.solution.evidence, problem.kind)
+                )
     return batch.solution
 
 
@@ -232,22 +238,3 @@ class Objective(NamedTuple):
         run(method.precondition, len(found), self.rows[part.numpy()], self.sums.factor,
             found.numpy())  # fmt: skip
         return found
-
-
-def _from_batch(
-    batch: Batch, inputs: Inputs, model: InputModel, turn: int, config: Config
-) -> Inputs:
-    """Return the estimates of the input with those of the batch itself, after a round."""
-    problem, _, _, solution = batch
-    inputs = inputs.copy()
-    if config.ingredients.noise_estimation and turn <= NOISE_ROUNDS:
-        extents = solution.shared[:, EXTENT:BIAS]
-        residuals = normalised_residuals(problem, solution.poses, extents)
-        model.set_noise(inputs, residuals, problem.kind)
-        if turn == NOISE_ROUNDS:
-            model.add_noise(residuals, problem.kind)
-    if config.ingredients.population_extents:
-        evidence, kind = model.extent_evidence()
-        evidence = np.concatenate([evidence, solution.evidence])
-        set_population(inputs, evidence, np.concatenate([kind, problem.kind]), model.constants)
-    return inputs

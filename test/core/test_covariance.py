@@ -2,23 +2,19 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.method import constants
-from boxreg_ros.core.method.arrays import COMMON
+from boxreg_ros.core.method.arrays import COMMON, EXTENT, GAP, PIVOT
 from boxreg_ros.core.method.covariance import (
-    empty_covariance_work,
     fill_extent_covariance,
     fill_face_distances,
-    fill_information_of_faces,
-    fill_underrated_information,
-    remove_means,
-    variance_of_mean,
+    fill_unclaimed,
 )
 from boxreg_ros.core.method.residuals import TERMS
 from boxreg_ros.core.refine import refine
 import numpy as np
-import pytest
 from scenes import drive, shared_of, simulated, track_of
 
-RECORD = constants.CONSTANTS.with_settings(Config()).record()
+CONSTANTS = constants.CONSTANTS
+RECORD = CONSTANTS.with_settings(Config()).record()
 
 
 def refined_tracks():
@@ -52,70 +48,66 @@ def test_extent_covariances_are_symmetric_and_positive():
         assert (np.linalg.eigvalsh(matrices) > 0).all()
 
 
-def extent_variances(deviation, error, is_free=1.0, measured=0.1):
-    """Return variances of extents with priors `deviation`, each `measured` once [m]."""
-    deviations, errors = np.full(23, deviation), np.full(15, error)
-    inverse = np.diag(1 / (deviations**-2 + measured**-2))
-    free = np.full(23, is_free)
-    underrated, found = np.empty(15), np.empty((3, 3))
-    fill_underrated_information(deviations, errors, deviations**-2, free, underrated)
-    fill_extent_covariance(inverse, free, errors, underrated, found)
-    return found.diagonal()
+def unclaimed(visibility=0.0, variance=0.0, extent=0.0, count=40, marginalised=0.0):
+    """Return the weights of extents and margins of 5 cm, and what (M28) adds to (M26)."""
+    terms, common = np.zeros(count, TERMS), np.zeros((), COMMON)[()]
+    terms['visibility'] = visibility
+    common['margin_variance'], common['unclaimed'][:3] = variance, extent
+    common['W_shared'] = 0.05**-2
+    G = np.empty((PIVOT, PIVOT))
+    fill_unclaimed(count, marginalised, terms, common, 0.0, RECORD, G)
+    return 0.05**-2, G
 
 
-def test_a_prior_that_is_too_tight_is_no_evidence():
-    # An extent with prior weight w = 1 / .05^2 and one measurement of information m = 1 / .1^2 is
-    # (w a + m b) / (w + m): the errors of a and b are .2 and .1 m.
-    w, m = 0.05**-2, 0.1**-2
-    known = (w**2 * 0.2**2 + m) / (w + m) ** 2
-    np.testing.assert_allclose(extent_variances(0.05, 0.2), known)
+def covariance_of(columns, free=1.0, G=None, deviation=0.0, variance=0.0):
+    """Return the covariance of the extents by columns (23, 23) of the inverse curvature."""
+    common, found = np.zeros((), COMMON)[()], np.empty((3, 3))
+    common['deviation'], common['unclaimed'] = deviation, variance
+    G = np.zeros((PIVOT, PIVOT)) if G is None else G
+    fill_extent_covariance(columns, np.full(23, free), common, G, found)
+    return found
 
 
-def test_a_prior_that_holds_leaves_the_inverse_curvature():
-    np.testing.assert_allclose(extent_variances(0.05, 0.05), 1 / (0.05**-2 + 0.1**-2))
+def test_the_error_of_the_margin_of_a_kind_is_common_to_opposite_faces():
+    # Points are on both sides of a box: its width errs by twice the error of the margin where
+    # the prior is exact, else by a share; the sum of two margins with the variances V + s^2.
+    V = 0.03**2
+    W, G = unclaimed(variance=V)
+    known = W**2 * V * np.kron(np.diag([1.0, 1.0, 0.0]), np.ones((2, 2)))
+    known[4:, 4:] = W**2 * V * np.eye(2)
+    np.testing.assert_allclose(G[GAP:, GAP:], known)
+    # Sides are seen exactly: width = 2 y + g + g', and margins are free within their prior.
+    columns = np.zeros((23, 23))
+    columns[1, 1] = 2 * 0.05**2
+    columns[1, GAP + 2] = columns[1, GAP + 3] = 0.05**2
+    np.testing.assert_allclose(covariance_of(columns, G=G)[1, 1], 2 * 0.05**2 + 4 * V)
+
+
+def test_errors_of_extents_that_no_weight_claims():
+    # A fit that follows the input, whose prior claims 5 cm: the variances add up.
+    W, G = unclaimed(extent=[0.01, 0.02, 0.03])
+    columns = np.zeros((23, 23))
+    columns[EXTENT : EXTENT + 3, EXTENT : EXTENT + 3] = np.eye(3) / W
+    found = covariance_of(columns, G=G)
+    np.testing.assert_allclose(found, np.diag([0.01, 0.02, 0.03]) + 0.05**2 * np.eye(3))
+
+
+def test_correlated_residuals_of_a_face_are_an_error_of_its_margin():
+    # 40 observations in the window and 40 before it, of weight 1/2, count as 40 independent ones;
+    # correlated by c as one in (1 + c) / (1 - c).
+    c = CONSTANTS.residual_correlation
+    W, G = unclaimed(visibility=[0.5, 0, 0, 0, 0, 0], marginalised=40.0)
+    known = W**2 * Config().faces.ends ** 2 / 40 * ((1 + c) / (1 - c) - 1)
+    np.testing.assert_allclose(G[GAP:, GAP:], np.diag([known, 0, 0, 0, 0, 0]))
 
 
 def test_fixed_extents_have_the_errors_of_the_input():
-    np.testing.assert_allclose(extent_variances(0.05, 0.2, is_free=0.0), 0.2**2)
+    found = covariance_of(np.eye(23), free=0.0, deviation=0.2, variance=0.01)
+    np.testing.assert_allclose(found, 0.05 * np.eye(3))
     for track in refine(simulated('street', 0).tracks()[:2], Config(extent='fixed')):
         deviations = np.sqrt(np.diagonal(track.extent_covariances, axis1=1, axis2=2))
         assert (deviations > 0.01 * track.boxes[:, 3:6]).all()
         assert (deviations < 0.2 * track.boxes[:, 3:6]).all()
-
-
-def test_scattered_residuals_of_faces_by_hand():
-    # Of a face that is visible in 40 observations, whose residuals alternate about 0.03 m: they
-    # are not correlated. Their scatter has the weight 40, the one of the settings 14.
-    terms, work = np.zeros(40, TERMS), empty_covariance_work(40)
-    terms['visibility'][:, 0] = 1.0
-    distances = np.zeros((40, 6))
-    distances[:, 0] = 0.03 + 0.06 * np.tile([1.0, -1.0], 20)
-    claimed = Config().faces.ends ** 2
-    work.claimed[:], work.underrated[:] = claimed, 0.0
-    remove_means(40, terms, distances, work)
-    fill_information_of_faces(40, 0.0, terms, np.full(6, 0.05), RECORD, work)
-    measured = 0.06**2 / (1 - 1 / 40)  # the mean of the window removes part of it
-    known = ((40 * measured + 14 * claimed) / 54 - claimed) / 40 / 0.05**4
-    np.testing.assert_allclose(work.underrated[9:15], [known, *[0] * 5], rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ('correlation', 'count'), [(0.0, 3000), (0.5, 3000), (0.8, 3000), (0.8, 2)]
-)
-def test_variance_of_the_mean_of_correlated_residuals(correlation, count):
-    rng = np.random.default_rng(0)
-    residuals, noise = np.zeros((count, 6)), rng.normal(size=(count, 6))
-    for i in range(1, count):
-        residuals[i] = correlation * residuals[i - 1] + noise[i]
-    terms, work = np.zeros(count, TERMS), empty_covariance_work(count)
-    terms['visibility'], work.claimed[:] = 1.0, 1.0
-    remove_means(count, terms, residuals, work)
-    found = variance_of_mean(count, terms, RECORD, work)
-    known = (1 + correlation) / (1 - correlation)
-    if count < 10:  # nearly the usual correlation
-        assert 1.5 < found < 5
-    else:
-        np.testing.assert_allclose(found, known, rtol=0.1)
 
 
 def test_residuals_of_faces_are_from_the_margins_of_other_tracks():

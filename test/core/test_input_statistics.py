@@ -21,7 +21,7 @@ def taught(seed, margin=0.02, tracks=20, drives=None, name=''):
     names = [str(i) for i in range(tracks)]
     shown = np.zeros((tracks, 5), TERMS)
     gaps = margin + 0.06 * rng.normal(size=(tracks, 6))
-    shown['distance'] = model.inputs(Config())['gap_correction'][0] - gaps[:, None]
+    shown['distance'] = model.inputs(Config())['margin'][0] - gaps[:, None]
     shown['visibility'], shown['num_points'] = 1.0, 100
     boxes = np.zeros((tracks, 5, 9))
     boxes[..., 3:6] = rng.normal([4.4, 1.8, 1.5], 0.1, (tracks, 1, 3))
@@ -31,7 +31,7 @@ def taught(seed, margin=0.02, tracks=20, drives=None, name=''):
 
 def first_margins(seed, drives):
     """Return the margins of a drive of three tracks that begins with `drives`."""
-    return taught(seed, tracks=3, drives=drives).inputs(Config())['gap_correction'][0]
+    return taught(seed, tracks=3, drives=drives).inputs(Config())['margin'][0]
 
 
 def test_a_file_has_the_same_bytes_in_any_order_of_joining():
@@ -47,11 +47,9 @@ def test_a_model_begins_with_what_other_drives_have_shown():
     # Their 60 tracks give the margin before the first box, and it stays with few own tracks.
     together = joined(taught(seed).statistics(f'drive {seed}') for seed in range(3))
     fresh = InputModel(Config().faces, together).inputs(Config())[0]
-    np.testing.assert_allclose(fresh['gap_correction'][:4], 0.02, atol=0.012)
+    np.testing.assert_allclose(fresh['margin'][:4], 0.02, atol=0.012)
     errors = [
-        np.abs(
-            taught(seed, tracks=3, drives=known).inputs(Config())['gap_correction'][0] - 0.02
-        ).max()
+        np.abs(taught(seed, tracks=3, drives=known).inputs(Config())['margin'][0] - 0.02).max()
         for known in (None, together)
         for seed in (7, 8, 9)
     ]

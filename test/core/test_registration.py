@@ -174,13 +174,14 @@ def test_observations_update_the_margins_once():
     model = InputModel(config.faces)
     many = [window(drive(12), seed, config, str(seed)) for seed in range(4)]
     register(many, config, model)
-    known = model.inputs(config)['gap_correction']
-    assert np.abs(known - InputModel(config.faces).inputs(config)['gap_correction']).max() > 1e-4
+    known = [row.tolist() for row in model.gaps_of_tracks(range(6))]
+    unknown = InputModel(config.faces).inputs(config)['margin']
+    assert np.abs(model.inputs(config)['margin'] - unknown).max() > 1e-4
     again = [
         w._replace(num_new=0, observations=w.observations[-4:], start=given(w)[-4:]) for w in many
     ]
     register(again, config, model)
-    np.testing.assert_array_equal(model.inputs(config)['gap_correction'], known)
+    assert [row.tolist() for row in model.gaps_of_tracks(range(6))] == known
 
 
 @pytest.mark.parametrize('length', [9, 13, 16])
@@ -192,8 +193,9 @@ def test_each_box_counts_once_in_the_noise(length):
         seen = whole.observations[max(0, end - 10) : end]
         register([whole._replace(observations=seen, num_new=len(seen))], ALONE, model)
     counted = length - 9
-    known = counted / (counted + 14) if counted >= 5 else 0.0
-    np.testing.assert_allclose(model.inputs(ALONE)['weight'][0], known)
+    known = counted if counted >= 5 else 0
+    (taught,) = model.statistics('one').values()
+    np.testing.assert_allclose(taught[0].noise['boxes'], known)
 
 
 def test_short_windows_have_no_estimate():

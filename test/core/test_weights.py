@@ -1,14 +1,10 @@
 """Expectation and weights of one window, from input whose noise is known."""
 
-from boxreg_ros.config import Config, KINDS
+from boxreg_ros.config import Config
 from boxreg_ros.core.method.arrays import BIAS, COMMON, EXTENT, GAP, PIVOT
 from boxreg_ros.core.method.assemble import empty_axes, weigh
 from boxreg_ros.core.method.constants import CONSTANTS, RESIDUAL_NAMES
-from boxreg_ros.core.method.expectation import (
-    CONSTANT_EXTENT_ERRORS,
-    empty_expectation_work,
-    expect,
-)
+from boxreg_ros.core.method.expectation import expect, EXTENT_TAILS
 from boxreg_ros.core.method.residuals import empty_linearised, TERMS
 from boxreg_ros.core.method.weights import fill_parked, robustify
 import numpy as np
@@ -23,7 +19,7 @@ def expected_of(problem, inputs=None, b=0):
     """Return the record `COMMON` of window `b` before its points are used."""
     common = np.zeros(len(problem.boxes), COMMON)
     inputs = no_inputs() if inputs is None else inputs
-    expect(b, problem, inputs[problem.kind[b]], RECORD, empty_expectation_work(), common[b])
+    expect(b, problem, inputs[problem.kind[b]], RECORD, np.empty(3), common[b])
     return common[b]
 
 
@@ -57,7 +53,7 @@ def test_means_of_shared_variables_by_hand():
     problem = car_problem(boxes, lengths=[3], marginalised_extents=[[8.6, 4.0, 3.0, 2.0]])
     problem.of_class['gaps'] = gaps
     beyond = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
-    found = expected_of(problem, no_inputs(gap_correction=beyond))['shared']
+    found = expected_of(problem, no_inputs(margin=beyond))['shared']
     known = np.zeros(23)
     known[EXTENT:BIAS] = [4.3, 2.0, 1.5]
     known[GAP:PIVOT] = gaps + beyond
@@ -65,68 +61,60 @@ def test_means_of_shared_variables_by_hand():
     np.testing.assert_allclose(found, known, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ('weight', 'fast', 'slow'),
-    [
-        (0.0, 0.235 / 0.3, 1.0),
-        (0.5, 2.5**0.5 * 0.1425 / 0.3, 2.5**0.5),
-        (1.0, 2 * 0.05 / 0.3, 2.0),
-    ],
-)
-def test_expected_bias_by_hand(weight, fast, slow):
-    # Twice as wide as expected, correlated by 0.2 where 0.385 is usual: weight 1/2 lies
-    # between, at 0.2925, and at (1 + 4) / 2 times the power. A bias is in proportion to that
-    # deviation and to what the correlation is above 0.15, up to 0.45, over a tenth of a second:
-    # at 2 Hz the fifth root of all three is.
+def test_errors_of_the_input_by_hand():
+    # Twice as wide as usual, correlated by 0.5 over 0.1 s: the deviation of the mean of many is
+    # widened by sqrt(1.5 / 0.5), and biases are as large as errors that change, for yaw half as
+    # large. At 2 Hz what is correlated by 0.5^5 over 0.5 s was correlated by 0.5 over 0.1 s.
     times = np.arange(6) * np.array([[0.1], [0.5]])
     problem = car_problem(np.broadcast_to(drive(6), (2, 6, 9)), times=times)
-    inputs = no_inputs(deviation=2.0, correlation=0.2, weight=weight)
-    for b, part in enumerate((fast, slow)):
-        bias = expected_of(problem, inputs, b)['deviation'][BIAS:GAP] / problem.of_class['pose'][b]
-        np.testing.assert_allclose(bias, part * np.array([1, 1, 1, 1, 1, 0.5]), rtol=1e-9)
+    usual, extent = problem.of_class['pose'][0], CONFIG.vehicle.extent
+    for b, correlation in enumerate((0.5, 0.5**5)):
+        inputs = no_inputs(deviation=2.0, correlation=correlation, extent_error=[0.5, 1.0, 2.0])
+        found = expected_of(problem, inputs, b)
+        wide = 2 * np.sqrt((1 + correlation) / (1 - correlation))
+        np.testing.assert_allclose(found['pose_deviation'], 2 * usual)
+        np.testing.assert_allclose(found['widened_deviation'], wide * usual)
+        np.testing.assert_allclose(found['deviation'][BIAS:GAP], usual * [2, 2, 2, 2, 2, 1])
+        known = drive(1)[0, 3:6] * extent * [0.5, 1.0, 2.0]
+        np.testing.assert_allclose(found['deviation'][EXTENT:BIAS], known)
+        # The mean of six errs by more: long tails, and errors that change.
+        of_mean = (wide * drive(1)[0, 3:6] * extent) ** 2 / 6
+        beyond = (np.square(EXTENT_TAILS) - 1) * known**2 + of_mean
+        np.testing.assert_allclose(found['unclaimed'][:BIAS], beyond)
 
 
-def test_low_noise_input_is_held_and_its_margins_differ_more():
-    # A hundredth of the usual error: the least bias, extents within a fifth of the usual error,
-    # and margins that differ by nearly twice as much.
+def test_low_noise_input_is_held_closer_than_it_errs():
     problem = car_problem(drive(6)[None])
-    found = expected_of(problem, no_inputs(deviation=0.01, correlation=0.9, weight=1.0))
-    bias = found['deviation'][BIAS:GAP] / problem.of_class['pose'][0]
-    np.testing.assert_allclose(bias, [0.1, 0.1, 0.1, 0.1, 0.1, 0.05], rtol=1e-9)
-    extents = found['deviation'][EXTENT:BIAS] / drive(1)[0, 3:6] / CONFIG.vehicle.extent
-    np.testing.assert_allclose(extents, 0.2, rtol=1e-9)
-    np.testing.assert_allclose(found['deviation'][GAP:PIVOT], 1.8 * CONFIG.vehicle.gap_spread)
+    usual, low = (expected_of(problem, no_inputs(low_noise=part)) for part in (1.0, 0.5))
+    for name in ('pose_deviation', 'widened_deviation'):
+        np.testing.assert_allclose(low[name], usual[name] / 4)
+    bias = usual['deviation'][BIAS:GAP]
+    np.testing.assert_allclose(low['deviation'][BIAS:GAP], bias / 4)
+    np.testing.assert_allclose(low['unclaimed'][BIAS:], bias**2 * (1 - 1 / 16))
+    extents = usual['deviation'][EXTENT:BIAS]
+    np.testing.assert_allclose(low['deviation'][EXTENT:BIAS], extents / 2)
+    total = [c['unclaimed'][:BIAS] + c['deviation'][EXTENT:BIAS] ** 2 for c in (usual, low)]
+    np.testing.assert_allclose(*total)
 
 
-def test_errors_of_the_input_by_hand():
-    # The mean of six extents, correlated by 0.2, errs by sqrt(1.2 / 0.8 / 6) = 1/2 of the measured
-    # error. Constant errors count by how far the correlation is above 0.15, of 0.3: 1/6. Biases
-    # likewise. The error of low-noise input is not lowered here. Detectors set roll and pitch to
-    # zero: how correlated their residuals are makes no difference.
-    problem, car = car_problem(drive(6)[None]), CONFIG.vehicle
-    correlation = np.full(9, 0.2)
-    correlation[3:5] = 0.9
-    for size in (2.0, 0.2):
-        inputs = no_inputs(deviation=size, correlation=correlation, weight=1.0)
-        found = expected_of(problem, inputs)['error']
-        constant = np.array(CONSTANT_EXTENT_ERRORS[0]) / 6
-        extent = drive(1)[0, 3:6] * car.extent * np.hypot(constant, 0.5)
-        bias = problem.of_class['pose'][0] * np.array([1, 1, 1, 1, 1, 0.5]) / 6
-        known = size * np.concatenate([extent, bias])
-        measured = [0, 1, 2, 3, 4, 5, 8]
-        np.testing.assert_allclose(found[measured], known[measured], rtol=1e-9)
+def test_independent_errors_have_nearly_no_constant_part():
+    problem = car_problem(drive(6)[None])
+    found = expected_of(problem, no_inputs(correlation=0.0))['deviation'][BIAS:GAP]
+    usual = problem.of_class['pose'][0]
+    np.testing.assert_allclose(found, usual * [0.1, 0.1, 0.1, 0.1, 0.1, 0.05])
 
 
-def test_held_extents_have_the_constant_errors_of_a_published_detector():
-    # Their scatter shows none. Those of input with less than 0.4 of the usual noise are smaller.
-    kind = KINDS.index('pedestrian')
-    of_class = settings_of(CONFIG.pedestrian)
-    problem = problem_of(drive(6)[None], kind=[kind], of_class=of_class)
-    for size, constant in ((2.0, 2.0), (0.5, 1.0), (0.2, 0.5)):
-        found = expected_of(problem, no_inputs(deviation=size, weight=1.0))['error'][:3]
-        ratios = np.array(CONSTANT_EXTENT_ERRORS[kind])
-        usual = drive(1)[0, 3:6] * CONFIG.pedestrian.extent
-        np.testing.assert_allclose(found, usual * np.hypot(constant * ratios, size / 6**0.5))
+def test_margins_differ_as_those_of_like_objects_do():
+    # Margins of cars that differ half as much as expected: those of a car do, too; those of a
+    # truck as the settings say, since its squared distance from cars counts 12 times.
+    problem = car_problem(np.concatenate([drive(6)[None], drive(6)[None]]))
+    problem.boxes[1, :, 3:6] *= np.array([4.0, 2.0, 2.0])
+    median = np.log(problem.boxes[0, 0, 3:6])
+    inputs = no_inputs(spread=0.5, median=median, margin_variance=0.02**2)
+    usual = CONFIG.vehicle.gap_spread
+    car, truck = (expected_of(problem, inputs, b)['deviation'][GAP:PIVOT] for b in (0, 1))
+    np.testing.assert_allclose(car, usual / 2)
+    np.testing.assert_allclose(truck, usual * np.sqrt(1 - 0.75 / 12.53), rtol=1e-3)
 
 
 def test_a_pinned_box_holds_extents_and_leaves_no_bias():
@@ -146,8 +134,8 @@ def test_a_pinned_box_holds_extents_and_leaves_no_bias():
 def test_robust_prior_of_labelling_margins_by_hand():
     # Points 0.3 m above the roofs of two boxes of three, all of weight 1; the left side
     # has been found with a gap 0.1 m wider than expected, 2 of its deviations; on the other faces
-    # all is as expected. An input correlated as usual, by 0.385, has biases of
-    # (0.385 - 0.15) / 0.3 of its errors, and so for extents, half of which a face moves by.
+    # all is as expected. An input correlated as usual, by 0.385, has biases as large
+    # as its errors; a face moves by half of the error of an extent.
     problem, car = car_problem(drive(3)[None]), CONFIG.vehicle
     common = expected_of(problem)
     visibility, distance = np.ones((3, 6)), np.zeros((3, 6))
@@ -155,8 +143,7 @@ def test_robust_prior_of_labelling_margins_by_hand():
     shared = common['shared'].copy()
     shared[GAP + 2] += 2 * car.gap_spread
     _, found = weighed(problem, common, shared, visibility=visibility, distance=distance)
-    part, height = (0.385 - 0.15) / 0.3, drive(1)[0, 5]
-    z, half = part * car.height, part * car.extent * height / 2
+    z, half = car.height, car.extent * drive(1)[0, 5] / 2
     known = np.full(6, car.gap_spread)
     known[2] *= 2**0.5
     known[4] *= (1 + 0.3**2 / (car.gap_spread**2 + z**2 + half**2) / 4) ** 0.5

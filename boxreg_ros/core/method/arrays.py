@@ -34,7 +34,8 @@ COMMON = np.dtype(
         ('pose_deviation', float, POSE),
         ('widened_deviation', float, POSE),
         ('unmodelled_bias', float, POSE),
-        ('error', float, PIVOT),
+        ('unclaimed', float, GAP),
+        ('margin_variance', float, 6),
         ('W_shared', float, SHARED),
         ('prior_mean', float, PRIOR),
         ('W_prior', float, (PRIOR, PRIOR)),
@@ -45,14 +46,16 @@ COMMON = np.dtype(
 What the observations of a window have in common in one round.
 
 shared, deviation
-    Expected means and deviations of the shared variables before points are used (M15), (23,).
+    Expected means and deviations of the shared variables before points are used (M14), (23,).
 pose_deviation, widened_deviation
     Deviation of the input poses along the axes of their boxes, without their bias; the same,
     widened for the correlation of the errors of neighbours, (6,) [m, rad].
 unmodelled_bias
     Deviation of the bias of windows with a pinned box, where no bias is estimated; else 0, (6,).
-error
-    Deviations of the errors of mean input extents, bias and margins, as far as known (M28), (15,).
+unclaimed
+    Variances of the errors of mean input extents and bias beyond those of `deviation` (M28), (9,).
+margin_variance
+    Of the margins of the kind, which all its tracks have in common (M15), (6,) [m^2].
 W_shared
     Weights of the shared variables (M8), (23,).
 prior_mean, W_prior
@@ -63,34 +66,36 @@ INPUTS = np.dtype(
     [
         ('deviation', float, 9),
         ('correlation', float, 9),
-        ('weight', float),
-        ('gap_correction', float, 6),
+        ('extent_error', float, 3),
+        ('low_noise', float),
+        ('margin', float, 6),
+        ('spread', float, 6),
+        ('margin_variance', float, 6),
         ('occlusion_inset', float, 6),
         ('range_inset', float, 6),
         ('median', float, 3),
         ('slopes', float, (3, 3)),
-        ('gap_variance', float, 6),
-        ('gap_tracks', float, 6),
-        ('gap_noise', float, 6),
     ],
     align=True,
 )
 """
-Estimated errors of the input of a stream, for one kind of objects.
+The model of the input of a stream, for one kind of objects.
 
 deviation, correlation
-    Of poses along the box axes and of extents (M14): deviation about the mean of a track, in units
-    of that of the settings; correlation from one observation to the next, (9,).
-weight
-    Of this noise against the settings: 0 without observations, near 1 after many.
-gap_correction, occlusion_inset, range_inset
-    Labelling margin of each face less the one of the settings; how much further inside the points
-    of an occluded face are, and those of an object 70 m away, (6,) [m].
+    Of the errors of poses along the box axes and of extents that change along a track (M16):
+    deviation in units of the settings; correlation from one observation to the next, (9,).
+extent_error
+    Deviation of the errors of extents that are constant along a track, in the same units, (3,).
+low_noise
+    Factor for low-noise input (M17), 1 for others.
+margin, margin_variance, spread
+    Labelling margin of each face less the one of the settings [m], the variance of this estimate
+    [m^2], and the deviation between tracks, in units of the settings (M15), (6,).
+occlusion_inset, range_inset
+    How much further inside the points of an occluded face are, and those of an object 70 m away,
+    (6,) [m].
 median, slopes
-    Of the population of extents (M16), (3,) and (3, 3); slopes are 0 where there is none.
-gap_variance, gap_tracks, gap_noise
-    Between the gaps of tracks (M18a): variance [m^2], number of tracks, and the share of the
-    variance of an observation in that of the mean of a track, (6,).
+    Of the population of extents (M18), (3,) and (3, 3); slopes are 0 where there is none.
 """
 
 
@@ -151,7 +156,7 @@ class Solution(NamedTuple):
     poses, shared : array, shapes (B, N, 6) and (B, 23)
         Boxes, and the variables that all observations of a window share.
     evidence : array, shape (B, 3, 3)
-        Evidence of the points about the extents (M17): logarithms of the input extents;
+        Evidence of the points about the extents (M18): logarithms of the input extents;
         corrections by the points alone; their weights.
     posterior : Posterior
         Of windows that are done.

@@ -119,21 +119,15 @@ class Constants(NamedTuple):
     max_lost_part: float = 0.5
     """A refined box may hold fewer points than its input box, by this part and 3. Chosen."""
 
-    # Expectation (M15) to (M17)
+    # Model of the input (M16) to (M18)
     typical_correlation: float = 0.385
     """Correlation of the errors of consecutive observations before any was estimated. Chosen:
     `(1 + c) / (1 - c)` is 1.5 squared."""
     correlation_interval: float = 0.1
-    """Time over which the errors of biased input are correlated [s]. Chosen."""
-    white_correlation: float = 0.15
-    """Input whose errors are correlated by less over that time has nearly no bias. Chosen."""
-    correlation_span: float = 0.3
-    """Above `white_correlation` by this much, the bias is as large as the error. Chosen."""
-    low_noise_ratio: float = 0.4
-    """Input with less than this part of its usual error is low-noise input, such as human labels.
-    Chosen."""
+    """Time over which errors that persist are correlated [s]. Chosen."""
     yaw_bias: float = 0.5
-    """Bias of the input yaw over that of the other variables, in deviations. Chosen."""
+    """Bias of the input yaw over that of the other variables. Measured of PointRCNN on KITTI: 1.1
+    over 2.1 degrees."""
     population_radius: float = 0.5
     """Distance in logarithms of extents at which objects have weight 1/2 for each other.
     Chosen."""
@@ -146,19 +140,18 @@ class Constants(NamedTuple):
     min_extent_gain: float = 0.2
     """Least part of the information about an extent that points provide as evidence. Chosen."""
 
-    # Noise of the input (M14)
+    # Errors that change (M16)
     min_observations: int = 5
     """Fewest observations of a track that noise is estimated from. Chosen."""
     half_weight: float = 14.0
-    """Observations with which an estimated noise has weight 1/2. Chosen."""
+    """Observations, or tracks, that settings count for where errors or margins are estimated.
+    Chosen."""
     max_correlation: float = 0.9
     """Largest correlation of consecutive errors. Chosen."""
     min_left: float = 0.3
     """Least part of a variance that the mean of a track is taken to leave. Chosen."""
 
-    # Labelling margins (M18)
-    min_gap_deviation: float = 0.02
-    """Added to the interquartile range of margins: few tracks may agree by chance [m]. Chosen."""
+    # Labelling margins
     max_gap: float = 0.5
     """No margin is estimated from points further from where they are expected [m]. Chosen."""
     min_box_points: int = 30

@@ -1,25 +1,13 @@
-"""Covariances of one window (M26, M28), and the residuals of its faces: once, at its end."""
+"""Covariances of one window (M26), and the residuals of its faces: once, at its end."""
 
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import EXTENT, GAP
+from boxreg_ros.core.method.arrays import EXTENT, GAP, PIVOT
 from boxreg_ros.core.method.compile import kernel
-from boxreg_ros.core.method.expectation import clamp, HEADING, SIZE
+from boxreg_ros.core.method.expectation import FACES, HEADING, SIZE
 from boxreg_ros.core.method.rotation import fill_rotation
 from boxreg_ros.core.method.weights import face_deviation
 import numpy as np
-
-FACES = 6
-CORRELATED_FACES = (1.0, 1.0, 0.0, 0.0, 1.0, 1.0)
-"""Faces whose correlation counts. Measured: the spread of the margins of the sides, `gap_spread`,
-covers theirs; with them too, normalised squared errors across are 0.3 on simulated data."""
-MIN_POWER = 1e-12
-"""Errors with a smaller variance do not change along a track [m^2, rad^2]. Derived: rounding."""
-MIN_WEIGHT = 1e-9
-"""Faces with less weight in total have no residuals. Derived: rounding."""
-UNDERRATED = GAP + FACES
-"""Shared variables of (M28), the first ones: extents, bias, margins."""
-
 
 MIN_DURATION = 1e-3
 """Least time between two observations [s]. Derived: stamps of one sweep are equal or further."""
@@ -41,40 +29,6 @@ class Inverse(NamedTuple):
     poses: Any
     border: Any
     corner: Any
-
-
-class CovarianceWork(NamedTuple):
-    """
-    Arrays that the covariances of one window work in.
-
-    Attributes
-    ----------
-    R : array, shape (3, 3)
-        Axes of a box.
-    off_mean : array, shape (N, 6)
-        Residuals of the faces from their mean over the window [m].
-    total, count, claimed : array, shape (6,)
-        Of each face: weight and number of its observations; their variance by these weights.
-    underrated : array, shape (15,)
-        Information of (M28) for extents, bias and margins.
-
-    """
-
-    R: Any
-    off_mean: Any
-    total: Any
-    count: Any
-    claimed: Any
-    underrated: Any
-
-
-@kernel
-def empty_covariance_work(N):
-    """Return the arrays for a window of N observations."""
-    return CovarianceWork(
-        np.empty((3, 3)), np.empty((N, FACES)), np.empty(FACES), np.empty(FACES), np.empty(FACES),
-        np.empty(UNDERRATED),
-    )  # fmt: skip
 
 
 @kernel
@@ -99,85 +53,53 @@ def fill_face_distances(boxes, poses, shared, expected, terms, R, distances):
 
 
 @kernel
-def remove_means(length, terms, distances, work):
-    """Write the residuals of a window less their weighted mean, and the sums of its weights."""
+def fill_unclaimed(length, marginalised, terms, common, shape, constants, G):
+    """
+    Write the covariance (15, 15) of the gradient by shared variables that no weight claims.
+
+    The mean of input extents has the errors that change, too; biases of low-noise input are held
+    closer than they err. The margin of a kind has an error,
+    which opposite faces have in common. Consecutive residuals of a face are correlated: the error
+    of their mean is one of its margin (M28).
+
+    """
+    c, W = constants.residual_correlation, common.W_shared
+    G[:] = 0.0
+    for k in range(GAP):
+        G[k, k] = W[k] ** 2 * common.unclaimed[k]
     for face in range(FACES):
-        total, count, mean = 0.0, 0, 0.0
+        total = 0.0
         for n in range(length):
             total += terms[n].visibility[face]
-            count += terms[n].visibility[face] > 0.0
-            mean += terms[n].visibility[face] * distances[n, face]
-        mean /= max(total, MIN_WEIGHT)
-        for n in range(length):
-            work.off_mean[n, face] = distances[n, face] - mean
-        work.total[face] = total
-        work.count[face] = count
-
-
-@kernel
-def weight_of(count, half_weight):
-    """Return the weight of what `count` observations show against what is usual."""
-    return count / (count + half_weight)
-
-
-@kernel
-def variance_of_mean(length, terms, constants, work):
-    """Return the variance of the mean of many residuals over that of independent ones."""
-    power, products = 0.0, 0.0
-    for n in range(length - 1):
-        for face in range(FACES):
-            if terms[n].visibility[face] > 0.0 and terms[n + 1].visibility[face] > 0.0:
-                first, second = work.off_mean[n, face], work.off_mean[n + 1, face]
-                power += (first**2 + second**2) / 2 / work.claimed[face]
-                products += first * second / work.claimed[face]
-    faces = 0
-    for face in range(FACES):
-        faces += work.count[face] > 0
-    n = max(work.count.sum() / max(faces, 1), 1.0)
-    unbiased = (products / max(power, MIN_POWER) + 1 / n) / max(1 - 4 / n, constants.min_left)
-    usual = constants.residual_correlation
-    correlation = usual + weight_of(n, constants.half_weight) * (unbiased - usual)
-    correlation = clamp(correlation, 0.0, constants.max_correlation)
-    return (1 + correlation) / (1 - correlation)
-
-
-@kernel
-def fill_information_of_faces(length, marginalised, terms, spread, constants, work):
-    """Add the information of the labelling margins for the errors of faces (M28), (6,)."""
-    of_mean = variance_of_mean(length, terms, constants, work)
-    for face in range(FACES):
-        total, count, claimed = work.total[face], work.count[face], work.claimed[face]
-        scatter = 0.0
-        for n in range(length):
-            share = terms[n].visibility[face] / max(total, MIN_WEIGHT)
-            scatter += share * work.off_mean[n, face] ** 2
-        scatter /= max(1 - of_mean / max(count, 1.0), constants.min_left)
-        shown = weight_of(count, constants.half_weight)
-        variance = of_mean * (claimed + shown * (scatter - claimed)) - claimed
         total *= (length + marginalised) / length
-        share = CORRELATED_FACES[face] / spread[face] ** 4
-        work.underrated[GAP + face] += variance / total * share if total > 0.0 else 0.0
+        own, opposite = GAP + face, GAP + face + 1 - 2 * (face % 2)
+        G[own, own] = W[own] ** 2 * common.margin_variance[face]
+        if total > 0.0:
+            independent = face_deviation(face, shape, constants) ** 2 / total
+            G[own, own] += W[own] ** 2 * independent * 2 * c / (1 - c)
+        if face < 4:  # top and bottom have margins of their own
+            G[own, opposite] = W[own] * W[opposite] * common.margin_variance[face]
 
 
 @kernel
-def fill_underrated_information(deviation, error, weight, free, underrated):
-    """Write the information of extents, bias and margins, (15,), beyond that of their prior."""
-    for s in range(UNDERRATED):
-        underrated[s] = free[s] * weight[s] * (error[s] ** 2 / deviation[s] ** 2 - 1)
+def add_sandwich(columns, G, found):
+    """Add the variance of the gradient, seen through rows (n, 15) of the inverse curvature."""
+    for i in range(len(columns)):
+        for k in range(PIVOT):
+            through = 0.0
+            for m in range(PIVOT):
+                through += columns[i, m] * G[m, k]
+            for j in range(len(columns)):
+                found[i, j] += through * columns[j, k]
 
 
 @kernel
-def fill_pose_covariances(length, times, poses, inverse, underrated, constants, found):
+def fill_pose_covariances(length, times, poses, inverse, G, constants, found):
     """Write the covariances of the poses, (N, 6, 6)."""
     shift = np.zeros(3)
     for n in range(len(poses)):
-        columns = inverse.border[n]
-        for i in range(6):
-            for j in range(6):
-                total = inverse.poses[n, i, j]
-                for s in range(UNDERRATED):
-                    total += columns[i, s] * underrated[s] * columns[j, s]
-                found[n, i, j] = total
+        found[n] = inverse.poses[n]
+        add_sandwich(inverse.border[n], G, found[n])
         found[n, HEADING, HEADING] += constants.heading_deviation**2
         if n >= length:
             continue
@@ -193,21 +115,20 @@ def fill_pose_covariances(length, times, poses, inverse, underrated, constants, 
 
 
 @kernel
-def fill_extent_covariance(corner, free, error, underrated, found):
+def fill_extent_covariance(corner, free, common, G, found):
     """Write the covariance of the extents, (3, 3); held ones have the errors of the input."""
+    rows = corner[EXTENT : EXTENT + SIZE]
+    found[:] = rows[:, EXTENT : EXTENT + SIZE]
+    add_sandwich(rows, G, found)
     for i in range(SIZE):
         for j in range(SIZE):
-            total = corner[EXTENT + i, EXTENT + j]
-            for s in range(UNDERRATED):
-                total += corner[EXTENT + i, s] * underrated[s] * corner[EXTENT + j, s]
-            found[i, j] = total * free[EXTENT + i] * free[EXTENT + j]
-        found[i, i] += (1 - free[EXTENT + i]) * error[EXTENT + i] ** 2
+            found[i, j] *= free[EXTENT + i] * free[EXTENT + j]
+        variance = common.deviation[EXTENT + i] ** 2 + common.unclaimed[EXTENT + i]
+        found[i, i] += (1 - free[EXTENT + i]) * variance
 
 
 @kernel
-def fill_posterior(
-    b, problem, poses, shared, terms, common, free, inverse, constants, work, found
-):
+def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, constants, found):
     """
     Write the covariances of window `b`, and the residuals of its faces.
 
@@ -227,24 +148,15 @@ def fill_posterior(
         Blocks of its inverse curvature.
     constants : record of `Constants`
         Of the method, with the settings.
-    work : CovarianceWork
-        Arrays to work in.
     found : Posterior
         Of the batch: written for the window.
 
     """
     length, shape = problem.lengths[b], problem.of_class[b].roughness
     distances, free_shared = found.face_distances[b], free[6 * len(poses) :]
-    deviation, error = common.deviation, common.error
-    for face in range(FACES):
-        work.claimed[face] = face_deviation(face, shape, constants) ** 2
-    fill_face_distances(problem.boxes[b], poses, shared, common.shared, terms, work.R, distances)
-    remove_means(length, terms, distances, work)
-    fill_underrated_information(deviation, error, common.W_shared, free_shared, work.underrated)
-    fill_information_of_faces(
-        length, problem.marginalised_extents[b, 3], terms, deviation[GAP:], constants, work
-    )
-    fill_pose_covariances(
-        length, problem.times[b], poses, inverse, work.underrated, constants, found.poses[b]
-    )
-    fill_extent_covariance(inverse.corner, free_shared, error, work.underrated, found.extents[b])
+    R, G = np.empty((3, 3)), np.empty((PIVOT, PIVOT))
+    fill_face_distances(problem.boxes[b], poses, shared, common.shared, terms, R, distances)
+    marginalised = problem.marginalised_extents[b, 3]
+    fill_unclaimed(length, marginalised, terms, common, shape, constants, G)
+    fill_pose_covariances(length, problem.times[b], poses, inverse, G, constants, found.poses[b])
+    fill_extent_covariance(inverse.corner, free_shared, common, G, found.extents[b])

@@ -1,12 +1,13 @@
-"""Noise of the input boxes of many tracks (M14)."""
+"""Noise of the input boxes of many tracks (M16)."""
 
 from math import sqrt
 
 from boxreg_ros.core.method.compile import kernel
-from boxreg_ros.core.method.covariance import MIN_POWER
 from boxreg_ros.core.method.selection import lower_median
 import numpy as np
 
+MIN_POWER = 1e-12
+"""Errors with a smaller variance do not change along a track [m^2, rad^2]. Derived: rounding."""
 MAD_TO_DEVIATION = 1.48
 """Standard deviation over median absolute deviation. Derived: 1 / 0.6745 for a Gaussian."""
 CORRELATION_ITERATIONS = 5

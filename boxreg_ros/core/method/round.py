@@ -30,8 +30,8 @@ from boxreg_ros.core.method.assemble import (
     weigh,
 )
 from boxreg_ros.core.method.compile import kernel
-from boxreg_ros.core.method.covariance import empty_covariance_work, fill_posterior, Inverse
-from boxreg_ros.core.method.expectation import empty_expectation_work, expect, fill_evidence
+from boxreg_ros.core.method.covariance import fill_posterior, Inverse
+from boxreg_ros.core.method.expectation import expect, fill_evidence, SIZE
 from boxreg_ros.core.method.faces import empty_face_work, observe_window
 from boxreg_ros.core.method.residuals import empty_linearised, TERMS
 from boxreg_ros.core.method.rigid_shape import agree, empty_shape_work
@@ -100,7 +100,7 @@ def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, s
     N = poses.shape[1]
     n = POSE * N
     at, out = empty_axes(N), empty_linearised()
-    of_expectation = empty_expectation_work()
+    mean_extents = np.empty(SIZE)
     of_faces = empty_face_work(0, len(problem.counts), problem, constants)
     of_shape = empty_shape_work(0, len(thinned.counts), thinned, N, constants.cells)
     for row in range(first, last):
@@ -108,7 +108,7 @@ def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, s
         kind = problem.kind[b]
         shared[b, ANCHOR:SIDESLIP] = 0.0
         terms, common = sums.terms[b], sums.common[b]
-        expect(b, problem, inputs[kind], constants, of_expectation, common)
+        expect(b, problem, inputs[kind], constants, mean_extents, common)
         observe_window(b, problem, poses[b], shared[b], inputs[kind], constants, of_faces, terms)
         if constants.uses_shape:
             agree(b, thinned, poses[b], shared[b, :3], constants, of_shape, terms)
@@ -185,7 +185,6 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
     n = POSE * N
     oldest = np.int64(1)  # for a literal 1 all that sums residuals would be compiled once more
     at, out, gradient = empty_axes(N), empty_linearised(), np.empty(n + SHARED)
-    work = empty_covariance_work(N)
     inverse = Inverse(
         np.empty((N, POSE, POSE)), np.empty((N, POSE, SHARED)), np.empty((SHARED, SHARED))
     )
@@ -209,7 +208,7 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
         invert_poses(A, inverse.corner, inverse.poses, inverse.border)
         fill_posterior(
             b, problem, found, solution.shared[b], terms, common, free[b], inverse, constants,
-            work, solution.posterior,
+            solution.posterior,
         )  # fmt: skip
         if len(solution.prior_state) and problem.lengths[b] == N:
             accumulate(x[row], oldest, terms, common, at, out, gradient, A)
