@@ -264,7 +264,7 @@ class Reason(StrEnum):
         'not_followed',
         'box on ~/follow',
         'its object is not followed: it has no id or no points, no transform is known, or none of '
-        'the clouds of the last 2 s has its stamp; the log says which',
+        'the clouds of the last 2 s has its stamp; `not_followed ID` in `/diagnostics` says which',
         'correct the box, its frame or its stamp',
     )
     LOST = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -9,7 +10,7 @@ from typing import NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core.following import person
 from boxreg_ros.core.following.between import between
-from boxreg_ros.core.following.sweeps import ascending, nearest, Points, Sweeps
+from boxreg_ros.core.following.sweeps import ascending, nearest, Points, SightLimits, Sweeps
 from boxreg_ros.core.following.tracker import (
     ARRIVED,
     END_OF_SWEEPS,
@@ -152,9 +153,10 @@ def follow_points(
 ) -> list[FollowedTrack]:
     """Follow as `follow` does, without the solve; `points` are those of `ascending`."""
     times = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
-    sweeps = Sweeps.of_drive(times, points, origins)
+    tops = None if origins is None else SightLimits(points, origins)
+    sweeps = Sweeps(times, points, len(times), tops=tops)
     objects = [_placed(name, rows, stamps_ns) for name, rows in _by_track(seeds).items()]
-    objects = _overlapping(objects)
+    objects = _of_class(_overlapping(objects))
     owned = Owned()
     followers = [
         Follower(sweeps, one.seeds, config.kind(one.class_name), owned, one.same)
@@ -179,6 +181,8 @@ class _Object(NamedTuple):
     problems: tuple[str, ...]
     same: tuple[int, ...] = ()
     """Indices of the objects with a seed that is inside of one of this, or the other way."""
+    is_of_class: bool = False
+    """Whether another object has the same size: no person draws the same box twice."""
 
 
 class _Seed(NamedTuple):
@@ -259,7 +263,7 @@ def _followed(
     rows = np.array(sorted(poses), np.int64)
     boxes = _boxes(rows, np.array([poses[row] for row in rows.tolist()]), seeds)
     if len(seeds.rows) == 1:
-        boxes = follower.grown(rows, boxes)
+        boxes = follower.grown(rows, boxes, one.is_of_class)
     words = tuple(status[row] for row in rows.tolist())
     return FollowedTrack(
         one.track_id, one.class_name, rows, stamps_ns[rows], boxes, words, tuple(ends), problems
@@ -298,6 +302,19 @@ def _overlapping(objects: Sequence[_Object]) -> list[_Object]:
         line = f'seeds of track {one.track_id!r}: one is inside that of track {other!r}; both are'
         found[index] = one._replace(problems=(*one.problems, f'{line} followed: delete one'))
     return found
+
+
+def _of_class(objects: Sequence[_Object]) -> list[_Object]:
+    """Return the objects; those with the size of another are said to have that of a class."""
+    sizes = [
+        {(one.class_name, *size) for size in one.seeds.boxes[:, BOX_EXTENT].round(3).tolist()}
+        for one in objects
+    ]
+    counts = Counter(size for own in sizes for size in own)
+    return [
+        one._replace(is_of_class=any(counts[size] > 1 for size in own))
+        for one, own in zip(objects, sizes, strict=True)
+    ]
 
 
 def _without_points(one: _Object, count: int) -> str:

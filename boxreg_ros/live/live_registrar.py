@@ -49,7 +49,7 @@ Publishers of /tf at 10 Hz and faster have sent three messages by then.
 BOXES_SILENCE = 3.0
 """After this time without boxes, final boxes are published without further observations [s]."""
 LOST_SHOWN = 10
-"""Followed objects that were lost last, of which /diagnostics says where; chosen."""
+"""Followed objects that were lost or refused last, of which /diagnostics says why; chosen."""
 CLOUD_SILENCE = 0.5
 """
 After this time without clouds, boxes that have waited as long are published unrefined [s].
@@ -331,7 +331,8 @@ class LiveRegistrar:
                 fixed_frame = self._session.require_fixed_frame(content)
                 T_fixed_item = self.tree.lookup(fixed_frame, content.frame_id, content.stamp_ns)
             except TransformUnavailable as error:
-                self._trouble(Reason.NOT_FOLLOWED, str(error), len(content.track_ids))
+                why = f'box at {content.stamp_ns}: {error}'
+                self._registrar.followed.refused += [(name, why) for name in content.track_ids]
                 continue
             for row, track_id in enumerate(content.track_ids):
                 self._sources[track_id] = _Detection(item.message, row, content.stamp_ns)
@@ -340,9 +341,10 @@ class LiveRegistrar:
     def _report_followed(self) -> None:
         """Report which objects are followed, where others were lost, and boxes not followed."""
         followed = self._registrar.followed
-        for line in followed.refused:
-            self._trouble(Reason.NOT_FOLLOWED, line, 1)
         lost = {}
+        for track_id, why in followed.refused:
+            lost[f'not_followed {track_id}'] = why
+            self._trouble(Reason.NOT_FOLLOWED, f'{track_id}: {why}', 1)
         for one in followed.lost:
             x, y, z = one.box[:3]
             place = f'{one.stamp_ns} ns, x {x:.1f} y {y:.1f} z {z:.1f} m in {self.fixed_frame}'
@@ -354,6 +356,7 @@ class LiveRegistrar:
         known = dict(list((known | lost).items())[-LOST_SHOWN:])
         for track_id in followed.track_ids:
             known.pop(f'lost {track_id}', None)
+            known.pop(f'not_followed {track_id}', None)
         if followed.track_ids or self._following or known:
             self._following = {'following': ', '.join(followed.track_ids) or 'none', **known}
 

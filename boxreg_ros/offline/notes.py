@@ -131,10 +131,9 @@ def _keyframe_notes(summary: Summary) -> Iterator[str]:
     if len(problems) > MAX_NAMED:
         yield f'{len(problems) - MAX_NAMED:,} more keyframes; {SUMMARY} lists all under "seeds"'
     first_ns, last_ns = summary.time_ranges.get('clouds', (0, 0))
-    if last_ns > first_ns:
+    if last_ns > first_ns and not summary.complete:
         rates = [n / (last_ns - first_ns) * 1e9 for n in (summary.box_arrays, summary.sweeps)]
-        is_filled = summary.sweeps_with_boxes['after'] * FEW_BOXES > summary.sweeps
-        yield from () if is_filled else sparse_boxes(*rates)
+        yield from sparse_boxes(*rates)
 
 
 def sparse_boxes(boxes: float, clouds: float) -> Iterator[str]:

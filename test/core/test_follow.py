@@ -1,10 +1,11 @@
 """Following one object through sweeps from a few boxes of a person."""
 
+from dataclasses import replace
+
 from boxreg_ros import follow, ShapeError
 from boxreg_ros.core.following import person
 from boxreg_ros.core.following.person import corrections, DEVIATIONS, EVIDENCE
 from boxreg_ros.core.metrics import iou_3d
-from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BoxArray, HUMAN, INTERPOLATED
 import numpy as np
 import pytest
@@ -158,45 +159,51 @@ def test_deviations_of_keyframes_follow_from_their_residuals():
         assert not corrections(*few, DEVIATIONS).any()
 
 
-def unoccluded(points, box):
-    """Return the points whose rays from `ORIGIN` do not cross a box."""
-    to_box = matrix_from_rpy(box[6:]).T
-    start = to_box @ (np.array(ORIGIN) - box[:3])
-    steps = (points - ORIGIN) @ to_box.T
-    with np.errstate(divide='ignore'):
-        at = np.sort([(-box[3:6] / 2 - start) / steps, (box[3:6] / 2 - start) / steps], axis=0)
-    is_crossed = (at[0].max(1) < at[1].min(1)) & (at[0].max(1) < 1) & (at[1].min(1) > 0)
-    return points[~is_crossed]
-
-
-def test_extents_shrink_where_rays_cross_the_box():
+def test_extents_shrink_to_the_edges_of_the_points():
     rng = np.random.default_rng(9)
     truth = drive(N, speed=6.0, turn=0.3)
     truth[:, 0] -= 13.0  # it passes, and both ends are seen
-    angle, height = rng.uniform(0.0, 2 * np.pi, 20_000), rng.uniform(-9.0, 1.0, 20_000)
-    wall = np.column_stack(
-        [60 * np.cos(angle), 60 * np.sin(angle), height]
-    )  # all around, in a valley
-    sweeps = [
-        np.concatenate(
-            [unoccluded(other, box) for other in (wall, road(rng))]
-            + [returns(box, rng, 150, ORIGIN)]
-        )
-        for box in truth
-    ]
+    sweeps = scene(truth, rng)
     large = seed(truth, 10)
     forward = np.array([np.cos(truth[10, 8]), np.sin(truth[10, 8]), 0.0])
     toward = np.sign(forward @ (np.array(ORIGIN) - truth[10, :3]))
     large.boxes[0, 3] += 0.6
     large.boxes[0, :3] -= toward * 0.3 * forward  # the near end stays
-    origins = np.tile(ORIGIN, (N, 1))
     own = seed(truth, 10)
-    for given, error in ((large, 0.25), (own, 0.05)):
-        [track] = follow(stamps(N), sweeps, [given], None, origins)
+    for given, error in ((large, 0.15), (own, 0.05)):
+        [track] = follow(stamps(N), sweeps, [given])
         assert np.abs(track.boxes[:, 3:6] - truth[:, 3:6]).max() < error
         assert iou_3d(track.boxes, truth[track.rows]).mean() > 0.85
-    [track] = follow(stamps(N), sweeps, [large])  # no rays without the place of the sensor
-    assert track.boxes[0, 3] - truth[0, 3] > 0.5
+    person = replace(large, class_names=('pedestrian',))
+    [track] = follow(stamps(N), sweeps, [person])  # limbs move: points show no extents
+    assert np.abs(track.boxes[:, 3:6] - large.boxes[0, 3:6]).max() < 0.05
+
+
+def test_boxes_of_the_same_size_have_that_of_their_class():
+    rng = np.random.default_rng(10)
+    truths = [drive(N, speed=6.0, turn=0.0) for _ in range(2)]
+    truths[1][:, 1] += 8.0
+    sweeps = [
+        np.concatenate([one, returns(truths[1][row], rng, 150, ORIGIN)])
+        for row, one in enumerate(scene(truths[0], rng))
+    ]
+    seeds = [seed(truth, 10, name) for truth, name in zip(truths, 'ab', strict=True)]
+    for one in seeds:
+        one.boxes[0, 5] += 0.2  # as much as a person may err
+        one.boxes[0, 2] += 0.1
+    tree = np.column_stack([rng.uniform(39, 41, (50, 2)), np.linspace(0.0, 12.0, 50)])
+    wooded = [np.concatenate([one, tree]) for one in sweeps]
+    origins = np.tile(ORIGIN, (N, 1))
+
+    def heights(points, given, *more):
+        return [t.boxes[0, 5] for t in follow(stamps(N), points, given, None, *more)]
+
+    height, given = truths[0][0, 5], seeds[0].boxes[0, 5]
+    np.testing.assert_allclose(heights(wooded, seeds[:1], origins), given, atol=0.05)
+    np.testing.assert_allclose(heights(wooded, seeds, origins), height, atol=0.1)
+    # The points may end at the limit of the field of view.
+    np.testing.assert_allclose(heights(sweeps, seeds, origins), given, atol=0.05)
+    np.testing.assert_allclose(heights(wooded, seeds), given, atol=0.05)
 
 
 def test_neighbour_and_road_do_not_pull_a_parked_car():

@@ -72,6 +72,9 @@ def test_one_box_is_followed_until_its_points_are_gone(graph: Graph, tmp_path):
     follow.publish(message)
     message.detections[0].id = ''
     follow.publish(message)
+    message.detections[0].id = 'road'
+    message.detections[0].bbox.center.position.z += 30.0
+    follow.publish(message)
     play(graph, records[ends[BOX_AT] :], early)
     graph.wait(
         lambda: f'lost {name}' in values_of(diagnostics), 'the place where the object was lost'
@@ -80,9 +83,13 @@ def test_one_box_is_followed_until_its_points_are_gone(graph: Graph, tmp_path):
     assert values['following'] == 'none'
     last = f'{scene.sweeps[GONE - 1].stamp_ns} ns'
     assert values[f'lost {name}'].startswith(f'few_points at {last}, x ')
-    assert values['not_followed'] == '1'
+    assert values['not_followed'] == '2'
+    assert 'expected a track id' in values['not_followed ']
+    assert 'expected points in it, got 0' in values['not_followed road']
     assert ended_cleanly(node)
-    assert "box of track '' at" in node.output() and f'lost: {name}: few_points' in node.output()
+    assert (
+        'not_followed: : box at' in node.output() and f'lost: {name}: few_points' in node.output()
+    )
 
     for messages in (early, final):
         found = {}

@@ -149,6 +149,17 @@ def test_one_box_of_each_object_is_followed(street, tmp_path):
     assert main(['follow', f'{street}/drive.mcap', '-o', str(out)]) == 2
 
 
+def test_a_seed_in_an_unknown_frame_is_said(street, tmp_path, capsys):
+    seeds = tmp_path / 'seeds.csv'
+    rows = (street / 'seeds.csv').read_text().splitlines()[:2]
+    seeds.write_text('\n'.join(rows).replace(',odom,', ',nowhere,') + '\n')
+    out = str(tmp_path / 'out')
+    assert main(['follow', f'{street}/drive.mcap', str(seeds), '--formats', 'csv', '-o', out]) == 1
+    lines = capsys.readouterr().err
+    assert "no transform from 'nowhere' to 'odom'" in lines
+    assert '--keyframes' not in lines
+
+
 def test_few_boxes_are_said_and_completed(street, tmp_path, capsys):
     words = ['relabel', f'{street}/drive.mcap', '--labels', f'csv:{street}/keys.csv']
     words += ['--formats', 'csv', '-o', str(tmp_path / 'out')]

@@ -92,14 +92,14 @@ class FollowedObjects:
     ----------
     lost : list of Lost
         Objects that have been lost; to be emptied by the caller.
-    refused : list of str
-        A line for each box that is not followed; to be emptied by the caller.
+    refused : list of (str, str)
+        Track id of each box that is not followed, and why; to be emptied by the caller.
 
     """
 
     def __init__(self, config: Config) -> None:
         self.lost: list[Lost] = []
-        self.refused: list[str] = []
+        self.refused: list[tuple[str, str]] = []
         self._config = config
         self._arrived = _Arrived()
         self._waiting: list[tuple[int, FollowedBox]] = []
@@ -207,4 +207,4 @@ class FollowedObjects:
             walk.seen.discard(row)
 
     def _refuse(self, one: FollowedBox, stamp_ns: int, what: str) -> None:
-        self.refused.append(f'box of track {one.track_id!r} at {stamp_ns}: {what}')
+        self.refused.append((one.track_id, f'box at {stamp_ns}: {what}'))

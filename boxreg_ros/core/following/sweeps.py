@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import lru_cache
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Protocol
 
-from boxreg_ros.core.following.kernels import free_space
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from numpy.typing import NDArray
 
-KEPT_SWEEPS = 64
-"""Sweeps whose order by azimuth is kept; chosen: 50 MB for clouds of 200,000 points."""
+MIN_DISTANCE = 2.0
+"""Nearer points do not show how far up the sensor sees [m]: they may be of its vehicle; chosen."""
 
 
 class Points(Protocol):
@@ -29,6 +26,27 @@ class Times(Protocol):
         """Return that of a sweep [s]."""
 
 
+class SightLimits:
+    """How far up the sensor sees in each sweep: by its steepest point."""
+
+    def __init__(self, points: Points, origins: Floats) -> None:
+        self._points = points
+        self._origins = origins
+        self._slopes: dict[int, float] = {}
+
+    def height(self, row: int, place: Floats, radius: float) -> float:
+        """Return how high it sees all around a place (3,), NaN without its position [m]."""
+        origin = self._origins[row]
+        if row not in self._slopes:
+            steps = self._points[row] - origin
+            away = np.hypot(steps[:, 0], steps[:, 1])
+            slopes = steps[away > MIN_DISTANCE, 2] / away[away > MIN_DISTANCE]
+            self._slopes[row] = float(slopes.max(initial=-np.inf))
+        away = float(np.hypot(*(place[:2] - origin[:2])))
+        slope = self._slopes[row]
+        return float(origin[2] + slope * (away - radius if slope > 0 else away + radius))
+
+
 class Sweeps(NamedTuple):
     """Times of sweeps [s], and their points, all in one frame; rows `first` to `stop` - 1."""
 
@@ -36,23 +54,8 @@ class Sweeps(NamedTuple):
     points: Points
     stop: int
     first: int = 0
-    origins: Floats | None = None
-    """Positions of the sensor by row (S, 3), NaN if unknown [m]."""
-    by_azimuth: Callable[[int], tuple[Ints, Ints]] | None = None
-    """As of `free_space.by_azimuth`, of a sweep by its row; None without positions."""
-
-    @classmethod
-    def of_drive(cls, times: Floats, points: Points, origins: Floats | None) -> Self:
-        """Return all sweeps of a drive."""
-        if origins is None:
-            return cls(times, points, len(times))
-
-        @lru_cache(KEPT_SWEEPS)
-        def by_azimuth(row: int) -> tuple[Ints, Ints]:
-            found: tuple[Ints, Ints] = free_space.by_azimuth(points[row], origins[row])
-            return found
-
-        return cls(times, points, len(times), 0, origins, by_azimuth)
+    tops: SightLimits | None = None
+    """None where it is not known how far up the sensor sees."""
 
     def has(self, row: int) -> bool:
         """Return whether there is such a row."""

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Self
 
-from boxreg_ros.core.following.extents import faces, freed, MAX_GROWTH
-from boxreg_ros.core.following.kernels import free_space, motion, registration, surface
+from boxreg_ros.core.following.extents import faces, MAX_GROWTH
+from boxreg_ros.core.following.kernels import motion, registration, surface
 from boxreg_ros.core.following.sweeps import Sweeps
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, PITCH, ROLL, YAW
@@ -67,8 +67,6 @@ MARGIN_LEARNT = 0.1
 """Points so far outside of the box are part of its surface [m]."""
 MAX_EXTENT_SWEEPS = 60
 """Sweeps of a track whose points show the extents; chosen."""
-MAX_RAY_SWEEPS = 20
-"""Sweeps whose rays show free space; chosen: all of their points are looked at."""
 MAX_CELLS = 20_000
 """Of a surface: those of a bus of 12 m at 0.15 m."""
 
@@ -76,15 +74,20 @@ ARRIVED, END_OF_SWEEPS = 'arrived', 'end_of_sweeps'
 
 
 class KindOfMotion(NamedTuple):
-    """Motion of a kind of object: densities of `motion.predict`, speed [m/s], road [m]."""
+    """
+    Motion of a kind of object: densities of `motion.predict`, speed [m/s], road [m].
+
+    Of others than rigid objects points do not show the extents: limbs move.
+    """
 
     noise: Floats
     max_speed: float
     clearance: float
+    is_rigid: bool = False
 
 
 MOTIONS = {
-    'vehicle': KindOfMotion(np.array([1.0, 0.1, 0.004, 1e-4]), 40.0, 0.25),
+    'vehicle': KindOfMotion(np.array([1.0, 0.1, 0.004, 1e-4]), 40.0, 0.25, True),
     'cyclist': KindOfMotion(np.array([1.0, 0.4, 0.01, 1e-3]), 12.0, 0.2),
     'pedestrian': KindOfMotion(np.array([0.6, 0.4, 0.02, 5e-3]), 3.0, 0.2),
 }
@@ -337,33 +340,30 @@ class Follower:
         box[:2] += travel * np.array([np.cos(box[YAW]), np.sin(box[YAW])])
         return box
 
-    def grown(self, rows: Ints, boxes: Floats) -> Floats:
+    def grown(self, rows: Ints, boxes: Floats, is_of_class: bool) -> Floats:
         """Return the boxes (n, 9) in sweeps `rows` (n,) with the extents that points show."""
+        if not self._kind.is_rigid:
+            return boxes
         some = np.unique(np.linspace(0, len(rows) - 1, MAX_EXTENT_SWEEPS).round().astype(int))
         points = [
             self._in_box(self._near(int(rows[i]), pose, MAX_GROWTH), pose, MAX_GROWTH)
             for i, pose in zip(some, boxes[:, POSE4][some], strict=True)
         ]
-        found = faces(points, self._half)
-        origins, by_azimuth = self._sweeps.origins, self._sweeps.by_azimuth
-        if origins is not None and by_azimuth is not None:
-            rays = [
-                free_space.crossings(
-                    self._sweeps.points[int(rows[i])], *by_azimuth(int(rows[i])),
-                    origins[rows[i]], boxes[i, POSE4], self._tilt, self._half,
-                )
-                for i in np.flatnonzero(rows % -(-len(rows) // MAX_RAY_SWEEPS) == 0)
-                if np.isfinite(origins[rows[i]]).all()
-            ]  # fmt: skip
-            if rays:
-                crossed, through = zip(*rays, strict=True)
-                found = freed(found, points, np.array(crossed), sum(through), self._half)
-        low, high = found
+        sees_top = [self._sees_top(int(rows[i]), boxes[i, POSE4]) for i in some]
+        low, high = faces(points, self._half, is_of_class, np.array(sees_top))
         grown = boxes.copy()
         shift = (low + high) / 2
         grown[:, :3] += matrix_from_rpy(boxes[:, ROLL:]) @ shift
         grown[:, BOX_EXTENT] = high - low
         return grown
+
+    def _sees_top(self, row: int, pose: Floats) -> bool:
+        """Return whether the sensor would see points above the box."""
+        tops = self._sweeps.tops
+        if tops is None:
+            return False
+        top = pose[2] + self._half[2] + MARGIN_LEARNT
+        return bool(tops.height(row, pose, float(np.hypot(*self._half[:2]))) > top)
 
     def jumps(self, seed: int) -> bool:
         """Return whether the next seed is farther away than such an object can move."""
