@@ -213,11 +213,13 @@ def _ranking(store: Path) -> Iterable[str]:
     rows = []
     for _, document in measurements(store, 'review'):
         for recording, inputs in document['results'].items():
-            for name, found in inputs.items():
-                shares = found['shares']
-                start = f'`{recording}`, {name} ({found["bad"]} of {found["tracks"]})'
-                rows.append([start, *(number(share[-1], 2) for share in shares.values())])
-    yield table(['', *shares], rows)
+            orders = next(iter(inputs.values()))['shares']
+            cells = (
+                ' / '.join(number(found['shares'][order][-1], 2) for found in inputs.values())
+                for order in orders
+            )
+            rows.append([f'`{recording}`', *cells])
+    yield table([' / '.join(inputs), *orders], rows)
 
 
 def _times(store: Path) -> Iterable[str]:
@@ -341,7 +343,7 @@ def _paper(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
         pose = ['x', 'y', 'z', 'roll', 'pitch', 'yaw'] if mode == '3d' else ['x', 'y', 'yaw']
         names = (
             'initial, published', 'refined, published', 'input', 'smoothing only',
-            'CTRA smoothing', 'paper, track', 'ours, final', 'ours, track', 'held extents, final',
+            'paper, track', 'ours, final', 'ours, track', 'held extents, final',
         )  # fmt: skip
         rows = [[name, *(number(methods[name].get(c)) for c in (*pose, 'iou'))] for name in names]
         yield table([f'mode: {mode}', *pose, '3D IoU' if mode == '3d' else 'BEV IoU'], rows)
@@ -394,6 +396,7 @@ def _highway(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
     rows = [
         [name, *(number(value) for of in results.values() for value in of[name].values())]
         for name in next(iter(results.values()))
+        if not name.startswith('smoothing, ')
     ]
     yield table(['3D IoU', *columns], rows)
 

@@ -131,6 +131,12 @@ def test_every_residual_is_a_row_of_the_method():
         assert re.search(rf'^\| \({number}\) \|.*`{row.function.__name__}`', text, re.MULTILINE)
 
 
+def test_the_method_reads_as_a_paper():
+    lines = (DOCS / 'method.md').read_text(encoding='utf-8').splitlines()
+    assert len(lines) <= 300
+    assert max(map(len, lines)) <= 150  # none of them longer to be fewer
+
+
 def test_readme_is_short():
     text = README.read_text(encoding='utf-8')
     assert len(text.splitlines()) <= 200
