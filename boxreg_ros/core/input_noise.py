@@ -7,7 +7,7 @@ docs/method.md, section Input model, has the formulas.
 
 from boxreg_ros.config import KINDS
 from boxreg_ros.core.input_statistics import NOISE, pooled_noise
-from boxreg_ros.core.method.constants import Constants
+from boxreg_ros.core.method.constants import CONSTANTS, Constants
 from boxreg_ros.core.method.expectation import SIZE
 from boxreg_ros.core.method.noise import estimate
 from boxreg_ros.core.problem import Problem
@@ -61,6 +61,10 @@ def set_noise(
         inputs['deviation'][k], inputs['correlation'][k] = np.exp(logarithms), correlation
     of_centres = np.exp(np.log(inputs['deviation'][:, :SIZE]).mean(1))
     inputs['low_noise'] = (of_centres / LOW_NOISE).clip(max=1.0)
+    if constants.pin_deviations != CONSTANTS.pin_deviations:
+        # Keyframes have their own deviations. The boxes between them follow the points, and agree
+        # with the fit for this alone.
+        inputs['low_noise'] = 1.0
     # Trackers may hold the extents: no residual shows their errors. Those of the centre do.
     inputs['extent_error'] = EXTENT_ERRORS * inputs['low_noise'][:, None]
 

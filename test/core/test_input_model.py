@@ -1,6 +1,7 @@
 """The input model, from input whose labelling margins and noise are known."""
 
 from boxreg_ros.config import Config, FaceConfig, KINDS
+from boxreg_ros.core.following import person
 from boxreg_ros.core.input_model import GAP_DEVIATIONS, InputModel, Pooled
 from boxreg_ros.core.input_noise import EXTENT_ERRORS, normalised_residuals, set_noise
 from boxreg_ros.core.input_noise import noise_of as estimate
@@ -115,12 +116,19 @@ def test_short_tracks_and_padding_are_left_out():
     assert found.boxes == known.boxes == 60
 
 
-def noise_by_kind(values, kind, past=None):
+def noise_by_kind(values, kind, past=None, constants=CONSTANTS):
     """Return the records `INPUTS` (K,) with the noise of tracks (B, N, 9) of a kind (B,)."""
     inputs = no_inputs()
     past = np.zeros(len(KINDS), NOISE) if past is None else past
-    set_noise(inputs, values, np.asarray(kind), past, CONSTANTS)
+    set_noise(inputs, values, np.asarray(kind), past, constants)
     return inputs
+
+
+def test_boxes_followed_from_keyframes_are_no_low_noise_input():
+    values = autoregressive(30, 40, np.full(9, 0.2), 0.3)
+    assert noise_by_kind(values, [0] * 30)['low_noise'][0] < 0.6
+    keyframes = person.numbers(person.DEVIATIONS)
+    assert noise_by_kind(values, [0] * 30, None, keyframes)['low_noise'][0] == 1.0
 
 
 def posterior(prior, boxes, square):
