@@ -7,7 +7,7 @@ docs/method.md, section Input model, has the formulas.
 
 from boxreg_ros.config import KINDS
 from boxreg_ros.core.input_statistics import NOISE, pooled_noise
-from boxreg_ros.core.method.constants import CONSTANTS, Constants
+from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.method.expectation import SIZE
 from boxreg_ros.core.method.noise import estimate
 from boxreg_ros.core.problem import Problem
@@ -23,9 +23,6 @@ REPEATED_BOX_TOLERANCE = 1e-3
 EXTENT_ERRORS = ((0.9, 0.9, 0.9), (0.8, 1.6, 0.65), (2.7, 1.6, 0.65))
 """Error of extents that is constant along a track, over the one of the settings, of vehicles,
 cyclists and pedestrians. Measured of PointRCNN on KITTI, widths of the latter two on PandaSet."""
-LOW_NOISE = 0.5
-"""Input whose centres err by less than this part of the settings is low-noise input, such as human
-labels: fits follow it more closely. Chosen."""
 DETECTED = [0, 1, 2, 5]
 """Variables of a pose that detectors estimate, with one correlation: x, y, z, yaw."""
 LEAST_RATIO = 0.02
@@ -60,11 +57,7 @@ def set_noise(
         correlation[DETECTED] = correlation[DETECTED].mean()
         inputs['deviation'][k], inputs['correlation'][k] = np.exp(logarithms), correlation
     of_centres = np.exp(np.log(inputs['deviation'][:, :SIZE]).mean(1))
-    inputs['low_noise'] = (of_centres / LOW_NOISE).clip(max=1.0)
-    if constants.pin_deviations != CONSTANTS.pin_deviations:
-        # Keyframes have their own deviations. The boxes between them follow the points, and agree
-        # with the fit for this alone.
-        inputs['low_noise'] = 1.0
+    inputs['low_noise'] = (of_centres / constants.low_noise).clip(max=1.0)
     # Trackers may hold the extents: no residual shows their errors. Those of the centre do.
     inputs['extent_error'] = EXTENT_ERRORS * inputs['low_noise'][:, None]
 

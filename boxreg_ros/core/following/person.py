@@ -8,6 +8,7 @@ they are solved with these; where they show smaller ones, the solution moves tow
 
 from __future__ import annotations
 
+from boxreg_ros.core.input_noise import LEAST_RATIO
 from boxreg_ros.core.method.arrays import BOX_POSE
 from boxreg_ros.core.method.constants import CONSTANTS, Constants
 from boxreg_ros.rotations import wrap_angle
@@ -32,8 +33,15 @@ MEDIAN_TO_DEVIATION = 1.48
 
 
 def numbers(deviations: Floats) -> Constants:
-    """Return the numbers of the method for keyframes of some deviations (9,)."""
-    return CONSTANTS._replace(pin_deviations=tuple(deviations[[*BOX_POSE, LENGTH]].tolist()))
+    """
+    Return the numbers of the method for keyframes of some deviations (9,).
+
+    The boxes between them follow the points, and agree with the fit for this alone: they are no
+    low-noise input.
+
+    """
+    of_pins = tuple(deviations[[*BOX_POSE, LENGTH]].tolist())
+    return CONSTANTS._replace(pin_deviations=of_pins, low_noise=LEAST_RATIO)
 
 
 def shown(keyframes: Floats, fits: Floats, variances: Floats, usual: Floats) -> Floats:

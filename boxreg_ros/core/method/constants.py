@@ -150,6 +150,9 @@ class Constants(NamedTuple):
     """Largest correlation of consecutive errors. Chosen."""
     min_left: float = 0.3
     """Least part of a variance that the mean of a track is taken to leave. Chosen."""
+    low_noise: float = 0.5
+    """Input whose centres err by less than this part of the settings is low-noise input, such as
+    human labels: fits follow it more closely. Chosen."""
 
     # Labelling margins
     max_gap: float = 0.5
