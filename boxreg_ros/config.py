@@ -15,7 +15,7 @@ from difflib import get_close_matches
 from math import isnan, nan
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from boxreg_ros.errors import ConfigError, unreadable
 import yaml
@@ -145,7 +145,6 @@ class SolverConfig:
     rounds: int = setting(
         10, 'most rounds; each renews the outermost points and the weights', '', 1, 100
     )
-    iterations: int = setting(2, 'most L-BFGS iterations per round', '', 1, 10000)
     threads: int = setting(
         0, 'threads that share the windows of a batch; 0: one per core', '', 0, 256
     )
@@ -176,6 +175,9 @@ class ClassConfig:
 
     """
 
+    tilt: ClassVar[float] = 0.02
+    """Standard deviation of the input roll and pitch [rad]. Chosen: detectors set both to zero."""
+
     names: tuple[str, ...] = setting(
         (), 'class names of this kind: any of these words, in any case'
     )
@@ -204,7 +206,6 @@ class ClassConfig:
         0.07, 'standard deviation of the height of the input centre', 'm', 1e-3, 10.0
     )
     heading: float = setting(0.04, 'standard deviation of the input yaw', 'rad', 1e-3, 3.2)
-    tilt: float = setting(0.02, 'standard deviation of the input roll and pitch', 'rad', 1e-4, 3.2)
     extent: float = setting(
         0.05, 'standard deviation of the input extents, as part of each', '', 1e-3, 1.0
     )

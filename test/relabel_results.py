@@ -5,7 +5,7 @@ from pathlib import Path
 
 from boxreg_ros.config import Config
 
-QUICK = Config().updated({'solver.rounds': 1, 'solver.iterations': 3, 'sampling.points': 64})
+QUICK = Config().updated({'solver.rounds': 1, 'sampling.points': 64})
 """Settings of a run that takes a fraction of a second."""
 
 

@@ -20,7 +20,7 @@ from paths import ROOT
 import pytest
 from ros_messages import Drive
 
-QUICK = ['--set', 'solver.rounds=1', '--set', 'solver.iterations=3']
+QUICK = ['--set', 'solver.rounds=1']
 SLOW = [
     '--set', 'objective=paper', '--set', 'paper.iterations=10000', '--set', 'estimate=early',
 ]  # fmt: skip
@@ -64,10 +64,10 @@ def test_options_are_used_by_the_run(tmp_path, capsys):
     drive = Drive(sweeps=8, motion='odometry')
     recording = drive.write(tmp_path / 'drive')
     config = tmp_path / 'config.yaml'
-    config.write_text('window: 4\nlag: 2\nsolver: {rounds: 1, iterations: 7}\n')
+    config.write_text('window: 4\nlag: 2\nsolver: {rounds: 1, threads: 2}\n')
     options = [
         '--points', '/points', '--boxes', '/boxes', '--odometry', '/odom', '--fixed-frame', 'odom',
-        '--config', config, '--set', 'solver.iterations=3', '--set', 'estimate=final',
+        '--config', config, '--set', 'solver.threads=1', '--set', 'estimate=final',
         '--set', 'faces.sides=0.07', '--formats', 'csv', '--start', '0.1', '--end', '0.6',
         '--workers', '1',
     ]  # fmt: skip
@@ -77,7 +77,7 @@ def test_options_are_used_by_the_run(tmp_path, capsys):
     assert ': 10 boxes in' in text
     used = Config.from_yaml(out / 'config.yaml')
     assert (used.window, used.lag, used.estimate) == (4, 2, 'final')
-    assert (used.solver.rounds, used.solver.iterations) == (1, 3)
+    assert (used.solver.rounds, used.solver.threads) == (1, 1)
     assert used.faces.sides == 0.07
     assert not (out / 'openlabel').exists()
 

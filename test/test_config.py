@@ -78,7 +78,7 @@ def test_dotted_names_update_a_copy():
     config = Config()
     changed = config.updated({'solver.rounds': 2, 'mode': 'bev', 'vehicle.names': ['Auto']})
     assert (changed.solver.rounds, changed.mode, changed.vehicle.names) == (2, 'bev', ('Auto',))
-    assert changed.solver.iterations == config.solver.iterations
+    assert changed.solver.threads == config.solver.threads
     assert config == Config()
 
 

@@ -113,7 +113,7 @@ def test_definition_without_a_field_is_refused(adapter, drive):
 
 def test_relabel_refines_the_boxes(tmp_path, drive):
     recording = drive.write(tmp_path / 'drive')
-    config = Config().updated({'solver.rounds': 1, 'solver.iterations': 3})
+    config = Config().updated({'solver.rounds': 1})
     summary = relabel(
         Request((recording,), config=config, formats=('csv', 'mcap')), tmp_path / 'out'
     )

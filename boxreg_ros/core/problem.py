@@ -7,12 +7,10 @@ numbers each and the shared variables s of `method.arrays`, the same for all obs
 """
 
 from collections.abc import Sequence
-from dataclasses import fields
 from itertools import chain
-from operator import attrgetter
 from typing import NamedTuple
 
-from boxreg_ros.config import ClassConfig, Config, KINDS
+from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, GAP, PIVOT, POSE, PRIOR, SHARED
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.observation import Observations
@@ -22,10 +20,6 @@ from boxreg_ros.structures import Floats, Ints, ROLL, YAW
 import numpy as np
 from numpy.typing import NDArray
 
-CLASS_NUMBERS = [item.name for item in fields(ClassConfig)[1:]]
-"""Names of the numbers of a `ClassConfig`."""
-numbers_of = attrgetter(*CLASS_NUMBERS)
-"""Returns the numbers of a `ClassConfig`, in this order."""
 PADDING_PERIOD = 0.1
 """Time step of padding observations [s]. Derived: any positive number keeps times increasing."""
 MAX_REVERSE_SPEED = 6.0
@@ -459,11 +453,11 @@ def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, 
 
 def settings_of_kinds(config: Config) -> NDArray[np.void]:
     """Return the settings of each of `KINDS`, records `CLASS_SETTINGS` (K,)."""
-    numbers = np.array([numbers_of(getattr(config, name)) for name in KINDS], dtype=np.float64)
+    kinds = [getattr(config, name) for name in KINDS]
     found = np.zeros(len(KINDS), CLASS_SETTINGS)
     for field, names in SETTINGS_OF.items():
-        columns = [CLASS_NUMBERS.index(name) for name in names]
-        found[field] = numbers[:, columns].reshape(found[field].shape)
+        numbers = np.array([[getattr(kind, name) for name in names] for kind in kinds])
+        found[field] = numbers.reshape(found[field].shape)
     return found
 
 

@@ -30,7 +30,7 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
     """
     quick = Config(
         objective=config.objective, mode=config.mode, estimate=config.estimate,
-        window=4, lag=3, solver=SolverConfig(rounds=2, iterations=2),
+        window=4, lag=3, solver=SolverConfig(rounds=2),
         paper=PaperConfig(iterations=2),
     )  # fmt: skip
     registrar = BoxRegistrar(quick, submit)

@@ -17,7 +17,7 @@ from typing import Any
 
 from boxreg_ros.config import Config, KINDS, Setting, settings
 from boxreg_ros.core.input_model import FACE_GROUPS, InputModel
-from boxreg_ros.core.input_noise import noise_of, normalised_residuals
+from boxreg_ros.core.input_noise import DETECTED, noise_of, normalised_residuals
 from boxreg_ros.core.matching import AT_ONCE
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.noise import MAD_TO_DEVIATION
@@ -43,7 +43,7 @@ import yaml
 
 GAPS = ('gap_ends', 'gap_sides', 'gap_top', 'gap_bottom')
 INSETS = ('inset_ends', 'inset_sides')
-ERRORS = ('position', 'lateral', 'height', 'tilt', 'heading', 'extent')
+ERRORS = ('position', 'lateral', 'height', 'heading', 'extent')
 PASSES = 4
 """Passes of the estimation: the outermost points depend a little on the margins. Chosen."""
 MIN_TRACKS = 3
@@ -187,10 +187,10 @@ def _errors_of_kind(
 
 
 def _deviations(residuals: Floats) -> Floats:
-    """Return the deviations (5,) of all `ERRORS` but the extent, of residuals (B, N, 9)."""
+    """Return the deviations (4,) of all `ERRORS` but the extent, of residuals (B, N, 9)."""
     noise = noise_of(residuals, CONSTANTS)
-    lon, lat, z, roll, pitch, yaw = noise['deviation'][:6].tolist()
-    return np.array([lon, lat, z, np.hypot(roll, pitch) / np.sqrt(2), yaw])
+    deviations: Floats = noise['deviation'][DETECTED]
+    return deviations
 
 
 def calibrated(config: Config, measured: Mapping[str, Measured]) -> dict[str, Any]:
@@ -220,9 +220,7 @@ def _valid(measured: Mapping[str, Measured]) -> dict[str, Any]:
     for name, found in measured.items():
         if found.tracks >= MIN_TRACKS:
             item = bounds[name]
-            # Neither labels nor input may have roll and pitch: their error is unknown.
-            if not (name.endswith('tilt') and found.value < (item.low or 0)):
-                values[name] = float(np.clip(found.value, item.low, item.high))
+            values[name] = float(np.clip(found.value, item.low, item.high))
     return values
 
 

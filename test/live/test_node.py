@@ -334,7 +334,7 @@ def test_boxes_that_wait_too_long_are_published_unchanged(graph, tmp_path):
 
 def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
     drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
-    slow = ('-p', 'solver.rounds:=40', '-p', 'solver.iterations:=400')
+    slow = ('-p', 'solver.rounds:=40')
     node = graph.start(*RELIABLE, *slow, '-p', 'backlog:=0.2')
     graph.wait_until_connected()
     play(graph, records)
@@ -392,7 +392,7 @@ def test_messages_are_queued_while_the_process_is_suspended(graph, tmp_path):
 
 def test_waiting_boxes_are_published_at_shutdown(graph, tmp_path):
     drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
-    slow = ('-p', 'solver.rounds:=20', '-p', 'solver.iterations:=100', '-p', 'backlog:=60.0')
+    slow = ('-p', 'solver.rounds:=20', '-p', 'backlog:=60.0')
     node = graph.start(*RELIABLE, *slow, '-p', 'queue:=100')
     graph.wait_until_connected()
     play(graph, records)

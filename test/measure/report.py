@@ -35,7 +35,7 @@ the options for WebGL make it use for all of the page.
 """
 VIEWPORT = {'width': 1366, 'height': 800}
 """Size of the window [CSS pixels]: a small laptop."""
-QUICK = ('--set=solver.rounds=1', '--set=solver.iterations=3', '--formats=csv')
+QUICK = ('--set=solver.rounds=1', '--formats=csv')
 """The boxes of the synthetic stream need not be good."""
 STEPS = 120
 """Steps of the time slider that are measured, one per frame: two seconds at 60 Hz."""

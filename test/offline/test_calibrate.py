@@ -143,8 +143,7 @@ DEVIATION = np.array([0.2, 0.1, 0.05, 0.03, 0.03, 0.06, 0.08])
 def test_errors_of_the_input_are_found(bias, turned):
     found = input_errors(noisy_drive(DEVIATION, bias=bias, turned=turned), Config())
     expected = {
-        'position': 0.2, 'lateral': 0.1, 'height': 0.05, 'tilt': 0.03, 'heading': 0.06,
-        'extent': 0.08,
+        'position': 0.2, 'lateral': 0.1, 'height': 0.05, 'heading': 0.06, 'extent': 0.08,
     }  # fmt: skip
     assert set(found) == {f'vehicle.{name}' for name in expected}
     for name, value in expected.items():
@@ -205,9 +204,9 @@ def test_written_settings():
     assert calibrated(Config(), margins) == known | {'cyclist.gap_top': 0.4}
     margins['cyclist.gap_top'] = margins['vehicle.gap_top'] = Measured(0.4, 0.01, 2)
     assert calibrated(Config(), margins) == {k: v for k, v in known.items() if k[-4:] != '_top'}
-    # Values beyond what a setting may have; tilt that neither labels nor input have.
+    # Values beyond what a setting may have.
     edges = {
-        'faces.inset_ends': Measured(-0.1, 0.01, 9), 'vehicle.tilt': Measured(0.0, 0.0, 9),
+        'faces.inset_ends': Measured(-0.1, 0.01, 9),
         'vehicle.heading': Measured(0.0, 0.0, 9),
     }  # fmt: skip
     assert calibrated(Config(), edges) == {'faces.inset_ends': 0.0, 'vehicle.heading': 0.001}

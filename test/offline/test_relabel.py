@@ -164,13 +164,13 @@ def test_start_and_end_select_a_part(tmp_path):
 
 def test_output_folder_contents(tmp_path):
     path = Drive(sweeps=4).write(tmp_path / 'drive')
-    summary, _ = run(path, tmp_path / 'out', settings={'solver.iterations': 2})
+    summary, _ = run(path, tmp_path / 'out', settings={'solver.rounds': 2})
     out = tmp_path / 'out'
     assert sorted(item.name for item in out.iterdir()) == [
         'boxes.csv', 'config.yaml', 'covariances.csv', 'input_model.json', 'openlabel',
         'review.csv', 'summary.json', 'tracks.csv',
     ]  # fmt: skip
-    assert Config.from_yaml(out / 'config.yaml') == QUICK.updated({'solver.iterations': 2})
+    assert Config.from_yaml(out / 'config.yaml') == QUICK.updated({'solver.rounds': 2})
     content = json.loads((out / 'summary.json').read_text())
     assert content.pop('files').keys() == {
         'boxes.csv', 'config.yaml', 'covariances.csv', 'input_model.json', 'openlabel/labels.json',

@@ -28,7 +28,7 @@ import zstandard
 
 SETTINGS = {'track_window': 16, 'min_observations': 3}
 """Windows of sixteen observations, so that there are several batches."""
-QUICK = ['--set=solver.rounds=1', '--set=solver.iterations=3']
+QUICK = ['--set=solver.rounds=1']
 
 
 def content_of(folder):

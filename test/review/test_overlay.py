@@ -16,7 +16,7 @@ from rosbags.typesys import get_typestore, Stores
 
 MARKERS = 'visualization_msgs/msg/MarkerArray'
 ADDED = ('/boxes_refined', '/boxes_refined_markers')
-QUICK = Config().updated({'solver.rounds': 1, 'solver.iterations': 3, 'sampling.points': 64})
+QUICK = Config().updated({'solver.rounds': 1, 'sampling.points': 64})
 
 
 def run(recordings, out, formats=('mcap',), config=QUICK, **options):

@@ -35,7 +35,7 @@ from scenes import drive, jittered, PERIOD_NS, START_NS, track_of
 
 pytest.importorskip('plotly')
 STREET = BAGS / 'street.mcap'
-QUICK = Config().updated({'solver.rounds': 1, 'solver.iterations': 3, 'sampling.points': 64})
+QUICK = Config().updated({'solver.rounds': 1, 'sampling.points': 64})
 SCRIPT = '<script>alert(1)</script>'
 
 
