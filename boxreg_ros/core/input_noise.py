@@ -49,13 +49,14 @@ def set_noise(
         for k in range(len(KINDS))
     ]
     for k in range(len(KINDS)):
-        logarithms, correlation = np.zeros(9), np.full(9, constants.typical_correlation)
+        variance, correlation = np.ones(9), np.full(9, constants.typical_correlation)
         for known in (pooled_noise(own[:k] + own[k + 1 :]), own[k]):
             share = known['boxes'] / (known['boxes'] + constants.half_weight)
-            logarithms += share * (np.log(known['deviation'].clip(LEAST_RATIO)) - logarithms)
+            variance += share * (known['deviation'] ** 2 - variance)
             correlation += share * (known['correlation'] - correlation)
         correlation[DETECTED] = correlation[DETECTED].mean()
-        inputs['deviation'][k], inputs['correlation'][k] = np.exp(logarithms), correlation
+        deviation = np.sqrt(variance).clip(LEAST_RATIO)
+        inputs['deviation'][k], inputs['correlation'][k] = deviation, correlation
     of_centres = np.exp(np.log(inputs['deviation'][:, :SIZE]).mean(1))
     inputs['low_noise'] = (of_centres / constants.low_noise).clip(max=1.0)
     # Trackers may hold the extents: no residual shows their errors. Those of the centre do.

@@ -132,8 +132,8 @@ def test_boxes_followed_from_keyframes_are_no_low_noise_input():
 
 
 def posterior(prior, boxes, square):
-    """Return a variance of boxes pooled with a prior that counts for 14, in logarithms."""
-    return prior * (square / prior) ** (boxes / (boxes + HALF_WEIGHT))
+    """Return a variance of boxes pooled with a prior that counts for 14."""
+    return (HALF_WEIGHT * prior + boxes * square) / (HALF_WEIGHT + boxes)
 
 
 def test_noise_of_a_kind_is_that_of_the_others_until_it_has_its_own():
@@ -152,6 +152,12 @@ def test_noise_of_a_kind_is_that_of_the_others_until_it_has_its_own():
     found = noise_by_kind(np.concatenate([values, few]), np.append(kind, [1, 1]))
     known = posterior(others, 60, noise_of(few).deviation ** 2)
     np.testing.assert_allclose(found['deviation'][1] ** 2, known)
+
+
+def test_few_boxes_that_agree_with_their_fit_are_not_taken_for_exact():
+    # The fit follows them, too: the settings count for 14 of 44 boxes.
+    deviation = noise_by_kind(1e-3 * autoregressive(1, 30, np.ones(9), 0.0), [2])['deviation'][2]
+    np.testing.assert_allclose(deviation, np.sqrt(14 / 44), rtol=1e-4)
 
 
 def test_noise_of_other_drives_counts_by_its_boxes():

@@ -109,19 +109,28 @@ def test_hard_braking_is_followed(estimate, most):
 @each_estimate
 def test_true_boxes_among_those_of_a_detector_are_not_lost(estimate):
     # Eight cars around the sensor: the boxes of the first are true, those of the others have the
-    # errors of a detector. The noise is that of all of them.
-    rng = np.random.default_rng(1)
+    # errors of a detector. The noise is that of all of them. Means of three draws: from one to the
+    # next the first car varies by .01.
+    draws = [exact_and_noisy(estimate, seed) for seed in (1, 2, 3)]
+    exact_bev, exact_3d, before, after = np.mean(draws, axis=0)
+    assert exact_bev > 0.96
+    assert exact_3d > 0.94
+    assert 1 - after < 0.75 * (1 - before)
+
+
+def exact_and_noisy(estimate, seed):
+    """Return BEV and 3D IoU of the true boxes, and 3D IoU of the others before and after."""
+    rng = np.random.default_rng(seed)
     angles = np.linspace(0, 2 * np.pi, 8, endpoint=False)
     truths = [drive(30, turn=0.1, start=(12 * np.cos(a), 12 * np.sin(a), a + 1.2)) for a in angles]
     tracks = [track_of(truth, rng, str(i)) for i, truth in enumerate(truths)]
     given = [truths[0], *(detector_noise(t, np.zeros((30, 3)), rng) for t in truths[1:])]
     tracks = [replace(t, boxes=boxes) for t, boxes in zip(tracks, given, strict=True)]
     exact, *others = refine(tracks, Config(estimate=estimate))
-    assert iou_bev(exact.boxes, truths[0]).mean() > 0.96
-    assert iou_3d(exact.boxes, truths[0]).mean() > 0.94
     before = np.mean([iou_3d(b, t).mean() for b, t in zip(given[1:], truths[1:], strict=True)])
     after = np.mean([iou_3d(o.boxes, t).mean() for o, t in zip(others, truths[1:], strict=True)])
-    assert 1 - after < 0.75 * (1 - before)
+    bev, volume = (iou(exact.boxes, truths[0]).mean() for iou in (iou_bev, iou_3d))
+    return bev, volume, before, after
 
 
 def test_a_parked_object_does_not_move():
