@@ -153,8 +153,8 @@ def follow_points(
 ) -> list[FollowedTrack]:
     """Follow as `follow` does, without the solve; `points` are those of `ascending`."""
     times = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
-    tops = None if origins is None else SightLimits(points, origins)
-    sweeps = Sweeps(times, points, len(times), tops=tops)
+    limits = None if origins is None else SightLimits(points, origins)
+    sweeps = Sweeps(times, points, len(times), sight_limits=limits)
     objects = [_placed(name, rows, stamps_ns) for name, rows in _by_track(seeds).items()]
     objects = _of_class(_overlapping(objects))
     owned = Owned()

@@ -16,8 +16,6 @@ from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, POSE
 import numpy as np
 from numpy.typing import NDArray
 
-LEAST_WEIGHT = 1e-9
-"""A smaller weight of a noise is none. Derived: rounding."""
 REPEATED_BOX_TOLERANCE = 1e-3
 """A box that differs from the one before by less repeats it [m, rad]. Chosen."""
 EXTENT_ERRORS = ((0.9, 0.9, 0.9), (0.8, 1.6, 0.65), (2.7, 1.6, 0.65))

@@ -27,7 +27,17 @@ class Times(Protocol):
 
 
 class SightLimits:
-    """How far up the sensor sees in each sweep: by its steepest point."""
+    """
+    How far up the sensor sees in each sweep: by its steepest point.
+
+    Parameters
+    ----------
+    points : sequence of arrays, shape (M, 3)
+        Of each sweep, in the fixed frame [m].
+    origins : array, shape (n, 3)
+        Position of the sensor in each sweep, as the points; NaN if unknown.
+
+    """
 
     def __init__(self, points: Points, origins: Floats) -> None:
         self._points = points
@@ -54,7 +64,7 @@ class Sweeps(NamedTuple):
     points: Points
     stop: int
     first: int = 0
-    tops: SightLimits | None = None
+    sight_limits: SightLimits | None = None
     """None where it is not known how far up the sensor sees."""
 
     def has(self, row: int) -> bool:

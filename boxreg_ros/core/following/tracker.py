@@ -359,11 +359,11 @@ class Follower:
 
     def _sees_top(self, row: int, pose: Floats) -> bool:
         """Return whether the sensor would see points above the box."""
-        tops = self._sweeps.tops
-        if tops is None:
+        limits = self._sweeps.sight_limits
+        if limits is None:
             return False
         top = pose[2] + self._half[2] + MARGIN_LEARNT
-        return bool(tops.height(row, pose, float(np.hypot(*self._half[:2]))) > top)
+        return bool(limits.height(row, pose, float(np.hypot(*self._half[:2]))) > top)
 
     def jumps(self, seed: int) -> bool:
         """Return whether the next seed is farther away than such an object can move."""

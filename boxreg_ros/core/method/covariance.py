@@ -58,9 +58,9 @@ def fill_unclaimed(length, marginalised, terms, common, shape, constants, G):
     Write the covariance (15, 15) of the gradient by shared variables that no weight claims.
 
     The mean of input extents has the errors that change, too; biases of low-noise input are held
-    closer than they err. The margin of a kind has an error,
-    which opposite faces have in common. Consecutive residuals of a face are correlated: the error
-    of their mean is one of its margin (M28).
+    closer than they err. The margin of a kind has an error, which opposite faces have in common.
+    Consecutive residuals of a face are correlated: the error of their mean is one of its margin
+    (M28).
 
     """
     c, W = constants.residual_correlation, common.W_shared

@@ -29,6 +29,7 @@ BESIDE = 0.3
 # A pose is accepted if all of these hold.
 REASONS = ('', 'few_points', 'no_fit', 'uncertain', 'jump')
 """Why a pose is not accepted."""
+ACCEPTED, FEW_POINTS, NO_FIT, UNCERTAIN, JUMP = range(len(REASONS))
 MIN_POINTS = 5
 """Points that fit the surface."""
 MIN_FIT = 0.5
@@ -102,8 +103,8 @@ def find(
                 best = other
     pose, covariance, stats, jump, reason = best
     fits_badly = stats[1] < MIN_FIT_AGAIN * max(stats[2], 1.0)
-    if is_lost and reason == 0 and (fits_badly or stats[3] < MIN_SCORE_AGAIN * usual):
-        reason = 2
+    if is_lost and reason == ACCEPTED and (fits_badly or stats[3] < MIN_SCORE_AGAIN * usual):
+        reason = NO_FIT
     return pose, covariance, stats, jump, reason
 
 
@@ -170,17 +171,17 @@ def registered(
 
 @kernel
 def _reason(pose, covariance, stats, jump):
-    """Return why a pose is not accepted, an index of `REASONS`: 0 if it is."""
+    """Return why a pose is not accepted, an index of `REASONS`."""
     inside, fitting, matched = stats[0], stats[1], stats[2]
     if fitting < MIN_POINTS:
-        return 1
+        return FEW_POINTS
     if fitting < MIN_FIT * matched or matched < MIN_SEEN * inside:
-        return 2
+        return NO_FIT
     c, s = np.cos(pose[3]), np.sin(pose[3])
     along = c * c * covariance[0, 0] + s * s * covariance[1, 1] + 2 * c * s * covariance[0, 1]
     if along > MAX_DEVIATION**2 or covariance[3, 3] > MAX_YAW_DEVIATION**2:
-        return 3
-    return 4 if jump > MAX_JUMP else 0
+        return UNCERTAIN
+    return JUMP if jump > MAX_JUMP else ACCEPTED
 
 
 @kernel

@@ -23,8 +23,6 @@ NORMAL_AGAIN = 1.1
 """The normal of a cell is found again after it got so many times its points; chosen."""
 LINE = 0.02
 """A neighbourhood with less spread in its second direction is a line [m]."""
-FLAT = 0.05
-"""Spread of a cell across its surface that is still a surface [m]."""
 
 
 @kernel
