@@ -15,6 +15,7 @@ import numpy as np
 from paths import ROOT
 from preloaded import NODE, PreloadedProcess
 import pytest
+from rcl_interfaces.srv import GetParameters
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -82,6 +83,33 @@ class Graph:
         kind = installed(type_name)
         self.node.create_subscription(kind, topic, received.append, QoSProfile(depth=100))
         return received
+
+    def call(self, kind, service, request):
+        """
+        Call a service of a node and return its response.
+
+        A server that has not yet discovered the reader of the client drops its response, and the
+        client does not know. So a call that changes nothing goes first, until it is answered:
+        readers are discovered in the order in which they were made.
+
+        """
+        client = self.node.create_client(kind, service)
+        node = service.rpartition('/')[0]
+        probe = self.node.create_client(GetParameters, f'{node}/get_parameters')
+
+        def is_answered():
+            future = probe.call_async(GetParameters.Request())
+            self.executor.spin_until_future_complete(future, timeout_sec=1.0)
+            return future.done()
+
+        self.wait(probe.service_is_ready, f'the services of {node}')
+        self.wait(is_answered, f'an answer of {node}')
+        self.wait(client.service_is_ready, f'the service {service}')
+        future = client.call_async(request)
+        self.wait(future.done, f'the response of {service}')
+        self.node.destroy_client(probe)
+        self.node.destroy_client(client)
+        return future.result()
 
     def wait(self, condition, awaited, seconds=PATIENCE):
         """Spin until `condition` holds; an error names `awaited`."""

@@ -126,8 +126,9 @@ def _track_lines(scores: TrackScores) -> str:
     ]
     if scores.added:
         lines.append(
-            f'{scores.added} added boxes with a mean 3D IoU of {scores.added_iou:.3f}, the others '
-            f'have {scores.given_iou:.3f}'
+            f'{scores.added} added boxes with a mean 3D IoU of {scores.added_iou:.3f}, of which '
+            f'{scores.added_ghosts} have no true box (IoU 0); the others have '
+            f'{scores.given_iou:.3f}'
         )
     return '\n'.join(lines)
 

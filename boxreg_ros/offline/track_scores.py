@@ -34,6 +34,8 @@ class TrackScores:
         of one object, the ids do not change places.
     added, added_iou : int and float
         Boxes that the input did not have, and their mean 3D IoU; 0 for a ghost.
+    added_ghosts : int
+        Those of them that overlap no true box.
     given_iou : float
         Mean 3D IoU of the other boxes, likewise.
     hota, det_a, ass_a, idf1 : float
@@ -48,6 +50,7 @@ class TrackScores:
     ids_per_object: float
     added: int
     added_iou: float
+    added_ghosts: int
     given_iou: float
     hota: float
     det_a: float
@@ -103,6 +106,7 @@ def track_scores(predicted: BoxTable, truth: BoxTable, scope: Ints | None = None
         ids_per_object=_part(sum(map(len, ids.values())), len(ids)),
         added=len(iou_of[True]),
         added_iou=_part(sum(iou_of[True]), len(iou_of[True])),
+        added_ghosts=iou_of[True].count(0.0),
         given_iou=_part(sum(iou_of[False]), len(iou_of[False])),
         **_trackeval_scores(stamps, predicted, truth),
     )

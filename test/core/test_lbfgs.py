@@ -56,31 +56,6 @@ def test_minima_of_rosenbrock():
     assert (found.status == Status.CONVERGED).all()
 
 
-def test_minima_equal_those_of_torch():
-    # Of one well-conditioned smooth function without a bottom known by hand, from afar.
-    A, known = quadratics(4, 6, seed=2)
-
-    def function(x, rows):
-        value, gradient = quadratic(A, known)(x, rows)
-        return value + x.exp().sum(1), gradient + x.exp()
-
-    start = starts(4, 6)
-    found = minimize(function, start, 200, 6, 1e-15)
-    for row in range(4):
-        index = torch.tensor([row])
-        x = start[index].clone().requires_grad_()
-        solver = torch.optim.LBFGS([x], max_iter=500, tolerance_grad=1e-12, tolerance_change=1e-16,
-                                   line_search_fn='strong_wolfe')  # fmt: skip
-
-        def closure(x=x, index=index):
-            value, x.grad = function(x.detach(), index)
-            return value[0]
-
-        solver.step(closure)
-        np.testing.assert_allclose(found.x[index], x.detach(), atol=1e-5)
-        np.testing.assert_allclose(found.value[index], closure(), rtol=1e-10)
-
-
 @pytest.mark.parametrize('iterations', [1, 5, 300])
 def test_a_batch_equals_single_rows(iterations):
     # Rows end at different times, so ended ones leave the batch on the way.

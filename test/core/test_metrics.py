@@ -66,18 +66,6 @@ def test_3d_equals_qhull(tilt):
     assert shared.max() > 1
 
 
-def test_3d_equals_monte_carlo():
-    rng = np.random.default_rng(3)
-    a, b = pairs(1, rng, tilt=0.4)
-    points = rng.uniform(-5, 5, (400_000, 3))
-    inside = []
-    for box in (a[0], b[0]):
-        local = (points - box[:3]) @ Rotation.from_euler('ZYX', box[[8, 7, 6]]).as_matrix()
-        inside.append((np.abs(local) < box[3:6] / 2).all(axis=1))
-    known = (inside[0] & inside[1]).sum() / (inside[0] | inside[1]).sum()
-    assert iou_3d(a, b)[0] == pytest.approx(known, abs=0.01)
-
-
 @pytest.mark.parametrize('iou', [iou_bev, iou_3d])
 def test_iou_of_known_pairs(iou):
     def moved(**change):

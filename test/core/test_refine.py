@@ -16,6 +16,9 @@ import torch
 
 ESTIMATES = ['early', 'final', 'track']
 each_estimate = pytest.mark.parametrize('estimate', ESTIMATES)
+each_objective = pytest.mark.parametrize(
+    ('objective', 'estimate'), [('paper', 'track'), *(('robust', name) for name in ESTIMATES)]
+)
 
 
 def a_track(seed=0, n=12, truth=None, **noise):
@@ -78,6 +81,9 @@ def test_refined_boxes_are_more_accurate_than_the_input(estimate, motion):
         refined = only(track, Config(estimate=estimate))
         missing.append([1 - iou_3d(boxes, truth).mean() for boxes in (track.boxes, refined.boxes)])
         assert set(refined.status[num_kept_at_start(estimate) :]) == {'refined'}
+        covariances = refined.covariances
+        np.testing.assert_allclose(covariances, covariances.swapaxes(1, 2), atol=1e-9)
+        assert (np.linalg.eigvalsh(covariances) > 0).all()
     before, after = np.mean(missing, axis=0)
     assert after < (2 / 3 if estimate == 'early' else 1 / 2) * before
 
@@ -148,6 +154,8 @@ def test_the_extents_of_a_track_are_estimated():
     refined = only(track)
     assert np.ptp(refined.boxes[:, 3:6], axis=0).max() == 0
     assert np.abs(refined.boxes - truth)[0, 3:6].max() < 0.1
+    paper = only(track, Config(objective='paper'))
+    assert np.ptp(paper.boxes[:, 3:6], axis=0).max() == 0
 
 
 def test_the_order_of_tracks_does_not_matter():
@@ -346,11 +354,6 @@ def test_lists_and_single_precision_give_the_boxes_of_arrays():
     np.testing.assert_allclose(only(single).boxes, only(track).boxes, atol=1e-3)
 
 
-def test_a_track_without_observations_stays_empty():
-    (refined,) = refine([Track('1', 'car', [], [], [])])
-    assert refined.boxes.shape == (0, 9)
-
-
 def test_tracks_are_equal_to_themselves_only():
     track, _ = a_track()
     twin = replace(track)
@@ -450,10 +453,11 @@ def test_accuracy_does_not_degrade_on_a_long_track(estimate):
 # --- settings ------------------------------------------------------------------------------------
 
 
-@each_estimate
-def test_bev_does_not_change_z_roll_and_pitch(estimate):
+@each_objective
+def test_bev_does_not_change_z_roll_and_pitch(objective, estimate):
     track, truth = a_track()
-    refined = only(track, Config(estimate=estimate, mode='bev', extent='fixed'))
+    config = Config(estimate=estimate, mode='bev', extent='fixed', objective=objective)
+    refined = only(track, config)
     np.testing.assert_allclose(refined.boxes[:, 2:8], track.boxes[:, 2:8], rtol=0, atol=1e-9)
     assert iou_3d(refined.boxes, truth).mean() > iou_3d(track.boxes, truth).mean()
 
@@ -465,10 +469,10 @@ def test_bev_keeps_the_mean_height_of_the_input():
     assert np.ptp(refined.boxes[:, 3:6], axis=0).max() == 0
 
 
-@each_estimate
-def test_fixed_extents_are_those_of_the_input(estimate):
+@each_objective
+def test_fixed_extents_are_those_of_the_input(objective, estimate):
     track, _ = a_track(extent=0.05)
-    refined = only(track, Config(estimate=estimate, extent='fixed'))
+    refined = only(track, Config(estimate=estimate, extent='fixed', objective=objective))
     np.testing.assert_array_equal(refined.boxes[:, 3:6], track.boxes[:, 3:6])
 
 

@@ -232,14 +232,6 @@ def test_points_are_motion_compensated_to_boxes_between_sweeps(estimate, offset_
 
 
 @each_estimate
-def test_the_same_calls_return_the_same_boxes(stream, estimate):
-    known, counts = run(stream, config_with(estimate))
-    again, again_counts = run(stream, config_with(estimate))
-    assert_equal(again, known)
-    assert again_counts == counts
-
-
-@each_estimate
 def test_reset_discards_all_but_the_counts(stream, estimate):
     known, counts = run(stream, config_with(estimate))
     registrar = BoxRegistrar(config_with(estimate))

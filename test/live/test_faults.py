@@ -47,15 +47,6 @@ def shifted(drive, seconds):
     return drive
 
 
-def call(graph, kind, name, request, node='/boxreg_node'):
-    """Call a service of the node and return its response."""
-    client = graph.node.create_client(kind, f'{node}/{name}')
-    graph.wait(client.service_is_ready, name)
-    future = client.call_async(request)
-    graph.wait(future.done, f'an answer of {name}')
-    return future.result()
-
-
 def test_parameters_and_services_at_run_time(graph, tmp_path):
     file = tmp_path / 'saved.yaml'
     graph.publisher(POINTS, '/points', is_reliable=False)
@@ -75,7 +66,7 @@ def test_parameters_and_services_at_run_time(graph, tmp_path):
     def set_to(**values):
         changes = [Parameter(n.replace('__', '.'), value=v) for n, v in values.items()]
         request = SetParameters.Request(parameters=[c.to_parameter_msg() for c in changes])
-        return call(graph, SetParameters, 'set_parameters', request).results
+        return graph.call(SetParameters, '/boxreg_node/set_parameters', request).results
 
     changes = {'solver__rounds': 2, 'transform_timeout': 1, 'vehicle__names': ['ute']}
     assert all(result.successful for result in set_to(**changes))
@@ -88,17 +79,17 @@ def test_parameters_and_services_at_run_time(graph, tmp_path):
         (result,) = set_to(**invalid)
         assert not result.successful
         assert all(word in result.reason for word in words), result.reason
-    answer = call(graph, Trigger, 'save_config', Trigger.Request())
+    answer = graph.call(Trigger, '/boxreg_node/save_config', Trigger.Request())
     assert (answer.success, answer.message) == (True, str(file))
     expected = {'solver.rounds': 2, 'vehicle.names': ['ute'], 'window': 8, 'lag': 7}
     assert Config.from_yaml(file) == Config().updated(expected)
     assert 'transform_timeout: 1.0' in file.read_text()  # an integer is accepted for a real
-    assert call(graph, Trigger, 'reset', Trigger.Request()).success
+    assert graph.call(Trigger, '/boxreg_node/reset', Trigger.Request()).success
     folder = tmp_path / 'folder'
     folder.mkdir()
     for invalid_file in (tmp_path / 'missing' / 'saved.yaml', folder, Path('/')):
         set_to(config_file=str(invalid_file))
-        answer = call(graph, Trigger, 'save_config', Trigger.Request())
+        answer = graph.call(Trigger, '/boxreg_node/save_config', Trigger.Request())
         assert not answer.success
         assert 'config_file' in answer.message
     assert not list(tmp_path.glob('.*.partial'))
@@ -107,7 +98,7 @@ def test_parameters_and_services_at_run_time(graph, tmp_path):
     renamed = ('-r', '__ns:=/front', '-r', '__node:=refiner')
     again = graph.start('--params-file', str(file), *renamed)
     request = GetParameters.Request(names=['transform_timeout'])
-    (timeout,) = call(graph, GetParameters, 'get_parameters', request, '/front/refiner').values
+    (timeout,) = graph.call(GetParameters, '/front/refiner/get_parameters', request).values
     assert timeout.double_value == 1.0
     assert ended_cleanly(again)
     assert 'unknown parameters' not in again.output()

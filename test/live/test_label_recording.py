@@ -78,11 +78,7 @@ class Robot:
         return '' if result.successful else result.reason
 
     def _request(self, kind, name, request):
-        client = self.graph.node.create_client(kind, f'/boxreg_node/{name}')
-        self.graph.wait(client.service_is_ready, f'the service {name}')
-        future = client.call_async(request)
-        self.graph.wait(future.done, f'the response of {name}')
-        return future.result()
+        return self.graph.call(kind, f'/boxreg_node/{name}', request)
 
     def state(self):
         """Return the newest state of the recording in /diagnostics, as level, text and values."""

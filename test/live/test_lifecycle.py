@@ -26,20 +26,13 @@ class Manager:
 
     def __init__(self, graph):
         self._graph = graph
-        self._change = graph.node.create_client(ChangeState, f'{NODE}/change_state')
-        self._state = graph.node.create_client(GetState, f'{NODE}/get_state')
-        graph.wait(self._change.service_is_ready, 'the services of the node')
 
     def change(self, transition):
         """Request a transition; return whether it succeeded, and the state after it."""
         request = ChangeState.Request(transition=Transition(id=transition))
-        succeeded = self._answer(self._change, request).success
-        return succeeded, self._answer(self._state, GetState.Request()).current_state.label
-
-    def _answer(self, client, request):
-        future = client.call_async(request)
-        self._graph.wait(future.done, 'an answer')
-        return future.result()
+        changed = self._graph.call(ChangeState, f'{NODE}/change_state', request)
+        state = self._graph.call(GetState, f'{NODE}/get_state', GetState.Request())
+        return changed.success, state.current_state.label
 
 
 def wait_until_unsubscribed(graph):

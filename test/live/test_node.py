@@ -431,12 +431,10 @@ def test_calibrated_settings_are_read_as_parameters(graph, tmp_path):
     margins = tmp_path / 'margins.yaml'
     write_settings(margins, values, 'a test')
     node = graph.start('--params-file', str(margins))
-    client = graph.node.create_client(GetParameters, '/boxreg_node/get_parameters')
-    graph.wait(client.service_is_ready, 'its parameters')
     names = [item.name for item in settings()]
-    future = client.call_async(GetParameters.Request(names=names))
-    graph.wait(future.done, 'an answer')
-    answer = map(parameter_value_to_python, future.result().values)
+    request = GetParameters.Request(names=names)
+    response = graph.call(GetParameters, '/boxreg_node/get_parameters', request)
+    answer = map(parameter_value_to_python, response.values)
     defaults = {item.name: value for item, value in Config().items()}
     expected = {
         name: list(value) if isinstance(value, tuple) else value

@@ -5,11 +5,7 @@ Of early, final and track estimates, for every class, along the axes of the true
 
 """
 
-from __future__ import annotations
-
-import argparse
 from pathlib import Path
-from typing import Any
 
 from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES
 from boxreg_ros.bench.common import progress_bar
@@ -17,9 +13,9 @@ from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance
 from boxreg_ros.offline.box_scores import match
-from boxreg_ros.offline.consistency import Consistency, consistency
+from boxreg_ros.offline.consistency import consistency
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.structures import REFINED, RefinedBoxes
+from boxreg_ros.structures import REFINED
 import numpy as np
 
 ARGUMENTS = {
@@ -27,9 +23,9 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
+def run(args):
     """Return coverage and normalised squared errors of each estimate, per recording."""
-    report: dict[str, Any] = {}
+    report = {}
     with progress_bar(len(args.data), args) as bar:
         for folder in args.data:
             found = measure(Drive.read(folder))
@@ -41,7 +37,7 @@ def run(args: argparse.Namespace) -> object:
     return report
 
 
-def measure(drive: Drive) -> dict[str, dict[str, Consistency]]:
+def measure(drive):
     """Return the consistency of each estimate of a drive, by class; without small classes."""
     found = {}
     for estimate in ('final', 'track'):
@@ -57,7 +53,7 @@ def measure(drive: Drive) -> dict[str, dict[str, Consistency]]:
     return found
 
 
-def _covariances(results: list[RefinedBoxes]) -> dict[tuple[int, str], BoxCovariance]:
+def _covariances(results):
     """Return the covariances of all refined boxes by stamp and track id; ranges are unknown."""
     return {
         (result.boxes.stamp_ns, track_id): BoxCovariance(np.nan, pose, extent)

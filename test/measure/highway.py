@@ -7,11 +7,6 @@ find out which (`sampling.box_time`).
 
 """
 
-from __future__ import annotations
-
-import argparse
-from collections.abc import Callable, Iterator
-
 from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.offline.box_scores import match
@@ -32,13 +27,13 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
+def run(args):
     """Return the mean 3D IoU of each method by speed and time of the boxes."""
-    results: dict[str, dict[str, dict[str, float]]] = {}
+    results = {}
     count = len(CONVENTIONS) * len(SPEEDS) * args.seeds
     with progress_bar(count, args) as bar:
         for convention in CONVENTIONS:
-            table: dict[str, dict[str, float]] = {}
+            table = {}
             for speed in SPEEDS:
                 for name, iou in _mean_ious(args, convention, speed, bar.update).items():
                     table.setdefault(name, {})[f'{speed:g} m/s'] = iou
@@ -46,11 +41,9 @@ def run(args: argparse.Namespace) -> object:
     return results
 
 
-def _mean_ious(
-    args: argparse.Namespace, convention: str, speed: float, done: Callable[[], object]
-) -> dict[str, float]:
+def _mean_ious(args, convention, speed, done):
     """Return the mean 3D IoU of each method over all seeds; `done` is called after each seed."""
-    ious: dict[str, list[float]] = {}
+    ious = {}
     for seed in range(args.seeds):
         for name, iou in measured(seed, args.sweeps, convention, speed):
             ious.setdefault(name, []).append(iou)
@@ -58,20 +51,8 @@ def _mean_ious(
     return {name: float(np.mean(values)) for name, values in ious.items()}
 
 
-def measured(seed: int, sweeps: int, convention: str, speed: float) -> Iterator[tuple[str, float]]:
-    """
-    Yield the name of each method and its mean 3D IoU on one drive.
-
-    Parameters
-    ----------
-    seed, sweeps : int
-        Of the drive.
-    convention : str
-        One of `CONVENTIONS`.
-    speed : float
-        Of the sensor [m/s].
-
-    """
+def measured(seed, sweeps, convention, speed):
+    """Yield the name of each method and its mean 3D IoU on one drive."""
     rng = np.random.default_rng(seed)
     drive = Drive.from_scene(highway(rng, sweeps, convention == 'sight', speed))
     for name, boxes in run_methods(drive, wanted=COMPARED).items():

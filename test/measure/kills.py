@@ -7,8 +7,6 @@ Boxes are lost if they were published before that and are in no segment.
 
 """
 
-from __future__ import annotations
-
 import argparse
 from contextlib import ExitStack
 import os
@@ -17,7 +15,7 @@ import signal
 import subprocess
 from tempfile import TemporaryDirectory
 import time
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.errors import BoxregError
@@ -55,18 +53,10 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
-    """
-    Return the loss of each kind when a process is killed.
-
-    Raises
-    ------
-    BoxregError
-        If no final boxes arrive, or a segment is not recovered.
-
-    """
+def run(args):
+    """Return the loss of each kind when a process is killed."""
     rng = np.random.default_rng(0)
-    report: dict[str, float] = {'load before': os.getloadavg()[0]}
+    report = {'load before': os.getloadavg()[0]}
     for victim in VICTIMS:
         losses = [_killed(args, victim, rng.uniform(*RUNNING_TIMES)) for _ in range(args.kills)]
         for kind, counts in zip(LostArrays._fields, zip(*losses, strict=True), strict=True):
@@ -76,7 +66,7 @@ def run(args: argparse.Namespace) -> object:
     return report
 
 
-def _killed(args: argparse.Namespace, victim: str, seconds: float) -> LostArrays:
+def _killed(args, victim, seconds):
     """Kill a process some time after the first final boxes; return the boxes lost."""
     scope = argparse.Namespace(
         tracks=args.tracks, points=args.points, rate=RATE, delay=0.05,
@@ -101,7 +91,7 @@ def _killed(args: argparse.Namespace, victim: str, seconds: float) -> LostArrays
         return LostArrays(*(len(published[name] - labels.stamps) for name in LostArrays._fields))
 
 
-def _wait_for_finals(arrivals: dict[str, Any], log: Path) -> None:
+def _wait_for_finals(arrivals, log):
     """Wait for the first final boxes."""
     end = time.monotonic() + STARTING_TIME
     while not arrivals['final']:
@@ -112,7 +102,7 @@ def _wait_for_finals(arrivals: dict[str, Any], log: Path) -> None:
         time.sleep(0.01)
 
 
-def _recover(labels: RecordedLabels, folder: Path) -> None:
+def _recover(labels, folder):
     """Recover cut-off segments, as soon as no recorder uses the folder; count the labels."""
     end = time.monotonic() + COMPLETION_TIME
     while labels.has_open_segment:

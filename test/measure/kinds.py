@@ -6,13 +6,8 @@ few pedestrians and cyclists, and the boxes of each share its errors.
 
 """
 
-from __future__ import annotations
-
-import argparse
-from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES
 from boxreg_ros.bench.common import progress_bar
@@ -46,9 +41,9 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
+def run(args):
     """Return the differences of each class: of each recording, or of all streets."""
-    measured: dict[str, dict[Comparison, dict[str, PairedBoxes]]] = {}  # by table; pairs by drive
+    measured = {}  # by table; pairs by drive
     with progress_bar(len(args.data) or args.seeds, args) as bar:
         for table, name, drive in _drives(args):
             comparisons = measured.setdefault(table, {})
@@ -59,7 +54,7 @@ def run(args: argparse.Namespace) -> object:
     return _plain(tables)
 
 
-def _drives(args: argparse.Namespace) -> Iterator[tuple[str, str, Drive]]:
+def _drives(args):
     """Yield the title of a table, and name and drive of each of its drives."""
     for folder in args.data:
         yield str(folder), folder.name, Drive.read(folder)
@@ -69,7 +64,7 @@ def _drives(args: argparse.Namespace) -> Iterator[tuple[str, str, Drive]]:
             yield f'{args.seeds} simulated {SCENARIOS[args.scenario]}', str(seed), drive
 
 
-def compared(drive: Drive) -> Iterator[tuple[Comparison, PairedBoxes]]:
+def compared(drive):
     """Yield the true boxes with points of each class, by our estimates and by their references."""
     truth = drive.truth
     methods = run_methods(drive, wanted=COMPARED)
@@ -88,9 +83,9 @@ def compared(drive: Drive) -> Iterator[tuple[Comparison, PairedBoxes]]:
                     yield (class_name, method, other), pairs
 
 
-def _differences(comparisons: Mapping[Comparison, Mapping[str, PairedBoxes]]) -> Differences:
+def _differences(comparisons):
     """Return the pooled difference of each comparison with enough boxes."""
-    found: Differences = {}
+    found = {}
     for (class_name, method, other), parts in sorted(comparisons.items()):
         difference = PairedBoxes.pooled(parts).difference()
         if difference.boxes >= MIN_CLASS_BOXES:
@@ -99,7 +94,7 @@ def _differences(comparisons: Mapping[Comparison, Mapping[str, PairedBoxes]]) ->
     return found
 
 
-def _plain(found: Any) -> Any:
+def _plain(found):
     """Return nested differences as nested dictionaries of numbers."""
     if isinstance(found, Difference):
         return asdict(found)

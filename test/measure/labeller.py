@@ -9,18 +9,13 @@ add: there, files are edited by hand.
 
 """
 
-from __future__ import annotations
-
-import argparse
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 import subprocess
 from tempfile import TemporaryDirectory
 from threading import Thread
 import time
-from typing import Any
 
 from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.core.metrics import iou_3d
@@ -29,7 +24,7 @@ from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.reviewed_drive import drive_of
 from boxreg_ros.review.server import review_server
-from boxreg_ros.structures import Floats, REJECTED, YAW
+from boxreg_ros.structures import BoxArray, REJECTED, YAW
 from browser import end_shared_browser, opened_page
 import numpy as np
 
@@ -49,7 +44,7 @@ TIMEOUT = 120_000
 """Of the page, on a loaded machine [ms]."""
 THINKING = 1.35
 """Of the same model, before each decision [s]."""
-BEFORE: Mapping[str, tuple[str, ...]] = {
+BEFORE = {
     'wrong': ('open', 'step', 'e', 'drag', 'drag', 'Enter', 'next'),
     'ghost': ('open', 'read id', 'editor', 'search', 'select rows', 'delete', 'save'),
     'broken': ('open', 'read id', 'open', 'read id', 'editor', 'replace', 'type', 'type',
@@ -65,13 +60,13 @@ BEFORE: Mapping[str, tuple[str, ...]] = {
 ARGUMENTS = {'--seed': (0, '')}
 
 
-def run(args: argparse.Namespace) -> object:
+def run(args):
     """Plant, relabel, review, and return actions and errors."""
     with TemporaryDirectory() as folder:
         return measure(Path(folder), args.seed)
 
 
-def measure(folder: Path, seed: int = 0) -> dict[str, Any]:
+def measure(folder, seed=0):
     """Return the errors that were planted, left by the run and by the review, and its actions."""
     truth = BoxTable.read(STREET / 'street_truth.csv')
     given = planted(truth, seed)
@@ -104,7 +99,7 @@ def measure(folder: Path, seed: int = 0) -> dict[str, Any]:
     }
 
 
-def judged(truth: BoxTable) -> list[str]:
+def judged(truth):
     """Return the objects that get errors and are judged: those with points, the most first."""
     names = np.array(truth.track_ids)
     points = {
@@ -113,7 +108,7 @@ def judged(truth: BoxTable) -> list[str]:
     return sorted((n for n in points if points[n] >= MIN_POINTS), key=lambda n: (-points[n], n))
 
 
-def planted(truth: BoxTable, seed: int) -> BoxTable:
+def planted(truth, seed):
     """Return the boxes of the detector of the street, with errors."""
     rng = np.random.default_rng(seed)
     arrays, _ = input_boxes(Recording([STREET / 'street.mcap']))
@@ -140,67 +135,48 @@ def planted(truth: BoxTable, seed: int) -> BoxTable:
         sign = rng.choice([-1.0, 1.0])
         boxes[part, :2] += sign * rng.uniform(0.4, 0.5, 2) * boxes[part, 3:4].clip(3.6)
         boxes[part, YAW] += sign * 0.4
-    columns = [keep.nonzero()[0]]
-    table = replace(table, track_ids=tuple(names), boxes=boxes)
-    table = _rows(table, columns[0])
+    table = replace(table, track_ids=tuple(names), boxes=boxes).rows(keep)
     return _with_ghosts(table, truth, rng)
 
 
-def _rows(table: BoxTable, rows: Any) -> BoxTable:
-    return replace(
-        table,
-        stamps_ns=table.stamps_ns[rows],
-        track_ids=tuple(table.track_ids[row] for row in rows),
-        class_names=tuple(table.class_names[row] for row in rows),
-        status=tuple(table.status[row] for row in rows),
-        scores=table.scores[rows],
-        boxes=table.boxes[rows],
-        num_points=table.num_points[rows],
-    )
-
-
-def _with_ghosts(table: BoxTable, truth: BoxTable, rng: np.random.Generator) -> BoxTable:
+def _with_ghosts(table, truth, rng):
     """Return a table with boxes at places where no object ever is."""
     stamps = np.unique(table.stamps_ns)
     low, high = truth.boxes[:, :2].min(0), truth.boxes[:, :2].max(0)
-    places: list[Floats] = []
+    places = []
     while len(places) < GHOSTS:
         place = rng.uniform(low, high)
         taken = np.concatenate([truth.boxes[:, :2], np.array(places).reshape(-1, 2)])
         if np.linalg.norm(taken - place, axis=1).min() > 5:
             places.append(place)
-    parts = [table]
-    for number, place in enumerate(places):
+    ghosts = []
+    for place in places:
         box = np.array([*place, 0.8, 4.4, 1.8, 1.6, 0, 0, rng.uniform(-3, 3)])
-        n = len(stamps)
-        parts.append(replace(
-            table, stamps_ns=stamps, track_ids=(str(201 + number),) * n,
-            class_names=('car',) * n, status=('input',) * n, scores=np.ones(n),
-            boxes=box + rng.normal(0, 0.05, (n, 9)) * [1, 1, 0, 0, 0, 0, 0, 0, 0.1],
-            num_points=np.zeros(n, np.int64),
+        ghosts.append(box + rng.normal(0, 0.05, (len(stamps), 9)) * [1, 1, *[0] * 6, 0.1])
+    names = tuple(str(201 + number) for number in range(GHOSTS))
+    arrays = []
+    for step, stamp_ns in enumerate(stamps.tolist()):
+        here = table.rows(table.stamps_ns == stamp_ns)
+        arrays.append(BoxArray(
+            stamp_ns, table.frame_id, here.track_ids + names,
+            here.class_names + ('car',) * GHOSTS, np.r_[here.scores, np.ones(GHOSTS)],
+            np.concatenate([here.boxes, np.array(ghosts)[:, step]]),
         ))  # fmt: skip
-    whole = replace(
-        table,
-        **{name: np.concatenate([getattr(part, name) for part in parts])
-           for name in ('stamps_ns', 'scores', 'boxes', 'num_points')},
-        **{name: tuple(one for part in parts for one in getattr(part, name))
-           for name in ('track_ids', 'class_names', 'status')},
-    )  # fmt: skip
-    return _rows(whole, np.argsort(whole.stamps_ns, kind='stable'))
+    return BoxTable.from_arrays(arrays)
 
 
 class Matches:
     """The true boxes by stamp, and the object that each box is nearest to."""
 
-    def __init__(self, truth: BoxTable) -> None:
+    def __init__(self, truth):
         self._truth = truth
-        self._rows: dict[int, Any] = {
+        self._rows = {
             int(stamp): np.flatnonzero(truth.stamps_ns == stamp)
             for stamp in np.unique(truth.stamps_ns)
         }
         self.judged = set(judged(truth))
 
-    def of(self, stamp_ns: int, box: Floats) -> tuple[str, float, Floats]:
+    def of(self, stamp_ns, box):
         """Return the nearest object, the 3D IoU with it, and its true box."""
         rows = self._rows[stamp_ns]
         boxes = self._truth.boxes[rows]
@@ -210,7 +186,7 @@ class Matches:
         overlap = float(iou_3d(box[None], boxes[nearest : nearest + 1])[0])
         return self._truth.track_ids[rows[nearest]], overlap, boxes[nearest]
 
-    def truth_of(self, names: Collection[str], stamp_ns: int, box: Floats) -> tuple[float, Floats]:
+    def truth_of(self, names, stamp_ns, box):
         """Return the largest 3D IoU with some objects, and that true box; 1 if none is there."""
         rows = [row for row in self._rows[stamp_ns] if self._truth.track_ids[row] in names]
         boxes = self._truth.boxes[rows]
@@ -218,20 +194,20 @@ class Matches:
         best = int(overlaps.argmax()) if rows else -1
         return (float(overlaps[best]), boxes[best]) if rows else (1.0, box)
 
-    def of_track(self, stamps_ns: Iterable[int], boxes: Floats) -> list[tuple[str, float, Floats]]:
+    def of_track(self, stamps_ns, boxes):
         """Return the same of each box of a track."""
         return [self.of(stamp, box) for stamp, box in zip(stamps_ns, boxes, strict=True)]
 
 
-def errors(table: BoxTable, truth: BoxTable) -> dict[str, int]:
+def errors(table, truth):
     """Return the wrong boxes, ghosts, broken and swapped tracks, and missing objects of labels."""
     matches = Matches(truth)
-    tracks: dict[str, list[int]] = {}
+    tracks = {}
     for row, name in enumerate(table.track_ids):
         if table.status[row] != REJECTED:
             tracks.setdefault(name, []).append(row)
     found = Counter(wrong=0, ghost=0, broken=0, swapped=0, missing=0)
-    owners: dict[str, set[str]] = {}
+    owners = {}
     for name, rows in tracks.items():
         near = matches.of_track(table.stamps_ns[rows].tolist(), table.boxes[rows])
         objects = Counter(one for one, _, _ in near if one)
@@ -252,7 +228,7 @@ def errors(table: BoxTable, truth: BoxTable) -> dict[str, int]:
     return dict(found)
 
 
-def _is_pure(table: BoxTable, rows: Sequence[int], matches: Matches) -> bool:
+def _is_pure(table, rows, matches):
     near = matches.of_track(table.stamps_ns[rows].tolist(), table.boxes[rows])
     objects = Counter(one for one, _, _ in near if one)
     return sum(count > len(rows) / 4 for count in objects.values()) == 1
@@ -271,42 +247,42 @@ class Labeller:
 
     """
 
-    def __init__(self, page: Any, truth: BoxTable) -> None:
+    def __init__(self, page, truth):
         self._page = page
         page.set_default_timeout(TIMEOUT)
         self._matches = Matches(truth)
         self._truth = truth
-        self.actions: Counter[str] = Counter()
-        self.decided: Counter[str] = Counter()
+        self.actions = Counter()
+        self.decided = Counter()
 
     @property
-    def seconds(self) -> float:
+    def seconds(self):
         """Return the time that a person needs [s]."""
         acting = sum(SECONDS[kind] * count for kind, count in self.actions.items())
         return acting + THINKING * self.decided.total()
 
-    def key(self, name: str) -> None:
+    def key(self, name):
         """Press a key."""
         self.actions['key'] += 1
         self._page.keyboard.press(name)
 
-    def click(self, selector: str) -> None:
+    def click(self, selector):
         """Click an element."""
         self.actions['click'] += 1
         self._page.click(selector)
 
-    def click_slider(self, selector: str, row: int, last: int) -> None:
+    def click_slider(self, selector, row, last):
         """Click a slider at one of its rows."""
         self.actions['click'] += 1
         bounds = self._page.locator(selector).bounding_box()
         x = bounds['x'] + 8 + (bounds['width'] - 16) * row / max(1, last)
         self._page.mouse.click(x, bounds['y'] + bounds['height'] / 2)
 
-    def review(self) -> None:
+    def review(self):
         """Look at every track, then at what is broken, then at what is missing."""
         self.click('#tab-tracks')
         self._page.wait_for_function('view.part')
-        seen: set[str] = set()
+        seen = set()
         while True:
             name = self._page.evaluate('current().id')
             if name in seen:
@@ -319,7 +295,7 @@ class Labeller:
         self._page.wait_for_function("$('notice').textContent.includes('boxes in')",
                                      timeout=600_000)  # fmt: skip
 
-    def _look(self) -> None:
+    def _look(self):
         """Decide about the open track, and go on with the next one."""
         near = self._matches.of_track(*self._boxes())
         objects = [one for one, _, _ in near]
@@ -339,7 +315,7 @@ class Labeller:
         self._correct()
         return self._next()
 
-    def _next(self) -> None:
+    def _next(self):
         """Accept and go on, unless the track was deleted."""
         name = self._page.evaluate('current().id')
         if self._page.evaluate('isGone(current())'):
@@ -351,7 +327,7 @@ class Labeller:
         self._page.wait_for_function(with_next)
         self._page.wait_for_timeout(50)
 
-    def _correct(self) -> None:
+    def _correct(self):
         """Correct boxes of the open track until all that are judged are right."""
         for _ in range(RUN):
             stamps_ns, boxes = self._boxes(with_solved=True)
@@ -377,7 +353,7 @@ class Labeller:
             self.key('o')
             self._page.wait_for_function('view.solved', timeout=120_000)
 
-    def _drag_to(self, target: Floats) -> None:
+    def _drag_to(self, target):
         """Drag the stroke at the front of the box, and the box in two views, to a true box."""
         turn, length, heading = self._page.evaluate(
             """target => {
@@ -396,7 +372,7 @@ class Labeller:
             if np.abs(there - here)[axes].max() > 0.1:
                 self._drag(view, here, there)
 
-    def _off(self, target: Floats) -> tuple[Floats, Floats]:
+    def _off(self, target):
         """Return the centre of the box, and of a true box, in the axes of the views."""
         here, there = self._page.evaluate(
             """target => [view.edit, moved(target, view.part.origin, -1)]
@@ -405,7 +381,7 @@ class Labeller:
         )
         return np.array(here), np.array(there)
 
-    def _drag(self, view: str, *places: Floats) -> None:
+    def _drag(self, view, *places):
         """Drag from one place to another one in a view."""
         self.actions['drag'] += 1
         points = self._page.evaluate(
@@ -422,7 +398,7 @@ class Labeller:
         self._page.mouse.up()
         self._page.wait_for_timeout(50)
 
-    def _join(self) -> None:
+    def _join(self):
         """Join the tracks of one object."""
         for name in sorted(self._matches.judged):
             pieces = [one for one, near in self._all().items() if near == name]
@@ -446,7 +422,7 @@ class Labeller:
                 self._page.wait_for_function(f'TRACKS.length < {count}')
                 pieces = [one for one, near in self._all().items() if near == name]
 
-    def _add(self) -> None:
+    def _add(self):
         """Add the objects that have no box."""
         missing = sorted(self._matches.judged - set(self._all().values()))
         names = np.array(self._truth.track_ids)
@@ -496,19 +472,19 @@ class Labeller:
             )
             self._correct()
 
-    def _open(self, name: str) -> None:
+    def _open(self, name):
         self.actions['click'] += 1  # on its line
         self._page.evaluate(f'openTrack(TRACKS.findIndex(t => t.id === {name!r}))')
         self._page.wait_for_function(f'view.part && current().id === {name!r}')
 
-    def _go(self, row: int) -> None:
+    def _go(self, row):
         """Go to a box of the open track by the slider."""
         last = self._page.evaluate('view.part.stamps.length - 1')
         self.click_slider('#time', row, last)
         while self._page.evaluate('view.row') != row:
             self.key('ArrowRight' if self._page.evaluate('view.row') < row else 'ArrowLeft')
 
-    def _boxes(self, with_solved: bool = False) -> tuple[list[int], Floats]:
+    def _boxes(self, with_solved=False):
         """Return stamps and boxes of the open track, as the page shows them."""
         stamps, boxes = self._page.evaluate(
             """isSolved => [view.part.stamps, view.part.usable.map((box, k) => {
@@ -520,7 +496,7 @@ class Labeller:
         )
         return list(map(int, stamps)), np.array(boxes)
 
-    def _all(self) -> dict[str, str]:
+    def _all(self):
         """Return the object of each track that is not deleted."""
         found = self._page.evaluate(
             """(async () => {
@@ -539,13 +515,13 @@ class Labeller:
             objects[name] = Counter(one for one, _, _ in near).most_common(1)[0][0]
         return objects
 
-    def _decide(self, kind: str, action: str, until: str) -> None:
+    def _decide(self, kind, action, until):
         self.decided[kind] += 1
         self.key(action.removeprefix('key:'))
         self._page.wait_for_function(until)
 
 
-def reviewed(out: Path, truth: BoxTable) -> Labeller:
+def reviewed(out, truth):
     """Review a result until it is right, write the labels, and return who did it."""
     server = review_server(out, 0, 'script', drive_of(out))
     Thread(target=server.serve_forever, daemon=True).start()

@@ -7,12 +7,8 @@ is read with and without the names of its LiDARs. The input boxes and the truth 
 
 """
 
-from __future__ import annotations
-
-import argparse
 from pathlib import Path
 import tempfile
-from typing import Any
 
 from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.config import Config
@@ -43,9 +39,9 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
+def run(args):
     """Return the mean IoU of the input and of each way to record the LiDARs."""
-    rows: dict[str, list[tuple[float, float]]] = {name: [] for name in ('input', *WAYS)}
+    rows = {name: [] for name in ('input', *WAYS)}
     with progress_bar(args.seeds * len(WAYS), args) as bar:
         for seed in range(args.seeds):
             for name, ious in measured(seed, args.sweeps, bar.update).items():
@@ -56,20 +52,10 @@ def run(args: argparse.Namespace) -> object:
     }
 
 
-def measured(seed: int, sweeps: int | None, done: Any) -> dict[str, tuple[float, float]]:
-    """
-    Return mean BEV and 3D IoU of the input and of each way for one drive.
-
-    Parameters
-    ----------
-    seed, sweeps
-        Of the drive.
-    done : callable
-        Called after each way.
-
-    """
+def measured(seed, sweeps, done):
+    """Return mean BEV and 3D IoU of the input and of each way for one drive."""
     scene = truck_scene(seed, sweeps)
-    found: dict[str, tuple[float, float]] = {}
+    found = {}
     with tempfile.TemporaryDirectory() as folder:
         for name, (layout, lidars) in WAYS.items():
             path = Path(folder) / f'{layout}.mcap'
@@ -85,7 +71,7 @@ def measured(seed: int, sweeps: int | None, done: Any) -> dict[str, tuple[float,
     return found
 
 
-def _ious(boxes: BoxTable, truth: BoxTable) -> tuple[float, float]:
+def _ious(boxes, truth):
     """Return the mean BEV and 3D IoU of the boxes that there are."""
     matches = match(boxes, truth, MIN_POINTS, CLASSES)
     is_there = matches.is_matched

@@ -8,8 +8,6 @@ the true boxes of the publisher.
 
 """
 
-from __future__ import annotations
-
 import argparse
 
 from boxreg_ros.core.metrics import iou_3d
@@ -31,23 +29,15 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
-    """
-    Return latency and accuracy by policy and number of tracks.
-
-    Raises
-    ------
-    BoxregError
-        If the node or the publisher ends early.
-
-    """
+def run(args):
+    """Return latency and accuracy by policy and number of tracks."""
     return {
         policy: {str(tracks): _measured(args, tracks, settings) for tracks in args.tracks}
         for policy, settings in POLICIES.items()
     }
 
 
-def _measured(args: argparse.Namespace, tracks: int, settings: list[str]) -> dict[str, float]:
+def _measured(args, tracks, settings):
     """Return latency, accuracy and losses for a number of tracks and parameters of the node."""
     scope = argparse.Namespace(
         tracks=tracks, points=args.points, rate=10.0, seconds=args.seconds, delay=0.05,
@@ -62,7 +52,7 @@ def _measured(args: argparse.Namespace, tracks: int, settings: list[str]) -> dic
     return {**latencies, 'input IoU': _input_iou(scope), **overlap, 'clouds dropped': dropped}
 
 
-def _mean_iou(args: argparse.Namespace, messages: dict[int, bytes]) -> float:
+def _mean_iou(args, messages):
     """Return the mean 3D IoU of serialised messages, by sweep, to the true boxes."""
     from rclpy.serialization import deserialize_message
     from visualization_msgs.msg import MarkerArray
@@ -76,7 +66,7 @@ def _mean_iou(args: argparse.Namespace, messages: dict[int, bytes]) -> float:
     return float(np.mean(overlaps)) if overlaps else float('nan')
 
 
-def _input_iou(args: argparse.Namespace) -> float:
+def _input_iou(args):
     """Return the mean 3D IoU of noisy boxes as the publisher makes them."""
     rng = np.random.default_rng(0)
     truth = np.concatenate(

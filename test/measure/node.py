@@ -7,10 +7,7 @@ publishing the later of cloud and boxes until the refined boxes arrive at the ob
 
 """
 
-from __future__ import annotations
-
 import argparse
-from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, ExitStack
 from functools import partial
 import os
@@ -21,12 +18,11 @@ import subprocess
 from tempfile import TemporaryDirectory
 from threading import Thread
 import time
-from typing import Any
 
 from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.errors import BoxregError, ConfigError
 from boxreg_ros.labels import module_of
-from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
+from boxreg_ros.structures import LENGTH, ROLL, YAW
 from measure import MEASURE
 from measure.recorded import RecordedLabels
 import numpy as np
@@ -69,16 +65,8 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
-    """
-    Return what was measured; a process with a role returns nothing.
-
-    Raises
-    ------
-    BoxregError
-        If rclpy cannot be imported, or the node or the publisher ends early.
-
-    """
+def run(args):
+    """Return what was measured; a process with a role returns nothing."""
     try:
         import rclpy  # noqa: F401
     except ImportError as error:
@@ -93,7 +81,7 @@ def run(args: argparse.Namespace) -> object:
 # ---------------------------------------------------------------- process of the publisher
 
 
-def true_boxes(args: argparse.Namespace, turn: int) -> Floats:
+def true_boxes(args, turn):
     """Return the true boxes (n, 9) of a sweep, in the sensor frame."""
     side = int(np.ceil(np.sqrt(args.tracks)))
     index = np.arange(args.tracks)
@@ -106,7 +94,7 @@ def true_boxes(args: argparse.Namespace, turn: int) -> Floats:
     return boxes
 
 
-def scene(args: argparse.Namespace, turn: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+def scene(args, turn, rng):
     """Return the points (M, 3) and noisy boxes (n, 9) of a sweep, in the sensor frame."""
     boxes = true_boxes(args, turn)
     phase = boxes[:, YAW]
@@ -130,7 +118,7 @@ def scene(args: argparse.Namespace, turn: int, rng: np.random.Generator) -> tupl
     return np.concatenate([points.reshape(-1, 3), road]), noisy
 
 
-def publish(args: argparse.Namespace) -> None:
+def publish(args):
     """Publish in real time; log stamp and time of publishing of every box array [ns]."""
     from nav_msgs.msg import Odometry
     import rclpy
@@ -180,7 +168,7 @@ def publish(args: argparse.Namespace) -> None:
     rclpy.shutdown()
 
 
-def _set_ids_and_stamp(array: Any, turn: int, stamp: tuple[int, int]) -> None:
+def _set_ids_and_stamp(array, turn, stamp):
     """Set the stamp of all markers of a sweep, and their ids, each new after `TRACK_LIFETIME`."""
     tracks = len(array.markers)
     for i, marker in enumerate(array.markers):
@@ -189,11 +177,11 @@ def _set_ids_and_stamp(array: Any, turn: int, stamp: tuple[int, int]) -> None:
         marker.header.stamp.sec, marker.header.stamp.nanosec = stamp
 
 
-def _sleep_until(moment_ns: int) -> None:
+def _sleep_until(moment_ns):
     time.sleep(max(0.0, (moment_ns - time.time_ns()) * 1e-9))
 
 
-def _cloud_bytes(points: Any) -> bytearray:
+def _cloud_bytes(points):
     """Return points (M, 3) as a serialised PointCloud2 with x, y, z and intensity."""
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import PointCloud2, PointField
@@ -210,7 +198,7 @@ def _cloud_bytes(points: Any) -> bytearray:
     return bytearray(serialize_message(cloud))
 
 
-def _marker_array(boxes: Any) -> Any:
+def _marker_array(boxes):
     """Return boxes (n, 9) as a MarkerArray of CUBE markers."""
     from msg_adapters.poses import quaternions_of
     from visualization_msgs.msg import Marker, MarkerArray
@@ -231,10 +219,10 @@ def _marker_array(boxes: Any) -> Any:
 # ----------------------------------------------------------------- process of the observer
 
 
-def compare(args: argparse.Namespace) -> dict[str, Any]:
+def compare(args):
     """Measure without and with recording in turn, and return the latencies of all runs."""
     formats = args.record
-    report: dict[str, Any] = {}
+    report = {}
     for turn in range(RECORDING_TURNS):
         for args.record in (None, formats):
             kind = 'recording' if args.record else 'not recording'
@@ -249,19 +237,8 @@ def compare(args: argparse.Namespace) -> dict[str, Any]:
     return report
 
 
-def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str, Any]:
-    """
-    Run node and publisher, and return the report of the observer.
-
-    Parameters
-    ----------
-    args : Namespace
-        Options of `measure node`.
-    keeps_messages : bool
-        Whether the report has ``messages`` as well: for early and final boxes, each serialised
-        message by its sweep, after `STARTUP_TIME`.
-
-    """
+def measure(args, keeps_messages=False):
+    """Run node and publisher, and return the report of the observer."""
     set_environment(args.transport)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
@@ -306,7 +283,7 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
     }
 
 
-def _await_last(sent: Any, arrivals: dict[str, Any]) -> None:
+def _await_last(sent, arrivals):
     """Wait until the last box array has arrived and is counted, but no longer than `LAST_TIME`."""
     deadline = time.monotonic() + LAST_TIME
     last_ns = int(sent[-1, 0])
@@ -316,7 +293,7 @@ def _await_last(sent: Any, arrivals: dict[str, Any]) -> None:
         time.sleep(0.1)
 
 
-def _ended(node: subprocess.Popen[bytes]) -> float:
+def _ended(node):
     """End a node and wait for its last messages; return the time that it took to end [s]."""
     begin = time.monotonic()
     node.send_signal(signal.SIGINT)
@@ -326,7 +303,7 @@ def _ended(node: subprocess.Popen[bytes]) -> float:
     return seconds
 
 
-def set_environment(transport: str) -> None:
+def set_environment(transport):
     """Set the transport of DDS, and a domain apart from other nodes of this machine."""
     if transport == 'large':
         os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(PROFILE)
@@ -336,20 +313,20 @@ def set_environment(transport: str) -> None:
     os.environ.setdefault('ROS_DOMAIN_ID', '231')
 
 
-def node_command(parameters: Sequence[str]) -> list[str]:
+def node_command(parameters):
     """Return the command of a node with parameters as ``KEY:=VALUE``."""
     options = [part for text in parameters for part in ('-p', text)]
     return [*BOXREG, 'node', '--ros-args', *options]
 
 
-def publisher_command(args: argparse.Namespace, log: Path) -> list[str]:
+def publisher_command(args, log):
     """Return the command of the publisher, which logs the box arrays sent."""
     names = ('tracks', 'points', 'rate', 'seconds', 'delay')
     options = [f'--{name}={getattr(args, name)}' for name in names]
     return [*MEASURE, 'node', '--role=publish', f'--log={log}', *options]
 
 
-def _by_sweep(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, dict[int, bytes]]:
+def _by_sweep(sent, arrivals, rate):
     """Return the serialised messages by the number of their sweep, after `STARTUP_TIME`."""
     turns = {stamp_ns: turn for turn, stamp_ns in enumerate(sent[:, 0].tolist())}
     begin = round(STARTUP_TIME * rate)
@@ -359,20 +336,8 @@ def _by_sweep(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, dic
     }
 
 
-def results(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, float]:
-    """
-    Return the published shares and the latencies after `STARTUP_TIME`.
-
-    Parameters
-    ----------
-    sent : array, shape (n, 2)
-        Stamp and time of publishing of each box array [ns].
-    arrivals : dict
-        As `observer` yields it.
-    rate : float
-        Box arrays per second.
-
-    """
+def results(sent, arrivals, rate):
+    """Return the published shares and the latencies after `STARTUP_TIME`."""
     measured = sent[round(STARTUP_TIME * rate) :]
     latencies = []
     for stamp_ns, sent_ns in measured.tolist():
@@ -401,27 +366,15 @@ def results(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, float
     return report
 
 
-def recording_parameters(formats: str | None, folder: Path) -> list[str]:
+def recording_parameters(formats, folder):
     """Return the parameters of a node that records labels and clouds; none without formats."""
     if formats is None:
         return []
     return [f'record_to:={folder}', f'record_formats:=[{formats}]', 'record_points:=true']
 
 
-def recording(labels: RecordedLabels, formats: str, sent: Any) -> dict[str, float]:
-    """
-    Wait for the last segment; return the recorded parts of the box arrays sent and their clouds.
-
-    Parameters
-    ----------
-    labels : RecordedLabels
-        The segments recorded so far.
-    formats : str
-        As given to the recorder.
-    sent : array, shape (n, 2)
-        Stamp and time of publishing of each box array [ns].
-
-    """
+def recording(labels, formats, sent):
+    """Wait for the last segment; return what is recorded of the box arrays sent."""
     deadline = time.monotonic() + COMPLETION_TIME
     while labels.has_open_segment and time.monotonic() < deadline:
         time.sleep(0.1)  # the recorder completes the last segment after the node has ended
@@ -439,17 +392,12 @@ def recording(labels: RecordedLabels, formats: str, sent: Any) -> dict[str, floa
     }
 
 
-def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
+def growth(samples):
     """
     Return memory, handles, threads and cores used by the node.
 
     A value that grows from the start, after `SETTLED_AFTER` or a third of the run, to the middle
     and on to the end is a leak.
-
-    Parameters
-    ----------
-    samples : list of tuple
-        `vitals` of the node every `SAMPLE_PERIOD`, from the first refined boxes on.
 
     """
     end = len(samples) - 1
@@ -464,13 +412,13 @@ def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
     }
 
 
-def children_of(pid: int) -> list[int]:
+def children_of(pid):
     """Return the processes that a process has started, in any of its threads."""
     lists = Path(f'/proc/{pid}/task').glob('*/children')
     return [int(word) for children in lists for word in children.read_text().split()]
 
 
-def vitals(pid: int) -> tuple[float, int, int, float]:
+def vitals(pid):
     """Return resident memory [MB], open files, threads and CPU time [s] of a process."""
     root = Path(f'/proc/{pid}')
     status = dict(line.split(':', 1) for line in (root / 'status').read_text().splitlines())
@@ -484,7 +432,7 @@ def vitals(pid: int) -> tuple[float, int, int, float]:
 
 
 @contextmanager
-def process(command: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
+def process(command, log):
     """Start a process, which is killed at the end of the context if it still runs."""
     with log.open('wb') as file:
         popen = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
@@ -497,14 +445,9 @@ def process(command: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @contextmanager
-def observer(keeps_messages: bool = False) -> Iterator[dict[str, Any]]:
+def observer(keeps_messages=False):
     """
     Subscribe to the outputs of the node while the context lasts.
-
-    Parameters
-    ----------
-    keeps_messages : bool
-        Whether ``messages`` are kept.
 
     Yields
     ------
@@ -520,17 +463,17 @@ def observer(keeps_messages: bool = False) -> Iterator[dict[str, Any]]:
     from rclpy.signals import SignalHandlerOptions
     from visualization_msgs.msg import MarkerArray
 
-    arrivals: dict[str, Any] = {'early': {}, 'final': {}, 'counters': {}}
+    arrivals = {'early': {}, 'final': {}, 'counters': {}}
     arrivals['messages'] = {'early': {}, 'final': {}}
 
-    def add_arrival(name: str, data: bytes) -> None:
+    def add_arrival(name, data):
         sec, nanosec = struct.unpack_from('<iI', data, FIRST_MARKER)
         stamp_ns = sec * 10**9 + nanosec
         arrivals[name].setdefault(stamp_ns, time.monotonic_ns())
         if keeps_messages:
             arrivals['messages'][name].setdefault(stamp_ns, data)
 
-    def add_counters(message: DiagnosticArray) -> None:
+    def add_counters(message):
         for item in message.status[0].values:
             if item.value.isdigit():
                 arrivals['counters'][item.key] = int(item.value)

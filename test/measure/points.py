@@ -8,11 +8,8 @@ In a recording with exact truth a point is on the object whose true box it is in
 
 """
 
-from __future__ import annotations
-
-import argparse
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 import time
@@ -26,9 +23,8 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.point_products import MAP_VOXEL
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.simulation.scene import SimulatedScene
 from boxreg_ros.simulation.simulate import simulate
-from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL
+from boxreg_ros.structures import Ints, LENGTH, ROLL
 import numpy as np
 from numpy.typing import NDArray
 
@@ -67,7 +63,7 @@ class Truth(NamedTuple):
     moves: Sequence[NDArray[np.bool_]]
 
     @classmethod
-    def of_scene(cls, scene: SimulatedScene) -> Truth:
+    def of_scene(cls, scene):
         """Return that of a simulation."""
         moves = []
         for sweep in scene.sweeps:
@@ -80,7 +76,7 @@ class Truth(NamedTuple):
         return cls(ids, [actor.class_name for actor in scene.actors], scene.owners, moves)
 
     @classmethod
-    def of_boxes(cls, drive: Drive) -> Truth:
+    def of_boxes(cls, drive):
         """Return that of a recording, by its true boxes, which are at the stamps of the sweeps."""
         tracks = tracks_of(drive.truth)
         owners, moves = [], []
@@ -118,16 +114,16 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
+def run(args):
     """Return the IoU of labels by method: of instances, of "moving" and by distance."""
-    counts: dict[str, Counter[str]] = {name: Counter() for name in METHODS}
+    counts = {name: Counter() for name in METHODS}
     for drive, truth in drives(args):
         for name, found in measured(drive, truth).items():
             counts[name] += found
     return {name: scores(found) for name, found in counts.items()}
 
 
-def drives(args: argparse.Namespace) -> Iterator[tuple[Drive, Truth]]:
+def drives(args):
     """Yield the drives that the options ask for."""
     for folder in args.data:
         drive = Drive.read(folder)
@@ -137,7 +133,7 @@ def drives(args: argparse.Namespace) -> Iterator[tuple[Drive, Truth]]:
         yield Drive.from_scene(scene), Truth.of_scene(scene)
 
 
-def measured(drive: Drive, truth: Truth) -> dict[str, Counter[str]]:
+def measured(drive, truth):
     """Return the counts of each of `METHODS` on a drive."""
     registrar = BoxRegistrar(Config())
     for sweep, boxes in zip(drive.sweeps, drive.boxes, strict=True):
@@ -156,7 +152,7 @@ def measured(drive: Drive, truth: Truth) -> dict[str, Counter[str]]:
     return found
 
 
-def tracks_of(table: BoxTable) -> list[ObjectTrack]:
+def tracks_of(table):
     """Return the tracks of a table as the labeller takes them."""
     names = np.array(table.track_ids)
     tracks = []
@@ -170,9 +166,7 @@ def tracks_of(table: BoxTable) -> list[ObjectTrack]:
     return tracks
 
 
-def labelled(
-    drive: Drive, truth: Truth, tracks: Sequence[ObjectTrack], config: Config, margins: Floats
-) -> Counter[str]:
+def labelled(drive, truth, tracks, config, margins):
     """Return counts of points, named by what they are of; see `scores`."""
     kinds = [KINDS.index(config.kind(track.class_name)) for track in tracks]
     stamps_ns = np.array([boxes.stamp_ns for boxes in drive.boxes])
@@ -180,7 +174,7 @@ def labelled(
     object_of = np.array([*(truth.ids.index(track.track_id) for track in tracks), -2, -1])
     classes = np.array([*truth.classes, 'unknown', 'background'])
     kind_of = np.array([*(config.kind(name) for name in truth.classes), '', ''])
-    counts: Counter[str] = Counter()
+    counts = Counter()
     kept, is_shadow = [], []
     for sweep, owners, moving in zip(drive.sweeps, truth.owners, truth.moves, strict=True):
         begun = time.process_time()
@@ -219,15 +213,13 @@ def labelled(
     return counts
 
 
-def add_iou(
-    counts: Counter[str], name: str, found: NDArray[np.bool_], true: NDArray[np.bool_]
-) -> None:
+def add_iou(counts, name, found, true):
     """Count the points of the intersection and of the union of two sets."""
     counts[f'{name}: both'] += int((found & true).sum())
     counts[f'{name}: either'] += int((found | true).sum())
 
 
-def scores(counts: Counter[str]) -> dict[str, float]:
+def scores(counts):
     """Return the IoU of each set, shares of points, and the CPU time of a sweep [ms]."""
     names = [key.removesuffix(': either') for key in counts if key.endswith(': either')]
     found = {

@@ -1,10 +1,7 @@
 """Labels that the node records during `measure node`: checked, counted, and deleted."""
 
-from __future__ import annotations
-
 from collections import deque
 import csv
-from pathlib import Path
 import shutil
 
 from boxreg_ros.labels.clouds import SUFFIXES
@@ -21,15 +18,6 @@ class RecordedLabels:
     A robot uploads its segments and deletes them: a long run needs no larger disk than a short
     one.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of the segments; need not exist yet.
-    kept : float
-        Size of whole segments that stay on the disk [bytes].
-    points : int
-        Number of points of each cloud.
-
     Attributes
     ----------
     stamps : set of int
@@ -41,16 +29,16 @@ class RecordedLabels:
 
     """
 
-    def __init__(self, folder: Path, kept: float, points: int) -> None:
-        self.stamps: set[int] = set()
+    def __init__(self, folder, kept, points):
+        self.stamps = set()
         self.cloud_files = 0
-        self.rows: list[IndexRow] = []
+        self.rows = []
         self._folder = folder
         self._kept = kept
         self._cloud_bytes = XYZ_BYTES * points
         self._on_disk = deque[IndexRow]()
 
-    def update(self) -> None:
+    def update(self):
         """Count the segments that are new in the index, and delete the oldest."""
         for row in read_index(self._folder)[len(self.rows) :]:
             self._count(self._folder / row.segment)
@@ -60,11 +48,11 @@ class RecordedLabels:
             shutil.rmtree(self._folder / self._on_disk.popleft().segment)
 
     @property
-    def has_open_segment(self) -> bool:
+    def has_open_segment(self):
         """Return whether a segment is not whole yet."""
         return any(self._folder.glob('.segment_*'))
 
-    def _count(self, segment: Path) -> None:
+    def _count(self, segment):
         with (segment / 'boxes.csv').open(newline='', encoding='utf-8') as file:
             self.stamps.update(int(cells['stamp_ns']) for cells in csv.DictReader(file))
         self.cloud_files += sum(

@@ -6,9 +6,6 @@ are folders of recordings with known truth: ``DATA/street`` has one recording an
 
 """
 
-from __future__ import annotations
-
-import argparse
 import json
 from pathlib import Path
 import shlex
@@ -27,16 +24,8 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> None:
-    """
-    Write each chosen file anew, whole or not at all.
-
-    Raises
-    ------
-    RecordingError
-        If a command fails.
-
-    """
+def run(args):
+    """Write each chosen file anew, whole or not at all."""
     for path in sorted(STORE.glob(f'{args.only}.json')):
         command = json.loads(path.read_text(encoding='utf-8'))['command']
         print(command, file=sys.stderr)
@@ -49,7 +38,7 @@ def run(args: argparse.Namespace) -> None:
         path.write_text(f'{json.dumps(document)}\n', encoding='utf-8')
 
 
-def resolved(command: str) -> list[str]:
+def resolved(command):
     """Return a stored command as words that run in any folder, by the Python of this process."""
     if command.startswith(PROGRAM):
         program = MEASURE

@@ -7,16 +7,11 @@ limit of the frame times. Beside them are those of a page with one changing numb
 
 """
 
-from __future__ import annotations
-
-import argparse
-from collections.abc import Sequence
 import json
 import os
 from pathlib import Path
 import subprocess
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.bench.speed.recordings import write_traffic
@@ -82,9 +77,9 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
+def run(args):
     """Return first paint and frame times of reports."""
-    report: dict[str, Any] = {
+    report = {
         'load before': os.getloadavg()[0],
         'page of one number': {
             name: {'frame [ms]': _reference_frame(options)}
@@ -103,7 +98,7 @@ def run(args: argparse.Namespace) -> object:
     return report
 
 
-def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
+def measure(recording, out, *options):
     """
     Relabel a recording, and open its report.
 
@@ -113,11 +108,6 @@ def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
         ``drawing [s]`` and ``size [MB]`` of the report. By `COMPOSITORS`: ``first paint [ms]``
         from the start of the page; ``script of a step``, ``longest script of a step`` and
         ``frame`` while stepping [ms], ``frames per second``, and the ``part of late frames``.
-
-    Raises
-    ------
-    RecordingError
-        If the recording cannot be relabelled.
 
     """
     command = [*BOXREG, 'relabel', str(recording), '-o', str(out), '--report', *options]
@@ -133,7 +123,7 @@ def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
     }
 
 
-def _stepped(report: Path, options: Sequence[str]) -> dict[str, float]:
+def _stepped(report, options):
     """Return the time of the first paint of a page, and the times of its steps."""
     with launched(*options) as browser:
         page = browser.new_page(viewport=VIEWPORT)
@@ -155,7 +145,7 @@ def _stepped(report: Path, options: Sequence[str]) -> dict[str, float]:
     }
 
 
-def _reference_frame(options: Sequence[str]) -> float:
+def _reference_frame(options):
     """Return the median time of a frame of a page with one changing number [ms]."""
     with launched(*options) as browser:
         page = browser.new_page(viewport=VIEWPORT)

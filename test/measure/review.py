@@ -7,29 +7,23 @@ each bad track, the one that the list names, is pinned at the true box, as by a 
 
 """
 
-from __future__ import annotations
-
-import argparse
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import math
 from pathlib import Path
-from typing import Any
 
 from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.config import Config
-from boxreg_ros.core.metrics import iou_3d, pose_errors, PoseErrors
+from boxreg_ros.core.metrics import iou_3d, pose_errors
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.offline.consistency import CONSISTENCY_VARIABLES
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.review.changes import Changes, median, TrackChanges
+from boxreg_ros.review.changes import Changes, median
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.review.decisions import Decision
 from boxreg_ros.review.risk import assess, Usual
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Sweep, X, YAW, Z
+from boxreg_ros.structures import BOX_EXTENT, BoxArray, ROLL, X, YAW, Z
 import numpy as np
 
 CUTS = (0.01, 0.05, 0.1, 0.2)
@@ -45,9 +39,9 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
+def run(args):
     """Return the share of bad tracks at the top of each list, per recording and input."""
-    report: dict[str, Any] = {}
+    report = {}
     with progress_bar(2 * len(args.data), args) as bar:
         for folder in args.data:
             drive = Drive.read(folder)
@@ -58,7 +52,7 @@ def run(args: argparse.Namespace) -> object:
     return report
 
 
-def measure(drive: Drive) -> dict[str, Any]:
+def measure(drive):
     """
     Refine the boxes of a drive, and sort its tracks by several orders.
 
@@ -96,12 +90,12 @@ def measure(drive: Drive) -> dict[str, Any]:
     return {'tracks': len(tracks), 'bad': count, 'shares': shares, 'pins': _gain(drive, bad, pins)}
 
 
-def refined_tracks(drive: Drive) -> list[TrackChanges]:
+def refined_tracks(drive):
     """Return the tracks of a drive before and after registration of whole tracks."""
-    given: dict[object, BoxArray] = {}
+    given = {}
     changes = Changes(drive.truth.frame_id)
     registrar = BoxRegistrar(Config())
-    items: list[Sweep | BoxArray] = [*drive.sweeps, *drive.boxes]
+    items = [*drive.sweeps, *drive.boxes]
     results = []
     for item in sorted(items, key=lambda item: item.stamp_ns):
         if isinstance(item, BoxArray):
@@ -113,7 +107,7 @@ def refined_tracks(drive: Drive) -> list[TrackChanges]:
     return changes.tracks()
 
 
-def _gain(drive: Drive, bad: Sequence[TrackChanges], pins: Mapping[str, int]) -> dict[str, Any]:
+def _gain(drive, bad, pins):
     """Return the 3D IoU of `bad` tracks before and after `pins`, and the parts gained."""
     corrected = refined_tracks(with_pins(drive, pins))
     pinned = [track for track in corrected if track.track_id in pins]
@@ -131,7 +125,7 @@ def _gain(drive: Drive, bad: Sequence[TrackChanges], pins: Mapping[str, int]) ->
     }
 
 
-def _constant_errors(drive: Drive, tracks: Sequence[TrackChanges]) -> dict[str, float]:
+def _constant_errors(drive, tracks):
     """Return the root mean square over tracks of their mean errors [m, rad]."""
     means = []
     for track in tracks:
@@ -142,7 +136,7 @@ def _constant_errors(drive: Drive, tracks: Sequence[TrackChanges]) -> dict[str, 
     return dict(zip(CONSISTENCY_VARIABLES, values.tolist(), strict=True))
 
 
-def _without_constant_error(drive: Drive, track: TrackChanges) -> TrackChanges:
+def _without_constant_error(drive, track):
     """
     Return a track without the mean errors of its poses in box axes and of its extents.
 
@@ -158,7 +152,7 @@ def _without_constant_error(drive: Drive, track: TrackChanges) -> TrackChanges:
     return replace(track, boxes=boxes)
 
 
-def _errors(drive: Drive, track: TrackChanges) -> tuple[list[int], PoseErrors]:
+def _errors(drive, track):
     """Return the rows of a track that have a true box, and their errors."""
     row_of = _rows_of_truth(drive.truth)
     keys = [(stamp_ns, track.track_id) for stamp_ns in track.stamps_ns.tolist()]
@@ -167,13 +161,13 @@ def _errors(drive: Drive, track: TrackChanges) -> tuple[list[int], PoseErrors]:
     return rows, pose_errors(track.boxes[rows], true)
 
 
-def _rows_of_truth(truth: BoxTable) -> dict[tuple[int, str], int]:
+def _rows_of_truth(truth):
     """Return the row of each true box by stamp and track id."""
     keys = zip(truth.stamps_ns.tolist(), truth.track_ids, strict=True)
     return {key: row for row, key in enumerate(keys)}
 
 
-def with_pins(drive: Drive, pins: Mapping[str, int]) -> Drive:
+def with_pins(drive, pins):
     """Return a drive with one pinned box of some tracks, at the true box: stamps by track id."""
     truth = drive.truth
     keys = zip(truth.track_ids, truth.stamps_ns.tolist(), strict=True)
@@ -186,7 +180,7 @@ def with_pins(drive: Drive, pins: Mapping[str, int]) -> Drive:
     return replace(drive, boxes=tuple(map(corrections.to_register, drive.boxes)))
 
 
-def planted(drive: Drive) -> Drive:
+def planted(drive):
     """Return a drive with its true boxes as input, with errors planted in some tracks."""
     rng = np.random.default_rng(SEED)
     truth = drive.truth
@@ -217,7 +211,7 @@ def planted(drive: Drive) -> Drive:
     return replace(drive, boxes=tuple(arrays))
 
 
-def _with_error(boxes: Floats, error: str, rng: np.random.Generator) -> Floats:
+def _with_error(boxes, error, rng):
     """Return the boxes (n, 9) of a track with an error: of size, yaw, a shift or a drift."""
     changed = boxes.copy()
     sign = rng.choice([-1.0, 1.0])
@@ -233,7 +227,7 @@ def _with_error(boxes: Floats, error: str, rng: np.random.Generator) -> Floats:
     return changed
 
 
-def _swap(names: Any, rows: Any, stamps_ns: Any) -> None:
+def _swap(names, rows, stamps_ns):
     """Swap the id of a track with that of another one in the middle of both, if there is one."""
     middle_ns = np.median(stamps_ns[rows])
     first = names[rows[0]]
@@ -247,9 +241,7 @@ def _swap(names: Any, rows: Any, stamps_ns: Any) -> None:
         return
 
 
-def _mean_overlap(
-    drive: Drive, tracks: Sequence[TrackChanges], left_out: Mapping[str, int] | None = None
-) -> Floats:
+def _mean_overlap(drive, tracks, left_out=None):
     """
     Return the mean 3D IoU of each track with the truth of its id, NaN without any.
 
@@ -273,12 +265,12 @@ def _mean_overlap(
     return means
 
 
-def _shares(is_bad: Any, values: Sequence[float]) -> list[float]:
+def _shares(is_bad, values):
     """Return the share of bad tracks within each of `CUTS` of the list sorted by `values`."""
     ordered = is_bad[np.argsort(np.array(values), kind='stable')]
     return [float(ordered[: _first(cut, len(ordered))].sum() / is_bad.sum()) for cut in CUTS]
 
 
-def _first(cut: float, count: int) -> int:
+def _first(cut, count):
     """Return the number of tracks in the first part of a list, at least one."""
     return max(1, math.ceil(cut * count))

@@ -7,10 +7,6 @@ workers that are lost.
 
 """
 
-from __future__ import annotations
-
-import argparse
-from collections.abc import Sequence
 from dataclasses import dataclass
 from heapq import heapify, heapreplace
 import json
@@ -21,13 +17,11 @@ import shutil
 import subprocess
 from tempfile import TemporaryDirectory
 import time
-from typing import Any
 
 from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.offline.job_process import JobRunner
-from boxreg_ros.structures import Floats
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 import numpy as np
@@ -83,9 +77,9 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
+def run(args):
     """Measure, and simulate a fleet."""
-    report: dict[str, Any] = {'recording': args.recording.name, 'load': os.getloadavg()[0]}
+    report = {'recording': args.recording.name, 'load': os.getloadavg()[0]}
     with TemporaryDirectory() as name:
         folder = Path(name)
         report['workers'] = _workers(args.recording, args.drives, args.rounds, folder)
@@ -107,27 +101,13 @@ def run(args: argparse.Namespace) -> object:
     return report
 
 
-def simulated(
-    seconds: float, rng: np.random.Generator, count: int = FLEET_JOBS, cores: int = FLEET_CORES
-) -> Fleet:
-    """
-    Return the schedule of jobs, the largest drives first, each on the core that is free first.
-
-    Parameters
-    ----------
-    seconds : float
-        Mean length of a job without stragglers [s].
-    rng : Generator
-        Lengths, stragglers and losses.
-    count, cores : int
-        Jobs and cores.
-
-    """
+def simulated(seconds, rng, count=FLEET_JOBS, cores=FLEET_CORES):
+    """Return the schedule of jobs of a mean length [s], the largest drives first."""
     lengths = seconds * rng.lognormal(-(LENGTH_SPREAD**2) / 2, LENGTH_SPREAD, count)
     lengths = np.sort(lengths)[::-1].copy()  # the sizes are known; stragglers are not
     lengths[rng.random(count) < STRAGGLER_PART] *= STRAGGLER_FACTOR
     losses = rng.geometric(1 - LOSS_PART, count) - 1
-    work: Floats = lengths * (1 + UNIT_PART * losses)  # each is resumed from its journal
+    work = lengths * (1 + UNIT_PART * losses)  # each is resumed from its journal
     free = [0.0] * cores
     heapify(free)
     for length in work:
@@ -140,7 +120,7 @@ def simulated(
     )  # fmt: skip
 
 
-def _workers(recording: Path, drives: int, rounds: int, folder: Path) -> dict[str, Any]:
+def _workers(recording, drives, rounds, folder):
     """
     Return how much faster two workers are than one.
 
@@ -163,7 +143,7 @@ def _workers(recording: Path, drives: int, rounds: int, folder: Path) -> dict[st
         for turn in range(rounds)
     ]
     seconds, used = np.moveaxis(np.array(runs), 2, 0)  # (round, workers) each
-    found: dict[str, Any] = {
+    found = {
         name: {
             'seconds': float(np.median(seconds[:, i])),
             'cores_used': float(np.median(used[:, i] / seconds[:, i])),
@@ -174,7 +154,7 @@ def _workers(recording: Path, drives: int, rounds: int, folder: Path) -> dict[st
     return found
 
 
-def _run_batch(drives: Sequence[Path], workers: int, out: Path) -> tuple[float, float]:
+def _run_batch(drives, workers, out):
     """Run `boxreg batch`; return its duration and its CPU time [s]."""
     command = [*BOXREG, 'batch', *map(str, drives), '-o', str(out), f'--workers={workers}']
     begun = time.perf_counter()
@@ -183,13 +163,13 @@ def _run_batch(drives: Sequence[Path], workers: int, out: Path) -> tuple[float, 
     return time.perf_counter() - begun, _children_seconds() - before
 
 
-def _children_seconds() -> float:
+def _children_seconds():
     """Return the CPU time of all processes that were started here and have ended [s]."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
-def _measured(recording: Path, folder: Path) -> dict[str, float]:
+def _measured(recording, folder):
     """Return size, time and memory of one job, and the time to inspect its recording."""
     begun = time.perf_counter()
     shown = subprocess.run(
@@ -217,27 +197,15 @@ def _measured(recording: Path, folder: Path) -> dict[str, float]:
     }
 
 
-def repeated(recording: Path, target: Path, gigabytes: float, copies: int = 12) -> None:
-    """
-    Write the messages of a recording again and again, each time later.
-
-    Parameters
-    ----------
-    recording, target : Path
-        MCAP files of ROS 2.
-    gigabytes : float
-        Size of `target` at least [GB].
-    copies : int
-        How often each cloud has its points.
-
-    """
+def repeated(recording, target, gigabytes, copies=12):
+    """Write the messages of a recording again and again, each time later."""
     store = get_typestore(Stores.ROS2_JAZZY)
     with recording.open('rb') as source, target.open('wb') as file:
         found = list(make_reader(source).iter_messages())
         span_ns = found[-1][2].log_time - found[0][2].log_time + 10**8
         writer = Writer(file, compression=CompressionType.NONE)
         writer.start('ros2')
-        channels: dict[str, int] = {}
+        channels = {}
         for schema, channel, _ in found:
             if schema is not None and channel.topic not in channels:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -256,7 +224,7 @@ def repeated(recording: Path, target: Path, gigabytes: float, copies: int = 12) 
         writer.finish()
 
 
-def _later(data: bytes, kind: str, later_ns: int) -> bytes:
+def _later(data, kind, later_ns):
     """Return a message with a later stamp: the first 8 bytes of its header in CDR."""
     first = 8 if kind.endswith('/TFMessage') else 4  # behind the length of its sequence
     seconds, rest = np.frombuffer(data, '<u4', 2, first).tolist()
@@ -265,7 +233,7 @@ def _later(data: bytes, kind: str, later_ns: int) -> bytes:
     return data[:first] + stamp + data[first + 8 :]
 
 
-def _enlarged(store: Any, data: bytes, kind: str, copies: int) -> bytes:
+def _enlarged(store, data, kind, copies):
     """Return a cloud that has its points several times."""
     cloud = store.deserialize_cdr(data, kind)
     cloud.data = np.tile(cloud.data, copies)

@@ -9,18 +9,14 @@ estimated from the data.
 
 """
 
-from __future__ import annotations
-
-import argparse
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatch
 from functools import partial
 from multiprocessing import get_context
-from typing import Any
 
 from boxreg_ros.bench.common import (
     add_estimate_argument,
@@ -28,12 +24,11 @@ from boxreg_ros.bench.common import (
     class_words,
     progress_bar,
 )
-from boxreg_ros.config import Config, KINDS, Setting
+from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method import constants
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.offline.box_scores import match, summarise
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.structures import BoxArray
 import numpy as np
 import torch
 
@@ -133,7 +128,7 @@ class Loss:
     failure: str = ''
 
     @property
-    def size(self) -> float:
+    def size(self):
         """Return the larger of the two losses; infinite where a run failed."""
         return float('inf') if self.failure else max(self.bev, self.volume)
 
@@ -141,7 +136,7 @@ class Loss:
 # ------------------------------------------------------------------------------- discovery
 
 
-def variations_of_settings(config: Config, kinds: Sequence[str] = KINDS) -> list[Variation]:
+def variations_of_settings(config, kinds=KINDS):
     """
     Return every numeric setting halved and doubled.
 
@@ -164,7 +159,7 @@ def variations_of_settings(config: Config, kinds: Sequence[str] = KINDS) -> list
     return found
 
 
-def _is_allowed(config: Config, name: str, value: float) -> bool:
+def _is_allowed(config, name, value):
     """Return whether a setting may have a value together with the others."""
     try:
         config.updated({name: value})
@@ -173,19 +168,19 @@ def _is_allowed(config: Config, name: str, value: float) -> bool:
     return True
 
 
-def _within_bounds(item: Setting, value: float) -> float:
+def _within_bounds(item, value):
     low = value if item.low is None else max(value, type(value)(item.low))
     return low if item.high is None else min(low, type(value)(item.high))
 
 
-def _scaled(value: float, factor: float) -> float:
+def _scaled(value, factor):
     """Return a number times a factor; a whole number stays whole and above zero."""
     if isinstance(value, int):
         return max(1, round(value * factor)) if value > 0 else round(value * factor)
     return value * factor
 
 
-def variations_of_constants() -> list[Variation]:
+def variations_of_constants():
     """Return every number of `Constants` that is no setting, halved and doubled."""
     known = constants.CONSTANTS
     of_settings = known.with_settings(UNLIKE)
@@ -204,7 +199,7 @@ def variations_of_constants() -> list[Variation]:
 
 
 @contextmanager
-def changed_constant(place: tuple[str, int], value: float) -> Iterator[None]:
+def changed_constant(place, value):
     """Replace one number of `Constants`, or one number of a tuple among them, for a context."""
     before = constants.CONSTANTS
     name, i = place
@@ -220,20 +215,8 @@ def changed_constant(place: tuple[str, int], value: float) -> Iterator[None]:
 # ----------------------------------------------------------------------------------- runs
 
 
-def measure(drive: Drive, measurement: Measurement, variation: Variation | None) -> Outcome:
-    """
-    Return the mean IoU of one run.
-
-    Parameters
-    ----------
-    drive : Drive
-        Sweeps, boxes and truth.
-    measurement : Measurement
-        Settings, estimate and scope.
-    variation : Variation or None
-        None for the settings as they are.
-
-    """
+def measure(drive, measurement, variation):
+    """Return the mean IoU of one run."""
     config = measurement.config
     estimate = measurement.estimate
     try:
@@ -252,14 +235,9 @@ def measure(drive: Drive, measurement: Measurement, variation: Variation | None)
     return Outcome(scores.iou_bev, scores.iou_3d)
 
 
-def run_all(
-    drives: Mapping[str, Drive],
-    measurement: Measurement,
-    variations: Sequence[Variation],
-    args: argparse.Namespace,
-) -> tuple[dict[str, Outcome], list[list[Outcome]]]:
+def run_all(drives, measurement, variations, args):
     """Return the outcome of each drive without variation, and per variation those of all."""
-    wanted: list[Variation | None] = [None, *variations]
+    wanted = [None, *variations]
     jobs = [(name, variation) for variation in wanted for name in drives]
     initial = (dict(drives), measurement)
     # Fresh processes: each has the memory of one run, and no threads are copied into it.
@@ -275,25 +253,21 @@ def run_all(
     return dict(zip(drives, rows[0], strict=True)), rows[1:]
 
 
-_worker: dict[str, Any] = {}
+_worker = {}
 
 
-def _start_worker(drives: dict[str, Drive], measurement: Measurement) -> None:
+def _start_worker(drives, measurement):
     torch.set_num_threads(1)
     _worker['run'] = {name: partial(measure, drive, measurement) for name, drive in drives.items()}
 
 
-def _work(job: tuple[str, Variation | None]) -> Outcome:
+def _work(job):
     name, variation = job
-    outcome: Outcome = _worker['run'][name](variation)
+    outcome = _worker['run'][name](variation)
     return outcome
 
 
-def losses(
-    variations: Sequence[Variation],
-    baseline: Mapping[str, Outcome],
-    outcomes: Sequence[Sequence[Outcome]],
-) -> list[Loss]:
+def losses(variations, baseline, outcomes):
     """Return the loss of each variation on the mean of the drives, the largest one first."""
     bev = np.mean([outcome.iou_bev for outcome in baseline.values()])
     volume = np.mean([outcome.iou_3d for outcome in baseline.values()])
@@ -324,18 +298,8 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
-    """
-    Return the loss of mean IoU by each variation.
-
-    Raises
-    ------
-    ConfigError
-        If ``--only`` names nothing, or ``--workers`` is below 1.
-    RecordingError
-        If a recording or its truth cannot be read.
-
-    """
+def run(args):
+    """Return the loss of mean IoU by each variation."""
     if args.workers < 1:
         raise ConfigError(f'--workers: expected 1 or more, got {args.workers}')
     drives = {str(folder): Drive.read(folder) for folder in args.data}
@@ -366,9 +330,9 @@ def run(args: argparse.Namespace) -> object:
     }
 
 
-def kinds_of(arrays: Sequence[BoxArray], config: Config) -> list[str]:
+def kinds_of(arrays, config):
     """Return the kinds of objects that are among the boxes, the most frequent first."""
-    counts: Counter[str] = Counter()
+    counts = Counter()
     for array in arrays:
         for class_name in array.class_names:
             counts[config.kind(class_name)] += 1

@@ -7,14 +7,9 @@ first row is a reference: the tracks before they were broken, registered.
 
 """
 
-from __future__ import annotations
-
-import argparse
-from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 import math
 from pathlib import Path
-from typing import Any
 
 from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.config import COMPLETE_STEPS, Config, KINDS
@@ -27,7 +22,7 @@ from boxreg_ros.offline.overlap import overlaps
 from boxreg_ros.offline.track_scores import track_scores, TrackScores
 from boxreg_ros.review.rules import DUPLICATE_IOU
 from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
-from boxreg_ros.structures import BoxArray, Ints, RefinedBoxes, REJECTED, Sweep
+from boxreg_ros.structures import REJECTED
 import numpy as np
 
 ONE_LABEL = 'with one label'
@@ -68,9 +63,9 @@ ARGUMENTS = {
 }
 
 
-def run(args: argparse.Namespace) -> object:
+def run(args):
     """Return the scores after each step, by recording."""
-    report: dict[str, Any] = {}
+    report = {}
     rows_per_drive = 4 if args.coast else 3 + len(COMPLETE_STEPS)
     with progress_bar(len(args.data) * rows_per_drive, args) as bar:
         for folder in args.data:
@@ -88,7 +83,7 @@ def run(args: argparse.Namespace) -> object:
     return report
 
 
-def broken(drive: Drive, seed: int, ghosts: float, far_misses: bool = False) -> Drive:
+def broken(drive, seed, ghosts, far_misses=False):
     """Return a drive with broken tracks."""
     stamps = np.array([array.stamp_ns for array in drive.boxes])
     origins = np.array([sweep.origin for sweep in drive.sweeps_at(stamps)])
@@ -97,14 +92,14 @@ def broken(drive: Drive, seed: int, ghosts: float, far_misses: bool = False) -> 
     return replace(drive, boxes=tuple(arrays))
 
 
-def _rows(whole: Drive, drive: Drive, coast: float) -> Iterator[tuple[str, Row]]:
+def _rows(whole, drive, coast):
     """Yield the scores of the registered tracks of the `whole` drive, then of the broken one."""
     config = Config(estimate='final' if coast else 'track')
     yield UNBROKEN, _row(_registered(_items(whole), config), whole)
     yield from with_coast(drive, coast) if coast else after_each_step(drive)
 
 
-def after_each_step(drive: Drive) -> Iterator[tuple[str, Row]]:
+def after_each_step(drive):
     """Yield the scores of the input, of registration alone, and with one more step each."""
     items = _items(drive)
     yield 'input', _input_row(drive)
@@ -117,7 +112,7 @@ def after_each_step(drive: Drive) -> Iterator[tuple[str, Row]]:
         yield f'+ {step}', _row(results, drive)
 
 
-def with_coast(drive: Drive, seconds: float) -> Iterator[tuple[str, Row]]:
+def with_coast(drive, seconds):
     """Yield the scores of the input, and of final boxes without and with `coast` [s]."""
     items = _items(drive)
     yield 'input', _input_row(drive)
@@ -126,31 +121,31 @@ def with_coast(drive: Drive, seconds: float) -> Iterator[tuple[str, Row]]:
         yield name, _row(_registered(items, config), drive)
 
 
-def _items(drive: Drive) -> list[Sweep | BoxArray]:
+def _items(drive):
     """Return sweeps and boxes in the order of their stamps, each sweep before its boxes."""
-    items: list[Sweep | BoxArray] = [*drive.sweeps, *drive.boxes]
+    items = [*drive.sweeps, *drive.boxes]
     return sorted(items, key=lambda item: item.stamp_ns)
 
 
-def _registered(items: Sequence[Sweep | BoxArray], config: Config) -> list[RefinedBoxes]:
+def _registered(items, config):
     """Return the last estimates of all box arrays."""
     registrar = BoxRegistrar(config)
-    results: list[RefinedBoxes] = []
+    results = []
     for item in items:
         results += hand_to_registrar(registrar, item, restarts=False)
     results += registrar.flush()
     return [result for result in results if result.is_final]
 
 
-def _input_row(drive: Drive) -> Row:
+def _input_row(drive):
     table = BoxTable.from_arrays(drive.boxes)
     scores = track_scores(table, drive.truth)
     return Row(scores, math.nan, math.nan, scores_by_kind(table, drive.truth))
 
 
-def _row(results: Sequence[RefinedBoxes], drive: Drive) -> Row:
+def _row(results, drive):
     """Return the scores of results, and which part of the input is rejected."""
-    is_rejected: dict[bool, list[bool]] = {True: [], False: []}  # of ghosts, and of other boxes
+    is_rejected = {True: [], False: []}  # of ghosts, and of other boxes
     for given, result in zip(drive.boxes, results, strict=True):
         for track_id, status in zip(given.track_ids, result.status, strict=False):
             is_rejected[track_id.startswith(GHOST_PREFIX)].append(status == REJECTED)
@@ -160,7 +155,7 @@ def _row(results: Sequence[RefinedBoxes], drive: Drive) -> Row:
     return Row(scores, ghosts, lost, scores_by_kind(table, drive.truth))
 
 
-def scores_by_kind(predicted: BoxTable, truth: BoxTable) -> dict[str, TrackScores]:
+def scores_by_kind(predicted, truth):
     """Return the scores of each kind of object that the truth has, and of objects `ONE_LABEL`."""
     scores = {}
     for kind in KINDS:
@@ -176,16 +171,16 @@ def scores_by_kind(predicted: BoxTable, truth: BoxTable) -> dict[str, TrackScore
     return scores
 
 
-def rows_with_one_label(truth: BoxTable) -> Ints:
+def rows_with_one_label(truth):
     """Return the rows of objects that never share `DUPLICATE_IOU` with another one."""
-    doubles: set[str] = set()
+    doubles = set()
     for stamp in overlaps(truth, truth):
         is_double = (stamp.iou >= DUPLICATE_IOU).sum(axis=1) > 1  # one is the box itself
         doubles.update(truth.track_ids[row] for row in stamp.true[is_double])
     return np.flatnonzero([track_id not in doubles for track_id in truth.track_ids])
 
 
-def table_of(results: Sequence[RefinedBoxes]) -> BoxTable:
+def table_of(results):
     """Return the boxes of results that are not rejected, with their status."""
     table = BoxTable.from_arrays([result.boxes for result in results])
     table = replace(table, status=tuple(word for r in results for word in r.status))

@@ -51,7 +51,7 @@ def test_misses_ghosts_and_added_boxes_are_counted():
     assert (scores.misses, scores.ghosts) == (2, 2)
     assert scores.recall == pytest.approx(6 / 8)
     assert scores.precision == pytest.approx(6 / 8)
-    assert scores.added == 3
+    assert (scores.added, scores.added_ghosts) == (3, 1)
     assert scores.added_iou == pytest.approx((1 / 7 + 1 + 0) / 3, abs=1e-6)
     assert scores.given_iou == pytest.approx(1)
 
