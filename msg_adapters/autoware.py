@@ -36,15 +36,10 @@ REQUIRED_FIELDS = (
 
 def from_msg(msg: Any) -> BoxArray:
     """
-    Return the boxes of TrackedObjects or DetectedObjects.
+    Return the boxes of TrackedObjects or DetectedObjects; UnsupportedMessage without a field.
 
-    An object without orientation gets NaN angles, so that its box is returned unchanged, unless
-    it is a cylinder. The sign of the heading is resolved per track later.
-
-    Raises
-    ------
-    UnsupportedMessage
-        If the definition of the message lacks a field.
+    An object without orientation gets NaN angles, so that its box is returned unchanged, unless it
+    is a cylinder. The sign of the heading is resolved per track later.
 
     """
     poses.require_fields('TrackedObjects', msg.objects[:1], REQUIRED_FIELDS)

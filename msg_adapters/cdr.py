@@ -44,19 +44,10 @@ class Layout:
     """
     Steps through the fields of a message type, and where to note the places of some of them.
 
-    Parameters
-    ----------
-    kind : type
-        Class of the messages, of rclpy; or another object with its field types.
-    paths : sequence of str
-        Fields to find, as ``items.pose.position.x``. All strings are found, too.
-    kind_of : callable
-        Returns the same of a type that a field has, as ``std_msgs/Header``.
-
-    Raises
-    ------
-    UnsupportedMessage
-        If the type lacks one of the fields, or has one of a type that is not walked.
+    `kind` is the class of the messages, of rclpy, or another object with its field types;
+    `kind_of` returns the same of a type that a field has, as ``std_msgs/Header``. Fields to find
+    are paths, as ``items.pose.position.x``; all strings are found, too. Raises UnsupportedMessage
+    if the type lacks one of the fields, or has one of a type that is not walked.
 
     """
 
@@ -134,18 +125,9 @@ class Fields:
     """
     The fields that a `Layout` has found in a message.
 
-    Parameters
-    ----------
-    data : bytes
-        The message.
-    body : array
-        The bytes after its header, filled up to a multiple of 8 with zeros.
-    places : dict of str to array, shape (k, 2)
-        Offset in `body` and count (numbers, letters, items) of each field, by path.
-    texts : tuple of str
-        Paths of all strings.
-    end : int
-        Where in `body` the last field ends.
+    `body` are the bytes after its header, filled up to a multiple of 8 with zeros. `places` has
+    offset in `body` and count (numbers, letters, items) of each field by path, (k, 2); `texts` are
+    the paths of all strings; `end` is where in `body` the last field ends.
 
     """
 
@@ -268,23 +250,10 @@ def walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> int:
     """
     Walk through a message and note the places of fields.
 
-    Parameters
-    ----------
-    body : array of uint8
-        Bytes of the message.
-    size : int
-        How many of them are of the message.
-    steps : array, shape (steps, 4)
-        Step, size, count and column.
-    counts : array, shape (columns,)
-        Set to the number of fields found; begins with zeros.
-    places : array, shape (columns, capacity, 2)
-        Set to offset and count of each field, as far as there is room.
-
-    Returns
-    -------
-    int
-        Where the last field ends; -1 if the message lacks fields.
+    Of `body`, `size` bytes are the message. A row of `steps` is step, size, count and column.
+    `counts` (columns,), zeros at first, is set to the number of fields found, and `places`
+    (columns, capacity, 2) to offset and count of each, as far as there is room. Returns where the
+    last field ends; -1 if the message lacks fields.
 
     """
     firsts = np.zeros(len(steps), np.int64)  # first repeated step, by depth

@@ -20,12 +20,7 @@ def with_points(msg: Any, is_kept: NDArray[np.bool_]) -> Any:
     """
     Return a cloud with some of its points, in the same layout and under the same header.
 
-    Parameters
-    ----------
-    msg : PointCloud2
-        The cloud.
-    is_kept : array, shape (height * width,)
-        Which points of the message are kept, row by row; those that are not finite count, too.
+    `is_kept` (height * width,) is row by row; points that are not finite count, too.
 
     """
     if is_kept.all():
@@ -35,17 +30,7 @@ def with_points(msg: Any, is_kept: NDArray[np.bool_]) -> Any:
 
 
 def with_fields(msg: Any, columns: Mapping[str, NDArray[Any]]) -> Any:
-    """
-    Return a cloud with more fields behind those it has.
-
-    Parameters
-    ----------
-    msg : PointCloud2
-        The cloud.
-    columns : mapping of str to array, shape (height * width,)
-        Values by name; the type of a field is that of its array.
-
-    """
+    """Return a cloud with more fields behind those it has: columns (height * width,) by name."""
     points = _bytes_of(msg)
     make = type(msg.fields[0])
     order = '>' if msg.is_bigendian else '<'

@@ -45,11 +45,8 @@ def plain(msg: Any) -> Any:
     """
     Return the cloud of a message of `CLOUD_TYPES` with the attributes of a PointCloud2.
 
-    Raises
-    ------
-    UnsupportedMessage
-        If the compressed data are damaged or of an unknown format, or a package that decompresses
-        them is not installed.
+    Raises UnsupportedMessage if the compressed data are damaged or of an unknown format, or a
+    package that decompresses them is not installed.
 
     """
     if hasattr(msg, 'compressed_data'):
@@ -192,12 +189,7 @@ def _columns(attribute: Any) -> list[NDArray[Any]]:
 
 
 def _draco_columns(data: bytes) -> list[tuple[str, NDArray[Any]]]:
-    """
-    Return name and values (M,) of all components of a Draco point cloud that states its names.
-
-    These are x, y, z for the coordinates, and the names in the stream for the others.
-
-    """
+    """Return name and values (M,) of all components of a Draco cloud; coordinates are x, y, z."""
     found = []
     for attribute in _draco_attributes(data):
         columns = _columns(attribute)

@@ -10,23 +10,14 @@ INFO_TYPE = 'autoware_sensing_msgs/msg/ConcatenatedPointCloudInfo'
 
 
 class CloudSource(NamedTuple):
-    """
-    The part of a concatenated cloud that one LiDAR measured.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Stamp of the cloud of the LiDAR [ns].
-    frame_id : str
-        Frame of the LiDAR.
-    begin, length : int
-        First point of the part in the concatenated cloud, and number of points.
-
-    """
+    """The part of a concatenated cloud that one LiDAR measured."""
 
     stamp_ns: int
+    """Of the cloud of the LiDAR [ns]."""
     frame_id: str
+    """Of the LiDAR."""
     begin: int
+    """First point of the part in the concatenated cloud."""
     length: int
 
 

@@ -45,27 +45,7 @@ The sign follows the letter: YAML reads ``y`` as a boolean, a command line ``-y`
 
 @dataclass(frozen=True, slots=True)
 class Convention:
-    """
-    Meaning of pose and size on one topic.
-
-    Attributes
-    ----------
-    pose_reference : str
-        Point of the box at the position of the pose: one of `REFERENCES`, or three numbers
-        ``'-0.28,0,-0.5'`` relative to the centre, in units of length, width and height.
-    size_order : str
-        Meaning of x, y and z of the size: ``'lwh'`` is length, width, height.
-    forward_axis : str
-        Axis of the pose that points forward, one of `FORWARD`.
-    associate : bool
-        Whether track ids are assigned by data association; ids of the messages are ignored.
-
-    Raises
-    ------
-    ConfigError
-        If a value is not one of these.
-
-    """
+    """Meaning of pose and size on one topic; ConfigError if a value is not one of those."""
 
     pose_reference: str = option(
         'center',

@@ -39,10 +39,8 @@ def from_msg(msg: Any) -> BoxArray:
     """
     Return the boxes; an object without classification has the class ``''`` and the score 1.
 
-    Raises
-    ------
-    UnsupportedMessage
-        If an object is in another frame than the array, or the definition lacks a field.
+    Raises UnsupportedMessage if an object is in another frame than the array, or the definition
+    lacks a field.
 
     """
     poses.require_fields('ObjectArray', msg.objects[:1], REQUIRED_FIELDS)

@@ -36,13 +36,8 @@ def from_msg(msg: Any) -> BoxArray:
     Return the cubes of a SceneUpdate; several cubes of one entity are ``id/0``, ``id/1`` ...
 
     Stamp and frame are those of the entities. An update without entities has the stamp 0 and the
-    frame ``''``.
-
-    Raises
-    ------
-    UnsupportedMessage
-        If the entities with cubes have different frames or stamps, a field is missing, or a value
-        has the wrong type.
+    frame ``''``. Raises UnsupportedMessage if the entities with cubes have different frames or
+    stamps, a field is missing, or a value has the wrong type.
 
     """
     entities = _items(msg, 'entities')

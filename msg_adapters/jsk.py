@@ -22,10 +22,7 @@ def from_msg(msg: Any) -> BoxArray:
     """
     Return the boxes of a BoundingBoxArray.
 
-    Raises
-    ------
-    UnsupportedMessage
-        If a box is in another frame than the array, or the definition lacks a field.
+    Raises UnsupportedMessage if a box is in another frame than the array, or a field is missing.
 
     """
     poses.require_fields('BoundingBoxArray', msg.boxes[:1], REQUIRED_FIELDS)

@@ -24,12 +24,8 @@ def from_msg(msg: Any) -> BoxArray:
     Return the boxes of a MarkerArray, all with the score 1.
 
     Stamp and frame are those of the markers. An array without markers has the stamp 0 and the
-    frame ``''``.
-
-    Raises
-    ------
-    UnsupportedMessage
-        If the boxes have different frames or stamps, or the definition lacks a field.
+    frame ``''``. Raises UnsupportedMessage if the boxes have different frames or stamps, or a
+    field is missing.
 
     """
     poses.require_fields('MarkerArray', msg.markers[:1], REQUIRED_FIELDS)
@@ -69,9 +65,9 @@ def to_msg(
 
 def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
     """
-    Return a copy with cubes of earlier messages added; see `Adapter.with_added`.
+    Return a copy with cubes of earlier messages added, which have the text ``coasted``.
 
-    A marker has no score. The added ones have the text ``coasted``, which is not displayed.
+    A marker has no score, and the text of a cube is not displayed. See `Adapter.with_added`.
 
     """
     header = msg.markers[0].header

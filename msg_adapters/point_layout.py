@@ -31,23 +31,14 @@ WHOLE_CLOUD = 5000
 
 
 class PointLayout(NamedTuple):
-    """
-    The layout of the clouds of a driver.
-
-    Attributes
-    ----------
-    name : str
-        Of the sensor or the point type.
-    kinds : dict of str and str
-        Fields that identify the layout, with the kind of their numbers; any if empty.
-    time_field, unit : str
-        Field of the times and their unit; empty if there are none.
-
-    """
+    """The layout of the clouds of a driver."""
 
     name: str
+    """Of the sensor or the point type."""
     kinds: Mapping[str, str]
+    """Fields that identify the layout, with the kind of their numbers; any if empty."""
     time_field: str = ''
+    """Of the times; empty if there are none."""
     unit: str = ''
 
 
@@ -103,21 +94,8 @@ def reading_of(
     """
     Return how finite times (M,), M > 0, of points are read; None if they are of no unit.
 
-    Parameters
-    ----------
-    raw : array, shape (M,)
-        As the message has them.
-    stamp_ns : int
-        Stamp of the cloud [ns].
-    layout : PointLayout or None
-        Known layout of the cloud.
-    unit : str
-        One of `TIME_UNIT_CHOICES`.
-
-    Raises
-    ------
-    UnsupportedMessage
-        If the times of a known layout are in another unit than that of its driver.
+    They are as the message has them; `unit` is one of `TIME_UNIT_CHOICES`. Raises
+    UnsupportedMessage if the times of a known layout are in another unit than that of its driver.
 
     """
     ends = float(raw.min()), float(raw.max())

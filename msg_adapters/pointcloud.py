@@ -30,27 +30,14 @@ def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
     Return the finite points of a PointCloud2, in its frame, with their times.
 
     Points are float32; float64 if the coordinates are float64 or 32-bit integers, to keep them
-    exact.
+    exact. Raises UnsupportedMessage if there are no fields x, y, z, a field has an unknown
+    datatype, the sizes in the message contradict each other, or the times of a known layout are in
+    a wrong unit.
 
-    Parameters
-    ----------
-    msg : PointCloud2
-        The message.
-    time_unit : str
-        Unit of the times of the points, or ``auto``.
-
-    Raises
-    ------
-    UnsupportedMessage
-        If there are no fields x, y, z, a field has an unknown datatype, the sizes in the message
-        contradict each other, or the times of a known layout are in a wrong unit.
-
-    Notes
-    -----
-    The layouts of `point_layout.LAYOUTS` state field and unit of the times. In other layouts
-    times are read from the first of the fields ``t``, ``time``, ``timestamp``, ``offset_time``,
-    ``time_stamp``; unit and origin are derived from type and magnitude. A float64 field within
-    1 s of the stamp in s, ms, us or ns is absolute. Other fields are relative to the stamp, in the
+    The layouts of `point_layout.LAYOUTS` state field and unit of the times. In other layouts times
+    are read from the first of the fields ``t``, ``time``, ``timestamp``, ``offset_time``,
+    ``time_stamp``; unit and origin are derived from type and magnitude. A float64 field within 1 s
+    of the stamp in s, ms, us or ns is absolute. Other fields are relative to the stamp, in the
     coarsest of these units in which all points are within 1 s of it; seconds only for floats. If
     none fits, ``times`` is None. A point whose time is not finite gets the time of the stamp.
 
@@ -82,15 +69,7 @@ def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
 
 
 def described(msg: Any, time_unit: str = AUTO) -> str:
-    """
-    Return the layout of a cloud and the reading of its times, in one line.
-
-    Raises
-    ------
-    UnsupportedMessage
-        As `from_msg`.
-
-    """
+    """Return layout of a cloud and reading of its times in one line; raises as `from_msg`."""
     if not msg.width * msg.height:
         return 'empty'
     fields = _fields(msg)
@@ -132,18 +111,10 @@ def positions(msg: Any) -> Floats:
 
 def intensities(msg: Any) -> Floats | None:
     """
-    Return the intensities of the points, in the unit of the sensor.
+    Return one intensity per point of `from_msg`, (M,), in the unit of the sensor.
 
-    Returns
-    -------
-    intensities : array, shape (M,), or None
-        One per point of `from_msg`; None if the message has none of the fields ``intensity``,
-        ``i``, ``reflectivity``. Values that are not finite are 0.
-
-    Raises
-    ------
-    UnsupportedMessage
-        As `from_msg`.
+    None if the message has none of the fields ``intensity``, ``i``, ``reflectivity``. Values that
+    are not finite are 0. Raises as `from_msg`.
 
     """
     if not msg.width * msg.height:

@@ -29,24 +29,11 @@ def stamp_ns(header: Any) -> int:
 
 def require_fields(kind: str, items: Iterable[Any], names: Sequence[str]) -> None:
     """
-    Check that messages have the fields that an adapter reads.
+    Raise UnsupportedMessage if a message lacks a field that an adapter reads.
 
     Recordings contain their own message definitions, and JSON has none, so a message of a known
-    name may lack a field.
-
-    Parameters
-    ----------
-    kind : str
-        Name of the message type in errors.
-    items : iterable of messages
-        Messages to check. One is enough where all have the same definition.
-    names : sequence of str
-        Paths of attributes: ``'pose.position'``.
-
-    Raises
-    ------
-    UnsupportedMessage
-        If a message lacks a field.
+    name may lack one. `names` are paths of attributes, as ``'pose.position'``. One item is enough
+    where all have the same definition.
 
     """
     for item in items:
@@ -64,10 +51,7 @@ def common_header(kind: str, header: Any, items: Sequence[Any]) -> Any:
     """
     Return the header of an array, or that of its items if the array has no frame.
 
-    Raises
-    ------
-    UnsupportedMessage
-        If an item names another frame.
+    Raises UnsupportedMessage if an item names another frame.
 
     """
     header = header if header.frame_id or not items else items[0].header
@@ -83,12 +67,9 @@ def common_header(kind: str, header: Any, items: Sequence[Any]) -> Any:
 
 def common_stamp_and_frame(kind: str, headers: Iterable[tuple[int, str]]) -> tuple[int, str]:
     """
-    Return the stamp [ns] and frame of boxes that have a header each; 0 and '' for no boxes.
+    Return stamp [ns] and frame of boxes that have a header each; 0 and '' for no boxes.
 
-    Raises
-    ------
-    UnsupportedMessage
-        If they differ.
+    Raises UnsupportedMessage if they differ.
 
     """
     found = set(headers)
@@ -106,11 +87,7 @@ def boxes_of(poses: Sequence[Any], sizes: Sequence[Any]) -> Floats:
     Return boxes (n, 9) from ``geometry_msgs`` poses and full extents, vectors or sequences.
 
     A box whose quaternion is not of unit length gets NaN angles, so that it is an invalid box.
-
-    Raises
-    ------
-    UnsupportedMessage
-        If a value is not a number, or a size does not have three.
+    Raises UnsupportedMessage if a value is not a number, or a size does not have three.
 
     """
     if not len(poses):
@@ -128,12 +105,7 @@ def boxes_of(poses: Sequence[Any], sizes: Sequence[Any]) -> Floats:
 
 
 def boxes_from(poses: Floats, sizes: Floats) -> Floats:
-    """
-    Return boxes (n, 9) from poses (n, 7), position and quaternion, and extents (n, 3).
-
-    A box whose quaternion is not of unit length gets NaN angles.
-
-    """
+    """Return boxes (n, 9) of positions, quaternions (n, 7) and extents (n, 3); see `boxes_of`."""
     boxes = np.full((len(poses), 9), np.nan)
     boxes[:, BOX_CENTER] = poses[:, :3]
     boxes[:, BOX_EXTENT] = sizes

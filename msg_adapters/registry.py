@@ -15,26 +15,16 @@ from msg_adapters.protocol import Adapter
 
 @dataclass(frozen=True, slots=True)
 class MessageType:
-    """
-    A type of box messages.
-
-    Attributes
-    ----------
-    module : str
-        Module that implements `Adapter`.
-    track_id : str
-        Field of the track id; '' if the type has none.
-    class_and_score : str
-        Fields of class name and score; '' if the type has none.
-    also_written : str
-        Fields that are written besides pose and size.
-
-    """
+    """A type of box messages; texts are empty where the type has none."""
 
     module: str
+    """Implements `Adapter`."""
     track_id: str = ''
+    """Field of the track id."""
     class_and_score: str = ''
+    """Fields of class name and score."""
     also_written: str = ''
+    """Fields that are written besides pose and size."""
 
 
 MESSAGE_TYPES = {
@@ -140,20 +130,11 @@ def canonical(type_name: str) -> str:
 
 def adapter_for(type_name: str, convention: Convention | None = None) -> Adapter:
     """
-    Return the adapter of a message type.
+    Return the adapter of a message type, ``package/msg/Type``.
 
-    Parameters
-    ----------
-    type_name : str
-        ``package/msg/Type``.
-    convention : Convention, optional
-        Meaning of pose and size on this topic, and whether track ids are assigned by
-        association. None stands for the definition of the type, and accepts types without ids.
-
-    Raises
-    ------
-    UnsupportedMessage
-        If no adapter reads the type, or it has no track ids and none are assigned.
+    Without a convention, pose and size are as the type defines them, and types without ids are
+    accepted. Raises UnsupportedMessage if no adapter reads the type, or it has no track ids and
+    none are assigned.
 
     """
     name = canonical(type_name)

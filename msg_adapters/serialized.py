@@ -33,93 +33,53 @@ BoxLabels = tuple[list[str], list[str], Floats]
 
 @dataclass(frozen=True, slots=True)
 class Rewrite:
-    """
-    The new boxes of a message, beside the old ones.
-
-    Attributes
-    ----------
-    boxes : BoxArray
-        The new boxes.
-    old_pose, new_pose : array, shape (n, 7)
-        Position and quaternion.
-    old_size : array, shape (n, 3)
-        Extents [m].
-    covariance : array, shape (n, 36)
-        NaN where that of the message remains.
-
-    """
+    """The new boxes of a message, beside the old ones."""
 
     boxes: BoxArray
+    """The new ones."""
     old_pose: Floats
+    """(n, 7), position and quaternion; so is `new_pose`."""
     new_pose: Floats
     old_size: Floats
+    """(n, 3) [m]."""
     covariance: Floats
+    """(n, 36), NaN where that of the message remains."""
 
 
 @dataclass(frozen=True, slots=True)
 class BoxFields:
-    """
-    Where the messages of a type have their boxes.
-
-    Attributes
-    ----------
-    frames : tuple of str
-        Frames of the array and of the boxes.
-    pose, size : str
-        First number of pose and of size.
-    labels : callable
-        Reads ids, classes and scores.
-    others : tuple of str
-        Further fields that the functions here use.
-    stamp : str
-        Seconds of the stamp, before its nanoseconds.
-    covariance : str
-        First number of the covariance of the pose; '' if there is none.
-    is_ordinary : callable
-        Whether all its objects are boxes that arrays can represent.
-    rows : callable, optional
-        Which of the poses are those of boxes; by default all.
-    has_angles : callable, optional
-        Which boxes have an orientation; by default all.
-    write : callable
-        Writes what depends on the box beside pose, size and covariance.
-
-    """
+    """Where the messages of a type have their boxes."""
 
     frames: tuple[str, ...]
+    """Of the array and of the boxes."""
     pose: str
+    """First number of the pose; so is `size`."""
     size: str
     labels: Callable[[Fields], BoxLabels]
+    """Reads ids, classes and scores."""
     others: tuple[str, ...] = ()
+    """Further fields that the functions here use."""
     stamp: str = 'header.stamp.sec'
+    """Seconds of the stamp, before its nanoseconds."""
     covariance: str = ''
+    """First number of the covariance of the pose; empty if there is none."""
     is_ordinary: Callable[[Fields], bool] = lambda fields: True
+    """Whether all its objects are boxes that arrays can represent."""
     rows: Callable[[Fields], NDArray[np.bool_]] | None = None
+    """Which of the poses are those of boxes; by default all."""
     has_angles: Callable[[Fields], NDArray[np.bool_]] | None = None
+    """Which boxes have an orientation; by default all."""
     write: Callable[[Fields, Rewrite], None] = lambda fields, rewrite: None
+    """Writes what depends on the box beside pose, size and covariance."""
 
 
 class SerializedAdapter:
     """
     An `Adapter` whose messages are bytes, as they arrive and as they are published.
 
-    Parameters
-    ----------
-    type_name : str
-        Message type, one of `BOX_FIELDS`.
-    kind : type
-        Its class, of rclpy.
-    inner : Adapter
-        Adapter of its messages.
-    deserialize : callable
-        Returns the message of bytes.
-    kind_of : callable, optional
-        As for `Layout`.
-
-    Raises
-    ------
-    UnsupportedMessage
-        If the type is an older one that lacks a field.
+    `kind` is the class of the type, of rclpy, and `kind_of` as for `Layout`; `inner` is the
+    adapter of the messages that `deserialize` makes. Raises UnsupportedMessage if the type is an
+    older one that lacks a field.
 
     """
 
@@ -228,12 +188,7 @@ def serialized_adapter_for(
     """
     Return the adapter of serialised messages of a type; None if there is none, or no numba.
 
-    Parameters
-    ----------
-    type_name, convention
-        As for `adapter_for`, which raises the same errors.
-    kind, deserialize
-        As for `SerializedAdapter`.
+    Errors are those of `adapter_for`; see `SerializedAdapter`.
 
     """
     inner = adapter_for(type_name, replace(STANDARD, associate=convention.associate))

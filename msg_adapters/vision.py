@@ -21,11 +21,8 @@ def from_msg(msg: Any) -> BoxArray:
     """
     Return the boxes; a detection without hypotheses has the class ``''`` and the score 1.
 
-    Raises
-    ------
-    UnsupportedMessage
-        If a detection is in another frame than the array, or the definition is older than
-        vision_msgs 4.
+    Raises UnsupportedMessage if a detection is in another frame than the array, or the definition
+    is older than vision_msgs 4.
 
     """
     if hasattr(msg, 'detections'):

@@ -32,46 +32,25 @@ csv.field_size_limit(2**31 - 1)  # ids may be as long as messages
 
 @dataclass(frozen=True, slots=True)
 class BoxTable:
-    """
-    Boxes of many stamps, one row each, as in ``boxes.csv``.
-
-    Attributes
-    ----------
-    stamps_ns : array, shape (n,)
-        Header stamps [ns].
-    frame_id : str
-        Frame of all `boxes`; ``''`` when there are none.
-    track_ids, class_names, status : tuple of n str
-        Identity over time, category, and where the box comes from.
-    scores : array, shape (n,)
-        Detector confidence.
-    boxes : array, shape (n, 9)
-        As defined in `structures`.
-    num_points : array, shape (n,)
-        Returns of the object, or inside the box.
-
-    """
+    """Boxes of many stamps, one row each, as in ``boxes.csv``."""
 
     stamps_ns: Ints
+    """(n,), of the headers [ns]."""
     frame_id: str
+    """Of all `boxes`; empty when there are none."""
     track_ids: tuple[str, ...]
     class_names: tuple[str, ...]
     scores: Floats
     boxes: Floats
+    """(n, 9), as defined in `structures`."""
     status: tuple[str, ...]
+    """Where each box comes from."""
     num_points: Ints
+    """(n,), returns of the object, or inside the box."""
 
     @classmethod
     def from_arrays(cls, arrays: Sequence[BoxArray], status: str = 'input') -> BoxTable:
-        """
-        Return the rows of box arrays that share one frame, in their order.
-
-        Raises
-        ------
-        RecordingError
-            If the arrays are in several frames.
-
-        """
+        """Return the rows of box arrays in order; RecordingError if they are in several frames."""
         frame_ids = {array.frame_id for array in arrays}
         if len(frame_ids) > 1:
             raise RecordingError(
@@ -96,11 +75,8 @@ class BoxTable:
         """
         Read a CSV file with the columns of ``boxes.csv``; others beside them are ignored.
 
-        Raises
-        ------
-        RecordingError
-            If the file cannot be read, a column is missing, a value is not what its column
-            needs, or the rows are in several frames.
+        Raises RecordingError if the file cannot be read, a column is missing, a value is not what
+        its column needs, or the rows are in several frames.
 
         """
         tables = cls.read_frames(path)
@@ -232,12 +208,7 @@ def cell(text: str) -> str:
 
 
 def protected(text: str) -> str:
-    """
-    Return a text as a cell that no spreadsheet takes for a formula; `unprotected` reads it.
-
-    A number with a sign is none.
-
-    """
+    """Return a text as a cell that no spreadsheet takes for a formula; a signed number is none."""
     if not text.startswith(FORMULA_STARTS):
         return text
     with suppress(ValueError):

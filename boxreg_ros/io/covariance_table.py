@@ -30,23 +30,14 @@ NUMBERS_FORMAT = ','.join(['%.7g'] * len(COVARIANCE_NUMBERS)) + '\n'
 
 
 class BoxCovariance(NamedTuple):
-    """
-    The row of one box.
-
-    Attributes
-    ----------
-    distance : float
-        Horizontal distance of the box from the sensor [m]; NaN if unknown.
-    pose : array, shape (6, 6)
-        Of x y z roll pitch yaw, in the frame of the box's row in ``boxes.csv`` [m, rad].
-    extent : array, shape (3, 3)
-        Of length, width and height [m].
-
-    """
+    """The row of one box."""
 
     distance: float
+    """Horizontal, from the sensor [m]; NaN if unknown."""
     pose: Floats
+    """(6, 6), of x y z roll pitch yaw in the frame of the row in ``boxes.csv`` [m, rad]."""
     extent: Floats
+    """(3, 3), of length, width and height [m]."""
 
 
 class CovarianceWriter:
@@ -86,10 +77,7 @@ def read_covariances(path: Path) -> dict[tuple[int, str], BoxCovariance]:
     """
     Read a table of covariances; of rows with one stamp and track id the first counts.
 
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read, or a column or a number is missing.
+    Raises RecordingError if the file cannot be read, or a column or a number is missing.
 
     """
     try:

@@ -28,23 +28,14 @@ import numpy as np
 
 
 class MovedItem(NamedTuple):
-    """
-    A cloud or boxes of a recording, and the same in the fixed frame.
-
-    Attributes
-    ----------
-    items : tuple of Item
-        As recorded: one, or the clouds of several LiDARs that were merged.
-    moved : Sweep or BoxArray, or None
-        In the fixed frame, boxes with their ids; None where no transform is known.
-    restarts : bool
-        True if time went back before it.
-
-    """
+    """A cloud or boxes of a recording, and the same in the fixed frame."""
 
     items: tuple[Item, ...]
+    """As recorded: one, or the clouds of several LiDARs that were merged."""
     moved: Sweep | BoxArray | None
+    """Boxes with their ids; None where no transform is known."""
     restarts: bool
+    """Whether time went back before it."""
 
     @property
     def T_fixed_item(self) -> Floats | None:
@@ -72,37 +63,17 @@ class StoredCloud(NamedTuple):
 
 class FixedFrameItems:
     """
-    Bring the items of a recording into the fixed frame.
+    Bring the items of an open recording into the fixed frame.
 
-    Parameters
-    ----------
-    source : ItemSource
-        Open.
-    config : Config
-        `max_gap` and `merge_span` are used.
-    convention : Convention
-        Convention of the boxes, and whether ids are to be assigned.
-    fixed_frame : str, optional
-        Fixed frame to use instead of the one that the source chooses.
-    stage : callable, optional
-        Measures the stages ``read``, ``decode`` and ``transform``.
+    It is the one that `source` chooses unless `fixed_frame` names another. Of `config`, `max_gap`
+    and `merge_span` are used; `convention` also says whether ids are assigned; `stage` measures
+    ``read``, ``decode`` and ``transform``. `counts` has sweeps, box arrays, time jumps, clouds
+    without a transform or whose LiDARs are not all known, and what has no stamp;
+    `missing_transforms` both clouds and box arrays. `first_missing_transform` and `first_unplaced`
+    are the errors of the first ones.
 
-    Attributes
-    ----------
-    session : Session
-        Has the transforms, the fixed frame and the finding of the pose check.
-    counts : Counter
-        Sweeps, box arrays, time jumps, clouds without a transform or whose LiDARs are not all
-        known, and clouds and box arrays without a stamp.
-    missing_transforms : int
-        Number of clouds and box arrays without a transform.
-    first_missing_transform, first_unplaced : str
-        Error of the first of them, and of the first cloud whose LiDARs are not all known.
-
-    Raises
-    ------
-    RecordingError
-        If no motion of the sensor is known, or no transforms lead to `fixed_frame`.
+    Raises RecordingError if no motion of the sensor is known, or no transforms lead to
+    `fixed_frame`.
 
     """
 
@@ -254,21 +225,10 @@ def input_boxes(
     source: AbstractContextManager[ItemSource], fixed_frame: str | None = None
 ) -> tuple[list[BoxArray], str]:
     """
-    Return the input boxes of a recording in the fixed frame that `relabel` would choose.
+    Return the input boxes of a recording, not open yet, in the frame that `relabel` would choose.
 
-    Parameters
-    ----------
-    source : context manager of ItemSource
-        Recording that is not open yet.
-    fixed_frame : str, optional
-        Fixed frame to use instead.
-
-    Returns
-    -------
-    arrays : list of BoxArray
-        All that could be decoded and transformed.
-    others : str
-        Number of the others, and why; empty if there are none.
+    Those that could not be decoded or transformed are counted, with the reason, in the text; it is
+    empty if there are none.
 
     """
     with source as recording:

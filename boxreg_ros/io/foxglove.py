@@ -83,17 +83,7 @@ def ros_type(schema_name: str) -> str:
 
 
 def decoder_of(origin: str, topic: str, schema: Schema) -> Callable[[bytes], Any]:
-    """
-    Return the function that decodes the messages of a channel.
-
-    Parameters
-    ----------
-    origin, topic : str
-        Names of the recording and of the topic, for errors.
-    schema : Schema
-        Schema of the channel.
-
-    """
+    """Return the function that decodes the messages of a channel; errors name origin and topic."""
     return _Decoder(origin, topic, schema)
 
 

@@ -26,12 +26,7 @@ Centre and extents have six degrees of freedom: chi-square has 99.7 % below 20.
 
 @dataclass(eq=False, slots=True)
 class _Track:
-    """
-    A constant-velocity Kalman filter of the centre.
-
-    All three axes have the same covariance (2, 2) of position and velocity.
-
-    """
+    """A constant-velocity Kalman filter of the centre, with one covariance (2, 2) for all axes."""
 
     track_id: str
     stamp_ns: int
@@ -69,18 +64,10 @@ class Tracker:
     """
     Assign ids that stay with the object; ids of the input are not used.
 
-    Boxes are assigned to the predictions of the tracks with least total cost, within a gate. A
-    box without a track starts one. The result depends on the order of calls only.
-
-    Parameters
-    ----------
-    max_gap : float
-        A track without a box for longer ends [s]; may change.
-
-    Attributes
-    ----------
-    count : int
-        Number of ids assigned so far.
+    Boxes are assigned to the predictions of the tracks with least total cost, within a gate. A box
+    without a track starts one; a track without a box for longer than `max_gap` [s], which may
+    change, ends. The result depends on the order of calls only. `count` ids have been assigned so
+    far.
 
     """
 
@@ -96,16 +83,11 @@ class Tracker:
 
     def identify(self, boxes: BoxArray) -> BoxArray:
         """
-        Return the boxes with ids.
+        Return boxes in a fixed frame with ids; invalid boxes get the id ``''``.
 
-        Invalid boxes get the id ``''``. Boxes with an older stamp than others before are
-        assigned to tracks but do not change them; without a track they get an id that is not
-        used again. If stamps go back further than `max_gap`, all tracks end.
-
-        Parameters
-        ----------
-        boxes : BoxArray
-            In a fixed frame.
+        Boxes with an older stamp than others before are assigned to tracks but do not change them;
+        without a track they get an id that is not used again. If stamps go back further than
+        `max_gap`, all tracks end.
 
         """
         from scipy.optimize import linear_sum_assignment  # slow, and only association needs it

@@ -38,30 +38,19 @@ QUALITY = 90
 
 
 class ImageCamera(NamedTuple):
-    """
-    A topic of images, and the model of its camera.
-
-    Attributes
-    ----------
-    topic, frame_id : str
-        Topic of the images, and frame of the camera: x right, y down, z forward.
-    size : tuple of int
-        Width and height [px]; 0 without a model.
-    matrix : array, shape (3, 4), or None
-        Projection of points in the camera's frame [px]; None where no model was recorded.
-    distortion : array, shape (k,)
-        Coefficients of the model; empty for rectified images.
-    model : str
-        ``plumb_bob``, ``rational_polynomial``, ``equidistant`` and the like.
-
-    """
+    """A topic of images, and the model of its camera."""
 
     topic: str
     frame_id: str
+    """Of the camera: x right, y down, z forward."""
     size: tuple[int, int]
+    """Width and height [px]; 0 without a model."""
     matrix: Floats | None
+    """(3, 4), projects points in the camera's frame [px]; None where no model was recorded."""
     distortion: Floats
+    """(k,), coefficients of the model; empty for rectified images."""
     model: str
+    """``plumb_bob``, ``rational_polynomial``, ``equidistant`` and the like."""
 
 
 class Image(NamedTuple):
@@ -93,12 +82,8 @@ class RecordedImages:
         """
         Return the image of a camera that is nearest to a stamp.
 
-        Raises
-        ------
-        RecordingError
-            If there is none within the second of `NEAR`.
-        UnsupportedMessage
-            If its encoding is not known.
+        Raises RecordingError if there is none within the second of `NEAR`, and UnsupportedMessage
+        if its encoding is not known.
 
         """
         middle_ns = stamp_ns + self._delays[camera.topic]

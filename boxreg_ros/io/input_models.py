@@ -28,10 +28,8 @@ def read_models(paths: Sequence[Path]) -> Drives:
     """
     Return the drives of some files.
 
-    Raises
-    ------
-    ConfigError
-        If a file cannot be read, is of another version or damaged, or all have no drive.
+    Raises ConfigError if a file cannot be read, is of another version or damaged, or all have no
+    drive.
 
     """
     found = joined(map(_read, paths))
@@ -57,9 +55,10 @@ def _read(path: Path) -> Drives:
 
 def disagreements(drives: Drives) -> Iterator[str]:
     """
-    Yield where a drive differs from the others by more than chance: other detectors or rules.
+    Yield where the gaps of a drive differ from the others by more than chance.
 
-    By the mean gap of each group of faces, with the scatter between its tracks.
+    Then detectors or rules differ. By the mean gap of each group of faces, with the scatter
+    between its tracks.
 
     """
     tests = len(drives) * len(KINDS) * len(GROUP_NAMES)

@@ -18,32 +18,20 @@ LOOKAHEAD_NS = 2 * 10**9
 
 
 class Item(NamedTuple):
-    """
-    A decoded cloud or box array, on its way from a recording or a topic to the registrar.
-
-    Attributes
-    ----------
-    received_ns : int
-        When it was received [ns]; live by a clock that never jumps.
-    content : Sweep or BoxArray
-        In the frame of its message.
-    intensities : array, shape (M,), or None
-        Of the points of a cloud; None unless asked for and recorded.
-    refined : RefinedBoxes or None
-        Status and covariances of boxes that come from label files; else None.
-    message : message or None
-        As it was received, live; else None.
-    T_fixed_item : array, shape (4, 4), or None
-        Maps the frame of its message to the fixed frame; None where it is not known yet.
-
-    """
+    """A decoded cloud or box array, on its way from a recording or a topic to the registrar."""
 
     received_ns: int
+    """When it was received [ns]; live by a clock that never jumps."""
     content: Sweep | BoxArray
+    """In the frame of its message."""
     intensities: Floats | None = None
+    """(M,), of the points of a cloud; None unless asked for and recorded."""
     refined: RefinedBoxes | None = None
+    """Status and covariances of boxes that come from label files."""
     message: Any = None
+    """As it was received, live."""
     T_fixed_item: Floats | None = None
+    """Maps the frame of its message to the fixed frame; None where it is not known yet."""
 
     @property
     def received(self) -> float:
@@ -61,23 +49,14 @@ def not_measured(stage: str) -> AbstractContextManager[object]:
 
 
 class Wanted(NamedTuple):
-    """
-    What is read of a source.
-
-    Attributes
-    ----------
-    clouds : bool
-        False leaves the clouds out, and saves decoding them.
-    intensities : bool
-        Whether the intensities of the points are decoded, too.
-    stage : callable
-        Measures the stages ``read`` and ``decode``.
-
-    """
+    """What is read of a source."""
 
     clouds: bool = True
+    """False leaves the clouds out, and saves decoding them."""
     intensities: bool = False
+    """Whether the intensities of the points are decoded, too."""
     stage: Stage = not_measured
+    """Measures ``read`` and ``decode``."""
 
 
 EVERYTHING = Wanted()
@@ -90,10 +69,7 @@ def requested_part(
     """
     Return begin and end of the part of a drive from `start` to `end` [s], in nanoseconds.
 
-    Raises
-    ------
-    RecordingError
-        If it is empty.
+    Raises RecordingError if it is empty.
 
     """
     first_ns = begin_ns + round((start or 0.0) * 1e9)
@@ -109,34 +85,22 @@ def requested_part(
 
 @runtime_checkable
 class ItemSource(Protocol):
-    """
-    A source of clouds and boxes: bags, MCAP files of Foxglove, clouds with label files.
-
-    Attributes
-    ----------
-    points_topic, boxes_topic
-        Topics; `points_topic` is the first of several, `boxes_topic` is empty if the boxes are
-        not from a topic.
-    placement
-        Topics of several LiDARs and the frames of their sensors; holds the info messages of
-        concatenated clouds once these have been read.
-    start_ns, end_ns
-        Part that is read, in receive time [ns].
-    unreadable, first_errors
-        Number of messages of each topic that could not be decoded, and the first error.
-    outside
-        Boxes that do not belong to the part that is read.
-
-    """
+    """A source of clouds and boxes: bags, MCAP files of Foxglove, clouds with label files."""
 
     points_topic: str
+    """The first of several."""
     boxes_topic: str
+    """Empty if the boxes are not from a topic."""
     placement: SensorPlacement
+    """Topics of the LiDARs and frames of their sensors; holds the info messages read so far."""
     start_ns: int
     end_ns: int
+    """End of the part that is read, in receive time, as `start_ns` [ns]."""
     unreadable: Counter[str]
     first_errors: dict[str, UnsupportedMessage]
+    """Of each topic with messages that could not be decoded; `unreadable` counts them."""
     outside: int
+    """Boxes that do not belong to the part that is read."""
 
     @property
     def odometry_topic(self) -> str | None:

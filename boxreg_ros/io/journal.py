@@ -46,12 +46,7 @@ class Journal:
     """
     A journal in a file of this machine; the caller keeps other processes out.
 
-    Raises
-    ------
-    RecordingError
-        If the file is no journal.
-    OSError
-        If it cannot be written.
+    Raises RecordingError if the file is no journal, and OSError if it cannot be written.
 
     """
 

@@ -25,55 +25,32 @@ SIZE_UNITS = ('MB', 'GB')
 
 
 class RecorderSettings(NamedTuple):
-    """
-    Settings of one recording of labels.
-
-    Attributes
-    ----------
-    folder : str
-        Absolute path of the folder of the segments.
-    formats : tuple of str
-        Label formats; ``csv`` is always written.
-    with_points : bool
-        Also write the clouds.
-    segment : str
-        Length of a segment: a number with the unit s, min, h, MB or GB.
-    camera : str
-        Path of a calibration file, for formats in a camera frame; empty for none.
-    config : Config
-        Settings of the core.
-
-    """
+    """Settings of one recording of labels."""
 
     folder: str
+    """Absolute path of the folder of the segments."""
     formats: tuple[str, ...]
+    """Label formats; ``csv`` is always written."""
     with_points: bool
+    """Also write the clouds."""
     segment: str
+    """Length of a segment: a number with the unit s, min, h, MB or GB."""
     camera: str
+    """Path of a calibration file, for formats in a camera frame; empty for none."""
     config: Config
 
 
 class LabelCloud(NamedTuple):
-    """
-    A cloud that label files may need.
-
-    Attributes
-    ----------
-    sweep : Sweep
-        Points in the frame of the sensor.
-    T_fixed_sweep : array, shape (4, 4)
-        Pose of that frame at the stamp.
-    intensities : array, shape (M,), or None
-        One value per point.
-    needed_from_ns : int
-        No further boxes have a smaller stamp [ns], except those that are late.
-
-    """
+    """A cloud that label files may need."""
 
     sweep: Sweep
+    """In the frame of the sensor."""
     T_fixed_sweep: Floats
+    """Pose (4, 4) of that frame at the stamp."""
     intensities: Floats | None
+    """(M,), None if the cloud has none."""
     needed_from_ns: int
+    """No further boxes have a smaller stamp [ns], except those that are late."""
 
 
 class FinalBoxes(NamedTuple):
@@ -96,49 +73,31 @@ class Tick(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RecorderStatus:
-    """
-    State of the recorder.
-
-    Attributes
-    ----------
-    segment : str
-        Name of the open segment; empty while there is none.
-    segments : int
-        Segments completed since the start.
-    frames, boxes, clouds : int
-        Written since the start.
-    size : int
-        Size of the label files written since the start.
-    rate : float
-        Growth of these files over the last seconds [bytes/s].
-    free : int
-        Room on the disk [bytes].
-    recovered : int
-        Segments recovered from the journals of earlier recordings.
-    damaged : int
-        Segments of earlier recordings whose journal cannot be read; their folder is kept.
-    without_cloud : int
-        Frames without a cloud, where clouds are written.
-    left_out : int
-        Boxes that a format cannot represent, summed over formats.
-    error : str
-        Reason why the recording ended; empty for none.
-
-    """
+    """State of the recorder; counts are since its start."""
 
     segment: str = ''
+    """The open one; empty while there is none."""
     segments: int = 0
+    """Completed."""
     frames: int = 0
     boxes: int = 0
     clouds: int = 0
     size: int = 0
+    """Of the label files written [bytes]."""
     rate: float = 0.0
+    """Growth of these files over the last seconds [bytes/s]."""
     free: int = 0
+    """Room on the disk [bytes]."""
     recovered: int = 0
+    """Segments recovered from the journals of earlier recordings."""
     damaged: int = 0
+    """Segments of earlier recordings whose journal cannot be read; their folder is kept."""
     without_cloud: int = 0
+    """Frames without a cloud, where clouds are written."""
     left_out: int = 0
+    """Boxes that a format cannot represent, summed over formats."""
     error: str = ''
+    """Why the recording ended."""
 
     def line(self) -> str:
         """Return the status as a line of JSON."""
@@ -154,10 +113,7 @@ def segment_limit(text: str) -> tuple[float, bool]:
     """
     Return the length of a segment [s or bytes], and whether it is in bytes.
 
-    Raises
-    ------
-    ConfigError
-        If the text is not a positive number with a unit of `UNITS`.
+    Raises ConfigError if the text is not a positive number with a unit of `UNITS`.
 
     """
     found = re.fullmatch(r'\s*(\d+(?:\.\d+)?)\s*([a-zA-Z]+)\s*', text)

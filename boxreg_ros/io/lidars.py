@@ -52,23 +52,11 @@ class Lidars:
     """
     Topics of the clouds, and frames of the LiDARs that measured them.
 
-    Attributes
-    ----------
-    topics : tuple of str
-        Topics whose clouds are merged, or the only one; empty for the only one that there is.
-    frames : tuple of str
-        Frames of the LiDARs where clouds are in another one: of each topic, or all LiDARs of a
-        single topic. Empty if the frame of each cloud is that of its LiDAR.
-    info : str
-        Topic of the messages that divide the clouds among the LiDARs; empty for none.
-    time_unit : str
-        Unit of the times of the points, or ``auto``.
+    `topics` are merged; empty stands for the only one. `frames` are those of each topic, or of all
+    LiDARs of a single topic; empty if each cloud is in the frame of its LiDAR.
 
-    Raises
-    ------
-    ConfigError
-        If the number of frames is not that of several topics, a topic is named twice, or info
-        messages are expected for several topics.
+    Raises ConfigError if the number of frames is not that of several topics, a topic is named
+    twice, or info messages are expected for several topics.
 
     """
 
@@ -130,14 +118,8 @@ class SensorPlacement:
     """
     Find the LiDARs that measured the points of a cloud.
 
-    State: the newest info messages of concatenated clouds. Not thread-safe.
-
-    Attributes
-    ----------
-    lidars : Lidars
-        Topics and frames.
-    layouts : dict of str
-        Layout of the first cloud of each topic, and how the times of its points are read.
+    State: the newest info messages of concatenated clouds, and in `layouts` the layout of the
+    first cloud of each topic and how the times of its points are read. Not thread-safe.
 
     """
 
@@ -155,10 +137,8 @@ class SensorPlacement:
         """
         Return the sweep of a cloud, with its topic if there are several.
 
-        Raises
-        ------
-        UnsupportedMessage
-            If the cloud cannot be read, or its points are not in the order of the info messages.
+        Raises UnsupportedMessage if it cannot be read, or its points are not in the order of the
+        infos.
 
         """
         if self.lidars.info and clouds.is_reordered(msg):
@@ -198,23 +178,10 @@ class SensorPlacement:
         """
         Return a cloud with the positions of its LiDARs, each at the stamp of its own part.
 
-        Points of a concatenated cloud without an info message are attributed to the nearest of
-        the LiDARs that are named: the one with the densest points, and rarely blocked by the
-        vehicle.
-
-        Parameters
-        ----------
-        sweep : Sweep
-            In the fixed frame.
-        tree : TransformTree
-            Transforms to the frames of the LiDARs.
-
-        Returns
-        -------
-        sweep : Sweep
-            Unchanged where nothing is known of its LiDARs.
-        reason, detail : Reason and str
-            What is missing; None and empty if nothing is.
+        The cloud is in the fixed frame; it is unchanged where nothing is known of its LiDARs, and
+        then reason and detail say what is missing. Points of a concatenated cloud without an info
+        message are attributed to the nearest of the LiDARs that are named: the one with the
+        densest points, and rarely blocked by the vehicle.
 
         """
         if self.lidars.info and not sweep.is_dropped:
@@ -338,26 +305,15 @@ class SweepMerger:
     """
     Merge the clouds of several LiDARs into one sweep per period.
 
-    A sweep has at most one cloud of each topic, and their stamps are within `merge_span`. It is
+    A sweep has at most one cloud of each topic, and their stamps are within `span` [s]. It is
     complete with a cloud of every LiDAR that was heard in the last second; without one of them it
     is returned once a later sweep is complete, or two later ones have begun. After a complete
     sweep the LiDARs keep their order within a period, so that a lost cloud shifts no pairs. The
     rule reads stamps and the order of arrival only, no clock. A sweep has the stamp of the first
     topic in it, in the order of `topics`; the times of its points are relative to that.
 
-    Parameters
-    ----------
-    topics : sequence of str
-        Topics of the clouds.
-    span : float
-        `merge_span` of the settings [s].
-    report : callable
-        Called for each cloud that is late, and each that a sweep lacks.
-
-    Attributes
-    ----------
-    counts : dict of str and Counter
-        Of each topic, clouds that were ``merged``, and those by the reasons of `report`.
+    `report` is called for each cloud that is late, and each that a sweep lacks; `counts` has them
+    by topic and reason, beside those ``merged``.
 
     """
 
@@ -377,14 +333,9 @@ class SweepMerger:
 
     def add(self, sweep: Sweep, extra: Any = None) -> list[MergedSweep]:
         """
-        Add a cloud; return the sweeps that are complete, in the order of their stamps.
+        Add a cloud in the fixed frame, with its topic; return the complete sweeps by their stamps.
 
-        Parameters
-        ----------
-        sweep : Sweep
-            In the fixed frame, with its topic.
-        extra : object
-            Returned with the merged sweep.
+        `extra` is returned with the merged sweep.
 
         """
         group = self._group_for(sweep)

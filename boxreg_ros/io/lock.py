@@ -29,23 +29,8 @@ def locked(path: Path, subject: str, seconds: float = 0.0) -> Iterator[None]:
     Hold the lock that a file stands for, and delete the file at the end.
 
     The kernel releases the lock when the process ends, in whichever way. A file system without
-    locks lets everyone in.
-
-    Parameters
-    ----------
-    path : Path
-        The file; its folder exists.
-    subject : str
-        What is locked, for the error.
-    seconds : float
-        How long to wait for another process [s].
-
-    Raises
-    ------
-    RecordingError
-        If another process holds the lock.
-    OSError
-        If the file cannot be written.
+    locks lets everyone in. Another process is waited for `seconds` [s]; then a RecordingError
+    names the `subject` that is locked.
 
     """
     file = _acquired(path, subject, time.monotonic() + seconds)

@@ -58,15 +58,7 @@ class _Shown:
     """
     Tracks that are shown in some namespaces, each with the number of its markers.
 
-    Parameters
-    ----------
-    numbers : iterator of int
-        Numbers for further tracks.
-
-    Attributes
-    ----------
-    gone : list of int
-        Numbers of the tracks that the last call of `replace` has removed.
+    `gone` are the numbers of the tracks that the last call of `replace` has removed.
 
     """
 
@@ -103,12 +95,7 @@ class MarkerBoard:
 
     A track keeps its marker number while it is seen, so that it moves instead of flickering;
     markers of tracks that are gone are deleted, and at first those that an earlier node may have
-    left. Not thread-safe.
-
-    Parameters
-    ----------
-    messages : object, optional
-        Has the classes of the messages as attributes; without it those of ROS are imported.
+    left. `messages` has the classes of the messages, by default those of ROS. Not thread-safe.
 
     """
 
@@ -128,14 +115,10 @@ class MarkerBoard:
         """
         Return the markers that bring what is shown of early boxes up to date.
 
-        Parameters
-        ----------
-        given, refined : BoxArray, RefinedBoxes
-            The same boxes before and after, in one frame; coasted boxes stand behind those of
-            the input. Boxes that are not finite, or have no volume, are not shown. Green is
-            refined, violet coasted, orange is kept, yellow is kept because there was no time;
-            grey is the input. The blue ellipse is the covariance of x and y of a refined box, 2
-            standard deviations.
+        Both are in one frame; coasted boxes stand behind those of the input. Boxes that are not
+        finite, or have no volume, are not shown. Green is refined, violet coasted, orange is kept,
+        yellow is kept because there was no time; grey is the input. The blue ellipse is the
+        covariance of x and y of a refined box, 2 standard deviations.
 
         """
         m = self._messages

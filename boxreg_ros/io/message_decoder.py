@@ -32,14 +32,10 @@ VISION_DEFINITIONS = {
 
 class MessageDecoder:
     """
-    Decode the messages of a recording by the definitions in it.
+    Decode the messages of a recording, called `origin`, by the definitions in it.
 
-    Attributes
-    ----------
-    origin : str
-        Name of the recording.
-    unreadable, first_errors
-        Number of messages of each topic that could not be decoded, and the first error.
+    `unreadable` counts the messages of each topic that could not be decoded; `first_errors` says
+    why.
 
     """
 
@@ -56,15 +52,7 @@ class MessageDecoder:
             self._reader.complete_definitions(stock_types())
 
     def message(self, record: Record) -> Any:
-        """
-        Return a message decoded.
-
-        Raises
-        ------
-        UnsupportedMessage
-            If its bytes are not of its type.
-
-        """
+        """Return a message decoded; UnsupportedMessage if its bytes are not of its type."""
         connection = record.connection
         kind = connection.msgtype
         origin = f'{self.origin}: a message on {connection.topic!r} is not a {kind}'

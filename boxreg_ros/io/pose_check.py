@@ -45,19 +45,9 @@ class PoseCheck:
     Compare the first boxes with their points under every convention.
 
     All conventions give boxes of the same volume about the same pose, so the right one contains
-    most points. Sweeps and boxes arrive in any order, in one frame.
-
-    Parameters
-    ----------
-    convention : Convention
-        The convention that the boxes have been read with.
-    tolerance : float
-        Largest time between boxes and their sweep [s].
-
-    Attributes
-    ----------
-    finding : str
-        Which setting is wrong and its right value; empty if none is known to be wrong.
+    most points. Sweeps and boxes arrive in any order, in one frame, at most `tolerance` [s] apart.
+    `finding` says which setting of the `convention` they were read with is wrong and its right
+    value; it is empty if none is known to be wrong.
 
     """
 

@@ -22,25 +22,9 @@ ReadTopics = Callable[[Collection[str], int | None, int | None], Iterator[Record
 
 class RecordedMotion:
     """
-    Transforms and odometry of a recording.
+    Transforms and odometry of a recording, in the part from begin to end of receive time [ns].
 
-    Parameters
-    ----------
-    topics : Topics
-        Of the recording.
-    decoder : MessageDecoder
-        Of its messages; counts those that are unreadable.
-    read : callable
-        Reads the messages on some topics.
-    part_ns : tuple of int
-        Begin and end of the part that is read, in receive time [ns].
-    odometry_topic : str or None
-        Topic of odometry that was asked for.
-
-    Attributes
-    ----------
-    odometry_topic : str or None
-        Topic of the odometry in use.
+    `odometry_topic` is the one that was asked for, then the one in use.
 
     """
 
@@ -79,12 +63,9 @@ class RecordedMotion:
 
     def first(self, topic: str) -> Any:
         """
-        Return the first readable message on a topic in the part that is read; None without.
+        Return the first readable message on a topic in the part that is read; None without any.
 
-        Raises
-        ------
-        UnsupportedMessage
-            If there are messages, and none is readable.
+        Raises UnsupportedMessage if there are messages, and none is readable.
 
         """
         first_error: UnsupportedMessage | None = None
@@ -101,19 +82,11 @@ class RecordedMotion:
         """
         Choose between TF and odometry, and return the fixed frame.
 
-        Parameters
-        ----------
-        tree : TransformTree
-            Empty; afterwards it holds the static and the first moving transforms.
-        frame : str
-            Frame of a LiDAR.
-        wanted : str or None
-            Fixed frame to use; by default the topmost frame that `frame` moves in.
+        It is `wanted`, or the topmost frame that the `frame` of a LiDAR moves in. The empty `tree`
+        then holds the static and the first moving transforms.
 
-        Raises
-        ------
-        RecordingError
-            If no motion is known, or no transforms connect `wanted` with `frame`.
+        Raises RecordingError if no motion is known, or no transforms connect `wanted` with
+        `frame`.
 
         """
         for record in self._read(self._topics.static_transforms, None, None):
@@ -169,10 +142,7 @@ class RecordedMotion:
         """
         Use the odometry that moves `root`, the topmost frame of TF, or any above `frame`.
 
-        Returns
-        -------
-        odometry : list of str
-            Topics with the frames that they connect.
+        Returns the topics with the frames that they connect.
 
         """
         odometry = []

@@ -13,19 +13,9 @@ NAMES = {'bool': 'boolean', 'byte': 'octet', 'float32': 'float', 'float64': 'dou
 
 class RecordedType:
     """
-    Stand-in for the class of a message type.
+    Stand-in for the class of a message type, ``package/msg/Type`` or ``package/Type``.
 
-    Parameters
-    ----------
-    store : Typestore
-        Definitions of a recording.
-    name : str
-        ``package/msg/Type``, or ``package/Type``.
-
-    Raises
-    ------
-    KeyError
-        If there is no definition.
+    Raises KeyError if the recording has no definition of it.
 
     """
 

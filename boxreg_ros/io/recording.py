@@ -44,40 +44,17 @@ class Recording:
     """
     One or several recordings of one drive, merged by receive time.
 
-    Receive times only order the stream and select the part between `start` and `end`; stamps
-    are those of the message headers. Topics that were recorded apart from the clouds are merged
-    by stamp, see `MessageOrder`. Use as a context manager; a copy can be opened again.
+    MCAP files, rosbag2 folders, ``.db3`` files, or ROS 1 bags. Receive times only order the stream
+    and select the part from `start` to `end` [s]; stamps are those of the message headers. Topics
+    that were recorded apart from the clouds are merged by stamp, see `MessageOrder`. Topics that
+    are not named are found by type, if only one has it. Use as a context manager; a copy can be
+    opened again.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        MCAP files, rosbag2 folders, .db3 files, or ROS 1 bags.
-    lidars : Lidars
-        Topics of the clouds, found by type if only one topic has it, and their LiDARs.
-    boxes, odometry : str, optional
-        Topics; found by type if only one topic has it.
-    start, end : float, optional
-        Part to read, from the beginning of the recording [s].
-    convention : Convention
-        Convention of the boxes, and whether ids will be assigned to them.
+    Attributes are those of `ItemSource`; also the `files`, and `part_ns`: begin and end that were
+    asked for, in receive time [ns], None where not.
 
-    Attributes
-    ----------
-    has_boxes : bool
-        Whether a topic of boxes is required; without, `boxes_topic` is empty.
-    points_topic, boxes_topic, odometry_topic, placement
-        See `ItemSource`.
-    start_ns, end_ns, unreadable, first_errors, outside
-        See `ItemSource`.
-    part_ns : tuple of int or None
-        Begin and end of the part that was asked for, in receive time [ns]; None if it was not.
-    files : list of Path
-        Files that are read.
-
-    Raises
-    ------
-    RecordingError
-        On entering, if a file or topic cannot be read or found; the message lists the topics.
+    Raises RecordingError on entering, if a file or topic cannot be read or found; the message
+    lists the topics.
 
     """
 
@@ -166,15 +143,9 @@ class Recording:
         """
         Yield clouds and box arrays in the order they were received.
 
-        Messages that cannot be decoded are counted in `unreadable` and left out.
-
-        Parameters
-        ----------
-        tree : TransformTree
-            At each item it holds the transforms received up to `LOOKAHEAD_NS` later. Older ones
-            are forgotten, so that memory does not grow with the recording.
-        wanted : Wanted
-            Whether clouds and intensities are decoded, and what measures the stages.
+        Messages that cannot be decoded are counted in `unreadable` and left out. At each item
+        `tree` holds the transforms received up to `LOOKAHEAD_NS` later. Older ones are forgotten,
+        so that memory does not grow with the recording.
 
         """
         self._decoder.reset()
@@ -214,30 +185,14 @@ class Recording:
             return
 
     def check_readable(self) -> None:
-        """
-        Check after the last item that some of the clouds, and of the boxes, were readable.
-
-        Raises
-        ------
-        UnsupportedMessage
-            If all messages of either topic were unreadable.
-
-        """
+        """Raise UnsupportedMessage, after the last item, if no cloud or no boxes were readable."""
         for topic, first in self.first_errors.items():
             alike = self.points_topics if topic in self.points_topics else {topic}
             if topic in self.data_topics and self._decoded_topics.isdisjoint(alike):
                 raise UnsupportedMessage(f'no message on {topic!r} can be read; first: {first}')
 
     def box_message(self, data: bytes) -> tuple[Any, BoxArray]:
-        """
-        Return a message of the boxes' topic from its bytes, and its boxes.
-
-        Raises
-        ------
-        UnsupportedMessage
-            If it is malformed.
-
-        """
+        """Return a message of the boxes' topic, and its boxes; UnsupportedMessage if malformed."""
         (connection, *_) = self._topics.connections({self.boxes_topic})
         message = self._decoder.message(Record(connection, 0, data))
         return message, cast(BoxArray, self._content(self.boxes_topic, message))
@@ -252,15 +207,7 @@ class Recording:
         return bytes(encode(replaced, kind))
 
     def cloud_message(self, topic: str, data: bytes) -> Any:
-        """
-        Return a message of a topic of clouds from its bytes.
-
-        Raises
-        ------
-        UnsupportedMessage
-            If it is malformed.
-
-        """
+        """Return a message of a topic of clouds; UnsupportedMessage if it is malformed."""
         (connection, *_) = self._topics.connections({topic})
         return self._decoder.message(Record(connection, 0, data))
 
@@ -338,19 +285,11 @@ class Recording:
         Choose the source of the sensor's motion, and return the fixed frame.
 
         TF is used where it connects the frames, else odometry. The default is the topmost frame
-        that the frame of the clouds moves in.
+        that the frame of the clouds moves in. The empty `tree` then holds the static and the first
+        moving transforms.
 
-        Parameters
-        ----------
-        tree : TransformTree
-            Empty; afterwards it holds the static and the first moving transforms.
-        fixed_frame : str, optional
-            Frame to use instead.
-
-        Raises
-        ------
-        RecordingError
-            If no motion is known, or no transforms connect `fixed_frame` with the clouds.
+        Raises RecordingError if no motion is known, or no transforms connect `fixed_frame` with
+        the clouds.
 
         """
         first_error: RecordingError | None = None

@@ -35,22 +35,10 @@ class MessageOrder:
     Order messages by receive time, and those recorded apart from the clouds by stamp.
 
     A message that was recorded apart gets the receive time of a cloud of its stamp. That is
-    possible where clouds were received with a constant delay after their stamps; it is not where
-    a recording was played in a loop or paused, and receive times are kept there.
-
-    Parameters
-    ----------
-    reader : Reader
-        Open.
-    points_topic : str
-        Topic of the clouds, the reference for the others.
-    stamp_of : callable
-        Returns the stamp of a message [ns]; None if it has none.
-
-    Attributes
-    ----------
-    apart : dict of str and float
-        Topics that were recorded apart, and how much later than the clouds [s].
+    possible where clouds were received with a constant delay after their stamps; it is not where a
+    recording was played in a loop or paused, and receive times are kept there. `stamp_of` returns
+    the stamp of a message [ns], None if it has none; `apart` has the topics that were recorded
+    apart, and how much later than the clouds [s].
 
     """
 

@@ -32,27 +32,16 @@ _T = TypeVar('_T')
 
 
 class Admitted(NamedTuple):
-    """
-    A sweep or boxes on the way to the registrar.
-
-    Attributes
-    ----------
-    moved : Sweep or BoxArray, or None
-        The item in the fixed frame, boxes with their ids; None where no transform is known.
-    T_fixed_item : array, shape (4, 4), or None
-        Maps the frame of the item to the fixed frame.
-    reason : Reason or None
-        ``no_transform`` for boxes or ``sweep_without_transform`` if `moved` is None; the reason
-        why not all LiDARs of a cloud are known; else empty.
-    detail : str
-        The transform or message that is missing; empty if none is.
-
-    """
+    """A sweep or boxes on the way to the registrar."""
 
     moved: Sweep | BoxArray | None
+    """In the fixed frame, boxes with their ids; None where no transform is known."""
     T_fixed_item: Floats | None
+    """Maps the frame of the item to the fixed frame."""
     reason: Reason | None = None
+    """Why `moved` is None, or why not all LiDARs of a cloud are known."""
     detail: str = ''
+    """The transform or message that is missing."""
 
 
 class JumpConfirmation(Generic[_T]):
@@ -73,12 +62,7 @@ class JumpConfirmation(Generic[_T]):
         """
         Return the items to process now, in order, and whether time went back before them.
 
-        Parameters
-        ----------
-        item : object
-            The next one; anything that the caller wants back.
-        content : Sweep or BoxArray
-            Its content, with a stamp.
+        `item` is what the caller wants back for the `content`, which has a stamp.
 
         """
         held = self._held
@@ -126,28 +110,10 @@ class Session:
     State: the transforms, the clouds that wait for those of other LiDARs, the tracks of id
     assignment, and the pose check. Not thread-safe.
 
-    Parameters
-    ----------
-    convention : Convention
-        Convention of the box poses and sizes, and whether ids are to be assigned. Adapters have
-        applied the convention already; the pose check compares it with the others.
-    config : Config
-        `max_gap` and `merge_span` are used.
-    fixed_frame : str
-        Frame to refine in; empty to choose it with `require_fixed_frame`.
-    placement : SensorPlacement, optional
-        Topics of the clouds and frames of the LiDARs; fed by the caller with info messages.
-    report : callable
-        Called with reason, text and count for clouds that are not merged.
-
-    Attributes
-    ----------
-    tree : TransformTree
-        To be fed by the caller.
-    fixed_frame : str
-        Frame to refine in; empty while it is not known.
-    sensor_frame : str
-        Frame of the point clouds, to be set by the caller; used to choose the fixed frame.
+    Adapters have applied the `convention` already; the pose check compares it with the others. Of
+    `config`, `max_gap` and `merge_span` are used; `report` is called for clouds that are not
+    merged. The caller feeds `tree` and `placement`, and sets `sensor_frame`, that of the point
+    clouds, by which `fixed_frame` is chosen where it is empty.
 
     """
 
@@ -192,15 +158,7 @@ class Session:
             self._tracker.forget()
 
     def admit(self, item: Sweep | BoxArray) -> Admitted:
-        """
-        Return a sweep or boxes in the fixed frame, with ids.
-
-        Parameters
-        ----------
-        item : Sweep or BoxArray
-            In the frame of its message.
-
-        """
+        """Return a sweep or boxes in the fixed frame, with ids."""
         if is_placeholder(item):
             return Admitted(None, None)
         try:
@@ -222,14 +180,9 @@ class Session:
 
     def merged(self, sweep: Sweep, extra: object = None) -> list[MergedSweep]:
         """
-        Return the sweeps that are complete with a cloud; this one, if there is a single topic.
+        Return the sweeps that a cloud in the fixed frame completes: itself for a single topic.
 
-        Parameters
-        ----------
-        sweep : Sweep
-            In the fixed frame.
-        extra : object
-            Returned with the sweep that the cloud is part of.
+        `extra` is returned with the sweep that the cloud is part of.
 
         """
         if self._merger is None:
@@ -249,10 +202,8 @@ class Session:
         """
         Return the fixed frame; choose it among the known transforms if it is not known yet.
 
-        Raises
-        ------
-        TransformUnavailable
-            If no motion of `sensor_frame` is known, or no point cloud has arrived.
+        Raises TransformUnavailable if no motion of `sensor_frame` is known, or no cloud has
+        arrived.
 
         """
         if self.fixed_frame:
@@ -290,21 +241,9 @@ def hand_to_registrar(
     registrar: BoxRegistrar, moved: Sweep | BoxArray | None, restarts: bool
 ) -> list[RefinedBoxes]:
     """
-    Hand an admitted item to the registrar.
+    Hand an item, moved as of `Admitted`, to the registrar; return results that are ready now.
 
-    Parameters
-    ----------
-    registrar : BoxRegistrar
-        If time went back, its tracks are flushed and it is reset before the item is added.
-    moved : Sweep or BoxArray, or None
-        As of `Admitted`; a caller may have put a ticket on the boxes.
-    restarts : bool
-        Whether time went back before it.
-
-    Returns
-    -------
-    ready : list of RefinedBoxes
-        Results that are ready now.
+    If time went back before it, tracks are flushed and the registrar is reset first.
 
     """
     ready: list[RefinedBoxes] = []
@@ -325,11 +264,6 @@ def is_placeholder(item: Sweep | BoxArray) -> bool:
 
 
 def covariances_to_write(refined: RefinedBoxes) -> Floats:
-    """
-    Return covariances (n, 6, 6) for messages, NaN where the box is kept.
-
-    A kept box is the detector's own, and so is the covariance that its message carries.
-
-    """
+    """Return covariances (n, 6, 6) for messages; NaN where kept: those of the detector remain."""
     is_kept = np.array([status == KEPT for status in refined.status], dtype=bool)
     return np.where(is_kept[:, None, None], np.nan, refined.covariances)

@@ -12,24 +12,15 @@ import numpy as np
 
 @dataclass(eq=False, slots=True)
 class Slot:
-    """
-    The place of one box array in the order.
-
-    Attributes
-    ----------
-    boxes : BoxArray
-        Input boxes, in the fixed frame where a transform to it is known.
-    T_fixed_sensor, T_fixed_boxes : array, shape (4, 4), or None
-        Poses of the sensor and of the frame of the input message; None where unknown.
-    result : RefinedBoxes or None
-        None until it is known.
-
-    """
+    """The place of one box array in the order."""
 
     boxes: BoxArray
+    """Of the input, in the fixed frame where a transform to it is known."""
     T_fixed_sensor: Floats | None
     T_fixed_boxes: Floats | None
+    """Pose of the frame of the input message; None where unknown, as that of the sensor."""
     result: RefinedBoxes | None = None
+    """None until it is known."""
 
     @property
     def stamp_ns(self) -> int:

@@ -17,12 +17,7 @@ class SweepStore:
     """
     The points of sweeps in a temporary file: a drive has more of them than fit the memory.
 
-    Attributes
-    ----------
-    stamps_ns : list of int
-        Stamps of the sweeps [ns].
-    origin : array, shape (3,)
-        Points are stored relative to this place, so that float32 is enough [m].
+    Points are stored relative to `origin` (3,), so that float32 is enough [m].
 
     """
 

@@ -19,15 +19,7 @@ SEVERAL_LIDARS = ', or merge several LiDARs: repeat --points'
 
 
 class Topics:
-    """
-    Topics of a recording.
-
-    Attributes
-    ----------
-    kinds : dict of str and str
-        All topics, sorted, with the types of their messages.
-
-    """
+    """Topics of a recording; `kinds` has all of them, sorted, with the types of their messages."""
 
     def __init__(self, connections: Sequence[Connection], origin: str) -> None:
         self._origin = origin
@@ -62,23 +54,9 @@ class Topics:
         """
         Return the topic that was asked for, or the only one of these types with messages.
 
-        Parameters
-        ----------
-        role : str
-            Option that chooses the topic, without the dashes.
-        content : str
-            Name of the content in errors.
-        types : sequence of str
-            Types of messages that have it.
-        asked : str, optional
-            Topic asked for.
-
-        Raises
-        ------
-        RecordingError
-            If there is no such topic, or more than one.
-        UnsupportedMessage
-            If the topic that was asked for has another type.
+        `role` is the option that chooses the topic, `content` the name of what it has, in errors.
+        Raises RecordingError if there is no such topic, or more than one, and UnsupportedMessage
+        if the one asked for has another type.
 
         """
         candidates = self.filled(types)

@@ -89,17 +89,10 @@ class TransformTree:
     Frames and the transforms between them, looked up by integer stamp.
 
     State: per pair of parent and child, one static transform or the samples of the last
-    `buffer_duration` seconds. After a time jump of a pair, new samples replace the old ones. Not
-    thread-safe.
-
-    Parameters
-    ----------
-    max_extrapolation : float
-        Largest distance of a stamp from the known samples [s]; outside of them the motion is
-        extrapolated. Between samples, however far apart, positions are interpolated linearly
-        and orientations along the shortest rotation, as tf2 does.
-    buffer_duration : float
-        How long a sample is kept after the newest of its pair [s].
+    `buffer_duration` [s]. After a time jump of a pair, new samples replace the old ones. Between
+    samples, however far apart, positions are interpolated linearly and orientations along the
+    shortest rotation, as tf2 does; up to `max_extrapolation` [s] outside of them the motion is
+    extrapolated. Not thread-safe.
 
     """
 
@@ -149,10 +142,8 @@ class TransformTree:
         """
         Return ``T_target_source`` (4, 4) at a stamp.
 
-        Raises
-        ------
-        TransformUnavailable
-            If no transforms connect the frames, or one of them is not known at the stamp.
+        Raises TransformUnavailable if no transforms connect the frames, or one is not known at the
+        stamp.
 
         """
         T_target_source = np.eye(4)

@@ -16,16 +16,10 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
     """
     Register a synthetic stream, so that the first real one does not wait.
 
-    Libraries are imported and kernels loaded, or compiled at the very first start. Six stamps of
-    a window of four cover cold, warm and full windows, or two rounds of a whole track; a few
-    iterations of the solver are enough.
-
-    Parameters
-    ----------
-    config : Config
-        Objective, estimate and mode are those of the stream to come.
-    submit : callable, optional
-        As for `BoxRegistrar`, which it is given to.
+    Libraries are imported and kernels loaded, or compiled at the very first start, for the
+    objective, estimate and mode of the stream to come. Six stamps of a window of four cover cold,
+    warm and full windows, or two rounds of a whole track; a few iterations of the solver are
+    enough.
 
     """
     quick = Config(

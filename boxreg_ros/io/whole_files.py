@@ -62,10 +62,7 @@ def temporary_folder() -> Iterator[Path]:
     """
     Yield a folder on the disk of temporary files, which is deleted at the end.
 
-    Raises
-    ------
-    TransferError
-        If that disk is full.
+    Raises TransferError if that disk is full.
 
     """
     try:

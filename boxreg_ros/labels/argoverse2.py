@@ -125,13 +125,8 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """
     Yield the frames of one log.
 
-    Parameters
-    ----------
-    path : Path
-        Annotations of the log, or detections of many logs as they are submitted, with the
-        column ``log_id``.
-    scene : SceneFrames
-        The log.
+    `path` has annotations of the log, or detections of many logs as they are submitted, with the
+    column ``log_id``.
 
     """
     from pyarrow import compute

@@ -16,17 +16,10 @@ METADATA_KEY = 'boxreg'
 
 class Table:
     """
-    Write a file row by row.
+    Write a ``.parquet`` or ``.feather`` file row by row, with a text for its metadata.
 
-    Parameters
-    ----------
-    path : Path
-        Ends in ``.parquet`` or ``.feather``.
-    columns : mapping of str to str
-        Name and type of each column. Types are those of pyarrow (int64, double, string). A type
-        followed by ``[]`` is a list, by ``[16]`` a list of sixteen items.
-    provenance : str
-        Text for the metadata of the file; '' for none.
+    The types of the columns are those of pyarrow (int64, double, string). A type followed by
+    ``[]`` is a list, by ``[16]`` a list of sixteen items.
 
     """
 
@@ -74,10 +67,7 @@ def read_table(path: Path, required: Collection[str] = (), what: str = '') -> An
     """
     Return the pyarrow table of a Parquet or Feather file.
 
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read, or lacks some of the `required` columns of `what`.
+    Raises RecordingError if it cannot be read, or lacks some of the `required` columns of `what`.
 
     """
     import pyarrow

@@ -36,39 +36,25 @@ KEYS = {
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """
-    A calibrated camera: x right, y down, z forward.
-
-    Attributes
-    ----------
-    projection : array, shape (3, 4)
-        From rectified camera coordinates [m] to homogeneous pixels.
-    rectification : array, shape (3, 3)
-        From camera to rectified camera coordinates.
-    T_camera_sensor : array, shape (4, 4)
-        Pose of the LiDAR in the camera frame.
-    size : tuple of two int
-        Width and height of the image [px].
-
-    """
+    """A calibrated camera: x right, y down, z forward."""
 
     projection: Floats
+    """(3, 4), from rectified camera coordinates [m] to homogeneous pixels."""
     rectification: Floats
+    """(3, 3), from camera to rectified camera coordinates."""
     T_camera_sensor: Floats
+    """Pose (4, 4) of the LiDAR in the camera frame."""
     size: tuple[int, int] = KITTI_SIZE
+    """Width and height of the image [px]."""
 
     @classmethod
     def read(cls, path: Path | None, needed_by: str = 'this format') -> Camera:
         """
         Read a calibration file of KITTI, or YAML with the keys of ``camera_info`` of ROS.
 
-        YAML holds ``projection_matrix``, ``T_camera_sensor`` (12 or 16 numbers, row by row)
-        and optionally ``rectification_matrix``, ``image_width`` and ``image_height``.
-
-        Raises
-        ------
-        ConfigError
-            If `path` is None, cannot be read, or a part is missing or has the wrong size.
+        YAML holds ``projection_matrix``, ``T_camera_sensor`` (12 or 16 numbers, row by row) and
+        optionally ``rectification_matrix``, ``image_width`` and ``image_height``. Raises
+        ConfigError if `path` is None, cannot be read, or a part is missing or has the wrong size.
 
         """
         if path is None:
@@ -103,19 +89,11 @@ class Camera:
 
     def project(self, boxes: Floats) -> tuple[Floats, Mask]:
         """
-        Return the bounding rectangles of boxes in the image.
+        Return the rectangles of boxes (n, 9) of the LiDAR frame, and which are in the image.
 
-        Parameters
-        ----------
-        boxes : array, shape (n, 9)
-            In the LiDAR frame.
-
-        Returns
-        -------
-        rectangles : array, shape (n, 4)
-            Left, top, right and bottom [px], clipped to the image; NaN for boxes outside of it.
-        is_inside : array, shape (n,)
-            True where the whole box is inside the image and in front of the camera.
+        Rectangles (n, 4) are left, top, right and bottom [px], clipped to the image; NaN for boxes
+        outside of it. A box is inside (n,) if all of it is in the image and in front of the
+        camera.
 
         """
         T = self.T_rect_sensor
@@ -140,20 +118,10 @@ class Camera:
 
     def to_upright(self, boxes: Floats) -> tuple[Floats, Floats]:
         """
-        Return the pose of boxes as KITTI states it.
+        Return the pose of boxes (n, 9), in the LiDAR frame, as KITTI states it.
 
-        Parameters
-        ----------
-        boxes : array, shape (n, 9)
-            In the LiDAR frame.
-
-        Returns
-        -------
-        centres : array, shape (n, 3)
-            In the rectified camera frame [m].
-        rotation_y : array, shape (n,)
-            Angle about y of the camera from its x axis to the heading [rad]; roll and pitch are
-            lost.
+        Centres (n, 3) are in the rectified camera frame [m]; angles (n,) are about y of the camera
+        from its x axis to the heading [rad]; roll and pitch are lost.
 
         """
         T = self.T_rect_sensor

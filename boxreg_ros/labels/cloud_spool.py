@@ -20,12 +20,8 @@ class Spool:
     """
     Store sweeps in their own frame, one file each, until no box array can need them.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of results. The clouds lie in a hidden folder inside it until `remove`.
-    config : Config
-        Gives the maximum time offset between boxes and their cloud, as for the registrar.
+    They lie in a hidden folder inside the folder of results until `remove`. `config` gives the
+    maximum time offset between boxes and their cloud, as for the registrar.
 
     """
 
@@ -37,19 +33,7 @@ class Spool:
         self._folder.mkdir()
 
     def add(self, sweep: Sweep, T_fixed_sweep: Floats, intensities: Floats | None = None) -> None:
-        """
-        Store a sweep; a second one of the same stamp is ignored.
-
-        Parameters
-        ----------
-        sweep : Sweep
-            Points in the frame of the sensor.
-        T_fixed_sweep : array, shape (4, 4)
-            Pose of that frame in the fixed frame at the stamp.
-        intensities : array, shape (M,), optional
-            One value per point.
-
-        """
+        """Store a sweep and the pose (4, 4) of its frame; a second one of its stamp is ignored."""
         stamp_ns = sweep.stamp_ns
         if stamp_ns in self._frames:
             return
@@ -65,21 +49,9 @@ class Spool:
         """
         Return the cloud nearest to a stamp, and delete the clouds that are too old for it.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            Stamp of a box array [ns], not smaller than in the call before.
-        frame_id : str
-            Frame to return the points in.
-        T_fixed_frame : array, shape (4, 4)
-            Pose of that frame in the fixed frame at the stamp.
-
-        Returns
-        -------
-        sweep : Sweep or None
-            None where no cloud lies within the maximum time offset.
-        intensities : array, shape (M,), or None
-            None where the cloud has none.
+        The points are returned in a frame whose pose (4, 4) at the stamp is known; None for a
+        cloud where none lies within the maximum time offset, and for intensities (M,) where it has
+        none. Stamps [ns] of box arrays are not smaller than in the call before.
 
         """
         self.delete_before(stamp_ns)

@@ -40,21 +40,11 @@ def write_cloud(
     """
     Write a cloud in the format of its file name, as little-endian float32.
 
-    Parameters
-    ----------
-    path : Path
-        Ends in ``.pcd`` (binary), ``.ply`` (binary), ``.pcd.bin`` (nuScenes: x y z intensity
-        ring) or ``.bin`` (KITTI: x y z intensity).
-    points : array, shape (M, 3)
-        In the sensor frame [m]; M may be 0.
-    intensities : array, shape (M,), optional
-        In the unit of the sensor. Without them, PCD and PLY files have no such field, and BIN
-        files have zeros. The ring is always zero.
-
-    Raises
-    ------
-    ConfigError
-        If the name has another suffix.
+    The name ends in ``.pcd`` (binary), ``.ply`` (binary), ``.pcd.bin`` (nuScenes: x y z intensity
+    ring) or ``.bin`` (KITTI: x y z intensity). Points (M, 3) are in the sensor frame [m],
+    intensities (M,) in the unit of the sensor. Without these, PCD and PLY files have no such
+    field, and BIN files have zeros. The ring is always zero. Raises ConfigError if the name has
+    another suffix.
 
     """
     suffix = next((s for s in SUFFIXES if path.name.endswith(s)), '')

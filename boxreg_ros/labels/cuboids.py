@@ -69,30 +69,21 @@ def box_from_xyz(*vectors: Mapping[str, float]) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Cuboid:
-    """
-    A box in the conventions of the tools.
-
-    Attributes
-    ----------
-    row : int
-        Row index into the boxes of the frame.
-    track_id, class_name : str
-        Track, '' if it has none; class, `UNKNOWN_CLASS` if it has none.
-    position, angles, extent : dict
-        By axis: centre in the sensor frame [m], R = Rx Ry Rz [rad], full extents [m].
-    evidence : dict
-        Status, reason, num_points, score, and the upper triangle of the covariance of x y z
-        roll pitch yaw in the fixed frame, row by row; the covariance of length width height.
-
-    """
+    """A box in the conventions of the tools."""
 
     row: int
+    """Into the boxes of the frame."""
     track_id: str
     class_name: str
+    """`UNKNOWN_CLASS` if it has none."""
     position: dict[str, float]
+    """Centre by axis in the sensor frame [m]."""
     angles: dict[str, float]
+    """By axis, R = Rx Ry Rz [rad]."""
     extent: dict[str, float]
+    """By axis, in full [m]."""
     evidence: dict[str, Any]
+    """As of `evidence_of`, with num_points; of the covariance the upper triangle, row by row."""
 
 
 class ReadCuboid(NamedTuple):
@@ -138,21 +129,9 @@ def single_part(path: Path, what: str, members: Collection[str]) -> tuple[Path, 
     """
     Return the folder of the only scene or episode of a project, and that of its sidecar files.
 
-    The sidecar files are in the part itself, or beside it.
-
-    Parameters
-    ----------
-    path : Path
-        The project, or the part itself.
-    what : str
-        Name of a part in messages: scene, episode.
-    members : collection of str
-        Files or folders; every part contains one of them.
-
-    Raises
-    ------
-    RecordingError
-        If there is no part, or several.
+    The sidecar files are in the part itself, or beside it; `path` may be the part, too. Every part
+    contains one of `members`; `what` names it in messages. Raises RecordingError if there is no
+    part, or several.
 
     """
     folders = [path]
@@ -197,19 +176,8 @@ def read_frames(
     """
     Yield the frames of a folder with sidecar files, in the fixed frame where it is known.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of the sidecar files.
-    names : list of str
-        Names of all frames that have labels or points, in order.
-    cuboids_by_name : callable
-        Returns the boxes of the frame of this name.
-
-    Raises
-    ------
-    RecordingError
-        If the sidecar files are missing or belong to other frames.
+    `names`, in order, are those of all frames that have labels or points. Raises RecordingError if
+    the sidecar files are missing or belong to other frames.
 
     """
     sidecar = read_sidecar(folder, len(names))

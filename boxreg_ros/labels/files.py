@@ -19,10 +19,7 @@ def require_single(found: Sequence[Path], path: Path, what: str) -> Path:
     """
     Return the only entry of `found`, the candidates in `path`.
 
-    Raises
-    ------
-    RecordingError
-        If there are none or several; `what` names them in the message.
+    Raises RecordingError if there are none or several; `what` names them in the message.
 
     """
     if len(found) != 1:
@@ -46,15 +43,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def from_json(path: Path) -> Any:
-    """
-    Return the content of a JSON file.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read or is not JSON.
-
-    """
+    """Return the content of a JSON file; RecordingError if it cannot be read or is not JSON."""
     try:
         return json.loads(path.read_text(encoding='utf-8'))
     except OSError as error:
@@ -67,17 +56,8 @@ def json_items(path: Path, prefix: str = 'item') -> Iterator[Any]:
     """
     Yield the items of a list in a JSON file one by one, without holding the list.
 
-    Parameters
-    ----------
-    path : Path
-        JSON file.
-    prefix : str
-        Place of the items in the words of ijson; by default the file is one list.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read or is not JSON.
+    `prefix` is their place in the words of ijson; by default the file is one list. Raises
+    RecordingError if the file cannot be read or is not JSON.
 
     """
     import ijson
@@ -109,14 +89,7 @@ class JsonList:
     """
     A JSON file that holds one list, written item by item.
 
-    Parameters
-    ----------
-    path : Path
-        File to write.
-    head : mapping, optional
-        Members of an object around the list.
-    name : str
-        Name of the list in this object.
+    `head` has members of an object around the list, in which it is called `name`.
 
     """
 

@@ -25,41 +25,22 @@ class FolderWriter:
     Write a scene frame by frame: labels by `add`, clouds, and ``boxreg.json``.
 
     A format derives from it, states the class attributes and implements `add`; one that completes
-    files at the end also `finish`.
-
-    Parameters
-    ----------
-    folder, provenance, options
-        As of `protocol.WriterFactory`.
-
-    Attributes
-    ----------
-    folders : tuple of str
-        Folders to create.
-    cloud_file : str
-        File of the cloud of a frame, with the fields ``name`` and ``number``; '' for none.
-    needs_clouds : bool
-        Whether a frame without a cloud gets an empty file, because the tool needs one.
-    needs_pose : bool
-        Whether frames without a pose of the sensor are dropped.
-    has_sidecar : bool
-        Whether stamps and poses are written beside the labels, as in `sidecar`.
-    number : int
-        Of the current frame, from 0.
-    name : str
-        Of the current frame, which sorts by time: its stamp [ns]; a repeated stamp gets ``_1``.
-    files : ExitStack
-        Files that are open until the writer is closed.
-    about : dict
-        Content of ``boxreg.json``: the provenance, then the names of frames.
+    files at the end also `finish`. Of the current frame, `number` counts from 0, and `name` sorts
+    by time. `files` are open until the writer is closed; `about` is the content of
+    ``boxreg.json``: the provenance, then the names of frames.
 
     """
 
     folders: ClassVar[tuple[str, ...]] = ()
+    """To create."""
     cloud_file: ClassVar[str] = ''
+    """Of the cloud of a frame, with the fields ``name`` and ``number``; empty for none."""
     needs_clouds: ClassVar[bool] = False
+    """Whether a frame without a cloud gets an empty file, because the tool needs one."""
     needs_pose: ClassVar[bool] = False
+    """Whether frames without a pose of the sensor are dropped."""
     has_sidecar: ClassVar[bool] = False
+    """Whether stamps and poses are written beside the labels, as in `sidecar`."""
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         self.dropped: Counter[str] = Counter()

@@ -138,13 +138,8 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """
     Yield the frames of a sequence, by the stamps and the camera of the data set.
 
-    Parameters
-    ----------
-    path : Path
-        Label file as the benchmark has it and trackers submit it, or a folder with
-        ``NAME.txt`` or ``label_02/NAME.txt`` of the sequence.
-    scene : SceneFrames
-        The sequence.
+    `path` is a label file as the benchmark has it and trackers submit it, or a folder with
+    ``NAME.txt`` or ``label_02/NAME.txt`` of the sequence.
 
     """
     if path.is_dir():

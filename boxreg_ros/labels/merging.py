@@ -22,32 +22,12 @@ class LabelMerger:
     """
     Yield the boxes of a stamp after the sweep of that stamp, or the next one.
 
-    Boxes whose labels have poses in the sensor frame are taken in the frame of the clouds and
-    move with the recording; the others are taken in the frame that the labels name. Boxes of the
-    status ``human`` are pinned.
+    Boxes whose labels have poses in the sensor frame are taken in the frame of the clouds and move
+    with the recording; the others are taken in the frame that the labels name. Boxes of the status
+    ``human`` are pinned. The stamps of `frames` ascend. Where only a part of the recording, from
+    `start_ns` on, is read, boxes before and after it are left out, and `outside` counts them.
 
-    Parameters
-    ----------
-    frames : iterator of LabelFrame
-        Stamps ascend.
-    tree : TransformTree
-        Of the recording.
-    sensor_frame : str
-        Frame of its clouds.
-    start_ns : int
-        Begin of the recording [ns].
-    is_part : bool
-        Whether only a part of the recording is read; boxes before and after it are left out.
-
-    Attributes
-    ----------
-    outside : int
-        Boxes left out.
-
-    Raises
-    ------
-    RecordingError
-        If all labels are earlier than the clouds, or all later.
+    Raises RecordingError if all labels are earlier than the clouds, or all later.
 
     """
 

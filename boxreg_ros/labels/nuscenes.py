@@ -317,13 +317,8 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """
     Yield the samples of one scene; memory does not grow with the other scenes.
 
-    Parameters
-    ----------
-    path : Path
-        Folder of the tables, or results of the detection or the tracking task as they are
-        submitted: ``{"meta": ..., "results": {sample_token: [...]}}``.
-    scene : SceneFrames
-        The scene.
+    `path` is the folder of the tables, or results of the detection or the tracking task as they
+    are submitted: ``{"meta": ..., "results": {sample_token: [...]}}``.
 
     """
     read_boxes = _scene_annotations if path.is_dir() else _scene_results

@@ -16,23 +16,9 @@ WITH_REJECTED = ('csv', 'mcap')
 
 class LabelOutput:
     """
-    Write each frame in every format.
+    Write each frame in every format: ``boxes.csv`` always, and one folder per other format.
 
-    Parameters
-    ----------
-    folder : Path
-        Exists; ``boxes.csv`` and one folder per other format are written into it.
-    formats : sequence of str
-        Formats to write; ``csv`` is always written.
-    provenance : Provenance
-        Origin of the labels.
-    options : Options
-        Settings of the formats.
-
-    Raises
-    ------
-    ConfigError
-        As `writer_for`, or if a format labels points.
+    Raises ConfigError as `writer_for`, or if a format labels points.
 
     """
 

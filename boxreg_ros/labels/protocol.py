@@ -30,97 +30,56 @@ INPUT_STATUS = 'input'
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """
-    The conventions of a format, as ``boxreg formats`` prints them.
-
-    Attributes
-    ----------
-    name, title : str
-        Name on the command line, and name in prose.
-    frame : str
-        Frame of the boxes.
-    reference : str
-        Point of the box at its position, for example its centre.
-    sizes : str
-        Order of the extents.
-    rotation : str
-        Parameters of the orientation, and the angles that are lost.
-    files : str
-        Files and folders that the writer creates, separated by commas. ``STAMP`` in the first
-        stands for one file per frame.
-    packages : tuple of str
-        Packages of pip that are needed beyond those of boxreg_ros itself.
-    options : tuple of str
-        Fields of `Options` that the writer uses.
-    has_points : bool
-        Whether it labels points; such a format is written by ``boxreg relabel`` alone.
-
-    """
+    """The conventions of a format, as ``boxreg formats`` prints them."""
 
     name: str
+    """On the command line."""
     title: str
+    """In prose."""
     frame: str
+    """Of the boxes."""
     reference: str
+    """Point of the box at its position, for example its centre."""
     sizes: str
+    """Order of the extents."""
     rotation: str
+    """Parameters of the orientation, and the angles that are lost."""
     files: str
+    """That the writer creates, and folders, with commas; ``STAMP`` stands for one per frame."""
     packages: tuple[str, ...] = ()
+    """Of pip, needed beyond those of boxreg_ros itself."""
     options: tuple[str, ...] = ()
+    """Fields of `Options` that the writer uses."""
     has_points: bool = False
+    """Whether it labels points; then ``boxreg relabel`` alone writes it."""
 
 
 @dataclass(frozen=True, slots=True)
 class LabelFrame:
-    """
-    The boxes of one stamp, with the poses that formats need to write them in their own frame.
-
-    Attributes
-    ----------
-    refined : RefinedBoxes
-        Boxes with status and covariance. They are in the fixed frame, except those without a
-        transform to it. Covariances use the same axes.
-    fixed_frame, sensor_frame : str
-        Names of the frames below.
-    T_fixed_sensor : array, shape (4, 4), or None
-        Pose of the sensor at the stamp of the boxes; None if unknown.
-    sweep : Sweep or None
-        Point cloud of that stamp in the sensor frame, if clouds are written.
-    intensities : array, shape (M,), or None
-        Intensities of its points in the unit of the sensor; None if it has none.
-    T_fixed_given : array, shape (4, 4), or None
-        Pose of the frame of the input boxes; None if unknown.
-    points : PointLabels or None
-        Labels of the points of `sweep`, for formats of points.
-
-    """
+    """The boxes of one stamp, with the poses by which formats write them in their own frame."""
 
     refined: RefinedBoxes
+    """In the fixed frame, but for boxes without a transform to it; covariances use its axes."""
     fixed_frame: str
+    """Name of the frame; so is `sensor_frame`."""
     sensor_frame: str
     T_fixed_sensor: Floats | None = None
+    """Pose (4, 4) of the sensor at the stamp of the boxes; None if unknown."""
     sweep: Sweep | None = None
+    """Point cloud of that stamp in the sensor frame, if clouds are written."""
     intensities: Floats | None = None
+    """(M,), of its points in the unit of the sensor; None if it has none."""
     T_fixed_given: Floats | None = None
+    """Pose (4, 4) of the frame of the input boxes; None if unknown."""
     points: PointLabels | None = None
+    """Labels of the points of `sweep`, for formats of points."""
 
     def boxes_in(self, frame: str, dropped: Counter[str]) -> tuple[Ints, Floats]:
         """
-        Return the valid boxes in the 'fixed' or the 'sensor' frame, with their row indices.
+        Return rows (k,) and boxes (k, 9) of the valid ones in the 'fixed' or 'sensor' frame.
 
-        Parameters
-        ----------
-        frame : str
-            'fixed' or 'sensor'.
-        dropped : Counter
-            Counts of boxes left out are added by reason: ``invalid_box`` (not finite, or an
-            extent that is not positive) and ``no_transform`` (no transform to `frame`).
-
-        Returns
-        -------
-        rows : array, shape (k,)
-            Row indices into `refined`.
-        boxes : array, shape (k, 9)
-            The boxes of these rows.
+        Boxes left out are added to `dropped`: ``invalid_box`` (not finite, or an extent that is
+        not positive) and ``no_transform`` (no transform to `frame`).
 
         """
         boxes = self.refined.boxes
@@ -136,12 +95,7 @@ class LabelFrame:
         return rows, _boxes_moved(boxes, self.T_fixed_sensor, frame, target).boxes[rows]
 
     def moved(self, frame: str) -> LabelFrame:
-        """
-        Return the frame with its boxes in the 'fixed' or the 'sensor' frame.
-
-        Boxes without a known transform stay in their frame.
-
-        """
+        """Return it with its boxes in the 'fixed' or 'sensor' frame, if a transform is known."""
         boxes = self.refined.boxes
         if frame == 'fixed':
             source, target = self.sensor_frame, self.fixed_frame
@@ -156,49 +110,29 @@ class LabelFrame:
 
 @dataclass(frozen=True, slots=True)
 class SceneFrames:
-    """
-    The frames of one scene of a data set, for label files that leave these facts to it.
-
-    Attributes
-    ----------
-    name : str
-        Of the scene, as in file names and ids of its data set.
-    stamps_ns : mapping of str to int
-        Stamp of each frame [ns], by the name that label files give it: the token of a sample of
-        nuScenes, the number of a frame of KITTI. Stamps ascend.
-    fixed_frame, sensor_frame : str
-        Names of the fixed frame, and of the frame of the clouds.
-    camera : Camera or None
-        Camera that the boxes of KITTI refer to.
-
-    """
+    """The frames of one scene of a data set, for label files that leave these facts to it."""
 
     name: str
+    """As in file names and ids of its data set."""
     stamps_ns: Mapping[str, int]
+    """By the name in label files: token of a sample of nuScenes, number of a frame of KITTI."""
     fixed_frame: str
     sensor_frame: str
+    """Of the clouds."""
     camera: Camera | None = None
+    """That the boxes of KITTI refer to."""
 
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """
-    Origin of labels, for the formats with a field for it.
-
-    Attributes
-    ----------
-    recordings : tuple of str
-        File names of the recordings.
-    config_hash : str
-        First 16 digits of the SHA-256 of the configuration as JSON; '' if none was used.
-    tool, version : str
-        Program that made the labels.
-
-    """
+    """Origin of labels, for the formats with a field for it."""
 
     recordings: tuple[str, ...] = ()
+    """Their file names."""
     config_hash: str = ''
+    """First 16 digits of the SHA-256 of the configuration as JSON; empty if none was used."""
     tool: str = 'boxreg_ros'
+    """That made the labels."""
     version: str = __version__
 
     @classmethod
@@ -215,17 +149,7 @@ class Provenance:
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """
-    Settings of the label writers.
-
-    Attributes
-    ----------
-    with_points, camera, swap_axes : bool, Path or None, bool
-        As their help says.
-    recording : Recording or None
-        Source recording, open or closed, for formats that copy it.
-
-    """
+    """Settings of the label writers."""
 
     with_points: bool = option(
         False, 'also write the point clouds that a label format stores beside its labels'
@@ -240,22 +164,14 @@ class Options:
         False, 'write the extents in the order that Datumaro and CVAT display them'
     )
     recording: Recording | None = None
+    """Source, open or closed, for formats that copy it."""
 
 
 class LabelWriter(Protocol):
-    """
-    Writes the frames of one drive.
-
-    Memory must not grow with the number of frames.
-
-    Attributes
-    ----------
-    dropped : Counter
-        Number of boxes that the format cannot represent, by reason.
-
-    """
+    """Writes the frames of one drive; memory must not grow with their number."""
 
     dropped: Counter[str]
+    """Boxes that the format cannot represent, by reason."""
 
     def write(self, frame: LabelFrame) -> None:
         """Add the boxes of one stamp; stamps ascend, except for boxes that arrived late."""

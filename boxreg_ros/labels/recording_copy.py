@@ -51,16 +51,8 @@ class RecordingCopy:
 
     Sources are MCAP files, rosbag2 folders, ``.db3`` files and ROS 1 bags. Messages of ROS 1 are
     not converted: Foxglove and mcap read such a file, ``ros2 bag play`` does not. Chunks are
-    compressed as those of an MCAP file; of the others by zstd.
-
-    Parameters
-    ----------
-    path : Path
-        File to write.
-    recording : Recording
-        The source, open.
-    provenance : Provenance or None
-        Written to the metadata of the file; None where the source has them.
+    compressed as those of an MCAP file; of the others by zstd. The provenance is written to the
+    metadata of the file; None where the source has it.
 
     """
 
@@ -121,12 +113,7 @@ class RecordingCopy:
     def _read_file(
         self, path: Path, start_ns: int | None, end_ns: int | None, whole: Collection[str]
     ) -> Iterator[RawMessage]:
-        """
-        Yield the messages of a file from `start_ns` to `end_ns`.
-
-        Topics in `whole` and those of static transforms are read from the whole file.
-
-        """
+        """Yield the messages of a part of a file; all static transforms and topics in `whole`."""
         with closing(opened(path)) as file:
             channels = {c.id: self._channel(c) for c in file.connections}
             uncut = [
@@ -154,12 +141,7 @@ class RecordingCopy:
 def _intervals(
     every: _T, uncut: _T, start_ns: int | None, end_ns: int | None
 ) -> list[tuple[_T, int | None, int | None]]:
-    """
-    Return selections of topics with their begin and end, in order of time.
-
-    `every` is read from `start_ns` to `end_ns`, `uncut` also before and after.
-
-    """
+    """Return selections of topics with begin and end, by time; `uncut` also before and behind."""
     intervals: list[tuple[_T, int | None, int | None]] = [(every, start_ns, end_ns)]
     if uncut and start_ns is not None:
         intervals.insert(0, (uncut, None, start_ns))

@@ -29,22 +29,11 @@ def refined_boxes(
     evidence: Sequence[Mapping[str, Any]] = (),
 ) -> RefinedBoxes:
     """
-    Return the n boxes of one stamp as read from a file.
+    Return the n boxes (n, 9) of one stamp [ns] as read from a file.
 
-    Parameters
-    ----------
-    stamp_ns : int
-        Stamp [ns].
-    frame_id : str
-        Frame of the boxes.
-    track_ids, class_names : sequence of n str
-        Identity and category.
-    boxes : array_like, shape (n, 9)
-        The boxes.
-    evidence : sequence of n mappings, optional
-        Values of a box by the names of `evidence_of` and ``num_points``; others are ignored. Of a
-        value that is missing or None the default is taken: score NaN, status `INPUT_STATUS`,
-        0 points, unit matrices, no reason.
+    `evidence` has the values of a box by the names of `evidence_of` and ``num_points``; others are
+    ignored. Of a value that is missing or None the default is taken: score NaN, status
+    `INPUT_STATUS`, 0 points, unit matrices, no reason.
 
     """
     n = len(track_ids)

@@ -47,10 +47,7 @@ def module_of(name: str) -> FormatModule:
     """
     Return the module of a format.
 
-    Raises
-    ------
-    ConfigError
-        If the format does not exist, or needs a package that is not installed.
+    Raises ConfigError if the format does not exist, or needs a package that is not installed.
 
     """
     module = import_format(name)
@@ -85,14 +82,10 @@ def require_boxes(names: Sequence[str]) -> None:
 
 def check_options(names: Sequence[str], options: Options) -> None:
     """
-    Refuse options that none of the formats `names` uses, and the lack of those that one needs.
+    Raise ConfigError for options that no format uses, and for the lack of those that one needs.
 
-    Raises
-    ------
-    ConfigError
-        If an option is not used; the message lists the formats that use it. If the camera that a
-        format needs is not given or cannot be read, or a format labels points. Also as
-        `module_of`.
+    The message lists the formats that use the option. Also if the camera that a format needs is
+    not given or cannot be read, if a format labels points, and as `module_of`.
 
     """
     require_boxes(names)
@@ -115,10 +108,7 @@ def writer_for(
     """
     Return a writer of this format for the folder of results `out`.
 
-    Raises
-    ------
-    ConfigError
-        As `module_of`, or if the format needs an option that is not given.
+    Raises ConfigError as `module_of`, or if the format needs an option that is not given.
 
     """
     module = module_of(name)
@@ -131,24 +121,11 @@ def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterat
     """
     Yield the frames of a label file or folder, or of all segments of a recording of labels.
 
-    Boxes whose file states no status or covariance have the status ``input`` and the unit
-    matrix.
+    Boxes whose file states no status or covariance have the status ``input`` and the unit matrix.
+    A scene of a data set, whose boxes are then read, completes the facts of the files.
 
-    Parameters
-    ----------
-    name : str
-        Of the format.
-    path : Path
-        File or folder.
-    scene : SceneFrames, optional
-        Scene of a data set whose boxes are read; its facts complete those of the files.
-
-    Raises
-    ------
-    ConfigError
-        As `module_of`, or if the format cannot be read.
-    RecordingError
-        If the files do not exist or do not follow the format.
+    Raises ConfigError as `module_of`, or if the format cannot be read, and RecordingError if the
+    files do not exist or do not follow the format.
 
     """
     module = module_of(name)
@@ -170,10 +147,7 @@ def import_format(name: str) -> FormatModule:
     """
     Return the module of a format, whether or not the packages it needs are installed.
 
-    Raises
-    ------
-    ConfigError
-        If the format does not exist, or the package that has it cannot be imported.
+    Raises ConfigError if the format does not exist, or the package that has it cannot be imported.
 
     """
     if name not in FORMATS:

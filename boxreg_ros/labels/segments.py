@@ -20,46 +20,30 @@ INDEX = 'index.csv'
 
 
 class IndexRow(NamedTuple):
-    """
-    A segment in the index; the fields are the columns.
-
-    Attributes
-    ----------
-    segment : str
-        Name of its folder.
-    first_stamp_ns, last_stamp_ns : int
-        Smallest and largest stamp of its boxes [ns].
-    frames, boxes, clouds : int
-        Stamps, boxes and clouds written.
-    left_out : int
-        Boxes that a format cannot represent, summed over formats.
-    size : int
-        Size of its files.
-    recovered : int
-        1 if it was made from the journal of a recording that was cut off, else
-        0.
-
-    """
+    """A segment in the index; the fields are the columns."""
 
     segment: str
+    """Name of its folder."""
     first_stamp_ns: int
     last_stamp_ns: int
+    """Largest stamp of its boxes, as `first_stamp_ns` is the smallest [ns]."""
     frames: int
+    """Stamps; boxes and clouds are counted, too."""
     boxes: int
     clouds: int
     left_out: int
+    """Boxes that a format cannot represent, summed over formats."""
     size: int
+    """Of its files."""
     recovered: int
+    """1 if it was made from the journal of a recording that was cut off, else 0."""
 
 
 def read_index(folder: Path) -> list[IndexRow]:
     """
     Return the segments of a folder, in the order of recording; none without an index.
 
-    Raises
-    ------
-    RecordingError
-        If the index does not have the columns of `IndexRow`.
+    Raises RecordingError if the index does not have the columns of `IndexRow`.
 
     """
     path = folder / INDEX

@@ -92,14 +92,9 @@ class Writer(FolderWriter):
 
 class Numbers:
     """
-    The class and the instance of the points of each track.
+    The class and the instance of the points of each track; all sweeps have the same tracks.
 
     Instances are the rows of the tracks, from 1; 0 for points on none, and beyond `MAX_INSTANCE`.
-
-    Parameters
-    ----------
-    points : PointLabels
-        Of any sweep: all have the same tracks.
 
     """
 

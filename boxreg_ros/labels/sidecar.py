@@ -25,27 +25,14 @@ POSES_FILE = 'poses.txt'
 
 @dataclass(frozen=True, slots=True)
 class Sidecar:
-    """
-    The content of the three files.
-
-    Attributes
-    ----------
-    stamps_ns : list of int
-        Stamp per frame [ns].
-    poses : list of array, shape (4, 4), or None
-        ``T_fixed_sensor`` per frame; None if unknown.
-    fixed_frame, sensor_frame : str
-        Names of the frames.
-    tracks : dict
-        Track ids by the numbers in the labels.
-
-    """
+    """The content of the three files; `poses` are ``T_fixed_sensor`` (4, 4), None if unknown."""
 
     stamps_ns: list[int]
     poses: list[Floats | None]
     fixed_frame: str
     sensor_frame: str
     tracks: dict[str, str]
+    """Track ids by the numbers in the labels."""
 
     def frame(self, index: int, refined: RefinedBoxes) -> LabelFrame:
         """Return a frame with boxes in the sensor frame."""
@@ -56,10 +43,7 @@ def read_sidecar(folder: Path, count: int, stamps: Path | None = None) -> Sideca
     """
     Return the stamps and poses of at least `count` frames.
 
-    Raises
-    ------
-    RecordingError
-        If `stamps` (default: ``timestamps.txt``) is missing or has fewer stamps than frames.
+    Raises RecordingError if `stamps` (default: ``timestamps.txt``) is missing or has too few.
 
     """
     path = stamps or folder / STAMPS_FILE
@@ -80,10 +64,7 @@ def read_stamps(path: Path) -> list[int]:
     """
     Return the stamps of a file [ns]: integers, or date and time (UTC) as in KITTI raw.
 
-    Raises
-    ------
-    RecordingError
-        If there is no such file, or a line is neither.
+    Raises RecordingError if there is no such file, or a line is neither.
 
     """
     try:
@@ -108,10 +89,7 @@ def read_poses(path: Path, count: int) -> list[Floats | None]:
     """
     Return ``T_fixed_sensor`` (4, 4) of `count` frames; None where the pose is unknown.
 
-    Raises
-    ------
-    RecordingError
-        If the file exists but is not `count` lines of twelve numbers.
+    Raises RecordingError if the file exists but is not `count` lines of twelve numbers.
 
     """
     if not path.exists() or not count:

@@ -48,12 +48,7 @@ class Writer(CuboidWriter):
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
-    """
-    Yield the frames of a scene with one stamp [ns] per label file in its ``timestamps.txt``.
-
-    Raises RecordingError if a file is missing or does not follow the format of the tool.
-
-    """
+    """Yield the frames of a scene with one stamp [ns] per label file in its ``timestamps.txt``."""
     names = {file.stem for file in path.glob('label/*.json')}
     yield from read_files(path, path / 'label', names, 'boxes of SUSTechPOINTS', _cuboids)
 

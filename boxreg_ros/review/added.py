@@ -23,18 +23,11 @@ MAX_CLICKED = 400
 
 def added_track(scene: DriveScene, seeds: Sequence[BoxArray], begin_ns: int) -> dict[str, Any]:
     """
-    Follow an added object from its boxes.
+    Follow an added object from its boxes; return its track as the page shows it.
 
-    Returns
-    -------
-    found : dict
-        ``row`` and ``part`` as of the tracks of a report; ``ends``: stamp and reason before the
-        first box and after the last; ``problems``: seeds that could not be used, and why.
-
-    Raises
-    ------
-    RecordingError
-        If the recording cannot be read, or no seed can be followed.
+    ``row`` and ``part`` are as of the tracks of a report; ``ends`` stamp and reason before the
+    first box and after the last; ``problems`` the seeds that could not be used, and why. Raises
+    RecordingError if the recording cannot be read, or no seed can be followed.
 
     """
     track = scene.follow(seeds)

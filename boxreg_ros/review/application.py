@@ -61,29 +61,13 @@ def review_application(
     is_ending: Callable[[], bool],
 ) -> tuple[ASGIApp, str]:
     """
-    Return the application for result folders; several are behind a page of their progress.
+    Return the application for result folders, and the token that requests need.
 
-    Parameters
-    ----------
-    results : sequence of Path and DriveSource
-        Result folders with a report, and their recordings, for whole clouds and added objects.
-    port : int
-        Port on loopback that it is served at: requests under another name are refused.
-    who : str
-        Name of the person, where the page sends none.
-    is_ending : callable
-        Whether the server ends: streams of events end then.
-
-    Returns
-    -------
-    application : ASGI application
-    token : str
-        Requests need it, in the address of the first one or in the cookie that this one sets.
-
-    Raises
-    ------
-    RecordingError
-        If decisions or summary cannot be read.
+    Several folders are behind a page of their progress; a recording gives whole clouds and added
+    objects. The port is one on loopback: requests under another name are refused. `who` is the
+    person where the page sends none. Streams of events end when the server `is_ending`. The token
+    is in the address of the first request or in the cookie that this one sets. Raises
+    RecordingError if decisions or summary cannot be read.
 
     """
     token = secrets.token_urlsafe(16)

@@ -27,20 +27,9 @@ def risks_of_box(
     Return the risk of a box of a report as it is and as `box` would have it [m].
 
     What follows from the points changes by what the points of the report show: where the outermost
-    ones are from each face, and how many of them are outside. The deviations stay.
-
-    Parameters
-    ----------
-    part : mapping
-        Of the track, as `TrackPart.part` returns it.
-    row : int
-        Row of the box.
-    box : array, shape (9,)
-        Relative to the origin of the part [m, rad].
-    class_name : str
-        Of the track.
-    points : array, shape (M, 3)
-        Near the box, relative to the same origin [m].
+    ones are from each face, and how many of them are outside. The deviations stay. `part` is as of
+    `TrackPart.part`; the box (9,) [m, rad] and the points (M, 3) near it [m] are relative to its
+    origin.
 
     """
     outside, sizes = part['usual']

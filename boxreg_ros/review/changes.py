@@ -24,59 +24,38 @@ from numpy.typing import ArrayLike, NDArray
 
 @dataclass(frozen=True, slots=True)
 class TrackChanges:
-    """
-    The boxes of one track before and after registration, by stamp.
-
-    Attributes
-    ----------
-    track_id, class_name : str
-        As in the input; the most frequent class of the track.
-    input_ids : tuple of n str
-        Track ids in the input; empty for boxes that the input does not have.
-    stamps_ns : array, shape (n,)
-        Header stamps [ns].
-    given, boxes : array, shape (n, 9)
-        Input and result in the fixed frame; NaN where a box is invalid or in another frame, and
-        in `given` for added boxes.
-    change : array, shape (n, 4)
-        Result minus input along the axes of the box [m] and in yaw [rad], without 180 degree
-        flips.
-    deviations : array, shape (n, 4)
-        Standard deviations of the result along the same axes; NaN for boxes that are not
-        refined.
-    extent_deviations : array, shape (n, 3)
-        Standard deviations of length, width and height [m]; NaN for boxes that are not refined.
-    face_distances, near_points : array, shapes (n, 6) and (n, 2)
-        As in `RefinedBoxes`.
-    disagreement : array, shape (n,)
-        1 - 3D IoU of the result with the early estimate; 0 where that is not known.
-    is_flipped : array, shape (n,)
-        True where the heading was flipped by 180 degrees.
-    status : array of str, shape (n,)
-        As in `RefinedBoxes`.
-    reasons : array of str, shape (n,)
-        Why a box was kept; empty for the others.
-    num_points : array, shape (n,)
-        Points inside the input boxes.
-
-    """
+    """The boxes of one track before and after registration, by stamp."""
 
     track_id: str
     class_name: str
+    """The most frequent one of the track."""
     input_ids: tuple[str, ...]
+    """Track ids in the input; empty for boxes that the input does not have."""
     stamps_ns: Ints
+    """(n,), of the headers [ns]."""
     given: Floats
+    """(n, 9), input in the fixed frame; NaN where invalid, in another frame, or added."""
     boxes: Floats
+    """(n, 9), result in the fixed frame; NaN where invalid or in another frame."""
     change: Floats
+    """(n, 4), result minus input along the axes of the box [m] and in yaw [rad], flips removed."""
     deviations: Floats
+    """(n, 4), of the result along the same axes; NaN for boxes that are not refined."""
     extent_deviations: Floats
+    """(n, 3), of length, width and height [m]; NaN for boxes that are not refined."""
     face_distances: Floats
     near_points: Floats
+    """(n, 2), as in `RefinedBoxes`, as are the face distances (n, 6)."""
     disagreement: Floats
+    """(n,), 1 - 3D IoU of the result with the early estimate; 0 where that is not known."""
     is_flipped: NDArray[np.bool_]
+    """(n,), where the heading was flipped by 180 degrees."""
     status: NDArray[np.str_]
+    """(n,), as in `RefinedBoxes`."""
     reasons: NDArray[np.str_]
+    """(n,), why a box was kept; empty for the others."""
     num_points: Ints
+    """(n,), inside the input boxes."""
 
     @property
     def is_refined(self) -> NDArray[np.bool_]:
@@ -103,10 +82,7 @@ class Changes:
     """
     Collect all boxes before and after registration, in a few numbers each.
 
-    Parameters
-    ----------
-    fixed_frame : str
-        Boxes in another frame are counted, but their numbers are NaN.
+    Boxes that are not in the fixed frame are counted, but their numbers are NaN.
 
     """
 
@@ -127,18 +103,10 @@ class Changes:
         added_ids: Sequence[str] = (),
     ) -> None:
         """
-        Add the boxes of one array.
+        Add the boxes of one array before and after; added boxes stand behind those of the input.
 
-        Parameters
-        ----------
-        given : BoxArray
-            The input.
-        refined : RefinedBoxes
-            The result; added boxes stand behind those of the input.
-        early : RefinedBoxes, optional
-            The early estimate of the same boxes, where the result is another.
-        added_ids : sequence of str
-            Ids that a person gave the objects of the added boxes; empty for others, and without.
+        `early` is the early estimate of the same boxes, where the result is another; `added_ids`
+        are those that a person gave the objects of the added boxes, empty for others.
 
         """
         boxes = refined.boxes
@@ -256,19 +224,9 @@ def _disagreement(boxes: Floats, early: Floats) -> Floats:
 
 def _deviations(boxes: Floats, covariances: Floats) -> Floats:
     """
-    Return standard deviations along the axes of the boxes.
+    Return standard deviations (n, 4) along the heading of boxes, across and up [m], and of yaw.
 
-    Parameters
-    ----------
-    boxes : array, shape (n, 9)
-        Boxes in the fixed frame.
-    covariances : array, shape (n, 6, 6)
-        Of x y z roll pitch yaw in the fixed frame.
-
-    Returns
-    -------
-    deviations : array, shape (n, 4)
-        Along the heading, across it and up [m], and of the yaw [rad].
+    The covariances (n, 6, 6) are of x y z roll pitch yaw in the fixed frame.
 
     """
     cos = np.cos(boxes[:, YAW])

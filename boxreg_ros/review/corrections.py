@@ -32,15 +32,11 @@ WITHOUT_EFFECT = ('accept', 'unsure', 'none')
 
 class Corrections:
     """
-    The decisions of a person as a run applies them; boxes can be pinned already.
+    The decisions of a person, in the order they were made, as a run applies them.
 
     Deleted boxes are not registered; ids, classes and pinned boxes are those of the decisions
-    before any step of the run; rejected boxes are as in the input again after it.
-
-    Parameters
-    ----------
-    decisions : iterable of Decision
-        In the order they were made.
+    before any step of the run; rejected boxes are as in the input again after it. Boxes can be
+    pinned already.
 
     """
 
@@ -64,10 +60,7 @@ class Corrections:
         """
         Return the boxes of added objects, one array each, in the fixed frame.
 
-        Raises
-        ------
-        RecordingError
-            If a box was added in another frame.
+        Raises RecordingError if a box was added in another frame.
 
         """
         found = []
@@ -136,12 +129,8 @@ class Corrections:
 
         Without deleted boxes, with new ids and classes, and with pinned boxes in the place of
         theirs. A pin shows the extents of the object: the other boxes of its track have them too,
-        in windows without a pin as well. Pins need the boxes in the fixed frame.
-
-        Raises
-        ------
-        RecordingError
-            If a box is pinned in another frame.
+        in windows without a pin as well. Raises RecordingError if a box is pinned in another
+        frame.
 
         """
         if not self._of_track:
@@ -177,12 +166,7 @@ class Corrections:
         """
         Return the result for all input boxes, in their order, and then for the added ones.
 
-        Parameters
-        ----------
-        given : BoxArray
-            The input.
-        refined : RefinedBoxes
-            The result for the boxes of `to_register`, in their order, and for added ones.
+        `refined` is that for the boxes of `to_register`, in their order, and for added ones.
 
         """
         is_pinned = _is_pinned(given)

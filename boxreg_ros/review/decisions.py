@@ -57,49 +57,29 @@ class Decision:
     """
     One decision about a track, or about some of its boxes.
 
-    Attributes
-    ----------
-    track_id : str
-        The track in the input of the run.
-    stamp_ns : int or None
-        Stamp of the box, or the first one of a range [ns]; None for the whole track.
-    kind : str
-        ``accept``, ``reject`` (keep the input), ``unsure``, ``pin`` (the box is right as given),
-        ``none`` (no judgement any more); ``delete``, ``restore``; ``rename`` and ``reclass``
-        (their `value` is the new id or class; empty for that of the input); ``add`` (a box of an
-        object that the input does not have, which is followed both ways; `value` is its class),
-        ``withdraw``.
-    comment : str
-        Free text in one line.
-    frame_id : str
-        Frame of `box`; empty without one.
-    box : array, shape (9,), or None
-        The pinned or added box [m, rad].
-    end_ns : int or None
-        Last stamp of a range [ns]; None for one box, or the whole track.
-    value : str
-        New id or class.
-    who, when : str
-        The person, and the time in UTC (ISO 8601).
-
-    Raises
-    ------
-    RecordingError
-        If the kind is unknown, stamps are no range of 64-bit numbers, or a pinned or added box has
-        no stamp, is none, or has no class.
+    Raises RecordingError if the kind is unknown, stamps are no range of 64-bit numbers, or a
+    pinned or added box has no stamp, is none, or has no class.
 
     """
 
     track_id: str
+    """The track in the input of the run."""
     stamp_ns: int | None
+    """Of the box, or the first one of a range [ns]; None for the whole track."""
     kind: str
     comment: str = ''
+    """Free text in one line."""
     frame_id: str = ''
+    """Of `box`."""
     box: Floats | None = None
+    """(9,), pinned or added [m, rad]."""
     end_ns: int | None = None
+    """Last stamp of a range [ns]; None for one box, or the whole track."""
     value: str = ''
+    """New id or class."""
     who: str = ''
     when: str = ''
+    """In UTC (ISO 8601)."""
 
     def __post_init__(self) -> None:
         """Check the decision."""
@@ -205,10 +185,8 @@ def read_decisions(path: Path) -> list[Decision]:
     """
     Return the decisions of a file, in its order; a last row without an end is left out.
 
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read, is of a later version, lacks a column, or a row is no decision.
+    Raises RecordingError if the file cannot be read, is of a later version, lacks a column, or a
+    row is no decision.
 
     """
     try:
@@ -257,20 +235,8 @@ class DecisionLog:
     """
     Append decisions to a file that other programs may append to; each is on disk at once.
 
-    Parameters
-    ----------
-    path : Path
-        The file; it is made with the first decision.
-
-    Attributes
-    ----------
-    decisions : list of Decision
-        All rows, as of the last `refresh` or `append`.
-
-    Raises
-    ------
-    RecordingError
-        If the file exists and holds something else.
+    The file is made with the first decision. `decisions` are all rows as of the last `refresh` or
+    `append`. Raises RecordingError if the file exists and holds something else.
 
     """
 

@@ -61,30 +61,13 @@ def fitted(
     extents: Mapping[str, Floats],
 ) -> Fitted:
     """
-    Return the box of the object at a place.
+    Return the box of the object at a place (2,) that a person points at.
 
-    The points around it that are above the road and touch each other are the object. The heading
-    is that whose sides are nearest to the points (the closeness of L-shapes), and the half of it
-    that is nearer to the heading of the sensor. Sides that the sensor does not see are completed
-    by the size of the class.
-
-    Parameters
-    ----------
-    points : array, shape (M, 3)
-        Of the sweep [m].
-    place : array, shape (2,)
-        That a person points at [m].
-    sensor : array, shape (2,)
-        Position of the sensor [m].
-    heading : float
-        Heading of the sensor [rad].
-    extents : mapping of str to array, shape (3,)
-        Length, width and height by class, of those that it may be; `USUAL_EXTENTS` if empty.
-
-    Raises
-    ------
-    RecordingError
-        If there is no object at the place.
+    The points (M, 3) around it that are above the road and touch each other are the object. The
+    heading is that whose sides are nearest to the points (the closeness of L-shapes), and the half
+    of it that is nearer to the heading of the sensor [rad]. Sides that the sensor, at (2,), does
+    not see are completed by the size of the class, one of `extents` or of `USUAL_EXTENTS`. Raises
+    RecordingError if there is no object at the place.
 
     """
     near = points[(np.abs(points[:, :2] - place) < FIT_REACH).all(1)].astype(np.float64)

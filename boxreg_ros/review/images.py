@@ -43,10 +43,7 @@ class DriveImages:
         """
         Return the image of a camera nearest to a stamp, and T_camera_fixed (4, 4) at its stamp.
 
-        Raises
-        ------
-        RecordingError
-            If there is no such camera, or no image nearby.
+        Raises RecordingError if there is no such camera, or no image nearby.
 
         """
         cameras = self._known()

@@ -19,30 +19,18 @@ MAX_STEP = 1.0
 
 @dataclass(frozen=True, slots=True)
 class LabelTrack:
-    """
-    The valid labels of one track, by stamp.
-
-    Attributes
-    ----------
-    track_id, class_name : str
-        Identity and category.
-    kind : str
-        Group of settings of the class: vehicle, cyclist or pedestrian.
-    stamps_ns : array, shape (n,)
-        Stamps [ns]; one may occur twice.
-    boxes : array, shape (n, 9)
-        In one fixed frame [m, rad].
-    num_points : array, shape (n,)
-        Points in each box; -1 where unknown.
-
-    """
+    """The valid labels of one track, by stamp."""
 
     track_id: str
     class_name: str
     kind: str
+    """Group of settings of the class: vehicle, cyclist or pedestrian."""
     stamps_ns: Ints
+    """(n,); one may occur twice [ns]."""
     boxes: Floats
+    """(n, 9), in one fixed frame [m, rad]."""
     num_points: Ints
+    """(n,), in each box; -1 where unknown."""
 
     @classmethod
     def of(
@@ -75,43 +63,24 @@ class LabelTrack:
 
 
 class Steps(NamedTuple):
-    """
-    Steps between consecutive boxes of a track.
-
-    Attributes
-    ----------
-    rows : array, shape (k,)
-        Row of the box before each step.
-    seconds : array, shape (k,)
-        Duration [s].
-    velocity : array, shape (k, 3)
-        Of the centre in the fixed frame [m/s].
-
-    """
+    """Steps between consecutive boxes of a track."""
 
     rows: Ints
+    """(k,), of the box before each step."""
     seconds: Floats
+    """(k,), duration [s]."""
     velocity: Floats
+    """(k, 3), of the centre in the fixed frame [m/s]."""
 
 
 class Pairs(NamedTuple):
-    """
-    Pairs of boxes of two tracks.
-
-    Attributes
-    ----------
-    tracks : array, shape (k, 2)
-        Indices of the two tracks, ascending.
-    stamps_ns : array, shape (k,)
-        Their stamp [ns].
-    iou : array, shape (k,)
-        3D IoU of their boxes.
-
-    """
+    """Pairs of boxes of two tracks."""
 
     tracks: Ints
+    """(k, 2), indices of the two tracks, ascending."""
     stamps_ns: Ints
     iou: Floats
+    """(k,), 3D IoU of their boxes."""
 
 
 class Labels(tuple[LabelTrack, ...]):

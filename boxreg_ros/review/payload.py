@@ -114,15 +114,7 @@ class TrackPoints(Protocol):
 
 
 class TrackPart:
-    """
-    The points and figures of one track, as the report shows them.
-
-    Attributes
-    ----------
-    before, after : Quality
-        Figures of the input boxes and of the refined boxes.
-
-    """
+    """The points and figures of one track, as the report shows them: `before` and `after`."""
 
     def __init__(
         self,

@@ -27,34 +27,24 @@ UNREAD = 2.0
 
 @dataclass(frozen=True, slots=True)
 class DriveProgress:
-    """
-    The review of one result.
-
-    Attributes
-    ----------
-    out : Path
-        Result folder.
-    tracks, decided, accepted, unread : int
-        Tracks of the result; those with a decision, accepted, and accepted within `UNREAD` of the
-        decision before of the same person.
-    risk, risk_left : float
-        Sum of the risks of all tracks and of those without a decision [m].
-    seconds : float
-        Time between the decisions of each person, pauses left out, of all of them [s].
-    people : tuple of str
-        Who has decided.
-
-    """
+    """The review of one result."""
 
     out: Path
+    """Its folder."""
     tracks: int
     decided: int
+    """Tracks with a decision."""
     accepted: int
     unread: int
+    """Tracks accepted within `UNREAD` of the decision before of the same person."""
     risk: float
+    """Sum over all tracks [m]."""
     risk_left: float
+    """Of the tracks without a decision [m]."""
     seconds: float
+    """Time between the decisions of each person, pauses left out, of all of them [s]."""
     people: tuple[str, ...]
+    """Who have decided."""
 
     @property
     def minutes_a_track(self) -> float:
@@ -66,10 +56,7 @@ def progress_of(out: Path) -> DriveProgress:
     """
     Return how far the review of a result is.
 
-    Raises
-    ------
-    RecordingError
-        If it has no list of tracks, or its decisions cannot be read.
+    Raises RecordingError if it has no list of tracks, or its decisions cannot be read.
 
     """
     risks = _risks(out / REVIEW)
@@ -116,12 +103,8 @@ def agreement(outs: Sequence[Path]) -> tuple[Floats, Floats]:
     """
     Return how well people agree where two have drawn the same box.
 
-    In one result, or in several ones of the same request and files, which each reviews alone.
-
-    Returns
-    -------
-    theirs, ours : array, shapes (n,) and (m,)
-        3D IoU of the boxes of two people, and of the refined box with each of these.
+    In one result, or in several ones of the same request and files, which each reviews alone: the
+    3D IoU (n,) of the boxes of two people, and (m,) of the refined box with each of these.
 
     """
     drawn: dict[tuple[str, str, int | None], dict[str, Floats]] = defaultdict(dict)

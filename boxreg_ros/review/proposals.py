@@ -12,12 +12,9 @@ PROPOSALS = 'proposals.csv'
 
 def proposals_of(out: Path) -> list[dict[str, Any]]:
     """
-    Return the proposals of a result: stamp, class, box and points; none without its file.
+    Return stamp, class, box and points of the proposals of a result; none without its file.
 
-    Raises
-    ------
-    RecordingError
-        If the file is no table of boxes.
+    Raises RecordingError if the file is no table of boxes.
 
     """
     path = out / PROPOSALS

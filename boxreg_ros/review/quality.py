@@ -20,48 +20,28 @@ CELL_RANGE = 2**16
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """
-    Figures of the boxes of one track; NaN where they are unknown.
-
-    Attributes
-    ----------
-    flips : int
-        Headings that turn by more than 90 degrees from one box to the next.
-    jitter : float
-        Mean distance of a centre from the middle of its two neighbours in time [m].
-    yaw_jitter : float
-        The same of the yaw [rad].
-    size_spread : float
-        Mean standard deviation of length, width and height over the track [m].
-    cells : int
-        Cubes of edge `CELL` that the points of all sweeps fill in the frame of the boxes.
-    iou : float
-        Mean 3D IoU with the true boxes.
-
-    """
+    """Figures of the boxes of one track; NaN where they are unknown."""
 
     flips: int
+    """Headings that turn by more than 90 degrees from one box to the next."""
     jitter: float
+    """Mean distance of a centre from the middle of its two neighbours in time [m]."""
     yaw_jitter: float
+    """The same of the yaw [rad]."""
     size_spread: float
+    """Mean standard deviation of length, width and height over the track [m]."""
     cells: int
+    """Cubes of edge `CELL` that the points of all sweeps fill in the frame of the boxes."""
     iou: float
+    """Mean 3D IoU with the true boxes."""
 
 
 def quality(track: TrackChanges, boxes: Floats, points: list[Floats], iou: Floats) -> Quality:
     """
-    Return the figures of the input boxes or of the refined boxes of a track.
+    Return the figures of the input boxes or of the refined boxes (n, 9) of a track.
 
-    Parameters
-    ----------
-    track : TrackChanges
-        The track.
-    boxes : array, shape (n, 9)
-        Its boxes, before or after; NaN where unknown.
-    points : list of n arrays, shape (M_i, 3)
-        Points near each box in the fixed frame [m].
-    iou : array, shape (n,)
-        3D IoU with the true boxes, NaN where unknown.
+    `points` are near each box in the fixed frame, n arrays (M_i, 3) [m]; `iou` (n,) with true
+    boxes is NaN where unknown, as are boxes.
 
     """
     known = np.asarray(np.isfinite(boxes).all(axis=1))

@@ -55,15 +55,7 @@ MAX_MAP_SENSOR = 2000
 
 
 def check_packages(what: str = '--report', packages: Sequence[str] = PACKAGES) -> None:
-    """
-    Check that the packages of the report, or of something else, are installed.
-
-    Raises
-    ------
-    ConfigError
-        If one is not.
-
-    """
+    """Raise ConfigError if a package of the report, or of something else, is not installed."""
     for package in packages:
         try:
             import_module(package)
@@ -82,26 +74,11 @@ def write_report(
     truth: BoxTable | None = None,
 ) -> None:
     """
-    Write the report of a run as one HTML file.
+    Write the report of a run as one HTML file into the result folder.
 
-    Parameters
-    ----------
-    folder : Path
-        Result folder.
-    line : str
-        The closing line of the run.
-    summary : mapping
-        Content of ``summary.json``.
-    config : Config
-        Settings of the run.
-    found : sequence of TrackRow
-        All tracks with their risks, in the order of the list.
-    violated : mapping of str to sequence of Violation
-        What violates each rule after the run, by its id.
-    points : PointCollector
-        The points of the recording.
-    truth : BoxTable, optional
-        True boxes in the fixed frame, by the same stamps and track ids.
+    `line` is the closing line of the run; `summary` the content of ``summary.json``; `found` are
+    all tracks with their risks, in the order of the list; `violated` has what violates each rule
+    after the run, by its id; true boxes are in the fixed frame, by the same stamps and track ids.
 
     """
     tracks = [row.track for row in found]

@@ -23,15 +23,7 @@ STAMP = re.compile(r'-?[0-9]{1,19}')
 
 
 async def json_of(request: Request) -> Mapping[str, Any]:
-    """
-    Return the object that a request has sent.
-
-    Raises
-    ------
-    RecordingError
-        If it is none.
-
-    """
+    """Return the object that a request has sent; RecordingError if it is none."""
     if request.headers.get('content-type') != 'application/json':  # no form of another page
         raise HTTPException(415, 'expected application/json')
     body = bytearray()
@@ -86,15 +78,7 @@ def box_of(sent: object) -> Floats:
 
 
 def numbers_of(sent: object, name: str, count: int) -> Floats:
-    """
-    Return numbers, shape (`count`,).
-
-    Raises
-    ------
-    RecordingError
-        If there are not so many, or they are none.
-
-    """
+    """Return numbers (`count`,); RecordingError if there are not so many, or they are none."""
     if not isinstance(sent, list) or not all(type(one) in (int, float) for one in sent):
         raise RecordingError(f'{name}: expected {count} numbers, got {sent!r:.80}')
     if len(sent) != count:

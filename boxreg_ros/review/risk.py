@@ -66,20 +66,12 @@ DEFAULTS = Config()
 
 
 class Risk(NamedTuple):
-    """
-    The risk of the boxes of one track.
-
-    Attributes
-    ----------
-    boxes : array, shape (n,)
-        Risk of each box [m].
-    parts : mapping of str to array, shape (n,)
-        Its parts by their reason in words [m], largest contributions included.
-
-    """
+    """The risk of the boxes of one track."""
 
     boxes: Floats
+    """(n,), of each box [m]."""
     parts: Mapping[str, Floats]
+    """(n,) by their reason in words [m], largest contributions included."""
 
     @property
     def track(self) -> float:
@@ -88,20 +80,12 @@ class Risk(NamedTuple):
 
 
 class Usual(NamedTuple):
-    """
-    What is usual among the tracks of a recording.
-
-    Attributes
-    ----------
-    outside : float
-        Part of the points in and near a box that are outside of it.
-    sizes : mapping of str to array, shape (2, 3)
-        By class: median and deviation of the logarithms of length, width and height.
-
-    """
+    """What is usual among the tracks of a recording."""
 
     outside: float = USUAL_OUTSIDE
+    """Part of the points in and near a box that are outside of it."""
     sizes: Mapping[str, Floats] = {}
+    """(2, 3) by class: median and deviation of the logarithms of length, width and height."""
 
     @classmethod
     def of(cls, tracks: Sequence[TrackChanges]) -> Usual:
@@ -265,12 +249,7 @@ def _unlike(track: TrackChanges, extents: Floats, usual: Usual) -> Floats:
 
 
 def _has_id_switch(track: TrackChanges) -> bool:
-    """
-    Return whether the boxes jump by more than half their extents off constant velocity.
-
-    Along the heading or across it.
-
-    """
+    """Return whether boxes jump by over half their length or width off constant velocity."""
     is_known = np.isfinite(track.boxes[:, X])
     boxes = track.boxes[is_known]
     seconds = np.diff(track.stamps_ns[is_known]) * 1e-9

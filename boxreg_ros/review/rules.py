@@ -16,45 +16,26 @@ WARNING = 'warning'
 
 
 class Violation(NamedTuple):
-    """
-    A place where labels violate a rule.
-
-    Attributes
-    ----------
-    track_id : str
-        The track.
-    stamp_ns : int
-        The stamp [ns].
-    text : str
-        What was found, with its figures.
-
-    """
+    """A place where labels violate a rule."""
 
     track_id: str
     stamp_ns: int
     text: str
+    """What was found, with its figures."""
 
 
 class Rule(NamedTuple):
-    """
-    A rule that labels should keep.
-
-    Attributes
-    ----------
-    rule_id, severity : str
-        Name, and `ERROR` or `WARNING`.
-    meaning, remedy : str
-        What is wrong, and what to do.
-    find : callable
-        Yields the violations of tracks that have boxes; at most one per track and finding.
-
-    """
+    """A rule that labels should keep."""
 
     rule_id: str
     severity: str
+    """`ERROR` or `WARNING`."""
     meaning: str
+    """What is wrong."""
     remedy: str
+    """What to do."""
     find: Callable[[Labels], Iterator[Violation]]
+    """Yields the violations of tracks that have boxes; at most one per track and finding."""
 
 
 RULES: dict[str, Rule] = {}

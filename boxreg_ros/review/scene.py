@@ -35,26 +35,16 @@ GRAIN = 0.03
 
 @dataclass(frozen=True, slots=True)
 class DriveSource:
-    """
-    The recording of a result.
-
-    Attributes
-    ----------
-    recording : callable
-        Returns the recording, not yet entered.
-    convention : Convention
-        Of its boxes.
-    fixed_frame : str
-        Frame of the result.
-    config : Config
-        Settings of the result.
-
-    """
+    """The recording of a result."""
 
     recording: Callable[[], AbstractContextManager[ItemSource]]
+    """Returns the recording, not yet entered."""
     convention: Convention
+    """Of its boxes."""
     fixed_frame: str
+    """Of the result."""
     config: Config
+    """Of the result."""
 
 
 class DriveScene:
@@ -77,23 +67,10 @@ class DriveScene:
 
     def sweep(self, stamp_ns: int) -> tuple[int, Floats, NDArray[np.float32], Floats]:
         """
-        Return the sweep nearest to a stamp.
+        Return the sweep nearest to a stamp: its stamp [ns], origin, points and sensor.
 
-        Returns
-        -------
-        stamp_ns : int
-            Its stamp [ns].
-        origin : array, shape (3,)
-            Place that its points are relative to [m].
-        points : array, shape (M, 3)
-            In the fixed frame, relative to `origin` [m].
-        sensor : array, shape (4,)
-            Position and heading of the sensor [m, rad].
-
-        Raises
-        ------
-        RecordingError
-            If the recording cannot be read.
+        The points (M, 3) are in the fixed frame, relative to the origin (3,) [m]; the sensor (4,)
+        is position and heading [m, rad]. Raises RecordingError if the recording cannot be read.
 
         """
         with self._changed:
@@ -107,10 +84,7 @@ class DriveScene:
         """
         Follow an object through all sweeps from its boxes, and solve its track.
 
-        Raises
-        ------
-        RecordingError
-            If the recording cannot be read, or no seed can be followed.
+        Raises RecordingError if the recording cannot be read, or no seed can be followed.
 
         """
         with self._changed:

@@ -54,16 +54,9 @@ def serve(results: Results, port: int, who: str) -> int:
 
 class ReviewServer:
     """
-    A server for result folders, bound to loopback.
+    A server for result folders, bound to loopback at `server_port`.
 
-    Attributes
-    ----------
-    server_port : int
-        Port that it listens on.
-    address : str
-        Address of the page, with the token that opens it.
-    log_paths : list of Path
-        Files of the decisions.
+    `address` has the token that opens the page; `log_paths` are the files of the decisions.
 
     """
 
@@ -113,12 +106,8 @@ def results_server(results: Results, port: int, who: str = '') -> ReviewServer:
     """
     Return a server, bound to loopback, for result folders and their recordings.
 
-    Raises
-    ------
-    RecordingError
-        If a folder has no finished report, or its decisions cannot be read.
-    ConfigError
-        If the port is in use, or a package is missing.
+    Raises RecordingError if a folder has no finished report, or its decisions cannot be read, and
+    ConfigError if the port is in use, or a package is missing.
 
     """
     from boxreg_ros.review.report import check_packages, REPORT

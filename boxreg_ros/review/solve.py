@@ -46,23 +46,12 @@ class ReportParts:
 
     def solved(self, sent: Mapping[str, Any]) -> bytes:
         """
-        Return the boxes of a track, solved again, as JSON.
+        Return the boxes of a track, solved again, as JSON; RecordingError without a usable box.
 
-        Parameters
-        ----------
-        sent : mapping
-            ``class`` of the track; its ``pieces``: the ``index`` of a track in the report,
-            ``begin`` and ``end`` stamp; ``pins``: boxes (9,) in the fixed frame by stamp.
-
-        Returns
-        -------
-        found : bytes
-            ``stamps``, ``boxes`` (n, 9) in the fixed frame, and ``status``, of the input boxes.
-
-        Raises
-        ------
-        RecordingError
-            If the request is none, or the track has no usable box.
+        It is sent as its ``class``; ``pieces``, with the ``index`` of a track in the report,
+        ``begin`` and ``end`` stamp; and ``pins``: boxes (9,) in the fixed frame by stamp. The
+        answer has ``stamps``, ``boxes`` (n, 9) in the fixed frame, and ``status``, of the input
+        boxes.
 
         """
         from boxreg_ros.core.refine import refine, Track
@@ -91,16 +80,8 @@ class ReportParts:
         """
         Return the risk of a box as it is and as a person drags it [m], as JSON.
 
-        Parameters
-        ----------
-        sent : mapping
-            ``index`` of the track in the report, ``row`` of the box, ``class``, and the ``box``
-            (9) in the fixed frame.
-
-        Raises
-        ------
-        RecordingError
-            If the request is none.
+        It is sent as ``index`` of the track in the report, ``row`` of the box, ``class``, and the
+        ``box`` (9) in the fixed frame. Raises RecordingError if the request is none.
 
         """
         box = box_of(sent.get('box'))

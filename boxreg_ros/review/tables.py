@@ -94,18 +94,9 @@ def write_tables(
     """
     Write ``tracks.csv`` and ``review.csv`` into a folder of results.
 
-    Parameters
-    ----------
-    folder : Path
-        The folder.
-    rows : sequence of TrackRow
-        As `assessed` returns them.
-    more_columns : sequence of str
-        Further columns of ``tracks.csv``.
-    more_cells : mapping, optional
-        Their cells by track id; empty for other tracks.
-    proposals : sequence of mapping
-        Objects that no box covers, as in ``summary.json``, for the end of ``review.csv``.
+    `rows` are as of `assessed`. ``tracks.csv`` has `more_columns`, whose cells by track id are
+    empty for other tracks; ``review.csv`` ends with `proposals`, as in ``summary.json``: objects
+    that no box covers.
 
     """
     found = more_cells or {}

@@ -25,30 +25,23 @@ MILLIMETRES = 1000.0
 
 
 class _Gathered(NamedTuple):
-    """
-    Points (M, 3) around a centre (3,) [mm from it], and their times.
-
-    The stamp of the sweep relative to that of the box, and the times of the points relative to the
-    stamp of the sweep, None where unknown [s].
-
-    """
+    """Points around a centre (3,) in its frame, and when they were measured."""
 
     center: Floats
     offsets: NDArray[np.int16]
+    """(M, 3), from the centre [mm]."""
     sweep_delay: float
+    """Stamp of the sweep relative to that of the box [s]."""
     times: NDArray[np.float32] | None
+    """(M,), relative to the stamp of the sweep, None where unknown [s]."""
 
 
 class PointCollector:
     """
     Gather the points around the input boxes, and around added ones, while a recording is read.
 
-    The recording is read once: points are gathered before the boxes are refined.
-
-    Attributes
-    ----------
-    stamps_ns : set of int
-        Of the box arrays, those without boxes included [ns].
+    The recording is read once: points are gathered before the boxes are refined. `stamps_ns` are
+    those of the box arrays, those without boxes included.
 
     """
 

@@ -46,28 +46,18 @@ RECORD_BYTES = 256
 
 
 class Chunk(NamedTuple):
-    """
-    A part of a file with messages.
-
-    Attributes
-    ----------
-    first_byte, end_byte : int
-        Byte range in the file.
-    start_ns, last_ns : int
-        Receive times of its first and last message [ns].
-    counts : dict of int
-        Number of messages by the id of their connection.
-    is_compressible : bool
-        False for messages outside of chunks, which are grouped to chunks here.
-
-    """
+    """A part of a file with messages."""
 
     first_byte: int
     end_byte: int
+    """End of its byte range in the file."""
     start_ns: int
     last_ns: int
+    """Receive time of its last message, as `start_ns` of the first [ns]."""
     counts: Mapping[int, int]
+    """Number of messages by the id of their connection."""
     is_compressible: bool = True
+    """False for messages outside of chunks, which are grouped to chunks here."""
 
 
 class StoredMessage(NamedTuple):
@@ -81,17 +71,7 @@ class StoredMessage(NamedTuple):
 
 
 class ChunkedFile(ABC):
-    """
-    An open file of chunks; see `StorageFile`.
-
-    Parameters
-    ----------
-    path : Path
-        File to read.
-    origin : Path, optional
-        File that it was unpacked from, for errors.
-
-    """
+    """An open file of chunks, unpacked from `origin` where that is given; see `StorageFile`."""
 
     def __init__(self, path: Path, origin: Path | None = None) -> None:
         self.name = shown(path, origin)

@@ -51,10 +51,7 @@ def part_of(path: Path) -> Part:
     """
     Return the files of a recording: of a folder those in its metadata, or all without metadata.
 
-    Raises
-    ------
-    RecordingError
-        If it does not exist, or is a folder without files of recordings.
+    Raises RecordingError if it does not exist, or is a folder without files of recordings.
 
     """
     if url_of(path) is not None:
@@ -101,10 +98,7 @@ def opened(path: Path) -> StorageFile:
     """
     Open a file of a recording; a compressed one is unpacked to a temporary file first.
 
-    Raises
-    ------
-    RecordingError
-        If it is none, or nothing in it can be read.
+    Raises RecordingError if it is none, or nothing in it can be read.
 
     """
     opener = OPENERS.get(_kind(path))
@@ -151,10 +145,7 @@ class Files:
     """
     Several open files of one path as one; see `StorageFile`.
 
-    Parameters
-    ----------
-    part : Part
-        Its files. One that cannot be opened is noted as a damage, unless none can be.
+    A file that cannot be opened is noted as a damage, unless none can be.
 
     """
 

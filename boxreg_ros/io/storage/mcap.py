@@ -78,44 +78,27 @@ class _Place(NamedTuple):
 
 
 class _ChunkHead(NamedTuple):
-    """
-    What a chunk claims about itself.
-
-    Attributes
-    ----------
-    start_ns, last_ns : int
-        First and last receive time [ns].
-    size, checksum : int
-        Of its content.
-    compression : str
-        One of `COMPRESSIONS`.
-    begin, stored : int
-        Begin and number of the compressed bytes in the record.
-
-    """
+    """What a chunk claims about itself."""
 
     start_ns: int
     last_ns: int
+    """Receive time of its last message, as `start_ns` of the first [ns]."""
     size: int
     checksum: int
+    """Of its content, as `size`."""
     compression: str
+    """One of `COMPRESSIONS`."""
     begin: int
+    """Of the compressed bytes in the record."""
     stored: int
+    """Number of the compressed bytes."""
 
 
 class McapFile(ChunkedFile):
     """
-    An open MCAP file; see `ChunkedFile`.
+    An open MCAP file; see `ChunkedFile`. It `is_indexed` unless the whole file had to be scanned.
 
-    Attributes
-    ----------
-    is_indexed : bool
-        False if the whole file had to be scanned.
-
-    Raises
-    ------
-    RecordingError
-        If there is no message in it, and it is not a whole MCAP file.
+    Raises RecordingError if there is no message in it, and it is not a whole MCAP file.
 
     """
 
@@ -182,13 +165,9 @@ class McapFile(ChunkedFile):
 
     def _read_index(self) -> dict[int, int] | None:
         """
-        Read the summary at the end of the file.
+        Read the summary at the end of the file; return the number of messages by channel.
 
-        Returns
-        -------
-        counts : dict of int, or None
-            Number of messages by channel; None where the summary is missing, damaged, or does
-            not list all chunks and channels.
+        None where the summary is missing, damaged, or does not list all chunks and channels.
 
         """
         try:

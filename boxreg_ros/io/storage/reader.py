@@ -31,21 +31,10 @@ Definitions = tuple[tuple[str, MessageDefinition], ...]
 
 class Reader:
     """
-    Read the files of a recording as one.
+    Read the files of a recording as one, by the message definitions of all of them.
 
-    Attributes
-    ----------
-    connections : list of Connection
-        Of all files.
-    typestore : Typestore
-        Message definitions of all files.
-    is2 : bool
-        False for messages of ROS 1.
-
-    Raises
-    ------
-    RecordingError
-        If a path has no readable file, or messages of ROS 1 and ROS 2 are mixed.
+    It `is2` unless its messages are of ROS 1. Raises RecordingError if a path has no readable
+    file, or messages of ROS 1 and ROS 2 are mixed.
 
     """
 
@@ -99,12 +88,7 @@ class Reader:
     def messages(
         self, connections: Collection[Connection], start: int | None, stop: int | None
     ) -> Iterator[Record]:
-        """
-        Yield the messages on `connections` in the order they were received.
-
-        What is damaged is left out and added to `damages`.
-
-        """
+        """Yield the messages on `connections` by receive time; damage is added to `damages`."""
         streams = []
         for file in self._files:
             wanted = {c.id: c for c in connections if c.owner is file}
@@ -120,10 +104,7 @@ class Reader:
         """
         Return a message; its first byte shows the encoding.
 
-        Raises
-        ------
-        UnsupportedMessage
-            If the bytes do not follow the definition, or there is none.
+        Raises UnsupportedMessage if the bytes do not follow the definition, or there is none.
 
         """
         if msgtype in self._decoders and data[:1] != b'\0':

@@ -13,52 +13,29 @@ NO_MESSAGES_NS = (2**63 - 1, 0)
 
 
 class Record(NamedTuple):
-    """
-    One message as it was recorded, still encoded.
-
-    Attributes
-    ----------
-    connection : Connection
-        Topic and type; its `owner` is the file.
-    received_ns : int
-        When it was received [ns].
-    data : bytes
-        Encoded message.
-    published_ns, sequence : int
-        Of MCAP files; equal to `received_ns`, and 0, for other files.
-
-    """
+    """One message as it was recorded, still encoded."""
 
     connection: Connection
+    """Topic and type; its `owner` is the file."""
     received_ns: int
     data: bytes
     published_ns: int = 0
+    """Of MCAP files [ns]; else equal to `received_ns`."""
     sequence: int = 0
 
 
 class Damage(NamedTuple):
-    """
-    Part of a file that cannot be read.
-
-    Attributes
-    ----------
-    file : str
-        File of the recording.
-    reason : str
-        Kind of the damage.
-    first_byte, end_byte : int or None
-        Byte range in the file; None where the format has none (rows of a database).
-    start_ns, end_ns : int or None
-        Receive times that are affected [ns]; None where unknown.
-
-    """
+    """Part of a file that cannot be read."""
 
     file: str
     reason: str
+    """Kind of the damage."""
     first_byte: int | None = None
     end_byte: int | None = None
+    """End of its byte range; None where the format has none (rows of a database)."""
     start_ns: int | None = None
     end_ns: int | None = None
+    """End of the receive times that are affected [ns]; None where unknown."""
 
     def __str__(self) -> str:
         """Return the damage in one line."""
@@ -75,24 +52,15 @@ Damages = dict[Damage, None]
 
 
 class StorageFile(Protocol):
-    """
-    One open file of a recording, or several that belong together.
-
-    Attributes
-    ----------
-    connections : list of Connection
-        Topics with types and numbers of messages.
-    start_time, end_time : int
-        Receive times of the first message and behind the last [ns].
-    damages : Damages
-        Known so far: some are found while messages are read.
-
-    """
+    """One open file of a recording, or several that belong together."""
 
     connections: list[Connection]
+    """Topics with types and numbers of messages."""
     start_time: int
     end_time: int
+    """Behind the last message, as `start_time` is that of the first [ns, received]."""
     damages: Damages
+    """Known so far: some are found while messages are read."""
 
     def messages(
         self, connections: Collection[Connection], start: int | None, stop: int | None

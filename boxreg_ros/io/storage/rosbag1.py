@@ -40,15 +40,7 @@ SEARCH_BYTES = 2**20
 
 
 class Rosbag1File(ChunkedFile):
-    """
-    An open ROS 1 bag; see `ChunkedFile`.
-
-    Raises
-    ------
-    RecordingError
-        If it has no whole chunk.
-
-    """
+    """An open ROS 1 bag; see `ChunkedFile`. Raises RecordingError if it has no whole chunk."""
 
     def _open(self) -> None:
         if self._bytes(0, len(BAG_MAGIC)) != BAG_MAGIC:

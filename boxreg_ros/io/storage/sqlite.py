@@ -52,20 +52,10 @@ PAGE_COUNT = slice(28, 32)
 
 class SqliteFile:
     """
-    An open ``.db3`` file; see `StorageFile`.
+    An open ``.db3`` file, unpacked from `origin` where that is given; see `StorageFile`.
 
-    Parameters
-    ----------
-    path : Path
-        Database. It and its folder are never changed: with a write-ahead log beside it, a copy in
-        the folder of temporary files is read.
-    origin : Path, optional
-        File that it was unpacked from, for errors.
-
-    Raises
-    ------
-    RecordingError
-        If it is no database of rosbag2.
+    The database and its folder are never changed: with a write-ahead log beside it, a copy in the
+    folder of temporary files is read. Raises RecordingError if it is no database of rosbag2.
 
     """
 
@@ -213,10 +203,9 @@ class SqliteFile:
 
     def _limited(self, query: str) -> Iterator[Any]:
         """
-        Yield the rows of a query over a whole table.
+        Yield the rows of a query over a whole table; OperationalError if that would never end.
 
-        Pages that refer to each other in a circle would never end: then an OperationalError is
-        raised.
+        Pages that refer to each other in a circle have no end.
 
         """
         calls = iter(range(1 + STEPS_PER_BYTE * self._size // QUERY_STEPS))

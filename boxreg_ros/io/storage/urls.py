@@ -86,17 +86,7 @@ class LocalFile:
 
 
 class RemoteFile:
-    """
-    A file behind a URL that is read by ranges.
-
-    Attributes
-    ----------
-    size : int
-        Size of the file [bytes].
-    bytes_read : int
-        Number of bytes that were requested so far.
-
-    """
+    """A file behind a URL that is read by ranges, `bytes_read` of its `size` so far."""
 
     def __init__(self, path: Path) -> None:
         self._system, self._name = _system_of(path)
@@ -192,10 +182,7 @@ def entry_of(path: Path) -> Entry:
     """
     Return size and version of a file behind a URL.
 
-    Raises
-    ------
-    RecordingError
-        If it does not exist, or its server does not answer.
+    Raises RecordingError if it does not exist, or its server does not answer.
 
     """
     system, name = _system_of(path)
@@ -289,17 +276,10 @@ def sizes_of(path: Path) -> dict[str, int]:
 
 def upload(folder: Path, target: Path, last: str, advanced: Callable[[], None]) -> None:
     """
-    Replace a folder behind a URL by one of this machine.
+    Replace a folder behind a URL by one of this machine; call `advanced` after each file.
 
-    Parameters
-    ----------
-    folder, target : Path
-        Source and URL.
-    last : str
-        File that marks a whole result: it is deleted first, and written when all others are.
-        `UPLOAD` is there from before the first change until then.
-    advanced : callable
-        Called after each file.
+    `last` marks a whole result: it is deleted first, and written when all others are. `UPLOAD` is
+    there from before the first change until then.
 
     """
     system, name = _system_of(target)
@@ -343,14 +323,10 @@ def _system_of(path: Path) -> tuple[Any, str]:
 
 def _answer_of(path: Path, request: Callable[[], _T], missing_is_error: bool = True) -> _T:
     """
-    Return the answer to a request for a file behind a URL.
+    Return the answer to a request for a file behind a URL, or raise TransferError.
 
     It is repeated after errors that may pass, once if there was no answer in `ANSWER_SECONDS`.
-
-    Raises
-    ------
-    TransferError
-        If no request is answered. File systems raise errors of any class.
+    File systems raise errors of any class.
 
     """
     begin = time.monotonic()
