@@ -237,7 +237,9 @@ def test_boxes_without_transform_are_published_unchanged_with_a_remedy():
         ('sweep_without_transform', 1), ('no_transform', 2),
     ]  # fmt: skip
     for _, text, _ in live.reports:
-        assert "neither /tf nor odometry has the motion of the frame of the clouds 'lidar';" in text
+        assert (
+            "neither /tf nor odometry has the motion of the frame of the clouds 'lidar';" in text
+        )
         assert text.endswith('if it does not move, set fixed_frame:=lidar')
 
 

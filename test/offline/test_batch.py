@@ -14,9 +14,8 @@ from boxreg_ros.cli import main
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.batch_results import INDEX_COLUMNS
 from boxreg_ros.offline.job import jobs_of
-from boxreg_ros.offline.job_process import JobRunner, memory_bytes
+from boxreg_ros.offline.job_process import JobRunner, memory_bytes, Watch, watched
 from boxreg_ros.offline.result_folder import whole_folder
-from boxreg_ros.offline.time_limit import Watch, watched
 from measure.node import children_of
 from paths import ROOT
 from preloaded import BOXREG, PreloadedProcess
