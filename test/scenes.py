@@ -115,6 +115,7 @@ def cut(track, part):
     return replace(
         track, stamps_ns=track.stamps_ns[part], boxes=track.boxes[part], points=track.points[part],
         sensor_origins=track.sensor_origins[part],
+        scores=None if track.scores is None else track.scores[part],
     )  # fmt: skip
 
 

@@ -518,18 +518,12 @@ def test_broken_files_raise_an_error_with_the_path(tmp_path, name):
 
 
 @pytest.mark.parametrize('name', READABLE_FORMATS)
-def test_missing_files_raise_an_error_with_the_path(tmp_path, name):
-    require_packages(name)
-    with pytest.raises((RecordingError, ConfigError), match='nowhere'):
-        list(frames_of(name, tmp_path / 'nowhere'))
-
-
-@pytest.mark.parametrize('name', READABLE_FORMATS)
-def test_missing_relative_path_raises_an_error_with_the_path(tmp_path, monkeypatch, name):
+def test_missing_files_raise_an_error_with_the_path(tmp_path, monkeypatch, name):
     require_packages(name)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises((RecordingError, ConfigError), match='nowhere'):
-        list(frames_of(name, Path('nowhere')))
+    for path in (tmp_path / 'nowhere', Path('nowhere')):
+        with pytest.raises((RecordingError, ConfigError), match='nowhere'):
+            list(frames_of(name, path))
 
 
 @pytest.mark.parametrize(

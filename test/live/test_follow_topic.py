@@ -11,12 +11,7 @@ from boxreg_ros.simulation.writer import write_recording
 from msg_adapters import vision
 import numpy as np
 from rclpy.serialization import deserialize_message
-from ros_graph import (
-    ended_cleanly,
-    Graph,
-    QUICK,
-    records_of,
-)
+from ros_graph import ended_cleanly, Graph, QUICK, records_of
 from ros_messages import DETECTIONS
 
 ACTOR = 3

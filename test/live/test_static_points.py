@@ -5,13 +5,7 @@ from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.simulation.writer import write_recording
 from msg_adapters import pointcloud
 import numpy as np
-from ros_graph import (
-    ended_cleanly,
-    Graph,
-    QUICK,
-    records_of,
-    stamp_of,
-)
+from ros_graph import ended_cleanly, Graph, QUICK, records_of, stamp_of
 
 POINTS = 'sensor_msgs/msg/PointCloud2'
 SWEEPS, WITHOUT_BOXES = 10, 2

@@ -99,14 +99,7 @@ def test_margins_do_not_depend_on_the_start(scene, plain):
 
 def test_margins_of_few_tracks(scene, plain):
     drive = Drive.from_scene(scene)
-    keep = [i for i, name in enumerate(drive.truth.track_ids) if name in ('9', '10', '11', '12')]
-    few = replace(
-        drive.truth,
-        stamps_ns=drive.truth.stamps_ns[keep], boxes=drive.truth.boxes[keep],
-        scores=drive.truth.scores[keep], num_points=drive.truth.num_points[keep],
-        **{name: tuple(getattr(drive.truth, name)[i] for i in keep)
-           for name in ('track_ids', 'class_names', 'status')},
-    )  # fmt: skip
+    few = drive.truth.rows(np.isin(drive.truth.track_ids, ('9', '10', '11', '12')))
     found = labelling_margins(replace(drive, truth=few), Config())
     assert {found[f'vehicle.{name}'].tracks for name in GAPS} <= {3, 4}
     known = plain['vehicle.gap_bottom'].value
