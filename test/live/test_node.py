@@ -60,7 +60,7 @@ def test_odometry_replaces_tf(graph, tmp_path):
     node = graph.run(
         [record for record in records if record.topic != '/boxes'],
         *QUICK,
-        command=('-c', WITHOUT_TF2_MSGS),
+        command=(CODE, WITHOUT_TF2_MSGS),
         kind=MARKERS,
     )
     begun = time.monotonic()
