@@ -118,6 +118,7 @@ def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serv
         page.keyboard.press('Enter')
         page.wait_for_function("view.part.status.filter(one => one === 'human').length === 2")
         assert page.evaluate('view.row') == 0
+        assert 'human' in page.inner_text('#clock')
         page.evaluate('step(5)')
         page.keyboard.press('Shift+D')
         page.wait_for_function('current().deleted === 1')
