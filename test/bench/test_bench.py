@@ -52,18 +52,10 @@ def run(*words):
 def small_street(seed):
     """Return a short scene with the boxes of four vehicles: the paper's method is slow."""
     scene = simulate('street', seed, sweeps=6)
-    detections = []
-    for array in scene.detections:
-        kept = [i for i, name in enumerate(array.track_ids) if name in ('4', '9', '10', '16')]
-        detections.append(
-            replace(
-                array,
-                track_ids=tuple(array.track_ids[i] for i in kept),
-                class_names=tuple(array.class_names[i] for i in kept),
-                scores=array.scores[kept],
-                boxes=array.boxes[kept],
-            )
-        )
+    detections = [
+        array.take([i for i, name in enumerate(array.track_ids) if name in ('4', '9', '10', '16')])
+        for array in scene.detections
+    ]
     return replace(scene, detections=tuple(detections))
 
 
