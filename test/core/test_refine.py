@@ -376,17 +376,6 @@ def test_tracks_without_valid_boxes_and_repeated_ids_are_refused():
 
 
 @each_estimate
-def test_heading_flips_are_corrected(estimate):
-    # One box in four is flipped, the first of them the third.
-    track, truth = a_track()
-    boxes = track.boxes.copy()
-    boxes[2::4, 8] += np.pi
-    refined = only(replace(track, boxes=boxes), Config(estimate=estimate))
-    assert pose_errors(boxes, truth).is_flipped.sum() == 3
-    assert np.abs(pose_errors(refined.boxes, truth).rotation[:, 2]).max() < 0.2
-
-
-@each_estimate
 def test_reversing_is_not_a_flip(estimate):
     track, truth = a_track(truth=drive(14, speed=-4.0, turn=0.2))
     refined = only(track, Config(estimate=estimate))

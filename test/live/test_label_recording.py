@@ -1,6 +1,5 @@
 """The node writes labels while it drives: equal to those of `relabel`, in whole segments."""
 
-import csv
 from importlib.util import find_spec
 import os
 import re
@@ -16,6 +15,7 @@ import orjson
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
+from relabel_results import rows_in
 from ros_graph import ended_cleanly, graph_in, records_of
 from ros_messages import Drive, MARKERS, SECOND
 from std_srvs.srv import Trigger
@@ -78,8 +78,7 @@ def index_of(folder):
     while not (folder / 'index.csv').is_file() or any(folder.glob('.*')):
         assert time.monotonic() < deadline, 'the recorder did not complete the last segment'
         time.sleep(0.05)
-    with (folder / 'index.csv').open() as file:
-        return list(csv.DictReader(file))
+    return rows_in(folder / 'index.csv')
 
 
 def files_of(folder):
@@ -232,8 +231,7 @@ def test_services_start_split_and_stop_a_recording(tmp_path):
     assert len(robot.node.early) == 20
     out = tmp_path / 'out'
     assert main(['relabel', str(path), '--labels', f'openlabel:{folder}', '-o', str(out)]) == 0
-    with (out / 'boxes.csv').open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_in(out / 'boxes.csv')
     assert len(rows) == 30
     assert {row['track_id'] for row in rows} == {'1', '2'}
 

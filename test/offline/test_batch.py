@@ -1,6 +1,5 @@
 """`boxreg batch`: each drive once, failures isolated, a second run skips done drives."""
 
-import csv
 from functools import partial
 import json
 import os
@@ -20,6 +19,7 @@ from measure.node import children_of
 from paths import ROOT
 from preloaded import BOXREG, PreloadedProcess
 import pytest
+from relabel_results import rows_in
 from ros_messages import Drive
 
 QUICK = ['--set=min_observations=3', '--set=window=5', '--set=lag=2']
@@ -28,8 +28,7 @@ DECISIONS = 'track_id,stamp_ns,decision,comment,frame_id,x,y,z,qx,qy,qz,qw,lengt
 
 
 def index_of(out):
-    with (out / 'index.csv').open(newline='') as file:
-        return {row['drive']: row for row in csv.DictReader(file)}
+    return {row['drive']: row for row in rows_in(out / 'index.csv')}
 
 
 @pytest.mark.usefixtures('quick_python')
