@@ -14,9 +14,9 @@ import zlib
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.review.box_risk import risks_of_box
 from boxreg_ros.review.payload import as_json
 from boxreg_ros.review.requests import box_of
+from boxreg_ros.review.risk import risks_of_box
 from boxreg_ros.review.track_points import MILLIMETRES
 from boxreg_ros.structures import BOX_EXTENT, Floats, is_valid_box, LENGTH, Z
 import numpy as np

@@ -523,7 +523,7 @@ class Labeller:
 
 def reviewed(out, truth):
     """Review a result until it is right, write the labels, and return who did it."""
-    server = review_server(out, 0, 'script', drive_of(out))
+    server = review_server([(out, drive_of(out))], 0, 'script')
     Thread(target=server.serve_forever, daemon=True).start()
     with opened_page(server.address, expected='409') as page:
         labeller = Labeller(page, truth)

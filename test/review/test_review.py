@@ -42,7 +42,7 @@ def boxreg(*words):
 
 def served(out):
     """Return a server for a result folder, running in a thread, and its address."""
-    server = review_server(out, 0)
+    server = review_server([(out, None)], 0)
     Thread(target=server.serve_forever, daemon=True).start()
     return server, server.address
 
@@ -330,7 +330,7 @@ def test_report_of_another_version_is_refused(result, tmp_path, capsys):
     page = (out / 'report.html').read_text(encoding='utf-8')
     (out / 'report.html').write_text(page.replace(' data-page="2"', ''), encoding='utf-8')
     with pytest.raises(RecordingError, match='expected a report of this version, got one of'):
-        review_server(out, 0)
+        review_server([(out, None)], 0)
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
@@ -355,7 +355,7 @@ def test_ended_server_names_the_command_that_applies_its_decisions(
 def test_busy_port_is_refused(result):
     server, _ = served(result[1])
     with pytest.raises(ConfigError, match=r'expected a free one, got .* --port'):
-        review_server(result[1], server.server_port)
+        review_server([(result[1], None)], server.server_port)
     server.shutdown()
 
 
@@ -463,7 +463,7 @@ def test_page_and_its_address_are_for_this_browser_alone(server):
 
 
 def test_connection_without_a_request_ends(server, monkeypatch):
-    monkeypatch.setattr('boxreg_ros.review.connections.REQUEST_SECONDS', 0.3)
+    monkeypatch.setattr('boxreg_ros.review.application.REQUEST_SECONDS', 0.3)
     _, headers = opened(server)
     lines = ''.join(f'{name}: {value}\r\n' for name, value in headers.items())
     host = f'Host: 127.0.0.1:{server.server_port}\r\n'

@@ -53,7 +53,7 @@ def serve():
     running = []
 
     def begin(folder):
-        found = review_server(folder, 0, 'anna', drive_of(folder))
+        found = review_server([(folder, drive_of(folder))], 0, 'anna')
         Thread(target=found.serve_forever, daemon=True).start()
         running.append(found)
         return found

@@ -49,7 +49,7 @@ def made(tmp_path_factory):
 def server(made, tmp_path):
     """Return a running server for a copy of the result."""
     out = shutil.copytree(made / 'out', tmp_path / 'out')
-    found = review_server(out, 0, 'anna', drive_of(out))
+    found = review_server([(out, drive_of(out))], 0, 'anna')
     Thread(target=found.serve_forever, daemon=True).start()
     yield found
     found.shutdown()
@@ -171,7 +171,7 @@ def test_labels_are_written_with_all_decisions_without_a_terminal(server):
     texts = [path.read_text() for path in sorted((again / 'sustechpoints').rglob('label/*.json'))]
     assert [text.count('"van"') for text in texts] == [0] * 8 + [1] * 6
     # The review goes on in the new folder: the same decisions hold, and are made no second time.
-    second = review_server(again, 0)
+    second = review_server([(again, None)], 0)
     Thread(target=second.serve_forever, daemon=True).start()
     with opened_page(second.address + '#tracks') as page:
         assert sorted(ids_of(page)) == ['1', '1_2', '2']
