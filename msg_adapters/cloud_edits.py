@@ -7,13 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from boxreg_ros.structures import Floats
-from msg_adapters.pointcloud import DTYPES
+from msg_adapters.pointcloud import DTYPES, NUMBERS
 from msg_adapters.poses import replaced
 import numpy as np
 from numpy.typing import NDArray
-
-NUMBERS = {kind: number for number, kind in DTYPES.items()}
-"""Kind of dtype -> ``PointField.datatype``."""
 
 
 def with_points(msg: Any, is_kept: NDArray[np.bool_]) -> Any:
