@@ -151,7 +151,8 @@ def _kinds(fields: Mapping[str, Any]) -> dict[str, str]:
 
 def _is_finite(table: NDArray[Any]) -> NDArray[np.bool_]:
     """Return which points of a table have finite coordinates, row by row."""
-    return np.logical_and.reduce([np.isfinite(table[key].reshape(-1)) for key in 'xyz'])
+    columns = [np.isfinite(table[key].reshape(-1)) for key in 'xyz']
+    return np.asarray(np.logical_and.reduce(columns))
 
 
 def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
