@@ -14,12 +14,7 @@ from numpy.typing import NDArray
 
 
 def with_points(msg: Any, is_kept: NDArray[np.bool_]) -> Any:
-    """
-    Return a cloud with some of its points, in the same layout and under the same header.
-
-    `is_kept` (height * width,) is row by row; points that are not finite count, too.
-
-    """
+    """Return a cloud with some of its points, `is_kept` (height * width,), in the same layout."""
     if is_kept.all():
         return msg
     kept = np.compress(is_kept, _bytes_of(msg), axis=0)  # a quarter of the time of an index

@@ -185,12 +185,7 @@ class SerializedAdapter:
 def serialized_adapter_for(
     type_name: str, convention: Convention, kind: Any, deserialize: Callable[[bytes, Any], Any]
 ) -> Adapter | None:
-    """
-    Return the adapter of serialised messages of a type; None if there is none, or no numba.
-
-    Errors are those of `adapter_for`; see `SerializedAdapter`.
-
-    """
+    """Return the adapter of serialised messages, as `adapter_for`; None if there is none."""
     inner = adapter_for(type_name, replace(STANDARD, associate=convention.associate))
     if type_name not in BOX_FIELDS or walker() is None:
         return None

@@ -137,12 +137,7 @@ class FixedFrameItems:
             return None
 
     def stored_cloud(self, item: MovedItem, frame_id: str) -> StoredCloud:
-        """
-        Return a cloud for label files: merged ones in `frame_id`, a single one in its own frame.
-
-        The times of its points are those by which it was moved.
-
-        """
+        """Return a cloud for label files, a merged one in `frame_id`, with its times as moved."""
         moved = item.moved
         given = item.given
         assert isinstance(given, Sweep)

@@ -75,12 +75,7 @@ class MessageDecoder:
 
 
 class RecordedType:
-    """
-    Stand-in for the class of a message type, ``package/msg/Type`` or ``package/Type``.
-
-    Raises KeyError if the recording has no definition of it.
-
-    """
+    """Stand-in for the class of a message type; KeyError if the recording does not define it."""
 
     def __init__(self, store: Typestore, name: str) -> None:
         package, _, kind = name.replace('/msg/', '/').partition('/')

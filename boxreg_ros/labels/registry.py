@@ -44,12 +44,7 @@ COMMAND_LINE_OPTIONS = ('camera', 'with_points', 'swap_axes')
 
 
 def module_of(name: str) -> FormatModule:
-    """
-    Return the module of a format.
-
-    Raises ConfigError if the format does not exist, or needs a package that is not installed.
-
-    """
+    """Return the module of a format; ConfigError if it does not exist, or lacks a package."""
     module = import_format(name)
     for package in module.FORMAT.packages:
         try:
@@ -105,12 +100,7 @@ def check_options(names: Sequence[str], options: Options) -> None:
 def writer_for(
     name: str, out: Path, provenance: Provenance, options: Options | None = None
 ) -> LabelWriter:
-    """
-    Return a writer of this format for the folder of results `out`.
-
-    Raises ConfigError as `module_of`, or if the format needs an option that is not given.
-
-    """
+    """Return a writer of this format for the folder of results `out`; raises as `module_of`."""
     module = module_of(name)
     folder = _folder_of(name, out)
     folder.mkdir(exist_ok=True)

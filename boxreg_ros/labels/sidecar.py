@@ -40,12 +40,7 @@ class Sidecar:
 
 
 def read_sidecar(folder: Path, count: int, stamps: Path | None = None) -> Sidecar:
-    """
-    Return the stamps and poses of at least `count` frames.
-
-    Raises RecordingError if `stamps` (default: ``timestamps.txt``) is missing or has too few.
-
-    """
+    """Return stamps (of `stamps`, if given) and poses of `count` frames, or RecordingError."""
     path = stamps or folder / STAMPS_FILE
     stamps_ns = read_stamps(path)
     if len(stamps_ns) < count:
@@ -86,12 +81,7 @@ def numbered_scene(
 
 
 def read_stamps(path: Path) -> list[int]:
-    """
-    Return the stamps of a file [ns]: integers, or date and time (UTC) as in KITTI raw.
-
-    Raises RecordingError if there is no such file, or a line is neither.
-
-    """
+    """Return the stamps of a file [ns]: integers, or UTC as in KITTI raw; else RecordingError."""
     try:
         lines = path.read_text(encoding='utf-8').split('\n')
     except OSError:

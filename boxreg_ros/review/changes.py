@@ -79,12 +79,7 @@ class TrackChanges:
 
 
 class Changes:
-    """
-    Collect all boxes before and after registration, in a few numbers each.
-
-    Boxes that are not in the fixed frame are counted, but their numbers are NaN.
-
-    """
+    """Collect all boxes before and after, in a few numbers each; NaN in other frames."""
 
     def __init__(self, fixed_frame: str) -> None:
         self._fixed_frame = fixed_frame

@@ -66,12 +66,7 @@ def points_per_box(boxes: int) -> int:
 
 
 class TrackTruth(NamedTuple):
-    """
-    The true boxes of a track (n, 9), and the 3D IoU (n,) of the input and the refined boxes.
-
-    NaN where there is no true box.
-
-    """
+    """True boxes of a track (n, 9), and 3D IoU (n,) of input and refined boxes; NaN without."""
 
     boxes: Floats
     iou_before: Floats

@@ -53,12 +53,7 @@ class DriveProgress:
 
 
 def progress_of(out: Path) -> DriveProgress:
-    """
-    Return how far the review of a result is.
-
-    Raises RecordingError if it has no list of tracks, or its decisions cannot be read.
-
-    """
+    """Return how far the review of a result is; RecordingError if its files cannot be read."""
     risks = _risks(out / REVIEW)
     path = out / DECISIONS
     made = read_decisions(path) if path.exists() else []

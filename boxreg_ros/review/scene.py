@@ -51,12 +51,7 @@ class DriveSource:
 
 
 class DriveScene:
-    """
-    The sweeps of a drive, in the fixed frame.
-
-    They are read in a thread, into a temporary file; who asks for one waits for it.
-
-    """
+    """The sweeps of a drive in the fixed frame, read in a thread that callers wait for."""
 
     def __init__(self, source: DriveSource) -> None:
         self._source = source
@@ -84,12 +79,7 @@ class DriveScene:
             return self._store.stamps_ns[row], self._store.origin, self._store[row], sensor
 
     def follow(self, seeds: Sequence[BoxArray]) -> FollowedTrack:
-        """
-        Follow an object through all sweeps from its boxes, and solve its track.
-
-        Raises RecordingError if the recording cannot be read, or no seed can be followed.
-
-        """
+        """Follow an object from its boxes, and solve its track; RecordingError if that fails."""
         with self._changed:
             self._wait(None)
         origin = self._store.origin

@@ -53,12 +53,7 @@ def serve(results: Results, port: int, who: str) -> int:
 
 
 class ReviewServer:
-    """
-    A server for result folders, bound to loopback at `server_port`.
-
-    `address` has the token that opens the page; `log_paths` are the files of the decisions.
-
-    """
+    """A server for result folders on loopback; its `address` has the token that opens the page."""
 
     def __init__(self, results: Results, bound: socket.socket, who: str) -> None:
         from boxreg_ros.review.application import review_application, TimedProtocol

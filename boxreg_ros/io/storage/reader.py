@@ -101,12 +101,7 @@ class Reader:
             yield from merged_streams(streams)
 
     def deserialize(self, data: bytes, msgtype: str) -> Any:
-        """
-        Return a message; its first byte shows the encoding.
-
-        Raises UnsupportedMessage if the bytes do not follow the definition, or there is none.
-
-        """
+        """Return a message, encoded as its first byte shows, or raise UnsupportedMessage."""
         if msgtype in self._decoders and data[:1] != b'\0':
             return self._decoders[msgtype](data)
         if data[:4] == ZSTD_MAGIC:
