@@ -21,7 +21,7 @@ from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder, RecordedType
 from boxreg_ros.io.recorded_motion import RecordedMotion
 from boxreg_ros.io.resync import MessageOrder
-from boxreg_ros.io.storage.files import is_ros1, part_of
+from boxreg_ros.io.storage.files import part_of
 from boxreg_ros.io.storage.reader import Reader
 from boxreg_ros.io.storage.record import Damage, Record
 from boxreg_ros.io.topics import ODOMETRY_TYPE, Topics
@@ -83,10 +83,6 @@ class Recording:
         """Open all files and find the topics."""
         parts = [part_of(path) for path in self._paths]
         self.files = [file for part in parts for file in part.files]
-        if len({is_ros1(file) for file in self.files}) > 1:
-            raise RecordingError(
-                'recordings of ROS 1 and ROS 2 cannot be merged; relabel them one by one'
-            )
         self._reader = Reader(parts)
         try:
             self._find_topics()

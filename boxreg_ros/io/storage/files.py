@@ -89,11 +89,6 @@ def size_of(path: Path) -> int:
     return path.stat().st_size if url_of(path) is None else entry_of(path).size
 
 
-def is_ros1(path: Path) -> bool:
-    """Return whether a file is a ROS 1 bag."""
-    return OPENERS.get(_kind(path)) is Rosbag1File
-
-
 def opened(path: Path) -> StorageFile:
     """Open a file, unpacked first if compressed; RecordingError if nothing can be read."""
     opener = OPENERS.get(_kind(path))
