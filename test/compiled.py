@@ -5,7 +5,7 @@ import shutil
 from paths import ROOT
 import pytest
 
-KERNELS = ('boxreg_ros/core/method', 'boxreg_ros/core/following/kernels')
+KERNELS = ('boxreg_ros/core/method',)
 READER = 'msg_adapters'
 """Where the only other compiled function lies, the reader of box messages."""
 

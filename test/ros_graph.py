@@ -58,6 +58,24 @@ class Graph:
         self.processes.append(process)
         return process
 
+    def run(self, records, *ros_args, kind=DETECTIONS, command=(NODE,)):
+        """
+        Return a node that is connected to publishers of the topics of a recording.
+
+        It has the lists ``early``, ``final`` and ``diagnostics``, which fill with its messages.
+
+        """
+        publishers_for(self, records)
+        collected = [
+            self.collect(kind, '/refined_boxes'),
+            self.collect(kind, '/refined_boxes_final'),
+            self.collect(DIAGNOSTICS, '/diagnostics'),
+        ]
+        node = self.start(*RELIABLE, *ros_args, command=command)
+        node.early, node.final, node.diagnostics = collected
+        self.wait_until_connected()
+        return node
+
     def start_player(self, path, boxes_topic='/boxes'):
         """Start a process that plays a recording when a line arrives on its standard input."""
         command = [__file__, str(path), boxes_topic, str(self.domain)]
@@ -169,6 +187,14 @@ class NodeProcess:
                 [sys.executable, *command], cwd=ROOT, env={**os.environ, **environment},
                 stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT,
             )  # fmt: skip
+
+    def play(self, records):
+        """Publish records, and wait after each box message until it is refined."""
+        play(self._graph, records, self.early)
+
+    def values(self):
+        """Return the newest values of the status as a dict of texts."""
+        return values_of(self.diagnostics)
 
     def output(self):
         return self._log.read_text() if self._log.exists() else ''

@@ -1,5 +1,6 @@
 """Scenes with known truth: a car and the points of a stationary sensor; batches by hand."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 from boxreg_ros.config import KINDS
@@ -107,6 +108,23 @@ def stream_of(tracks):
         )  # fmt: skip
         pairs.append((sweep, boxes))
     return pairs
+
+
+def cut(track, part):
+    """Return the observations `part` of a track."""
+    return replace(
+        track, stamps_ns=track.stamps_ns[part], boxes=track.boxes[part], points=track.points[part],
+        sensor_origins=track.sensor_origins[part],
+    )  # fmt: skip
+
+
+def fed(registrar, stream):
+    """Add sweeps and boxes to a registrar, and return the results."""
+    results = []
+    for sweep, boxes in stream:
+        results += registrar.add_sweep(sweep)
+        results += registrar.add_boxes(boxes)
+    return results
 
 
 def observation(**changes):

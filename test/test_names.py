@@ -7,7 +7,7 @@ from paths import ROOT
 
 PROTOCOL = {'DATASET', 'FORMAT', 'REQUIRED_FIELDS', '__all__'}
 """Names that each label format, data set or message adapter defines for itself."""
-KERNELS = [ROOT / 'boxreg_ros' / 'core' / name for name in ('method', 'following/kernels')]
+KERNELS = [ROOT / 'boxreg_ros' / 'core' / name for name in ('method',)]
 """Kernels number what others have under the same names: variables as slices, reasons."""
 
 

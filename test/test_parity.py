@@ -10,7 +10,7 @@ from msg_adapters.clouds import COMPRESSED_TYPE
 from msg_adapters.poses import quaternions_of
 import numpy as np
 import pytest
-from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
+from ros_graph import ended_cleanly, graph_in, records_of, RELIABLE, ROOT, stamp_of
 from ros_messages import DETECTIONS, Drive, JSK, MARKERS
 
 SETTINGS = {'window': 5, 'lag': 3}
@@ -65,46 +65,28 @@ def test_final_boxes_equal_those_of_relabel(tmp_path, recording):
     expected = relabelled(path, tmp_path / 'out', *(f'--set={k}={v}' for k, v in late.items()))
     records = records_of(path, boxes_topic)
     (type_name,) = {record.type_name for record in records if record.topic == boxes_topic}
-    with graph_in(tmp_path) as graph:
-        options = [*UNHURRIED, 'output_frame:=odom']
-        options += [f'{key}:={value}' for key, value in {**SETTINGS, **late}.items()]
-        publishers_for(graph, records)
-        early = graph.collect(type_name, '/refined_boxes')
-        final = graph.collect(type_name, '/refined_boxes_final')
-        parameters = [part for option in options for part in ('-p', option)]
-        node = graph.start(*RELIABLE, *parameters, '-r', f'boxes:={boxes_topic}')
-        graph.wait_until_connected()
-        play(graph, records, early)
-        node.stop()
-        assert node.popen.returncode == 0, node.output()
+    parameters = [f'{key}:={value}' for key, value in late.items()]
+    final = final_of_node(tmp_path, records, *parameters, boxes=(type_name, boxes_topic))
     # Boxes that the node held when it received the signal are included.
-    found = as_published(final, type_name)
-    assert found.keys() == expected.keys()
-    keys = sorted(expected)
-    difference = np.abs(np.array([found[k] for k in keys]) - [expected[k] for k in keys])
-    assert difference.max() < 1e-6
+    assert_equal_boxes(as_published(final, type_name), expected)
     assert [stamp_of(message) for message in final] == sorted({stamp for stamp, _ in expected})
 
 
-def final_of_node(tmp_path, records, *parameters):
-    """Return the final boxes of the node for records, as of `as_published`, and its output."""
+def final_of_node(tmp_path, records, *parameters, boxes=(DETECTIONS, '/boxes')):
+    """Return the final boxes of the node for records, with boxes of a type on a topic."""
+    type_name, boxes_topic = boxes
+    options = [*UNHURRIED, 'output_frame:=odom', *parameters]
+    options += [f'{key}:={value}' for key, value in SETTINGS.items()]
+    topics = {record.topic for record in records if record.topic not in ('/tf', '/tf_static')}
+    options += [
+        f'qos_overrides.{topic}.subscription.reliability:=reliable' for topic in sorted(topics)
+    ]
+    every = [part for option in options for part in ('-p', option)]
     with graph_in(tmp_path) as graph:
-        options = [*UNHURRIED, 'output_frame:=odom']
-        options += [f'{key}:={value}' for key, value in SETTINGS.items()]
-        topics = {record.topic for record in records if record.topic not in ('/tf', '/tf_static')}
-        options += [
-            f'qos_overrides.{topic}.subscription.reliability:=reliable' for topic in sorted(topics)
-        ]
-        publishers_for(graph, records)
-        early = graph.collect(DETECTIONS, '/refined_boxes')
-        final = graph.collect(DETECTIONS, '/refined_boxes_final')
-        every = [part for option in [*options, *parameters] for part in ('-p', option)]
-        node = graph.start(*every)
-        graph.wait_until_connected()
-        play(graph, records, early)
-        node.stop()
-        assert node.popen.returncode == 0, node.output()
-        return as_published(final, DETECTIONS), node.output()
+        node = graph.run(records, *every, '-r', f'boxes:={boxes_topic}', kind=type_name)
+        node.play(records)
+        assert ended_cleanly(node)
+        return node.final
 
 
 def assert_equal_boxes(found, expected):
@@ -124,8 +106,8 @@ def test_missed_detections_are_added_live_and_offline(tmp_path):
     assert len(expected) == 24
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
     assert (summary['boxes_in'], summary['status']['coasted']) == (22, 2)
-    found, _ = final_of_node(tmp_path, records_of(path), 'coast:=0.5')
-    assert_equal_boxes(found, expected)
+    final = final_of_node(tmp_path, records_of(path), 'coast:=0.5')
+    assert_equal_boxes(as_published(final, DETECTIONS), expected)
 
 
 @pytest.mark.parametrize('clouds', ['topics', 'compressed', 'info'])
@@ -141,8 +123,8 @@ def test_two_lidars_give_the_same_boxes_live_and_offline(tmp_path, clouds):
         parameters = ['points:=[/front, /rear]']
     if clouds == 'compressed':
         parameters.append(f'points_type:={COMPRESSED_TYPE}')
-    found, _ = final_of_node(tmp_path, records_of(path), *parameters)
-    assert_equal_boxes(found, expected)
+    final = final_of_node(tmp_path, records_of(path), *parameters)
+    assert_equal_boxes(as_published(final, DETECTIONS), expected)
 
 
 @pytest.mark.parametrize('type_name', [t for t in ADAPTERS if t not in (DETECTIONS, MARKERS)])

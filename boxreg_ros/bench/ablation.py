@@ -30,20 +30,10 @@ ABLATED_ESTIMATES = ('final', 'track')
 
 @dataclass(frozen=True, slots=True)
 class Ingredient:
-    """
-    A part of the method that can be switched off.
+    """A part of the method that can be switched off."""
 
-    Attributes
-    ----------
-    meaning : str
-        Description of the method without it.
-    settings : mapping
-        Values of `Config` that switch it off, by dotted name.
-
-    """
-
-    meaning: str
-    settings: Mapping[str, Any]
+    meaning: str  # description of the method without it
+    settings: Mapping[str, Any]  # values of `Config` that switch it off, by dotted name
 
 
 def _without(*names: str) -> dict[str, tuple[str, ...]]:
@@ -182,10 +172,8 @@ def greedy(
     """
     Leave out the ingredient that costs least, again and again, up to the loss ``--greedy``.
 
-    Returns
-    -------
-    order : list of pairs
-        Names of all that are out so far, and the largest loss of mean 3D IoU of an estimate.
+    Return the names of all that are out so far, with the largest loss of mean 3D IoU of an
+    estimate.
 
     """
     whole = {

@@ -256,12 +256,9 @@ def print_tables(folder: Path, drive: Drive, found: Mapping[str, Matches | str])
 
 def iou_and_group_values(drive: Drive, matches: Matches, mode: str) -> Floats:
     """
-    Return for each true box its IoU and the values by which boxes are grouped.
+    Return (n, 3): for each true box its IoU, range [m] and number of points, to group by.
 
-    Returns
-    -------
-    rows : array, shape (n, 3)
-        IoU of `mode` (NaN without a prediction), range [m], number of points.
+    The IoU of `mode` is NaN without a prediction.
 
     """
     iou = matches.iou_3d if mode == '3d' else matches.iou_bev

@@ -184,14 +184,9 @@ def _without_flips(yaw: Floats) -> Floats:
 
 def _map_estimate(times: Floats, values: Floats, deviation: float, change: float) -> Floats:
     """
-    Return the maximum a posteriori estimate of a coordinate by reweighted least squares.
+    Return the maximum a posteriori estimate (N,) by reweighted least squares at times (N,) [s].
 
-    Parameters
-    ----------
-    times, values : arrays, shape (N,)
-        Seconds, and the noisy coordinate.
-    deviation, change : float
-        Standard deviations of a value and of its second derivative.
+    The standard deviations are those of a value and of its second derivative.
 
     """
     n = len(values)
@@ -269,13 +264,8 @@ def icp(track: Track) -> Floats:
     """
     Return boxes aligned by ICP of the points to points sampled on the visible faces.
 
-    Only x, y and yaw of the transform are used: a vehicle does not fill its box, so points on its
-    slopes bias z, roll and pitch.
-
-    Raises
-    ------
-    ImportError
-        Without small_gicp.
+    Only x, y and yaw of the transform are used: a vehicle does not fill its box, so points on
+    its slopes bias z, roll and pitch. Raises ImportError without small_gicp.
 
     """
     import small_gicp

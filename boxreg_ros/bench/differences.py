@@ -26,45 +26,23 @@ REFERENCE_METHODS = {
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """
-    Mean IoU of one method minus that of another, over the true boxes that both have.
-
-    Attributes
-    ----------
-    boxes : int
-        Number of true boxes.
-    iou_bev, iou_bev_error, iou_3d, iou_3d_error : float
-        Means, and their standard errors by `clustered_error`.
-    tracks, tracks_ahead : int
-        Number of tracks, and of those whose mean BEV IoU by the first method is not lower.
-
-    """
+    """Mean IoU of one method minus that of another, over the true boxes that both have."""
 
     boxes: int
     iou_bev: float
-    iou_bev_error: float
+    iou_bev_error: float  # standard error by `clustered_error`
     iou_3d: float
     iou_3d_error: float
     tracks: int
-    tracks_ahead: int
+    tracks_ahead: int  # of which the mean BEV IoU by the first method is not lower
 
 
 @dataclass(frozen=True, slots=True)
 class PairedBoxes:
-    """
-    True boxes that two methods have.
+    """True boxes that two methods have."""
 
-    Attributes
-    ----------
-    tracks : tuple of n str
-        Id of the track of each.
-    iou_bev, iou_3d : array, shape (n,)
-        IoU by the first method minus that by the second.
-
-    """
-
-    tracks: tuple[str, ...]
-    iou_bev: Floats
+    tracks: tuple[str, ...]  # n, the id of the track of each
+    iou_bev: Floats  # (n,) by the first method minus that by the second
     iou_3d: Floats
 
     @classmethod
@@ -96,16 +74,7 @@ def differences(
     """
     Return the differences of a method to its `REFERENCE_METHODS`.
 
-    Parameters
-    ----------
-    method : str
-        One of `found`.
-    found : mapping of str to Matches
-        By method, all of the same n true boxes.
-    truth : BoxTable
-        The true boxes.
-    scope : array, shape (n,)
-        Which of them count.
+    `found` has the matches by method, all of the same n true boxes, of which `scope` (n,) count.
 
     """
     return {

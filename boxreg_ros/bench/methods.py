@@ -39,21 +39,7 @@ def run_methods(
     wanted: Sequence[str] = METHODS,
     done: Callable[[], object] = lambda: None,
 ) -> Methods:
-    """
-    Return the boxes of every method for one drive, the input first.
-
-    Parameters
-    ----------
-    drive : Drive
-        Sweeps and noisy boxes that all methods get.
-    mode : str
-        As `Config.mode`; the baselines ignore it.
-    wanted : sequence of str
-        Some of `METHODS`.
-    done : callable
-        Called after each of them.
-
-    """
+    """Return the boxes of the `wanted` methods, the input first; baselines ignore `mode`."""
     methods: Methods = {'input': BoxTable.from_arrays(drive.boxes)}
     needs_tracks = not BASELINES.keys().isdisjoint(wanted)
     tracks = drive.tracks() if needs_tracks else []

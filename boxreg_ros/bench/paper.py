@@ -40,14 +40,10 @@ PAPER_SCENARIOS = {'3d': 'paper', 'bev': 'paper-bev'}
 
 class ModeResult:
     """
-    Rows of one mode, collected over the seeds.
+    Rows of one mode, collected over the seeds, per method.
 
-    Attributes
-    ----------
-    rows : dict of str to list
-        Per method: one `error_row` per seed, or the reason why the method did not run.
-    group_values : dict of str to list of arrays, shape (n, 3)
-        Per method: one `iou_and_group_values` per seed.
+    `rows` has one `error_row` per seed, or the reason why the method did not run, `group_values`
+    one `iou_and_group_values` (n, 3).
 
     """
 
@@ -96,17 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """
-    Print Table I and draw the two figures.
-
-    Raises
-    ------
-    ConfigError
-        If ``--seeds`` is below 1.
-    BoxregError
-        If matplotlib is not installed.
-
-    """
+    """Print Table I and draw the two figures, which need matplotlib."""
     if args.seeds < 1:
         raise ConfigError(f'--seeds: expected 1 or more, got {args.seeds}')
     results: dict[str, ModeResult] = {}
@@ -186,15 +172,7 @@ def _mean_row(found: Sequence[tuple[float, ...] | str]) -> tuple[float, ...] | s
 
 
 def draw_figures(folder: Path, mode: str, methods: Methods, truth: BoxTable) -> None:
-    """
-    Draw trajectory and errors over time as PNG files: truth, input and the last method.
-
-    Raises
-    ------
-    BoxregError
-        If matplotlib is not installed.
-
-    """
+    """Draw trajectory and errors over time of truth, input and the last method as PNG files."""
     try:
         import matplotlib
     except ImportError:

@@ -18,17 +18,8 @@ def read_bin(path: Path, suffix: str) -> Cloud:
     """
     Return the cloud of a BIN file: rows of little-endian float32 that begin x y z intensity.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    suffix : str
-        A key of `BIN_COLUMNS`: the number of columns.
-
-    Raises
-    ------
-    UnsupportedMessage
-        If the file is missing or is not a whole number of rows.
+    Their number of columns is that of `suffix` in `BIN_COLUMNS`. Raises UnsupportedMessage if
+    the file is missing or is not a whole number of rows.
 
     """
     columns = BIN_COLUMNS[suffix]
@@ -72,15 +63,7 @@ def missing_sweep(path: Path, error: OSError) -> UnsupportedMessage:
 
 
 def require(path: Path, what: str, remedy: str) -> Path:
-    """
-    Return a file or folder of a data set.
-
-    Raises
-    ------
-    RecordingError
-        If it does not exist; `what` names it and `remedy` says where it comes from.
-
-    """
+    """Return a file or folder of a data set; RecordingError with `what` it is and the remedy."""
     if not path.exists():
         raise RecordingError(f'{path}: expected {what}, got no such file; {remedy}')
     return path
@@ -90,10 +73,7 @@ def require_lidars(asked: Sequence[str], names: Sequence[str], main: str = '') -
     """
     Return the LiDARs that are asked for, else the main one, else the only one.
 
-    Raises
-    ------
-    RecordingError
-        If there is no such LiDAR, or several and none is the main one.
+    Raises RecordingError if there is no such LiDAR, or several and none is the main one.
 
     """
     default = [main] if main else list(names)[: len(names) == 1]

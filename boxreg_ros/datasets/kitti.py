@@ -44,19 +44,9 @@ def oxts_rows(path: Path) -> Floats:
 
 def oxts_poses(rows: Floats, T_velo_imu: Floats) -> Floats:
     """
-    Return the poses of the LiDAR, relative to the position of the first row.
+    Return the poses (n, 7) of the LiDAR, relative to the position of the first row (n, 30).
 
-    Parameters
-    ----------
-    rows : array, shape (n, 30)
-        Of OXTS.
-    T_velo_imu : array, shape (4, 4)
-        Pose of the GPS/IMU unit in the frame of the LiDAR.
-
-    Returns
-    -------
-    poses : array, shape (n, 7)
-        x y z qx qy qz qw; x is east, y is north, z is up.
+    They are x y z qx qy qz qw; x is east, y is north, z is up.
 
     """
     latitude, longitude = np.radians(rows[:, 0]), np.radians(rows[:, 1])
@@ -70,12 +60,7 @@ def oxts_poses(rows: Floats, T_velo_imu: Floats) -> Floats:
 
 
 def exported_poses(folder: Path, count: int) -> tuple[Ints, Floats] | None:
-    """
-    Return stamps and poses of our own exports, which have no OXTS; None for other folders.
-
-    Frames whose pose is unknown are left out.
-
-    """
+    """Return stamps and known poses of our own exports, without OXTS; None for other folders."""
     if not (folder / POSES_FILE).is_file():
         return None
     stamps_ns = np.array(read_stamps(folder / STAMPS_FILE), np.int64)

@@ -25,23 +25,11 @@ MAX_NAMED = 5
 
 
 class Address(NamedTuple):
-    """
-    A scene of a data set, on the command line ``PREFIX:FOLDER#SCENE``.
+    """A scene of a data set, on the command line ``PREFIX:FOLDER#SCENE``."""
 
-    Attributes
-    ----------
-    dataset : str
-        A name of `DATASETS`.
-    root : Path
-        Folder of the data set.
-    scene : str
-        Name of the scene; '' for the only one.
-
-    """
-
-    dataset: str
+    dataset: str  # a name of `DATASETS`
     root: Path
-    scene: str
+    scene: str  # '' for the only one
 
     def __str__(self) -> str:
         """Return the address as on the command line."""
@@ -53,10 +41,7 @@ def address_of(path: Path) -> Address | None:
     """
     Return the address that the text of a path states; None for a file or folder.
 
-    Raises
-    ------
-    RecordingError
-        If the text has the form of an address, but no data set has its prefix.
+    Raises RecordingError if it has the form of an address, but no data set has its prefix.
 
     """
     prefix, colon, rest = str(path).partition(':')
@@ -84,12 +69,8 @@ def scene_names(address: Address) -> list[str]:
     """
     Return the names of all scenes in the folder of a data set.
 
-    Raises
-    ------
-    RecordingError
-        If there are none; the message names the files that are expected.
-    ConfigError
-        If the data set needs a package that is not installed.
+    Raises RecordingError if there are none, with the files that are expected, and ConfigError if
+    the data set needs a package that is not installed.
 
     """
     module = module_of(address.dataset)
@@ -117,10 +98,8 @@ def resolved(address: Address) -> Address:
     """
     Return the address with the name of its scene.
 
-    Raises
-    ------
-    RecordingError
-        If there is no such scene, or several and none is named; also as `scene_names`.
+    Raises RecordingError if there is no such scene, or several and none is named; also as
+    `scene_names`.
 
     """
     names = scene_names(address)

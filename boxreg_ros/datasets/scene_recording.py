@@ -27,32 +27,10 @@ class SceneRecording:
     """
     Clouds, poses and boxes of a scene, as `Recording` has those of a bag: an `ItemSource`.
 
-    One sweep is in memory at a time. Sweeps that cannot be read are counted and left out.
-
-    Parameters
-    ----------
-    address : Address
-        Data set, folder and scene.
-    lidars : sequence of str
-        Names of the LiDARs; by default the main one of the data set.
-    start, end : float, optional
-        Part to read, from the first sweep [s].
-    labels : tuple of str and Path, optional
-        Format and path of label files to read the boxes from, in place of the annotations.
-
-    Attributes
-    ----------
-    has_boxes : bool
-        Whether boxes are required.
-    points_topic, placement, boxes_topic, odometry_topic, start_ns, end_ns
-        See `ItemSource`.
-    unreadable, first_errors, outside
-        See `ItemSource`.
-
-    Raises
-    ------
-    RecordingError
-        On entering, if the scene or a part of it is missing.
+    One sweep is in memory at a time. Sweeps that cannot be read are counted and left out. The
+    LiDARs are by default the main one of the data set; `start` and `end` are counted from the
+    first sweep [s]; with `labels`, a format and a path, the boxes are those of label files and
+    not the annotations. Entering raises RecordingError if the scene or a part of it is missing.
 
     """
 
@@ -134,10 +112,7 @@ class SceneRecording:
         """
         Return the fixed frame of the scene, and add its first pose to `tree`.
 
-        Raises
-        ------
-        RecordingError
-            If `fixed_frame` is neither this frame nor that of the clouds.
+        Raises RecordingError if `fixed_frame` is neither this frame nor that of the clouds.
 
         """
         frames = self._scene.frames

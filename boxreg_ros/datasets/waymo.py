@@ -241,19 +241,7 @@ def _rays(calibration: _Calibration, shape: tuple[int, ...], rows: Any, columns:
 
 
 def _at_stamp(points: Floats, pixel_poses: Floats, T_world_vehicle: Floats) -> Floats:
-    """
-    Return points of the vehicle frame at their own times in that at the stamp.
-
-    Parameters
-    ----------
-    points : array, shape (M, 3)
-        In the frame of the vehicle when each was measured [m].
-    pixel_poses : array, shape (M, 6)
-        Pose of this frame in the world: roll pitch yaw x y z [rad, m].
-    T_world_vehicle : array, shape (4, 4)
-        Pose of the vehicle at the stamp.
-
-    """
+    """Return points (M, 3) moved to the stamp; each has a pose (M, 6) roll pitch yaw x y z."""
     R = matrix_from_rpy(pixel_poses[:, :3])
     world = np.einsum('mij,mj->mi', R, points) + pixel_poses[:, 3:]
     T = inverse(T_world_vehicle)

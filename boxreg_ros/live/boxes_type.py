@@ -15,14 +15,8 @@ class BoxesTypeSearch:
     """
     Takes the first type, by name, that has an adapter and whose package is installed.
 
-    Parameters
-    ----------
-    topics : NodeTopics
-        Reads the graph.
-    name : str
-        Resolved name of the topic, for problems.
-    convention : Convention
-        Convention of the boxes: decides whether types without track ids are accepted.
+    `name` is that of the topic, resolved. The convention of the boxes decides whether types
+    without track ids are accepted.
 
     """
 

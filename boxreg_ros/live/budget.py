@@ -43,27 +43,17 @@ class TickBudget:
     Limit the windows that are solved for a box array, so that it is published by its deadline.
 
     The registrar reads no clock; this object does for it. The time for windows is the deadline
-    less the time used by then, for decoding and cropping, less that for publishing, less a reserve
-    for overruns. The times of a window and of publishing are the second
-    longest of `RECENT` ones, the reserve is the second largest overrun of `OVERRUNS` ticks: a
-    single interruption of the process is ignored.
+    less the time used by then, for decoding and cropping, less that for publishing, less a
+    reserve for overruns. The times of a window and of publishing are the second longest of
+    `RECENT` ones, the reserve is the second largest overrun of `OVERRUNS` ticks: a single
+    interruption of the process is ignored.
 
-    Final boxes are given up last. In a tick that is late with any plan, and after the early boxes
-    of any other, the windows that they need are solved, as long as these take no longer than what
-    a batch costs in any case (`BATCH_OVERHEAD`): else clouds would be dropped.
+    Final boxes are given up last. In a tick that is late with any plan, and after the early
+    boxes of any other, the windows that they need are solved, as long as these take no longer
+    than what a batch costs in any case (`BATCH_OVERHEAD`): else clouds would be dropped.
 
-    Parameters
-    ----------
-    deadline : float
-        Maximum time from complete data to published early boxes [s]; negative:
-        `PART_OF_PERIOD` of the measured period of the boxes.
-    clock : callable
-        Returns a time that never jumps [s].
-
-    Attributes
-    ----------
-    deadline : float
-        As above; may change.
+    `deadline`, which may change, is the maximum time from complete data to published early boxes
+    [s]; negative: `PART_OF_PERIOD` of the measured period of the boxes.
 
     """
 
@@ -102,17 +92,9 @@ class TickBudget:
 
     def windows(self, needed: int) -> int:
         """
-        Return how many windows may be solved before the early boxes are published.
+        Return how many windows may be solved before the early boxes are published, at least one.
 
-        Parameters
-        ----------
-        needed : int
-            Windows per box array that refine every final box.
-
-        Returns
-        -------
-        limit : int
-            At least one, so that its time is measured.
+        `needed` is the number of windows per box array that refine every final box.
 
         """
         self._owed = min(needed, BATCH_OVERHEAD)

@@ -32,11 +32,6 @@ class Health:
 
     Counters only grow. Rates and levels refer to the time since the last `status`.
 
-    Parameters
-    ----------
-    logger : RcutilsLogger
-        Logger of the node.
-
     """
 
     def __init__(self, logger: RcutilsLogger) -> None:
@@ -103,32 +98,14 @@ class Health:
                 self._log(reason, text)
 
     def log_waiting(self, fixed_frame: str) -> None:
-        """
-        Log what the node waits for, every `LOG_PERIOD` until its first refined box.
-
-        Parameters
-        ----------
-        fixed_frame : str
-            Frame to refine in; '' while it is not known.
-
-        """
+        """Log what the node waits for, every `LOG_PERIOD` until its first refined box."""
         with self._lock:
             counts = self._counts + self._core_counts
         if not counts[REFINED] and self.is_due(WAITING):
             self._logger.info(f'waiting for {_awaited(counts, fixed_frame)}; no box refined yet')
 
     def status(self, name: str, facts: Mapping[str, object]) -> DiagnosticStatus:
-        """
-        Return the state since the last call.
-
-        Parameters
-        ----------
-        name : str
-            Name of the status.
-        facts : mapping
-            Further values, reported between the latencies and the counters.
-
-        """
+        """Return the state since the last call; `facts` come between latencies and counters."""
         now = time.monotonic()
         with self._lock:
             counts = self._counts + self._core_counts

@@ -18,29 +18,13 @@ many more of them than of clouds may wait.
 
 
 class Message(NamedTuple):
-    """
-    A received message.
+    """A received message."""
 
-    Attributes
-    ----------
-    number : int
-        Order of arrival.
-    topic : str
-        ``points``, ``boxes`` or ``passing``.
-    content : message
-        As received.
-    received_ns : int
-        Time of arrival (monotonic) [ns].
-    lidar : str
-        Topic of a cloud, where those of several are merged.
-
-    """
-
-    number: int
-    topic: str
+    number: int  # order of arrival
+    topic: str  # ``points``, ``boxes`` or ``passing``
     content: Any
-    received_ns: int
-    lidar: str = ''
+    received_ns: int  # time of arrival (monotonic)
+    lidar: str = ''  # topic of a cloud, where those of several are merged
 
 
 class Inbox:
@@ -48,21 +32,9 @@ class Inbox:
     Bounded queues of clouds and box arrays, and an unbounded one of events.
 
     Events are transforms, odometry, parameter changes and service requests. The worker handles
-    them before the next message. Thread-safe: neither thread waits for the other.
-
-    Parameters
-    ----------
-    capacity : int
-        Number of clouds of each LiDAR that may wait.
-    lidars : int
-        Number of LiDARs.
-
-    Attributes
-    ----------
-    capacity : dict of str to int
-        Number of messages that may wait, by topic.
-    wake_up : threading.Event
-        Set whenever something was put.
+    them before the next message. Thread-safe: neither thread waits for the other. `capacity` is
+    the number of clouds of each LiDAR that may wait; the attribute has it by topic. `wake_up` is
+    set whenever something was put.
 
     """
 

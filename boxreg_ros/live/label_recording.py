@@ -37,17 +37,9 @@ class LabelRecording:
     """
     Start, stop and split the recording of labels. Used by the thread of the executor only.
 
-    Parameters
-    ----------
-    node : Node
-        Offers the services ``~/start_recording``, ``~/stop_recording`` and ``~/split`` while the
-        recording is open.
-    inbox : Inbox
-        Passes recorders to the worker, in the order of the messages.
-    health : Health
-        Counters of dropped items.
-    settings : callable
-        Returns the present settings of core and node.
+    While the recording is open the node offers ``~/start_recording``, ``~/stop_recording`` and
+    ``~/split``. The inbox passes recorders to the worker, in the order of the messages;
+    `settings` returns the present settings.
 
     """
 

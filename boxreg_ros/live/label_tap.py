@@ -21,13 +21,8 @@ class LabelTap:
     """
     Hand every box array to the recorder once, in the order of stamps, when it is final.
 
-    Without a recorder nothing is held. Box arrays that were with the registrar before `start` are
-    not recorded. Used by the thread of the worker only.
-
-    Parameters
-    ----------
-    session : Session
-        Has the transforms and the names of the frames.
+    Without a recorder nothing is held. Box arrays that were with the registrar before `start`
+    are not recorded. Used by the thread of the worker only.
 
     """
 

@@ -1,4 +1,4 @@
-"""The live node as a lifecycle node, for launch files and managers that start nodes in order."""
+"""The live node as a lifecycle node, and its bond with the manager that starts it in order."""
 
 from __future__ import annotations
 
@@ -6,15 +6,76 @@ from collections.abc import Callable
 from functools import partial
 from queue import Queue
 from threading import Event
+from typing import Any
+from uuid import uuid4
 
-from boxreg_ros.errors import BoxregError
-from boxreg_ros.live.bond import Bond
+from boxreg_ros.errors import BoxregError, UnsupportedMessage
 from boxreg_ros.live.label_recording import RECORDING_TIME
 from boxreg_ros.live.node import BoxregNode
+from boxreg_ros.live.topics import import_message
 from boxreg_ros.live.worker import Worker
 from lifecycle_msgs.srv import ChangeState
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
+
+BOND_TOPIC = 'bond'
+BOND_TYPE = 'bond/msg/Status'
+HEARTBEAT_PERIOD = 0.1
+"""Time between two heartbeats [s]; that of the nodes of Nav2."""
+HEARTBEAT_TIMEOUT = 4.0
+"""Silence after which the other end takes the bond for broken [s]; that of Nav2 by default."""
+BOND_DEPTH = 10
+"""Queue size: a second of heartbeats."""
+END_HEARD_TIME = 1.0
+"""Longest wait for the other end to take the last message [s]; ten of its heartbeats."""
+
+
+class Bond:
+    """
+    Publish heartbeats on `BOND_TOPIC` until `end`, which announces the end.
+
+    The manager has the other end and acts when heartbeats fail to come; the node does not depend
+    on the manager. Both ends name the bond by the name of the node.
+
+    """
+
+    def __init__(self, node: Node, kind: Any) -> None:
+        self._node = node
+        self._status = kind(
+            id=node.get_name(), instance_id=str(uuid4()), active=True,
+            heartbeat_timeout=HEARTBEAT_TIMEOUT, heartbeat_period=HEARTBEAT_PERIOD,
+        )  # fmt: skip
+        self._publisher = node.create_publisher(kind, BOND_TOPIC, BOND_DEPTH)
+        # A steady clock: the manager's timeout runs on while /clock stands still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(HEARTBEAT_PERIOD, self._publish, clock=steady)
+
+    @classmethod
+    def offered_by(cls, node: Node) -> Bond | None:
+        """Return a new bond; None, with a log entry, where its message type is not installed."""
+        try:
+            kind = import_message(BOND_TYPE)
+        except UnsupportedMessage as error:
+            node.get_logger().info(f'no bond, set bond_timeout of a manager to 0.0: {error}')
+            return None
+        return cls(node, kind)
+
+    def end(self) -> None:
+        """Announce the end of the bond, and publish no more."""
+        self._node.destroy_timer(self._timer)
+        self._status.active = False
+        self._publish()
+        # A publisher that is destroyed takes along what was not acknowledged.
+        self._publisher.wait_for_all_acked(Duration(seconds=END_HEARD_TIME))
+        self._node.destroy_publisher(self._publisher)
+
+    def _publish(self) -> None:
+        self._status.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(self._status)
+
 
 AnswerChange = Callable[[ChangeState.Request, ChangeState.Response], ChangeState.Response]
 

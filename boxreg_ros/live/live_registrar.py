@@ -60,28 +60,13 @@ Five periods of a LiDAR of 10 Hz.
 
 
 class Outgoing(NamedTuple):
-    """
-    A message to publish.
-
-    Attributes
-    ----------
-    message : message
-        Of the type of the input.
-    is_final : bool
-        True for the topic of final boxes, False for that of early ones.
-    given, refined : BoxArray and RefinedBoxes, or None
-        Input and result in the frame of `message`; None for an input message that is passed
-        through.
-    received : float or None
-        When the input arrived [s]; None if it is passed through.
-
-    """
+    """A message to publish, of the type of the input."""
 
     message: Any
-    is_final: bool
-    given: BoxArray | None = None
+    is_final: bool  # for the topic of final boxes, not of early ones
+    given: BoxArray | None = None  # in the frame of the message; None if it is passed through
     refined: RefinedBoxes | None = None
-    received: float | None = None
+    received: float | None = None  # when the input arrived [s]
 
 
 class _Detection(NamedTuple):
@@ -127,22 +112,20 @@ class LiveRegistrar:
         Settings of the core; `estimate` must be ``final``.
     fixed_frame, output_frame : str
         Frames to refine and to publish in. Empty: the topmost frame that the frame of the clouds
-        moves in, chosen once; and the frame of each input message.
+        moves in, chosen once; and the frame of each input message, which may change.
     transform_timeout : float
-        How long a message waits for transforms that cover its stamp [s]. After that, transforms
-        may be extrapolated a little.
+        How long a message waits for transforms that cover its stamp [s]; may change. After that,
+        transforms may be extrapolated a little.
     trouble : callable
         Called with reason, text and count for everything that is not refined here.
-    convention : Convention
-        Convention of the boxes, and whether ids are to be assigned.
-    lidars : Lidars
-        Topics of the clouds and frames of the LiDARs.
+    convention, lidars : Convention and Lidars
+        Of the boxes, whose ids may have to be assigned, and of the clouds.
     budget : TickBudget, optional
         Limits the windows that are solved for a box array. Default: all are solved.
     static_patience : float, optional
         How long a cloud without moving objects waits for its boxes [s]. Default: no such clouds
         are made.
-    input_model : str, optional
+    input_model : str
         File of what drives have shown of the detector: read now, and written by `save_model`.
 
     Attributes
@@ -151,8 +134,6 @@ class LiveRegistrar:
         Decodes clouds; to be fed by the caller with info messages.
     adapter : Adapter or None
         Reads and writes the boxes; to be set before the first of them.
-    output_frame, transform_timeout
-        As above; may change.
     tap : LabelTap
         Records labels, once it has a recorder.
     static_points : StaticPoints or None
@@ -244,14 +225,9 @@ class LiveRegistrar:
 
     def confirm(self, item: Item) -> tuple[list[Item], list[Outgoing]]:
         """
-        Confirm the order of stamps before a message is processed.
+        Return the messages to process next, in the order of stamps: none while this one is held.
 
-        Returns
-        -------
-        confirmed : list of Item
-            The messages to process next, in order: none while this one is held.
-        ready : list of Outgoing
-            Everything that was held where time went back: tracks and transforms start anew.
+        Also return all that was held where time went back: tracks and transforms start anew.
 
         """
         if is_placeholder(item.content):
@@ -413,17 +389,7 @@ class LiveRegistrar:
         return ready
 
     def lose(self, stamp_ns: int, lidar: str = '') -> list[Outgoing]:
-        """
-        Release the boxes that wait for a cloud that was dropped.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            Its stamp [ns].
-        lidar : str
-            Its topic, where the clouds of several are merged.
-
-        """
+        """Release the boxes that wait for a cloud that was dropped, of one of several LiDARs."""
         nothing = np.zeros((0, 3))
         sweep = Sweep(stamp_ns, self.fixed_frame, nothing, is_dropped=True, topic=lidar)
         if lidar:
@@ -487,15 +453,7 @@ class LiveRegistrar:
         return ready
 
     def save_model(self) -> str:
-        """
-        Add what this drive has shown of its detector to the file of the input model.
-
-        Returns
-        -------
-        differing : str
-            Where drives in it differ, which one detector would not do.
-
-        """
+        """Add this drive to the file of the input model; return where drives in it differ."""
         if self._model_file is None:
             return ''
         drives = joined([self._drives, self._registrar.statistics()])
@@ -505,17 +463,9 @@ class LiveRegistrar:
 
     def abandon(self, item: Item | None) -> list[Outgoing]:
         """
-        Start again after an internal error.
+        Start again after an internal error while a message was being processed.
 
-        Parameters
-        ----------
-        item : Item or None
-            The message that was being processed.
-
-        Returns
-        -------
-        ready : list of Outgoing
-            Messages made before the error, and all that are held, passed through.
+        Return the messages made before the error, and all that are held, passed through.
 
         """
         if self.static_points is not None:
@@ -551,12 +501,7 @@ class LiveRegistrar:
         """
         Return an input message as final boxes, or hold it behind those before it.
 
-        Parameters
-        ----------
-        message : message
-            As it was received.
-        reason : str
-            Reason for its boxes to be kept, in label files; empty: they are in no label file.
+        `reason` is that of its boxes in label files; empty: they are in none.
 
         """
         if reason and self.adapter is not None:

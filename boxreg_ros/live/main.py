@@ -18,19 +18,10 @@ def main(args: Sequence[str] | None = None, is_managed: bool = False) -> int:
     """
     Run the node until SIGINT or SIGTERM, then end the process.
 
-    Parameters
-    ----------
-    args : sequence of str, optional
-        Arguments after the name of the program; None: those of the process.
-    is_managed : bool
-        Whether to run the lifecycle node.
-
-    Returns
-    -------
-    int
-        Exit status if the node could not start: 2 if an argument or a parameter is wrong, else
-        1. Once started the process ends here, with status 0 after a signal and 1 after a failure.
-        Failures are printed in one line on stderr.
+    Return the exit status if the node could not start: 2 if an argument or a parameter is wrong,
+    else 1. Once started the process ends here, with status 0 after a signal and 1 after a
+    failure. Failures are printed in one line on stderr. The arguments are by default those of
+    the process.
 
     """
     for number in (signal.SIGINT, signal.SIGTERM):

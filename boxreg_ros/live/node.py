@@ -61,19 +61,9 @@ class BoxregNode(Node):
     `open_topics` creates topics and services. `close_topics` destroys these again.
 
     Callbacks run in the thread of the executor. They put messages and events into the inbox and
-    return at once. `worker` runs in another thread and does the rest.
-
-    Attributes
-    ----------
-    worker : Worker
-        Registers boxes and publishes them in the thread of `run_worker`; made by `open_topics`.
-    recording : LabelRecording
-        Writes the final boxes as label files, where that is asked for.
-
-    Raises
-    ------
-    ConfigError
-        If a parameter has a wrong value.
+    return at once. `worker`, made by `open_topics`, runs in the thread of `run_worker` and does
+    the rest. `recording` writes the final boxes as label files, where that is asked for. Raises
+    ConfigError if a parameter has a wrong value.
 
     """
 
@@ -117,12 +107,8 @@ class BoxregNode(Node):
         """
         Create topics, services and timers.
 
-        Raises
-        ------
-        ConfigError
-            If a QoS override has a wrong value.
-        UnsupportedMessage
-            If `boxes_type` cannot be read or its package is not installed.
+        Raises ConfigError for a wrong QoS override, and UnsupportedMessage if `boxes_type`
+        cannot be read or its package is not installed.
 
         """
         _, options = self._settings

@@ -171,27 +171,12 @@ class NodeOptions(NamedTuple):
 
 def declare(node: Node) -> tuple[Config, NodeOptions]:
     """
-    Declare all parameters of a node and return their values.
+    Declare all parameters of a node; return the settings of the core and the options.
 
-    Parameters
-    ----------
-    node : Node
-        Made with ``automatically_declare_parameters_from_overrides``: this way integers are
-        accepted for real parameters, and unknown names can be reported.
-
-    Returns
-    -------
-    config, options
-        Settings of the core with `estimate` ``final``, and options of the node.
-
-    Raises
-    ------
-    ConfigError
-        For a value of the wrong type or out of its bounds, by name.
-
-    Notes
-    -----
-    `estimate` is ignored with a warning: the node publishes both early and final estimates.
+    The node is made with ``automatically_declare_parameters_from_overrides``: this way integers
+    are accepted for real parameters, and unknown names can be reported. `estimate` is ignored
+    with a warning: the node publishes both early and final estimates. Raises ConfigError for a
+    value of the wrong type or out of its bounds, by name.
 
     """
     parameters: dict[str, Any] = node.get_parameters_by_prefix('')  # wrong annotation in rclpy
@@ -218,12 +203,7 @@ def declare(node: Node) -> tuple[Config, NodeOptions]:
 
 
 def numbers_as_declared(node: Node, parameters: list[Parameter]) -> list[Parameter]:
-    """
-    Return parameters with numbers converted where the node declares a real or a text.
-
-    ``ros2 param set NODE vehicle.shape 1`` sends an integer.
-
-    """
+    """Return parameters as declared: ``ros2 param set NODE vehicle.shape 1`` sends an integer."""
     converted = []
     for parameter in parameters:
         is_number = parameter.type_ in (Parameter.Type.INTEGER, Parameter.Type.DOUBLE)
@@ -240,15 +220,7 @@ def numbers_as_declared(node: Node, parameters: list[Parameter]) -> list[Paramet
 def changed(
     config: Config, options: NodeOptions, parameters: Iterable[Parameter]
 ) -> tuple[Config, NodeOptions]:
-    """
-    Return the settings with some parameters changed.
-
-    Raises
-    ------
-    ConfigError
-        For a value of the wrong type or out of its bounds, by name.
-
-    """
+    """Return the settings with some parameters changed; raise ConfigError as `declare`."""
     return _updated(config, options, _values_of(parameters))
 
 
@@ -258,13 +230,6 @@ def parameters_yaml(config: Config, options: NodeOptions | None = None) -> str:
 
     The file applies to nodes of any name in any namespace. ``boxreg relabel --config`` reads it
     too and ignores the options of the node. `estimate` is left out: the node ignores it.
-
-    Parameters
-    ----------
-    config : Config
-        Settings of the core.
-    options : NodeOptions, optional
-        Options of the node; None: their defaults.
 
     """
     if options is None:

@@ -27,19 +27,7 @@ def make_node(program: str, arguments: list[str], is_managed: bool = False) -> B
     """
     Initialise ROS and return the node: open, or unconfigured if it is managed.
 
-    Parameters
-    ----------
-    program : str
-        Name of the program, for its help text.
-    arguments : list of str
-        Its arguments, those of ROS included.
-    is_managed : bool
-        Whether it is a lifecycle node, which waits for its transitions.
-
-    Raises
-    ------
-    BoxregError
-        See `BoxregNode`.
+    `program` is the name in its help text. Errors are those of `BoxregNode`.
 
     """
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)

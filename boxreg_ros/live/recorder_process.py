@@ -61,15 +61,7 @@ CHECK_TIME = 10.0
 
 
 def check_recording(camera: str, formats: Sequence[str]) -> None:
-    """
-    Let a recorder check parameters: the node does not import the label formats.
-
-    Raises
-    ------
-    ConfigError
-        For a format that cannot be recorded, or a calibration file that cannot be read.
-
-    """
+    """Let a recorder check parameters, as the node imports no label format; raise ConfigError."""
     command = [sys.executable, '-m', PROGRAM, camera, *formats]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=CHECK_TIME)
@@ -80,22 +72,12 @@ def check_recording(camera: str, formats: Sequence[str]) -> None:
 
 
 class RawCloud(NamedTuple):
-    """
-    A cloud whose intensities are decoded by the thread that sends it, not by the worker.
-
-    Attributes
-    ----------
-    sweep, T_fixed_sweep, needed_from_ns
-        As of `LabelCloud`.
-    messages : sequence of message
-        The messages of the clouds that it was merged from, in the order of its points.
-
-    """
+    """A cloud whose intensities are decoded by the thread that sends it, see `LabelCloud`."""
 
     sweep: Sweep
     T_fixed_sweep: Floats
     needed_from_ns: int
-    messages: Sequence[Any]
+    messages: Sequence[Any]  # of the clouds that it was merged from, in order
 
 
 class RecorderProcess:
@@ -121,8 +103,6 @@ class RecorderProcess:
 
     Attributes
     ----------
-    settings : RecorderSettings
-        As given.
     status : RecorderStatus
         The newest from the recorder.
     has_ended : threading.Event

@@ -23,26 +23,12 @@ MOST_WAITING = 50
 
 
 class StaticCloud(NamedTuple):
-    """
-    A cloud to publish.
+    """A cloud to publish."""
 
-    Attributes
-    ----------
-    message : PointCloud2
-        The input, with the same layout and header, without the points of moving objects.
-    received : float
-        When the input arrived (monotonic) [s].
-    is_late : bool
-        True for the input itself, because its boxes are late.
-    cpu : float
-        CPU time spent on it [s].
-
-    """
-
-    message: Any
-    received: float
-    is_late: bool
-    cpu: float
+    message: Any  # the input without the points of moving objects
+    received: float  # when the input arrived (monotonic) [s]
+    is_late: bool  # True for the input itself, because its boxes are late
+    cpu: float  # time spent on it [s]
 
 
 class _Waiting(NamedTuple):
@@ -66,14 +52,8 @@ class StaticPoints:
     """
     Hold each cloud until the early boxes of its stamp are known, and leave out what moves.
 
-    A cloud whose boxes do not come in time passes unchanged. Not thread-safe.
-
-    Parameters
-    ----------
-    patience : float
-        How long a cloud waits for its boxes [s].
-    registrar : BoxRegistrar
-        Its labelling margins and the time of its boxes are used.
+    A cloud whose boxes do not come within `patience` [s] passes unchanged. The labelling margins
+    and the time of the boxes are those of the registrar. Not thread-safe.
 
     """
 

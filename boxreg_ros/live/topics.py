@@ -64,45 +64,20 @@ class Mismatch(NamedTuple):
 
 @dataclass(eq=False, slots=True)
 class Endpoint:
-    """
-    A subscription or publisher of the node.
+    """A subscription or publisher of the node."""
 
-    Attributes
-    ----------
-    topic, name : str
-        Topic before and after namespace and remaps.
-    type_name : str
-        Message type, as ``package/msg/Type``.
-    qos : QoSProfile
-        QoS profile; overrides are written into it when the entity is made.
-    callback : callable or None
-        Takes the messages of a subscription; None for a publisher.
-    is_required : bool
-        True if the node refines nothing without messages on it.
-    has_overrides : bool
-        True if parameters may override the QoS profile.
-    is_raw : bool
-        True if the callback takes bytes.
-    entity : Subscription or Publisher
-        The entity of rclpy, once made.
-    since : float
-        When the endpoint was made (monotonic) [s].
-    received : int
-        Number of received messages.
-
-    """
-
-    topic: str
-    name: str
-    type_name: str
-    qos: QoSProfile
-    callback: Callable[[Any], None] | None = None
-    is_required: bool = False
-    has_overrides: bool = True
-    is_raw: bool = False
-    entity: Any = None
+    topic: str  # before namespace and remaps
+    name: str  # after them
+    type_name: str  # as ``package/msg/Type``
+    qos: QoSProfile  # overrides are written into it when the entity is made
+    callback: Callable[[Any], None] | None = None  # takes the messages of a subscription
+    is_required: bool = False  # the node refines nothing without messages on it
+    has_overrides: bool = True  # parameters may override the QoS profile
+    is_raw: bool = False  # the callback takes bytes
+    entity: Any = None  # of rclpy, once made
+    # when the endpoint was made (monotonic) [s]
     since: float = field(default_factory=time.monotonic)
-    received: int = 0
+    received: int = 0  # number of messages
 
     @property
     def is_input(self) -> bool:
@@ -115,13 +90,6 @@ class NodeTopics:
     Creates subscriptions and publishers, and compares them with those of other nodes.
 
     Used by the thread of the executor only.
-
-    Parameters
-    ----------
-    node : Node
-        The node that owns them.
-    health : Health
-        Receives the counters of lost messages and of incompatible QoS.
 
     """
 
@@ -142,34 +110,12 @@ class NodeTopics:
         is_raw: bool = False,
     ) -> None:
         """
-        Create a subscription.
+        Create a subscription; the arguments are those of `Endpoint`.
 
         With reliability ``BEST_AVAILABLE``, rclpy chooses by the publishers that exist when it
-        subscribes. The subscription is created anew when one comes that offers less.
-
-        Parameters
-        ----------
-        type_name : str
-            Message type.
-        topic : str
-            Topic before namespace and remaps.
-        callback : callable
-            Takes each message.
-        qos : QoSProfile
-            QoS profile before overrides.
-        is_required : bool
-            True to report that nothing is published or received on it.
-        has_overrides : bool
-            True to let parameters override the QoS profile.
-        is_raw : bool
-            True to receive messages as bytes.
-
-        Raises
-        ------
-        ConfigError
-            For a QoS override of the wrong type.
-        UnsupportedMessage
-            If the message package is not installed.
+        subscribes. The subscription is created anew when one comes that offers less. Raises
+        ConfigError for a wrong QoS override, UnsupportedMessage if the message package is
+        missing.
 
         """
         name = self._node.resolve_topic_name(topic)
@@ -180,17 +126,7 @@ class NodeTopics:
         self._endpoints.append(endpoint)
 
     def publish(self, type_name: str, topic: str, depth: int) -> Publisher:
-        """
-        Create a publisher; parameters may override its QoS profile.
-
-        Raises
-        ------
-        ConfigError
-            For a QoS override of the wrong type.
-        UnsupportedMessage
-            If the message package is not installed.
-
-        """
+        """Create a publisher; parameters may override its QoS profile. Raises as `subscribe`."""
         kind = import_message(type_name)
         name = self._node.resolve_topic_name(topic)
         endpoint = Endpoint(topic, name, type_name, QoSProfile(depth=depth))
@@ -247,17 +183,7 @@ class NodeTopics:
         return found
 
     def report(self, name: str, further: list[TopicProblem]) -> DiagnosticStatus:
-        """
-        Log new problems and return the state of all topics.
-
-        Parameters
-        ----------
-        name : str
-            Name of the status.
-        further : list of TopicProblem
-            Problems found elsewhere.
-
-        """
+        """Log new problems, these and further ones, and return the state of all topics."""
         problems = [*self.problems(), *further]
         for problem in problems:
             if problem.text not in self._logged:
@@ -372,15 +298,7 @@ class NodeTopics:
 
 
 def import_message(type_name: str) -> type:
-    """
-    Return the class of a message type.
-
-    Raises
-    ------
-    UnsupportedMessage
-        If its package is not installed; the message names it.
-
-    """
+    """Return the class of a message type; raise UnsupportedMessage if its package is missing."""
     package, _, name = canonical(type_name).split('/')
     try:
         kind: type = getattr(import_module(f'{package}.msg'), name)
@@ -396,10 +314,7 @@ def mismatches(offered: QoSProfile, requested: QoSProfile) -> list[Mismatch]:
     """
     Return the policies for which a publisher offers less than a subscription requests.
 
-    Parameters
-    ----------
-    offered, requested : QoSProfile
-        Of the publisher and of the subscription. A policy that is ``BEST_AVAILABLE`` fits.
+    A policy that is ``BEST_AVAILABLE`` fits.
 
     """
     found = []

@@ -54,18 +54,15 @@ class Worker:
     Registers boxes in a thread of its own, from `run` until `stop`.
 
     The worker alone uses the registrar, its transforms and the markers. It shares the inbox and
-    the counters with the executor's thread, which also sets `cloud_frame` and `cloud_received`.
+    the counters with the executor's thread, which also sets `cloud_frame`, that of the newest
+    cloud, and `cloud_received`, when it arrived (monotonic) [s].
 
     Parameters
     ----------
     live : LiveRegistrar
         Transforms, registers and makes the messages to publish.
-    inbox : Inbox
-        Source of messages and events.
-    health : Health
-        Counters and log.
-    logger : RcutilsLogger
-        Logger of the node.
+    inbox, health, logger : Inbox, Health and RcutilsLogger
+        Those of the node.
     budget : TickBudget
         That of `live`.
     backlog : float
@@ -75,10 +72,6 @@ class Worker:
 
     Attributes
     ----------
-    cloud_frame : str
-        Frame of the newest cloud; empty before the first.
-    cloud_received : float
-        When it arrived (monotonic) [s].
     fixed_frame : str
         Frame that boxes are refined in; empty until it is chosen.
     tracks : int
@@ -165,12 +158,7 @@ class Worker:
         self._finish(item)
 
     def drop(self, message: Message) -> None:
-        """
-        Count a message that the solver has no time for, and pass boxes through.
-
-        Either thread may call this.
-
-        """
+        """Count a message that there is no time for, and pass boxes through; in any thread."""
         reason = REASONS[f'{message.topic}_queue_full']
         self._health.report(reason, reason.remedy)
         if message.topic == 'boxes':

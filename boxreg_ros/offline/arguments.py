@@ -41,16 +41,8 @@ def add_options(
     """
     Add the options that a dataclass states, those of dataclasses within it included.
 
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Gets the options.
-    owner : type
-        The dataclass.
-    names : str
-        Fields to add; all by default. A dataclass within `owner` adds all its options.
-    defaults : object
-        Defaults that differ from those of the fields, by name.
+    With `names` only these fields; a dataclass within `owner` adds all its options. `defaults`
+    are those that differ from the fields.
 
     """
     for one, facts in _options(owner, names):

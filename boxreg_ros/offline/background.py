@@ -14,13 +14,8 @@ class Background:
     """
     Call functions one after another in a thread, while the caller goes on.
 
-    It is ended by `complete` or `abandon`.
-
-    Parameters
-    ----------
-    most_waiting : int
-        Number of calls that may be incomplete when a call returns to the caller. With 0 the
-        caller waits for each.
+    At most `most_waiting` calls are incomplete when a call returns to the caller: with 0 it waits
+    for each. `complete` or `abandon` is the end.
 
     """
 
@@ -32,15 +27,7 @@ class Background:
     def __call__(
         self, function: Callable[_P, object], *args: _P.args, **kwargs: _P.kwargs
     ) -> None:
-        """
-        Call a function after those before it.
-
-        Raises
-        ------
-        Exception
-            The first exception of an earlier call, or of this one if it was waited for.
-
-        """
+        """Call a function after those before it; raise the first exception of an earlier call."""
         self._waiting.append(self._thread.submit(function, *args, **kwargs))
         self._wait(self._most_waiting)
 

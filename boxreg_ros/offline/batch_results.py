@@ -39,45 +39,22 @@ SHARD_INDEX = re.compile(r'index\.(\d+)-of-(\d+)\.csv')
 
 @dataclass
 class Result:
-    """
-    Result of a job: a row of the index.
+    """Result of a job: a row of the index."""
 
-    Attributes
-    ----------
-    drive : str
-        Name of the result folder.
-    status : str
-        ``done``, ``up to date`` or ``failed``.
-    exit_status : int or None
-        Of its last process; negative for the signal that ended it.
-    attempts : int
-        Processes that were started.
-    seconds : float
-        Time of all attempts [s].
-    peak_mb : int
-        Largest memory of a process and its workers, shared pages divided among them [MB].
-    sweeps, boxes_in, refined, kept, damages : int
-        Of its ``summary.json``.
-    last_line : str
-        Last line that its process printed, or why it failed.
-    key : str
-        Hash of the content of its files, the options and the version.
-
-    """
-
-    drive: str
-    status: str = DRIVE_FAILED
+    drive: str  # name of the result folder
+    status: str = DRIVE_FAILED  # one of the three words above
+    # of its last process; negative for the signal that ended it
     exit_status: int | None = None
-    attempts: int = 0
-    seconds: float = 0.0
-    peak_mb: int = 0
+    attempts: int = 0  # processes that were started
+    seconds: float = 0.0  # of all attempts
+    peak_mb: int = 0  # largest memory of a process and its workers, their shared pages divided
     sweeps: int = 0
     boxes_in: int = 0
     refined: int = 0
     kept: int = 0
     damages: int = 0
-    last_line: str = ''
-    key: str = ''
+    last_line: str = ''  # last line that its process printed, or why it failed
+    key: str = ''  # hash of the content of its files, the options and the version
 
     @property
     def is_done(self) -> bool:
@@ -98,19 +75,7 @@ INDEX_COLUMNS = tuple(column.name for column in fields(Result))
 
 
 def write_results(out: Path, rows: Sequence[dict[str, Any]], shard: str = '') -> None:
-    """
-    Write the index, the merged summary and the report over all drives.
-
-    Parameters
-    ----------
-    out : Path
-        Folder with the result folders.
-    rows : sequence of dict
-        With the columns of `Result`.
-    shard : str
-        Part of the file names, as in ``.1-of-8``; empty for all drives.
-
-    """
+    """Write index, merged summary and report over all drives; `shard` is as in ``.1-of-8``."""
     with written_whole(out / f'index{shard}.csv') as file:
         file.write(csv_row(INDEX_COLUMNS))
         for row in rows:
@@ -141,10 +106,7 @@ def rows_of_shards(out: Path) -> list[dict[str, Any]]:
     """
     Return the rows of the indexes of all shards, ordered by drive.
 
-    Raises
-    ------
-    RecordingError
-        If there are none, some are missing, or they are of different numbers of shards.
+    Raises RecordingError if some are missing, or they are of different numbers of shards.
 
     """
     found = {}

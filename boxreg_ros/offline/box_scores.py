@@ -1,27 +1,28 @@
 """
 Scores of boxes against true boxes: overlap, errors of pose and extent, flips, jitter.
 
-`match` pairs predictions with true boxes, `summarise` turns pairs into one row of scores.
+`match` pairs predictions with true boxes, by their ids or by their `overlaps`; `summarise` turns
+pairs into one row of scores.
 
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from boxreg_ros.config import words_of
 from boxreg_ros.core.metrics import iou_3d, iou_bev, pose_errors
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.offline.overlap import best_pairs, overlaps
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, is_valid_box, YAW
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 RECALLS = (0.5, 0.7, 0.8)
 """IoU thresholds of the recalls."""
@@ -37,99 +38,48 @@ Pairing = Callable[[BoxTable, BoxTable], Ints]
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """
-    All true boxes in scope, each with its prediction if there is one.
+    """All n true boxes in scope, each with its prediction if there is one."""
 
-    Attributes
-    ----------
-    rows : array, shape (n,)
-        Rows of the true boxes in their table.
-    predicted_rows : array, shape (n,)
-        Rows of their predictions in the table of these; -1 without one.
-    class_names : tuple of n str
-        Of the true boxes.
-    num_points : array, shape (n,)
-        Of the true boxes.
-    is_matched : array, shape (n,)
-        True where a finite prediction exists; the errors below are 0 elsewhere.
-    iou_bev, iou_3d : array, shape (n,)
-        Overlap with the prediction.
-    translation, extent, rotation : array, shape (n, 3)
-        Errors as in `PoseErrors`.
-    scale_iou : array, shape (n,)
-        3D IoU after alignment of centre and heading.
-    is_flipped : array, shape (n,)
-        True where the heading error is larger than 90 degrees.
-    jitter, turn_jitter : array, shape (n,)
-        Norm of the second difference over time of the predicted centre [m/s^2] and yaw
-        [rad/s^2]; NaN without a box of the track within `MAX_STEP` before and after.
-    true_jitter : array, shape (n,)
-        The same of the true centre, as a reference for `jitter`.
-    unmatched : int
-        Predictions without a true box.
-    invalid : int
-        True boxes that are out of scope because of NaN or an extent that is not positive.
-
-    """
-
-    rows: Ints
-    predicted_rows: Ints
-    class_names: tuple[str, ...]
+    rows: Ints  # (n,) of the true boxes in their table
+    predicted_rows: Ints  # (n,) of their predictions in the table of these; -1 without one
+    class_names: tuple[str, ...]  # here and below: of the true boxes
     num_points: Ints
-    is_matched: Mask
+    is_matched: Mask  # (n,) a finite prediction exists; the errors below are 0 elsewhere
     iou_bev: Floats
     iou_3d: Floats
-    translation: Floats
+    translation: Floats  # (n, 3), as extent and rotation: errors as in `PoseErrors`
     extent: Floats
     rotation: Floats
-    scale_iou: Floats
-    is_flipped: Mask
+    scale_iou: Floats  # (n,) 3D IoU after alignment of centre and heading
+    is_flipped: Mask  # (n,) the heading error is larger than 90 degrees
+    # (n,) norm of the second difference over time of the predicted centre [m/s^2]
     jitter: Floats
-    turn_jitter: Floats
-    true_jitter: Floats
-    unmatched: int
-    invalid: int
+    turn_jitter: Floats  # of yaw [rad/s^2]; NaN without boxes within `MAX_STEP` on both sides
+    true_jitter: Floats  # that of the true centre, as a reference
+    unmatched: int  # predictions without a true box
+    invalid: int  # true boxes out of scope because of NaN or an extent that is not positive
 
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """
-    Means over true boxes: errors over those with a prediction, recalls over all.
+    """Means over true boxes: errors over those with a prediction, recalls over all."""
 
-    Attributes
-    ----------
-    boxes, missing, unmatched : int
-        True boxes in scope, those without a prediction, and predictions without a true box.
-    iou_bev, iou_3d, iou_bev_median, iou_3d_median : float
-        Over matched boxes.
-    recall_bev, recall_3d : tuple of float
-        Fraction of the true boxes with at least each IoU of `RECALLS`; a missing prediction
-        counts as IoU 0.
-    ate, ase, aoe, aoe_median : float
-        Average translation error [m], average scale error (1 - IoU after alignment), and
-        average absolute yaw error [rad], as in nuScenes.
-    flips : float
-        Fraction of the matched boxes with a heading error larger than 90 degrees.
-    jitter, turn_jitter, true_jitter : float
-        Means of the values in `Matches` [m/s^2, rad/s^2].
-
-    """
-
-    boxes: int
-    missing: int
-    unmatched: int
-    iou_bev: float
+    boxes: int  # true boxes in scope
+    missing: int  # those without a prediction
+    unmatched: int  # predictions without a true box
+    iou_bev: float  # here and below: over matched boxes
     iou_3d: float
     iou_bev_median: float
     iou_3d_median: float
+    # parts of the true boxes with each IoU of `RECALLS`; missing ones have 0
     recall_bev: tuple[float, ...]
     recall_3d: tuple[float, ...]
-    ate: float
-    ase: float
-    aoe: float
+    ate: float  # average translation error [m], as in nuScenes
+    ase: float  # 1 - IoU after alignment
+    aoe: float  # average absolute yaw error [rad]
     aoe_median: float
-    flips: float
-    jitter: float
+    flips: float  # part of the matched boxes with a heading error larger than 90 degrees
+    jitter: float  # means of the values in `Matches` [m/s^2, rad/s^2]
     turn_jitter: float
     true_jitter: float
 
@@ -151,13 +101,7 @@ def by_id(predicted: BoxTable, truth: BoxTable) -> Ints:
 
 
 def by_overlap(predicted: BoxTable, truth: BoxTable) -> Ints:
-    """
-    Return the row of the prediction that overlaps each true box, or -1.
-
-    At each stamp the one-to-one pairs with the greatest sum of 3D IoU are chosen; ids play no
-    role.
-
-    """
+    """Return the row of the prediction of each true box, by the greatest sum of 3D IoU, or -1."""
     rows = np.full(len(truth.boxes), -1, np.int64)
     for stamp in overlaps(predicted, truth):
         true, found = best_pairs(stamp.iou)
@@ -317,23 +261,10 @@ def _second_difference(
     stamps_ns: Ints, track_ids: Sequence[str], values: Floats, is_angle: bool = False
 ) -> Floats:
     """
-    Return the norm of the second difference over time of the values of each track.
+    Return the norm (n,) of the second difference over time of the values (n, D) of each track.
 
-    Parameters
-    ----------
-    stamps_ns : array, shape (n,)
-        Stamps [ns].
-    track_ids : sequence of n str
-        Tracks.
-    values : array, shape (n, D)
-        Values, in metres or radians.
-    is_angle : bool
-        Wrap differences to the half-open interval from -pi to pi.
-
-    Returns
-    -------
-    norms : array, shape (n,)
-        In units per s^2; NaN without a value of the track within `MAX_STEP` before and after.
+    In units per s^2; NaN without a value of the track within `MAX_STEP` before and after.
+    Differences of angles are wrapped.
 
     """
     norms = np.full(len(stamps_ns), np.nan)
@@ -371,3 +302,60 @@ def _mean(values: NDArray[Any]) -> float:
 def _median(values: NDArray[Any]) -> float:
     """Return the median; NaN without a value."""
     return float(np.median(values)) if len(values) else math.nan
+
+
+class Overlaps(NamedTuple):
+    """All boxes of one stamp."""
+
+    predicted: Ints  # (p,) rows in their table
+    true: Ints  # (t,)
+    iou: Floats  # (t, p) 3D IoU of each pair
+
+
+def overlaps(predicted: BoxTable, truth: BoxTable) -> Iterator[Overlaps]:
+    """Yield the valid boxes of each stamp of two tables in one frame, in the order of stamps."""
+    predicted_rows = _rows_by_stamp(predicted)
+    true_rows = _rows_by_stamp(truth)
+    none = np.zeros(0, np.int64)
+    for stamp_ns in sorted(predicted_rows.keys() | true_rows.keys()):
+        found = predicted_rows.get(stamp_ns, none)
+        true = true_rows.get(stamp_ns, none)
+        yield Overlaps(found, true, pairwise_iou(truth.boxes[true], predicted.boxes[found]))
+
+
+def pairwise_iou(first: Floats, second: Floats) -> Floats:
+    """Return the 3D IoU (n, m) of boxes (n, 9) with boxes (m, 9)."""
+    iou = np.zeros((len(first), len(second)))
+    radii = [np.linalg.norm(boxes[:, BOX_EXTENT], axis=1) / 2 for boxes in (first, second)]
+    distances = np.linalg.norm(first[:, None, :3] - second[None, :, :3], axis=2)
+    near = np.nonzero(distances < radii[0][:, None] + radii[1])
+    iou[near] = iou_3d(first[near[0]], second[near[1]])
+    return iou
+
+
+def best_pairs(
+    iou: Floats, least: float = 0.0, is_preferred: NDArray[np.bool_] | None = None
+) -> tuple[Ints, Ints]:
+    """
+    Return the rows and columns of the one-to-one pairs with the greatest sum of IoU (t, p).
+
+    Pairs need more than 0 and at least `least`. Those that are preferred (t, p) count as one more
+    IoU of 1: more than any other pair of one of the boxes.
+
+    """
+    gains = np.where(iou >= least, iou, 0.0)
+    if is_preferred is not None:
+        gains += is_preferred & (gains > 0)
+    rows, columns = linear_sum_assignment(gains, maximize=True)
+    is_pair = (iou[rows, columns] > 0) & (iou[rows, columns] >= least)
+    return rows[is_pair], columns[is_pair]
+
+
+def _rows_by_stamp(table: BoxTable) -> dict[int, Ints]:
+    """Return the rows of the valid boxes of each stamp."""
+    valid = np.flatnonzero(is_valid_box(table.boxes))
+    valid = valid[np.argsort(table.stamps_ns[valid], kind='stable')]
+    stamps, first = np.unique(table.stamps_ns[valid], return_index=True)
+    ends = [*first[1:], len(valid)][: len(first)]
+    parts = zip(stamps.tolist(), first, ends, strict=True)
+    return {stamp_ns: valid[begin:end] for stamp_ns, begin, end in parts}

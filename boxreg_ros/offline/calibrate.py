@@ -52,23 +52,11 @@ MIN_TRACKS = 3
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """
-    A setting as estimated from labelled tracks.
+    """A setting as estimated from labelled tracks."""
 
-    Attributes
-    ----------
-    value : float
-        The estimate; NaN without evidence.
-    spread : float
-        Robust standard deviation between tracks, in the unit of the value.
-    tracks : int
-        Number of tracks with evidence.
-
-    """
-
-    value: float
-    spread: float
-    tracks: int
+    value: float  # the estimate; NaN without evidence
+    spread: float  # robust standard deviation between tracks, in the unit of the value
+    tracks: int  # number of tracks with evidence
 
     @classmethod
     def median(cls, means: Sequence[Floats]) -> Measured:
@@ -80,20 +68,10 @@ class Measured:
 
 def labelling_margins(drive: Drive, config: Config) -> dict[str, Measured]:
     """
-    Estimate the labelling margins and insets of faces at true boxes.
+    Estimate the labelling margins and insets of faces at the true boxes of a drive [m].
 
-    Parameters
-    ----------
-    drive : Drive
-        Sweeps and true boxes; its input boxes are not used.
-    config : Config
-        How faces are observed, and the margins to begin with.
-
-    Returns
-    -------
-    margins : dict of Measured
-        By name of the setting [m]: margins of the kinds of objects there are, insets of all kinds
-        together. NaN without evidence.
+    Its input boxes are not used; `config` has the margins to begin with. Margins are by the kinds
+    of objects there are, insets of all kinds together; NaN without evidence.
 
     """
     kinds: dict[str, list[Window]] = {}

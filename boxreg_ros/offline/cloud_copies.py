@@ -42,19 +42,8 @@ class CloudCopies:
     """
     Copy a recording, once for each kind of clouds.
 
-    Parameters
-    ----------
-    request : Request
-        Of the run.
-    places : list of StoredPlace
-        Of all sweeps.
-    labelled : callable
-        Return a sweep by its number, with its labels; None where it has no transform.
-
-    Attributes
-    ----------
-    unchanged : int
-        Clouds that were copied as they are.
+    `places` are those of all sweeps; `labelled` returns a sweep by its number, with its labels, or
+    None where it has no transform. `unchanged` counts the clouds that were copied as they are.
 
     """
 

@@ -28,10 +28,7 @@ def run(args: argparse.Namespace) -> int:
     """
     Compile what has not been compiled yet, and print where it is kept.
 
-    Raises
-    ------
-    BoxregError
-        If numba cannot compile, or cannot keep what it has compiled.
+    Raises BoxregError if numba cannot compile, or cannot keep what it has compiled.
 
     """
     begun = time.monotonic()

@@ -25,8 +25,7 @@ from boxreg_ros.structures import (
     ROLL,
     Sweep,
 )
-from boxreg_ros.tracks.complete import complete, CompletionPlan
-from boxreg_ros.tracks.effects import TrackSteps
+from boxreg_ros.tracks.complete import complete, CompletionPlan, TrackSteps
 from boxreg_ros.tracks.followed import with_evidence
 import numpy as np
 
@@ -41,15 +40,7 @@ Moved = Sweep | BoxArray | None
 
 
 class PointCounter:
-    """
-    Count the points above the road in the boxes of each array.
-
-    Attributes
-    ----------
-    counts : dict
-        Counts (n,) of the arrays by ticket; of arrays without a sweep there are none.
-
-    """
+    """Count the points above the road in boxes, (n,) by the ticket of each array with a sweep."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -97,18 +88,7 @@ def points_above_road(sweep: Sweep, boxes: Floats) -> Ints:
 
 
 class FirstPass(NamedTuple):
-    """
-    A registered recording, before its tracks are completed.
-
-    Attributes
-    ----------
-    given, results, num_points : list of lists
-        Box arrays, their registration, and the points above the road in each box: one list for
-        each part of the recording between two time jumps.
-    parts : list of Arrivals
-        Of these parts.
-
-    """
+    """A registered recording, before its tracks are completed: by part between time jumps."""
 
     given: list[list[BoxArray]]
     results: list[list[RefinedBoxes]]
@@ -133,18 +113,8 @@ def first_pass(
     """
     Register a recording, and count the points in its boxes.
 
-    Parameters
-    ----------
-    items : iterable of (item, restarts)
-        Sweeps and boxes in the fixed frame, and whether time went back before them.
-    config : Config
-        Settings.
-    submit : callable, optional
-        As of `BoxRegistrar`.
-    fixed_frame : str, optional
-        With it, sweeps without boxes get an empty array, see `Arrivals`.
-    drives : Drives, optional
-        As of `BoxRegistrar`.
+    `items` are in the fixed frame, each with whether time went back before it. With `fixed_frame`
+    sweeps without boxes get an empty array, see `Arrivals`. The rest is as of `BoxRegistrar`.
 
     """
     registrar = BoxRegistrar(config, submit, drives=drives)
@@ -190,16 +160,9 @@ def first_pass(
 
 class Completion:
     """
-    Register completed tracks: the second pass.
+    Register completed tracks: the second pass over the items that the plan was made of.
 
-    Parameters
-    ----------
-    plan : CompletionPlan
-        From the first pass over the same items.
-    config : Config
-        Settings.
-    deviations : array, shape (9,), optional
-        Of the boxes, where the input is of a person, see `person.numbers`.
+    `deviations` (9,) are those of the boxes of a person, see `person.numbers`.
 
     """
 
@@ -264,16 +227,8 @@ def completed(
     """
     Return the completed tracks of a drive in memory, and the effects of the steps on each.
 
-    Parameters
-    ----------
-    items : sequence of Sweep and BoxArray
-        In the order of stamps, in the fixed frame.
-    fixed_frame : str
-        That frame.
-    config : Config
-        Settings; see `Config.complete`.
-    first : FirstPass, optional
-        That of the same items, with any of the steps.
+    `items` are in the order of stamps, in the fixed frame; `first` is a first pass over the same
+    items, with any of the steps.
 
     """
     if first is None:

@@ -33,28 +33,14 @@ SIGNIFICANT = 2.0
 
 
 class Consistency(NamedTuple):
-    """
-    Covariances against errors over a group of boxes, without heading flips.
+    """Covariances against errors over a group of boxes, without heading flips; by variable."""
 
-    Attributes
-    ----------
-    boxes, tracks : int
-        Boxes with a true box and a covariance, and true tracks that they are of.
-    coverage : dict
-        By variable: part of the errors within two standard deviations; 0.954 is consistent.
-    nees : dict
-        By variable: mean squared error over variance; 1 is consistent.
-    nees_error : dict
-        By variable: standard error of `nees` over the tracks, whose boxes share their constant
-        errors; NaN for one track.
-
-    """
-
-    boxes: int
-    tracks: int
+    boxes: int  # with a true box and a covariance
+    tracks: int  # true ones of these boxes
+    # part of the errors within two standard deviations; 0.954 is consistent
     coverage: dict[str, float]
-    nees: dict[str, float]
-    nees_error: dict[str, float]
+    nees: dict[str, float]  # mean squared error over variance; 1 is consistent
+    nees_error: dict[str, float]  # standard error of it over the tracks; NaN for one track
 
     def is_off(self, variable: str) -> bool:
         """Return whether the NEES of a variable is out of `CONSISTENT_NEES`, and not by chance."""
@@ -69,19 +55,7 @@ def consistency(
     truth: BoxTable,
     covariances: Mapping[tuple[int, str], BoxCovariance],
 ) -> dict[str, Consistency]:
-    """
-    Return the consistency of all boxes, by kind, class and range, by the name of the group.
-
-    Parameters
-    ----------
-    matches : Matches
-        True boxes with the errors of their predictions.
-    predicted, truth : BoxTable
-        The tables of the predictions and of the true boxes.
-    covariances : mapping
-        Of the predictions, by stamp and track id.
-
-    """
+    """Return the consistency by group; `covariances` of predictions are by stamp and track id."""
     known = []
     for i in np.flatnonzero(matches.is_matched & ~matches.is_flipped).tolist():
         row = matches.predicted_rows[i]

@@ -23,9 +23,9 @@ from boxreg_ros.labels import (
 )
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline.arguments import add_options, values_of
-from boxreg_ros.offline.labelled_recording import label_frame_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
+from boxreg_ros.offline.sources import label_frame_of
 from boxreg_ros.structures import BoxArray, Sweep
 
 
@@ -39,23 +39,10 @@ class _Unused:
 
 def convert(request: Request, out: Path) -> dict[str, Any]:
     """
-    Write labels in other formats.
+    Write the labels of a request in its formats; return the content of ``summary.json``.
 
     Boxes are written in the fixed frame if the labels or the recording have the sensor poses.
-
-    Parameters
-    ----------
-    request : Request
-        Its labels are converted to its formats. Recordings, for the poses of the sensor and the
-        clouds, are needed only where the label files lack the poses.
-    out : Path
-        Folder of results. As that of `relabel`, it appears complete or not at all.
-
-    Returns
-    -------
-    summary : dict
-        Content of ``summary.json``: number of boxes read, and of boxes that a format cannot
-        represent, by reason.
+    Recordings, for these poses and the clouds, are needed only where the label files lack them.
 
     Raises
     ------

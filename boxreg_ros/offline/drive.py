@@ -39,25 +39,12 @@ NEARBY_MARGIN = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """
-    Sweeps and noisy boxes of one drive, in time order, in the frame of its true boxes.
-
-    Attributes
-    ----------
-    sweeps : tuple of Sweep
-    boxes : tuple of BoxArray
-        Noisy boxes.
-    truth : BoxTable
-        True boxes; all are in their frame.
-    left_out : str
-        Number of messages of the recording that are not used, and why; empty if all are.
-
-    """
+    """Sweeps and noisy boxes of one drive, in time order, in the frame of its true boxes."""
 
     sweeps: tuple[Sweep, ...]
-    boxes: tuple[BoxArray, ...]
+    boxes: tuple[BoxArray, ...]  # noisy ones
     truth: BoxTable
-    left_out: str = ''
+    left_out: str = ''  # number of messages that are not used, and why; empty if all are
 
     @classmethod
     def from_scene(cls, scene: SimulatedScene) -> Drive:
@@ -71,10 +58,7 @@ class Drive:
         """
         Read the one recording in a folder, of these LiDARs, and the ``truth.csv`` beside it.
 
-        Raises
-        ------
-        RecordingError
-            If they do not exist, or cannot be read.
+        Raises RecordingError if they do not exist, or cannot be read.
 
         """
         if not folder.is_dir():
@@ -99,12 +83,8 @@ class Drive:
 
         Messages that cannot be decoded or have no transform are left out; clouds of several
         LiDARs are merged by `config`. Sweeps are held in memory: all of them, or those within
-        `within` [s] of the stamp of a true box.
-
-        Raises
-        ------
-        RecordingError
-            If it has no sweeps, cannot be read, or no transforms connect it with that frame.
+        `within` [s] of the stamp of a true box. Raises RecordingError if it has no sweeps,
+        cannot be read, or no transforms connect it with that frame.
 
         """
         sweeps: list[Sweep] = []

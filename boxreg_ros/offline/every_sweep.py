@@ -18,16 +18,9 @@ def empty_array(stamp_ns: int, frame_id: str) -> BoxArray:
 
 @dataclass(slots=True)
 class Arrivals:
-    """
-    Sweeps and box arrays of a part of a recording between two time jumps, as they arrived.
+    """Sweeps and box arrays of a part of a recording between two time jumps, as they arrived."""
 
-    Attributes
-    ----------
-    items : list of int or BoxArray
-        The stamp of each sweep [ns], and box arrays, in the fixed frame.
-
-    """
-
+    # the stamp of each sweep, and box arrays, in the fixed frame
     items: list[int | BoxArray] = field(default_factory=list)
 
     def add(self, item: Sweep | BoxArray) -> None:
@@ -69,15 +62,7 @@ class Arrivals:
 
 
 class Inserter:
-    """
-    Decide where empty arrays are inserted: after their sweep, and after all older arrays.
-
-    Parameters
-    ----------
-    parts : sequence of Arrivals
-        Of the whole recording.
-
-    """
+    """Decide where empty arrays are inserted: after their sweep, and after all older arrays."""
 
     def __init__(self, parts: Sequence[Arrivals]) -> None:
         self._missing = [set(part.missing_ns()) for part in parts]

@@ -81,15 +81,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def inspect(args: argparse.Namespace) -> dict[str, Any]:
-    """
-    Return what is in a recording, as `boxreg inspect --json` prints it.
-
-    Raises
-    ------
-    RecordingError
-        If nothing in it can be read.
-
-    """
+    """Return what `boxreg inspect --json` prints; RecordingError if nothing can be read."""
     from boxreg_ros.offline.sources import scene_address
 
     request = request_from(args)

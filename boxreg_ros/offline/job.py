@@ -37,23 +37,12 @@ READ_BYTES = 2**24
 
 @dataclass(frozen=True)
 class Job:
-    """
-    One drive.
+    """One drive."""
 
-    Attributes
-    ----------
-    name : str
-        Name of its result folder.
-    recordings : tuple of Path
-        Files or folders, merged by time; absolute, so that they are the same on each machine.
-    problem : str
-        Why it cannot be done; empty if it can.
-
-    """
-
-    name: str
+    name: str  # of its result folder
+    # merged by time; absolute, so that they are the same on each machine
     recordings: tuple[Path, ...]
-    problem: str = ''
+    problem: str = ''  # why it cannot be done; empty if it can
 
     def size(self) -> int:
         """Return the size of all files [bytes]; 0 where they cannot be found."""
@@ -68,12 +57,8 @@ class Job:
         """
         Return path, size, times and hash of each file; of a URL the tag or time of its server.
 
-        Parameters
-        ----------
-        earlier : sequence
-            Return value of an earlier run: unchanged files are not read again.
-        advanced : callable
-            Called while files are read.
+        `earlier` is the return value of an earlier run: unchanged files are not read again.
+        `advanced` is called while files are read.
 
         """
         known = {tuple(found[:-1]): found[-1] for found in earlier}
@@ -115,18 +100,8 @@ def jobs_of(
     A manifest is a text file with one drive per line: its recordings, merged by time. Relative
     paths begin at the manifest; ``#`` begins a comment. A data set without the name of a scene
     is one drive per scene. A drive that does not exist, or is named a second time, has a problem.
-
-    Parameters
-    ----------
-    arguments : sequence of Path
-        As on the command line.
-    known : mapping of str to sequence of str, optional
-        Recordings of the drives that are done, by name: these keep it.
-
-    Raises
-    ------
-    ConfigError
-        If two drives have the same name.
+    Drives that are done keep their names: `known` has the recordings by name. Raises ConfigError
+    if two drives have the same name.
 
     """
     drives: list[tuple[Path, ...]] = []
@@ -151,12 +126,8 @@ def names_of(
     """
     Return a name for each drive: that of its first recording, with folders where it needs them.
 
-    The order of the drives does not matter.
-
-    Raises
-    ------
-    ConfigError
-        If two drives have the same name with all their folders.
+    The order of the drives does not matter. Raises ConfigError if two drives have the same name
+    with all their folders.
 
     """
     earlier = {tuple(map(Path, paths)): name for name, paths in known.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 import ctypes
 from dataclasses import dataclass, field
@@ -16,8 +17,9 @@ import signal
 import subprocess
 import sys
 from tempfile import TemporaryFile
+from threading import Thread, TIMEOUT_MAX
 import time
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import RecordingError
@@ -28,7 +30,9 @@ from boxreg_ros.offline.batch_results import DRIVE_DONE, Result, UP_TO_DATE
 from boxreg_ros.offline.job import Job, JOBS
 from boxreg_ros.offline.progress import PIPE
 from boxreg_ros.offline.result_folder import claimed, earlier_summary, whole_summary
-from boxreg_ros.offline.time_limit import Watch, watched
+
+_T = TypeVar('_T')
+
 
 DRIVE = '{drive}'
 """Stands for the name of the drive in the options of a batch."""
@@ -48,38 +52,17 @@ Process = subprocess.Popen[bytes]
 
 @dataclass(frozen=True)
 class JobRunner:
-    """
-    Run jobs one by one; can be sent to another machine that has the same files.
+    """Run jobs one by one; can be sent to another machine that has the same files."""
 
-    Attributes
-    ----------
-    out : Path
-        Folder with one result folder per drive; absolute.
-    options : tuple of str
-        Options of `boxreg relabel`; `DRIVE` in them and in `inputs` is the name of the job.
-    config : str
-        The effective settings, for the key.
-    inputs : tuple of Path
-        Files and folders that the options name, for the key.
-    retries : int
-        How often a job whose process was killed is tried again.
-    timeout : float
-        Longest time without progress [s].
-    memory : float
-        Largest memory of one job [bytes].
-    running : set
-        Processes that run now, to end them.
-
-    """
-
-    out: Path
+    out: Path  # folder with one result folder per drive; absolute
+    # of `boxreg relabel`; `DRIVE` in them and in `inputs` is the name of the job
     options: tuple[str, ...]
-    config: str
-    inputs: tuple[Path, ...] = ()
-    retries: int = 1
-    timeout: float = inf
-    memory: float = inf
-    running: set[Process] = field(default_factory=set)
+    config: str  # the effective settings, for the key
+    inputs: tuple[Path, ...] = ()  # files and folders that the options name, for the key
+    retries: int = 1  # how often a job whose process was killed is tried again
+    timeout: float = inf  # longest time without progress [s]
+    memory: float = inf  # largest of one job [bytes]
+    running: set[Process] = field(default_factory=set)  # processes that run now, to end them
 
     def __call__(self, job: Job) -> Result:
         """Relabel a drive if it is not done."""
@@ -222,6 +205,49 @@ class JobRunner:
             process.kill()
             _wait_for(process, END_SECONDS)  # one that reads from a dead mount does not end
             return problem
+
+
+class Watch:
+    """Time without progress, and its limit [s]."""
+
+    def __init__(self, limit: float) -> None:
+        self.limit = limit
+        self._since = time.monotonic()
+
+    def advanced(self) -> None:
+        """Note that there was progress."""
+        self._since = time.monotonic()
+
+    @property
+    def left(self) -> float:
+        """Return the time until the limit is reached [s], at least 0."""
+        return max(self._since + self.limit - time.monotonic(), 0.0)
+
+
+def watched(watch: Watch, call: Callable[[], _T]) -> _T:
+    """
+    Call a function, but wait for it no longer than a time without progress, noted in `watch`.
+
+    It runs in a thread of its own, which is left behind if it is late: a read from a dead mount
+    cannot be interrupted. The thread does not keep the process from its end. Raises TimeoutError
+    if the call makes no progress in time.
+
+    """
+    result: Future[_T] = Future()
+
+    def run() -> None:
+        try:
+            result.set_result(call())
+        except BaseException as error:
+            result.set_exception(error)
+
+    Thread(target=run, daemon=True).start()
+    while True:
+        try:
+            return result.result(min(watch.left, TIMEOUT_MAX))
+        except TimeoutError:
+            if result.done() or not watch.left:
+                raise
 
 
 def read_states(out: Path) -> dict[str, dict[str, Any]]:

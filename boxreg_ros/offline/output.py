@@ -12,9 +12,9 @@ from boxreg_ros.io.stamp_order import kept, Slot, StampOrder
 from boxreg_ros.labels import LabelFrame, LabelOutput, Provenance
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline.background import Background
+from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.reader import ReadItem, Source, uses_one_core
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.reasons import Reason
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.structures import (
@@ -42,44 +42,7 @@ class Sink:
     Every box array gets a ticket on its way to the registrar; its result is found by that
     ticket, because several arrays may have the same stamp. Files are written in a thread, while
     the registrar goes on; attributes are those of all results after the end of the block only.
-
-    Parameters
-    ----------
-    folder : Path
-        Result folder.
-    request : Request
-        Formats to write, and further products of the results.
-    source : Source
-        The recording.
-    clock : Stopwatch
-        The time spent on files is added to its stage ``write``.
-    corrections : Corrections
-        The decisions of a person.
-
-    Attributes
-    ----------
-    boxes_in, boxes_out : int
-        Boxes of the input, and boxes written, added ones included.
-    arrays_in, arrays_out : int
-        Box arrays of the input, and those written, that have any box.
-    status, reasons : Counter
-        Of the boxes written.
-    heading_flips : int
-        Refined headings that differ from the input by more than 90 degrees.
-    without_cloud : int
-        Box arrays without a cloud, where clouds are to be written.
-    time_ranges : dict
-        First and last stamp [ns] of the ``boxes`` and of the ``clouds``.
-    unknown_classes : Counter
-        Boxes by class name, of the names that no group of settings has.
-    changes : Changes
-        Boxes before and after, for the report and the tables of tracks.
-    corrections : Corrections
-        The decisions of a person.
-    array_stamps_ns : list of int
-        Stamps of all box arrays [ns].
-    points : PointCollector or None
-        Points around the input boxes, for the report.
+    The time spent on files is added to the stage ``write`` of the clock.
 
     """
 
@@ -132,15 +95,7 @@ class Sink:
         self.without_cloud = 0
 
     def expect(self, item: ReadItem) -> ReadItem:
-        """
-        Store a cloud that files need, or reserve the place of a box array.
-
-        Returns
-        -------
-        item : ReadItem
-            The same for the registrar; boxes carry a ticket.
-
-        """
+        """Store a cloud that files need, or reserve the place of boxes, which get a ticket."""
         if self.points is not None and item.moved is not None:
             with self._clock('report'):
                 self.points.add(item.moved)

@@ -65,21 +65,7 @@ def labeller_of(
     registrar: BoxRegistrar,
     config: Config,
 ) -> PointLabeller:
-    """
-    Return the labeller of a run.
-
-    Parameters
-    ----------
-    tracks : sequence of TrackChanges
-        Results of the run.
-    array_stamps_ns : sequence of int
-        Stamps of all box arrays [ns].
-    registrar : BoxRegistrar
-        That of the run: its labelling margins and the time of its boxes are used.
-    config : Config
-        Of the run.
-
-    """
+    """Return the labeller of a run, with the labelling margins and box times of its registrar."""
     objects = object_tracks(tracks)
     kinds = [KINDS.index(config.kind(one.class_name)) for one in objects]
     margins = registrar.margins()[kinds].reshape(-1, 6)
@@ -111,15 +97,7 @@ def write_point_products(
     labeller: PointLabeller,
     fixed_frame: str,
 ) -> dict[str, Any]:
-    """
-    Write the formats and clouds that a request asks for.
-
-    Returns
-    -------
-    counts : dict
-        Sweeps and points by their label, for ``summary.json``.
-
-    """
+    """Write the formats and clouds of a request; return sweeps and points by their label."""
     products = _Products(folder, request, sweeps, labeller, fixed_frame)
     products.write()
     return products.summary()
@@ -298,15 +276,7 @@ def _file_name(track_id: str, row: int) -> str:
 
 
 class VoxelCloud:
-    """
-    Points with one per voxel, the first.
-
-    Parameters
-    ----------
-    edge : float
-        Of the voxels [m].
-
-    """
+    """Points with one per voxel, the first; `edge` is that of the voxels [m]."""
 
     def __init__(self, edge: float) -> None:
         self._edge = edge

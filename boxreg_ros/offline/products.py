@@ -10,12 +10,11 @@ from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.times import time_range
 from boxreg_ros.offline.notes import closing_line, MAX_NAMED
+from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.sources import true_boxes
-from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.structures import Ints
-from boxreg_ros.tracks.effects import TrackSteps
 import numpy as np
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from boxreg_ros.review.rules import Violation
     from boxreg_ros.review.tables import TrackRow
     from boxreg_ros.review.track_points import PointCollector
-    from boxreg_ros.tracks.complete import CompletionPlan
+    from boxreg_ros.tracks.complete import CompletionPlan, TrackSteps
 
 STEP_COLUMNS = ('fragments', 'filled', 'extended', 'rejected', 'reclassified', 'ambiguous')
 

@@ -21,15 +21,7 @@ def write_proposals(
     labeller: PointLabeller,
     fixed_frame: str,
 ) -> list[dict[str, Any]]:
-    """
-    Find objects that no box covers, and write a box of each to `PROPOSALS`.
-
-    Returns
-    -------
-    proposals : list of dict
-        For ``summary.json``, longest first.
-
-    """
+    """Write a box of each object that no box covers to `PROPOSALS`; return them, longest first."""
     proposer = Proposer()
     for sweep, _ in sweeps:
         if sweep is not None and labeller.knows(sweep.stamp_ns):

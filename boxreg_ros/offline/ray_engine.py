@@ -30,23 +30,11 @@ def ray_engine(
     Yield a function that runs a job on a cluster, how many to run at a time, and one to end them.
 
     A job whose worker or node is lost is started again and goes on from its journal, as the
-    output is on storage that all nodes share. So does a job of a driver that was killed, when the
-    same command is run again.
-
-    Parameters
-    ----------
-    runner : JobRunner
-        Runs one job on a node; its paths must exist there. Each job asks for one core and the
-        memory of the runner.
-    address : str or None
-        Of the cluster; None for the one of this machine, or a new local one.
-
-    Raises
-    ------
-    ConfigError
-        If Ray is not installed, or no node has the memory of a job.
-    RecordingError
-        If the cluster does not answer.
+    output is on storage that all nodes share. So does a job of a driver that was killed, when
+    the same command is run again. The paths of `runner` must exist on the nodes; each job asks
+    for one core and its memory. Without an address the cluster is that of this machine, or a new
+    local one. Raises ConfigError if Ray is not installed, or no node has the memory of a job,
+    and RecordingError if the cluster does not answer.
 
     """
     ray = _connected(address)

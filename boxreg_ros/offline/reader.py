@@ -24,9 +24,9 @@ from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.offline.background import Background
-from boxreg_ros.offline.labelled_recording import label_frame_of
+from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.offline.sources import label_frame_of
 from boxreg_ros.offline.stored_sweeps import StoredPlace, StoredSweeps
 from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send
 from boxreg_ros.structures import BoxArray, Floats, Sweep
@@ -57,125 +57,55 @@ SAMPLED_SECONDS = 5.0
 
 
 class ReadItem(NamedTuple):
-    """
-    A cloud or boxes for the registrar, with the poses that label files need.
+    """A cloud or boxes for the registrar, with the poses (4, 4) that label files need."""
 
-    Attributes
-    ----------
-    seconds : float
-        Time since the start of the part that is read [s].
-    restarts : bool
-        True if time went back before this item.
-    given, moved : Sweep or BoxArray, or None
-        In its own and in the fixed frame. `given` is None for a cloud that is not written;
-        `moved` is None where no transform is known.
-    T_fixed_given, T_fixed_sensor : array, shape (4, 4), or None
-        Poses of its own frame and of the sensor frame of label files. None where unknown, and
-        for a cloud that is not written: it has the second.
-    intensities : array, shape (M,), or None
-        Of a cloud that is written.
-
-    """
-
-    seconds: float
-    restarts: bool
-    given: Sweep | BoxArray | None
-    moved: Sweep | BoxArray | None
-    T_fixed_given: Floats | None
-    T_fixed_sensor: Floats | None
-    intensities: Floats | None
+    seconds: float  # since the start of the part that is read
+    restarts: bool  # time went back before this item
+    given: Sweep | BoxArray | None  # in its own frame; None for a cloud that is not written
+    moved: Sweep | BoxArray | None  # in the fixed frame; None where no transform is known
+    T_fixed_given: Floats | None  # None where unknown, and for a cloud that is not written
+    T_fixed_sensor: Floats | None  # pose of the sensor frame of label files
+    intensities: Floats | None  # (M,) of a cloud that is written
 
 
 class Source(NamedTuple):
-    """
-    Properties of a recording that are known before the first item.
+    """Properties of a recording that are known before the first item."""
 
-    Attributes
-    ----------
-    topics : dict
-        Topics of points, boxes and odometry; None where there is none.
-    fixed_frame, sensor_frame : str
-        Frame to refine in, and sensor frame of label files.
-    seconds : float
-        Duration of the part that is read [s].
-    latency : Latency
-        Of the boxes, which have been corrected for it.
-
-    """
-
-    topics: dict[str, str | None]
-    fixed_frame: str
-    sensor_frame: str
-    seconds: float
-    latency: Latency
+    topics: dict[str, str | None]  # of points, boxes and odometry; None where there is none
+    fixed_frame: str  # to refine in
+    sensor_frame: str  # of label files
+    seconds: float  # duration of the part that is read
+    latency: Latency  # of the boxes, which have been corrected for it
 
 
 class Findings(NamedTuple):
-    """
-    Properties of a recording that are known after the last item.
+    """Properties of a recording that are known after the last item."""
 
-    Attributes
-    ----------
-    counts, first_missing_transform, first_unplaced
-        As of `FixedFrameItems`.
-    lidars : dict of str and Counter
-        Of each of several topics of clouds: clouds that were merged, late and missing.
-    point_layouts : dict of str
-        Layout of the clouds of each topic, and how the times of their points are read.
-    unreadable, first_unreadable : int and str
-        Number of unreadable messages, and the first error of each topic.
-    apart : dict
-        Topics that were recorded apart from the clouds, and by how much [s].
-    damages : list of Damage
-        Parts of the files that could not be read.
-    outside : int
-        Boxes of label files outside of the part that is read.
-    warning, facts : str and dict
-        Finding of the pose check, and origin of the ids.
-    places : list of StoredPlace
-        Of the stored sweeps; empty where none are stored.
-    seconds : dict
-        Time spent in each stage [s].
-
-    """
-
-    counts: Counter[str]
+    counts: Counter[str]  # this and the next two: as of `FixedFrameItems`
     first_missing_transform: str
     first_unplaced: str
+    # clouds of each of several topics that were merged, late and missing
     lidars: dict[str, Counter[str]]
+    # of the clouds of each topic, and how the times of their points are read
     point_layouts: dict[str, str]
-    unreadable: int
-    first_unreadable: str
+    unreadable: int  # messages
+    first_unreadable: str  # the first error of each topic
+    # topics that were recorded apart from the clouds, and by how much [s]
     apart: dict[str, float]
-    damages: list[Damage]
-    outside: int
-    warning: str
-    facts: dict[str, Any]
-    places: list[StoredPlace]
-    seconds: dict[str, float]
+    damages: list[Damage]  # parts of the files that could not be read
+    outside: int  # boxes of label files outside of the part that is read
+    warning: str  # finding of the pose check
+    facts: dict[str, Any]  # origin of the ids
+    places: list[StoredPlace]  # of the stored sweeps; empty where none are stored
+    seconds: dict[str, float]  # spent in each stage
 
 
 class RecordingReader:
     """
-    Read a recording and bring its items into the fixed frame.
+    Read an open recording and bring its items into the fixed frame.
 
-    Parameters
-    ----------
-    recording : ItemSource
-        Open.
-    request : Request
-        Frames, convention and settings.
-    clock : Stopwatch
-        Measures the stages ``read``, ``decode`` and ``transform``.
-    latency : Latency
-        By which the boxes are corrected.
-    sweeps : StoredSweeps, optional
-        Where all sweeps are stored.
-
-    Attributes
-    ----------
-    source : Source
-        Known before the first item.
+    The stages ``read``, ``decode`` and ``transform`` are measured by the clock. All sweeps are
+    stored in `sweeps`. `source` is known before the first item.
 
     """
 
@@ -212,10 +142,7 @@ class RecordingReader:
         """
         Yield clouds and boxes in the order they were received.
 
-        Raises
-        ------
-        UnsupportedMessage
-            At the end, if no cloud, or no message of boxes, was readable.
+        Raises UnsupportedMessage at the end, if no cloud, or no message of boxes, was readable.
 
         """
         yield from in_time(self._read(), self.source.latency.seconds, self._waits)
@@ -279,15 +206,8 @@ def in_time(items: Iterable[ReadItem], latency: float, waits: bool) -> Iterator[
     """
     Yield items in their order, late boxes moved to where their objects are at their stamp.
 
-    Parameters
-    ----------
-    items : iterable of ReadItem
-        In the fixed frame, as read.
-    latency : float
-        Of the boxes [s].
-    waits : bool
-        Whether boxes wait for the later ones that show their objects; as the node, which cannot
-        wait, they are otherwise predicted.
+    With `waits` boxes wait for the later ones that show their objects; as in the node, which
+    cannot wait, they are otherwise predicted. `latency` is that of the boxes [s].
 
     """
     late = LateBoxes()
@@ -378,17 +298,7 @@ def uses_one_core(config: Config) -> bool:
 
 
 class ReadAhead:
-    """
-    Iterate over the items that a `RecordingReader` yields, in another process a few ahead.
-
-    Attributes
-    ----------
-    source : Source
-        Known before the first item.
-    findings : Findings
-        Known after the last item; not set before.
-
-    """
+    """Items that a `RecordingReader` yields in another process; `findings` follow the last one."""
 
     def __init__(self, receive: Receive) -> None:
         self._receive = receive

@@ -23,8 +23,8 @@ from boxreg_ros.core.tables import joined
 from boxreg_ros.core.window import Estimate, Window
 from boxreg_ros.io.compilation import announced_compilation
 from boxreg_ros.io.warm_up import warm_up, warm_up_crop
+from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.reader import uses_one_core
-from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send, WorkerProcess
 
 
@@ -37,16 +37,8 @@ def registration_worker(
 
     Yield None where a worker is no gain or cannot work: a sliding window is awaited before the
     next sweep is taken, a run on one core is one process, and only the CPU can be used after a
-    fork.
-
-    Parameters
-    ----------
-    config : Config
-        Settings.
-    clock : Stopwatch
-        The time in `register` is added to its stage ``solve``.
-    announce : callable
-        Called with what is waited for where that takes long.
+    fork. The time in `register` is added to the stage ``solve`` of the clock; `announce` is called
+    with what is waited for where that takes long.
 
     """
     if config.estimate != 'track' or uses_one_core(config):
@@ -110,12 +102,7 @@ def _registered(packed: Any, config: Config, model: InputModel) -> tuple[Any, ..
 
 
 def _packed(windows: Sequence[Window]) -> tuple[Any, ...]:
-    """
-    Return windows, and the observations of all of them as one table.
-
-    In place of its observations a window holds their number.
-
-    """
+    """Return windows with the number of their observations, and the table of all of these."""
     tables, rows = joined([item for window in windows for item in window.observations])
     heads = [
         window._replace(observations=cast(Any, len(window.observations))) for window in windows

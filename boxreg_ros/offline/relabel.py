@@ -25,7 +25,7 @@ from boxreg_ros.offline.products import (
     write_run_report,
     write_track_tables,
 )
-from boxreg_ros.offline.progress import Progress
+from boxreg_ros.offline.progress import Progress, Stopwatch
 from boxreg_ros.offline.reader import ReadAhead, reader, ReadItem
 from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.offline.result_folder import (
@@ -35,7 +35,6 @@ from boxreg_ros.offline.result_folder import (
     whole_folder,
     write_summary,
 )
-from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.review.decisions import DECISIONS, read_decisions

@@ -47,31 +47,11 @@ class Request:
     """
     Inputs and options of one relabel run; each command line option is stated by its field.
 
-    Attributes
-    ----------
-    recordings : tuple of Path
-        Files or folders of one drive, merged by time, or the address of a scene of a data set.
-    lidars : Lidars
-        Topics of the clouds, and their LiDARs.
-    convention : Convention
-        Meaning of pose and size of the input boxes.
-    config : Config
-        Settings of the core.
-    options : Options
-        Settings of the label formats.
-    command : tuple of str
-        Arguments of `boxreg` that describe the request; empty if it was made in another way.
-    others
-        As their options state; None for the default named there.
-
-    Raises
-    ------
-    ConfigError
-        If an option cannot work, alone or with another one.
+    Raises ConfigError if an option cannot work, alone or with another one.
 
     """
 
-    recordings: tuple[Path, ...]
+    recordings: tuple[Path, ...]  # one drive, merged by time, or a scene of a data set
     lidars: Lidars = SINGLE_LIDAR
     boxes: str | None = option(
         None,
@@ -180,6 +160,7 @@ class Request:
         parse=Path,
     )
 
+    # arguments of `boxreg`, if these made it
     command: tuple[str, ...] = field(default=(), repr=False, compare=False)
 
     def __post_init__(self) -> None:

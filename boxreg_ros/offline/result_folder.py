@@ -66,15 +66,7 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> None:
 
 
 def spare(out: Path, inputs: Iterable[Path | None]) -> None:
-    """
-    Refuse to replace a result folder that contains an input.
-
-    Raises
-    ------
-    ConfigError
-        If one of `inputs` is `out` or lies in it, symbolic links followed.
-
-    """
+    """Raise ConfigError for a result folder that contains an input, symbolic links followed."""
     folder = out.resolve()
     for path in filter(None, inputs):
         if path.resolve().is_relative_to(folder):
@@ -85,15 +77,7 @@ def spare(out: Path, inputs: Iterable[Path | None]) -> None:
 
 
 def spare_file(out: Path, inputs: Iterable[Path]) -> None:
-    """
-    Refuse to write a file over an input.
-
-    Raises
-    ------
-    ConfigError
-        If `out` is one of `inputs`, or lies in a folder that is one, symbolic links followed.
-
-    """
+    """Raise ConfigError for a file that is an input or in a folder of one, links followed."""
     file = out.resolve()
     for path in inputs:
         if file.is_relative_to(path.resolve()):
@@ -108,12 +92,8 @@ def claimed(out: Path) -> Iterator[None]:
     """
     Keep other runs from an output, and settle what a run that was killed has left of it.
 
-    Object stores have no locks: of a URL, a second run is not noticed.
-
-    Raises
-    ------
-    RecordingError
-        If another run writes to it, or it cannot be written.
+    Object stores have no locks: of a URL, a second run is not noticed. Raises RecordingError if
+    another run writes to it, or it cannot be written.
 
     """
     with writing(out):
@@ -184,15 +164,7 @@ def _uploaded_folder(out: Path) -> Iterator[Path]:
 
 @contextmanager
 def writing(out: Path) -> Iterator[None]:
-    """
-    Name the output in errors of the file system.
-
-    Raises
-    ------
-    RecordingError
-        If the disk of `out` is full, or it cannot be written.
-
-    """
+    """Raise errors of the file system, as of a full disk, as RecordingError with the output."""
     try:
         yield
     except OSError as error:

@@ -33,18 +33,9 @@ class EstimateJournal:
     """
     Store estimates in the order their windows are submitted; use as a context manager.
 
-    Parameters
-    ----------
-    path : Path
-        File of the journal, or its folder behind a URL. It is deleted after success, and where it
-        has no estimates.
-    fingerprint : str
-        Of the request. A journal of another request is begun again.
-
-    Raises
-    ------
-    OSError
-        On entering, if the file cannot be written.
+    The file, or folder behind a URL, is deleted after success, and where it has no estimates. A
+    journal of a request with another fingerprint is begun again. Entering raises OSError if the
+    file cannot be written.
 
     """
 
@@ -128,10 +119,7 @@ def journal_path(out: Path) -> Path:
     """
     Return the journal of a result folder: beside it, hidden; of a URL, too.
 
-    Raises
-    ------
-    ConfigError
-        If nothing can be beside it.
+    Raises ConfigError if nothing can be beside it.
 
     """
     if url_of(out) is None:

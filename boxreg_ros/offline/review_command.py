@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+import json
 from pathlib import Path
 import subprocess
 import sys
+from typing import NoReturn
 
+from boxreg_ros.config import Config
+from boxreg_ros.datasets import SceneRecording
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.files import METADATA
+from boxreg_ros.offline import relabel_command
 from boxreg_ros.offline.arguments import add_options, Settings, values_of, words_of
 from boxreg_ros.offline.request import NO_TOPIC, Request
-from boxreg_ros.offline.result_folder import SUMMARY
-from boxreg_ros.offline.reviewed_drive import drive_of
-from boxreg_ros.offline.sources import scene_address
+from boxreg_ros.offline.result_folder import CONFIG, SUMMARY
+from boxreg_ros.offline.sources import scene_address, source_of
+from boxreg_ros.review.scene import DriveSource
 from boxreg_ros.review.server import add_server_arguments, serve
 from msg_adapters import ADAPTERS
 
@@ -91,3 +97,55 @@ def _print_progress(outs: Sequence[Path]) -> int:
 
     print('\n'.join(progress_lines([progress_of(out) for out in outs])))
     return 0
+
+
+def drive_of(out: Path) -> DriveSource | None:
+    """
+    Return the recording of a result; None for a result that no command has made.
+
+    Raises RecordingError if another version has made it, with options that this one lacks.
+
+    """
+    summary = json.loads((out / SUMMARY).read_bytes())
+    command, folder = summary.get('command', []), Path(summary.get('folder', '.'))
+    if command[:1] != ['relabel']:
+        return None
+    parser = _Parser()
+    relabel_command.add_arguments(parser)
+    args = parser.parse_args([*command[1:], '-o', str(out)])
+    values = values_of(args, Request)
+    paths = [_within(folder, path) for path in args.recordings]
+    labels = values['labels']
+    if labels is not None:
+        labels = labels[0], _within(folder, labels[1])
+
+    def source() -> Recording | SceneRecording:
+        return source_of(
+            paths,
+            values['lidars'],
+            values['boxes'],
+            values['odometry'],
+            values['start'],
+            values['end'],
+            values['convention'],
+            labels,
+        )
+
+    config = Config.from_yaml(out / CONFIG)
+    return DriveSource(source, values['convention'], summary['fixed_frame'], config)
+
+
+class _Parser(argparse.ArgumentParser):
+    """Refuse the command of a result that another version has made."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise RecordingError."""
+        raise RecordingError(
+            f'{SUMMARY}: expected a command of this version, got another one ({message}); make '
+            f'the result again with boxreg relabel RECORDING -o NEW --report'
+        )
+
+
+def _within(folder: Path, path: Path) -> Path:
+    """Return a path relative to the folder of the command; addresses of data sets as they are."""
+    return folder / path if (folder / path).exists() else path

@@ -2,22 +2,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.datasets import Address, address_of, SceneRecording
-from boxreg_ros.errors import ConfigError
+from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import FixedFrameItems
+from boxreg_ros.io.items import EVERYTHING, Item, ItemSource, Wanted
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.offline.labelled_recording import LabelledRecording, UnlabelledRecording
+from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.labels import frames_of
+from boxreg_ros.labels.merging import LabelMerger
 from boxreg_ros.offline.request import NO_TOPIC
 from boxreg_ros.structures import BoxArray
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
+
+
+class LabelledRecording(Recording):
+    """Clouds and motion of a recording, and boxes of label files as `LabelMerger` orders them."""
+
+    has_boxes = False
+
+    def __init__(self, labels: tuple[str, Path], paths: Any, **options: Any) -> None:
+        super().__init__(paths, **options)
+        self._labels = labels
+        self._is_part = any(options.get(name) is not None for name in ('start', 'end'))
+
+    def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
+        """Yield clouds and boxes; see `Recording.items`. Boxes have `Item.refined`."""
+        merger = LabelMerger(
+            frames_of(*self._labels), tree, self.sensor_frame(), self.start_ns, self._is_part
+        )
+        for cloud in super().items(tree, wanted._replace(clouds=True)):
+            if wanted.clouds:
+                yield cloud
+            yield from merger.after(cloud.received_ns, cloud.content.stamp_ns)
+        yield from merger.rest()
+        self.outside = merger.outside
+
+
+class UnlabelledRecording(Recording):
+    """Clouds and motion of a recording, with an empty array of boxes at each cloud."""
+
+    has_boxes = False
+
+    def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
+        """Yield clouds and empty arrays; see `Recording.items`."""
+        for cloud in super().items(tree, wanted._replace(clouds=True)):
+            if wanted.clouds:
+                yield cloud
+            sweep = cloud.content
+            none = BoxArray(sweep.stamp_ns, sweep.frame_id, (), (), np.zeros(0), np.zeros((0, 9)))
+            yield Item(cloud.received_ns, none)
+
+
+def label_frame_of(
+    recording: ItemSource, tree: TransformTree, fixed_frame: str, wish: str | None
+) -> str:
+    """
+    Return the sensor frame of label files: the frame of the clouds, or `wish`.
+
+    Raises RecordingError if no transforms connect it with the fixed frame.
+
+    """
+    frame = (wish or recording.sensor_frame()).lstrip('/')
+    if not tree.connects(fixed_frame, frame):
+        raise RecordingError(
+            f'{recording}: label frame {frame!r}: expected one that is connected with '
+            f'{fixed_frame!r}; TF: {tree}; choose another with --label-frame'
+        )
+    return frame
 
 
 def source_of(
@@ -31,21 +91,10 @@ def source_of(
     labels: tuple[str, Path] | None = None,
 ) -> Recording | SceneRecording:
     """
-    Return the recording or the scene of a data set, not yet open.
+    Return the recording or the scene of a data set, not yet open; options as of `Recording`.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Recordings of one drive, or one address of a scene.
-    lidars, boxes, odometry, start, end, convention
-        As those of `Recording`.
-    labels : tuple of str and Path, optional
-        Format and path of label files to read the boxes from.
-
-    Raises
-    ------
-    ConfigError
-        If an option does not apply to a scene, or there are several.
+    With `labels`, a format and a path, the boxes are those of label files. Raises ConfigError if
+    an option does not apply to a scene, or there are several.
 
     """
     address = scene_address(paths)
@@ -65,10 +114,7 @@ def scene_address(paths: Sequence[Path]) -> Address | None:
     """
     Return the address of a scene among paths; None if all are recordings.
 
-    Raises
-    ------
-    ConfigError
-        If there are other paths beside it.
+    Raises ConfigError if there are other paths beside it.
 
     """
     addresses = [address for address in map(address_of, paths) if address is not None]
@@ -112,10 +158,7 @@ def true_boxes(path: Path) -> BoxTable:
     """
     Return true boxes: of a table, or the annotations of a scene of a data set.
 
-    Raises
-    ------
-    RecordingError
-        If they cannot be read.
+    Raises RecordingError if they cannot be read.
 
     """
     address = address_of(path)

@@ -18,63 +18,26 @@ ALIGNMENT = 16
 
 
 class MergedCloud(NamedTuple):
-    """
-    A cloud that a sweep was merged from.
+    """A cloud that a sweep was merged from."""
 
-    Attributes
-    ----------
-    topic : str
-        Empty if there is only one topic of clouds.
-    stamp_ns : int
-        Of its header [ns].
-    rows : slice
-        Its points in the sweep.
-    R_fixed_cloud : array, shape (3, 3)
-        Rotation of its frame; the identity where unknown.
-
-    """
-
-    topic: str
+    topic: str  # empty if there is only one topic of clouds
     stamp_ns: int
-    rows: slice
-    R_fixed_cloud: Floats
+    rows: slice  # its points in the sweep
+    R_fixed_cloud: Floats  # (3, 3) the identity where unknown
 
 
 class StoredSweep(NamedTuple):
-    """
-    A sweep of the recording.
+    """A sweep of the recording."""
 
-    Attributes
-    ----------
-    sweep : Sweep or None
-        In the fixed frame; None where no transform is known.
-    cloud : StoredCloud or None
-        The same for label files; None unless asked for.
-
-    """
-
-    sweep: Sweep | None
-    cloud: StoredCloud | None
+    sweep: Sweep | None  # in the fixed frame; None where no transform is known
+    cloud: StoredCloud | None  # the same for label files; None unless asked for
 
 
 class StoredPlace(NamedTuple):
-    """
-    Where a sweep is in the file, and the clouds that it was merged from.
-
-    Attributes
-    ----------
-    first_byte : int
-        Where its arrays begin.
-    sizes : list of int
-        Bytes of its arrays, one after the other, and of what describes them; each begins at a
-        multiple of `ALIGNMENT`.
-    parts : tuple of MergedCloud
-        The clouds.
-
-    """
+    """Where a sweep is in the file, and the clouds that it was merged from."""
 
     first_byte: int
-    sizes: list[int]
+    sizes: list[int]  # bytes of its arrays, and of their description; starts are aligned
     parts: tuple[MergedCloud, ...]
 
 
@@ -82,17 +45,9 @@ class StoredSweeps:
     """
     Sweeps in a temporary file: written by the process that reads, then read by the other.
 
-    Parameters
-    ----------
-    folder : Path or None
-        Where the file lies, without a name; None for the folder of temporary files.
-    with_clouds : bool
-        Whether sweeps are stored for label files, too.
-
-    Attributes
-    ----------
-    places : list of StoredPlace
-        Of all sweeps, in the order of reading; the process that reads them hands them over.
+    It lies in `folder`, without a name, or among the temporary files; with clouds, it has the
+    sweeps for label files, too. `places` are in the order of reading; the process that reads them
+    hands them over.
 
     """
 

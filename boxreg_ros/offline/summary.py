@@ -29,138 +29,65 @@ NO_BOXES = 'no boxes in this part of the recording: nothing was refined; see --s
 
 @dataclass(slots=True)
 class Summary:
-    """
-    The content of ``summary.json``.
-
-    Attributes
-    ----------
-    recordings : list of str
-        Paths.
-    command, folder : list of str, and str
-        Arguments of `boxreg` that made the result, and the folder they were given in; no
-        arguments for a run from Python.
-    topics : dict
-        Topics of points, boxes and odometry; None where there is none.
-    labels : dict or None
-        Format and path of the label files that the boxes come from, and their boxes outside of
-        the part that was read; None for boxes of the recording.
-    fixed_frame, estimate : str
-        Frame of the results, and setting.
-    sweeps, box_arrays : int
-        Messages that were read.
-    boxes_in, boxes_out : int
-        Boxes of the input, and boxes written, added ones included.
-    status, reasons : dict
-        Boxes by status, and kept and rejected ones by reason, the most frequent first.
-    time_jumps, heading_flips, frames_without_cloud : int
-        Their numbers.
-    recorded_apart : dict
-        Topics that were recorded apart from the clouds, and by how much [s].
-    box_time : dict
-        Estimated time and latency of the boxes.
-    time_ranges : dict
-        First and last stamp [ns] of boxes and clouds.
-    unknown_classes : dict
-        Boxes by class name that no group of settings has.
-    dropped, without_stamp : dict
-        Messages that were not used by reason, and clouds and box arrays with the stamp 0.
-    damage : list of dict
-        Parts of the files that could not be read.
-    lidars, point_layouts : dict
-        Clouds of each of several LiDARs, and layout of the clouds of each topic.
-    first_missing_transform, first_unplaced, first_unreadable : str
-        The first error of its kind; empty without one.
-    warning : str
-        Findings about the input as a whole.
-    ids : str
-        Origin of the track ids.
-    associated_tracks : int or None
-        Tracks that the association has made; None without it.
-    left_out_of_labels : dict
-        Boxes that a format cannot represent, by format and reason.
-    unused_decisions : list of str
-        Tracks and boxes with a decision that the recording does not have.
-    versions : dict
-        Of everything that can change the results.
-    complete : dict
-        Tracks and boxes that each step of completion changed; empty without steps.
-    seeds : list of dict
-        Where each track of keyframes ends in both directions and why, and keyframes that could
-        not be used; empty without keyframes.
-    proposals : list of dict
-        Objects that no box covers, longest first; empty where they are not looked for.
-    sweeps_with_boxes : dict
-        Sweeps with a box ``before`` and ``after`` the run.
-    fingerprint : str
-        Of the request and its files.
-    seconds : dict
-        Time of each stage [s].
-    rules : dict
-        Violations of each rule before and after the run.
-    points : dict
-        Sweeps and points by their label; empty where points are not labelled.
-    input_model : dict
-        Drives that the input model began with, and where drives of it differ.
-
-    """
+    """The content of ``summary.json``."""
 
     recordings: list[str]
-    command: list[str]
-    folder: str
-    topics: dict[str, str | None]
+    command: list[str]  # arguments of `boxreg`; none for a run from Python
+    folder: str  # that the arguments were given in
+    topics: dict[str, str | None]  # of points, boxes and odometry; None where there is none
+    # format and path of label files, and their boxes outside of the part
     labels: dict[str, Any] | None
     fixed_frame: str
     estimate: str
-    sweeps: int
+    sweeps: int  # here and below: messages that were read
     box_arrays: int
     boxes_in: int
-    boxes_out: int
+    boxes_out: int  # added ones included
     status: dict[str, int]
-    reasons: dict[str, int]
+    reasons: dict[str, int]  # of kept and rejected boxes, the most frequent first
     time_jumps: int
+    # topics recorded apart from the clouds, and by how much [s]
     recorded_apart: dict[str, float]
     heading_flips: int
-    box_time: dict[str, Any]
-    time_ranges: dict[str, list[int]]
-    unknown_classes: dict[str, int]
-    dropped: dict[str, int]
-    without_stamp: dict[str, int]
-    damage: list[dict[str, Any]]
-    lidars: dict[str, dict[str, int]]
-    point_layouts: dict[str, str]
-    first_missing_transform: str
+    box_time: dict[str, Any]  # estimated time and latency of the boxes
+    time_ranges: dict[str, list[int]]  # first and last stamp [ns] of boxes and clouds
+    unknown_classes: dict[str, int]  # boxes by class name that no group of settings has
+    dropped: dict[str, int]  # messages that were not used, by reason
+    without_stamp: dict[str, int]  # clouds and box arrays with the stamp 0
+    damage: list[dict[str, Any]]  # parts of the files that could not be read
+    lidars: dict[str, dict[str, int]]  # clouds of each of several LiDARs
+    point_layouts: dict[str, str]  # of the clouds of each topic
+    first_missing_transform: str  # here and below: the first error of its kind, or empty
     first_unplaced: str
     first_unreadable: str
-    warning: str
-    ids: str
+    warning: str  # findings about the input as a whole
+    ids: str  # origin of the track ids
+    # boxes that a format cannot represent, by reason
     left_out_of_labels: dict[str, dict[str, int]]
-    unused_decisions: list[str]
+    unused_decisions: list[str]  # on tracks and boxes that the recording does not have
     frames_without_cloud: int
-    versions: dict[str, str]
-    associated_tracks: int | None = None
+    versions: dict[str, str]  # of everything that can change the results
+    associated_tracks: int | None = None  # that the association has made; None without it
+    # tracks and boxes that each step changed
     complete: dict[str, int] = field(default_factory=dict)
+    # ends of tracks of keyframes, and why
     seeds: list[dict[str, Any]] = field(default_factory=list)
+    # objects that no box covers, longest first
     proposals: list[dict[str, Any]] = field(default_factory=list)
-    sweeps_with_boxes: dict[str, int] = field(default_factory=dict)
-    fingerprint: str = ''
-    seconds: dict[str, float] = field(default_factory=dict)
+    sweeps_with_boxes: dict[str, int] = field(default_factory=dict)  # ``before`` and ``after``
+    fingerprint: str = ''  # of the request and its files
+    seconds: dict[str, float] = field(default_factory=dict)  # of each stage
+    # violations before and after the run
     rules: dict[str, dict[str, int]] = field(default_factory=dict)
-    points: dict[str, Any] = field(default_factory=dict)
+    points: dict[str, Any] = field(default_factory=dict)  # sweeps and points by their label
+    # drives it began with, and differences
     input_model: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(
         cls, request: Request, recording: ReadAhead, registrar: BoxRegistrar, sink: Sink
     ) -> Self:
-        """
-        Return the summary of a run whose boxes are written.
-
-        Raises
-        ------
-        RuntimeError
-            If the registrar has not returned all boxes.
-
-        """
+        """Return the summary of a written run; RuntimeError if the registrar has lost boxes."""
         if sink.missing():
             raise RuntimeError(
                 f'boxes: expected all {sink.boxes_in} back from the registrar, {sink.missing()} '

@@ -28,19 +28,7 @@ def check_plotly() -> None:
 
 
 def write_timeline(path: Path, facts: Mapping[str, Any], lines: Sequence[str]) -> None:
-    """
-    Write one HTML page with the timeline and the text of `boxreg inspect`.
-
-    Parameters
-    ----------
-    path : Path
-        File to write; it appears whole or not at all.
-    facts : mapping
-        What `boxreg inspect --json` prints.
-    lines : sequence of str
-        What `boxreg inspect` prints.
-
-    """
+    """Write one whole HTML page with the timeline of facts, and the text of `boxreg inspect`."""
     import plotly.graph_objects as go
 
     rows = {entry['topic']: entry for entry in facts['topics']}

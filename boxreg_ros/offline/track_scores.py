@@ -9,7 +9,7 @@ import math
 from typing import Any
 
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.offline.overlap import best_pairs, Overlaps, overlaps
+from boxreg_ros.offline.box_scores import best_pairs, Overlaps, overlaps
 from boxreg_ros.structures import ADDED, Floats, Ints
 import numpy as np
 
@@ -22,39 +22,23 @@ class TrackScores:
     """
     Scores of boxes as tracks. Boxes are matched by overlap at each stamp, not by their ids.
 
-    Attributes
-    ----------
-    recall, precision : float
-        Part of the true boxes, and of the predicted boxes, that are found with `LEAST_IOU`.
-    misses, ghosts : int
-        True boxes that are not found, and predicted boxes that find none.
-    ids_per_object : float
-        Mean number of predicted ids that find a true object, over the objects found. As in
-        CLEAR MOT, a pair of ids goes on while its boxes overlap: where the truth has two boxes
-        of one object, the ids do not change places.
-    added, added_iou : int and float
-        Boxes that the input did not have, and their mean 3D IoU; 0 for a ghost.
-    added_ghosts : int
-        Those of them that overlap no true box.
-    given_iou : float
-        Mean 3D IoU of the other boxes, likewise.
-    hota, det_a, ass_a, idf1 : float
-        HOTA, its parts for detection and association, and IDF1; NaN without trackeval.
+    As in CLEAR MOT, a pair of ids goes on while its boxes overlap: where the truth has two boxes
+    of one object, the ids do not change places.
 
     """
 
-    recall: float
-    precision: float
-    misses: int
-    ghosts: int
-    ids_per_object: float
-    added: int
-    added_iou: float
-    added_ghosts: int
-    given_iou: float
-    hota: float
-    det_a: float
-    ass_a: float
+    recall: float  # part of the true boxes that are found with `LEAST_IOU`
+    precision: float  # the same of the predicted boxes
+    misses: int  # true boxes that are not found
+    ghosts: int  # predicted boxes that find none
+    ids_per_object: float  # predicted ids that find a true object, mean over the objects found
+    added: int  # boxes that the input did not have
+    added_iou: float  # their mean 3D IoU; 0 for a ghost
+    added_ghosts: int  # those of them that overlap no true box
+    given_iou: float  # of the other boxes, likewise
+    hota: float  # NaN without trackeval, as the next three
+    det_a: float  # its part for detection
+    ass_a: float  # its part for association
     idf1: float
 
 
@@ -65,15 +49,10 @@ def has_trackeval() -> bool:
 
 def track_scores(predicted: BoxTable, truth: BoxTable, scope: Ints | None = None) -> TrackScores:
     """
-    Return the scores of tracks.
+    Return the scores of tracks in one frame; invalid boxes are ignored.
 
-    Parameters
-    ----------
-    predicted, truth : BoxTable
-        Boxes in one frame; invalid ones are ignored.
-    scope : array, shape (n,), optional
-        Rows of the true boxes that count. A predicted box that finds one of the others is
-        ignored. Default: all.
+    Only the true boxes in the rows of `scope` (n,) count, by default all. A predicted box that
+    finds one of the others is ignored.
 
     """
     is_in_scope = np.ones(len(truth.boxes), bool)

@@ -31,47 +31,19 @@ ENDED = (EOFError, OSError, pickle.UnpicklingError)
 
 
 class WorkerProcess:
-    """
-    The parent's end of the connection to a worker process.
-
-    Parameters
-    ----------
-    connection : socket
-        Connection to the worker.
-    purpose : str
-        The work of the process as a verb phrase, as in 'reads the recording'; used in errors.
-
-    """
+    """The parent's end of the connection to a worker process, with its purpose for errors."""
 
     def __init__(self, connection: socket.socket, purpose: str) -> None:
         self._receive, self._send = _ends(connection)
         self._purpose = purpose
 
     def send(self, item: Any) -> None:
-        """
-        Send an item that can be pickled.
-
-        Raises
-        ------
-        BoxregError
-            If the process has ended.
-
-        """
+        """Send an item that can be pickled; raise BoxregError if the process has ended."""
         with self._report_end():
             self._send(item)
 
     def receive(self) -> Any:
-        """
-        Wait for the next item from the worker and return it.
-
-        Raises
-        ------
-        BoxregError
-            If the process has ended.
-        Exception
-            The exception that ended the function in the worker.
-
-        """
+        """Return the next item; raise BoxregError if the process has ended, or its exception."""
         with self._report_end():
             item = self._receive()
         if isinstance(item, Exception):
@@ -98,15 +70,9 @@ def run_in_worker(serve: Serve, purpose: str) -> Iterator[WorkerProcess]:
 
     The process is forked: it starts at once and sees a copy of all data of this one. No other
     thread may hold a lock that the function needs. The worker ends with the block, and also if
-    this process is killed.
-
-    Parameters
-    ----------
-    serve : callable
-        The function to run. Its arguments are a function that waits for the next item sent to
-        the worker, and one that sends an item back. An exception it raises is sent back.
-    purpose : str
-        The work of the process as a verb phrase; used in errors.
+    this process is killed. `serve` is called with a function that waits for the next item sent to
+    the worker, and one that sends an item back; an exception it raises is sent back. `purpose` is
+    its work as a verb phrase, as in 'reads the recording', for errors.
 
     """
     parent_end, worker_end = socket.socketpair()

@@ -31,11 +31,14 @@ from boxreg_ros.io.whole_files import DISK_ERRORS
 from boxreg_ros.labels import FORMATS, import_format, LabelFrame, module_of
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.cloud_spool import Spool
-from boxreg_ros.recorder.folder import delete_remains, lock_of, recover_all, Recovery
 from boxreg_ros.recorder.segment import (
+    delete_remains,
     journal_settings,
+    lock_of,
     next_number,
     open_segments,
+    recover_all,
+    Recovery,
     Segment,
     SegmentFiles,
 )
@@ -57,17 +60,8 @@ class Recorder:
     Write final boxes and clouds as segments of label files.
 
     The last steps of a segment, until it is on the disk itself, run in a thread beside the next
-    segment.
-
-    Parameters
-    ----------
-    settings : RecorderSettings
-        Settings of the recording. Its folder exists and is locked.
-
-    Raises
-    ------
-    ConfigError
-        For formats that cannot be written, or a length of segments that is none.
+    segment. The folder of the settings exists and is locked. Raises ConfigError for formats that
+    cannot be written, or a length of segments that is none.
 
     """
 
@@ -118,12 +112,9 @@ class Recorder:
 
     def status(self) -> RecorderStatus:
         """
-        Return the present state; store the open segment, and end one that has reached its size.
+        Return the present state; store the open segment, and end one that is long enough.
 
-        Raises
-        ------
-        RecordingError
-            If the folder was deleted.
+        Raises RecordingError if the folder was deleted.
 
         """
         self._collect()
@@ -232,15 +223,7 @@ class Growth:
 
 
 def check_formats(settings: RecorderSettings) -> None:
-    """
-    Refuse formats that do not exist, lack a package or an option, or need a recording.
-
-    Raises
-    ------
-    ConfigError
-        By name of the parameter.
-
-    """
+    """Raise ConfigError for formats that lack a package, an option or a recording."""
     check_each(settings.formats, settings.camera)
     for name in settings.formats:
         if 'camera' in options_of(name) and not settings.camera:
@@ -258,15 +241,7 @@ def check_formats(settings: RecorderSettings) -> None:
 
 
 def check_each(formats: Sequence[str], camera: str) -> None:
-    """
-    Refuse what is wrong by itself: a format, or a calibration file.
-
-    Raises
-    ------
-    ConfigError
-        By name of the parameter.
-
-    """
+    """Raise ConfigError for what is wrong by itself: a format, or a calibration file."""
     live = [name for name in FORMATS if is_live(name)]
     for name in formats:
         if name not in live:
@@ -301,10 +276,7 @@ def serve(source: IO[bytes], report: Callable[[RecorderStatus], None]) -> None:
     """
     Record what arrives on `source`, until its end.
 
-    Raises
-    ------
-    BoxregError
-        If nothing can be written, or not any more.
+    Raises BoxregError if nothing can be written, or not any more.
 
     """
     settings: RecorderSettings = pickle.load(source)

@@ -8,8 +8,7 @@ import sys
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.segments import INDEX, read_index
-from boxreg_ros.recorder.folder import delete_remains, lock_of, recover_all
-from boxreg_ros.recorder.segment import open_segments
+from boxreg_ros.recorder.segment import delete_remains, lock_of, open_segments, recover_all
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,19 +1,24 @@
-"""One segment: label files and their journal in a hidden folder until they are complete."""
+"""Segments: label files and a journal in a hidden folder until they are whole or recovered."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 import os
 from pathlib import Path
 import re
 import shutil
+from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.journal import Journal
 from boxreg_ros.io.label_feed import RecorderSettings
-from boxreg_ros.io.whole_files import store, store_folder
+from boxreg_ros.io.lock import locked
+from boxreg_ros.io.whole_files import delete_partial_files, store, store_folder
 from boxreg_ros.labels import LabelFrame, LabelOutput, Options, Provenance
+from boxreg_ros.labels.cloud_spool import FOLDER as CLOUDS
 from boxreg_ros.labels.output import with_csv
 from boxreg_ros.labels.protocol import absolute
 from boxreg_ros.labels.segments import INDEX, IndexRow, read_index, write_index
@@ -24,27 +29,18 @@ JOURNAL = 'journal.sqlite'
 LABEL_FILES = 'labels'
 """Folder of the label files inside that of an open segment."""
 CONFIG = 'config.yaml'
+LOCK = '.lock'
+DAMAGED = '.damaged'
+"""Suffix of the folder of a segment whose journal cannot be read."""
 OPEN_NAME = re.compile(r'\.(segment_\d{6,})\.open')
 SEGMENT_NAME = re.compile(r'\.?segment_(\d{6,})(\.open|\.damaged)?')
 
 
 class SegmentFiles:
     """
-    The label files of a segment.
+    The label files of a segment, in the folder `opened` until they are completed in `target`.
 
-    Parameters
-    ----------
-    opened, target : Path
-        Folder of the open segment, which gets the files, and that of the completed one.
-    settings : mapping of str to str
-        As of `journal_settings`.
-
-    Attributes
-    ----------
-    frames, boxes, clouds : int
-        Written so far.
-    size : int
-        Size of the completed files [bytes].
+    `settings` are as of `journal_settings`. `size` is that of the completed files [bytes].
 
     """
 
@@ -187,22 +183,10 @@ def next_number(folder: Path) -> int:
 
 def recover(opened: Path) -> int:
     """
-    Make a whole segment from the journal of one that was cut off.
+    Make a whole segment from the journal of one that was cut off, and delete that folder.
 
-    Parameters
-    ----------
-    opened : Path
-        Folder of the open segment; it is deleted at the end.
-
-    Returns
-    -------
-    frames : int
-        Frames of the segment; 0 if the journal has none, and no segment was made.
-
-    Raises
-    ------
-    RecordingError
-        If the journal cannot be read; nothing is deleted then.
+    Return the frames of the segment; 0 if the journal has none, and no segment was made. Raises
+    RecordingError if the journal cannot be read; nothing is deleted then.
 
     """
     found = OPEN_NAME.fullmatch(opened.name)
@@ -235,3 +219,41 @@ def _rebuild(opened: Path, target: Path) -> int:
         return files.frames
     finally:
         journal.close()
+
+
+class Recovery(NamedTuple):
+    """Segments made from journals, and the folders of those that cannot be read."""
+
+    recovered: int
+    damaged: tuple[Path, ...]
+
+
+def lock_of(folder: Path) -> AbstractContextManager[None]:
+    """Return a context that keeps other recordings out of a folder; see `locked`."""
+    return locked(folder / LOCK, f'record_to {str(folder)!r}')
+
+
+def delete_remains(folder: Path) -> None:
+    """Delete the clouds and partial files of a locked folder; no segment is made from them."""
+    shutil.rmtree(folder / CLOUDS, ignore_errors=True)
+    delete_partial_files(folder)
+
+
+def recover_all(opened: Sequence[Path]) -> Recovery:
+    """
+    Complete the segments of a locked folder that were cut off.
+
+    They are from `open_segments`, before a further one was opened. One that cannot be read gets
+    another name, so that it neither is lost nor stops a recording.
+
+    """
+    recovered = 0
+    damaged = []
+    for path in opened:
+        try:
+            recovered += recover(path) > 0
+        except (ConfigError, OSError):  # a package that is missing, a full disk: no fault of it
+            raise
+        except Exception:  # label writers, also of other packages, may fail with any
+            damaged.append(path.rename(path.with_suffix(DAMAGED)))
+    return Recovery(recovered, tuple(damaged))

@@ -57,28 +57,12 @@ def break_tracks(
     """
     Return box arrays with missed boxes, gaps, changed ids and ghosts.
 
-    Parameters
-    ----------
-    arrays : sequence of n BoxArray
-        One per sweep, in the order of stamps, in one fixed frame.
-    rng : Generator
-        Source of all random numbers.
-    ghosts : float
-        Mean number of boxes per sweep that belong to no object.
-    origins : array, shape (n, 3), optional
-        Positions of the sensor; needed for ghosts and far misses [m].
-    far_misses : bool
-        Misses come in runs, as likely as the square of the distance, like those of a detector
-        that has too few points. By default they are independent.
-
-    Raises
-    ------
-    ConfigError
-        If `ghosts` is negative, or something needs `origins` that are not given.
-
-    Notes
-    -----
-    The boxes that are left have exactly the input poses and extents.
+    The arrays are one per sweep, in the order of stamps, in one fixed frame. `ghosts` is the
+    mean number of boxes per sweep that belong to no object. `origins` (n, 3) are the positions
+    of the sensor, for ghosts and far misses. Far misses come in runs, as likely as the square of
+    the distance, like those of a detector that has too few points; other misses are independent.
+    The boxes that are left have exactly the input poses and extents. Raises ConfigError if
+    `ghosts` is negative, or something needs `origins` that are not given.
 
     """
     if ghosts < 0 or ((ghosts or far_misses) and origins is None):

@@ -28,20 +28,11 @@ Noise = Callable[[Floats, Floats, np.random.Generator], Floats]
 
 def detector_noise(boxes: Floats, origins: Floats, rng: np.random.Generator) -> Floats:
     """
-    Return the boxes of one track as a detector reports them.
+    Return the boxes (n, 9) of one track as a detector at `origins` (n, 3) reports them.
 
     An error is a constant of the track plus an autoregressive, heavy-tailed part. The end that
     faces the sensor is the most accurate: a wrong length moves the other end. Some boxes are
     flipped.
-
-    Parameters
-    ----------
-    boxes : array, shape (n, 9)
-        True boxes.
-    origins : array, shape (n, 3)
-        Positions of the sensor in the same frame [m].
-    rng : Generator
-        Source of all random numbers.
 
     """
     errors = _detector_errors(len(boxes), rng)

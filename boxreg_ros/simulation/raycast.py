@@ -120,10 +120,7 @@ def body(shape: str, extent: Floats) -> list[Floats]:
     """
     Return the convex parts of a body that fills a box of `extent` (3,) [m].
 
-    Returns
-    -------
-    parts : list of arrays, shape (P, 4)
-        Half-spaces n.x <= d in the box frame, rows n and d.
+    Each has half-spaces n.x <= d in the box frame, (P, 4), rows n and d.
 
     """
     length, width, height = extent
@@ -212,27 +209,9 @@ def revolution(
     """
     Return the first hits of one revolution of a sensor on `ego`, above a flat road at z = 0.
 
-    Parameters
-    ----------
-    actors, parts
-        All road users, and the parts of their bodies.
-    ego : Motion
-        Motion of the sensor.
-    sensor : Sensor
-        Its beams, reach and noise.
-    stamp : float
-        The stamp of the revolution, see `Sensor` [s].
-    rng : Generator
-        Source of noise and drop-outs.
-
-    Returns
-    -------
-    points : array, shape (M, 3)
-        In the fixed frame [m].
-    times : array, shape (M,)
-        Time of each ray relative to the stamp [s].
-    owners : array, shape (M,)
-        Row of the actor that each ray hit, or `ROAD`.
+    `parts` are those of the bodies of the actors, `stamp` is that of the revolution, see
+    `Sensor` [s]. Returned are points (M, 3) in the fixed frame, the time (M,) of each ray
+    relative to the stamp, and the row of the actor (M,) that it hit, or `ROAD`.
 
     """
     columns = sensor.columns

@@ -67,22 +67,12 @@ class ActorPlan(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """
-    What a sensor sees of some road users.
-
-    Attributes
-    ----------
-    sweeps, owners, T_fixed_sensor
-        As in `SimulatedScene`.
-    true_boxes : array, shape (a, n, 9)
-        Of each road user at each sweep.
-
-    """
+    """What a sensor sees of a road users, the first three as in `SimulatedScene`."""
 
     sweeps: list[Sweep]
     owners: list[Ints]
     T_fixed_sensor: Floats
-    true_boxes: Floats
+    true_boxes: Floats  # (a, n, 9) of each road user at each sweep
 
 
 def zero(times: Floats) -> Floats:
@@ -174,17 +164,9 @@ def highway(
     """
     Return a highway: every vehicle moves by metres while the sensor turns.
 
-    Parameters
-    ----------
-    rng : Generator
-        Source of all random numbers.
-    sweeps : int or None
-        Number of sweeps.
-    at_sight : bool
-        Whether a box is where the vehicle was when the sensor saw it, and not where it was at
-        the stamp.
-    speed : float
-        Of the vehicle that carries the sensor [m/s]; the others drive 0.83 to 1.33 times as fast.
+    With `at_sight` a box is where the vehicle was when the sensor saw it, and not where it was
+    at the stamp. `speed` is that of the vehicle that carries the sensor [m/s]; the others drive
+    0.83 to 1.33 times as fast.
 
     """
     count = sweeps or HIGHWAY_SWEEPS
@@ -338,16 +320,8 @@ def drive(
     """
     Return the motion of a body on a plane whose rear axle does not slip sideways.
 
-    Parameters
-    ----------
-    duration : float
-        Length of the motion [s].
-    start : tuple of float
-        x, y and yaw of the centre at time 0 [m, rad].
-    speed, yaw_rate : callable
-        Along the heading [m/s] and of the heading [rad/s], at times (G,) [s].
-    axle : float
-        Distance of the rear axle behind the centre [m].
+    It starts at time 0 with its centre at `start`; speed along the heading and yaw rate are
+    functions of times (G,). The rear axle is `axle` behind the centre [m].
 
     """
     times = np.arange(-SWEEP_PERIOD, duration + SWEEP_PERIOD, INTEGRATION_STEP)

@@ -24,32 +24,13 @@ MIN_RETURNS = 5  # an object with fewer is not detected
 
 @dataclass(frozen=True, slots=True)
 class SimulatedScene:
-    """
-    A simulated scene.
+    """A simulated scene of n sweeps."""
 
-    Attributes
-    ----------
-    sweeps : tuple of n Sweep
-        In frame ``lidar``, with times.
-    owners : tuple of n arrays, shape (M,)
-        The object that each point belongs to: a row of `actors`, or `raycast.ROAD`.
-    detections : tuple of n BoxArray
-        Noisy boxes, in frame ``lidar``.
-    T_fixed_sensor : array, shape (n, 4, 4)
-        At the stamps.
-    truth : BoxTable
-        True boxes in frame ``odom``, from the first to the last return of each actor;
-        `num_points` counts its own returns.
-    actors : tuple of Actor
-        All road users.
-
-    """
-
-    sweeps: tuple[Sweep, ...]
-    owners: tuple[Ints, ...]
-    detections: tuple[BoxArray, ...]
-    T_fixed_sensor: Floats
-    truth: BoxTable
+    sweeps: tuple[Sweep, ...]  # in frame ``lidar``, with times
+    owners: tuple[Ints, ...]  # (M,) of each point: a row of `actors`, or `raycast.ROAD`
+    detections: tuple[BoxArray, ...]  # noisy boxes, in frame ``lidar``
+    T_fixed_sensor: Floats  # (n, 4, 4) at the stamps
+    truth: BoxTable  # in ``odom``, from first to last return; `num_points` are its own returns
     actors: tuple[Actor, ...]
 
     def fixed_detections(self) -> list[BoxArray]:
@@ -101,24 +82,10 @@ def make_scene(
     rng: np.random.Generator,
 ) -> SimulatedScene:
     """
-    Return a scene with its truth and its detections.
+    Return a scene with its truth and its detections; sequences as in `SimulatedScene`.
 
-    Parameters
-    ----------
-    actors : sequence of a Actor
-        All road users.
-    true_boxes : array, shape (a, n, 9)
-        Per actor and sweep, in the fixed frame.
-    sweeps, owners : sequences of n
-        As in `SimulatedScene`.
-    T_fixed_sensor : array, shape (n, 4, 4)
-        As in `SimulatedScene`.
-    noise : callable
-        Makes the noisy boxes of one track.
-    miss_probability : float
-        Part of the boxes that are not detected.
-    rng : Generator
-        Source of all random numbers.
+    `true_boxes` (a, n, 9) are per actor and sweep, in the fixed frame. `noise` makes the noisy
+    boxes of one track; a part `miss_probability` of them is not detected.
 
     """
     returns = np.array([[np.sum(owner == a) for owner in owners] for a in range(len(actors))])

@@ -57,19 +57,7 @@ def simulate(scenario: str = 'street', seed: int = 0, sweeps: int | None = None)
 
 
 def broken(scene: SimulatedScene, seed: int, ghosts: float = 0.0) -> SimulatedScene:
-    """
-    Return a scene whose detections are broken on purpose; its truth stays.
-
-    Parameters
-    ----------
-    scene : SimulatedScene
-        The scene.
-    seed : int
-        Of the breaks.
-    ghosts : float
-        Mean number of boxes per sweep that belong to no object.
-
-    """
+    """Return a scene with broken detections and its truth; `ghosts` is their number per sweep."""
     rng = np.random.default_rng([seed, BREAK_STREAM])
     origins = scene.T_fixed_sensor[:, :3, 3]
     arrays = break_tracks(scene.fixed_detections(), rng, ghosts, origins)
@@ -117,12 +105,8 @@ def run(args: argparse.Namespace) -> int:
     """
     Write a recording and its truth, and print a summary.
 
-    Raises
-    ------
-    ConfigError
-        If an option is out of range, or both files are the same.
-    RecordingError
-        If the recording cannot be written.
+    Raises ConfigError if an option is out of range, or both files are the same, and
+    RecordingError if the recording cannot be written.
 
     """
     truth = args.truth or args.output.with_name(f'{args.output.stem}_truth.csv')

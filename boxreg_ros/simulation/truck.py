@@ -67,26 +67,12 @@ What is recorded: a topic per corner, one concatenated cloud with or without inf
 
 
 class TruckScene(NamedTuple):
-    """
-    A drive of the truck.
+    """A drive of the truck."""
 
-    Attributes
-    ----------
-    clouds : dict of str and tuple of n Sweep
-        Of each LiDAR, in its frame and at its stamps.
-    detections : tuple of n BoxArray
-        Noisy boxes in frame ``base``.
-    truth : BoxTable
-        True boxes in frame ``odom``.
-    ego : Motion
-        Of the frame ``base`` in ``odom``.
-
-    """
-
-    clouds: dict[str, tuple[Sweep, ...]]
-    detections: tuple[BoxArray, ...]
-    truth: BoxTable
-    ego: Motion
+    clouds: dict[str, tuple[Sweep, ...]]  # n of each LiDAR, in its frame and at its stamps
+    detections: tuple[BoxArray, ...]  # n noisy ones in frame ``base``
+    truth: BoxTable  # in frame ``odom``
+    ego: Motion  # of the frame ``base`` in ``odom``
 
 
 def truck_scene(seed: int, sweeps: int | None = None) -> TruckScene:
@@ -111,15 +97,7 @@ def truck_scene(seed: int, sweeps: int | None = None) -> TruckScene:
 
 
 def write_truck(path: Path, scene: TruckScene, layout: str) -> None:
-    """
-    Write a recording of some LiDARs of the truck.
-
-    Raises
-    ------
-    RecordingError
-        If `path` does not end in ``.mcap`` or cannot be written.
-
-    """
+    """Write a recording of some LiDARs of the truck; raise as `write_messages`."""
     write_messages(path, _messages(scene, layout), is_compressed=True)
 
 

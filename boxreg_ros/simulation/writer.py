@@ -44,23 +44,9 @@ def write_recording(
     """
     Write ``/points``, ``/detections``, ``/odom`` and ``/tf``; an old file is replaced at the end.
 
-    Parameters
-    ----------
-    path : Path
-        Ends in ``.mcap``.
-    sweeps, intensities, detections
-        One each per stamp, all in the sensor frame.
-    T_fixed_sensor : n arrays, shape (4, 4)
-        Pose of the sensor in `fixed_frame` at each stamp.
-    fixed_frame : str
-        Parent frame of the odometry.
-    is_compressed : bool
-        Compress by zstd, which `ros2 bag record` does only on request.
-
-    Raises
-    ------
-    RecordingError
-        If `path` does not end in ``.mcap`` or cannot be written.
+    There is one sweep, with intensities, and one array of boxes per stamp, all in the sensor
+    frame, whose poses (4, 4) are those of the odometry. Compression is by zstd, which `ros2 bag
+    record` does only on request. Raises as `write_messages`.
 
     """
     make = LidarMessages()
@@ -83,21 +69,9 @@ def write_messages(
     path: Path, messages: Iterable[tuple[str, Any, int]], is_compressed: bool = False
 ) -> None:
     """
-    Write messages of `LidarMessages`; an old file is replaced at the end.
+    Write messages of `LidarMessages` with topic and receive time [ns], at the end in one step.
 
-    Parameters
-    ----------
-    path : Path
-        Ends in ``.mcap``.
-    messages : iterable of tuple
-        Topic, message and receive time [ns].
-    is_compressed : bool
-        Compress by zstd.
-
-    Raises
-    ------
-    RecordingError
-        If `path` does not end in ``.mcap`` or cannot be written.
+    Raises RecordingError if `path` does not end in ``.mcap`` or cannot be written.
 
     """
     if path.suffix != '.mcap':

@@ -30,15 +30,28 @@ from boxreg_ros.structures import (
     REJECTED,
     Y,
 )
-from boxreg_ros.tracks.effects import AddedBoxes, TrackSteps
 from boxreg_ros.tracks.extend import extend, num_free, num_supported, points_at_end
 from boxreg_ros.tracks.fill import fill
 from boxreg_ros.tracks.prune import duplicates, ghosts
 from boxreg_ros.tracks.static import join_static
 from boxreg_ros.tracks.stitch import stitch
-from boxreg_ros.tracks.tracklet import Tracklet, tracklets_of
+from boxreg_ros.tracks.tracklet import AddedBoxes, Tracklet, tracklets_of
 import numpy as np
 from numpy.typing import NDArray
+
+
+@dataclass(slots=True)
+class TrackSteps:
+    """Effects of the completing steps on one track: numbers of boxes, but for `fragments`."""
+
+    track_id: str
+    class_name: str  # of all its boxes: the most frequent one of the input
+    fragments: int = 1  # parts that were joined
+    filled: int = 0  # added in gaps
+    extended: int = 0  # added at the ends
+    rejected: int = 0
+    reclassified: int = 0  # of another class before
+    ambiguous: tuple[str, ...] = ()  # tracks that may be the same object, but were left alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,26 +69,13 @@ class AddedBox:
 
 @dataclass(slots=True)
 class PlannedArray:
-    """
-    The boxes of one array after completion.
+    """The boxes of one array after completion."""
 
-    Attributes
-    ----------
-    track_ids, class_names : list of n str
-        Of the input boxes.
-    rejected : dict
-        Reason by row.
-    added : list
-        Boxes to add.
-    moved : dict
-        Boxes to register in place of those of the input, by row.
-
-    """
-
-    track_ids: list[str]
-    class_names: list[str]
-    rejected: dict[int, str] = field(default_factory=dict)
+    track_ids: list[str]  # n, of the input boxes
+    class_names: list[str]  # n
+    rejected: dict[int, str] = field(default_factory=dict)  # reason by row
     added: list[AddedBox] = field(default_factory=list)
+    # to register in place of those of the input, by row
     moved: dict[int, Floats] = field(default_factory=dict)
 
     def to_register(self, given: BoxArray) -> BoxArray:
@@ -119,20 +119,10 @@ class _Extension:
 
 @dataclass(slots=True)
 class CompletionPlan:
-    """
-    The completed tracks of a recording.
+    """The completed tracks of a recording."""
 
-    Attributes
-    ----------
-    arrays : list of PlannedArray
-        One per box array of the input.
-    tracks : list of TrackSteps
-        Effects of the steps on each track; `extended` is known after `finished`.
-
-    """
-
-    arrays: list[PlannedArray]
-    tracks: list[TrackSteps]
+    arrays: list[PlannedArray]  # one per box array of the input
+    tracks: list[TrackSteps]  # `extended` is known after `finished`
     extensions: list[_Extension] = field(default_factory=list)
 
     def finished(
@@ -144,14 +134,8 @@ class CompletionPlan:
         """
         Return the results with rejected boxes, and without extensions that no points support.
 
-        Parameters
-        ----------
-        given : sequence of BoxArray
-            The input.
-        registered : sequence of RefinedBoxes
-            Results of `PlannedArray.to_register`, in the same order.
-        num_points : sequence of arrays
-            Points above the road in each box that was registered.
+        `registered` are the results of `PlannedArray.to_register` of the arrays `given`,
+        `num_points` the points above the road in each box that was registered.
 
         """
         supported = self._supported(given, num_points)
@@ -219,25 +203,18 @@ def complete(
     config: Config,
 ) -> CompletionPlan:
     """
-    Plan the completed tracks of a recording.
+    Plan the completed tracks of a recording: the boxes to register in the second pass.
 
     Parameters
     ----------
-    given : sequence of BoxArray
-        The input boxes.
-    results : sequence of RefinedBoxes
-        Their registration, in the same order.
+    given, results : sequences of BoxArray and RefinedBoxes
+        The input boxes and their registration, in the same order.
     num_points : sequence of arrays, shape (n,)
         Points above the road in each input box.
     fixed_frame : str
         Arrays in another frame stay as they are.
     config : Config
         The steps that are on, and their settings.
-
-    Returns
-    -------
-    plan : CompletionPlan
-        Boxes to register in the second pass.
 
     """
     steps = config.complete

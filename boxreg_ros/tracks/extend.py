@@ -13,11 +13,9 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.support import is_owned, least_support
 from boxreg_ros.structures import EXTENDED, Floats, Ints
-from boxreg_ros.tracks.effects import AddedBoxes
 from boxreg_ros.tracks.fill import accelerations
 from boxreg_ros.tracks.prune import CONFIRMED_BOXES
-from boxreg_ros.tracks.tracklet import Tracklet
-from boxreg_ros.tracks.tracklet_motion import end_motion, is_parked
+from boxreg_ros.tracks.tracklet import AddedBoxes, end_motion, is_parked, Tracklet
 import numpy as np
 
 MOVING_REACH, PARKED_REACH = 1.0, 4.0
@@ -26,19 +24,7 @@ for a second. Literature: MS3D extends parked objects by 4 s."""
 
 
 def extend(tracklet: Tracklet, array_stamps_ns: Ints, config: Config) -> list[AddedBoxes]:
-    """
-    Return the candidates before the first box of a track and after its last.
-
-    Parameters
-    ----------
-    tracklet : Tracklet
-        The track.
-    array_stamps_ns : array, shape (a,)
-        Stamps at which the input has boxes of any object, ascending [ns].
-    config : Config
-        Settings.
-
-    """
+    """Return the candidates before and after a track, at stamps (a,) of the input, ascending."""
     if len(tracklet.stamps_ns) < CONFIRMED_BOXES:
         return []
     reach_ns = (PARKED_REACH if is_parked(tracklet.boxes) else MOVING_REACH) * 1e9
@@ -57,12 +43,8 @@ def num_supported(num_points: Ints, at_end: Ints) -> int:
     """
     Return how many boxes of an extension are supported, from the track outwards.
 
-    Parameters
-    ----------
-    num_points : array, shape (n,)
-        Points above the road in each box, from the track outwards.
-    at_end : array, shape (m,)
-        The same of the boxes at that end of the track.
+    `num_points` (n,) are the points above the road in each box, from the track outwards, `at_end`
+    (m,) the same of the boxes at that end of the track.
 
     """
     is_supported = num_points >= least_support(at_end)
@@ -92,17 +74,7 @@ def points_at_end(tracklet: Tracklet, is_last: bool) -> Ints:
 
 
 def num_free(candidates: AddedBoxes, owned: dict[int, list[Floats]]) -> int:
-    """
-    Return how many boxes of an extension stand where no other track does, from the track out.
-
-    Parameters
-    ----------
-    candidates : AddedBoxes
-        The extension.
-    owned : dict
-        Boxes (9,) of the other tracks, by stamp.
-
-    """
+    """Return how many boxes of an extension are free of the boxes (9,) of others, by stamp."""
     for count, (stamp_ns, box) in enumerate(
         zip(candidates.stamps_ns.tolist(), candidates.boxes, strict=True)
     ):

@@ -12,26 +12,12 @@ from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.motion import motion_at
 from boxreg_ros.structures import Floats, INTERPOLATED, Ints
-from boxreg_ros.tracks.effects import AddedBoxes
-from boxreg_ros.tracks.tracklet import Tracklet
-from boxreg_ros.tracks.tracklet_motion import between, is_parked
+from boxreg_ros.tracks.tracklet import AddedBoxes, between, is_parked, Tracklet
 import numpy as np
 
 
 def fill(tracklet: Tracklet, array_stamps_ns: Ints, config: Config) -> list[AddedBoxes]:
-    """
-    Return the boxes of each gap of a track.
-
-    Parameters
-    ----------
-    tracklet : Tracklet
-        The track.
-    array_stamps_ns : array, shape (a,)
-        Stamps at which the input has boxes of any object, ascending [ns].
-    config : Config
-        `complete.fill_gap`, the longest gap of an object that moves.
-
-    """
+    """Return the boxes of each gap of a track, at stamps (a,) of the input, ascending."""
     added = []
     max_gap_ns = config.complete.fill_gap * 1e9
     for row in range(len(tracklet.stamps_ns) - 1):

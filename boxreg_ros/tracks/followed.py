@@ -8,8 +8,7 @@ from dataclasses import replace
 from boxreg_ros.core.follow import FollowedTrack
 from boxreg_ros.core.following.person import corrections, diagonals, moved
 from boxreg_ros.structures import BoxArray, Floats, HUMAN, REFINED, RefinedBoxes
-from boxreg_ros.tracks.complete import AddedBox, CompletionPlan, unchanged_plan
-from boxreg_ros.tracks.effects import TrackSteps
+from boxreg_ros.tracks.complete import AddedBox, CompletionPlan, TrackSteps, unchanged_plan
 import numpy as np
 
 UNSUPPORTED = np.diag(np.square([0.5, 0.5, 0.2, 0.05, 0.05, 0.1]))
@@ -22,14 +21,8 @@ def followed_plan(
     """
     Return the plan that adds the boxes of followed tracks; none is rejected or renamed.
 
-    Parameters
-    ----------
-    given : sequence of BoxArray
-        Keyframes, and an empty array for each sweep without one.
-    tracks : sequence of FollowedTrack
-        From these keyframes.
-    has_seeds : bool
-        Whether the keyframes are in `given`; if not, they are added too.
+    `given` has the keyframes, and an empty array for each sweep without one. If `has_seeds` is
+    false, it lacks those of the tracks, and they are added too.
 
     """
     plan = unchanged_plan(given)
@@ -59,16 +52,9 @@ def with_evidence(
     """
     Return results that are nearer to the keyframes if these show it, see `person.corrections`.
 
-    Boxes between keyframes are moved by the steps of these, interpolated in time.
-
-    Parameters
-    ----------
-    given : sequence of BoxArray
-        Keyframes as they were registered, and empty arrays.
-    results : sequence of RefinedBoxes
-        Of the same arrays, each with added boxes behind the keyframes.
-    deviations : array, shape (9,)
-        With which they were registered.
+    Boxes between keyframes are moved by the steps of these, interpolated in time. `given` has
+    the keyframes as they were registered with `deviations` (9,); `results` have added boxes
+    behind them.
 
     """
     keyframes = [

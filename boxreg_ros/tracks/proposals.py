@@ -67,32 +67,14 @@ USUAL = {
 
 
 class Proposal(NamedTuple):
-    """
-    An object that no box covers.
+    """An object that no box covers."""
 
-    Attributes
-    ----------
-    class_name : str
-        ``car``, ``truck`` or ``pedestrian``, by its size.
-    stamp_ns : int
-        Of its box, where most of its points are [ns].
-    box : array, shape (9,)
-        In the fixed frame [m, rad].
-    num_points : int
-        In the cluster there.
-    stamps_ns : array, shape (N,)
-        Of all sweeps with its cluster.
-    speed : float
-        From the first to the last; 0 for what stands [m/s].
-
-    """
-
-    class_name: str
-    stamp_ns: int
-    box: Floats
-    num_points: int
-    stamps_ns: Ints
-    speed: float
+    class_name: str  # by its size
+    stamp_ns: int  # of its box, where most of its points are
+    box: Floats  # (9,) in the fixed frame [m, rad]
+    num_points: int  # in the cluster there
+    stamps_ns: Ints  # (N,) of all sweeps with its cluster
+    speed: float  # from the first to the last; 0 for what stands [m/s]
 
 
 class _Cluster(NamedTuple):
@@ -120,21 +102,7 @@ class Proposer:
     def add(
         self, stamp_ns: int, points: NDArray[np.floating], origin: Floats, boxes: Floats
     ) -> None:
-        """
-        Add the next sweep.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            Its stamp [ns].
-        points : array, shape (M, 3)
-            Its points [m].
-        origin : array, shape (3,)
-            Position of the sensor [m].
-        boxes : array, shape (n, 9)
-            Boxes of the objects that are known at the stamp.
-
-        """
+        """Add a sweep: points (M, 3), sensor position (3,), boxes (n, 9) of known objects."""
         chains, self._open = self._open, []
         for chain in chains:
             goes_on = 0 < stamp_ns - chain[-1].stamp_ns <= MAX_GAP_NS

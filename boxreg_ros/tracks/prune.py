@@ -69,12 +69,7 @@ def duplicates(tracklets: list[Tracklet], config: Config) -> set[str]:
     """
     Return the ids of tracks of few boxes that overlap those of tracks with more evidence.
 
-    Parameters
-    ----------
-    tracklets : list of Tracklet
-        All tracks of a recording.
-    config : Config
-        Kinds of objects: a rider and a bicycle are no duplicates.
+    Only tracks of one kind of object: a rider and a bicycle are no duplicates.
 
     """
     ranked = sorted(tracklets, key=lambda t: (evidence(t), len(t.stamps_ns)), reverse=True)

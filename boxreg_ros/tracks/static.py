@@ -11,9 +11,8 @@ from __future__ import annotations
 from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import iou_3d, iou_bev
 from boxreg_ros.structures import Floats
-from boxreg_ros.tracks.links import join_links
-from boxreg_ros.tracks.tracklet import Tracklet
-from boxreg_ros.tracks.tracklet_motion import is_parked
+from boxreg_ros.tracks.stitch import join_links
+from boxreg_ros.tracks.tracklet import is_parked, Tracklet
 import numpy as np
 
 SAME_PLACE = 0.5
@@ -21,17 +20,7 @@ SAME_PLACE = 0.5
 
 
 def join_static(tracklets: list[Tracklet], config: Config) -> list[Tracklet]:
-    """
-    Join parked tracklets at one place.
-
-    Parameters
-    ----------
-    tracklets : list of Tracklet
-        In the order of their start.
-    config : Config
-        The kinds of objects.
-
-    """
+    """Join parked tracklets at one place; all are in the order of their start."""
     parked = [i for i, tracklet in enumerate(tracklets) if is_parked(tracklet.boxes)]
     places = {i: np.median(tracklets[i].boxes, axis=0) for i in parked}
     pairs: list[tuple[int, int]] = []

@@ -9,15 +9,69 @@ as good, none is made.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from boxreg_ros.config import Config
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.motion import EndMotion
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import BOX_EXTENT, X, Y, YAW, Z
-from boxreg_ros.tracks.links import best_links, join_links
-from boxreg_ros.tracks.tracklet import Tracklet
-from boxreg_ros.tracks.tracklet_motion import end_motion
+from boxreg_ros.structures import BOX_EXTENT, Floats, X, Y, YAW, Z
+from boxreg_ros.tracks.tracklet import end_motion, joined_tracklets, Tracklet
 import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+AMBIGUITY = 6.0
+"""
+Least difference of cost to the next best choice.
+
+Derived: costs are -2 ln of a likelihood, so 6 is a likelihood ratio of 20.
+
+"""
+
+
+class Links(NamedTuple):
+    """Pairs of tracklets that continue each other, earlier and later one."""
+
+    pairs: list[tuple[int, int]]
+    ambiguous: list[tuple[int, int]]  # left alone, because another choice is nearly as good
+
+
+def best_links(costs: Floats) -> Links:
+    """Return the pairs of least total cost (n, n) of predecessors, inf for none, one for each."""
+    is_possible = np.isfinite(costs)
+    found = Links([], [])
+    if not is_possible.any():
+        return found
+    # Any possible pair is better than none.
+    worst = costs[is_possible].max() + 1.0
+    gains = np.where(is_possible, worst - costs + AMBIGUITY, 0.0)
+    for before, after in zip(*linear_sum_assignment(gains, maximize=True), strict=True):
+        if not is_possible[before, after]:
+            continue
+        # A later part of the same chain is no alternative: it continues the pair.
+        later = np.where(is_possible[after], np.inf, costs[before])
+        earlier = np.where(is_possible[:, before], np.inf, costs[:, after])
+        others = np.append(np.delete(later, after), np.delete(earlier, before))
+        is_clear = others.min(initial=np.inf) >= costs[before, after] + AMBIGUITY
+        (found.pairs if is_clear else found.ambiguous).append((int(before), int(after)))
+    return found
+
+
+def join_links(tracklets: list[Tracklet], pairs: list[tuple[int, int]]) -> list[Tracklet]:
+    """Return tracklets with those of each chain of pairs joined, in the order of their start."""
+    successor = dict(pairs)
+    followers = set(successor.values())
+    whole = []
+    for index in range(len(tracklets)):
+        if index in followers:
+            continue
+        chain = [index]
+        while chain[-1] in successor:
+            chain.append(successor[chain[-1]])
+        parts = [tracklets[part] for part in chain]
+        whole.append(joined_tracklets(parts) if len(parts) > 1 else parts[0])
+    return whole
+
 
 STITCH_GATE = 24.3
 """Greatest squared distance; derived: 99.9 % of chi-square with 7 degrees of freedom."""
@@ -35,21 +89,9 @@ def stitch(
     tracklets: list[Tracklet], config: Config
 ) -> tuple[list[Tracklet], list[tuple[str, str]]]:
     """
-    Join tracklets that continue each other.
+    Join tracklets that continue each other, at most over `complete.fill_gap`.
 
-    Parameters
-    ----------
-    tracklets : list of Tracklet
-        In the order of their start.
-    config : Config
-        `complete.fill_gap`, and the motion of each class.
-
-    Returns
-    -------
-    tracklets : list of Tracklet
-        Joined ones included.
-    ambiguous : list of (str, str)
-        Ids of pairs that were left alone.
+    They are in the order of their start. Also return the ids of pairs that were left alone.
 
     """
     n = len(tracklets)

@@ -9,6 +9,8 @@ from itertools import count
 from typing import NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
+from boxreg_ros.core.motion import EndMotion, motion_at, UNKNOWN_SPEED_DEVIATION
+from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import (
     BOX_CENTER,
     Floats,
@@ -16,7 +18,12 @@ from boxreg_ros.structures import (
     is_valid_box,
     KEPT,
     LENGTH,
+    PITCH,
     RefinedBoxes,
+    ROLL,
+    X,
+    Y,
+    YAW,
 )
 import numpy as np
 
@@ -40,39 +47,17 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Tracklet:
-    """
-    Boxes of one object in the order of stamps; at most one per stamp.
-
-    Attributes
-    ----------
-    track_id, class_name : str
-        Identity, and the most frequent class of the boxes.
-    places : tuple of n Place
-        Of the input boxes.
-    stamps_ns : array, shape (n,)
-        Strictly increasing [ns].
-    boxes : array, shape (n, 9)
-        Registered boxes, or the input where they were kept, in the fixed frame.
-    covariances : array, shape (n, 6, 6)
-        Of x y z roll pitch yaw.
-    scores : array, shape (n,)
-        Detector confidence.
-    num_points : array, shape (n,)
-        Points above the road in each input box.
-    fragments : int
-        Tracklets of the input that it consists of.
-
-    """
+    """Boxes of one object in the order of stamps; at most one per stamp."""
 
     track_id: str
-    class_name: str
-    places: tuple[Place, ...]
-    stamps_ns: Ints
-    boxes: Floats
-    covariances: Floats
-    scores: Floats
-    num_points: Ints
-    fragments: int = 1
+    class_name: str  # the most frequent one of the boxes
+    places: tuple[Place, ...]  # n, of the input boxes
+    stamps_ns: Ints  # (n,) strictly increasing
+    boxes: Floats  # (n, 9) registered, or the input where they were kept, in the fixed frame
+    covariances: Floats  # (n, 6, 6) of x y z roll pitch yaw
+    scores: Floats  # (n,) detector confidence
+    num_points: Ints  # (n,) points above the road in each input box
+    fragments: int = 1  # tracklets of the input that it consists of
 
     @property
     def first_ns(self) -> int:
@@ -118,22 +103,12 @@ def tracklets_of(
     config: Config,
 ) -> list[Tracklet]:
     """
-    Return the boxes of a recording as tracklets.
+    Return the boxes of a recording, as its results have them, as tracklets in one frame.
 
     An id is split where it names two objects: at one stamp, after `max_gap` without a box, or
     where the next box is out of reach. The longest part keeps the id. Invalid boxes, those
-    without an id and those in another frame are in no tracklet.
-
-    Parameters
-    ----------
-    results : sequence of RefinedBoxes
-        One per box array.
-    num_points : sequence of arrays, shape (n,)
-        Points above the road in each box of each array.
-    fixed_frame : str
-        Frame of the tracklets.
-    config : Config
-        `max_gap`, and the settings of the classes.
+    without an id and those in another frame are in no tracklet. `num_points` has the points (n,)
+    above the road in each box of each array.
 
     """
     places_of: dict[str, list[Place]] = {}
@@ -242,3 +217,69 @@ def _input_covariance(model: ClassConfig) -> Floats:
     horizontal = max(model.position, model.lateral)
     deviations = [horizontal, horizontal, model.height, model.tilt, model.tilt, model.heading]
     return np.diag(np.square(deviations))
+
+
+PARKED_RADIUS = 0.5
+"""A parked object stays within this distance of its median position [m]; chosen: 5 deviations."""
+
+
+def end_motion(tracklet: Tracklet, is_last: bool, config: Config) -> EndMotion:
+    """Return the motion at the last or the first box of a tracklet, from a fit of lines."""
+    row = -1 if is_last else 0
+    return motion_at(tracklet.stamps_ns, tracklet.boxes, row, tracklet.model(config))
+
+
+def is_parked(boxes: Floats) -> bool:
+    """Return whether boxes (n, 9) of one object stand at one place."""
+    offsets = boxes[:, X : Y + 1] - np.median(boxes[:, X : Y + 1], axis=0)
+    return bool((np.linalg.norm(offsets, axis=1) < PARKED_RADIUS).all())
+
+
+def between(before: EndMotion, after: EndMotion, stamps_ns: Ints) -> Floats:
+    """
+    Return the boxes (n, 9) of an object at stamps between two of its boxes.
+
+    The centre follows the cubic Hermite curve of positions and velocities at both ends. Heading
+    and extents are interpolated linearly; a half turn is no rotation of the object.
+
+    """
+    duration_ns = after.stamp_ns - before.stamp_ns
+    s = ((stamps_ns - before.stamp_ns) / duration_ns)[:, None]
+    seconds = duration_ns * 1e-9
+    chord = (after.box - before.box)[BOX_CENTER] / seconds
+    ends = [_velocity_or(motion, chord) * seconds for motion in (before, after)]
+    boxes = (1 - s) * before.box + s * after.box
+    boxes[:, BOX_CENTER] = (
+        (1 + 2 * s) * (1 - s) ** 2 * before.box[BOX_CENTER]
+        + s * (1 - s) ** 2 * ends[0]
+        + s**2 * (3 - 2 * s) * after.box[BOX_CENTER]
+        - s**2 * (1 - s) * ends[1]
+    )
+    turn = wrap_angle(2 * (after.box[YAW] - before.box[YAW])) / 2
+    boxes[:, YAW] = wrap_angle(before.box[YAW] + s[:, 0] * turn)
+    for angle in (ROLL, PITCH):
+        boxes[:, angle] = before.box[angle]
+    return np.asarray(boxes)
+
+
+def _velocity_or(motion: EndMotion, chord: Floats) -> Floats:
+    """Return the velocity at an end; that of the chord where only one box is known."""
+    return chord if motion.speed_variance >= UNKNOWN_SPEED_DEVIATION**2 else motion.velocity
+
+
+@dataclass(frozen=True, slots=True)
+class AddedBoxes:
+    """Successive boxes that a step adds to one track, in the fixed frame."""
+
+    status: str  # ``interpolated`` or ``extended``
+    stamps_ns: Ints  # (n,) [ns]; of an extension from the track outwards
+    boxes: Floats  # (n, 9) on the motion model
+    covariances: Floats  # (n, 6, 6) of x y z roll pitch yaw on the motion model
+    scores: Floats  # (n,) detector confidence, from the neighbours
+
+    def first(self, count: int) -> AddedBoxes:
+        """Return the first `count` of the boxes."""
+        return AddedBoxes(
+            self.status, self.stamps_ns[:count], self.boxes[:count], self.covariances[:count],
+            self.scores[:count],
+        )  # fmt: skip

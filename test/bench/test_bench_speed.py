@@ -4,8 +4,7 @@ import json
 
 from boxreg_ros.bench.speed import report as speed_report
 from boxreg_ros.bench.speed.reference import compare
-from boxreg_ros.bench.speed.scaling import held_tracks
-from boxreg_ros.bench.speed.stages import crop, tick
+from boxreg_ros.bench.speed.scaling import crop, held_tracks, tick
 from boxreg_ros.config import Config
 from paths import ROOT
 import pytest

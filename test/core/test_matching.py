@@ -75,18 +75,70 @@ def test_the_tolerance_is_symmetric(stamp, is_pair, first):
     assert feed.counts['sweep_without_boxes'] == (not is_pair)
 
 
-def test_the_nearest_sweep_is_paired():
-    feed = Feed()
-    assert feed.add('s90', 's104', 's115', 'b100') == [(100, 104)]
-    assert feed.flush() == []
-    assert feed.counts == {'sweep_without_boxes': 2}
+FLUSH = 'flush'
+STEPS = {
+    'the nearest sweep is paired': (
+        {}, [('s90 s104 s115 b100', [(100, 104)]), (FLUSH, [])], {'sweep_without_boxes': 2},
+    ),
+    'a sweep is paired with all boxes near it': (
+        {}, [('s100 b95 b105', [(95, 100), (105, 100)]), (FLUSH, [])], {},
+    ),
+    'boxes at twice the rate share sweeps': (
+        {'reach': REACH},
+        [('s100 b100 b150 s200 b200 b250 s300 b300',
+          [(100, 100), (150, 100), (200, 200), (250, 200), (300, 300)])],
+        {},
+    ),
+    'boxes of a dropped sweep are returned at once, without one': (
+        {'reach': REACH}, [('s100 d150 b150', [(150, None)]), ('b200 d200', [(200, None)])],
+        {'sweep_without_boxes': 1},
+    ),
+    'duplicate and late sweeps are counted': (
+        {}, [('s100 s100 s200 b200 s100 s179', [(200, 200)]), ('s180 b180', [(180, 180)])],
+        {'sweep_duplicate': 1, 'sweep_without_boxes': 1, 'sweep_late': 2},
+    ),
+    'boxes are returned in the order of stamps': (
+        {},
+        [('b300 b100 b200', []), ('s100 s200 s300', [(100, 100), (200, 200), (300, 300)])],
+        {},
+    ),
+    # A sweep at 340 would be paired with 320; after one at 341 no such sweep is expected.
+    'boxes are held until a younger sweep arrives': (
+        {}, [('b100 b200', []), ('s120', [(100, 120)]), ('s220', [(200, 220)]), ('b320', []),
+             ('s341', [(320, None)])],
+        {},
+    ),
+    'sweeps are held for boxes of a tracker with a latency of a second': (
+        {'capacity': 20},
+        [('s100 s200 s300 s400 s500 s600 s700 s800 s900 s1000', []),
+         ('b100 b200 b300', [(100, 100), (200, 200), (300, 300)])],
+        {},
+    ),
+    'sweeps beyond the capacity are dropped, the oldest first': (
+        {'capacity': 3},
+        [('s100 s200 s300 s400 s500', []), ('b300', [(300, 300)]), ('b500', [(500, 500)])],
+        {'sweep_without_boxes': 3},
+    ),
+    'boxes beyond the capacity are returned unpaired, the oldest first': (
+        {'capacity': 3},
+        [('b100 b200 b300', []), ('b400', [(100, None)]), ('s200', [(200, 200)]),
+         (FLUSH, [(300, None), (400, None)])],
+        {},
+    ),
+    'a flush returns all boxes and discards sweeps': (
+        {}, [('b100 s300 b310 b350 s500', [(100, None), (310, 300), (350, None)]),
+             ('b600 b700', []), (FLUSH, [(600, None), (700, None)]), (FLUSH, [])],
+        {'sweep_without_boxes': 1},
+    ),
+}  # fmt: skip
 
 
-def test_a_sweep_is_paired_with_all_boxes_near_it():
-    feed = Feed()
-    assert feed.add('s100', 'b95', 'b105') == [(95, 100), (105, 100)]
-    assert feed.flush() == []
-    assert feed.counts == {}
+@pytest.mark.parametrize(('options', 'steps', 'counts'), STEPS.values(), ids=STEPS)
+def test_items_are_paired(options, steps, counts):
+    feed = Feed(**options)
+    for items, pairs in steps:
+        assert (feed.flush() if items == FLUSH else feed.add(*items.split())) == pairs, items
+    assert +feed.counts == counts
 
 
 @pytest.mark.parametrize('late', range(3))
@@ -104,26 +156,6 @@ def test_boxes_between_sweeps_are_paired_when_a_younger_sweep_arrives(late):
     assert feed.counts == {'sweep_without_boxes': 1}
 
 
-def test_boxes_at_twice_the_rate_share_sweeps():
-    feed = Feed(reach=REACH)
-    pairs = feed.add('s100', 'b100', 'b150', 's200', 'b200', 'b250', 's300', 'b300')
-    assert pairs == [(100, 100), (150, 100), (200, 200), (250, 200), (300, 300)]
-    assert feed.counts == {}
-
-
-def test_boxes_of_a_dropped_sweep_are_returned_without_one():
-    feed = Feed(reach=REACH)
-    assert feed.add('s100', 'd150', 'b150') == [(150, None)]  # at once, and not with 100
-    assert feed.add('b200', 'd200') == [(200, None)]
-
-
-def test_duplicate_and_late_sweeps_are_counted():
-    feed = Feed()
-    assert feed.add('s100', 's100', 's200', 'b200', 's100', 's179') == [(200, 200)]
-    assert feed.add('s180', 'b180') == [(180, 180)]
-    assert feed.counts == {'sweep_duplicate': 1, 'sweep_without_boxes': 1, 'sweep_late': 2}
-
-
 def test_no_box_array_is_lost_in_any_order():
     # In every order each box array is returned once, with its own sweep or none, and sweeps
     # without boxes are counted. If each kind arrives in order, all are paired.
@@ -138,61 +170,6 @@ def test_no_box_array_is_lost_in_any_order():
             [i for i in order if i[0] == 'b'] == ['b100', 'b200', 'b300']
         ):
             assert pairs == [(100, 100), (200, 200), (300, 300)], order
-
-
-def test_boxes_are_returned_in_the_order_of_stamps():
-    feed = Feed()
-    assert feed.add('b300', 'b100', 'b200') == []
-    assert feed.add('s100', 's200', 's300') == [(100, 100), (200, 200), (300, 300)]
-
-
-def test_boxes_are_held_until_a_younger_sweep_arrives():
-    feed = Feed()
-    assert feed.add('b100', 'b200') == []
-    assert feed.add('s120') == [(100, 120)]
-    assert feed.add('s220') == [(200, 220)]
-    # A sweep at 340 would be paired with 320; after one at 341 no such sweep is expected.
-    assert feed.add('b320') == []
-    assert feed.add('s341') == [(320, None)]
-
-
-def test_sweeps_are_held_for_boxes_that_arrive_late():
-    # A tracker with a latency of one second: ten sweeps.
-    feed = Feed(capacity=20)
-    assert feed.add(*[f's{100 * i}' for i in range(1, 11)]) == []
-    assert feed.add('b100', 'b200', 'b300') == [(100, 100), (200, 200), (300, 300)]
-    assert feed.counts == {}
-
-
-def test_sweeps_beyond_capacity_are_dropped_oldest_first_and_counted():
-    feed = Feed(capacity=3)
-    assert feed.add('s100', 's200', 's300', 's400', 's500') == []
-    assert feed.counts == {'sweep_without_boxes': 2}
-    assert feed.add('b300') == [(300, 300)]
-    assert feed.add('b500') == [(500, 500)]
-    assert feed.counts == {'sweep_without_boxes': 3}  # 400 had no boxes
-
-
-def test_boxes_beyond_capacity_are_returned_unpaired_oldest_first():
-    feed = Feed(capacity=3)
-    assert feed.add('b100', 'b200', 'b300') == []
-    assert feed.add('b400') == [(100, None)]
-    assert feed.add('s200') == [(200, 200)]
-    assert feed.flush() == [(300, None), (400, None)]
-    assert feed.counts == {}
-
-
-def test_flush_returns_all_boxes_and_discards_sweeps():
-    feed = Feed()
-    assert feed.add('b100', 's300', 'b310', 'b350', 's500') == [
-        (100, None),
-        (310, 300),
-        (350, None),
-    ]
-    assert feed.add('b600', 'b700') == []
-    assert feed.flush() == [(600, None), (700, None)]
-    assert feed.counts == {'sweep_without_boxes': 1}
-    assert feed.flush() == []
 
 
 def test_memory_is_bounded():

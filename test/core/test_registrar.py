@@ -14,19 +14,11 @@ from boxreg_ros.core.registration import register, solve
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest
-from scenes import drive, PERIOD_NS, stamps, stream_of, track_of
+from scenes import cut, drive, fed, PERIOD_NS, stamps, stream_of, track_of
 import torch
 
 ESTIMATES = ['early', 'final', 'track']
 each_estimate = pytest.mark.parametrize('estimate', ESTIMATES)
-
-
-def cut(track, part):
-    """Return the observations `part` of a track."""
-    return replace(
-        track, stamps_ns=track.stamps_ns[part], boxes=track.boxes[part], points=track.points[part],
-        sensor_origins=track.sensor_origins[part],
-    )  # fmt: skip
 
 
 @pytest.fixture(scope='module')
@@ -46,14 +38,6 @@ def config_with(estimate='final', **changes):
     # Few points, for speed.
     base = {'estimate': estimate, 'window': 6, 'lag': 3, 'sampling.points': 64}
     return Config().updated({**base, **changes})
-
-
-def fed(registrar, stream):
-    results = []
-    for sweep, boxes in stream:
-        results += registrar.add_sweep(sweep)
-        results += registrar.add_boxes(boxes)
-    return results
 
 
 def run(stream, config):

@@ -27,24 +27,6 @@ def rows_of(path, out):
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize(
-    'encodings',
-    [
-        {'/boxes': 'protobuf', '/points': 'cdr', '/tf': 'cdr'},
-        {'/boxes': 'json', '/points': 'cdr', '/tf': 'cdr'},
-        {'/boxes': 'protobuf', '/points': 'protobuf', '/tf': 'protobuf'},
-        {'/boxes': 'json', '/points': 'json', '/tf': 'json'},
-    ],
-    ids=lambda encodings: '-'.join(encodings.values()),
-)
-def test_every_encoding_gives_the_same_boxes(tmp_path, encodings):
-    drive = Drive(sweeps=5, boxes=SCENE)
-    expected = rows_of(drive.write(tmp_path / 'ros'), tmp_path / 'expected')
-    assert {row['status'] for row in expected} == {'refined'}
-    path = write_foxglove_mcap(tmp_path / 'foreign.mcap', drive, encodings)
-    assert rows_of(path, tmp_path / 'out') == expected
-
-
 def test_a_foxglove_file_and_a_ros_recording_are_merged(tmp_path):
     drive = Drive(sweeps=5, boxes=SCENE)
     expected = rows_of(drive.write(tmp_path / 'ros'), tmp_path / 'expected')

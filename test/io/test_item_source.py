@@ -4,7 +4,7 @@ from boxreg_ros.cli import main
 from boxreg_ros.io.items import ItemSource, Wanted
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import move_to_frame, TransformTree
-from boxreg_ros.offline.labelled_recording import LabelledRecording
+from boxreg_ros.offline.sources import LabelledRecording
 from boxreg_ros.structures import Sweep
 import numpy as np
 import pytest

@@ -42,21 +42,6 @@ def error_of(paths, **options):
     return text
 
 
-@pytest.mark.parametrize('boxes', ['vision', 'markers'])
-@pytest.mark.parametrize('storage', ['mcap', 'mcap-folder', 'sqlite3', 'rosbag1'])
-def test_every_storage_gives_the_same_items(tmp_path, storage, boxes):
-    drive = Drive(boxes=boxes, ros1=storage == 'rosbag1')
-    sweeps, arrays, fixed_frame = read(drive.write(tmp_path / 'drive', storage))
-    assert fixed_frame == 'odom'
-    assert [sweep.stamp_ns for sweep in sweeps] == drive.stamps
-    assert [array.stamp_ns for array in arrays] == drive.stamps
-    assert {array.track_ids for array in arrays} == {('1', '2')}
-    assert all(sweep.points.shape == (240, 3) for sweep in sweeps)
-    if boxes == 'vision' and storage == 'mcap':
-        expected = drive.truth[START][:, :3] - [0, 0, 2]
-        np.testing.assert_allclose(arrays[0].boxes[:, :3], expected, atol=0.3)
-
-
 def test_single_db3_and_folder_without_metadata(tmp_path):
     folder = Drive().write(tmp_path / 'drive', 'sqlite3')
     (file,) = folder.glob('*.db3')

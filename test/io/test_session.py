@@ -6,9 +6,9 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.session import hand_to_registrar, is_placeholder, JumpConfirmation, Session
+from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.reader import RecordingReader
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.structures import BoxArray, Sweep
 from msg_adapters import adapter_for, pointcloud
 from msg_adapters.convention import Convention, STANDARD

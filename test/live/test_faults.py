@@ -22,7 +22,6 @@ from ros_graph import (
     numbers_changed,
     play,
     play_in_time,
-    publishers_for,
     QUICK,
     records_of,
     RELIABLE,
@@ -109,65 +108,33 @@ def test_time_jump_with_sim_time_and_silence_after_it(graph, tmp_path):
         records_of(shifted(Drive(sweeps=8), seconds).write(tmp_path / f'drive{seconds}'))
         for seconds in (30, 0)
     )
-    publishers_for(graph, first)
     clock = graph.publisher('rosgraph_msgs/msg/Clock', '/clock')
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    final = graph.collect(DETECTIONS, '/refined_boxes_final')
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    node = graph.start(*RELIABLE, *QUICK, '-p', 'use_sim_time:=true', '-p', 'backlog:=60.0')
-    graph.wait_until_connected()
+    node = graph.run(first, *QUICK, '-p', 'use_sim_time:=true', '-p', 'backlog:=60.0')
     for records, sec in ((first, START // SECOND + 31), (second, START // SECOND + 1)):
         message = import_message('rosgraph_msgs/msg/Clock')()
         message.clock.sec = sec
         clock.publish(message)
-        play(graph, records, early)
+        node.play(records)
     # The last boxes are published after 3 s without boxes, and every message exactly once.
-    graph.wait(lambda: len(final) == 16, 'final boxes after a silence')
-    graph.wait(lambda: values_of(diagnostics).get('final_published') == '16', 'counters')
-    values = values_of(diagnostics)
+    graph.wait(lambda: len(node.final) == 16, 'final boxes after a silence')
+    graph.wait(lambda: node.values().get('final_published') == '16', 'counters')
+    values = node.values()
     assert values['time_jump'] == '1'
     assert 'late' not in values
     assert 'no_transform' not in values  # the transform before the first array is kept
     assert 0.0 < float(values['newest transform, age [s]']) < 1.0
     stamps = [START + 30 * SECOND + k * SECOND // 10 for k in range(8)]
     stamps += [stamp_ns - 30 * SECOND for stamp_ns in stamps]
-    assert sorted(stamp_of(message) for message in final) == sorted(stamps)
-    assert ended_cleanly(node)
-
-
-@pytest.mark.parametrize('boxes_first', [False, True])
-def test_first_boxes_after_a_time_jump_are_not_late(graph, tmp_path, boxes_first):
-    first, second = (
-        records_of(shifted(Drive(sweeps=8, motion='none'), seconds).write(tmp_path / f'{seconds}'))
-        for seconds in (30, 0)
-    )
-    publishers_for(graph, first)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    node = graph.start(*RELIABLE, *QUICK, '-p', 'fixed_frame:=lidar')
-    graph.wait_until_connected()
-    play(graph, first, early)
-    second = [record for record in second if record.topic in ('/points', '/boxes')]
-    if boxes_first:
-        second[0:2] = second[1::-1]
-    play(graph, second)
-    graph.wait(lambda: values_of(diagnostics).get('early_published') == '16', 'counters')
-    values = values_of(diagnostics)
-    assert values['time_jump'] == '1'
-    assert not {'late', 'sweep_late', 'no_sweep', 'no_transform'} & values.keys(), values
-    assert sorted(map(stamp_of, early[8:])) == Drive(sweeps=8).stamps
+    assert sorted(stamp_of(message) for message in node.final) == sorted(stamps)
     assert ended_cleanly(node)
 
 
 def test_second_node_continues_after_the_first_was_killed(graph, tmp_path):
     records = records_of(Drive(sweeps=12).write(tmp_path / 'drive'))
     half = [i for i, record in enumerate(records) if record.topic == '/boxes'][5] + 1
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
     shown = graph.collect(MARKERS, '/refined_markers')
-    node = graph.start(*RELIABLE, *QUICK)
-    graph.wait_until_connected()
-    play(graph, records[:half], early)
+    node = graph.run(records, *QUICK)
+    node.play(records[:half])
     for _ in range(10):  # markers are published after their boxes
         graph.executor.spin_once(timeout_sec=0.05)
     node.kill()
@@ -177,50 +144,41 @@ def test_second_node_continues_after_the_first_was_killed(graph, tmp_path):
     graph.wait(lambda: graph.publishers['/points'].get_subscription_count() >= 1, 'readers')
     for _ in range(20):  # discovery in both directions
         graph.executor.spin_once(timeout_sec=0.05)
-    play(graph, records[half:], early)
+    node.play(records[half:])
     graph.wait(lambda: len(shown) > count, 'markers')
     assert shown[count].markers[0].action == 3  # deletes those of the first node
     assert ended_cleanly(second)
-    assert [stamp_of(message) for message in early] == Drive(sweeps=12).stamps
+    assert [stamp_of(message) for message in node.early] == Drive(sweeps=12).stamps
 
 
 def test_boxes_wait_half_a_second_for_clouds_after_the_lidar_stops(graph, tmp_path):
     records = records_of(Drive(sweeps=12).write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    node = graph.start(*RELIABLE, *QUICK)
-    graph.wait_until_connected()
+    node = graph.run(records, *QUICK)
     half = [i for i, record in enumerate(records) if record.topic == '/boxes'][5] + 1
-    play(graph, records[:half], early)
+    node.play(records[:half])
     play(graph, [record for record in records[half:] if record.topic != '/points'])
     graph.wait(
-        lambda: len(early) == 12, 'boxes without their clouds', 2.5
+        lambda: len(node.early) == 12, 'boxes without their clouds', 2.5
     )  # less than the 3 s of silence
-    graph.wait(lambda: values_of(diagnostics).get('no_sweep') == '12', 'counters')
-    slowest = [values_of([d]).get('latency most [ms]', 0) for d in diagnostics]
+    graph.wait(lambda: node.values().get('no_sweep') == '12', 'counters')
+    slowest = [values_of([d]).get('latency most [ms]', 0) for d in node.diagnostics]
     assert max(map(float, slowest)) >= 500.0
     assert ended_cleanly(node)
 
 
 def test_a_recording_is_refined_at_every_rate_and_in_each_loop(graph, tmp_path):
     records = records_of(Drive(sweeps=14).write(tmp_path / 'drive'))  # stamps go back by > 1 s
-    publishers_for(graph, records)
     graph.publisher('rosgraph_msgs/msg/Clock', '/clock')
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    final = graph.collect(DETECTIONS, '/refined_boxes_final')
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    node = graph.start(*RELIABLE, *QUICK, '-p', 'use_sim_time:=true')
-    graph.wait_until_connected()
+    node = graph.run(records, *QUICK, '-p', 'use_sim_time:=true')
     for loop, rate in enumerate((0.5, 1, 2, 2)):
         play_in_time(graph, records, rate)
-        graph.wait(lambda n=loop: len(early) == 14 * (n + 1), 'early boxes')
-    graph.wait(lambda: values_of(diagnostics).get('time_jump') == '3', 'counters')
+        graph.wait(lambda n=loop: len(node.early) == 14 * (n + 1), 'early boxes')
+    graph.wait(lambda: node.values().get('time_jump') == '3', 'counters')
     assert ended_cleanly(node)
     for loop in range(4):
         part = slice(14 * loop, 14 * loop + 14)
-        assert numbers_changed(early[part], records) == [0, 0, *[2] * 12]
-        assert numbers_changed(final[part], records) == [2] * 14
+        assert numbers_changed(node.early[part], records) == [0, 0, *[2] * 12]
+        assert numbers_changed(node.final[part], records) == [2] * 14
 
 
 def stepped(seconds):
@@ -258,13 +216,10 @@ def without(topic, first, last, sweeps):
 def test_boxes_are_refined_again_after_a_disturbance(graph, tmp_path, drive, refined):
     """With two tracks: the number of early boxes refined at each sweep."""
     records = records_of(drive.write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    node = graph.start(*RELIABLE, *QUICK, '-p', 'transform_timeout:=0.1')
-    graph.wait_until_connected()
-    play(graph, records, early)
+    node = graph.run(records, *QUICK, '-p', 'transform_timeout:=0.1')
+    node.play(records)
     assert ended_cleanly(node)
-    assert numbers_changed(early, records) == refined
+    assert numbers_changed(node.early, records) == refined
 
 
 def malformed_messages():
@@ -318,13 +273,8 @@ def malformed_messages():
 def test_malformed_messages_are_counted_and_others_are_refined(graph, tmp_path):
     drive = Drive(sweeps=6)
     records = records_of(shifted(drive, 5).write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    final = graph.collect(DETECTIONS, '/refined_boxes_final')
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     parameters = ('-p', 'transform_timeout:=0.05', '-p', 'queue:=100')
-    node = graph.start(*RELIABLE, *QUICK, *parameters)
-    graph.wait_until_connected()
+    node = graph.run(records, *QUICK, *parameters)
     play(graph, [record for record in records if record.topic.startswith('/tf')])
     for topic, message in malformed_messages():
         graph.publishers[topic].publish(message)
@@ -343,16 +293,16 @@ def test_malformed_messages_are_counted_and_others_are_refined(graph, tmp_path):
     cloud.header = crowd.header
     graph.publishers['/points'].publish(cloud)
     graph.publishers['/boxes'].publish(crowd)
-    play(graph, [r for r in records if not r.topic.startswith('/tf')], early)
-    graph.wait(lambda: int(values_of(diagnostics).get('final_published', 0)) >= 12, 'counters')
-    values = {k: int(v) for k, v in values_of(diagnostics).items() if v.isdigit()}
+    node.play([r for r in records if not r.topic.startswith('/tf')])
+    graph.wait(lambda: int(node.values().get('final_published', 0)) >= 12, 'counters')
+    values = {k: int(v) for k, v in node.values().items() if v.isdigit()}
     assert values['unreadable'] > 8
     assert 'failed' not in values, node.output()
     assert values['refined'] > 0
     assert ended_cleanly(node)
     # Every box message is published once, malformed ones included.
-    assert len(early) == len(final) == 6 + 6 + 1
-    of_drive = [m for m in final if stamp_of(m) >= START + 5 * SECOND]
+    assert len(node.early) == len(node.final) == 6 + 6 + 1
+    of_drive = [m for m in node.final if stamp_of(m) >= START + 5 * SECOND]
     for message in of_drive[2:]:
         array = vision.from_msg(message)
         k = drive.stamps.index(array.stamp_ns - 5 * SECOND)

@@ -12,15 +12,10 @@ from msg_adapters import vision
 import numpy as np
 from rclpy.serialization import deserialize_message
 from ros_graph import (
-    DIAGNOSTICS,
     ended_cleanly,
     Graph,
-    play,
-    publishers_for,
     QUICK,
     records_of,
-    RELIABLE,
-    values_of,
 )
 from ros_messages import DETECTIONS
 
@@ -50,16 +45,11 @@ def test_one_box_is_followed_until_its_points_are_gone(graph: Graph, tmp_path):
     zeros = [np.zeros(len(sweep.points)) for sweep in sweeps]
     write_recording(path, sweeps, zeros, detections, scene.T_fixed_sensor, FIXED_FRAME)
     records = records_of(path, '/detections')
-    publishers_for(graph, records)
     follow = graph.publisher(DETECTIONS, '/boxreg_node/follow')
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    final = graph.collect(DETECTIONS, '/refined_boxes_final')
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    node = graph.start(*RELIABLE, *QUICK, '-r', 'boxes:=/detections')
-    graph.wait_until_connected()
+    node = graph.run(records, *QUICK, '-r', 'boxes:=/detections')
 
     ends = [i + 1 for i, record in enumerate(records) if record.boxes_stamp_ns is not None]
-    play(graph, records[: ends[BOX_AT]], early)
+    node.play(records[: ends[BOX_AT]])
     box_record = records[ends[BOX_AT] - 1]
     message = deserialize_message(box_record.data, import_message(DETECTIONS))
     truth = scene.truth.rows(np.array(scene.truth.track_ids) == name)
@@ -75,11 +65,9 @@ def test_one_box_is_followed_until_its_points_are_gone(graph: Graph, tmp_path):
     message.detections[0].id = 'road'
     message.detections[0].bbox.center.position.z += 30.0
     follow.publish(message)
-    play(graph, records[ends[BOX_AT] :], early)
-    graph.wait(
-        lambda: f'lost {name}' in values_of(diagnostics), 'the place where the object was lost'
-    )
-    values = values_of(diagnostics)
+    node.play(records[ends[BOX_AT] :])
+    graph.wait(lambda: f'lost {name}' in node.values(), 'the place where the object was lost')
+    values = node.values()
     assert values['following'] == 'none'
     last = f'{scene.sweeps[GONE - 1].stamp_ns} ns'
     assert values[f'lost {name}'].startswith(f'few_points at {last}, x ')
@@ -91,7 +79,7 @@ def test_one_box_is_followed_until_its_points_are_gone(graph: Graph, tmp_path):
         'not_followed: : box at' in node.output() and f'lost: {name}: few_points' in node.output()
     )
 
-    for messages in (early, final):
+    for messages in (node.early, node.final):
         found = {}
         for step, array in enumerate(map(vision.from_msg, messages)):
             if name in array.track_ids:

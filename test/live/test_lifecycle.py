@@ -7,7 +7,6 @@ from preloaded import LIFECYCLE_NODE
 import pytest
 from ros_graph import (
     ended_cleanly,
-    numbers_changed,
     play,
     publishers_for,
     QUICK,
@@ -136,22 +135,3 @@ def test_an_activation_that_fails_leaves_the_node_inactive(graph):
     assert 'std_msgs/msg/String' in node.output()
     assert 'Traceback' not in node.output()
     assert ended_cleanly(node)
-
-
-def test_activation_without_transforms_publishes_boxes_unchanged(graph, tmp_path):
-    records = records_of(Drive(sweeps=4, motion='none').write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    node = graph.start(*RELIABLE, *QUICK, '-p', 'transform_timeout:=0.1', command=COMMAND)
-    manager = Manager(graph)
-    assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
-    assert manager.change(Transition.TRANSITION_ACTIVATE) == (True, 'active')
-    graph.wait_until_connected()
-    play(graph, records, early)
-    assert numbers_changed(early, records) == [0] * 4
-    assert ended_cleanly(node)
-    lines = [line for line in node.output().splitlines() if 'neither /tf nor odometry' in line]
-    assert len(lines) == 2  # of the clouds, and of the boxes
-    for line in lines:
-        assert "the frame of the clouds 'lidar'; known: base -> lidar" in line
-        assert line.endswith('if it does not move, set fixed_frame:=lidar')

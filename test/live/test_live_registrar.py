@@ -236,7 +236,11 @@ def test_boxes_without_transform_are_published_unchanged_with_a_remedy():
     assert [(reason, number) for reason, _, number in live.reports] == [
         ('sweep_without_transform', 1), ('no_transform', 2),
     ]  # fmt: skip
-    assert all('fixed_frame:=lidar' in text for _, text, _ in live.reports)
+    for _, text, _ in live.reports:
+        assert (
+            "neither /tf nor odometry has the motion of the frame of the clouds 'lidar';" in text
+        )
+        assert text.endswith('if it does not move, set fixed_frame:=lidar')
 
 
 def test_a_stationary_sensor_needs_no_transform():

@@ -57,22 +57,23 @@ def test_odometry_replaces_tf(graph, tmp_path):
             message.child_frame_id = 'lidar'
             message.pose.pose.position.z = 2.0
     records = records_of(drive.write(tmp_path / 'drive'))
-    publishers_for(graph, [record for record in records if record.topic != '/boxes'])
     graph.publisher(MARKERS, '/boxes', is_reliable=False)
-    early = graph.collect(MARKERS, '/refined_boxes')
     shown = graph.collect(MARKERS, '/refined_markers')
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    node = graph.start(*RELIABLE, *QUICK, command=('-c', WITHOUT_TF2_MSGS))
-    graph.wait_until_connected()
+    node = graph.run(
+        [record for record in records if record.topic != '/boxes'],
+        *QUICK,
+        command=('-c', WITHOUT_TF2_MSGS),
+        kind=MARKERS,
+    )
     begun = time.monotonic()
-    play(graph, records[:3], early)
+    node.play(records[:3])
     assert time.monotonic() - begun < 2.0
-    play(graph, records[3:], early)
+    node.play(records[3:])
     graph.wait(lambda: len(shown) == 6 + 4, 'markers of early and final boxes')
-    graph.wait(lambda: values_of(diagnostics).get('early_published') == '6', 'diagnostics')
-    assert values_of(diagnostics)['fixed_frame'] == 'odom'
-    assert int(values_of(diagnostics)['refined']) > 0
-    levels = {message.status[0].message: message.status[0].level for message in diagnostics}
+    graph.wait(lambda: node.values().get('early_published') == '6', 'diagnostics')
+    assert node.values()['fixed_frame'] == 'odom'
+    assert int(node.values()['refined']) > 0
+    levels = {message.status[0].message: message.status[0].level for message in node.diagnostics}
     assert levels.pop('refining') == DiagnosticStatus.OK
     assert all(text.startswith('nothing received') for text in levels), levels
     assert ended_cleanly(node)
@@ -80,7 +81,7 @@ def test_odometry_replaces_tf(graph, tmp_path):
     assert node.output().count('tf2_msgs') >= 1
     assert node.output().count('WARN') == 1, node.output()
 
-    array = markers.from_msg(early[-1])
+    array = markers.from_msg(node.early[-1])
     assert array.frame_id == 'lidar' and array.track_ids == ('1',)
     assert shown[-1].markers[0].action == 3  # all are deleted when the node ends
     added = [{m.ns for m in message.markers if m.action == 0} for message in shown[:10]]
@@ -102,27 +103,22 @@ def test_late_transforms_are_awaited_and_invalid_boxes_are_unchanged(graph, tmp_
     )
     drive.replace('/points', 4, lambda m: setattr(m, 'width', 10**6))
     records = records_of(drive.write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    final = graph.collect(DETECTIONS, '/refined_boxes_final')
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    node = graph.start(*RELIABLE, *QUICK, '-p', 'transform_timeout:=20')
-    graph.wait_until_connected()
+    node = graph.run(records, *QUICK, '-p', 'transform_timeout:=20')
     moving = [record for record in records if record.topic == '/tf']
     play(graph, [record for record in records if record.topic != '/tf'])
     for _ in range(20):
         graph.executor.spin_once(timeout_sec=0.02)
-    assert not early  # they wait for their transforms
+    assert not node.early  # they wait for their transforms
     play(graph, moving)
-    graph.wait(lambda: len(early) == 8, 'early boxes')
-    graph.wait(lambda: values_of(diagnostics).get('unreadable') == '1', 'the unreadable cloud')
+    graph.wait(lambda: len(node.early) == 8, 'early boxes')
+    graph.wait(lambda: node.values().get('unreadable') == '1', 'the unreadable cloud')
     assert ended_cleanly(node, signal.SIGTERM)
     assert 'unreadable' in node.output() and 'width' in node.output()
-    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+    assert [stamp_of(m) for m in node.early] == [stamp_of(m) for m in node.final] == drive.stamps
     # The invalid box is returned unchanged in its place.
-    assert [d.id for d in final[3].detections] == ['1', '2']
-    assert np.isnan(final[3].detections[0].bbox.center.position.x)
-    for message in final:
+    assert [d.id for d in node.final[3].detections] == ['1', '2']
+    assert np.isnan(node.final[3].detections[0].bbox.center.position.x)
+    for message in node.final:
         array = vision.from_msg(message)
         assert array.frame_id == 'lidar'
         ego = np.array([0.5 * drive.stamps.index(array.stamp_ns), 0, 2.0])
@@ -134,29 +130,25 @@ def test_boxes_without_a_fixed_frame_are_published_unchanged(graph, tmp_path):
     drive = Drive(sweeps=4, boxes='vision', motion='none')
     path = drive.write(tmp_path / 'drive')
     records = records_of(path)
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    final = graph.collect(DETECTIONS, '/refined_boxes_final')
-    node = graph.start(*RELIABLE, *QUICK, '-p', 'transform_timeout:=0.1')
-    graph.wait_until_connected()
-    play(graph, records, early)
-    graph.wait(lambda: len(final) == 4, 'final boxes')
+    node = graph.run(records, *QUICK, '-p', 'transform_timeout:=0.1')
+    node.play(records)
+    graph.wait(lambda: len(node.final) == 4, 'final boxes')
     given = [message for topic, _, message in drive.items if topic == '/boxes']
-    for before, after in zip(given, final, strict=True):
+    for before, after in zip(given, node.final, strict=True):
         assert np.array_equal(vision.from_msg(before).boxes, vision.from_msg(after).boxes)
     assert ended_cleanly(node)
     assert 'fixed_frame:=lidar' in node.output()
 
-    early.clear()
-    final.clear()
+    node.early.clear()
+    node.final.clear()
     settings = ('-p', 'fixed_frame:=lidar', '-p', f'boxes_type:={DETECTIONS}')
     second = graph.start(*RELIABLE, *QUICK, *settings)
     graph.wait_until_connected()
-    play(graph, records, early)
+    node.play(records)
     assert ended_cleanly(second)
-    assert len(final) == 4
+    assert len(node.final) == 4
     assert 'WARN' not in second.output()
-    refined = np.array([vision.from_msg(message).boxes for message in final])
+    refined = np.array([vision.from_msg(message).boxes for message in node.final])
     assert np.abs(refined - [vision.from_msg(message).boxes for message in given]).max() > 1e-4
 
 
@@ -175,9 +167,7 @@ sys.exit(main())
 
 def test_two_signals_end_the_node_cleanly_under_load(graph, tmp_path):
     records = records_of(Drive(sweeps=30).write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    node = graph.start(*RELIABLE, *QUICK, command=(CODE, SLOW_EVENTS))
-    graph.wait_until_connected()
+    node = graph.run(records, *QUICK, command=(CODE, SLOW_EVENTS))
     is_over = Event()
 
     def flow():
@@ -404,18 +394,14 @@ def test_waiting_boxes_are_published_at_shutdown(graph, tmp_path):
 
 def test_busy_solver_delays_neither_diagnostics_nor_shutdown(graph, tmp_path):
     records = records_of(Drive(sweeps=30).write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     # The paper's objective is minimised by torch: some tenths of a second for each box array.
     slow = ['objective:=paper', 'paper.iterations:=100', 'window:=30']
     options = [part for text in (*slow, 'backlog:=60.0', 'queue:=100') for part in ('-p', text)]
-    node = graph.start(*RELIABLE, *options)
-    graph.wait_until_connected()
+    node = graph.run(records, *options)
     play(graph, records)
-    graph.wait(lambda: len(early) >= 4, 'some boxes')
-    graph.wait(lambda: len(diagnostics) >= 2, 'diagnostics while the solver runs')
-    assert len(early) < 25
+    graph.wait(lambda: len(node.early) >= 4, 'some boxes')
+    graph.wait(lambda: len(node.diagnostics) >= 2, 'diagnostics while the solver runs')
+    assert len(node.early) < 25
     assert ended_cleanly(node)
 
 

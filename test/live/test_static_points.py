@@ -6,18 +6,12 @@ from boxreg_ros.simulation.writer import write_recording
 from msg_adapters import pointcloud
 import numpy as np
 from ros_graph import (
-    DIAGNOSTICS,
     ended_cleanly,
     Graph,
-    play,
-    publishers_for,
     QUICK,
     records_of,
-    RELIABLE,
     stamp_of,
-    values_of,
 )
-from ros_messages import DETECTIONS
 
 POINTS = 'sensor_msgs/msg/PointCloud2'
 SWEEPS, WITHOUT_BOXES = 10, 2
@@ -33,21 +27,15 @@ def test_static_points(graph: Graph, tmp_path):
     records = records_of(path, '/detections')
     last = [boxes.stamp_ns for boxes in scene.detections[-WITHOUT_BOXES:]]
     records = [record for record in records if record.boxes_stamp_ns not in last]
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
     static = graph.collect(POINTS, '/static_points')
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    node = graph.start(*RELIABLE, *QUICK, *STATIC, '-r', 'boxes:=/detections')
-    graph.wait_until_connected()
-    play(graph, records, early)
+    node = graph.run(records, *QUICK, *STATIC, '-r', 'boxes:=/detections')
+    node.play(records)
     graph.wait(lambda: len(static) == SWEEPS, 'a cloud without moving objects for each sweep')
     counted = ('static_published', 'static_unchanged', 'static_points CPU median [ms]')
-    graph.wait(
-        lambda: values_of(diagnostics).get('static_unchanged') == str(WITHOUT_BOXES), 'the count'
-    )
+    graph.wait(lambda: node.values().get('static_unchanged') == str(WITHOUT_BOXES), 'the count')
     assert ended_cleanly(node)
     assert 'static_unchanged' in node.output()
-    seen = {status.key for message in diagnostics for status in message.status[0].values}
+    seen = {status.key for message in node.diagnostics for status in message.status[0].values}
     assert set(counted) <= seen
     assert 'static_points latency median [ms]' in seen
 

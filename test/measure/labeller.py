@@ -22,7 +22,7 @@ from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.offline.reviewed_drive import drive_of
+from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, REJECTED, YAW
 from browser import end_shared_browser, opened_page

@@ -8,7 +8,7 @@ publishing the later of cloud and boxes until the refined boxes arrive at the ob
 """
 
 import argparse
-from contextlib import contextmanager, ExitStack
+from contextlib import contextmanager, ExitStack, suppress
 from functools import partial
 import os
 from pathlib import Path
@@ -414,8 +414,11 @@ def growth(samples):
 
 def children_of(pid):
     """Return the processes that a process has started, in any of its threads."""
-    lists = Path(f'/proc/{pid}/task').glob('*/children')
-    return [int(word) for children in lists for word in children.read_text().split()]
+    found = []
+    for children in Path(f'/proc/{pid}/task').glob('*/children'):
+        with suppress(FileNotFoundError):  # the thread may have ended
+            found += map(int, children.read_text().split())
+    return found
 
 
 def vitals(pid):

@@ -4,7 +4,6 @@ import array
 from types import SimpleNamespace
 
 from boxreg_ros.errors import UnsupportedMessage
-from boxreg_ros.structures import BoxArray
 from msg_adapters import adapter_for, ADAPTERS, markers, pointcloud, vision
 from msg_adapters.poses import quaternions_of
 import numpy as np
@@ -229,38 +228,12 @@ def markers_msg():
     )
 
 
-def test_vision_boxes():
-    boxes = vision.from_msg(vision_msg())
-    assert (boxes.stamp_ns, boxes.frame_id) == (STAMP, 'lidar')
-    assert boxes.track_ids == ('7', '')
-    assert boxes.class_names == ('car', 'truck')
-    np.testing.assert_array_equal(boxes.scores, [0.9, 0.6])
-    np.testing.assert_allclose(boxes.boxes, BOXES, atol=1e-12)
-
-
 def test_marker_boxes():
     boxes = markers.from_msg(markers_msg())
     assert (boxes.stamp_ns, boxes.frame_id) == (STAMP, 'lidar')
     assert boxes.track_ids == ('7', '9')
     assert boxes.class_names == ('car', 'truck')
     np.testing.assert_allclose(boxes.boxes, BOXES, atol=1e-12)
-
-
-@pytest.mark.parametrize('adapter', [vision, markers])
-def test_written_boxes_are_read_back(adapter):
-    message = vision_msg() if adapter is vision else markers_msg()
-    given = adapter.from_msg(message)
-    moved = BoxArray(
-        STAMP, 'odom', given.track_ids, given.class_names, given.scores, BOXES[::-1] + 0.01
-    )
-    out = adapter.to_msg(message, moved, np.stack([np.eye(6), np.diag(np.arange(6.0))]))
-    back = adapter.from_msg(out)
-    assert (back.stamp_ns, back.frame_id, back.track_ids) == (STAMP, 'odom', given.track_ids)
-    assert back.class_names == given.class_names
-    np.testing.assert_allclose(back.boxes, moved.boxes, atol=1e-12)
-    unchanged = adapter.from_msg(message)
-    assert unchanged.frame_id == 'lidar', 'the input message is not modified'
-    np.testing.assert_array_equal(unchanged.boxes, given.boxes)
 
 
 def test_vision_output_has_the_covariance_and_copies_the_rest():
@@ -400,24 +373,3 @@ def test_rclpy_and_rosbags_read_the_same_cloud():
     assert (ours.stamp_ns, ours.frame_id) == (theirs.stamp_ns, theirs.frame_id)
     np.testing.assert_array_equal(ours.points, theirs.points)
     np.testing.assert_array_equal(ours.times, theirs.times)
-
-
-@pytest.mark.parametrize(('name', 'adapter'), [(MARKERS, markers), (DETECTIONS, vision)])
-def test_rclpy_and_rosbags_read_and_write_the_same_boxes(name, adapter):
-    message = markers_msg() if adapter is markers else vision_msg()
-    native = rclpy_message(name, M.store.serialize_cdr(message, name))
-    ours, theirs = adapter.from_msg(message), adapter.from_msg(native)
-    assert ours.track_ids == theirs.track_ids
-    assert ours.class_names == theirs.class_names
-    np.testing.assert_array_equal(ours.boxes, theirs.boxes)
-
-    from rclpy.serialization import serialize_message
-
-    moved = BoxArray(
-        STAMP, 'odom', ours.track_ids, ours.class_names, ours.scores, ours.boxes + 0.5
-    )
-    covariances = np.stack([np.eye(6), 2 * np.eye(6)])
-    written = adapter.to_msg(message, moved, covariances)
-    native_written = adapter.to_msg(native, moved, covariances)
-    again = M.store.deserialize_cdr(serialize_message(native_written), name)
-    assert M.store.serialize_cdr(again, name) == M.store.serialize_cdr(written, name)

@@ -1,6 +1,5 @@
 """`boxreg batch`: each drive once, failures isolated, a second run skips done drives."""
 
-from contextlib import suppress
 import csv
 from functools import partial
 import json
@@ -15,9 +14,9 @@ from boxreg_ros.cli import main
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.batch_results import INDEX_COLUMNS
 from boxreg_ros.offline.job import jobs_of
-from boxreg_ros.offline.job_process import JobRunner, memory_bytes
+from boxreg_ros.offline.job_process import JobRunner, memory_bytes, Watch, watched
 from boxreg_ros.offline.result_folder import whole_folder
-from boxreg_ros.offline.time_limit import Watch, watched
+from measure.node import children_of
 from paths import ROOT
 from preloaded import BOXREG, PreloadedProcess
 import pytest
@@ -354,15 +353,6 @@ def test_a_drive_that_goes_on_has_no_limit_of_time(tmp_path, monkeypatch):
     assert result.seconds > 1.5
     for end in (reader, writer):
         os.close(end)
-
-
-def children_of(pid):
-    """Return the numbers of the processes that the threads of another one started."""
-    found = []
-    for task in Path(f'/proc/{pid}/task').iterdir():
-        with suppress(FileNotFoundError):  # a thread may end between both lines
-            found += (task / 'children').read_text().split()
-    return found
 
 
 def test_a_batch_that_is_killed_takes_its_processes_with_it(tmp_path):

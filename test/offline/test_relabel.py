@@ -30,11 +30,9 @@ import numpy as np
 from paths import BAGS, SHARED
 import pytest
 from relabel_results import QUICK, rows_of
-from ros_messages import Drive, JSK, Messages, SECOND, START, write_recording
+from ros_messages import Drive, JSK, SECOND, START, write_recording
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
-
-M = Messages()
 
 
 def run(recording, out, **options):
@@ -144,24 +142,6 @@ def test_boxes_and_clouds_in_different_frames(tmp_path):
             assert float(after[name]) == pytest.approx(float(before[name]), abs=1e-6)
 
 
-def test_several_recordings_are_merged(tmp_path):
-    drive = Drive(sweeps=6)
-    whole = run(drive.write(tmp_path / 'whole'), tmp_path / 'whole_out')[1]
-    half = len(drive.items) // 2
-    parts = tuple(
-        write_recording(tmp_path / f'part{i}', part)
-        for i, part in enumerate([drive.items[:half], drive.items[half:]])
-    )
-    relabel(Request(parts, config=QUICK), tmp_path / 'parts_out')
-    assert rows_of(tmp_path / 'parts_out') == whole
-
-
-def test_start_and_end_select_a_part(tmp_path):
-    drive = Drive(sweeps=10)
-    rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out', start=0.25, end=0.75)[1]
-    assert sorted({stamp for stamp, _ in keys(rows)}) == drive.stamps[3:8]
-
-
 def test_output_folder_contents(tmp_path):
     path = Drive(sweeps=4).write(tmp_path / 'drive')
     summary, _ = run(path, tmp_path / 'out', settings={'solver.rounds': 2})
@@ -186,12 +166,6 @@ def test_output_folder_contents(tmp_path):
     }  # fmt: skip
     label = json.loads((out / 'openlabel' / 'labels.json').read_text())['openlabel']
     assert len(label['frames']) == 4
-
-
-def test_csv_as_the_only_format(tmp_path):
-    run(Drive(sweeps=3).write(tmp_path / 'drive'), tmp_path / 'out', formats=('csv',))
-    assert not (tmp_path / 'out' / 'openlabel').exists()
-    assert (tmp_path / 'out' / 'boxes.csv').exists()
 
 
 # Faulty input and failures ----------------------------------------------------------------------
@@ -512,22 +486,6 @@ def test_empty_clouds_and_empty_arrays(tmp_path):
     assert (summary.sweeps, summary.box_arrays) == (6, 6)
 
 
-def test_boxes_without_points_are_written(tmp_path):
-    drive = Drive(sweeps=4)
-    pose = ((-30.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    for topic, stamp, message in drive.items:
-        if topic == '/boxes':
-            more = drive.messages.detections(
-                stamp, 'lidar', [('empty', 'car', 0.5, *pose, (4.0, 2.0, 1.5))]
-            )
-            message.detections += more.detections
-    rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')[1]
-    assert len(rows) == 12
-    empty = [row for row in rows if row['track_id'] == 'empty']
-    assert all(row['num_points'] == '0' for row in empty)
-    assert all(np.isfinite(float(row['x'])) for row in empty)
-
-
 def truncated(path, out, sizes):
     """Copy a recording; `sizes` maps (topic, k) to the bytes left of message k on the topic."""
     count = Counter()
@@ -689,11 +647,6 @@ def test_output_that_contains_an_input_is_refused(tmp_path, capsys, given):
     with pytest.raises(ConfigError, match='choose another'):
         convert(conversion, out)
     assert sorted(out.rglob('*')) == before
-
-
-def test_unknown_format_is_refused_before_reading():
-    with pytest.raises(ConfigError, match="format 'kiti'"):
-        Request((Path('nothing'),), formats=('csv', 'kiti'))
 
 
 def test_fingerprint_differs_between_requests(tmp_path):

@@ -5,8 +5,14 @@ import math
 
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline import track_scores as module
-from boxreg_ros.offline.box_scores import by_id, by_overlap, match, summarise
-from boxreg_ros.offline.overlap import best_pairs, pairwise_iou
+from boxreg_ros.offline.box_scores import (
+    best_pairs,
+    by_id,
+    by_overlap,
+    match,
+    pairwise_iou,
+    summarise,
+)
 from boxreg_ros.offline.track_scores import track_scores
 from boxreg_ros.structures import BoxArray
 import numpy as np

@@ -1,6 +1,5 @@
 """Worker processes: same results, errors raised in the parent, no process left over."""
 
-from dataclasses import replace
 import os
 from pathlib import Path
 import signal
@@ -14,34 +13,18 @@ from boxreg_ros.core.registration import register
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.io.compilation import announced_compilation, COMPILING
 from boxreg_ros.offline import registration_worker as registration
+from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.registration_worker import registration_worker
 from boxreg_ros.offline.relabel import relabel, Request
-from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.worker_process import run_in_worker
+from measure.node import children_of
 import numpy as np
 from paths import ROOT
 import pytest
 from ros_messages import Drive
-from scenes import drive, stream_of, track_of
+from scenes import cut, drive, fed, stream_of, track_of
 
 SHORT = Config().updated({'sampling.points': 64, 'track_window': 24, 'max_gap': 0.3})
-
-
-def cut(track, part):
-    """Return a `Track` with the observations `part` of another one."""
-    return replace(
-        track, stamps_ns=track.stamps_ns[part], boxes=track.boxes[part], points=track.points[part],
-        sensor_origins=track.sensor_origins[part],
-    )  # fmt: skip
-
-
-def fed(registrar, stream):
-    """Add sweeps and boxes to a registrar; return the results."""
-    results = []
-    for sweep, boxes in stream:
-        results += registrar.add_sweep(sweep)
-        results += registrar.add_boxes(boxes)
-    return results
 
 
 def assert_equal(results, expected):
@@ -71,19 +54,6 @@ def stream():
     ]  # fmt: skip
 
 
-def children_of(pid):
-    """Return the ids of the child processes of `pid`."""
-    found = []
-    for path in Path('/proc').glob('[0-9]*/stat'):
-        try:
-            number, _, rest = path.read_text().partition(' (')
-        except OSError:
-            continue
-        if int(rest.rpartition(') ')[2].split()[1]) == pid:
-            found.append(int(number))
-    return found
-
-
 @pytest.fixture(autouse=True)
 def no_process_left():
     before = children_of(os.getpid())
@@ -97,11 +67,6 @@ def no_process_left():
 def echo(receive, send):
     while True:
         send(receive())
-
-
-def flood(receive, send):
-    while True:
-        send(np.zeros(2**16))
 
 
 def test_items_survive_the_round_trip():

@@ -28,9 +28,8 @@ from boxreg_ros.io.label_feed import (
 )
 from boxreg_ros.labels import frames_of, LabelFrame
 from boxreg_ros.labels.segments import read_index
-from boxreg_ros.recorder.folder import lock_of
 from boxreg_ros.recorder.main import Recorder, serve
-from boxreg_ros.recorder.segment import journal_settings, Segment
+from boxreg_ros.recorder.segment import journal_settings, lock_of, Segment
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 import numpy as np
 from paths import ROOT

@@ -7,7 +7,7 @@ from threading import Thread
 from boxreg_ros.cli import main
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.offline.reviewed_drive import drive_of
+from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.server import review_server
 from browser import NEEDS_BROWSER, opened_page
 import numpy as np

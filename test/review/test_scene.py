@@ -12,7 +12,7 @@ from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
-from boxreg_ros.offline.reviewed_drive import drive_of
+from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.fit import fitted
 from boxreg_ros.review.server import review_server

@@ -13,7 +13,7 @@ from boxreg_ros import Config, refine, Track
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
-from boxreg_ros.offline.reviewed_drive import drive_of
+from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
 from browser import NEEDS_BROWSER, opened_page

@@ -5,12 +5,16 @@ from boxreg_ros.core.motion import motion_at
 from boxreg_ros.io.stamp_order import kept
 from boxreg_ros.tracks.extend import extend, MOVING_REACH, num_free, num_supported
 from boxreg_ros.tracks.fill import fill
-from boxreg_ros.tracks.links import best_links
 from boxreg_ros.tracks.prune import duplicates, ghosts
 from boxreg_ros.tracks.static import join_static
-from boxreg_ros.tracks.stitch import stitch
-from boxreg_ros.tracks.tracklet import joined_tracklets, tracklets_of, unused_id
-from boxreg_ros.tracks.tracklet_motion import between, is_parked
+from boxreg_ros.tracks.stitch import best_links, stitch
+from boxreg_ros.tracks.tracklet import (
+    between,
+    is_parked,
+    joined_tracklets,
+    tracklets_of,
+    unused_id,
+)
 from drives import detections, path, STEP_NS, tracklet
 import numpy as np
 import pytest

@@ -12,8 +12,7 @@ from boxreg_ros.bench.common import print_json
 from boxreg_ros.bench.speed.recordings import relabel
 from boxreg_ros.bench.speed.reference import compare
 from boxreg_ros.bench.speed.report import beside, draw_scaling, text
-from boxreg_ros.bench.speed.scaling import cores, held_tracks, scaling
-from boxreg_ros.bench.speed.stages import crop, tick
+from boxreg_ros.bench.speed.scaling import cores, crop, held_tracks, scaling, tick
 from boxreg_ros.config import Config
 
 

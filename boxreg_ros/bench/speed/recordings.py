@@ -28,21 +28,15 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
     """
     Return time and memory of `boxreg relabel` on a recording of `seconds` at 10 Hz.
 
-    It runs in processes of its own.
-
-    Returns
-    -------
-    found : dict
-        ``total``: elapsed time [s]; the times of the stages add up to more, since reading and
-        solving overlap. ``start``: time until the recording is open [s]. ``faster``: length of the
-        recording over ``total``; ``compressed``: the same for a recording packed by zstd.
-        ``rest``: part of the total in which nothing is solved. ``memory``: peak of all processes
-        [MB]; ``memory, shared once``: the same with shared pages counted once, of a run of its
-        own, since to count them takes a fifth of the machine. ``short`` and ``long``: peaks for
-        recordings of this length and of ten times that, with sweeps of ``few`` points: a fifth of
-        all if the disk has no room for more. ``faster, long``, ``rest, long`` and ``cores, long``
-        (cores that are busy on average): of the latter. ``help``: shortest time of three runs with
-        ``--help`` [s].
+    ``total``: elapsed time [s]; the times of the stages add up to more, since reading and
+    solving overlap. ``start``: time until the recording is open [s]. ``faster``: length of the
+    recording over ``total``; ``compressed``: the same for a recording packed by zstd. ``rest``:
+    part of the total in which nothing is solved. ``memory``: peak of all processes [MB];
+    ``memory, shared once``: the same with shared pages counted once, of a run of its own, since
+    to count them takes a fifth of the machine. ``short`` and ``long``: peaks for recordings of
+    this length and of ten times that, with sweeps of ``few`` points: a fifth of all if the disk
+    has no room for more. ``faster, long``, ``rest, long`` and ``cores, long`` (cores that are
+    busy on average): of the latter. ``help``: shortest time of three runs with ``--help`` [s].
 
     """
     command = [*BOXREG, 'relabel']

@@ -13,8 +13,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Self
 
 from boxreg_ros.core.following.extents import faces, MAX_GROWTH
-from boxreg_ros.core.following.kernels import motion, registration, surface
 from boxreg_ros.core.following.sweeps import Sweeps
+from boxreg_ros.core.method import sweep_fit, turn_rate
+from boxreg_ros.core.method.constants import CONSTANTS
+from boxreg_ros.core.method.follow_numbers import FOLLOW
+from boxreg_ros.core.method.surface import empty_surface, insert_foreign
+from boxreg_ros.core.method.sweep_fit import Expected, Registered, Target
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, PITCH, ROLL, YAW
 import numpy as np
@@ -28,27 +32,13 @@ CLIMB = 0.1
 """The height of a box changes by this in a second, as a random walk [m]; chosen."""
 PARKED_NOISE = 0.1
 """Factor on the noise of the motion of a parked object; chosen."""
-STOPPED = 0.3
-"""Slower objects count as parked where they are held through an occlusion [m/s]."""
-REAR_AXLE = 0.25
-"""Distance of the rear axle of a vehicle behind its centre, as part of the length."""
 
-MIN_FIT_TO_LEARN = 0.7
-"""Points of a sweep with a smaller part that fits are not added to the surface."""
 HOLD, HOLD_PARKED = 2.0, 5.0
 """An object that is not found for so long is lost [s]."""
 YOUNG = 1.0
 """A way of this duration does not yet know its speed well [s]."""
 SPEED_AFTER_LOSS = 2.0
 """Deviation of the speed of a young way after a loss [m/s]."""
-SEARCH_STEP = 0.4
-"""Distance of the starts of a search along the heading after a loss [m]."""
-SLIP_STEP = 0.15
-"""And while it is seen [m]: points further from the surface have hardly any weight."""
-SLIPS = 2
-"""Starts in each direction while it is seen; chosen: half the reach of a registration."""
-MOST_STEPS = 10
-"""And after a loss, at most; chosen."""
 
 MAX_GAP = 0.3
 """A way has arrived at a seed if it is nearer than this [m]; swept in findings: 0.2 to 0.5."""
@@ -63,19 +53,15 @@ SPEEDS_TESTED = 4
 """Most likely speeds by the first sweeps that are tested with `SEARCH_SWEEPS`."""
 START_INFORMATION = np.diag(np.array([0.5, 0.5, 0.1, 0.05]) ** -2.0)
 """Of the starts of a search for the speed: x y z [m] and yaw [rad]."""
-MARGIN_LEARNT = 0.1
-"""Points so far outside of the box are part of its surface [m]."""
 MAX_EXTENT_SWEEPS = 60
 """Sweeps of a track whose points show the extents; chosen."""
-MAX_CELLS = 20_000
-"""Of a surface: those of a bus of 12 m at 0.15 m."""
 
 ARRIVED, END_OF_SWEEPS = 'arrived', 'end_of_sweeps'
 
 
 class KindOfMotion(NamedTuple):
     """
-    Motion of a kind of object: densities of `motion.predict`, speed [m/s], road [m].
+    Motion of a kind of object: densities of `turn_rate.predict`, speed [m/s], road [m].
 
     Of others than rigid objects points do not show the extents: limbs move.
     """
@@ -156,26 +142,6 @@ class Walk:
     is_over: bool = False
 
 
-class _Found(NamedTuple):
-    """A registered pose, its covariance (4, 4), fit, jump, and why it is not accepted."""
-
-    pose: Floats
-    covariance: Floats
-    fit: Floats
-    jump: float
-    reason: int
-    """Of `registration.REASONS`; 0 if it is accepted."""
-
-    @property
-    def score(self) -> float:
-        return float(self.fit[3])
-
-    @property
-    def part(self) -> float:
-        """Part of the points near the surface that fit it."""
-        return float(self.fit[1] / max(self.fit[2], 1.0))
-
-
 class _State(NamedTuple):
     """State and covariance of `motion`, height, its variance, and the information of the pose."""
 
@@ -192,9 +158,9 @@ class _State(NamedTuple):
         covariance = np.diag(np.square(deviations))
         return cls(planar, covariance, pose[2], SEED_DEVIATIONS[2] ** 2, START_INFORMATION)
 
-    def updated(self, found: _Found) -> Self:
+    def updated(self, found: Registered) -> Self:
         """Return the state with a registered pose."""
-        planar, covariance = motion.update(
+        planar, covariance = turn_rate.update(
             self.planar, self.covariance, found.pose, found.covariance
         )
         z, z_variance = found.pose[2], found.covariance[2, 2]
@@ -211,7 +177,7 @@ class _State(NamedTuple):
 
     @property
     def is_parked(self) -> bool:
-        return bool(abs(self.speed) < STOPPED)
+        return bool(abs(self.speed) < CONSTANTS.parked_speed)
 
 
 class Owned:
@@ -234,7 +200,7 @@ class Owned:
             self._boxes[row] = of_row, count + 1
 
     def __getitem__(self, row: int, /) -> Floats:
-        """Return those in a sweep, as `registration.near` takes them."""
+        """Return those in a sweep, as `sweep_fit.near` takes them."""
         boxes, count = self._boxes.get(row, (np.empty((0, 16)), 0))
         return boxes[:count]
 
@@ -266,20 +232,20 @@ class Follower:
         self._kind = MOTIONS[kind]
         self._owned = owned
         self._same = np.array(same, np.float64)
-        self._half = seeds.boxes[:, BOX_EXTENT].mean(0) / 2
-        self._tilt = matrix_from_rpy(np.append(seeds.boxes[0, [ROLL, PITCH]], 0.0))
-        self._pivot = REAR_AXLE * 2 * self._half[0] if kind == 'vehicle' else 0.0
-        self._surface = surface.empty(self._half, MAX_CELLS)
+        half = seeds.boxes[:, BOX_EXTENT].mean(0) / 2
+        tilt = matrix_from_rpy(np.append(seeds.boxes[0, [ROLL, PITCH]], 0.0))
+        self._target = Target(half, tilt, self._kind.clearance, empty_surface(half))
+        self._pivot = CONSTANTS.pivot * 2 * half[0] if kind == 'vehicle' else 0.0
         self._road = np.nan
         self._start_speeds: dict[int, float] = {}
         self.num_points = 0
         for row, pose in zip(seeds.rows.tolist(), seeds.boxes[:, POSE4], strict=True):
             points = self._near(row, pose)
-            around = self._in_box(points, pose, surface.RIM)
-            surface.insert_foreign(around, self._half, MARGIN_LEARNT, self._surface[0])
-            self.num_points += self._learn(points, pose)
+            around = self._in_box(points, pose, FOLLOW.rim)
+            insert_foreign(around, half, self._target.surface.slots)
+            self.num_points += sweep_fit.learn(points, pose, self._target)
             if np.isnan(self._road):
-                self._road = self._road_below(points, pose)
+                self._road = sweep_fit.road_below(points, pose, self._target)
 
     def way(self, seed: int, sign: int, stop: int) -> Way:
         """Follow the object from a seed to the row `stop`, forwards or backwards."""
@@ -313,18 +279,18 @@ class Follower:
             if not walk.is_over:
                 walk.poses[row] = state.pose
             walk.state = state
-            walk.reason = registration.REASONS[found.reason]
+            walk.reason = sweep_fit.REASONS[found.reason]
             return
         walk.state = state.updated(found)
         walk.reason = ''
         walk.poses[row] = found.pose
         walk.seen.add(row)
         walk.last_seen = times[row]
-        walk.usual += (found.score - walk.usual) / 5
-        if found.part > MIN_FIT_TO_LEARN:
-            self._learn(points, found.pose)
+        walk.usual += (found.fit.score - walk.usual) / 5
+        if found.fit.part > FOLLOW.min_fit_to_learn:
+            sweep_fit.learn(points, found.pose, self._target)
             if np.isnan(self._road):
-                self._road = self._road_below(points, found.pose)
+                self._road = sweep_fit.road_below(points, found.pose, self._target)
 
     def continue_in(self, sweeps: Sweeps, owned: Owned) -> None:
         """Go on with further sweeps, and the boxes of other objects in them."""
@@ -334,7 +300,7 @@ class Follower:
     def box(self, pose: Floats, travel: float = 0.0) -> Floats:
         """Return the object at a pose (4,), moved forward by `travel` [m], as a row (9,)."""
         box: Floats = self._seeds.boxes[0].copy()
-        box[BOX_EXTENT] = 2 * self._half
+        box[BOX_EXTENT] = 2 * self._target.half
         box[POSE4] = pose
         box[YAW] = wrap_angle(box[YAW])
         box[:2] += travel * np.array([np.cos(box[YAW]), np.sin(box[YAW])])
@@ -350,7 +316,7 @@ class Follower:
             for i, pose in zip(some, boxes[:, POSE4][some], strict=True)
         ]
         sees_top = [self._sees_top(int(rows[i]), boxes[i, POSE4]) for i in some]
-        low, high = faces(points, self._half, is_of_class, np.array(sees_top))
+        low, high = faces(points, self._target.half, is_of_class, np.array(sees_top))
         grown = boxes.copy()
         shift = (low + high) / 2
         grown[:, :3] += matrix_from_rpy(boxes[:, ROLL:]) @ shift
@@ -362,8 +328,9 @@ class Follower:
         limits = self._sweeps.sight_limits
         if limits is None:
             return False
-        top = pose[2] + self._half[2] + MARGIN_LEARNT
-        return bool(limits.height(row, pose, float(np.hypot(*self._half[:2]))) > top)
+        half = self._target.half
+        top = pose[2] + half[2] + FOLLOW.tolerance
+        return bool(limits.height(row, pose, float(np.hypot(*half[:2]))) > top)
 
     def jumps(self, seed: int) -> bool:
         """Return whether the next seed is farther away than such an object can move."""
@@ -377,27 +344,28 @@ class Follower:
         scores = [self._score(row, pose) for row, pose in zip(rows.tolist(), poses, strict=True)]
         return float(np.mean(scores)) if scores else 0.0
 
-    def _find(self, row: int, state: _State, walk: Walk) -> tuple[Floats, _Found]:
+    def _find(self, row: int, state: _State, walk: Walk) -> tuple[Floats, Registered]:
         """Return the points around a prediction, and the pose by them."""
         is_lost = bool(walk.reason)
-        step, count = SLIP_STEP, SLIPS
+        step, count = FOLLOW.slip_step, FOLLOW.slips
         if is_lost:
             reach = 2.5 * np.sqrt(state.covariance[0, 0] + state.covariance[1, 1])
-            step, count = SEARCH_STEP, min(int(reach / SEARCH_STEP), MOST_STEPS)
-        points = self._near(row, state.pose, registration.AROUND + step * count)
-        found = registration.find(
-            points, state.pose, state.information, step, count, is_lost, walk.usual, self._road,
-            self._tilt, self._half, self._kind.clearance, *self._surface[:4],
-        )  # fmt: skip
-        return points, _Found(*found)
+            step = FOLLOW.search_step
+            count = min(int(reach / step), FOLLOW.max_search)
+        points = self._near(row, state.pose, FOLLOW.around + step * count)
+        expected = Expected(
+            state.pose, state.information, step, count, is_lost, walk.usual, self._road
+        )
+        found: Registered = sweep_fit.find(points, expected, self._target)
+        return points, found
 
-    def _registered(self, row: int, start: Floats, information: Floats, iterations: int) -> _Found:
+    def _registered(self, row: int, start: Floats, information: Floats, steps: int) -> Registered:
         """Return the pose in a sweep from one start."""
-        found = registration.registered(
-            self._near(row, start), start, start, information, self._tilt, self._half,
-            self._kind.clearance, *self._surface[:4], iterations,
-        )  # fmt: skip
-        return _Found(*found)
+        points = self._near(row, start)
+        found: Registered = sweep_fit.registered(
+            points, start, start, information, self._target, steps
+        )
+        return found
 
     def _start_speed(self, seed: int) -> float:
         """Return the speed at a seed [m/s]: by its neighbours in time, or searched."""
@@ -430,7 +398,7 @@ class Follower:
         for i, speed in enumerate(speeds):
             for other in around:
                 start = pose + speed * (times[other] - times[row]) * forward
-                scores[i] += self._registered(other, start, START_INFORMATION, 6).score
+                scores[i] += self._registered(other, start, START_INFORMATION, 6).fit.score
             scores[i] = scores[i] / len(around) - _cost(speed)
         likely = speeds[np.argsort(-scores, kind='stable')[:SPEEDS_TESTED]]
         tested = [self._tested_speed(row, pose, speed) for speed in likely]
@@ -449,7 +417,7 @@ class Follower:
                     break
                 state = self._predicted(state, times[other] - times[other - sign])
                 found = self._registered(other, state.pose, state.information, 8)
-                total += registration.rank(found.score, found.jump) / count
+                total += sweep_fit.rank(found) / count
                 weights += 1 / count
                 z, z_variance = state.z, state.z_variance
                 state = state.updated(found)._replace(z=z, z_variance=z_variance)
@@ -458,42 +426,25 @@ class Follower:
 
     def _predicted(self, state: _State, seconds: float) -> _State:
         noise = self._kind.noise * (PARKED_NOISE if state.is_parked else 1.0)
-        planar, covariance, z_variance, information = motion.predict(
+        planar, covariance, z_variance, information = turn_rate.predict(
             state.planar, state.covariance, state.z_variance, seconds, noise, CLIMB**2, self._pivot
         )
         return _State(planar, covariance, state.z, z_variance, information)
 
     def _near(self, row: int, pose: Floats, margin: float = 0.0) -> Floats:
         """Return the points (n, 3) around a pose that are not in the box of another object."""
-        near: Floats = registration.near(
-            self._sweeps.points[row], pose, self._half, margin, self._owned[row], self._same
+        near: Floats = sweep_fit.near(
+            self._sweeps.points[row], pose, self._target.half, margin, self._owned[row], self._same
         )
         return near
 
-    def _learn(self, points: Floats, pose: Floats) -> int:
-        """Add the points in the box to the surface; return their number."""
-        count: int = registration.learn(
-            points, pose, self._tilt, self._half, self._kind.clearance, MARGIN_LEARNT,
-            *self._surface,
-        )  # fmt: skip
-        return count
-
     def _in_box(self, points: Floats, pose: Floats, margin: float) -> Floats:
-        found: Floats = registration.in_box(
-            points, pose, self._tilt, self._half, self._kind.clearance, margin
-        )
+        found: Floats = sweep_fit.in_box(points, pose, self._target, margin)
         return found
 
-    def _road_below(self, points: Floats, pose: Floats) -> float:
-        return float(registration.road_below(points, pose, self._tilt, self._half))
-
     def _score(self, row: int, pose: Floats) -> float:
-        """Return how well the points of a sweep fit a pose, see `registration.fit`."""
-        fit = registration.fit(
-            self._near(row, pose), pose, self._tilt, self._half, self._kind.clearance,
-            *self._surface[:4],
-        )  # fmt: skip
-        return float(fit[3])
+        """Return how well the points of a sweep fit a pose, see `Fit`."""
+        return float(sweep_fit.fit(self._near(row, pose), pose, self._target).score)
 
 
 def _cost(speed: float) -> float:

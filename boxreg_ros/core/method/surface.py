@@ -1,45 +1,56 @@
-"""
-The surface of one object in its box frame: cells with the moments of their points.
+"""The surface of one object in its box frame: cells with the moments of their points."""
 
-A map is a tuple of arrays. `slots` (nx, ny, nz) holds the number of the cell at a place plus one,
-0, or `FOREIGN` for points beside the box that a person has drawn; `means` (S, 3) of its points;
-`normals` (S, 3) the direction of least spread around it; `used` (1,) the number of cells;
-`moments` (S, 11) the count, the sums of x y z and of xx xy xz yy yz zz of its points, and the
-count at which the normal was found.
-
-"""
+from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.follow_numbers import FOLLOW
 import numpy as np
 
-SURFACE_CELL = 0.15
-"""Side of a cell [m]."""
-FULL = 60
-"""A cell takes no more points than this."""
-RIM = 0.6
-"""A map reaches this far outside of the box [m]."""
 FOREIGN = -1
-NORMAL_AGAIN = 1.1
-"""The normal of a cell is found again after it got so many times its points; chosen."""
-LINE = 0.02
-"""A neighbourhood with less spread in its second direction is a line [m]."""
+"""In place of the number of a cell: points beside the box that a person has drawn."""
+
+
+class Surface(NamedTuple):
+    """
+    The map of a surface.
+
+    Attributes
+    ----------
+    slots : array, shape (nx, ny, nz)
+        Number of the cell at a place plus one, 0, or `FOREIGN`.
+    means, normals : array, shape (S, 3)
+        Of the points of each cell, and the direction of least spread around it.
+    used : array, shape (1,)
+        Number of cells.
+    moments : array, shape (S, 11)
+        Count, sums of x y z and of xx xy xz yy yz zz of the points of each cell, and the count at
+        which the normal was found.
+
+    """
+
+    slots: Any
+    means: Any
+    normals: Any
+    used: Any
+    moments: Any
 
 
 @kernel
 def cell_of(x, y, z, slots):
     """Return the indices of the cell at a place of the box frame; i = -1 outside of the map."""
     nx, ny, nz = slots.shape
-    i = int(np.floor(x / SURFACE_CELL)) + nx // 2
-    j = int(np.floor(y / SURFACE_CELL)) + ny // 2
-    k = int(np.floor(z / SURFACE_CELL)) + nz // 2
+    i = int(np.floor(x / FOLLOW.cell)) + nx // 2
+    j = int(np.floor(y / FOLLOW.cell)) + ny // 2
+    k = int(np.floor(z / FOLLOW.cell)) + nz // 2
     if i < 1 or j < 1 or k < 1 or i >= nx - 1 or j >= ny - 1 or k >= nz - 1:
         return -1, -1, -1
     return i, j, k
 
 
 @kernel
-def insert(points, half, slots, means, normals, used, moments):
+def insert(points, half, surface):
     """Add points (n, 3) of the box frame to a map; update the normals of their cells."""
+    slots, means, normals, used, moments = surface
     for n in range(len(points)):
         x, y, z = points[n]
         i, j, k = cell_of(x, y, z, slots)
@@ -53,7 +64,7 @@ def insert(points, half, slots, means, normals, used, moments):
             used[0] += 1
             slots[i, j, k] = slot + 1
         of_cell = moments[slot]
-        if of_cell[0] >= FULL:
+        if of_cell[0] >= FOLLOW.max_cell_points:
             continue
         of_cell[0] += 1.0
         of_cell[1] += x
@@ -67,18 +78,18 @@ def insert(points, half, slots, means, normals, used, moments):
         of_cell[9] += z * z
     for slot in range(used[0]):
         count = moments[slot, 0]
-        if count > NORMAL_AGAIN * moments[slot, 10]:
+        if count > FOLLOW.growth * moments[slot, 10]:
             means[slot] = moments[slot, 1:4] / count
             normals[slot] = normal_at(means[slot], half, slots, moments)
             moments[slot, 10] = count
 
 
 @kernel
-def insert_foreign(points, half, margin, slots):
-    """Mark the places of points (n, 3) of the box frame that are further outside than `margin`."""
+def insert_foreign(points, half, slots):
+    """Mark the places of points (n, 3) of the box frame that are beside the box."""
     for n in range(len(points)):
         x, y, z = points[n]
-        if max(abs(x) - half[0], abs(y) - half[1]) > margin:
+        if max(abs(x) - half[0], abs(y) - half[1]) > FOLLOW.tolerance:
             i, j, k = cell_of(x, y, z, slots)
             if i >= 0 and slots[i, j, k] == 0:
                 slots[i, j, k] = FOREIGN
@@ -132,7 +143,7 @@ def normal_at(mean, half, slots, moments):
     C[2, 2] = total[9] / n - m[2] * m[2]
     C[1, 0], C[2, 0], C[2, 1] = C[0, 1], C[0, 2], C[1, 2]
     values = eigenvalues(C)
-    if values[1] < LINE**2 or values[1] < 3 * values[0]:
+    if values[1] < FOLLOW.line**2 or values[1] < 3 * values[0]:
         along = eigenvector(C, values[2])
         length = np.hypot(along[0], along[1])
         if length < 0.5:
@@ -176,12 +187,13 @@ def eigenvector(C, value):
 
 
 @kernel
-def nearest(x, y, z, slots, means, limit):
-    """Return the cell with the nearest mean to a place, or -1 beyond `limit` [m]."""
+def nearest_cell(x, y, z, surface):
+    """Return the cell with the nearest mean to a place, or -1 where none is in reach."""
+    slots, means = surface.slots, surface.means
     i, j, k = cell_of(x, y, z, slots)
     if i < 0:
         return -1
-    best = limit * limit
+    best = FOLLOW.reach * FOLLOW.reach
     found = -1
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):
@@ -199,10 +211,11 @@ def nearest(x, y, z, slots, means, limit):
     return found
 
 
-def empty(half, cells):
+def empty_surface(half):
     """Return a map without points for a box with `half` extents (3,)."""
-    sides = (2 * np.ceil((half + RIM) / SURFACE_CELL) + 2).astype(np.int64)
-    return (
+    cells = FOLLOW.max_cells
+    sides = (2 * np.ceil((half + FOLLOW.rim) / FOLLOW.cell) + 2).astype(np.int64)
+    return Surface(
         np.zeros(sides, np.int32),
         np.zeros((cells, 3)),
         np.zeros((cells, 3)),

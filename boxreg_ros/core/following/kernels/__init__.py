@@ -1,1 +1,0 @@
-"""Compiled loops over the points of one object, and its motion."""

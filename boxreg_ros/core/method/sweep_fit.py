@@ -1,0 +1,400 @@
+"""Registration of the points of one sweep to the surface of one object."""
+
+from typing import Any, NamedTuple
+
+from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.follow_numbers import FOLLOW
+from boxreg_ros.core.method.surface import insert, is_foreign, nearest_cell
+import numpy as np
+
+REASONS = ('', 'few_points', 'no_fit', 'uncertain', 'jump')
+"""Why a pose is not accepted."""
+ACCEPTED, FEW_POINTS, NO_FIT, UNCERTAIN, JUMP = range(len(REASONS))
+
+
+class Target(NamedTuple):
+    """
+    An object that is followed.
+
+    Attributes
+    ----------
+    half : array, shape (3,)
+        Half its extents [m].
+    tilt : array, shape (3, 3)
+        Rotation by roll and pitch.
+    clearance : float
+        Height above the bottom under which points are of the road [m].
+    surface : Surface
+        What has been seen of it.
+
+    """
+
+    half: Any
+    tilt: Any
+    clearance: Any
+    surface: Any
+
+
+class Expected(NamedTuple):
+    """
+    A predicted pose (4,) x y z yaw, and its information (4, 4).
+
+    How it is searched: `starts` further ones in each direction, each `step` [m] along the
+    heading. `usual` is the running mean of the score, `road` the height of the road above the
+    bottom of the box.
+
+    """
+
+    pose: Any
+    information: Any
+    step: float = 0.0
+    starts: int = 0
+    is_lost: bool = False
+    usual: float = 0.0
+    road: float = np.nan
+
+
+class Fit(NamedTuple):
+    """
+    How the points of a sweep fit a pose.
+
+    Points in the box, those that fit, those near the surface, and a score: the harmonic mean of
+    the part of the points, with those beside the box, that fit, and of the part of the surface
+    that they hit; 0 for fewer than three points.
+
+    """
+
+    inside: float
+    fitting: float
+    matched: float
+    score: float
+
+    @property
+    def part(self) -> float:
+        """Part of the points near the surface that fit it."""
+        return self.fitting / max(self.matched, 1.0)
+
+
+class Registered(NamedTuple):
+    """A pose (4,), its covariance (4, 4), fit, squared distance from the prediction, `REASONS`."""
+
+    pose: Any
+    covariance: Any
+    fit: Any
+    jump: float
+    reason: int
+
+
+@kernel
+def find(points, expected, target):
+    """
+    Return the pose of an object by the points (n, 3) around its prediction, as `registered`.
+
+    After a loss, and where it fits worse than usual, it is searched along the heading.
+
+    """
+    prior, information = expected.pose.copy(), expected.information.copy()
+    own = _around(points, prior, target.half)
+    height = road_below(own, prior, target) - expected.road
+    if np.isfinite(height):
+        weight = FOLLOW.road_deviation**-2
+        prior[2] += height * weight / (information[2, 2] + weight)
+        information[2, 2] += weight
+    best = registered(own, prior, prior, information, target, 12)
+    slips = best.fit.inside > FOLLOW.effective_points
+    slips = slips and best.fit.score < FOLLOW.search_below * expected.usual
+    if expected.is_lost or slips:
+        for n in range(-expected.starts, expected.starts + 1):
+            start = prior.copy()
+            start[0] += n * expected.step * np.cos(prior[3])
+            start[1] += n * expected.step * np.sin(prior[3])
+            own = _around(points, start, target.half)
+            if n == 0 or len(own) < FOLLOW.min_points:
+                continue
+            other = registered(own, start, prior, information, target, 12)
+            if rank(other) > rank(best) + FOLLOW.jump_cost:
+                best = other
+    if expected.is_lost and best.reason == ACCEPTED:
+        fits = best.fit.fitting >= FOLLOW.min_fit_again * max(best.fit.matched, 1.0)
+        if not fits or best.fit.score < FOLLOW.min_score_again * expected.usual:
+            return Registered(best.pose, best.covariance, best.fit, best.jump, NO_FIT)
+    return best
+
+
+@kernel
+def rank(found):
+    """Return the score of a registered pose, less what the distance from its prediction costs."""
+    return found.fit.score - FOLLOW.jump_cost * min(found.jump, FOLLOW.max_jump_cost)
+
+
+@kernel
+def _around(points, pose, half):
+    """Return the points (n, 3) around a pose."""
+    reach = np.hypot(half[0], half[1]) + FOLLOW.crop + FOLLOW.around
+    found = np.empty_like(points)
+    count = 0
+    for n in range(len(points)):
+        if abs(points[n, 0] - pose[0]) >= reach or abs(points[n, 1] - pose[1]) >= reach:
+            continue
+        if abs(points[n, 2] - pose[2]) < half[2] + FOLLOW.crop_above:
+            found[count] = points[n]
+            count += 1
+    return found[:count]
+
+
+@kernel
+def registered(points, start, prior, information, target, iterations):
+    """
+    Return the pose of a box x y z yaw that puts points on its surface, and its tests.
+
+    Parameters
+    ----------
+    points : array, shape (n, 3)
+        Of the sweep.
+    start, prior : array, shape (4,)
+        Poses.
+    information : array, shape (4, 4)
+        Of the prior.
+    target : Target
+        The object.
+    iterations : int
+        At most.
+
+    """
+    points = np.ascontiguousarray(points[:: 1 + len(points) // FOLLOW.max_sweep_points])
+    pose = start.copy()
+    total = information.copy()
+    for _ in range(iterations):
+        H, g, count = _system(points, pose, target)
+        if count < FOLLOW.min_points:
+            break
+        total = H + information
+        gradient = g + information @ (pose - prior)
+        step = np.linalg.solve(total, gradient)
+        size = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+        if size > FOLLOW.max_step:
+            step *= FOLLOW.max_step / size
+        pose = pose - step
+        if size < 1e-3 and abs(step[3]) < 5e-4:
+            break
+    found = fit(points, pose, target)
+    covariance = np.linalg.inv(total)
+    off = pose - prior
+    jump = off @ information @ off
+    return Registered(pose, covariance, found, jump, _reason(pose, covariance, found, jump))
+
+
+@kernel
+def _reason(pose, covariance, found, jump):
+    """Return why a pose is not accepted, an index of `REASONS`."""
+    if found.fitting < FOLLOW.min_points:
+        return FEW_POINTS
+    fits = found.fitting >= FOLLOW.min_fit * found.matched
+    if not fits or found.matched < FOLLOW.min_seen * found.inside:
+        return NO_FIT
+    c, s = np.cos(pose[3]), np.sin(pose[3])
+    along = c * c * covariance[0, 0] + s * s * covariance[1, 1] + 2 * c * s * covariance[0, 1]
+    if along > FOLLOW.max_deviation**2 or covariance[3, 3] > FOLLOW.max_yaw_deviation**2:
+        return UNCERTAIN
+    return JUMP if jump > FOLLOW.max_jump else ACCEPTED
+
+
+@kernel
+def _system(points, pose, target):
+    """Return the normal equations (4, 4) and (4,) of the points at a pose, and their number."""
+    half, surface = target.half, target.surface
+    H = np.zeros((4, 4))
+    g = np.zeros(4)
+    R = axes(pose, target.tilt)
+    J = np.empty(4)
+    weights = 0.0
+    count = 0
+    for n in range(len(points)):
+        dx, dy, x, y, z = offset_in_box(points, n, pose, R)
+        out_x, out_y = abs(x) - half[0], abs(y) - half[1]
+        if max(out_x, out_y, z - half[2]) > FOLLOW.margin or z < target.clearance - half[2]:
+            continue
+        count += 1
+        nx, ny, nz = 0.0, 0.0, 0.0
+        slot = nearest_cell(x, y, z, surface)
+        if slot >= 0:
+            nx, ny, nz = surface.normals[slot]
+            if nx == 0 and ny == 0 and nz == 0:
+                continue
+            r = from_surface(x, y, z, slot, surface)
+            robust = 1 / (1 + (r / FOLLOW.outlier) ** 2) ** 2
+            w = robust / FOLLOW.deviation**2
+            weights += robust
+        else:
+            r = max(out_x, out_y) - FOLLOW.tolerance
+            if r <= 0 or z > half[2] or is_foreign(x, y, z, surface.slots):
+                continue
+            if out_x > out_y:
+                nx = np.sign(x)
+            else:
+                ny = np.sign(y)
+            w = (1 - min(1.0, r / (FOLLOW.margin - FOLLOW.tolerance)) ** 2) ** 2
+            w /= FOLLOW.outside_deviation**2
+            weights += 1.0
+        wx = R[0, 0] * nx + R[0, 1] * ny + R[0, 2] * nz
+        wy = R[1, 0] * nx + R[1, 1] * ny + R[1, 2] * nz
+        J[0], J[1] = -wx, -wy
+        J[2] = -(R[2, 0] * nx + R[2, 1] * ny + R[2, 2] * nz)
+        J[3] = wx * dy - wy * dx
+        for a in range(4):
+            g[a] += w * J[a] * r
+            for b in range(4):
+                H[a, b] += w * J[a] * J[b]
+    scale = FOLLOW.effective_points / max(weights, FOLLOW.effective_points)
+    return H * scale, g * scale, count
+
+
+@kernel
+def from_surface(x, y, z, slot, surface):
+    """Return the signed distance of a place of the box frame from a piece of the surface [m]."""
+    nx, ny, nz = surface.normals[slot]
+    mx, my, mz = surface.means[slot]
+    return nx * (x - mx) + ny * (y - my) + nz * (z - mz)
+
+
+@kernel
+def fit(points, pose, target):
+    """Return how points (n, 3) fit a pose, `Fit`."""
+    half, surface = target.half, target.surface
+    R = axes(pose, target.tilt)
+    hit = np.zeros(surface.used[0], np.bool_)
+    inside, fitting, beside, matched = 0.0, 0.0, 0.0, 0.0
+    for n in range(len(points)):
+        _, _, x, y, z = offset_in_box(points, n, pose, R)
+        if z < target.clearance - half[2] or z > half[2] + FOLLOW.tolerance:
+            continue
+        out = max(abs(x) - half[0], abs(y) - half[1])
+        if out > FOLLOW.tolerance:
+            if out < FOLLOW.margin and not is_foreign(x, y, z, surface.slots):
+                beside += 1
+            continue
+        inside += 1
+        slot = nearest_cell(x, y, z, surface)
+        if slot >= 0:
+            hit[slot] = True
+            matched += 1
+            fitting += abs(from_surface(x, y, z, slot, surface)) < FOLLOW.outlier
+    score = 0.0
+    if inside >= 3:
+        part = fitting / (inside + beside)
+        seen = hit.sum() / max(1.0, surface.used[0])
+        score = 2 * part * seen / max(part + seen, 1e-9)
+    return Fit(inside, fitting, matched, score)
+
+
+@kernel
+def near(points, pose, half, margin, boxes, same):
+    """
+    Return the points (n, 3), which ascend by x, around a pose, without those of other objects.
+
+    `boxes` (m, 16) have centre, half extents, axes and number of each of these. Not left out are
+    the points of one whose centre is in the box (it is the object itself), or with a number in
+    `same`.
+
+    """
+    reach = np.hypot(half[0], half[1]) + FOLLOW.crop + margin
+    first = np.searchsorted(points[:, 0], pose[0] - reach)
+    last = np.searchsorted(points[:, 0], pose[0] + reach)
+    found = np.empty((last - first, 3))
+    count = 0
+    for n in range(first, last):
+        if abs(points[n, 1] - pose[1]) >= reach:
+            continue
+        if abs(points[n, 2] - pose[2]) < half[2] + FOLLOW.crop_above:
+            found[count, 0] = points[n, 0]
+            found[count, 1] = points[n, 1]
+            found[count, 2] = points[n, 2]
+            count += 1
+    found = found[:count]
+    reach += FOLLOW.beside
+    for k in range(len(boxes)):
+        other = boxes[k]
+        away = np.hypot(other[0] - pose[0], other[1] - pose[1])
+        is_near = half[1] < away < reach + np.hypot(other[3], other[4])
+        if is_near and not (same == other[15]).any():
+            found = _outside(found, other[:3], other[3:6], other[6:15].reshape(3, 3))
+    return found
+
+
+@kernel
+def _outside(points, center, half, R):
+    """Return the points (n, 3) that are not in a box, in place."""
+    count = 0
+    for n in range(len(points)):
+        _, _, x, y, z = offset_in_box(points, n, center, R)
+        if abs(x) > half[0] or abs(y) > half[1] or abs(z) > half[2]:
+            points[count] = points[n]
+            count += 1
+    return points[:count]
+
+
+@kernel
+def axes(pose, tilt):
+    """Return the axes of a box as columns (3, 3)."""
+    c, s = np.cos(pose[3]), np.sin(pose[3])
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt
+
+
+@kernel
+def offset_in_box(points, n, center, R):
+    """Return dx, dy of a point from the centre of a box, and x, y, z along the columns of R."""
+    dx = points[n, 0] - center[0]
+    dy = points[n, 1] - center[1]
+    dz = points[n, 2] - center[2]
+    x = R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz
+    y = R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz
+    z = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+    return dx, dy, x, y, z
+
+
+@kernel
+def in_box(points, pose, target, margin):
+    """Return points (n, 3) within `margin` of a box and above the road, in the box frame."""
+    half = target.half
+    R = axes(pose, target.tilt)
+    found = np.empty((len(points), 3))
+    count = 0
+    for n in range(len(points)):
+        _, _, x, y, z = offset_in_box(points, n, pose, R)
+        is_inside = max(abs(x) - half[0], abs(y) - half[1], z - half[2]) < margin
+        if is_inside and z > target.clearance - half[2]:
+            found[count, 0], found[count, 1], found[count, 2] = x, y, z
+            count += 1
+    return found[:count]
+
+
+@kernel
+def learn(points, pose, target):
+    """Add the points (n, 3) in a box to the map of its surface; return their number."""
+    inside = in_box(points, pose, target, FOLLOW.tolerance)
+    insert(inside, target.half, target.surface)
+    return len(inside)
+
+
+@kernel
+def road_below(points, pose, target):
+    """Return the height of the road above the bottom of a box; NaN without points of it [m]."""
+    half = target.half
+    R = axes(pose, target.tilt)
+    heights = np.empty(len(points))
+    count = 0
+    for n in range(len(points)):
+        _, _, x, y, z = offset_in_box(points, n, pose, R)
+        out = max(abs(x) - half[0], abs(y) - half[1])
+        height = z + half[2]
+        if 0.05 < out < 1.0 and abs(height) < 0.6:
+            heights[count] = height
+            count += 1
+    if count < 5:
+        return np.nan
+    ordered = np.sort(heights[:count])
+    low = ordered[int(0.1 * count)]
+    middle = ordered[int(0.3 * count)]
+    if ordered[int(0.6 * count)] - low > 0.15:
+        return np.nan
+    return middle
