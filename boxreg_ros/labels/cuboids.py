@@ -9,6 +9,7 @@ sensor frame; the extents are along x (forward), y (left) and z of the box.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any, ClassVar
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.files import following, from_json, require_single
-from boxreg_ros.labels.folder import FolderWriter, FrameNames
+from boxreg_ros.labels.folder import FolderWriter, frame_name
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame
 from boxreg_ros.labels.records import evidence_of, ReadBox, refined_of, UPPER_TRIANGLE
 from boxreg_ros.labels.sidecar import read_sidecar, STAMPS_FILE
@@ -172,8 +173,8 @@ def read_frames(
 
     """
     sidecar = read_sidecar(folder, len(names))
-    namer = FrameNames()
-    order = [namer.of(stamp_ns) for stamp_ns in sidecar.stamps_ns]
+    used: Counter[int] = Counter()
+    order = [frame_name(stamp_ns, used) for stamp_ns in sidecar.stamps_ns]
     if not set(names) <= set(order):  # frames named by another program: one stamp for each
         if len(names) != len(order):
             raise RecordingError(

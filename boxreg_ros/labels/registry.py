@@ -8,7 +8,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from itertools import chain
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.labels.camera import Camera
@@ -18,7 +18,6 @@ from boxreg_ros.labels.protocol import (
     LabelWriter,
     Options,
     Provenance,
-    ReadableModule,
     SceneFrames,
 )
 from boxreg_ros.labels.segments import segments_of
@@ -124,13 +123,13 @@ def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterat
         raise ConfigError(f'format {name!r} can only be written; readable: {able}')
     if not path.exists():
         raise RecordingError(f'labels {str(path)!r}: no such file or folder; correct the path')
-    readable = cast(ReadableModule, module)
+    readable: Any = module
     if scene is not None and hasattr(module, 'read_scene'):
-        return readable.read_scene(path, scene)
-    segments = segments_of(path)
-    if not segments:
-        return readable.read(path)
-    return chain.from_iterable(readable.read(_folder_of(name, part)) for part in segments)
+        parts = [readable.read_scene(path, scene)]
+    else:
+        folders = [_folder_of(name, segment) for segment in segments_of(path)]
+        parts = [readable.read(one) for one in folders or [path]]
+    return chain.from_iterable(parts)
 
 
 def import_format(name: str) -> FormatModule:
