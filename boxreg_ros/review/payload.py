@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, Protocol
 import zlib
 
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.review.changes import median, TrackChanges
-from boxreg_ros.review.quality import ious, quality
+from boxreg_ros.review.changes import ious, median, TrackChanges
+from boxreg_ros.review.quality import quality
 from boxreg_ros.review.risk import UNKNOWN_USUAL, Usual
 from boxreg_ros.review.tables import TrackRow
 from boxreg_ros.review.track_points import to_millimetres

@@ -224,9 +224,7 @@ MAX_GROUND_OFFSET = 1.0
 )
 def _floating(tracks: Labels) -> Iterator[Violation]:
     """Yield the first box of each track that is off the bottoms of the boxes around it."""
-    stamps_ns = np.concatenate([np.zeros(0, np.int64), *(t.stamps_ns for t in tracks)])
-    boxes = np.concatenate([np.zeros((0, 9)), *(t.boxes for t in tracks)])
-    owner = np.repeat(np.arange(len(tracks)), [len(t.boxes) for t in tracks])
+    stamps_ns, boxes, owner = tracks.rows
     bottom = boxes[:, Z] - boxes[:, HEIGHT] / 2
     reported: set[int] = set()
     order = np.argsort(stamps_ns, kind='stable')

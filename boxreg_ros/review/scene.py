@@ -152,14 +152,11 @@ class DriveScene:
         if not self._is_begun:
             self._is_begun = True
             Thread(target=self._read, daemon=True).start()
-        self._changed.wait_for(lambda: self._has(stamp_ns))
+        self._changed.wait_for(lambda: self._is_done or self._has_read(stamp_ns))
         if not self._store.stamps_ns:
             raise RecordingError(self._error or 'recording: expected sweeps, got none')
         if self._error and not self._has_read(stamp_ns):
             raise RecordingError(self._error)
-
-    def _has(self, stamp_ns: int | None) -> bool:
-        return self._is_done or self._has_read(stamp_ns)
 
     def _has_read(self, stamp_ns: int | None) -> bool:
         stamps_ns = self._store.stamps_ns
