@@ -8,8 +8,8 @@ Write the tables of `docs/results.md` and `docs/results/` from the stored measur
 A measurement is the output of ``boxreg bench`` or of ``test/measure``, stored as
 ``KIND_DATA.json``, for example ``real_pandaset_002_a.json`` of ``boxreg bench real pandaset_002_a
 --json``. A page has the rows that a reader decides by, between two marks; the text around them is
-written by hand. The page of a kind is that of `KINDS`, which
-also has all its tables. `docs/results.md` has the main figures of each kind.
+written by hand. `KINDS` has the page of each kind and its tables; `docs/results.md` has the main
+figures of each.
 
 """
 
