@@ -84,7 +84,10 @@ def main(words: Sequence[str] | None = None) -> int:
 
 def pages(store: Path) -> dict[Path, str]:
     """Return the text of each page for the measurements in a folder."""
-    parts = [(OVERVIEW, '', _overview(store))]
+    parts = [
+        (OVERVIEW, name, [f'{part}\n' for part in section(store)])
+        for name, section in OVERVIEW_SECTIONS.items()
+    ]
     for name, kind in KINDS.items():
         section = name if kind.page in SHARED else ''
         parts.append((STORE / f'{kind.page}.md', section, _deciding(store, name)))
@@ -117,23 +120,15 @@ def all_tables(store: Path, kind: str) -> Iterable[str]:
         yield from (f'{part}\n' for part in KINDS[kind].tables(document['results']))
 
 
-def _overview(store: Path) -> Iterable[str]:
-    """Yield the main tables of `docs/results.md`."""
+def _recordings(store: Path) -> Iterable[str]:
+    """Yield the recordings, and the version that has measured them."""
     recordings = [[f'`{name}`', *texts] for name, texts in DATA.items()]
     yield table(['recording', 'title', 'content'], recordings, '---')
-    yield f'\nMeasured by version {__version__}, where no other one is named.'
-    yield ''
-    for section in (_mean_ious, _gains, _completion, _coverage, _ranking, _times):
-        yield from (f'{part}\n' for part in section(store))
+    yield f'Measured by version {__version__}, where no other one is named.'
 
 
 def _mean_ious(store: Path) -> Iterable[str]:
     """Yield the mean 3D IoU of the main methods on each recording."""
-    yield '## Accuracy'
-    yield (
-        'Mean 3D IoU (number of true boxes). [Accuracy](results/real.md) has the other scores, '
-        '[Ablation](results/ablation.md) the loss without each ingredient.'
-    )
     rows = []
     for data, document in measurements(store, 'real'):
         for methods in document['results'].values():
@@ -144,11 +139,6 @@ def _mean_ious(store: Path) -> Iterable[str]:
 
 def _gains(store: Path) -> Iterable[str]:
     """Yield the gain of 3D IoU of each class on the simulated streets."""
-    yield '## Classes'
-    yield (
-        'Mean 3D IoU minus that of the input and of smoothing, with standard errors over tracks. '
-        '[Gain of each class](results/scenes.md) has the other recordings.'
-    )
     document = dict(measurements(store, 'kinds'))['']
     for drives, classes in document['results'].items():
         rows = []
@@ -165,12 +155,6 @@ def _gains(store: Path) -> Iterable[str]:
 
 def _completion(store: Path) -> Iterable[str]:
     """Yield the scores of broken tracks, of completed ones, and of tracks never broken."""
-    yield '## Completed tracks'
-    yield (
-        'Broken tracks as they are given -> with `--complete`; in brackets those of the same '
-        'tracks before they were broken, the best that completion can restore. '
-        '[Completed tracks](results/tracks.md) has ghosts, distant misses and the node.'
-    )
     rows = []
     for data, document in measurements(store, 'tracks'):
         if data in DATA:  # without other breaks
@@ -191,11 +175,6 @@ def _change(before: Any, after: Any, key: str, digits: int = 3) -> str:
 
 def _coverage(store: Path) -> Iterable[str]:
     """Yield the part of the errors within two standard deviations, for each recording."""
-    yield '## Covariances'
-    yield (
-        'Part of the errors of whole tracks within two standard deviations; 0.95 is consistent. '
-        '[Covariances](results/certainty.md) has squared errors and the other estimates.'
-    )
     rows = []
     for _, document in measurements(store, 'covariance'):
         for recording, estimates in document['results'].items():
@@ -208,12 +187,6 @@ def _coverage(store: Path) -> Iterable[str]:
 
 def _ranking(store: Path) -> Iterable[str]:
     """Yield the share of bad tracks in the first fifth of each list, for each recording."""
-    yield '## Review list'
-    yield (
-        'Share of the worst tracks that are in the first fifth of the list: by risk, and by the '
-        'orders it is compared with. [Review list](results/certainty.md#review-list) has shorter '
-        'parts of the lists, and the gain of one corrected box.'
-    )
     rows = []
     for _, document in measurements(store, 'review'):
         for recording, inputs in document['results'].items():
@@ -228,12 +201,6 @@ def _ranking(store: Path) -> Iterable[str]:
 
 def _times(store: Path) -> Iterable[str]:
     """Yield the main figures of speed, memory and latency beside their aims."""
-    yield '## Speed'
-    yield (
-        'On two cores of a CPU. [Speed](results/speed.md) has all figures, '
-        '[The live node under load](results/node.md#under-load) latencies, '
-        '[Scale](results/speed.md#scale) core-hours of a fleet.'
-    )
     ((_, speed),) = measurements(store, 'speed')
     ((_, load),) = measurements(store, 'load')
     found = speed['results']
@@ -522,6 +489,18 @@ def _kills(documents: Documents) -> Iterable[str]:
     rows = [[process, *found.values()] for process, found in killed.items()]
     figures = list(next(iter(killed.values())))
     yield table(['', *figures], rows)
+
+
+OVERVIEW_SECTIONS = {
+    'recordings': _recordings,
+    'accuracy': _mean_ious,
+    'classes': _gains,
+    'completion': _completion,
+    'coverage': _coverage,
+    'ranking': _ranking,
+    'times': _times,
+}
+"""The parts of `OVERVIEW`, by the names of their marks."""
 
 
 class Kind(NamedTuple):
