@@ -71,7 +71,7 @@ class StoredMessage(NamedTuple):
     sequence: int
 
 
-class Place(NamedTuple):
+class RecordPlace(NamedTuple):
     """A record in the file, without its content; `kind` is its operation code."""
 
     kind: int
@@ -144,14 +144,14 @@ class ChunkedFile(ABC):
         """Return the messages of a chunk from its bytes; any error means that it is damaged."""
 
     @abstractmethod
-    def _place_at(self, first_byte: int) -> Place | None:
+    def _place_at(self, first_byte: int) -> RecordPlace | None:
         """Return the record at a position; None where there can be none."""
 
     @abstractmethod
     def _next_chunk(self, position: int) -> int:
         """Return where the next whole chunk begins; the end of the file without."""
 
-    def _places(self, first_byte: int) -> Iterator[Place]:
+    def _places(self, first_byte: int) -> Iterator[RecordPlace]:
         """Yield the records from a position on; skip and note what is no record."""
         while first_byte < self.size:
             place = self._place_at(first_byte)

@@ -21,7 +21,7 @@ import zlib
 
 from boxreg_ros.errors import RecordingError, TransferError
 from boxreg_ros.io.storage import chunks
-from boxreg_ros.io.storage.chunks import Chunk, Place, StoredMessage
+from boxreg_ros.io.storage.chunks import Chunk, RecordPlace, StoredMessage
 from boxreg_ros.io.storage.record import Definition, one_line
 from lz4.frame import LZ4FrameDecompressor
 from mcap import records
@@ -93,7 +93,7 @@ class McapFile(chunks.ChunkedFile):
         self._schemas: dict[int, records.Schema] = {}
         self.is_indexed = True
         self._channels: dict[int, records.Channel] = {}
-        self._extras: list[Place] = []
+        self._extras: list[RecordPlace] = []
         super().__init__(path, origin)
 
     def schema_of(self, connection: Connection) -> records.Schema | None:
@@ -116,7 +116,7 @@ class McapFile(chunks.ChunkedFile):
         if not self._chunks:
             return ''
         chunk = self._chunks[0]
-        head = self._chunk_head_at(Place(Opcode.CHUNK, chunk.first_byte, chunk.end_byte))
+        head = self._chunk_head_at(RecordPlace(Opcode.CHUNK, chunk.first_byte, chunk.end_byte))
         return '' if head is None else head.compression
 
     def extras(self) -> Iterator[records.Attachment | records.Metadata]:
@@ -183,7 +183,7 @@ class McapFile(chunks.ChunkedFile):
             if chunk.counts or chunk.last_ns
         ]
         self._extras = [
-            Place(
+            RecordPlace(
                 Opcode.ATTACHMENT if isinstance(r, records.AttachmentIndex) else Opcode.METADATA,
                 r.offset,
                 r.offset + r.length,
@@ -215,7 +215,7 @@ class McapFile(chunks.ChunkedFile):
         self._channels.clear()
         self._schemas.clear()
         has_end = False
-        group: list[Place] = []
+        group: list[RecordPlace] = []
         for place in self._places(len(MCAP_MAGIC)):
             if place.kind == Opcode.MESSAGE:
                 group.append(place)
@@ -240,7 +240,7 @@ class McapFile(chunks.ChunkedFile):
         self._locate_damages()
         return self._count_messages()
 
-    def _place_at(self, first_byte: int) -> Place | None:
+    def _place_at(self, first_byte: int) -> RecordPlace | None:
         """Return the record at a position; None where there can be none."""
         head = self._bytes(first_byte, first_byte + HEAD_BYTES)
         if len(head) < HEAD_BYTES:
@@ -249,7 +249,11 @@ class McapFile(chunks.ChunkedFile):
         end_byte = first_byte + HEAD_BYTES + length
         # Codes from 128 are for the extensions of others.
         is_known = Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode >= 128
-        return Place(opcode, first_byte, end_byte) if is_known and end_byte <= self.size else None
+        return (
+            RecordPlace(opcode, first_byte, end_byte)
+            if is_known and end_byte <= self.size
+            else None
+        )
 
     def _next_chunk(self, position: int) -> int:
         """Return where the next whole chunk begins; the end of the file without."""
@@ -265,7 +269,7 @@ class McapFile(chunks.ChunkedFile):
             position += SEARCH_BYTES
         return self.size
 
-    def _chunk_head_at(self, place: Place) -> _ChunkHead | None:
+    def _chunk_head_at(self, place: RecordPlace) -> _ChunkHead | None:
         """Return the head of a chunk; None if it is no chunk."""
         record = self._bytes(place.first_byte, place.first_byte + CHUNK_BEGIN_BYTES + 16)
         size = place.end_byte - place.first_byte
@@ -276,7 +280,7 @@ class McapFile(chunks.ChunkedFile):
         is_whole = head.begin + head.stored == size and head.start_ns <= head.last_ns
         return head if is_whole else None
 
-    def _add_chunk(self, places: list[Place]) -> None:
+    def _add_chunk(self, places: list[RecordPlace]) -> None:
         """Add a chunk, or messages outside of chunks as one, and the definitions in it."""
         if not places:
             return
@@ -287,7 +291,7 @@ class McapFile(chunks.ChunkedFile):
 
     # Content ----------------------------------------------------------------------------------
 
-    def _parsed(self, kind: Any, place: Place) -> Any:
+    def _parsed(self, kind: Any, place: RecordPlace) -> Any:
         """Return the record of a class of `records` at a place; None, and noted, if damaged."""
         content = self._bytes(place.first_byte + HEAD_BYTES, place.end_byte)
         try:

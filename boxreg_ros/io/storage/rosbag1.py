@@ -10,7 +10,7 @@ import struct
 
 from boxreg_ros.errors import RecordingError, TransferError
 from boxreg_ros.io.storage import chunks
-from boxreg_ros.io.storage.chunks import Chunk, Place, StoredMessage
+from boxreg_ros.io.storage.chunks import Chunk, RecordPlace, StoredMessage
 from boxreg_ros.io.storage.record import one_line
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.interfaces import (
@@ -80,7 +80,7 @@ class Rosbag1File(chunks.ChunkedFile):
             for number, connection in sorted(self._found.items())
         ]
 
-    def _place_at(self, first_byte: int) -> Place | None:
+    def _place_at(self, first_byte: int) -> RecordPlace | None:
         """Return the record at a position; None where there can be none."""
         try:
             (length,) = struct.unpack('<I', self._bytes(first_byte, first_byte + 4))
@@ -95,7 +95,7 @@ class Rosbag1File(chunks.ChunkedFile):
         except Exception:  # of the library, for any malformed content
             return None
         end_byte = data_byte + 4 + size
-        return Place(kind, first_byte, end_byte) if end_byte <= self.size else None
+        return RecordPlace(kind, first_byte, end_byte) if end_byte <= self.size else None
 
     def _next_chunk(self, position: int) -> int:
         """Return where the next whole chunk begins; the end of the file without."""
