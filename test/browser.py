@@ -2,6 +2,7 @@
 
 from contextlib import contextmanager, ExitStack
 import shutil
+from threading import Thread
 
 import pytest
 
@@ -41,6 +42,16 @@ def end_shared_browser():
     """End it, where it was started."""
     _running.clear()
     _shared.close()
+
+
+@contextmanager
+def serving(server):
+    """Run a server in a thread; yield it, and end it afterwards."""
+    Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
 
 
 @contextmanager

@@ -23,6 +23,7 @@ OBJECTS_WITH_COVARIANCE = 'derived_object_msgs/msg/ObjectWithCovarianceArray'
 SCENE = 'foxglove_msgs/msg/SceneUpdate'
 JSK = 'jsk_recognition_msgs/msg/BoundingBoxArray'
 BOXES = 'vision_msgs/msg/BoundingBox3DArray'
+ZEROS = {'string': '', 'bool': False, 'float32': 0.0, 'float64': 0.0}
 NUMBERS = {'i1': 1, 'u1': 2, 'i2': 3, 'u2': 4, 'i4': 5, 'u4': 6, 'f4': 7, 'f8': 8}
 
 
@@ -65,7 +66,7 @@ class Messages:
                 return given
             return self.build(args, **(given or {}))
         if kind == Nodetype.BASE:
-            zero = {'string': '', 'bool': False}.get(args[0], 0)
+            zero = ZEROS.get(args[0], 0)
             return zero if given is None else given
         element, count = args
         if given is None:
@@ -98,22 +99,18 @@ class Messages:
         )
 
     def header(self, stamp_ns, frame_id):
-        stamp = self.make(
-            'builtin_interfaces/msg/Time', sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9
-        )
-        extra = {'seq': 0} if self.ros1 else {}
-        return self.make('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id, **extra)
+        sec, nanosec = divmod(stamp_ns, 10**9)
+        stamp = {'sec': sec, 'nanosec': nanosec}
+        return self.build('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id)
 
     def vector(self, x, y, z):
         return self.make('geometry_msgs/msg/Vector3', x=float(x), y=float(y), z=float(z))
 
     def pose(self, position=(0, 0, 0), quaternion_xyzw=(0, 0, 0, 1)):
-        x, y, z, w = map(float, quaternion_xyzw)
-        px, py, pz = map(float, position)
-        return self.make(
+        return self.build(
             'geometry_msgs/msg/Pose',
-            position=self.make('geometry_msgs/msg/Point', x=px, y=py, z=pz),
-            orientation=self.make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w),
+            position=dict(zip('xyz', map(float, position), strict=True)),
+            orientation=dict(zip('xyzw', map(float, quaternion_xyzw), strict=True)),
         )
 
     def cloud(self, stamp_ns, frame_id, columns, order='<', height=1, padding=0, row_padding=0):
@@ -154,93 +151,44 @@ class Messages:
 
     def detections(self, stamp_ns, frame_id, boxes):
         """Return a Detection3DArray; `boxes` are (id, class, score, position, quat, size)."""
-        covariance = np.zeros(36)
         items = []
         for track, class_name, score, position, quaternion_xyzw, size in boxes:
             pose = self.pose(position, quaternion_xyzw)
             results = [
-                self.make(
-                    'vision_msgs/msg/ObjectHypothesisWithPose',
-                    hypothesis=self.make(
-                        'vision_msgs/msg/ObjectHypothesis', class_id=name, score=value
-                    ),
-                    pose=self.make(
-                        'geometry_msgs/msg/PoseWithCovariance', pose=pose, covariance=covariance
-                    ),
-                )
+                {'hypothesis': {'class_id': name, 'score': value}, 'pose': {'pose': pose}}
                 for name, value in (('unlikely', 0.01), (class_name, score))
             ]
-            items.append(
-                self.make(
-                    'vision_msgs/msg/Detection3D',
-                    header=self.header(stamp_ns, frame_id),
-                    results=results,
-                    bbox=self.make(
-                        'vision_msgs/msg/BoundingBox3D', center=pose, size=self.vector(*size)
-                    ),
-                    id=track,
-                )
-            )
-        return self.make(DETECTIONS, header=self.header(stamp_ns, frame_id), detections=items)
+            header = self.header(stamp_ns, frame_id)
+            bbox = {'center': pose, 'size': self.vector(*size)}
+            items.append({'header': header, 'results': results, 'bbox': bbox, 'id': track})
+        return self.build(DETECTIONS, header=self.header(stamp_ns, frame_id), detections=items)
 
     def marker(self, stamp_ns, frame_id, track, class_name, pose, size, kind=1, action=0):
-        empty = np.zeros(0, np.uint8)
-        extra = {}
-        if not self.ros1:
-            extra = {
-                'texture_resource': '',
-                'texture': self.make(
-                    'sensor_msgs/msg/CompressedImage',
-                    header=self.header(0, ''), format='', data=empty,
-                ),
-                'uv_coordinates': [],
-                'mesh_file': self.make(
-                    'visualization_msgs/msg/MeshFile', filename='', data=empty
-                ),
-            }  # fmt: skip
-        return self.make(
+        return self.build(
             'visualization_msgs/msg/Marker',
             header=self.header(stamp_ns, frame_id), ns=class_name, id=track, type=kind,
             action=action, pose=self.pose(*pose), scale=self.vector(*size),
-            color=self.make('std_msgs/msg/ColorRGBA', r=0.0, g=1.0, b=0.0, a=0.5),
-            lifetime=self.make('builtin_interfaces/msg/Duration', sec=0, nanosec=0),
-            frame_locked=False, points=[], colors=[], text='', mesh_resource='',
-            mesh_use_embedded_materials=False, **extra,
+            color={'g': 1.0, 'a': 0.5},
         )  # fmt: skip
 
     def markers(self, markers):
         return self.make(MARKERS, markers=markers)
 
     def transform(self, stamp_ns, parent, child, position=(0, 0, 0), quaternion_xyzw=(0, 0, 0, 1)):
-        pose = self.pose(position, quaternion_xyzw)
-        return self.make(
+        rotation = self.pose(position, quaternion_xyzw).orientation
+        return self.build(
             'geometry_msgs/msg/TransformStamped',
-            header=self.header(stamp_ns, parent),
-            child_frame_id=child,
-            transform=self.make(
-                'geometry_msgs/msg/Transform',
-                translation=self.vector(*position), rotation=pose.orientation,
-            ),
+            header=self.header(stamp_ns, parent), child_frame_id=child,
+            transform={'translation': self.vector(*position), 'rotation': rotation},
         )  # fmt: skip
 
     def tf(self, *transforms):
         return self.make(TF, transforms=list(transforms))
 
     def odometry(self, stamp_ns, parent, child, position=(0, 0, 0), quaternion_xyzw=(0, 0, 0, 1)):
-        zero = self.vector(0, 0, 0)
-        return self.make(
-            ODOMETRY,
-            header=self.header(stamp_ns, parent),
-            child_frame_id=child,
-            pose=self.make(
-                'geometry_msgs/msg/PoseWithCovariance',
-                pose=self.pose(position, quaternion_xyzw), covariance=np.zeros(36),
-            ),
-            twist=self.make(
-                'geometry_msgs/msg/TwistWithCovariance',
-                twist=self.make('geometry_msgs/msg/Twist', linear=zero, angular=zero),
-                covariance=np.zeros(36),
-            ),
+        return self.build(
+            ODOMETRY, header=self.header(stamp_ns, parent), child_frame_id=child,
+            pose={'pose': self.pose(position, quaternion_xyzw)},
         )  # fmt: skip
 
 

@@ -23,7 +23,9 @@ from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.problem import CLASS_SETTINGS, Problem, SETTINGS_OF
 from boxreg_ros.core.refine import Track
 from boxreg_ros.core.window import Window
+from boxreg_ros.simulation.scene import FIXED_FRAME
 from boxreg_ros.simulation.simulate import simulate
+from boxreg_ros.simulation.writer import write_recording
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -115,6 +117,7 @@ def cut(track, part):
     return replace(
         track, stamps_ns=track.stamps_ns[part], boxes=track.boxes[part], points=track.points[part],
         sensor_origins=track.sensor_origins[part],
+        scores=None if track.scores is None else track.scores[part],
     )  # fmt: skip
 
 
@@ -157,6 +160,15 @@ def window_of(track, config):
     ]
     name, n = track.track_id, len(observations)
     return Window(name, track.class_name, observations, n, np.zeros((0, 9)))
+
+
+def write_scene(path, scene, **changes):
+    """Write a simulated scene, with some parts changed, as a recording; return its path."""
+    scene = replace(scene, **changes)
+    intensities = [np.zeros(len(sweep.points)) for sweep in scene.sweeps]
+    poses = scene.T_fixed_sensor
+    write_recording(path, scene.sweeps, intensities, scene.detections, poses, FIXED_FRAME)
+    return path
 
 
 PARTS = {

@@ -46,6 +46,14 @@ def start(*arguments, **options):
     return subprocess.Popen(command, cwd=ROOT, text=True, **options)
 
 
+def ended(*command, **environment):
+    """Run a command in another process, and return the process with its output."""
+    return subprocess.run(
+        [*map(str, command)], cwd=ROOT, capture_output=True, text=True, timeout=60,
+        env=os.environ | environment,
+    )  # fmt: skip
+
+
 def test_relabel_prints_one_closing_line(tmp_path, capsys):
     recording = Drive(sweeps=5).write(tmp_path / 'drive')
     out = tmp_path / 'out'
@@ -332,9 +340,7 @@ def test_parsing_imports_no_large_library(command):
         "large = {'numba', 'rosbags', 'scipy', 'torch'}\n"
         'print(*sorted(large & set(sys.modules)), file=sys.stderr)\n'
     )
-    done = subprocess.run(
-        [sys.executable, '-c', code, *command], cwd=ROOT, capture_output=True, text=True
-    )
+    done = ended(sys.executable, '-c', code, *command)
     assert 'usage: boxreg' in done.stdout or 'did you mean relabel?' in done.stderr
     assert done.stderr.splitlines()[-1] == ''
 
@@ -450,11 +456,7 @@ def test_a_signal_where_an_exception_would_be_lost_is_raised_afterwards(tmp_path
     recording = Drive(sweeps=40).write(tmp_path / 'drive')
     workers = 2 if where == 'fork' else 1
     relabel = 'relabel', recording, '-o', tmp_path / 'r' / 'out', '--resume', '--workers', workers
-    command = [sys.executable, '-c', SIGNAL_THAT_IS_LOST, *map(str, relabel), *QUICK]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=60,
-        env=os.environ | {'WHERE': where},
-    )  # fmt: skip
+    done = ended(sys.executable, '-c', SIGNAL_THAT_IS_LOST, *relabel, *QUICK, WHERE=where)
     words = 'nothing was written, the same command goes on'
     assert done.stderr == f'boxreg: interrupted; {words}\n'
     assert done.returncode == 130
@@ -478,11 +480,7 @@ def test_a_signal_during_the_import_of_torch_ends_the_process_at_once(tmp_path, 
     recording = Drive(sweeps=4).write(tmp_path / 'drive')
     # With one worker the process that reads the command line imports torch.
     relabel = 'relabel', recording, '-o', tmp_path / 'out', '--workers', 1
-    command = [sys.executable, '-c', SIGNAL_IN_TORCH, *map(str, relabel)]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=60,
-        env=os.environ | {'NUMBER': str(int(number))},
-    )  # fmt: skip
+    done = ended(sys.executable, '-c', SIGNAL_IN_TORCH, *relabel, NUMBER=str(int(number)))
     cause = 'interrupted' if number == signal.SIGINT else 'ended by SIGTERM'
     assert done.stderr == f'boxreg: {cause}; nothing was written{GO_ON}\n'
     assert done.returncode == 128 + number
@@ -517,20 +515,8 @@ def test_a_run_that_is_interrupted_in_a_step_leaves_no_files(tmp_path, preloaded
         'c.command()\n'
     )
     out = tmp_path / 'r' / 'out'
-    command = [
-        preloaded_python,
-        '-c',
-        program,
-        'relabel',
-        recording,
-        '-o',
-        out,
-        '--report',
-        *QUICK,
-    ]
-    done = subprocess.run(
-        [*map(str, command)], cwd=ROOT, capture_output=True, text=True, timeout=60
-    )
+    command = ['relabel', recording, '-o', out, '--report', *QUICK]
+    done = ended(preloaded_python, '-c', program, *command)
     assert done.stderr == f'boxreg: interrupted; nothing was written{GO_ON}\n'
     assert done.returncode == 130
     assert list((tmp_path / 'r').glob('*')) == []
@@ -579,11 +565,8 @@ def test_a_run_that_ends_while_results_wait_to_be_written(
     if earlier:
         assert cli.main(['relabel', str(recording), '-o', str(out), *QUICK]) == 0
     before = {path.name: path.read_bytes() for path in out.glob('*.*')}
-    done = subprocess.run(
-        [preloaded_python, '-c', WRITER_THAT_FAILS, 'relabel', recording, '-o', out, *QUICK],
-        cwd=ROOT, capture_output=True, text=True, timeout=60,
-        env=os.environ | {'WHEN': when, 'ENDING': ending},
-    )  # fmt: skip
+    command = ['relabel', recording, '-o', out, *QUICK]
+    done = ended(preloaded_python, '-c', WRITER_THAT_FAILS, *command, WHEN=when, ENDING=ending)
     assert (done.returncode, done.stdout) == (status, '')
     assert done.stderr.startswith(f'boxreg: {line}') and done.stderr.count('\n') == 1
     assert [path.name for path in (tmp_path / 'r').iterdir()] == ['out'] * earlier

@@ -1,4 +1,4 @@
-"""Angles, matrices and quaternions against known answers, SciPy and each other."""
+"""Angles, matrices and quaternions against SciPy and each other."""
 
 from boxreg_ros.rotations import (
     GIMBAL_LOCK,
@@ -15,19 +15,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 import torch
-
-HALF = np.sqrt(0.5)
-# Roll, pitch, yaw; the rows of R; the quaternion x y z w.
-KNOWN = [
-    ((0, 0, 0), [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [0, 0, 0, 1]),
-    ((np.pi / 2, 0, 0), [[1, 0, 0], [0, 0, -1], [0, 1, 0]], [HALF, 0, 0, HALF]),
-    ((0, np.pi / 6, 0), [[0.75**0.5, 0, 0.5], [0, 1, 0], [-0.5, 0, 0.75**0.5]],
-     [0, np.sin(np.pi / 12), 0, np.cos(np.pi / 12)]),
-    ((0, 0, np.pi / 2), [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0, 0, HALF, HALF]),
-    # Heading +y, then the left side up: x of the box is y, y of the box is z.
-    ((np.pi / 2, 0, np.pi / 2), [[0, 0, 1], [1, 0, 0], [0, 1, 0]], [0.5, 0.5, 0.5, 0.5]),
-]  # fmt: skip
-known = pytest.mark.parametrize('rpy, R, quaternion_xyzw', KNOWN)
 
 
 def random_rpy(*shape):
@@ -57,15 +44,6 @@ def test_wrap_angle_of_known_angles(angle, wrapped, kind):
     assert float(wrap_angle(kind(angle, **kwargs))) == pytest.approx(wrapped, abs=1e-14)
 
 
-@pytest.mark.parametrize('kind', [np.asarray, torch.from_numpy, np.ndarray.tolist])
-def test_wrap_angle_subtracts_whole_turns(kind):
-    angle = np.linspace(-50, 50, 1001)
-    wrapped = np.asarray(wrap_angle(kind(angle)))
-    turns = (angle - wrapped) / (2 * np.pi)
-    assert np.abs(wrapped).max() <= np.pi
-    np.testing.assert_allclose(turns, turns.round(), atol=1e-13)
-
-
 def test_wrap_angle_equals_the_angle_of_its_sine_and_cosine():
     angle = np.random.default_rng(2).uniform(-20, 20, (50, 3))
     np.testing.assert_allclose(
@@ -92,30 +70,13 @@ def test_wrap_angle_of_integers_nan_and_nothing():
 # --- known answers ------------------------------------------------------------------------------
 
 
-@known
-def test_known_rotations(rpy, R, quaternion_xyzw):
-    np.testing.assert_allclose(matrix_from_rpy(rpy), R, atol=1e-15)
-    np.testing.assert_allclose(rpy_from_matrix(R), rpy, atol=1e-15)
-    np.testing.assert_allclose(quaternion_from_rpy(rpy), quaternion_xyzw, atol=1e-15)
-    np.testing.assert_allclose(quaternion_from_matrix(R), quaternion_xyzw, atol=1e-15)
-    np.testing.assert_allclose(matrix_from_quaternion(quaternion_xyzw), R, atol=1e-15)
-    np.testing.assert_allclose(rpy_from_quaternion(quaternion_xyzw), rpy, atol=1e-15)
-
-
 def test_matrix_equals_scipy():
     rpy = random_rpy(100)
     scipy = Rotation.from_euler('ZYX', rpy[:, ::-1]).as_matrix()
     np.testing.assert_allclose(matrix_from_rpy(rpy), scipy, atol=1e-14)
 
 
-def test_norm_and_sign_of_a_quaternion_are_ignored():
-    quaternion_xyzw = np.random.default_rng(3).normal(size=(20, 4))
-    R = matrix_from_quaternion(quaternion_xyzw)
-    np.testing.assert_allclose(matrix_from_quaternion(-7.0 * quaternion_xyzw), R, atol=1e-14)
-    np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.tile(np.eye(3), (20, 1, 1)), atol=1e-14)
-
-
-@pytest.mark.parametrize('norm', [1e-200, 1e-3, 1.0, 1e200])
+@pytest.mark.parametrize('norm', [1e-200, 1e-3, -7.0, 1e200])
 def test_matrix_of_a_quaternion_of_any_norm_equals_scipy(norm):
     quaternion_xyzw = np.random.default_rng(4).normal(size=(50, 4))
     scipy = Rotation.from_quat(quaternion_xyzw).as_matrix()
@@ -227,28 +188,12 @@ def test_nan_gives_nan_in_its_row_only(function, given, returned):
 # --- interpolation ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    'share, yaw', [(0.0, 0.2), (0.25, 0.4), (1.0, 1.0), (1.5, 1.4), (-1, -0.6)]
-)
-@pytest.mark.parametrize('sign', [1, -1])
-def test_interpolation_about_one_axis_is_linear(share, yaw, sign):
-    first = quaternion_from_rpy([0.0, 0.0, 0.2])
-    second = sign * quaternion_from_rpy([0.0, 0.0, 1.0])  # both signs are the same rotation
-    found = interpolate_rotation(first, second, share)
-    np.testing.assert_allclose(found, matrix_from_rpy([0.0, 0.0, yaw]), atol=1e-14)
-
-
-def test_interpolation_takes_the_shortest_path():
-    first, second = quaternion_from_rpy([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0]])
-    found = rpy_from_matrix(interpolate_rotation(first, second, 0.5))
-    assert abs(found[2]) == pytest.approx(np.pi, abs=1e-12)
-
-
 @pytest.mark.parametrize('distance', [0.0, 1e-12, 1e-4, 1.0])
 def test_interpolation_equals_scipy(distance):
     first, step = np.random.default_rng(5).normal(size=(2, 4))
     second = first + distance * step
     slerp = Slerp([0, 1], Rotation.from_quat([first, second]))
     for share in (0.0, 0.3, 1.0):
-        found = interpolate_rotation(first, second, share)
-        np.testing.assert_allclose(found, slerp(share).as_matrix(), atol=1e-14)
+        for end in (second, -second):
+            found = interpolate_rotation(first, end, share)
+            np.testing.assert_allclose(found, slerp(share).as_matrix(), atol=1e-14)

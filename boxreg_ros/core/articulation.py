@@ -15,21 +15,11 @@ from numpy.typing import NDArray
 
 def extent_ranges(problem: Problem, past: Floats, span: int) -> Floats:
     """
-    Return the range of the input extents of each track up to the end of its window.
+    Return the range of the input extents of each track up to the end of its window, (B, 2, 3).
 
-    Parameters
-    ----------
-    problem : Problem
-        B windows.
-    past : array, shape (B, 2, 3)
-        Ranges up to the windows before.
-    span : int
-        Successive boxes whose medians make the range: gross errors are not part of it.
-
-    Returns
-    -------
-    ranges : array, shape (B, 2, 3)
-        Least and largest logarithm of length, width and height; `NO_RANGE` before `span` boxes.
+    Least and largest logarithm of length, width and height, with the ranges `past` of the windows
+    before; `NO_RANGE` before `span` boxes. They are of medians of `span` successive boxes: gross
+    errors are not part of it.
 
     """
     if problem.length < span:
@@ -47,12 +37,8 @@ def changes_shape(ranges: Floats, deviation: Floats) -> NDArray[np.bool_]:
     """
     Return which bodies change their width by more than their boxes err (M27a), (B,).
 
-    Parameters
-    ----------
-    ranges : array, shape (B, 2, 3)
-        See `extent_ranges`.
-    deviation : array, shape (B,)
-        Of the input extents, as part of each.
+    `ranges` (B, 2, 3) are those of `extent_ranges`, `deviation` (B,) that of the input extents, as
+    part of each.
 
     """
     length, width, height = (ranges[:, 1] - ranges[:, 0]).T

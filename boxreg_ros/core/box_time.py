@@ -74,14 +74,8 @@ class BoxTimeEvidence:
         Compare boxes with their points, moved to the time of sight and to the stamp.
 
         The points are on the surface of the object: near the faces of a box of their own time.
-        Each is moved by its own delay, since two LiDARs may see an object at different times.
-
-        Parameters
-        ----------
-        seen : sequence of n Observation
-            Of the boxes, in one table.
-        velocities : array, shape (n, 3)
-            Of the objects [m/s].
+        Each is moved by its own delay, since two LiDARs may see an object at different times. The
+        n observations `seen` are of one table; `velocities` (n, 3) are those of the objects [m/s].
 
         """
         if not seen:

@@ -37,20 +37,12 @@ class FieldOfView:
         Return which of n objects reach up to the highest ring of the LiDAR, (n,).
 
         That is, no ray of this sweep or those before it is higher, and rays to other objects end
-        at the same ring: a single high object is no evidence of an edge.
+        at the same ring: a single high object is no evidence of an edge. With several LiDARs at
+        once no top is hidden.
 
-        Parameters
-        ----------
-        sweep : Sweep
-            Of one LiDAR: with several at once no top is hidden.
-        origin, centers : array, shapes (3,) and (n, 3)
-            The sensor and the centres of the boxes in the frame of the points [m].
-        extents : array, shape (n, 3)
-            Of the boxes [m].
-        row, owner : array, shape (P,)
-            Point and object of each pair that belongs together.
-        ring_heights : array, shape (n,)
-            Height between two rings at each object [m].
+        The sensor `origin` (3,) and the `centers` (n, 3) of boxes of `extents` (n, 3) are in the
+        frame of the points [m]; `row` and `owner` (P,) are point and object of each pair that
+        belongs together, `ring_heights` (n,) those between two rings at each object [m].
 
         """
         is_hidden = np.zeros(len(centers), bool)

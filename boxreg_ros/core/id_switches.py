@@ -46,15 +46,7 @@ def by_id(track_ids: Sequence[str], stamps_ns: Ints, centers: Floats) -> dict[st
 
 
 def id_switches(tracks: Mapping[str, Centers]) -> list[Switch]:
-    """
-    Return where two tracks continue each other better than themselves, oldest first.
-
-    Parameters
-    ----------
-    tracks : mapping of str to Centers
-        Of each id, ascending by stamp, as of `by_id`.
-
-    """
+    """Return where two tracks, by id, continue each other better than themselves, oldest first."""
     known = {name: track for name, track in tracks.items() if len(track[0]) >= 2 * NUM_BOXES}
     names = sorted(known)
     stamps = np.array([known[name][0][[0, -1]] for name in names]).reshape(-1, 2)

@@ -73,31 +73,21 @@ TRACK_SECONDS = 3.0
 
 
 class Latency(NamedTuple):
-    """
-    Latency of the boxes of a recording.
-
-    Attributes
-    ----------
-    seconds : float
-        By which the boxes are corrected; 0 where the evidence is too weak, or it is below
-        `NOTABLE`.
-    finding : str
-        Why it could not be estimated; empty where it could.
-    estimated, deviation : float or None
-        What the points say, and its standard deviation [s]; None without evidence.
-    tracks : int
-        Moving objects that provide evidence.
-    drifts : bool
-        Whether it is not one time for the whole recording.
-
-    """
+    """Latency of the boxes of a recording."""
 
     seconds: float = 0.0
+    """By which the boxes are corrected; 0 where the evidence is too weak, or it is below
+    `NOTABLE`."""
     finding: str = ''
+    """Why it could not be estimated; empty where it could."""
     estimated: float | None = None
+    """What the points say [s]; None without evidence."""
     deviation: float | None = None
+    """Standard deviation of that [s]."""
     tracks: int = 0
+    """Moving objects that provide evidence."""
     drifts: bool = False
+    """Whether it is not one time for the whole recording."""
 
     @property
     def warning(self) -> str:

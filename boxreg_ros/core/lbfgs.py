@@ -42,22 +42,16 @@ class Status(IntEnum):
 
 
 class Minimum(NamedTuple):
-    """
-    The best point of each row.
-
-    Attributes
-    ----------
-    x, value : Tensor, shapes (B, D) and (B,)
-        Best point and its value; those of the start if nothing better was found.
-    status, iterations : Tensor, shape (B,)
-        `Status` (RUNNING: the iterations ran out), and iterations taken.
-
-    """
+    """The best point of each row."""
 
     x: Tensor
+    """(B, D), best point; that of the start if nothing better was found."""
     value: Tensor
+    """(B,), its value."""
     status: Tensor
+    """(B,), `Status`; RUNNING: the iterations ran out."""
     iterations: Tensor
+    """(B,), taken."""
 
 
 class _Search(NamedTuple):

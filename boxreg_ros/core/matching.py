@@ -31,13 +31,7 @@ class StampMatcher:
     as soon as a younger sweep than the boxes is known: no later one can be nearer, whichever kind
     arrives first. A sweep may be paired with several box arrays. A box array whose sweep was
     dropped is returned without one. At most `queue` sweeps and `queue` box arrays are held.
-
-    Parameters
-    ----------
-    config : Config
-        Its `reach` and `queue` are used.
-    counts : Counter
-        Counts dropped sweeps by reason.
+    Dropped sweeps are counted in `counts` by reason.
 
     """
 

@@ -17,46 +17,20 @@ PARALLEL_SINE = 1e-12
 
 
 class PoseErrors(NamedTuple):
-    """
-    Predicted minus true, one row per pair.
-
-    Attributes
-    ----------
-    translation, extent : array, shape (n, 3)
-        Errors of the centre along the axes of the true box, and of length, width, height [m].
-    rotation : array, shape (n, 3)
-        Errors of roll, pitch and yaw, each wrapped into [-pi, pi) [rad].
-    is_flipped : array, shape (n,)
-        True for the wrong heading sign: |yaw error| > pi / 2.
-
-    """
+    """Predicted minus true, one row per pair."""
 
     translation: Floats
+    """(n, 3), of the centre along the axes of the true box [m]."""
     extent: Floats
+    """(n, 3), of length, width, height [m]."""
     rotation: Floats
+    """(n, 3), of roll, pitch and yaw, each wrapped into [-pi, pi) [rad]."""
     is_flipped: NDArray[np.bool_]
+    """(n,), True for the wrong heading sign: abs(yaw error) > pi / 2."""
 
 
 def pose_errors(boxes: ArrayLike, truth: ArrayLike) -> PoseErrors:
-    """
-    Return the errors of boxes against true ones.
-
-    Parameters
-    ----------
-    boxes, truth : array, shape (n, 9)
-        In one frame [m, rad].
-
-    Returns
-    -------
-    errors : PoseErrors
-        Row by row.
-
-    Raises
-    ------
-    ShapeError
-        For arrays of other shapes.
-
-    """
+    """Return the errors of boxes (n, 9) against true ones, in one frame [m, rad], row by row."""
     a, b = _rows(boxes, truth)
     difference = a - b
     rotation = wrap_angle(difference[:, ROLL:])
@@ -68,24 +42,9 @@ def pose_errors(boxes: ArrayLike, truth: ArrayLike) -> PoseErrors:
 
 def iou_bev(boxes: ArrayLike, truth: ArrayLike) -> Floats:
     """
-    Return the intersection over union of footprints.
+    Return the intersection over union of footprints, (n,), as `iou_3d`.
 
     A footprint is the rectangle length x width turned by yaw; roll and pitch are ignored.
-
-    Parameters
-    ----------
-    boxes, truth : array, shape (n, 9)
-        In one frame [m, rad].
-
-    Returns
-    -------
-    iou : array, shape (n,)
-        From 0 to 1; 0 for boxes that are not finite or have no area.
-
-    Raises
-    ------
-    ShapeError
-        For arrays of other shapes.
 
     """
     # Footprints become upright boxes from z = -1/2 to 1/2.
@@ -97,22 +56,10 @@ def iou_bev(boxes: ArrayLike, truth: ArrayLike) -> Floats:
 
 def iou_3d(boxes: ArrayLike, truth: ArrayLike) -> Floats:
     """
-    Return the intersection over union of volumes, for boxes with any rotation.
+    Return the intersection over union of volumes, for boxes with any rotation, (n,), from 0 to 1.
 
-    Parameters
-    ----------
-    boxes, truth : array, shape (n, 9)
-        In one frame [m, rad].
-
-    Returns
-    -------
-    iou : array, shape (n,)
-        From 0 to 1; 0 for boxes that are not finite or have no volume.
-
-    Raises
-    ------
-    ShapeError
-        For arrays of other shapes.
+    Of boxes (n, 9) in one frame [m, rad], row by row; ShapeError for arrays of other shapes. 0 for
+    boxes that are not finite or have no volume.
 
     """
     a, b = _rows(boxes, truth)

@@ -27,32 +27,20 @@ TURN_RATE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class EndMotion:
-    """
-    Motion at the first or last box of a track.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Stamp of that box [ns].
-    box : array, shape (9,)
-        That box.
-    velocity : array, shape (3,)
-        Of the centre [m/s].
-    turn_rate : float
-        Of the heading [rad/s].
-    speed_variance : float
-        Variance of each component of the velocity [m^2/s^2].
-    model : ClassConfig
-        Accelerations of its kind of object.
-
-    """
+    """Motion at the first or last box of a track."""
 
     stamp_ns: int
+    """Of that box [ns]."""
     box: Floats
+    """That box, (9,)."""
     velocity: Floats
+    """(3,), of the centre [m/s]."""
     turn_rate: float
+    """Of the heading [rad/s]."""
     speed_variance: float
+    """Of each component of the velocity [m^2/s^2]."""
     model: ClassConfig
+    """Accelerations of its kind of object."""
 
     def predict(self, stamp_ns: int) -> Floats:
         """Return the box (9,) at a stamp, on a circle at constant speed."""
@@ -90,21 +78,7 @@ class EndMotion:
 
 
 def motion_at(stamps_ns: Ints, boxes: Floats, row: int, model: ClassConfig) -> EndMotion:
-    """
-    Return the motion at the first or last of some boxes.
-
-    Parameters
-    ----------
-    stamps_ns : array, shape (n,)
-        Stamps [ns].
-    boxes : array, shape (n, 9)
-        Boxes of one object.
-    row : int
-        0 for the first, -1 for the last.
-    model : ClassConfig
-        Accelerations of its kind of object.
-
-    """
+    """Return the motion at the first (row 0) or last (-1) of the boxes (n, 9) of one object."""
     seconds = (stamps_ns - stamps_ns[row]) * 1e-9
     is_near = np.abs(seconds) <= MOTION_SECONDS
     seconds = seconds[is_near]

@@ -45,70 +45,46 @@ of an input or predicted box. Of simulated boxes of known time that move by 0.2 
 
 
 class Crop(NamedTuple):
-    """
-    Pairs of a point and a box that are near each other, ascending by box.
-
-    Attributes
-    ----------
-    row, owner : array, shape (P,)
-        Row of the point in its sweep, and of the box.
-    offset : array, shape (3, P)
-        Point minus the centre of the box, axes of the fixed frame [m].
-    outside : array, shape (3, P)
-        Distance outside of the faces, along the axes of the box; negative inside [m].
-
-    """
+    """Pairs of a point and a box that are near each other, ascending by box."""
 
     row: Ints
+    """(P,), of the point in its sweep."""
     owner: Ints
+    """(P,), row of the box."""
     offset: Floats
+    """(3, P), point minus the centre of the box, axes of the fixed frame [m]."""
     outside: Floats
+    """(3, P), distance outside of the faces, along the axes of the box; negative inside [m]."""
 
 
 class Observations(NamedTuple):
-    """
-    Observations of n boxes, one row each: their points, relative to the centre of the box.
-
-    Attributes
-    ----------
-    stamps_ns : array, shape (n,)
-        Stamps of the boxes [ns].
-    boxes : array, shape (n, 9)
-        Input boxes in the fixed frame.
-    points : array, shape (P, 3)
-        Points near each box and above the road, minus its centre; axes of the fixed frame [m]. The
-        points of one box follow those of the box before.
-    delays : array, shape (P,)
-        Time of each point relative to the stamp [s]; 0 without `sampling.deskew`.
-    counts : array, shape (n,)
-        Points of each box.
-    origins : array, shape (n, K, 3)
-        Each sensor that sees the object minus centre [m]; NaN where unknown. The last repeats.
-    ground : array, shape (n,)
-        Height of the road beside the box minus z of the centre [m]; NaN where not found.
-    ring_heights : array, shape (n,)
-        Height between two rings of the LiDAR at the object [m]; 0 where unknown, `UNKNOWN_TOP`
-        where no ring passes above.
-    num_points : array, shape (n,)
-        Sweep points inside the input box.
-    sights : array, shape (n,)
-        Median of the delays [s]: when the sweep saw the object.
-    is_pinned : array, shape (n,)
-        Whether a person has corrected the box.
-
-    """
+    """Observations of n boxes, one row each: their points, relative to the centre of the box."""
 
     stamps_ns: Ints
+    """(n,), of the boxes [ns]."""
     boxes: Floats
+    """(n, 9), input boxes in the fixed frame."""
     points: NDArray[np.float32]
+    """(P, 3), points near each box and above the road, minus its centre; axes of the fixed
+    frame [m]. The points of one box follow those of the box before."""
     delays: NDArray[np.float32]
+    """(P,), time of each point relative to the stamp [s]; 0 without `sampling.deskew`."""
     counts: Ints
+    """(n,), points of each box."""
     origins: Floats
+    """(n, K, 3), each sensor that sees the object minus centre [m]; NaN where unknown. The last
+    repeats."""
     ground: Floats
+    """(n,), height of the road beside the box minus z of the centre [m]; NaN where not found."""
     ring_heights: Floats
+    """(n,), height between two rings of the LiDAR at the object [m]; 0 where unknown,
+    `UNKNOWN_TOP` where no ring passes above."""
     num_points: Ints
+    """(n,), sweep points inside the input box."""
     sights: Floats
+    """(n,), median of the delays [s]: when the sweep saw the object."""
     is_pinned: NDArray[np.bool_]
+    """(n,), whether a person has corrected the box."""
 
     @property
     def first(self) -> Ints:
@@ -219,7 +195,7 @@ def observe(
     view: FieldOfView | None = None,
 ) -> Observations:
     """
-    Return the observations of boxes in a sweep.
+    Return the observations of valid `boxes` (n, 9) in a sweep, one row each; none is pinned.
 
     A point near several boxes belongs to the box it is deepest inside of, or least outside. It
     also belongs to boxes it is nearly as deep inside of: two boxes of one object do not take
@@ -227,23 +203,9 @@ def observe(
     Points less than `GROUND_CLEARANCE` above the road beside the box are left out; the height of
     the road is kept.
 
-    Parameters
-    ----------
-    sweep : Sweep
-        In the fixed frame; its points may be in their own, see `Sweep.T_frame_points`.
-    boxes : array, shape (n, 9)
-        Valid boxes in the fixed frame, at the stamp of the sweep.
-    stamp_ns : int
-        Stamp of the observations [ns].
-    config : Config
-        Settings.
-    view : FieldOfView, optional
-        Of the LiDAR, from the sweeps before; without it all tops are in view.
-
-    Returns
-    -------
-    observations : Observations
-        One row for each of `boxes`; none is pinned.
+    The sweep is in the fixed frame; its points may be in their own, see `Sweep.T_frame_points`.
+    The boxes are at its stamp, the observations at `stamp_ns`. Without the `view` of the LiDAR,
+    known from the sweeps before, all tops are in view.
 
     """
     n = len(boxes)
@@ -332,25 +294,17 @@ def _medians(values: NDArray[np.float32], counts: Ints) -> Floats:
 
 
 class OwnPoints(NamedTuple):
-    """
-    The points that belong to each of n boxes, as P pairs, and the road beside them.
-
-    Attributes
-    ----------
-    row, owner : array, shape (P,)
-        Row of the point in its sweep, and of the box. Ascending by box, then by the x coordinate
-        of the point.
-    road : array, shape (n,)
-        Height of the road above the bottom of each box, along its z axis [m]; NaN if unknown.
-    num_inside : array, shape (n,)
-        Sweep points inside each box.
-
-    """
+    """The points that belong to each of n boxes, as P pairs, and the road beside them."""
 
     row: Ints
+    """(P,), of the point in its sweep."""
     owner: Ints
+    """(P,), row of the box: ascending, then by the x coordinate of the point."""
     road: Floats
+    """(n,), height of the road above the bottom of each box, along its z axis [m]; NaN if
+    unknown."""
     num_inside: Ints
+    """(n,), sweep points inside each box."""
 
 
 def crop_numbers(config: Config) -> crop_kernels.CropNumbers:
@@ -402,24 +356,7 @@ def shapes_of(sweep: Sweep, boxes: Floats, margin: float) -> crop_kernels.Shapes
 
 
 def crop(sweep: Sweep, boxes: Floats, margin: float) -> Crop:
-    """
-    Return all pairs of a point and a box within `margin` of each other.
-
-    Parameters
-    ----------
-    sweep : Sweep
-        In the frame of the boxes.
-    boxes : array, shape (n, 9)
-        Valid boxes.
-    margin : float
-        Distance from the faces of the box [m].
-
-    Returns
-    -------
-    near : Crop
-        The pairs.
-
-    """
+    """Return all pairs of a point and a valid box (n, 9), in one frame, within `margin` [m]."""
     columns = np.ascontiguousarray(sweep.points.T)
     shapes = shapes_of(sweep, boxes, margin)
     row, owner, offset, outside = crop_kernels.crop(columns, shapes, margin)
@@ -460,21 +397,9 @@ def _runs(first: Ints, counts: Ints) -> Ints:
 
 def farthest_point_sample(points: Floats, count: int) -> Ints:
     """
-    Return the rows of `count` points that cover a cloud.
+    Return the rows of `count` different ones of points (M, 3) that cover a cloud; `count` <= M.
 
     The first one is farthest from the mean, each next one farthest from all before.
-
-    Parameters
-    ----------
-    points : array, shape (M, 3)
-        The cloud [m].
-    count : int
-        At most M.
-
-    Returns
-    -------
-    rows : array, shape (count,)
-        All different.
 
     """
     gaps = np.square(points - points.mean(0)).sum(1)

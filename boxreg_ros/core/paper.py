@@ -40,21 +40,14 @@ PADDING_POSITION = 1e6
 
 
 class Observed(NamedTuple):
-    """
-    What the terms compare boxes with.
-
-    Attributes
-    ----------
-    points, mask : Tensor, shapes (B, N, M, 3) and (B, N, M)
-        Points in the frame of the boxes [m]; False for padding.
-    valid : Tensor, shape (B, N)
-        False for padding.
-
-    """
+    """What the terms compare boxes with."""
 
     points: Tensor
+    """(B, N, M, 3), in the frame of the boxes [m]."""
     mask: Tensor
+    """(B, N, M), False for padding."""
     valid: Tensor
+    """(B, N), False for padding."""
 
     @classmethod
     def of(cls, problem: Problem) -> 'Observed':

@@ -221,30 +221,20 @@ class PendingBox:
 
 @dataclass(eq=False, slots=True)
 class ObservedTrack:
-    """
-    The observations of a track that windows still need, oldest first.
-
-    Attributes
-    ----------
-    covariance : array, shape (6, 6), or None
-        Of the newest estimate.
-    num_carried : int
-        Newest observations that were in no window yet, because the budget was used up.
-    detected_ns : int
-        Stamp of the last detection [ns].
-    least_points : float
-        Points inside a predicted box that confirm it, known after the first missed detection.
-
-    """
+    """The observations of a track that windows still need, oldest first."""
 
     track_id: str
     class_name: str
     entries: list[PendingBox] = field(default_factory=list)
     prior: MarginalisationPrior | None = None
     covariance: Floats | None = None
+    """(6, 6), of the newest estimate."""
     num_carried: int = 0
+    """Newest observations that were in no window yet, because the budget was used up."""
     detected_ns: int = 0
+    """Stamp of the last detection [ns]."""
     least_points: float = inf
+    """Points inside a predicted box that confirm it, known after the first missed detection."""
 
     @property
     def newest_ns(self) -> int:

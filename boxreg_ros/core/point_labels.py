@@ -41,63 +41,38 @@ sweeps at 10 Hz."""
 
 
 class ObjectTrack(NamedTuple):
-    """
-    The boxes of one object.
-
-    Attributes
-    ----------
-    track_id, class_name : str
-        Identity and category.
-    stamps_ns : array, shape (n,)
-        Strictly increasing [ns].
-    boxes : array, shape (n, 9)
-        In the fixed frame.
-    is_certain : array, shape (n,)
-        Whether the points confirm the box.
-
-    """
+    """The boxes of one object."""
 
     track_id: str
     class_name: str
     stamps_ns: Ints
+    """(n,), strictly increasing [ns]."""
     boxes: Floats
+    """(n, 9), in the fixed frame."""
     is_certain: Mask
+    """(n,), whether the points confirm the box."""
 
 
 class PointLabels(NamedTuple):
-    """
-    Labels of the points of a sweep.
-
-    Attributes
-    ----------
-    track : array, shape (M,)
-        Row of the track that each point is on, `BACKGROUND` or `UNKNOWN`.
-    motion : array, shape (M,)
-        Motion of its object, or of the one that an unknown point is next to; `UNKNOWN_MOTION` for
-        points on none.
-    rows : array, shape (L,)
-        Rows of the points on an object, ascending.
-    local : array, shape (L, 3)
-        These points in the frame of their box at their own time [m].
-    owner : array, shape (L,)
-        Row of their object in `objects`.
-    objects : Objects
-        Those of the stamp.
-    tracks : sequence of T ObjectTrack
-        All objects of the drive.
-    moves : array, shape (T,)
-        Whether each of them moves at some time.
-
-    """
+    """Labels of the points of a sweep."""
 
     track: Ints
+    """(M,), row of the track that each point is on, `BACKGROUND` or `UNKNOWN`."""
     motion: Bytes
+    """(M,), of its object, or of the one that an unknown point is next to; `UNKNOWN_MOTION` for
+    points on none."""
     rows: Ints
+    """(L,), of the points on an object, ascending."""
     local: Floats
+    """(L, 3), these points in the frame of their box at their own time [m]."""
     owner: Ints
+    """(L,), row of their object in `objects`."""
     objects: Objects
+    """Those of the stamp."""
     tracks: Sequence[ObjectTrack]
+    """All T objects of the drive."""
     moves: Mask
+    """(T,), whether each of them moves at some time."""
 
     def at_stamp(self) -> Floats:
         """Return the points on an object, moved with it to the stamp, (L, 3), fixed frame [m]."""
@@ -115,18 +90,11 @@ class PointLabels(NamedTuple):
 
 class PointLabeller:
     """
-    Label the points of sweeps by the boxes of tracks.
+    Label the points of sweeps by the boxes of tracks, all T objects of the drive.
 
-    Parameters
-    ----------
-    tracks : sequence of ObjectTrack
-        All objects of the drive.
-    array_stamps_ns : array, shape (a,)
-        Stamps at which the input has boxes, or states that there are none [ns].
-    config : Config
-        `max_gap`, `reach`, `tolerance`, and the time that boxes are of, `sampling.box_time`.
-    margins : array, shape (T, 6)
-        Labelling margin of each face of each track: front, rear, left, right, top, bottom [m].
+    At `array_stamps_ns` (a,) the input has boxes, or states that there are none. Of `config` are
+    used `max_gap`, `reach`, and the time that boxes are of, `sampling.box_time`. `margins` (T, 6)
+    are the labelling margins of front, rear, left, right, top and bottom [m].
 
     """
 

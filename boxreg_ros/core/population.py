@@ -18,30 +18,17 @@ def population_slopes(evidence: Floats, constants: Constants) -> tuple[Floats, F
     """
     Return the regression of extent corrections on extents.
 
-    Parameters
-    ----------
-    evidence : array, shape (n, 3, 3)
-        Of the points of n tracks. Rows of length, width and height: logarithms of the input's;
-        corrections to these, over the square of their expected error; the weights of these, 0
-        without enough evidence.
-    constants : Constants
-        Of the method.
-
-    Returns
-    -------
-    median : array, shape (3,)
-        Of the logarithms of extents.
-    slopes : array, shape (3, 3)
-        Of the corrections, one row for each corrected extent.
-
-    Notes
-    -----
     Trained detectors shrink extents toward those of the majority, noise spreads them. Tracks with
     evidence about their extents show which, and by how much: a ridge regression of their
     corrections on the distance of all three extents from the medians, in logarithms and in
-    proportion to the square of the error, so that low-noise input is left as it is. Objects
-    unlike the majority, trucks among cars, are corrected little, and the medians not at all: the
+    proportion to the square of the error, so that low-noise input is left as it is. Objects unlike
+    the majority, trucks among cars, are corrected little, and the medians not at all: the
     labelling margin accounts for a common error.
+
+    `evidence` (n, 3, 3) is of the points of n tracks. Rows of length, width and height: logarithms
+    of the input's; corrections to these, over the square of their expected error; the weights of
+    these, 0 without enough evidence. Returned are the medians (3,) of the logarithms of extents,
+    and the slopes (3, 3) of the corrections, one row for each corrected extent.
 
     """
     log, correction, weight = evidence.swapaxes(0, 1)  # (n, 3) each

@@ -85,66 +85,49 @@ CLASS_SETTINGS = np.dtype(
 
 
 class Problem(NamedTuple):
-    """
-    A batch of padded windows; centres are relative to one point per window.
-
-    Attributes
-    ----------
-    boxes : array, shape (B, N, 9)
-        Input boxes, yaw unwrapped along the window and 180° flips corrected [m, rad].
-    start : array, shape (B, N, 9)
-        Start of the search: the input, or the estimate of the window before.
-    lengths : array, shape (B,)
-        Observations of each window; the others are padding.
-    times : array, shape (B, N)
-        Time since the first observation, increasing over the padding too [s].
-    origins : array, shape (B, N, K, 3)
-        Each sensor that sees the object minus the centre of the input box [m]; NaN if unknown.
-    ground : array, shape (B, N)
-        Height of the road minus that of the input centre [m]; NaN if unknown.
-    ring_heights : array, shape (B, N)
-        Height between two rings of the LiDAR at the object [m]; 0 if unknown.
-    points, delays : array, shapes (P, 3) and (P,)
-        Returns of all observations minus the centre of their input box [m], and their measurement
-        times relative to the stamp of the box [s].
-    first, counts : array, shape (B, N)
-        First of the returns of each observation, and their number.
-    stride : int
-        Every n-th return of an observation is used.
-    is_moving : bool
-        Whether any delay is not zero.
-    pinned : array, shape (B, N)
-        Whether a person has corrected a box.
-    prior_mean, prior_information : array, shapes (B, 35) and (B, 35, 35)
-        Marginalisation prior (M9) on the two oldest poses and the shared variables: the minimum
-        of its quadratic form, and its information matrix, 0 without a prior.
-    marginalised_extents : array, shape (B, 4)
-        Sum of the input extents of marginalised observations [m], and the number of these.
-    kind : array, shape (B,)
-        Index of the kind of each window's object among `KINDS`.
-    of_class : array of `CLASS_SETTINGS`, shape (B,)
-
-    """
+    """A batch of padded windows; centres are relative to one point per window."""
 
     boxes: Floats
+    """(B, N, 9), input boxes, yaw unwrapped along the window and 180° flips corrected [m, rad]."""
     start: Floats
+    """(B, N, 9), start of the search: the input, or the estimate of the window before."""
     lengths: Ints
+    """(B,), observations of each window; the others are padding."""
     times: Floats
+    """(B, N), since the first observation, increasing over the padding too [s]."""
     origins: Floats
+    """(B, N, K, 3), each sensor that sees the object minus the centre of the input box [m]; NaN
+    if unknown."""
     ground: Floats
+    """(B, N), height of the road minus that of the input centre [m]; NaN if unknown."""
     ring_heights: Floats
+    """(B, N), height between two rings of the LiDAR at the object [m]; 0 if unknown."""
     points: NDArray[np.float32]
+    """(P, 3), returns of all observations minus the centre of their input box [m]."""
     delays: NDArray[np.float32]
+    """(P,), their measurement times relative to the stamp of the box [s]."""
     first: Ints
+    """(B, N), first of the returns of each observation."""
     counts: Ints
+    """(B, N), number of these."""
     stride: int
+    """Every n-th return of an observation is used."""
     is_moving: bool
+    """Whether any delay is not zero."""
     pinned: NDArray[np.bool_]
+    """(B, N), whether a person has corrected a box."""
     prior_mean: Floats
+    """(B, 35), minimum of the marginalisation prior (M9), on the two oldest poses and the
+    shared variables."""
     prior_information: Floats
+    """(B, 35, 35), of that prior; 0 without one."""
     marginalised_extents: Floats
+    """(B, 4), sum of the input extents of marginalised observations [m], and the number of
+    these."""
     kind: Ints
+    """(B,), kind of each window's object, an index of `KINDS`."""
     of_class: NDArray[np.void]
+    """(B,), records `CLASS_SETTINGS`."""
 
     @property
     def errors(self) -> Floats:
@@ -170,21 +153,10 @@ class Problem(NamedTuple):
 
     def part(self, windows: Sequence[int], columns: Sequence[Sequence[int]]) -> 'Problem':
         """
-        Return some windows with some of their observations only.
+        Return some windows with some of their observations only, padded to the most that one has.
 
+        `columns` are those of the observations of each of `windows`, ascending, at least one.
         Marginalised observations are left out, with their prior and their extents.
-
-        Parameters
-        ----------
-        windows : sequence of b int
-            Rows of the windows.
-        columns : sequence of b sequences of int
-            Columns of the observations of each of them, ascending, at least one.
-
-        Returns
-        -------
-        part : Problem
-            Of b windows, padded to the most observations that one of them has.
 
         """
         lengths = np.array(list(map(len, columns)))
@@ -288,23 +260,10 @@ def stack_windows(
     windows: Sequence[Window], config: Config, decay: float
 ) -> tuple[Problem, Floats]:
     """
-    Stack windows to padded arrays.
+    Stack windows, each with at least one observation, to padded arrays.
 
-    Parameters
-    ----------
-    windows : sequence of B Window
-        Each with at least one observation.
-    config : Config
-        Settings.
-    decay : float
-        Factor on the information of the marginalisation priors.
-
-    Returns
-    -------
-    problem : Problem
-        Positions are relative to `base`.
-    base : array, shape (B, 3)
-        One origin per window in the fixed frame [m].
+    The information of marginalisation priors is multiplied by `decay`. Positions of the problem
+    are relative to the second value, (B, 3): one origin per window in the fixed frame [m].
 
     """
     lengths = np.array([len(window.observations) for window in windows])
@@ -472,27 +431,13 @@ def resolve_headings(
     boxes: Floats, times: Floats, valid: NDArray[np.bool_], known_yaw: Floats
 ) -> Floats:
     """
-    Return unwrapped yaw angles with one heading sign per window, 180° flips corrected.
+    Return unwrapped yaw angles with one heading sign per window, 180° flips corrected, (B, N).
 
-    The majority of a window decides on the sign; against a known sign, three quarters. An object
-    faster than `MAX_REVERSE_SPEED` heads where it moves. A single heading that is off by a
-    quarter turn does not affect those after it.
-
-    Parameters
-    ----------
-    boxes : array, shape (B, N, 9)
-        Input boxes [m, rad].
-    times : array, shape (B, N)
-        Increasing [s].
-    valid : array, shape (B, N)
-        False for padding.
-    known_yaw : array, shape (B,)
-        Heading of the first box as estimated before [rad]; NaN where unknown.
-
-    Returns
-    -------
-    yaw : array, shape (B, N)
-        Each within a whole number of half turns of the input [rad].
+    The majority of a window decides on the sign; against a known sign, `known_yaw` (B,) of the
+    first box as estimated before [rad] (NaN where unknown), three quarters. An object faster than
+    `MAX_REVERSE_SPEED` heads where it moves. A single heading that is off by a quarter turn does
+    not affect those after it. `boxes` (B, N, 9) [m, rad] have increasing `times` (B, N) [s];
+    `valid` is False for padding. Each angle is within a whole number of half turns of the input.
 
     """
     input_yaw = boxes[..., YAW]

@@ -41,22 +41,11 @@ KEPT_REASONS = (Reason.NO_POINTS, Reason.NOT_FINITE, Reason.NO_GAIN, Reason.NOT_
 @one_torch_thread()
 def register(windows: list[Window], config: Config, model: InputModel) -> list[Estimate | None]:
     """
-    Refine the boxes of many windows.
+    Refine the boxes of many windows, each of its own track.
 
-    Parameters
-    ----------
-    windows : list of Window
-        Each of its own track.
-    config : Config
-        Settings.
-    model : InputModel
-        Labelling margins and noise of the input. It is updated: first with the new observations,
-        then with the fits.
-
-    Returns
-    -------
-    estimates : list of Estimate or None
-        In the order of `windows`; None for those with fewer than `min_observations`.
+    The labelling margins and the noise of the input in `model` are updated: first with the new
+    observations, then with the fits. Returned in the order of `windows`; None for those with fewer
+    than `min_observations`.
 
     """
     estimates: dict[int, Estimate] = {}

@@ -37,30 +37,20 @@ the input, and the noise would be estimated smaller in every round."""
 
 @dataclass(frozen=True, slots=True)
 class SolverPlan:
-    """
-    How a batch is solved.
-
-    Attributes
-    ----------
-    rounds : int
-        Most rounds.
-    starts_from_fit : bool
-        Whether the start is the fit of the tick before: faces are judged by its extents, and its
-        motion is good enough for robust weights in the first round.
-    uses_rigid_shape : bool
-        Whether observations are tied by the rigid shape of their track, from the second round on.
-    estimates_noise : bool
-        Whether the noise of the input is estimated from this batch and not taken from the model.
-    marginalises : bool
-        Whether full windows leave a prior to the next ones.
-
-    """
+    """How a batch is solved."""
 
     rounds: int
+    """Most rounds."""
     starts_from_fit: bool = False
+    """Whether the start is the fit of the tick before: faces are judged by its extents, and its
+    motion is good enough for robust weights in the first round."""
     uses_rigid_shape: bool = False
+    """Whether observations are tied by the rigid shape of their track, from the second round
+    on."""
     estimates_noise: bool = False
+    """Whether the noise of the input is estimated from this batch and not taken from the model."""
     marginalises: bool = False
+    """Whether full windows leave a prior to the next ones."""
 
     @classmethod
     def choose(cls, config: Config, is_warm: bool) -> 'SolverPlan':
@@ -79,49 +69,26 @@ class SolverPlan:
 
 
 class Batch(NamedTuple):
-    """
-    Windows that are being solved.
-
-    Attributes
-    ----------
-    problem : Problem
-    free : array, shape (B, 6 N + 23)
-        1 for variables that are estimated.
-    sums : Sums
-        The sums of residuals of the round.
-    solution : Solution
-        Where the round begins; the round writes its end.
-
-    """
+    """Windows that are being solved."""
 
     problem: Problem
     free: Floats
+    """(B, 6 N + 23), 1 for variables that are estimated."""
     sums: method.Sums
+    """The sums of residuals of the round."""
     solution: Solution
+    """Where the round begins; the round writes its end."""
 
 
 def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) -> Solution:
     """
     Minimise the robust objective (M1) of a batch: rounds until every window is settled.
 
-    Parameters
-    ----------
-    problem : Problem
-        B windows, all warm or all cold.
-    config : Config
-        Settings.
-    model : InputModel
-        Labelling margins and noise of the input, and the constants of the method.
-    is_warm : bool
-        Whether all boxes but the newest start from an earlier fit.
+    The B windows are all warm, with all boxes but the newest starting from an earlier fit, or all
+    cold. `model` has labelling margins and noise of the input, and the constants of the method.
+    Returned are poses, shared variables and covariances; for sliding windows also the prior of the
+    next ones.
 
-    Returns
-    -------
-    solution : Solution
-        Poses, shared variables, covariances; for sliding windows, the prior of the next ones.
-
-    Notes
-    -----
     Settled windows take no part in further rounds. Within a round windows do not depend on each
     other: threads share them.
 
@@ -211,16 +178,7 @@ def run_round(
 
 
 class Objective(NamedTuple):
-    """
-    The sums of residuals of the windows `rows` (b,) of a batch, as `minimize` calls them.
-
-    Attributes
-    ----------
-    rows : array, shape (b,)
-    free, sums
-        As in `Batch`.
-
-    """
+    """The sums of residuals of the windows `rows` (b,) of a `Batch`, as `minimize` calls them."""
 
     rows: Ints
     free: Floats

@@ -16,19 +16,9 @@ import numpy as np
 
 def joined(items: Sequence[tuple[Any, int]]) -> tuple[list[Any], Ints]:
     """
-    Return the different tables of some items, and the row of each item in their concatenation.
+    Return the different tables of some items, in the order of their first item.
 
-    Parameters
-    ----------
-    items : sequence of n pairs
-        Table, and row in it.
-
-    Returns
-    -------
-    tables : list
-        In the order of their first item.
-    rows : array, shape (n,)
-        Of the items, in the concatenation of `tables`.
+    And the row (n,) of each item in their concatenation.
 
     """
     of_id = {id(table): table for table, _ in items}

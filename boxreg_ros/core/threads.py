@@ -67,16 +67,8 @@ def run(kernel: Callable[..., Any], windows: int, *arguments: Any) -> None:
     """
     Run a kernel for a number of `windows`, shared between threads within `shared_between`.
 
-    No window depends on another: the results do not depend on the number of threads.
-
-    Parameters
-    ----------
-    kernel : callable
-        A kernel whose first arguments are the first window, and that after the last.
-    windows : int
-        Number of windows.
-    *arguments
-        The other arguments.
+    Its first arguments are the first window, and that after the last. No window depends on
+    another: the results do not depend on the number of threads.
 
     """
     parts = max(1, min(num_workers(), windows // MIN_WINDOWS_PER_THREAD))

@@ -10,22 +10,11 @@ from numpy.typing import NDArray
 
 class TrackRows:
     """
-    Keep one array per track, for a limited number of tracks.
+    Keep one array per track, for at most `capacity` tracks; a new one begins with `fresh`.
 
     A new track takes the place of the one that was seen longest ago, but not of one that is seen
-    together with it: where there are too many tracks at once, the first ones stay.
-
-    Parameters
-    ----------
-    fresh : array, shape (...)
-        Array of a new track.
-    capacity : int
-        Most tracks.
-
-    Attributes
-    ----------
-    arrays : array, shape (n, ...)
-        Of n tracks.
+    together with it: where there are too many tracks at once, the first ones stay. `arrays` are
+    those of all tracks, (n, ...).
 
     """
 
@@ -45,12 +34,7 @@ class TrackRows:
         """
         Mark different tracks as seen now, and make rows for the new ones.
 
-        Returns
-        -------
-        places : array, shape (m,)
-            Which of `track_ids` are kept.
-        rows : array, shape (m,)
-            Their rows in `arrays`.
+        Returns which of `track_ids` are kept, (m,), and their rows in `arrays`, (m,).
 
         """
         for track_id in track_ids:

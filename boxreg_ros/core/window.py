@@ -27,56 +27,36 @@ class MarginalisationPrior(NamedTuple):
     Its variables are the poses of the two oldest observations and the parameters that all
     observations of a track share (35 in all).
 
-    Attributes
-    ----------
-    base : array, shape (3,)
-        Fixed origin of all positions of the track, in the fixed frame [m].
-    state : array, shape (35,)
-        Linearisation point: the variables when the last observation was marginalised.
-    step : array, shape (35,)
-        Minimum of the quadratic form minus `state`.
-    information : array, shape (35, 35)
-        Hessian of the quadratic form.
-    marginalised_extents : array, shape (4,)
-        Sum of the input extents of marginalised observations [m], and their number.
-    extent_range : array, shape (2, 3)
-        Range of the input extents of all observations, see `articulation.extent_ranges`.
-
     """
 
     base: Floats
+    """(3,), fixed origin of all positions of the track, in the fixed frame [m]."""
     state: Floats
+    """(35,), linearisation point: the variables when the last observation was marginalised."""
     step: Floats
+    """(35,), minimum of the quadratic form minus `state`."""
     information: Floats
+    """(35, 35), Hessian of the quadratic form."""
     marginalised_extents: Floats
+    """(4,), sum of the input extents of marginalised observations [m], and their number."""
     extent_range: Floats
+    """(2, 3), range of the input extents of all observations, see `articulation.extent_ranges`."""
 
 
 class Window(NamedTuple):
-    """
-    Consecutive observations of one track.
-
-    Attributes
-    ----------
-    track_id, class_name : str
-        Identity and category.
-    observations : sequence of N Observation
-        Ascending by stamp.
-    num_new : int
-        Observations, the last ones, that have been in no window before.
-    start : array, shape (N - num_new, 9)
-        Boxes of the other observations as estimated in the window before; empty without one.
-    prior : MarginalisationPrior or None
-        From observations before the window.
-
-    """
+    """Consecutive observations of one track."""
 
     track_id: str
     class_name: str
     observations: Sequence[Observation]
+    """N of them, ascending by stamp."""
     num_new: int
+    """The last ones, that have been in no window before."""
     start: Floats
+    """(N - num_new, 9), boxes of the others as estimated in the window before; empty without
+    one."""
     prior: MarginalisationPrior | None = None
+    """From observations before the window."""
 
     @property
     def is_warm(self) -> bool:
@@ -96,54 +76,35 @@ class Window(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """
-    The refined boxes of many windows, one row each, window after window.
-
-    Attributes
-    ----------
-    boxes : array, shape (n, 9)
-        Refined boxes, or input boxes where those are kept; fixed frame [m, rad].
-    status : array of str, shape (n,)
-        ``refined`` or ``kept``.
-    reasons : array of str, shape (n,)
-        One of `KEPT_REASONS` for kept boxes, '' for refined ones.
-    covariances : array, shape (n, 6, 6)
-        Of x y z roll pitch yaw [m, rad]; the identity for kept boxes.
-    extent_covariances : array, shape (n, 3, 3)
-        Of length, width and height [m]; the identity for kept boxes.
-    face_distances, near_points : array, shapes (n, 6) and (n, 2)
-        As in `RefinedBoxes`.
-
-    """
+    """The refined boxes of many windows, one row each, window after window."""
 
     boxes: Floats
+    """(n, 9), refined boxes, or input boxes where those are kept; fixed frame [m, rad]."""
     status: NDArray[np.str_]
+    """(n,), ``refined`` or ``kept``."""
     reasons: NDArray[np.str_]
+    """(n,), one of `KEPT_REASONS` for kept boxes, '' for refined ones."""
     covariances: Floats
+    """(n, 6, 6), of x y z roll pitch yaw [m, rad]; the identity for kept boxes."""
     extent_covariances: Floats
+    """(n, 3, 3), of length, width and height [m]; the identity for kept boxes."""
     face_distances: Floats
+    """(n, 6), as in `RefinedBoxes`."""
     near_points: Ints
+    """(n, 2), likewise."""
 
 
 class Estimate(NamedTuple):
-    """
-    The refined boxes of one window: some successive rows of `Estimates`.
-
-    Attributes
-    ----------
-    table : Estimates
-        Those of all windows that were solved together.
-    begin, end : int
-        First row of the window, and the one after its last.
-    prior : MarginalisationPrior or None
-        For the next window, if this one is full and was solved.
-
-    """
+    """The refined boxes of one window: some successive rows of `Estimates`."""
 
     table: Estimates
+    """Those of all windows that were solved together."""
     begin: int
+    """First row of the window."""
     end: int
+    """The row after its last."""
     prior: MarginalisationPrior | None = None
+    """For the next window, if this one is full and was solved."""
 
     @property
     def boxes(self) -> Floats:

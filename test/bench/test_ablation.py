@@ -9,9 +9,9 @@ from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE, without
 from boxreg_ros.config import Ingredients, settings
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.simulate import simulate
-from boxreg_ros.simulation.writer import write_recording
 import numpy as np
 import pytest
+from scenes import write_scene
 
 NAMES = list(INGREDIENTS)[1:]
 
@@ -62,11 +62,7 @@ def test_every_switch_is_used():
 def test_losses_are_printed(tmp_path, scene, capsys):
     for name in ('a', 'b'):
         (tmp_path / name).mkdir()
-        intensities = [np.zeros(len(owner)) for owner in scene.owners]
-        write_recording(
-            tmp_path / name / 'recording.mcap', scene.sweeps, intensities, scene.detections,
-            scene.T_fixed_sensor, 'odom',
-        )  # fmt: skip
+        write_scene(tmp_path / name / 'recording.mcap', scene)
         scene.truth.write(tmp_path / name / 'truth.csv')
     options = ['--without', 'one extent', '--min-points', '50']
     folders = [str(tmp_path / name) for name in ('a', 'b')]

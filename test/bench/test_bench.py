@@ -14,9 +14,9 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.box_scores import evaluate, match
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.simulate import simulate
-from boxreg_ros.simulation.writer import write_recording
 import numpy as np
 import pytest
+from scenes import write_scene
 import torch
 
 ROWS = {
@@ -52,18 +52,10 @@ def run(*words):
 def small_street(seed):
     """Return a short scene with the boxes of four vehicles: the paper's method is slow."""
     scene = simulate('street', seed, sweeps=6)
-    detections = []
-    for array in scene.detections:
-        kept = [i for i, name in enumerate(array.track_ids) if name in ('4', '9', '10', '16')]
-        detections.append(
-            replace(
-                array,
-                track_ids=tuple(array.track_ids[i] for i in kept),
-                class_names=tuple(array.class_names[i] for i in kept),
-                scores=array.scores[kept],
-                boxes=array.boxes[kept],
-            )
-        )
+    detections = [
+        array.take([i for i, name in enumerate(array.track_ids) if name in ('4', '9', '10', '16')])
+        for array in scene.detections
+    ]
     return replace(scene, detections=tuple(detections))
 
 
@@ -88,11 +80,7 @@ def test_all_methods_return_every_input_box(monkeypatch):
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp('drive')
     scene = small_street(seed=2)
-    intensities = [np.zeros(len(owner)) for owner in scene.owners]
-    path = folder / 'recording.mcap'
-    write_recording(
-        path, scene.sweeps, intensities, scene.detections, scene.T_fixed_sensor, 'odom'
-    )
+    write_scene(folder / 'recording.mcap', scene)
     scene.truth.write(folder / 'truth.csv')
     return folder
 

@@ -1,15 +1,14 @@
 """`boxreg bench follow` end to end on a small scene."""
 
 import argparse
-from dataclasses import replace
 import json
 
 from boxreg_ros.bench import main as bench
 from boxreg_ros.bench.follow import CASES, KEYFRAMES, OFF_SIZE, ONE, ONE_OF_CLASS, TWO
 from boxreg_ros.simulation.simulate import simulate
-from boxreg_ros.simulation.writer import write_recording
 import numpy as np
 import pytest
+from scenes import write_scene
 
 OBJECTS = ('4', '9', '10', '16')
 """Three moving cars and a parked one."""
@@ -20,11 +19,8 @@ SWEEPS = 21
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp('drive')
     scene = simulate('street', 2, SWEEPS)
-    zeros = [np.zeros(len(owner)) for owner in scene.owners]
-    written = replace(scene, truth=scene.truth.rows(np.isin(scene.truth.track_ids, OBJECTS)))
-    path = folder / 'recording.mcap'
-    write_recording(path, scene.sweeps, zeros, scene.detections, scene.T_fixed_sensor, 'odom')
-    written.truth.write(folder / 'truth.csv')
+    write_scene(folder / 'recording.mcap', scene)
+    scene.truth.rows(np.isin(scene.truth.track_ids, OBJECTS)).write(folder / 'truth.csv')
     return folder
 
 

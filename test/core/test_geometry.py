@@ -1,14 +1,7 @@
-"""Box geometry against SciPy, finite differences and values calculated by hand."""
+"""Box geometry against SciPy and values calculated by hand."""
 
-from boxreg_ros.core.geometry import (
-    FACE_AXIS,
-    face_distances,
-    FACE_SIGN,
-    rotation_derivatives,
-    rotation_from_rpy,
-)
+from boxreg_ros.core.geometry import FACE_AXIS, face_distances, FACE_SIGN, rotation_from_rpy
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 import torch
 
@@ -25,24 +18,12 @@ def test_rotation_equals_scipy():
     np.testing.assert_allclose(rotation_from_rpy(rpy), known, atol=1e-14)
 
 
-def test_derivatives_equal_finite_differences():
-    # Central differences of sines: error step^2 / 6 + 1e-16 / step, 1e-10 at this step.
-    rpy, step = angles(50), 1e-5
-    R, dR = rotation_derivatives(rpy)
-    np.testing.assert_array_equal(R, rotation_from_rpy(rpy))
-    for k in range(3):
-        move = step * torch.eye(3, dtype=torch.float64)[k]
-        known = (rotation_from_rpy(rpy + move) - rotation_from_rpy(rpy - move)) / (2 * step)
-        np.testing.assert_allclose(dR[:, k], known, atol=1e-9)
-
-
-@pytest.mark.parametrize('function', [rotation_from_rpy, lambda rpy: rotation_derivatives(rpy)[1]])
-def test_any_leading_dimensions(function):
+def test_any_leading_dimensions():
     rpy = angles(2, 4, 3)
-    many = function(rpy)
+    many = rotation_from_rpy(rpy)
     for index in np.ndindex(2, 4, 3):
-        np.testing.assert_array_equal(many[index], function(rpy[index]))
-    assert function(rpy[:0]).shape == (0, *many.shape[1:])
+        np.testing.assert_array_equal(many[index], rotation_from_rpy(rpy[index]))
+    assert rotation_from_rpy(rpy[:0]).shape == (0, *many.shape[1:])
 
 
 def test_face_distances_equal_scipy():

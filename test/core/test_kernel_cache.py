@@ -79,46 +79,6 @@ def test_kernels_take_nothing_of_the_package_from_outside_of_their_folder():
                 assert node.module.startswith('boxreg_ros.core.method'), path.name
 
 
-REFINE = """
-import sys, warnings
-import numpy as np
-warnings.simplefilter('always')
-with warnings.catch_warnings(record=True) as caught:
-    from boxreg_ros import Config, Track, refine
-    rng = np.random.default_rng(0)
-    boxes = np.array([[10.0 + i, 0, 0, 4, 1.8, 1.5, 0, 0, 0] for i in range(6)])
-    surface = rng.uniform(-1, 1, (200, 3)) * [2, 0.9, 0.75]
-    surface[:100, 0], surface[100:, 1] = -2.0, 0.9
-    points = [box[:3] + surface for box in boxes]
-    boxes += 0.1 * rng.normal(size=boxes.shape)
-    track = Track('7', 'car', np.arange(6) * 10**8, boxes, points, np.zeros((6, 3)))
-    (refined,) = refine([track], Config())
-texts = [str(w.message) for w in caught if 'numba' in str(w.message)]
-print(len(texts), *texts, sep='\\n')
-print(*refined.boxes.ravel().tolist())
-"""
-
-
-def refined(folder=ROOT, **environment):
-    """Return the warnings about numba, and the boxes, of a small refinement in a process."""
-    done = subprocess.run(
-        [sys.executable, '-c', REFINE],
-        cwd=folder, env={**os.environ, **environment}, capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    count, *texts, boxes = done.stdout.splitlines()
-    assert len(texts) == int(count)
-    return texts, np.array(boxes.split(), float)
-
-
-@pytest.fixture(scope='module')
-def known_boxes():
-    """Return the boxes of the small refinement, by the kernels."""
-    texts, boxes = refined()
-    assert texts == []
-    return boxes
-
-
 @pytest.fixture
 def copy(tmp_path):
     """Return a folder with a copy of the package and its compiled kernels."""
@@ -136,22 +96,22 @@ with warnings.catch_warnings(record=True) as caught:
     R = np.empty((3, 3))
     PREPARE
     fill_rotation(0.1, 0.2, 0.3, R)
-(text,) = [str(w.message) for w in caught]
-print(text)
+print(*[str(w.message) for w in caught], sep='\\n')
 print(*R.ravel().tolist())
 """
 KNOWN_ROTATION = matrix_from_rpy(np.array([0.1, 0.2, 0.3])).ravel()
 
 
-def rotated(folder, places, prepare='pass'):
-    """Return the warning and the numbers of a rotation by a kernel, compiled in a process."""
+def rotated(folder, prepare='pass', **places):
+    """Return the warnings and the numbers of a rotation by a kernel, in a process."""
     # One kernel stands for all, which take a minute.
     done = subprocess.run(
         [sys.executable, '-c', ROTATE.replace('PREPARE', prepare)],
         cwd=folder, env={**os.environ, **places}, capture_output=True, text=True, check=True,
     )  # fmt: skip
-    text, values = done.stdout.splitlines()
-    return text, np.array(values.split(), float)
+    *texts, values = done.stdout.splitlines()
+    np.testing.assert_allclose(np.array(values.split(), float), KNOWN_ROTATION, atol=1e-15)
+    return [text for text in texts if text]
 
 
 def test_a_read_only_home_gives_one_warning(copy):
@@ -161,26 +121,23 @@ def test_a_read_only_home_gives_one_warning(copy):
     shutil.rmtree(cache)
     cache.touch()
     places = {'HOME': str(cache), 'XDG_CACHE_HOME': str(cache), 'NUMBA_CACHE_DIR': str(cache)}
-    text, values = rotated(copy, places)
+    (text,) = rotated(copy, **places)
     assert 'set NUMBA_CACHE_DIR' in text
-    np.testing.assert_allclose(values, KNOWN_ROTATION, atol=1e-15)
 
 
 def test_a_full_disk_gives_one_warning(copy):
     # A limit of the size of files stands for the full disk: it holds for the superuser as well.
-    places = {'NUMBA_CACHE_DIR': str(copy / 'cache')}
     limit = 'resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))'
-    text, values = rotated(copy, places, limit)
+    (text,) = rotated(copy, limit, NUMBA_CACHE_DIR=str(copy / 'cache'))
     assert 'make room' in text and str(copy / 'cache') in text
-    np.testing.assert_allclose(values, KNOWN_ROTATION, atol=1e-15)
 
 
-def test_a_damaged_cache_is_written_again_with_one_warning(copy, known_boxes):
+def test_a_damaged_cache_is_written_again_with_one_warning(copy):
     cache = copy / 'boxreg_ros' / 'core' / 'method' / '__pycache__'
-    for file in cache.glob('faces.count_held*.nbi'):
+    indexes = list(cache.glob('rotation.fill_rotation*.nbi'))
+    assert indexes
+    for file in indexes:
         file.write_bytes(b'damaged')
-    (text,), found = refined(folder=copy)
+    (text,) = rotated(copy)
     assert 'delete the folder' in text
-    np.testing.assert_array_equal(found, known_boxes)
-    texts, _ = refined(folder=copy)
-    assert texts == []
+    assert rotated(copy) == []

@@ -70,8 +70,9 @@ def test_a_pair_is_returned_when_it_is_complete(items):
 def test_the_tolerance_is_symmetric(stamp, is_pair, first):
     feed = Feed()
     items = [f's{stamp}', 'b100'][:: 1 if first == 'sweep' else -1]
-    pairs = feed.add(*items) + feed.flush()
-    assert pairs == [(100, stamp if is_pair else None)]
+    pairs = feed.add(*items)
+    assert (pairs == [(100, stamp)]) == is_pair  # at once
+    assert pairs + feed.flush() == [(100, stamp if is_pair else None)]
     assert feed.counts['sweep_without_boxes'] == (not is_pair)
 
 

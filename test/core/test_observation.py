@@ -49,15 +49,6 @@ def test_points_within_the_margin_are_kept(axis, sign):
     assert seen.num_points == 0  # both are outside the box itself
 
 
-def test_the_crop_rotates_with_the_box():
-    # Heading along +y, the box reaches 2 m along y and 1 m along x, and 0.6 m more.
-    turned = CAR + np.eye(9)[8] * np.pi / 2
-    offsets = np.array([[0, 2.5, 0], [1.5, 0, 0], [2.5, 0, 0], [0, 0.5, 0]])
-    (seen,) = observed(CAR[:3] + offsets, turned)
-    assert rows(seen.points) == rows(offsets[[0, 1, 3]])
-    assert seen.num_points == 1
-
-
 def test_observation_is_relative_to_the_center():
     times = np.array([0.05, -0.02])
     origin = np.array([1.0, 2.0, 3.0])
@@ -198,11 +189,6 @@ def test_two_boxes_of_one_object_share_its_points():
     points = near([2.0, 0, 0], [-2.0, 0, 0], [0, 0.9, 0], [1.0, -0.9, 0.3])
     seen = observed(points, CAR, CAR + np.eye(9)[0] * 0.1)
     assert [len(observation.points) for observation in seen] == [4, 4]
-
-
-def test_num_points_counts_points_of_any_owner():
-    seen = observed([[11.7, 20.0, 1.0], [11.8, 20.0, 1.0], [10.0, 20.0, 1.0]], CAR, OTHER)
-    assert [observation.num_points for observation in seen] == [3, 2]
 
 
 def border_between(boxes, axes, i, j, points):

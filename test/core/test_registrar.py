@@ -361,12 +361,7 @@ def test_short_tracks_are_kept_and_boxes_without_points_refined(stream, estimate
     # The second car is observed twice only; the first has no points at one stamp.
     sweep, _ = stream[7]
     nothing = Sweep(sweep.stamp_ns, 'odom', sweep.points[:0], None, sweep.origin)
-    part = [
-        (s, b if i < 4 else replace(
-            b, track_ids=('a',), class_names=('car',), scores=b.scores[:1], boxes=b.boxes[:1]
-        ))
-        for i, (s, b) in enumerate(stream)
-    ]  # fmt: skip
+    part = [(s, b if i < 4 else b.take([0])) for i, (s, b) in enumerate(stream)]
     part[7] = (nothing, part[7][1])
     results, counts = run(part, config_with(estimate))
     assert counts['short_track'] == 2

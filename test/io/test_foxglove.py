@@ -1,6 +1,5 @@
 """MCAP files of Foxglove's schemas: protobuf, JSON, and both mixed with ROS messages."""
 
-import csv
 from dataclasses import replace
 import json
 import sys
@@ -17,14 +16,14 @@ from mcap.reader import make_reader
 from msg_adapters import adapter_for
 import numpy as np
 import pytest
+from relabel_results import rows_in
 from ros_messages import Drive, SCENE
 
 
 def rows_of(path, out):
     """Relabel a recording; return the rows of boxes.csv."""
     assert main(['relabel', str(path), '-o', str(out), '--formats=csv']) == 0
-    with (out / 'boxes.csv').open() as file:
-        return list(csv.DictReader(file))
+    return rows_in(out / 'boxes.csv')
 
 
 def test_a_foxglove_file_and_a_ros_recording_are_merged(tmp_path):
@@ -39,8 +38,7 @@ def test_a_foxglove_file_and_a_ros_recording_are_merged(tmp_path):
     rest = drive.write(tmp_path / 'rest')
     command = ['relabel', str(foreign), str(rest), '-o', str(tmp_path / 'out'), '--formats=csv']
     assert main(command) == 0
-    with (tmp_path / 'out' / 'boxes.csv').open() as file:
-        assert list(csv.DictReader(file)) == expected
+    assert rows_in(tmp_path / 'out' / 'boxes.csv') == expected
 
 
 @pytest.mark.parametrize('encoding', ['protobuf', 'json'])

@@ -173,7 +173,7 @@ def test_old_samples_are_removed():
 def test_unused_frames_of_objects_are_removed():
     """Some trackers publish a frame per object: thousands in an hour."""
     tree = tree_of(static=[(0, 'base', 'lidar', (0, 0, 2))])
-    for k in range(10 * FRAMES_BEFORE_CLEANUP):
+    for k in range(3 * FRAMES_BEFORE_CLEANUP):
         tree.add_transforms([M.transform(k * S, 'odom', 'base', (k, 0, 0))])
         tree.add_transforms([M.transform(k * S, 'odom', f'object {k}')])
         assert tree.lookup('odom', 'lidar', k * S)[0, 3] == k

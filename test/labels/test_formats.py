@@ -105,19 +105,8 @@ def sorted_by_track(frame):
     """Return a frame with its boxes in the fixed frame, sorted by track id."""
     refined = frame.moved('fixed').refined
     order = sorted(range(len(refined.status)), key=lambda i: refined.boxes.track_ids[i])
-    boxes = refined.boxes
-    return LabelFrame(
-        RefinedBoxes(
-            BoxArray(
-                boxes.stamp_ns, boxes.frame_id, tuple(boxes.track_ids[i] for i in order),
-                tuple(boxes.class_names[i] for i in order), boxes.scores[order],
-                boxes.boxes[order],
-            ),
-            tuple(refined.status[i] for i in order), tuple(refined.reasons[i] for i in order),
-            refined.num_points[order], refined.covariances[order],
-        ),
-        frame.fixed_frame, frame.sensor_frame, frame.T_fixed_sensor,
-    )  # fmt: skip
+    places = frame.fixed_frame, frame.sensor_frame, frame.T_fixed_sensor
+    return LabelFrame(refined.take(order), *places)
 
 
 def written(name, folder, frames=None, **options):
@@ -518,18 +507,12 @@ def test_broken_files_raise_an_error_with_the_path(tmp_path, name):
 
 
 @pytest.mark.parametrize('name', READABLE_FORMATS)
-def test_missing_files_raise_an_error_with_the_path(tmp_path, name):
-    require_packages(name)
-    with pytest.raises((RecordingError, ConfigError), match='nowhere'):
-        list(frames_of(name, tmp_path / 'nowhere'))
-
-
-@pytest.mark.parametrize('name', READABLE_FORMATS)
-def test_missing_relative_path_raises_an_error_with_the_path(tmp_path, monkeypatch, name):
+def test_missing_files_raise_an_error_with_the_path(tmp_path, monkeypatch, name):
     require_packages(name)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises((RecordingError, ConfigError), match='nowhere'):
-        list(frames_of(name, Path('nowhere')))
+    for path in (tmp_path / 'nowhere', Path('nowhere')):
+        with pytest.raises((RecordingError, ConfigError), match='nowhere'):
+            list(frames_of(name, path))
 
 
 @pytest.mark.parametrize(

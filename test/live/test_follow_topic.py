@@ -7,17 +7,12 @@ from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.live.topics import import_message
 from boxreg_ros.simulation.scene import FIXED_FRAME
 from boxreg_ros.simulation.simulate import simulate
-from boxreg_ros.simulation.writer import write_recording
 from msg_adapters import vision
 import numpy as np
 from rclpy.serialization import deserialize_message
-from ros_graph import (
-    ended_cleanly,
-    Graph,
-    QUICK,
-    records_of,
-)
+from ros_graph import ended_cleanly, Graph, QUICK, records_of
 from ros_messages import DETECTIONS
+from scenes import write_scene
 
 ACTOR = 3
 """A car that drives past with 170 points and more."""
@@ -41,9 +36,7 @@ def test_one_box_is_followed_until_its_points_are_gone(graph: Graph, tmp_path):
         array.take([row for row, other in enumerate(array.track_ids) if other != name])
         for array in scene.detections
     ]
-    path = tmp_path / 'street.mcap'
-    zeros = [np.zeros(len(sweep.points)) for sweep in sweeps]
-    write_recording(path, sweeps, zeros, detections, scene.T_fixed_sensor, FIXED_FRAME)
+    path = write_scene(tmp_path / 'street.mcap', scene, sweeps=sweeps, detections=detections)
     records = records_of(path, '/detections')
     follow = graph.publisher(DETECTIONS, '/boxreg_node/follow')
     node = graph.run(records, *QUICK, '-r', 'boxes:=/detections')

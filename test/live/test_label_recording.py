@@ -1,6 +1,5 @@
 """The node writes labels while it drives: equal to those of `relabel`, in whole segments."""
 
-import csv
 from importlib.util import find_spec
 import os
 import re
@@ -16,16 +15,9 @@ import orjson
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
-from ros_graph import (
-    DIAGNOSTICS,
-    ended_cleanly,
-    graph_in,
-    play,
-    publishers_for,
-    records_of,
-    RELIABLE,
-)
-from ros_messages import DETECTIONS, Drive, MARKERS, SECOND
+from relabel_results import rows_in
+from ros_graph import ended_cleanly, graph_in, records_of
+from ros_messages import Drive, MARKERS, SECOND
 from std_srvs.srv import Trigger
 
 SETTINGS = {'window': 5, 'lag': 3}
@@ -48,23 +40,16 @@ class Robot:
     def __init__(self, graph, path, **parameters):
         self.graph = graph
         self.records = records_of(path)
-        publishers_for(graph, self.records)
-        self.early = graph.collect(DETECTIONS, '/refined_boxes')
-        self.diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
         parameters = {'transform_timeout': 20.0, 'backlog': 60.0, **SETTINGS, **parameters}
         given = [part for item in parameters.items() for part in ('-p', '{}:={}'.format(*item))]
-        self.node = graph.start(*RELIABLE, *given)
-        graph.wait_until_connected()
+        self.node = graph.run(self.records, *given)
         if 'record_to' in parameters:
             # A drive of a second may end before the recorder has started, and then lacks its end.
-            graph.wait(self._is_recording, 'the recorder')
-
-    def _is_recording(self):
-        return self.diagnostics and float(self.state()[2].get('disk free [GB]', 0)) > 0
+            graph.wait(self.node.is_recording, 'the recorder')
 
     def play(self, records=None):
         """Publish messages, and wait after each box array until it is refined."""
-        play(self.graph, self.records if records is None else records, self.early)
+        self.node.play(self.records if records is None else records)
 
     def call(self, name):
         """Call a service of the node and return its response."""
@@ -80,12 +65,6 @@ class Robot:
     def _request(self, kind, name, request):
         return self.graph.call(kind, f'/boxreg_node/{name}', request)
 
-    def state(self):
-        """Return the newest state of the recording in /diagnostics, as level, text and values."""
-        every = [status for message in self.diagnostics for status in message.status]
-        status = [one for one in every if one.name == '/boxreg_node: recording'][-1]
-        return status.level, status.message, {v.key: v.value for v in status.values}
-
     def stop(self):
         self.node.stop()
         assert self.node.popen.returncode == 0, self.node.output()
@@ -99,8 +78,7 @@ def index_of(folder):
     while not (folder / 'index.csv').is_file() or any(folder.glob('.*')):
         assert time.monotonic() < deadline, 'the recorder did not complete the last segment'
         time.sleep(0.05)
-    with (folder / 'index.csv').open() as file:
-        return list(csv.DictReader(file))
+    return rows_in(folder / 'index.csv')
 
 
 def files_of(folder):
@@ -225,15 +203,15 @@ def test_services_start_split_and_stop_a_recording(tmp_path):
         answer = robot.call('start_recording')
         assert not answer.success
         assert 'file' in answer.message
-        graph.wait(lambda: robot.state()[0] == DiagnosticStatus.ERROR, 'an ERROR')
+        graph.wait(lambda: robot.node.recording()[0] == DiagnosticStatus.ERROR, 'an ERROR')
         robot.set_parameter('record_to', str(folder))
         answer = robot.call('start_recording')
         assert answer.success, answer.message
         assert 'call ~/stop_recording first' in robot.call('start_recording').message
         per_sweep = 3  # transform, cloud, boxes
         robot.play(robot.records[: 1 + 10 * per_sweep])
-        graph.wait(lambda: robot.state()[2].get('frames') == '7', 'final boxes')  # lag 3
-        level, text, values = robot.state()
+        graph.wait(lambda: robot.node.recording()[2].get('frames') == '7', 'final boxes')  # lag 3
+        level, text, values = robot.node.recording()
         assert level == DiagnosticStatus.OK
         assert text.startswith('recording segment_000001, ')
         assert (values['folder'], values['boxes'], values['boxes waiting']) == (
@@ -248,13 +226,12 @@ def test_services_start_split_and_stop_a_recording(tmp_path):
         assert answer.message == f'{folder}: 30 boxes in 2 segments'
         assert [row['frames'] for row in index_of(folder)] == ['7', '8']
         robot.play(robot.records[1 + 15 * per_sweep :])  # not recorded
-        graph.wait(lambda: robot.state()[1] == 'off', 'the end of the recording')
+        graph.wait(lambda: robot.node.recording()[1] == 'off', 'the end of the recording')
         robot.stop()
-    assert len(robot.early) == 20
+    assert len(robot.node.early) == 20
     out = tmp_path / 'out'
     assert main(['relabel', str(path), '--labels', f'openlabel:{folder}', '-o', str(out)]) == 0
-    with (out / 'boxes.csv').open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_in(out / 'boxes.csv')
     assert len(rows) == 30
     assert {row['track_id'] for row in rows} == {'1', '2'}
 
@@ -267,17 +244,17 @@ def test_a_recorder_that_died_is_started_again(tmp_path):
         robot = Robot(graph, path, record_to=folder)
         per_sweep = 3  # transform, cloud, boxes
         robot.play(robot.records[: 1 + 10 * per_sweep])
-        graph.wait(lambda: robot.state()[2].get('frames') == '7', 'final boxes')  # lag 3
+        graph.wait(lambda: robot.node.recording()[2].get('frames') == '7', 'final boxes')  # lag 3
         os.kill(int((folder / '.lock').read_text().split()[0]), signal.SIGKILL)
         graph.wait(lambda: 'recorder_restarted' in robot.node.output(), 'a warning')
         robot.play(robot.records[1 + 10 * per_sweep :])
         answer = robot.call('stop_recording')
         assert answer.success, answer.message
-        assert robot.state()[0] == DiagnosticStatus.OK
+        assert robot.node.recording()[0] == DiagnosticStatus.OK
         robot.stop()
     assert 'exit status -9' in robot.node.output()
     assert 'ERROR' not in robot.node.output()
-    assert len(robot.early) == 20
+    assert len(robot.node.early) == 20
     rows = sorted(index_of(folder), key=lambda row: row['segment'])
     assert [row['recovered'] for row in rows] == ['1', '0']
     # After 3 s of silence the node gives up the boxes that it holds: the kill may meet them.
@@ -299,9 +276,9 @@ def test_two_nodes_another_clock_and_a_killed_node(tmp_path):
         graph.wait(lambda: 'writes to, got one in use' in second.output(), 'an error')
         assert second.output().count('ERROR') == 1
         robot.play()
-        graph.wait(lambda: robot.state()[2].get('frames') == '9', 'final boxes')  # lag 3
+        graph.wait(lambda: robot.node.recording()[2].get('frames') == '9', 'final boxes')  # lag 3
         robot.play(records_of(simulated))
-        graph.wait(lambda: robot.state()[2].get('frames') == '17', 'final boxes')
+        graph.wait(lambda: robot.node.recording()[2].get('frames') == '17', 'final boxes')
         robot.node.kill()
         assert ended_cleanly(second)
     output = robot.node.output()

@@ -6,6 +6,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from preloaded import LIFECYCLE_NODE
 import pytest
 from ros_graph import (
+    DIAGNOSTICS,
     ended_cleanly,
     play,
     publishers_for,
@@ -75,15 +76,18 @@ def test_each_activation_records_its_own_segments(graph, tmp_path):
     early = graph.collect(DETECTIONS, '/refined_boxes')
     folder = tmp_path / 'labels'
     node = graph.start(*RELIABLE, *QUICK, '-p', f'record_to:={folder}', command=COMMAND)
+    node.diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     manager = Manager(graph)
     assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
     for _ in range(2):  # the second begins while the recorder completes the first segment
         assert manager.change(Transition.TRANSITION_ACTIVATE) == (True, 'active')
         graph.wait_until_connected()
+        graph.wait(node.is_recording, 'the recorder')
         play(graph, records, early)
         assert manager.change(Transition.TRANSITION_DEACTIVATE) == (True, 'inactive')
         wait_until_unsubscribed(graph)  # else it counts as connected before it is again
         early.clear()
+        node.diagnostics.clear()
     assert ended_cleanly(node)
     assert 'ERROR' not in node.output()
     # The recorder completes the last segment after its node.

@@ -23,7 +23,6 @@ import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
 from ros_graph import (
-    DIAGNOSTICS,
     ended_cleanly,
     Graph,
     numbers_changed,
@@ -34,7 +33,6 @@ from ros_graph import (
     RELIABLE,
     ROOT,
     stamp_of,
-    values_of,
 )
 from ros_messages import DETECTIONS, Drive, MARKERS, START
 
@@ -62,7 +60,7 @@ def test_odometry_replaces_tf(graph, tmp_path):
     node = graph.run(
         [record for record in records if record.topic != '/boxes'],
         *QUICK,
-        command=('-c', WITHOUT_TF2_MSGS),
+        command=(CODE, WITHOUT_TF2_MSGS),
         kind=MARKERS,
     )
     begun = time.monotonic()
@@ -233,12 +231,10 @@ def test_best_effort_publisher_of_boxes_may_start_after_the_node(graph, tmp_path
 def test_wait_for_transforms_does_not_count_as_backlog(graph, tmp_path):
     # All clouds get their transforms at once and take longer to solve than `backlog`. Boxes
     # arrive before the first cloud, which determines the fixed frame.
-    drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
+    drive, records = thirty_stamps(tmp_path)
     options = ['transform_timeout:=60.0', 'queue:=100', 'backlog:=0.02', 'window:=4', 'lag:=2']
     options += ['solver.rounds:=1']  # on a busy machine, too, less than the wait for transforms
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    node = graph.start(*RELIABLE, *[part for text in options for part in ('-p', text)])
-    graph.wait_until_connected()
+    node = graph.run(records, *[part for text in options for part in ('-p', text)])
     moving = [record for record in records if record.topic == '/tf']
     others = [record for record in records if record.topic != '/tf']
     others.sort(key=lambda record: record.topic)  # boxes before points
@@ -246,18 +242,18 @@ def test_wait_for_transforms_does_not_count_as_backlog(graph, tmp_path):
     waited_from = time.monotonic() + 5.0
 
     def is_waiting():
-        values = values_of(diagnostics)
+        values = node.values()
         received = values.get('points_received'), values.get('boxes_received')
         return received == ('30', '30') and time.monotonic() > waited_from
 
     graph.wait(is_waiting, 'all messages but the transforms')
-    assert not early
+    assert not node.early
     play(graph, moving)
-    values = wait_for_thirty_early_boxes(graph, early)
+    values = wait_for_thirty_early_boxes(graph, node)
     assert int(values['refined']) > 50  # boxes held for `lag` = 2 stamps are not counted yet
     assert not {'points_queue_full', 'boxes_queue_full', 'no_transform'} & values.keys()
     assert ended_cleanly(node)
-    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+    assert [stamp_of(m) for m in node.early] == [stamp_of(m) for m in node.final] == drive.stamps
 
 
 def test_empty_box_array_deletes_the_markers(graph, tmp_path):
@@ -276,21 +272,17 @@ def test_empty_box_array_deletes_the_markers(graph, tmp_path):
     assert ended_cleanly(node)
 
 
-def publish_thirty_stamps(graph, tmp_path):
-    """Return a drive of 30 stamps, its records, and lists that fill with early and final boxes."""
+def thirty_stamps(tmp_path):
+    """Return a drive of 30 stamps, and its records."""
     drive = Drive(sweeps=30)
-    records = records_of(drive.write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    found = (graph.collect(DETECTIONS, f'/refined_boxes{end}') for end in ('', '_final'))
-    return drive, records, *found
+    return drive, records_of(drive.write(tmp_path / 'drive'))
 
 
-def wait_for_thirty_early_boxes(graph, early):
+def wait_for_thirty_early_boxes(graph, node):
     """Wait until all 30 early boxes have arrived and are counted; return the counters."""
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    graph.wait(lambda: len(early) == 30, 'early boxes')
-    graph.wait(lambda: int(values_of(diagnostics).get('early_published', 0)) == 30, 'counters')
-    return values_of(diagnostics)
+    graph.wait(lambda: len(node.early) == 30, 'early boxes')
+    graph.wait(lambda: int(node.values().get('early_published', 0)) == 30, 'counters')
+    return node.values()
 
 
 SLOW_SOLVER = """
@@ -309,87 +301,81 @@ sys.exit(main())
 def test_boxes_that_wait_too_long_are_published_unchanged(graph, tmp_path):
     # Boxes wait ten times the backlog, 0.3 s. Each stamp takes a tenth of a second to solve,
     # while the boxes after it wait.
-    drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
-    node = graph.start(*RELIABLE, '-p', 'backlog:=0.03', command=(CODE, SLOW_SOLVER))
-    graph.wait_until_connected()
+    drive, records = thirty_stamps(tmp_path)
+    node = graph.run(records, '-p', 'backlog:=0.03', command=(CODE, SLOW_SOLVER))
     first = 1 + [record.boxes_stamp_ns for record in records].index(drive.stamps[3])
-    play(graph, records[:first], early)
+    node.play(records[:first])
     play(graph, records[first:])
-    passed = int(wait_for_thirty_early_boxes(graph, early)['boxes_queue_full'])
+    passed = int(wait_for_thirty_early_boxes(graph, node)['boxes_queue_full'])
     assert 0 < passed < 30
     assert 'boxes_queue_full' in node.output()
     assert ended_cleanly(node)
-    assert sorted(map(stamp_of, early)) == sorted(map(stamp_of, final)) == drive.stamps
+    assert sorted(map(stamp_of, node.early)) == sorted(map(stamp_of, node.final)) == drive.stamps
 
 
 def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
-    drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
+    drive, records = thirty_stamps(tmp_path)
     slow = ('-p', 'solver.rounds:=40')
-    node = graph.start(*RELIABLE, *slow, '-p', 'backlog:=0.2')
-    graph.wait_until_connected()
+    node = graph.run(records, *slow, '-p', 'backlog:=0.2')
     play(graph, records)
-    assert int(wait_for_thirty_early_boxes(graph, early)['points_queue_full']) > 5
+    assert int(wait_for_thirty_early_boxes(graph, node)['points_queue_full']) > 5
     assert 'points_queue_full' in node.output()
     assert ended_cleanly(node)
-    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+    assert [stamp_of(m) for m in node.early] == [stamp_of(m) for m in node.final] == drive.stamps
 
 
 def test_boxes_beyond_the_deadline_are_kept_and_no_cloud_is_dropped(graph, tmp_path):
     # Within a deadline of 1 ms one window a stamp is solved; the drive has two tracks.
-    _, records, early, final = publish_thirty_stamps(graph, tmp_path)
-    node = graph.start(*RELIABLE, *QUICK, '-p', 'deadline:=0.001')
-    graph.wait_until_connected()
-    play(graph, records, early)
-    counts = wait_for_thirty_early_boxes(graph, early)
+    _, records = thirty_stamps(tmp_path)
+    node = graph.run(records, *QUICK, '-p', 'deadline:=0.001')
+    node.play(records)
+    counts = wait_for_thirty_early_boxes(graph, node)
     assert not {'points_queue_full', 'boxes_queue_full'} & counts.keys()
     assert ended_cleanly(node)
-    assert numbers_changed(early, records)[2:] == [1] * 28
-    assert numbers_changed(final, records)[1:29] == [2] * 28  # by a window of the next stamp
+    assert numbers_changed(node.early, records)[2:] == [1] * 28
+    assert numbers_changed(node.final, records)[1:29] == [2] * 28  # by a window of the next stamp
 
 
 def test_a_node_without_any_parameter_refines_a_track_at_every_stamp(graph, tmp_path):
     """The default deadline leaves at least one window a stamp, on the slowest machine."""
-    drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
-    node = graph.start()
-    graph.wait_until_connected()
-    play(graph, records, early)
-    counts = wait_for_thirty_early_boxes(graph, early)
+    drive, records = thirty_stamps(tmp_path)
+    node = graph.run(records, base=())
+    node.play(records)
+    counts = wait_for_thirty_early_boxes(graph, node)
     assert 0.0 < float(counts['deadline [ms]']) <= 1000.0
     assert not {'points_queue_full', 'boxes_queue_full'} & counts.keys()
     assert ended_cleanly(node)
-    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
-    assert set(numbers_changed(early, records)[2:]) <= {1, 2}
-    assert numbers_changed(final, records)[1:29] == [2] * 28
+    assert [stamp_of(m) for m in node.early] == [stamp_of(m) for m in node.final] == drive.stamps
+    assert set(numbers_changed(node.early, records)[2:]) <= {1, 2}
+    assert numbers_changed(node.final, records)[1:29] == [2] * 28
 
 
 def test_messages_are_queued_while_the_process_is_suspended(graph, tmp_path):
     """The queue in DDS holds more clouds than the usual depth of sensor data."""
-    drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
+    drive, records = thirty_stamps(tmp_path)
     first = 1 + [record.boxes_stamp_ns for record in records].index(drive.stamps[14])
-    node = graph.start(*RELIABLE, '-p', 'transform_timeout:=20', '-p', 'backlog:=60.0')
-    graph.wait_until_connected()
+    node = graph.run(records, '-p', 'transform_timeout:=20', '-p', 'backlog:=60.0')
     node.popen.send_signal(signal.SIGSTOP)
     play(graph, records[:first])
     node.popen.send_signal(signal.SIGCONT)
-    graph.wait(lambda: len(early) == 15, 'boxes of the first half')
-    play(graph, records[first:], early)
-    counts = wait_for_thirty_early_boxes(graph, early)
+    graph.wait(lambda: len(node.early) == 15, 'boxes of the first half')
+    node.play(records[first:])
+    counts = wait_for_thirty_early_boxes(graph, node)
     assert counts['points_received'] == counts['boxes_received'] == '30'
     assert counts.get('boxes_without_sweep', '0') == '0'
     assert ended_cleanly(node)
-    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+    assert [stamp_of(m) for m in node.early] == [stamp_of(m) for m in node.final] == drive.stamps
 
 
 def test_waiting_boxes_are_published_at_shutdown(graph, tmp_path):
-    drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
+    drive, records = thirty_stamps(tmp_path)
     slow = ('-p', 'solver.rounds:=20', '-p', 'backlog:=60.0')
-    node = graph.start(*RELIABLE, *slow, '-p', 'queue:=100')
-    graph.wait_until_connected()
+    node = graph.run(records, *slow, '-p', 'queue:=100')
     play(graph, records)
-    graph.wait(lambda: len(early) >= 4, 'some boxes')
-    assert len(early) < 20
+    graph.wait(lambda: len(node.early) >= 4, 'some boxes')
+    assert len(node.early) < 20
     assert ended_cleanly(node)
-    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+    assert [stamp_of(m) for m in node.early] == [stamp_of(m) for m in node.final] == drive.stamps
 
 
 def test_busy_solver_delays_neither_diagnostics_nor_shutdown(graph, tmp_path):

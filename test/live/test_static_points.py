@@ -1,17 +1,10 @@
 """Clouds without moving objects, published by the node for a SLAM beside it."""
 
-from boxreg_ros.simulation.scene import FIXED_FRAME
 from boxreg_ros.simulation.simulate import simulate
-from boxreg_ros.simulation.writer import write_recording
 from msg_adapters import pointcloud
 import numpy as np
-from ros_graph import (
-    ended_cleanly,
-    Graph,
-    QUICK,
-    records_of,
-    stamp_of,
-)
+from ros_graph import ended_cleanly, Graph, QUICK, records_of, stamp_of
+from scenes import write_scene
 
 POINTS = 'sensor_msgs/msg/PointCloud2'
 SWEEPS, WITHOUT_BOXES = 10, 2
@@ -21,10 +14,7 @@ STATIC = ('-p', 'static_points:=true', '-p', 'static_points_wait:=3.0')
 def test_static_points(graph: Graph, tmp_path):
     """Moving objects are left out, parked ones stay; clouds without boxes pass unchanged."""
     scene = simulate('street', 0, SWEEPS)
-    path = tmp_path / 'street.mcap'
-    zeros = [np.zeros(len(owner)) for owner in scene.owners]
-    write_recording(path, scene.sweeps, zeros, scene.detections, scene.T_fixed_sensor, FIXED_FRAME)
-    records = records_of(path, '/detections')
+    records = records_of(write_scene(tmp_path / 'street.mcap', scene), '/detections')
     last = [boxes.stamp_ns for boxes in scene.detections[-WITHOUT_BOXES:]]
     records = [record for record in records if record.boxes_stamp_ns not in last]
     static = graph.collect(POINTS, '/static_points')

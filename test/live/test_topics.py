@@ -168,7 +168,7 @@ sys.exit(main())
 
 def test_start_up_line_names_resolved_topics_with_type_and_qos(graph):
     remaps = ('-r', '__ns:=/front', '-r', 'points:=/lidar/points', '-r', '__node:=refiner')
-    node = graph.start(*remaps, '-p', f'boxes_type:={DETECTIONS}', command=('-c', WITH_TF2_ROS))
+    node = graph.start(*remaps, '-p', f'boxes_type:={DETECTIONS}', command=(CODE, WITH_TF2_ROS))
     graph.wait(lambda: 'boxes are' in node.output(), 'the start-up line')
     # The outputs exist before anything is published.
     for topic in ('refined_boxes', 'refined_boxes_final', 'refined_markers'):

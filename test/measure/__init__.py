@@ -29,6 +29,8 @@ MEASUREMENTS = {
     'renew': 'run the command of each stored measurement again, and store its output',
 }
 """Modules of this package, each with `ARGUMENTS` and `run`, and their summaries."""
+RECORDINGS = (Path, 'folder: one recording and truth.csv', {'nargs': '+'})
+"""The argument of those that measure on recordings."""
 METAVARS = {int: 'N', float: 'S', Path: 'DATA'}
 """Of arguments by type, where they state no other."""
 PROGRAM = 'python test/measure'

@@ -5,10 +5,7 @@ Of early, final and track estimates, for every class, along the axes of the true
 
 """
 
-from pathlib import Path
-
 from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES
-from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance
@@ -16,25 +13,21 @@ from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.consistency import consistency
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.structures import REFINED
+from measure import RECORDINGS
 import numpy as np
 
-ARGUMENTS = {
-    'data': (Path, 'folder: one recording and truth.csv', {'nargs': '+'}),
-}
+ARGUMENTS = {'data': RECORDINGS}
 
 
 def run(args):
     """Return coverage and normalised squared errors of each estimate, per recording."""
-    report = {}
-    with progress_bar(len(args.data), args) as bar:
-        for folder in args.data:
-            found = measure(Drive.read(folder))
-            bar.update()
-            report[str(folder)] = {
-                estimate: {name: group._asdict() for name, group in groups.items()}
-                for estimate, groups in found.items()
-            }
-    return report
+    return {
+        str(folder): {
+            estimate: {name: group._asdict() for name, group in groups.items()}
+            for estimate, groups in measure(Drive.read(folder)).items()
+        }
+        for folder in args.data
+    }
 
 
 def measure(drive):

@@ -7,7 +7,6 @@ find out which (`sampling.box_time`).
 
 """
 
-from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.drive import Drive
@@ -30,24 +29,20 @@ ARGUMENTS = {
 def run(args):
     """Return the mean 3D IoU of each method by speed and time of the boxes."""
     results = {}
-    count = len(CONVENTIONS) * len(SPEEDS) * args.seeds
-    with progress_bar(count, args) as bar:
-        for convention in CONVENTIONS:
-            table = {}
-            for speed in SPEEDS:
-                for name, iou in _mean_ious(args, convention, speed, bar.update).items():
-                    table.setdefault(name, {})[f'{speed:g} m/s'] = iou
-            results[convention] = table
+    for convention in CONVENTIONS:
+        table = results.setdefault(convention, {})
+        for speed in SPEEDS:
+            for name, iou in _mean_ious(args, convention, speed).items():
+                table.setdefault(name, {})[f'{speed:g} m/s'] = iou
     return results
 
 
-def _mean_ious(args, convention, speed, done):
-    """Return the mean 3D IoU of each method over all seeds; `done` is called after each seed."""
+def _mean_ious(args, convention, speed):
+    """Return the mean 3D IoU of each method over all seeds."""
     ious = {}
     for seed in range(args.seeds):
         for name, iou in measured(seed, args.sweeps, convention, speed):
             ious.setdefault(name, []).append(iou)
-        done()
     return {name: float(np.mean(values)) for name, values in ious.items()}
 
 

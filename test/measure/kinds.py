@@ -10,7 +10,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES
-from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.bench.differences import Difference, paired, PairedBoxes, REFERENCE_METHODS
 from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.io.box_table import BoxTable
@@ -44,12 +43,10 @@ ARGUMENTS = {
 def run(args):
     """Return the differences of each class: of each recording, or of all streets."""
     measured = {}  # by table; pairs by drive
-    with progress_bar(len(args.data) or args.seeds, args) as bar:
-        for table, name, drive in _drives(args):
-            comparisons = measured.setdefault(table, {})
-            for comparison, pairs in compared(drive):
-                comparisons.setdefault(comparison, {})[name] = pairs
-            bar.update()
+    for table, name, drive in _drives(args):
+        comparisons = measured.setdefault(table, {})
+        for comparison, pairs in compared(drive):
+            comparisons.setdefault(comparison, {})[name] = pairs
     tables = {table: _differences(comparisons) for table, comparisons in measured.items()}
     return _plain(tables)
 

@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 import subprocess
 from tempfile import TemporaryDirectory
-from threading import Thread
 import time
 
 from boxreg_ros.bench.common import BOXREG
@@ -25,7 +24,7 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, REJECTED, YAW
-from browser import end_shared_browser, opened_page
+from browser import end_shared_browser, opened_page, serving
 import numpy as np
 
 STREET = Path(__file__).parents[2] / 'bags'
@@ -235,25 +234,15 @@ def _is_pure(table, rows, matches):
 
 
 class Labeller:
-    """
-    A person at the page, who sees what is wrong and acts by mouse and keys.
-
-    Attributes
-    ----------
-    actions : Counter
-        Keys, clicks and drags.
-    decided : Counter
-        Decisions by the kind of error.
-
-    """
+    """A person at the page, who sees what is wrong and acts by mouse and keys."""
 
     def __init__(self, page, truth):
         self._page = page
         page.set_default_timeout(TIMEOUT)
         self._matches = Matches(truth)
         self._truth = truth
-        self.actions = Counter()
-        self.decided = Counter()
+        self.actions = Counter()  # keys, clicks and drags
+        self.decided = Counter()  # decisions by the kind of error
 
     @property
     def seconds(self):
@@ -523,11 +512,11 @@ class Labeller:
 
 def reviewed(out, truth):
     """Review a result until it is right, write the labels, and return who did it."""
-    server = review_server([(out, drive_of(out))], 0, 'script')
-    Thread(target=server.serve_forever, daemon=True).start()
-    with opened_page(server.address, expected='409') as page:
+    with (
+        serving(review_server([(out, drive_of(out))], 0, 'script')) as server,
+        opened_page(server.address, expected='409') as page,
+    ):
         labeller = Labeller(page, truth)
         labeller.review()
     end_shared_browser()
-    server.shutdown()
     return labeller

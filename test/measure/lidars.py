@@ -10,7 +10,6 @@ is read with and without the names of its LiDARs. The input boxes and the truth 
 from pathlib import Path
 import tempfile
 
-from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
@@ -42,17 +41,16 @@ ARGUMENTS = {
 def run(args):
     """Return the mean IoU of the input and of each way to record the LiDARs."""
     rows = {name: [] for name in ('input', *WAYS)}
-    with progress_bar(args.seeds * len(WAYS), args) as bar:
-        for seed in range(args.seeds):
-            for name, ious in measured(seed, args.sweeps, bar.update).items():
-                rows[name].append(ious)
+    for seed in range(args.seeds):
+        for name, ious in measured(seed, args.sweeps).items():
+            rows[name].append(ious)
     return {
         name: dict(zip(('bev', '3d'), np.mean(ious, axis=0).tolist(), strict=True))
         for name, ious in rows.items()
     }
 
 
-def measured(seed, sweeps, done):
+def measured(seed, sweeps):
     """Return mean BEV and 3D IoU of the input and of each way for one drive."""
     scene = truck_scene(seed, sweeps)
     found = {}
@@ -67,7 +65,6 @@ def measured(seed, sweeps, done):
             request = Request((path,), lidars=lidars, formats=('csv',), config=Config())
             relabel(request, out)
             found[name] = _ious(BoxTable.read(out / 'boxes.csv'), scene.truth)
-            done()
     return found
 
 

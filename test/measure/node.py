@@ -27,6 +27,7 @@ from measure import MEASURE
 from measure.recorded import RecordedLabels
 import numpy as np
 from paths import SHARE
+from ros_messages import Messages, POINTS
 
 PROFILE = SHARE / 'fastdds.xml'
 CIRCLE_PERIOD = 5.0  # time until a car is back where it began [s]
@@ -183,19 +184,12 @@ def _sleep_until(moment_ns):
 
 def _cloud_bytes(points):
     """Return points (M, 3) as a serialised PointCloud2 with x, y, z and intensity."""
-    from rclpy.serialization import serialize_message
-    from sensor_msgs.msg import PointCloud2, PointField
-
-    table = np.zeros((len(points), 4), np.float32)
-    table[:, :3] = points
-    cloud = PointCloud2(height=1, width=len(table), point_step=16, row_step=16 * len(table))
-    cloud.header.frame_id = 'lidar'
-    cloud.fields = [
-        PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1)
-        for i, name in enumerate(('x', 'y', 'z', 'intensity'))
+    messages = Messages()
+    columns = [
+        *zip('xyz', ['f4'] * 3, points.T, strict=True),
+        ('intensity', 'f4', np.zeros(len(points))),
     ]
-    cloud.data.frombytes(table.tobytes())
-    return bytearray(serialize_message(cloud))
+    return bytearray(messages.store.serialize_cdr(messages.cloud(0, 'lidar', columns), POINTS))
 
 
 def _marker_array(boxes):

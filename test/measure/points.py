@@ -24,9 +24,8 @@ from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.point_products import MAP_VOXEL
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.simulate import simulate
-from boxreg_ros.structures import Ints, LENGTH, ROLL
+from boxreg_ros.structures import LENGTH, ROLL
 import numpy as np
-from numpy.typing import NDArray
 
 SCENARIOS = ('street', 'highway')
 METHODS = ('input', 'smoothing only', 'ours, track')
@@ -43,24 +42,12 @@ NOISE = 0.08
 
 
 class Truth(NamedTuple):
-    """
-    What the points of a drive are on.
-
-    Attributes
-    ----------
-    ids, classes : sequence of n str
-        Of the objects.
-    owners : sequence of arrays, shape (M,)
-        Row of the object of each point, for each sweep; -1 for none.
-    moves : sequence of arrays, shape (n + 1,)
-        Whether each object moves, for each sweep; the last is False, that of points on none.
-
-    """
+    """What the points of a drive are on: arrays by sweep, of its M points or of n objects."""
 
     ids: Sequence[str]
     classes: Sequence[str]
-    owners: Sequence[Ints]
-    moves: Sequence[NDArray[np.bool_]]
+    owners: Sequence[np.ndarray]  # row of the object of each point; -1 for none
+    moves: Sequence[np.ndarray]  # whether each object moves; last False, of points on none
 
     @classmethod
     def of_scene(cls, scene):

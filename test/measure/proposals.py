@@ -7,13 +7,13 @@ label an object twice. A proposal that is near no true box is a false alarm.
 
 """
 
-from pathlib import Path
 import time
 
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.offline.completion import points_above_road
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.tracks.proposals import Proposer
+from measure import RECORDINGS
 import numpy as np
 
 PARTS = 3
@@ -22,9 +22,7 @@ OVERLAP = 0.1
 """3D IoU from which a box is of the same object."""
 NEAR = 1.0
 """And distance of the centres, up to which it is [m]."""
-ARGUMENTS = {
-    'data': (Path, 'folder: one recording and truth.csv', {'nargs': '+'}),
-}
+ARGUMENTS = {'data': RECORDINGS}
 
 
 def run(args):

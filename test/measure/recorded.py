@@ -13,19 +13,10 @@ XYZ_BYTES = 12
 
 class RecordedLabels:
     """
-    Count the labels of each whole segment; delete the oldest segments beyond a size.
+    Count the labels of each whole segment; delete the oldest segments beyond a size [bytes].
 
     A robot uploads its segments and deletes them: a long run needs no larger disk than a short
-    one.
-
-    Attributes
-    ----------
-    stamps : set of int
-        Stamps of the box arrays in the segments [ns].
-    cloud_files : int
-        Files with a whole cloud.
-    rows : list of IndexRow
-        The segments that were counted.
+    one. `stamps` are those of the box arrays, `cloud_files` whole clouds, `rows` the segments.
 
     """
 

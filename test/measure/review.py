@@ -9,9 +9,7 @@ each bad track, the one that the list names, is pinned at the true box, as by a 
 
 from dataclasses import replace
 import math
-from pathlib import Path
 
-from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import iou_3d, pose_errors
 from boxreg_ros.core.registrar import BoxRegistrar
@@ -24,6 +22,7 @@ from boxreg_ros.review.decisions import Decision
 from boxreg_ros.review.risk import assess, Usual
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, ROLL, X, YAW, Z
+from measure import RECORDINGS
 import numpy as np
 
 CUTS = (0.01, 0.05, 0.1, 0.2)
@@ -34,21 +33,16 @@ PLANTED_PART = 0.2
 """Part of the tracks that get an error; chosen: enough of each kind of error."""
 PLANTED_ERRORS = ('size', 'yaw', 'shift', 'swap', 'drift')
 SEED = 0
-ARGUMENTS = {
-    'data': (Path, 'folder: one recording and truth.csv', {'nargs': '+'}),
-}
+ARGUMENTS = {'data': RECORDINGS}
 
 
 def run(args):
     """Return the share of bad tracks at the top of each list, per recording and input."""
     report = {}
-    with progress_bar(2 * len(args.data), args) as bar:
-        for folder in args.data:
-            drive = Drive.read(folder)
-            report[str(folder)] = {}
-            for name, given in (('own boxes', drive), ('planted errors', planted(drive))):
-                report[str(folder)][name] = measure(given)
-                bar.update()
+    for folder in args.data:
+        drive = Drive.read(folder)
+        inputs = {'own boxes': drive, 'planted errors': planted(drive)}
+        report[str(folder)] = {name: measure(given) for name, given in inputs.items()}
     return report
 
 

@@ -7,7 +7,6 @@ workers that are lost.
 
 """
 
-from dataclasses import dataclass
 from heapq import heapify, heapreplace
 import json
 import os
@@ -17,6 +16,7 @@ import shutil
 import subprocess
 from tempfile import TemporaryDirectory
 import time
+from typing import NamedTuple
 
 from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.errors import RecordingError
@@ -44,28 +44,13 @@ PRICE = 0.04
 """Price of a core for an hour [USD]; of the order of a list price on demand."""
 
 
-@dataclass(frozen=True, slots=True)
-class Fleet:
-    """
-    Results of a simulated fleet.
+class Fleet(NamedTuple):
+    """Results of a simulated fleet."""
 
-    Attributes
-    ----------
-    hours : float
-        Time until the last job has ended [h].
-    least_hours : float
-        The same without losses, on cores that are never idle [h].
-    used : float
-        Part of the time of the cores in which they run jobs.
-    lost : float
-        Part of the work that is done twice.
-
-    """
-
-    hours: float
-    least_hours: float
-    used: float
-    lost: float
+    hours: float  # until the last job has ended
+    least_hours: float  # the same without losses, on cores that are never idle
+    used: float  # part of the time of the cores in which they run jobs
+    lost: float  # part of the work that is done twice
 
 
 ARGUMENTS = {
@@ -96,7 +81,7 @@ def run(args):
         'core_hours': core_hours,
         'usd_per_core_hour': args.price,
         'usd': core_hours * args.price,
-        **{name: getattr(fleet, name) for name in Fleet.__slots__},
+        **fleet._asdict(),
     }
     return report
 

@@ -13,17 +13,12 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from fnmatch import fnmatch
 from functools import partial
 from multiprocessing import get_context
+from typing import NamedTuple
 
-from boxreg_ros.bench.common import (
-    add_estimate_argument,
-    add_scope_arguments,
-    class_words,
-    progress_bar,
-)
+from boxreg_ros.bench.common import add_estimate_argument, add_scope_arguments, class_words
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method import constants
 from boxreg_ros.errors import ConfigError
@@ -43,48 +38,18 @@ UNLIKE = Config().updated(
 """A configuration that differs from the default one in all that `with_settings` fills."""
 
 
-@dataclass(frozen=True, slots=True)
-class Variation:
-    """
-    One number with another value.
+class Variation(NamedTuple):
+    """One number with another value, within its bounds."""
 
-    Attributes
-    ----------
-    name : str
-        Dotted name of a setting, or that of a constant.
-    factor : float
-        Factor that was asked for: one of `FACTORS`.
-    default, value : int or float
-        The number as it is and as it is for this run, within its bounds.
-    place : pair of str and int, optional
-        Field of a constant, and its place in a tuple; None for settings.
-
-    """
-
-    name: str
-    factor: float
+    name: str  # dotted, of a setting; or that of a constant
+    factor: float  # that was asked for: one of `FACTORS`
     default: float
     value: float
-    place: tuple[str, int] | None = None
+    place: tuple | None = None  # field of a constant, and its place in a tuple
 
 
-@dataclass(frozen=True, slots=True)
-class Measurement:
-    """
-    Settings and scope of a measurement.
-
-    Attributes
-    ----------
-    config : Config
-        The settings that are varied.
-    estimate : str
-        ``early``, ``final`` or ``track``.
-    min_points : int
-        Fewest points of true boxes that count.
-    classes : sequence of str
-        Words of the classes that count, as in `match`.
-
-    """
+class Measurement(NamedTuple):
+    """Settings that are varied, and the scope of the boxes that count, as in `match`."""
 
     config: Config
     estimate: str
@@ -92,8 +57,7 @@ class Measurement:
     classes: Sequence[str]
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(NamedTuple):
     """Mean IoU of a run; NaN and the reason where the run failed."""
 
     iou_bev: float
@@ -101,23 +65,8 @@ class Outcome:
     failure: str = ''
 
 
-@dataclass(frozen=True, slots=True)
-class Loss:
-    """
-    Loss of the mean IoU of all data sets by one variation; negative for a gain.
-
-    Attributes
-    ----------
-    name : str
-        As in `Variation`.
-    factor, default, value : float
-        As in `Variation`.
-    bev, volume : float
-        Loss of mean BEV and 3D IoU; NaN where a run failed.
-    failure : str
-        Why a run failed; '' if all succeeded.
-
-    """
+class Loss(NamedTuple):
+    """Loss of the mean IoU of all data sets by one variation; negative for a gain."""
 
     name: str
     factor: float
@@ -241,14 +190,9 @@ def run_all(drives, measurement, variations, args):
     jobs = [(name, variation) for variation in wanted for name in drives]
     initial = (dict(drives), measurement)
     # Fresh processes: each has the memory of one run, and no threads are copied into it.
-    with (
-        ProcessPoolExecutor(args.workers, get_context('spawn'), _start_worker, initial) as pool,
-        progress_bar(len(jobs), args) as bar,
-    ):
-        outcomes = []
-        for outcome in pool.map(_work, jobs):
-            outcomes.append(outcome)
-            bar.update()
+    context = get_context('spawn')
+    with ProcessPoolExecutor(args.workers, context, _start_worker, initial) as pool:
+        outcomes = list(pool.map(_work, jobs))
     rows = [outcomes[i : i + len(drives)] for i in range(0, len(jobs), len(drives))]
     return dict(zip(drives, rows[0], strict=True)), rows[1:]
 
@@ -274,17 +218,9 @@ def losses(variations, baseline, outcomes):
     found = []
     for variation, row in zip(variations, outcomes, strict=True):
         failures = [outcome.failure for outcome in row if outcome.failure]
-        found.append(
-            Loss(
-                variation.name,
-                variation.factor,
-                variation.default,
-                variation.value,
-                float(bev - np.mean([outcome.iou_bev for outcome in row])),
-                float(volume - np.mean([outcome.iou_3d for outcome in row])),
-                failures[0] if failures else '',
-            )
-        )
+        means = np.mean([outcome[:2] for outcome in row], axis=0)
+        lost = bev - means[0], volume - means[1]
+        found.append(Loss(*variation[:4], *map(float, lost), failures[0] if failures else ''))
     return sorted(found, key=lambda loss: -loss.size)
 
 
@@ -325,8 +261,8 @@ def run(args):
     return {
         'objective': args.objective,
         'estimate': args.estimate,
-        'baseline': {name: asdict(outcome) for name, outcome in baseline.items()},
-        'losses': [asdict(loss) for loss in found],
+        'baseline': {name: outcome._asdict() for name, outcome in baseline.items()},
+        'losses': [loss._asdict() for loss in found],
     }
 
 

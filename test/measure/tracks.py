@@ -7,11 +7,11 @@ first row is a reference: the tracks before they were broken, registered.
 
 """
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 import math
 from pathlib import Path
+from typing import NamedTuple
 
-from boxreg_ros.bench.common import progress_bar
 from boxreg_ros.config import COMPLETE_STEPS, Config, KINDS
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.box_table import BoxTable
@@ -31,27 +31,13 @@ UNBROKEN = 'unbroken, refined'
 """Row of the tracks before they were broken: the boxes that completion has to restore."""
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """
-    Scores after one step.
+class Row(NamedTuple):
+    """Scores after one step."""
 
-    Attributes
-    ----------
-    scores : TrackScores
-        Of the boxes that are not rejected.
-    ghosts, lost : float
-        Rejected part of the ghosts, and of the other boxes of the input; NaN without any.
-    by_kind : dict of str to TrackScores
-        Scores of the boxes of each kind of object; and if some objects of the truth have two
-        labels, those of the `ONE_LABEL` others.
-
-    """
-
-    scores: TrackScores
-    ghosts: float
-    lost: float
-    by_kind: dict[str, TrackScores]
+    scores: TrackScores  # of the boxes that are not rejected
+    ghosts: float  # rejected part of the ghosts; NaN without any
+    lost: float  # rejected part of the other boxes of the input
+    by_kind: dict  # scores of each kind of object, and of objects with `ONE_LABEL`
 
 
 ARGUMENTS = {
@@ -66,20 +52,18 @@ ARGUMENTS = {
 def run(args):
     """Return the scores after each step, by recording."""
     report = {}
-    rows_per_drive = 4 if args.coast else 3 + len(COMPLETE_STEPS)
-    with progress_bar(len(args.data) * rows_per_drive, args) as bar:
-        for folder in args.data:
-            whole = Drive.read(folder)
-            drive = broken(whole, args.seed, args.ghosts, args.far_misses)
-            rows = {}
-            for name, row in _rows(whole, drive, args.coast):
-                rows[name] = asdict(row.scores) | {
-                    'ghosts_rejected': row.ghosts,
-                    'lost': row.lost,
-                    'by_kind': {kind: asdict(scores) for kind, scores in row.by_kind.items()},
-                }
-                bar.update()
-            report[str(folder)] = rows
+    for folder in args.data:
+        whole = Drive.read(folder)
+        drive = broken(whole, args.seed, args.ghosts, args.far_misses)
+        report[str(folder)] = {
+            name: asdict(row.scores)
+            | {
+                'ghosts_rejected': row.ghosts,
+                'lost': row.lost,
+                'by_kind': {kind: asdict(scores) for kind, scores in row.by_kind.items()},
+            }
+            for name, row in _rows(whole, drive, args.coast)
+        }
     return report
 
 

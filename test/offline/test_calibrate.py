@@ -16,11 +16,11 @@ from boxreg_ros.offline.calibrate import (
 )
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.simulate import simulate
-from boxreg_ros.simulation.writer import write_recording
 from boxreg_ros.structures import BoxArray
 import numpy as np
 import pytest
 from ros_messages import Drive as Recorded
+from scenes import write_scene
 from scipy.spatial.transform import Rotation
 import yaml
 
@@ -99,14 +99,7 @@ def test_margins_do_not_depend_on_the_start(scene, plain):
 
 def test_margins_of_few_tracks(scene, plain):
     drive = Drive.from_scene(scene)
-    keep = [i for i, name in enumerate(drive.truth.track_ids) if name in ('9', '10', '11', '12')]
-    few = replace(
-        drive.truth,
-        stamps_ns=drive.truth.stamps_ns[keep], boxes=drive.truth.boxes[keep],
-        scores=drive.truth.scores[keep], num_points=drive.truth.num_points[keep],
-        **{name: tuple(getattr(drive.truth, name)[i] for i in keep)
-           for name in ('track_ids', 'class_names', 'status')},
-    )  # fmt: skip
+    few = drive.truth.rows(np.isin(drive.truth.track_ids, ('9', '10', '11', '12')))
     found = labelling_margins(replace(drive, truth=few), Config())
     assert {found[f'vehicle.{name}'].tracks for name in GAPS} <= {3, 4}
     known = plain['vehicle.gap_bottom'].value
@@ -215,13 +208,8 @@ def test_written_settings():
 @pytest.fixture(scope='module')
 def street(tmp_path_factory, scene):
     folder = tmp_path_factory.mktemp('street')
-    intensities = [np.zeros(len(owner)) for owner in scene.owners]
-    path = folder / 'street.mcap'
-    write_recording(
-        path, scene.sweeps, intensities, scene.detections, scene.T_fixed_sensor, 'odom'
-    )
     drawn(scene.truth).write(folder / 'truth.csv')
-    return path
+    return write_scene(folder / 'street.mcap', scene)
 
 
 def test_relabel_reads_the_written_settings(street, scene, tmp_path, capsys):
@@ -247,11 +235,8 @@ def test_relabel_reads_the_written_settings(street, scene, tmp_path, capsys):
 
 
 def test_margins_of_a_recording_without_boxes(street, scene, tmp_path, capsys):
-    path = tmp_path / 'clouds.mcap'
-    nobody = [replace(a, track_ids=(), class_names=(), scores=a.scores[:0], boxes=a.boxes[:0])
-              for a in scene.detections]  # fmt: skip
-    intensities = [np.zeros(len(owner)) for owner in scene.owners]
-    write_recording(path, scene.sweeps, intensities, nobody, scene.T_fixed_sensor, 'odom')
+    nobody = [array.take([]) for array in scene.detections]
+    path = write_scene(tmp_path / 'clouds.mcap', scene, detections=nobody)
     truth = str(street.with_name('truth.csv'))
     assert cli.main(['calibrate', str(path), '--truth', truth, '--no-boxes']) == 0
     text = capsys.readouterr().out

@@ -34,15 +34,8 @@ def truth_table(count=10):
 
 
 def rows(table, keep):
-    """Return a table with the rows `keep` of another one."""
-    keep = np.asarray(keep)
-    arrays = ('stamps_ns', 'scores', 'boxes', 'num_points')
-    words = ('track_ids', 'class_names', 'status')
-    return replace(
-        table,
-        **{name: getattr(table, name)[keep] for name in arrays},
-        **{name: tuple(getattr(table, name)[i] for i in keep) for name in words},
-    )
+    """Return a table with the rows `keep`, which are sorted, of another one."""
+    return table.rows(np.isin(np.arange(len(table.scores)), keep))
 
 
 def run(*words):
@@ -148,7 +141,7 @@ def test_tables_that_cannot_be_compared_are_refused():
     ):
         match(replace(truth, frame_id='map'), truth)
     with pytest.raises(RecordingError, match="got '1' 2 times at stamp 0"):
-        match(truth, rows(truth, [0, 0]))
+        match(truth, replace(truth, track_ids=('1',) * 20))
     arrays = [
         BoxArray(0, frame, ('1',), ('car',), np.ones(1), np.ones((1, 9))) for frame in ('a', 'b')
     ]

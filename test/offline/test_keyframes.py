@@ -10,7 +10,7 @@ from boxreg_ros.offline.every_sweep import Arrivals, empty_array
 from boxreg_ros.structures import Sweep
 import numpy as np
 import pytest
-from relabel_results import rows_of
+from relabel_results import rows_in, rows_of
 
 SWEEPS = 13
 
@@ -21,8 +21,7 @@ def street(tmp_path_factory):
     folder = tmp_path_factory.mktemp('street')
     words = f'simulate -o {folder}/drive.mcap --truth {folder}/truth.csv --sweeps {SWEEPS}'
     assert main(words.split()) == 0
-    with open(folder / 'truth.csv', newline='') as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_in(folder / 'truth.csv')
     stamps = sorted({int(row['stamp_ns']) for row in rows})
     keys = [row for row in rows if int(row['stamp_ns']) in stamps[1:12:5]]
     write(folder / 'keys.csv', keys)
@@ -65,8 +64,7 @@ def test_keyframes_get_a_box_at_every_sweep(street, tmp_path, capsys):
     assert "seeds of track 'nothing': expected points in their boxes" in printed.err
     assert "track 'late'" in printed.err and 'the nearest is' in printed.err
     rows = rows_of(out)
-    with open(street / 'keys.csv', newline='') as file:
-        given = list(csv.DictReader(file))
+    given = rows_in(street / 'keys.csv')
     for track_id in {row['track_id'] for row in given}:
         stamps = [int(row['stamp_ns']) for row in given if row['track_id'] == track_id]
         of_track = [row for row in rows if row['track_id'] == track_id]
@@ -86,8 +84,7 @@ def test_keyframes_get_a_box_at_every_sweep(street, tmp_path, capsys):
 
 
 def test_bad_keyframes_are_named_in_one_line_each_and_the_rest_is_done(street, tmp_path, capsys):
-    with open(street / 'truth.csv', newline='') as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_in(street / 'truth.csv')
     stamps = sorted({int(row['stamp_ns']) for row in rows})
     at = {(row['track_id'], stamps.index(int(row['stamp_ns']))): row for row in rows}
 
@@ -142,8 +139,7 @@ def test_one_box_of_each_object_is_followed(street, tmp_path):
     words = ['follow', f'{street}/drive.mcap', f'{street}/seeds.csv', '-o', str(out)]
     assert main([*words, '--formats', 'csv']) == 0
     iou = scores(out, street / 'truth.csv')
-    with open(street / 'truth.csv', newline='') as file:
-        true = [row for row in csv.DictReader(file) if int(row['num_points']) >= 30]
+    true = [row for row in rows_in(street / 'truth.csv') if int(row['num_points']) >= 30]
     assert len(iou) > 0.7 * len(true)
     assert (iou > 0.5).mean() > 0.97
     assert main(['follow', f'{street}/drive.mcap', '-o', str(out)]) == 2

@@ -18,9 +18,7 @@ from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
 from boxreg_ros.review.changes import Changes
 from boxreg_ros.simulation.raycast import ROAD
-from boxreg_ros.simulation.scene import FIXED_FRAME
 from boxreg_ros.simulation.simulate import simulate
-from boxreg_ros.simulation.writer import write_recording
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 from consumers import consumer
 from mcap.reader import make_reader
@@ -31,6 +29,7 @@ from relabel_results import QUICK
 from ros_messages import Drive
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
+from scenes import write_scene
 
 SWEEPS = 12
 ALL_CLOUDS = ('static', 'background', 'object')
@@ -43,9 +42,7 @@ def scene():
 
 @pytest.fixture(scope='module')
 def recording(scene, tmp_path_factory):
-    path = tmp_path_factory.mktemp('drive') / 'street.mcap'
-    write_scene(path, scene)
-    return path
+    return write_scene(tmp_path_factory.mktemp('drive') / 'street.mcap', scene)
 
 
 @pytest.fixture(scope='module')
@@ -55,13 +52,6 @@ def results(recording, tmp_path_factory):
     command = ['relabel', str(recording), '-o', str(out), '--formats=csv,mcap', '--label-points']
     assert cli.main([*command, *options, '--undistort']) == 0
     return out
-
-
-def write_scene(path, scene):
-    intensities = [np.zeros(len(owner)) for owner in scene.owners]
-    write_recording(
-        path, scene.sweeps, intensities, scene.detections, scene.T_fixed_sensor, FIXED_FRAME
-    )
 
 
 def true_motion(scene, sweep):

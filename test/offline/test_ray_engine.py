@@ -1,6 +1,5 @@
 """`boxreg batch --engine ray` on a local Ray cluster of two nodes."""
 
-import csv
 import os
 from pathlib import Path
 import signal
@@ -11,6 +10,7 @@ from boxreg_ros.cli import main
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
 import pytest
+from relabel_results import rows_in
 from ros_messages import Drive
 
 pytest.importorskip('ray')
@@ -73,8 +73,7 @@ def test_lost_workers_and_drivers_lose_no_drive(tmp_path, address, preloaded_pyt
     assert main(arguments) == 0
     assert f'{out}: 3 of 3 drives done, {len(done)} of them earlier' in capfd.readouterr().out
     assert all(path.stat().st_mtime_ns == when for path, when in results.items())
-    with (out / 'index.csv').open(newline='') as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_in(out / 'index.csv')
     assert sum(row['status'] == 'up to date' for row in rows) == len(done)
     assert main([*arguments, '--memory=1e6']) == 2  # else it would wait for such a node for ever
     assert '--memory: expected at most ' in capfd.readouterr().err

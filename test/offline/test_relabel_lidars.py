@@ -67,19 +67,6 @@ def test_a_lidar_that_tf_does_not_know_is_counted_and_the_other_goes_on(tmp_path
     assert '6 clouds' in line
 
 
-def test_a_silent_lidar_is_counted(tmp_path, capsys):
-    drive = LidarDrive(6)
-    rear = [item for item in drive.items if item[0] == '/rear']
-    drive.items = [item for item in drive.items if item[0] != '/rear' or item is rear[0]]
-    path = drive.write(tmp_path / 'drive')
-    _, summary = relabelled(path, tmp_path / 'out', *TOPICS)
-    assert summary['lidars'] == {
-        '/front': {'merged': 6},
-        '/rear': {'merged': 1, 'cloud_missing': 5},
-    }
-    assert 'LiDAR /rear: 1 clouds merged, 0 late, 5 missing' in capsys.readouterr().err
-
-
 def test_a_lidar_that_is_a_second_late_is_counted_and_the_other_goes_on(tmp_path, capsys):
     drive = LidarDrive(30)
     late = [

@@ -9,7 +9,6 @@ import random
 import resource
 import shutil
 import subprocess
-import sys
 
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
@@ -224,10 +223,13 @@ def test_a_result_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
     assert events[renamed + 1] == ('sync', state.parent)
 
 
-def test_file_size_limit_is_an_error_and_leaves_nothing(tmp_path, request_of_drive):
+def test_file_size_limit_is_an_error_and_leaves_nothing(
+    tmp_path, request_of_drive, preloaded_python
+):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     code = (
-        f'import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, {limits[1]})); '
+        'import resource, sys, tempfile; tempfile.tempdir = None; '
+        f'resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, {limits[1]})); '
         f'from boxreg_ros.cli import main; sys.exit(main(sys.argv[1:]))'
     )
     out = tmp_path / 'results' / 'out'
@@ -240,9 +242,10 @@ def test_file_size_limit_is_an_error_and_leaves_nothing(tmp_path, request_of_dri
         (recording, 'openlabel,mcap', room),
         (packed, 'csv', f'temporary files in {tmp_path}: expected room for a copy'),
     ):
+        command = [preloaded_python, '-c', code, 'relabel', path, '-o', out, *QUICK]
         ran = subprocess.run(
-            [sys.executable, '-c', code, 'relabel', path, '-o', out, '--formats', formats, *QUICK],
-            capture_output=True, text=True, env={**os.environ, 'TMPDIR': str(tmp_path)},
+            [*command, f'--formats={formats}'], capture_output=True, text=True,
+            env={**os.environ, 'TMPDIR': str(tmp_path)},
         )  # fmt: skip
         assert ran.returncode == 1
         assert ran.stderr.startswith(f'boxreg: {words}')

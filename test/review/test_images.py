@@ -2,14 +2,13 @@
 
 from io import BytesIO
 import shutil
-from threading import Thread
 
 from boxreg_ros.cli import main
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.server import review_server
-from browser import NEEDS_BROWSER, opened_page
+from browser import NEEDS_BROWSER, opened_page, serving
 import numpy as np
 import pytest
 from ros_messages import Drive, SCENE
@@ -94,9 +93,10 @@ def test_boxes_are_shown_in_the_nearest_image_of_the_best_camera(tmp_path):
     recording = drive.write(tmp_path / 'drive')
     assert main(['relabel', str(recording), '-o', str(out), '--report', *QUICK]) == 0
     assert b'image/jpeg' not in (out / 'report.html').read_bytes()
-    server = review_server([(out, drive_of(out))], 0, 'anna')
-    Thread(target=server.serve_forever, daemon=True).start()
-    with opened_page(server.address + '#track=1') as page:
+    with (
+        serving(review_server([(out, drive_of(out))], 0, 'anna')) as server,
+        opened_page(server.address + '#track=1') as page,
+    ):
         for row, image in ((0, 0), (1, 0), (2, 2), (4, 4)):  # 70 ms are nearer than 130
             page.evaluate(f'step({row})')
             page.wait_for_function(f"cameras.shown === '1 ' + view.part.stamps[{row}]")
@@ -136,7 +136,6 @@ def test_boxes_are_shown_in_the_nearest_image_of_the_best_camera(tmp_path):
           const c = document.querySelectorAll('#drive-cameras canvas')[1], [x, y] = c.at([9, 9]);
           return [...c.getContext('2d').getImageData(x, y, 1, 1).data]; })()""")
         assert np.abs(np.subtract(shown, [0, 0, 200, 255])).max() < 6  # bgr8
-    server.shutdown()
 
 
 @NEEDS_BROWSER
@@ -154,9 +153,10 @@ def test_missing_clouds_and_damaged_images_are_said_where_they_are(tmp_path):
             message.encoding = '64FC3'
     shutil.rmtree(tmp_path / 'drive')
     drive.write(tmp_path / 'drive')
-    server = review_server([(out, drive_of(out))], 0, 'anna')
-    Thread(target=server.serve_forever, daemon=True).start()
-    with opened_page(server.address + '#track=1', expected='400') as page:
+    with (
+        serving(review_server([(out, drive_of(out))], 0, 'anna')) as server,
+        opened_page(server.address + '#track=1', expected='400') as page,
+    ):
         page.wait_for_function("$('camera-text').textContent.includes('damaged')")
         page.select_option('#camera-choice', '1')
         page.wait_for_function("$('camera-text').textContent.includes('64FC3')")
@@ -174,7 +174,6 @@ def test_missing_clouds_and_damaged_images_are_said_where_they_are(tmp_path):
         page.locator('#top').focus()
         page.keyboard.press('a')
         page.wait_for_function('log.count === 1')
-    server.shutdown()
 
 
 @pytest.mark.parametrize('encoding', ['protobuf', 'json'])

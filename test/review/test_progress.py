@@ -1,7 +1,6 @@
 """The progress of a review over drives, and the agreement of people."""
 
 import shutil
-from threading import Thread
 
 from boxreg_ros.cli import main
 from boxreg_ros.core.metrics import iou_3d
@@ -9,7 +8,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
 from boxreg_ros.review.progress import progress_of
 from boxreg_ros.review.server import review_server
-from browser import NEEDS_BROWSER, opened_page
+from browser import NEEDS_BROWSER, opened_page, serving
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -96,9 +95,10 @@ def test_progress_counts_decisions_and_the_time_between_them(outs, capsys):
 @NEEDS_BROWSER
 def test_several_drives_are_reviewed_under_one_address(outs):
     decide(outs[0], Decision('1', None, 'accept', who='anna', when=at(0)))
-    server = review_server([(out, None) for out in outs], 0, 'anna')
-    Thread(target=server.serve_forever, daemon=True).start()
-    with opened_page(server.address, ready='#drives') as page:
+    with (
+        serving(review_server([(out, None) for out in outs], 0, 'anna')) as server,
+        opened_page(server.address, ready='#drives') as page,
+    ):
         rows = page.locator('#drives tr').all_inner_texts()
         assert [row.split()[0] for row in rows[1:]] == [str(outs[1]), str(outs[0]), 'all']
         found = pytest.importorskip('axe_playwright_python.sync_playwright').Axe().run(page)
@@ -121,4 +121,3 @@ def test_several_drives_are_reviewed_under_one_address(outs):
         page.wait_for_selector('#drives')
         texts = page.locator('#drives tr').all_inner_texts()
         assert 'anna' in texts[1] and texts[1].split()[1:3] == ['2', '1']
-    server.shutdown()

@@ -2,7 +2,6 @@
 
 import base64
 from collections import Counter
-import csv
 from dataclasses import replace
 from html.parser import HTMLParser
 import json
@@ -30,6 +29,7 @@ from msg_adapters.convention import Convention
 import numpy as np
 from paths import BAGS
 import pytest
+from relabel_results import rows_in
 from ros_messages import Drive, JSK
 from scenes import drive, jittered, PERIOD_NS, START_NS, track_of
 
@@ -107,8 +107,7 @@ def test_numbers_agree_with_the_summary(street):
     rows = page.data['tracks']
     assert sum(row['boxes'] for row in rows) == summary.boxes_in
     assert sum(row['flips'] for row in rows) == summary.heading_flips > 0
-    with open(out / 'review.csv', newline='', encoding='utf-8') as file:
-        review = list(csv.DictReader(file))
+    review = rows_in(out / 'review.csv')
     assert [row['id'] for row in rows] == [row['track_id'] for row in review]
     assert [row['risk'] for row in rows] == [float(row['risk_m']) for row in review]
     assert [row['riskiest'] for row in rows] == [row['stamp_ns'] for row in review]

@@ -25,7 +25,7 @@ from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, RefinedBoxes
-from browser import NEEDS_BROWSER, opened_page
+from browser import NEEDS_BROWSER, opened_page, serving
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -38,13 +38,6 @@ QUICK = ['--set', 'solver.rounds=2', '--set', 'sampling.points=64']
 
 def boxreg(*words):
     return main([str(word) for word in words])
-
-
-def served(out):
-    """Return a server for a result folder, running in a thread, and its address."""
-    server = review_server([(out, None)], 0)
-    Thread(target=server.serve_forever, daemon=True).start()
-    return server, server.address
 
 
 @pytest.fixture(scope='module')
@@ -353,10 +346,11 @@ def test_ended_server_names_the_command_that_applies_its_decisions(
 
 
 def test_busy_port_is_refused(result):
-    server, _ = served(result[1])
-    with pytest.raises(ConfigError, match=r'expected a free one, got .* --port'):
+    with (
+        serving(review_server([(result[1], None)], 0)) as server,
+        pytest.raises(ConfigError, match=r'expected a free one, got .* --port'),
+    ):
         review_server([(result[1], None)], server.server_port)
-    server.shutdown()
 
 
 def opened(server, **headers):
@@ -385,9 +379,8 @@ def row(track_id='1', decision='accept', **more):
 def server(result, tmp_path):
     """Return a running server for a copy of a result."""
     out = shutil.copytree(result[1], tmp_path / 'out')
-    found, _ = served(out)
-    yield found
-    found.shutdown()
+    with serving(review_server([(out, None)], 0)) as found:
+        yield found
 
 
 PIN = {'decision': 'pin', 'stamp_ns': '5'}
@@ -477,20 +470,19 @@ def test_connection_without_a_request_ends(server, monkeypatch):
 
 def test_what_others_have_decided_is_not_overwritten_unseen(server):
     """Another tab, another server on the same folder, and decisions about other tracks."""
-    second, _ = served(server.log_paths[0].parent)
     assert posted(server, {'seen': 0, 'rows': [row('1', who='anna')]})[0] == 200
-    status, text = posted(second, {'seen': 0, 'rows': [row('1', 'reject')]})
-    assert status == 409
-    assert "anna has decided about track '1' meanwhile (accept)" in json.loads(text)['message']
-    assert len(json.loads(text)['rows']) == 1
-    assert posted(second, {'seen': 0, 'rows': [row('2', 'reject', who='ben')]})[0] == 200
-    assert posted(second, {'seen': 2, 'rows': [row('1', 'reject', who='ben')]})[0] == 200
+    with serving(review_server([(server.log_paths[0].parent, None)], 0)) as second:
+        status, text = posted(second, {'seen': 0, 'rows': [row('1', 'reject')]})
+        assert status == 409
+        assert "anna has decided about track '1' meanwhile (accept)" in json.loads(text)['message']
+        assert len(json.loads(text)['rows']) == 1
+        assert posted(second, {'seen': 0, 'rows': [row('2', 'reject', who='ben')]})[0] == 200
+        assert posted(second, {'seen': 2, 'rows': [row('1', 'reject', who='ben')]})[0] == 200
     connection, headers = opened(server)
     connection.request('GET', '/events?seen=1', headers=headers)
     answer = connection.getresponse()
     data = next(line for line in answer if line.startswith(b'data: '))
     connection.close()
-    second.shutdown()
     found = [
         (one['track_id'], one['decision'], one['who']) for one in json.loads(data[6:])['rows']
     ]
@@ -516,7 +508,7 @@ def slowly_served(page, place):
             self.end_headers()
             if self.path == '/':
                 self.wfile.write(page[:place])
-                sleep(3.0)
+                sleep(1.5)
                 self.wfile.write(page[place:])
 
         def log_message(self, *_):
@@ -622,41 +614,37 @@ def test_narrow_page_does_not_overflow(result, scheme):
 
 
 @NEEDS_BROWSER
-def test_pin_and_re_solve_round_trip(result, tmp_path):
-    recording, out = result
-    server, url = served(out)
-    try:
-        with opened_page(url + '#track=1') as page:
-            page.keyboard.press('a')
-            page.wait_for_selector('[data-do=accept][aria-pressed=true]')
-            page.keyboard.press('r')
-            page.wait_for_selector('[data-do=reject][aria-pressed=true]')
-            page.keyboard.press('z')
-            page.wait_for_selector('[data-do=accept][aria-pressed=true]')
-            page.fill('#comment', SCRIPT)
-            page.keyboard.press('Enter')
-            page.wait_for_function('judgementOf(current())?.comment')
-            page.evaluate('step(6)')
-            page.keyboard.press('e')
-            before = page.evaluate('view.edit.slice()')
-            for _ in range(10):
-                page.keyboard.press('l')  # 0.2 m longer
-            bounds = page.locator('#side').bounding_box()
-            middle = bounds['x'] + bounds['width'] / 2, bounds['y'] + bounds['height'] / 2
-            page.mouse.move(*middle)
-            page.mouse.down()
-            page.mouse.move(middle[0], middle[1] - 10, steps=4)  # up
-            page.mouse.up()
-            # A correction that is not saved is not left by mistake.
-            page.fill('#time', '2')
-            page.evaluate('openTrack(1 - view.track)')
-            assert page.evaluate('[view.row, view.edit !== null]') == [6, True]
-            assert 'not saved' in page.inner_text('#failure')
-            page.locator('#top').focus()
-            page.keyboard.press('Enter')
-            page.wait_for_selector('[data-do=unpin]')
-    finally:
-        server.shutdown()
+def test_decisions_and_a_pin_are_made_by_keys_and_the_mouse(server):
+    with opened_page(server.address + '#track=1') as page:
+        page.keyboard.press('a')
+        page.wait_for_selector('[data-do=accept][aria-pressed=true]')
+        page.keyboard.press('r')
+        page.wait_for_selector('[data-do=reject][aria-pressed=true]')
+        page.keyboard.press('z')
+        page.wait_for_selector('[data-do=accept][aria-pressed=true]')
+        page.fill('#comment', SCRIPT)
+        page.keyboard.press('Enter')
+        page.wait_for_function('judgementOf(current())?.comment')
+        page.evaluate('step(6)')
+        page.keyboard.press('e')
+        before = page.evaluate('view.edit.slice()')
+        for _ in range(10):
+            page.keyboard.press('l')  # 0.2 m longer
+        bounds = page.locator('#side').bounding_box()
+        middle = bounds['x'] + bounds['width'] / 2, bounds['y'] + bounds['height'] / 2
+        page.mouse.move(*middle)
+        page.mouse.down()
+        page.mouse.move(middle[0], middle[1] - 10, steps=4)  # up
+        page.mouse.up()
+        # A correction that is not saved is not left by mistake.
+        page.fill('#time', '2')
+        page.evaluate('openTrack(1 - view.track)')
+        assert page.evaluate('[view.row, view.edit !== null]') == [6, True]
+        assert 'not saved' in page.inner_text('#failure')
+        page.locator('#top').focus()
+        page.keyboard.press('Enter')
+        page.wait_for_selector('[data-do=unpin]')
+    out = server.log_paths[0].parent
     with open(out / DECISIONS, newline='', encoding='utf-8') as file:
         assert file.readline() == '# boxreg decisions 2\n'
         rows = list(csv.DictReader(file))
@@ -668,38 +656,24 @@ def test_pin_and_re_solve_round_trip(result, tmp_path):
     row = [i for i, name in enumerate(table.track_ids) if name == '1'][6]
     assert pin.stamp_ns == table.stamps_ns[row]
     assert 0.02 < pin.box[2] - table.boxes[row, 2] < 0.5
-    decisions = tmp_path / DECISIONS
-    (out / DECISIONS).rename(decisions)
-    again = tmp_path / 'again'
-    options = ['-o', again, '--report', '--decisions', decisions, *QUICK]
-    assert boxreg('relabel', recording, *options) == 0
-    corrected = BoxTable.read(again / 'boxes.csv')
-    np.testing.assert_allclose(corrected.boxes[row], pin.box, atol=1e-3)
-    with opened_page((again / 'report.html').as_uri() + f'#track=1&stamp={pin.stamp_ns}') as page:
-        assert 'human' in page.inner_text('#clock')
 
 
 @NEEDS_BROWSER
-def test_a_box_is_decided_about_and_commented_on_beside_its_track(result):
-    server, url = served(result[1])
-    try:
-        with opened_page(url + '#track=1') as page:
-            page.keyboard.press('a')
-            page.wait_for_selector('[data-do=accept][aria-pressed=true]')
-            page.keyboard.press('Shift+U')
-            page.wait_for_selector('[data-do=unsure-box][aria-pressed=true]')
-            page.keyboard.press('Shift+C')
-            page.keyboard.type('hidden')
-            page.keyboard.press('Enter')
-            page.wait_for_function('judgementOfBox()?.comment')
-            assert page.locator('[data-do=accept][aria-pressed=true]').count() == 1
-            selected = page.locator('#rows tr[aria-selected=true] .decision')
-            assert selected.inner_text() == 'accept, 1 box'
-            stamp = int(page.evaluate('view.part.stamps[view.row]'))
-        made = read_decisions(result[1] / DECISIONS)
-    finally:
-        server.shutdown()
-        (result[1] / DECISIONS).unlink()
+def test_a_box_is_decided_about_and_commented_on_beside_its_track(server):
+    with opened_page(server.address + '#track=1') as page:
+        page.keyboard.press('a')
+        page.wait_for_selector('[data-do=accept][aria-pressed=true]')
+        page.keyboard.press('Shift+U')
+        page.wait_for_selector('[data-do=unsure-box][aria-pressed=true]')
+        page.keyboard.press('Shift+C')
+        page.keyboard.type('hidden')
+        page.keyboard.press('Enter')
+        page.wait_for_function('judgementOfBox()?.comment')
+        assert page.locator('[data-do=accept][aria-pressed=true]').count() == 1
+        selected = page.locator('#rows tr[aria-selected=true] .decision')
+        assert selected.inner_text() == 'accept, 1 box'
+        stamp = int(page.evaluate('view.part.stamps[view.row]'))
+    made = read_decisions(server.log_paths[0])
     assert [(one.stamp_ns, one.kind, one.comment) for one in made] == [
         (None, 'accept', ''),
         (stamp, 'unsure', ''),
@@ -708,40 +682,33 @@ def test_a_box_is_decided_about_and_commented_on_beside_its_track(result):
 
 
 @NEEDS_BROWSER
-def test_decisions_can_be_listed_and_undone_from_another_track(result):
-    server, url = served(result[1])
-    try:
-        with opened_page(url + '#tracks') as page:
-            first, second = page.evaluate('DATA.tracks.map(track => track.id)')
-            page.keyboard.press('c')
-            page.keyboard.type('look')
-            page.keyboard.press('Enter')
-            page.wait_for_function('log.held.size === 1')
-            cells = page.locator('#rows .decision')
-            assert cells.all_inner_texts() == ['comment', '']
-            page.select_option('#f-decision', 'open')
-            assert page.inner_text('#f-count') == '1 of 2 tracks, 1 decided'
-            # The list has lost the open track: the next one is that which took its place.
-            page.locator('#top').focus()
-            page.keyboard.press('ArrowDown')
-            page.wait_for_function(f"current().id === '{second}'")
-            page.keyboard.press('z')
-            page.wait_for_function(f"current().id === '{first}'")
-            assert page.evaluate('log.held.size') == 0
-            page.click('#f-clear')
-    finally:
-        server.shutdown()
-        (result[1] / DECISIONS).unlink()
+def test_decisions_can_be_listed_and_undone_from_another_track(server):
+    with opened_page(server.address + '#tracks') as page:
+        first, second = page.evaluate('DATA.tracks.map(track => track.id)')
+        page.keyboard.press('c')
+        page.keyboard.type('look')
+        page.keyboard.press('Enter')
+        page.wait_for_function('log.held.size === 1')
+        cells = page.locator('#rows .decision')
+        assert cells.all_inner_texts() == ['comment', '']
+        page.select_option('#f-decision', 'open')
+        assert page.inner_text('#f-count') == '1 of 2 tracks, 1 decided'
+        # The list has lost the open track: the next one is that which took its place.
+        page.locator('#top').focus()
+        page.keyboard.press('ArrowDown')
+        page.wait_for_function(f"current().id === '{second}'")
+        page.keyboard.press('z')
+        page.wait_for_function(f"current().id === '{first}'")
+        assert page.evaluate('log.held.size') == 0
+        page.click('#f-clear')
 
 
 @NEEDS_BROWSER
-def test_lost_server_is_said_and_nothing_counts_as_saved(result):
-    server, url = served(result[1])
-    with opened_page(url + '#track=1', expected='500') as page:
+def test_lost_server_is_said_and_nothing_counts_as_saved(server):
+    with opened_page(server.address + '#track=1', expected='500') as page:
         page.route('**/decisions', lambda route: route.fulfill(status=500, body='disk full'))
         page.evaluate("judge('accept', false)")
         page.wait_for_selector('#failure:not([hidden])')
         assert 'disk full' in page.inner_text('#failure')
         assert page.evaluate('log.held.size') == 0
         page.unroute('**/decisions')
-    server.shutdown()

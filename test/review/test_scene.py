@@ -5,7 +5,6 @@ from dataclasses import replace
 import math
 import signal
 import subprocess
-from threading import Thread
 
 from boxreg_ros.cli import main
 from boxreg_ros.core.metrics import iou_3d
@@ -17,7 +16,7 @@ from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_d
 from boxreg_ros.review.fit import fitted
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray
-from browser import NEEDS_BROWSER, opened_page
+from browser import NEEDS_BROWSER, opened_page, serving
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -50,17 +49,10 @@ def out(drive, tmp_path):
 @pytest.fixture
 def serve():
     """Return a function that serves a result with its recording, and returns the server."""
-    running = []
-
-    def begin(folder):
-        found = review_server([(folder, drive_of(folder))], 0, 'anna')
-        Thread(target=found.serve_forever, daemon=True).start()
-        running.append(found)
-        return found
-
-    yield begin
-    for one in running:
-        one.shutdown()
+    with ExitStack() as running:
+        yield lambda folder: running.enter_context(
+            serving(review_server([(folder, drive_of(folder))], 0, 'anna'))
+        )
 
 
 def open_scene(page, at):
@@ -126,6 +118,7 @@ def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serv
         page.keyboard.press('Enter')
         page.wait_for_function("view.part.status.filter(one => one === 'human').length === 2")
         assert page.evaluate('view.row') == 0
+        assert 'human' in page.inner_text('#clock')
         page.evaluate('step(5)')
         page.keyboard.press('Shift+D')
         page.wait_for_function('current().deleted === 1')

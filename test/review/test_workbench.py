@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from threading import Thread
 
 from boxreg_ros import Config, refine, Track
 from boxreg_ros.cli import main
@@ -16,7 +15,7 @@ from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
-from browser import NEEDS_BROWSER, opened_page
+from browser import NEEDS_BROWSER, opened_page, serving
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -49,10 +48,8 @@ def made(tmp_path_factory):
 def server(made, tmp_path):
     """Return a running server for a copy of the result."""
     out = shutil.copytree(made / 'out', tmp_path / 'out')
-    found = review_server([(out, drive_of(out))], 0, 'anna')
-    Thread(target=found.serve_forever, daemon=True).start()
-    yield found
-    found.shutdown()
+    with serving(review_server([(out, drive_of(out))], 0, 'anna')) as found:
+        yield found
 
 
 def boxes_of(table, track_id, *columns):
@@ -171,12 +168,12 @@ def test_labels_are_written_with_all_decisions_without_a_terminal(server):
     texts = [path.read_text() for path in sorted((again / 'sustechpoints').rglob('label/*.json'))]
     assert [text.count('"van"') for text in texts] == [0] * 8 + [1] * 6
     # The review goes on in the new folder: the same decisions hold, and are made no second time.
-    second = review_server([(again, None)], 0)
-    Thread(target=second.serve_forever, daemon=True).start()
-    with opened_page(second.address + '#tracks') as page:
+    with (
+        serving(review_server([(again, None)], 0)) as second,
+        opened_page(second.address + '#tracks') as page,
+    ):
         assert sorted(ids_of(page)) == ['1', '1_2', '2']
         assert page.locator('#rows tr.gone').count() == 1
-    second.shutdown()
     assert not list(out.parent.glob('.*partial*'))
 
 

@@ -1,7 +1,6 @@
 """The steps together: from a broken drive to whole tracks, through files."""
 
 from collections import Counter
-import csv
 from dataclasses import replace
 import json
 
@@ -20,7 +19,7 @@ from drives import ALL_STEPS, complete, drive, only, path, steps_of
 from measure.tracks import broken, table_of
 import numpy as np
 import pytest
-from relabel_results import rows_of
+from relabel_results import rows_in, rows_of
 from ros_messages import Drive as Recorded
 
 FORMATS = ('csv', 'openlabel', 'tracklets', 'nuscenes', 'sustechpoints', 'xtreme1')
@@ -192,8 +191,7 @@ def test_every_format_has_added_boxes_and_no_rejected_ones(tmp_path):
     for name in FORMATS[1:]:
         frames = frames_of(name, tmp_path / 'out' / name)
         assert sum(len(frame.refined.status) for frame in frames) == 28, name
-    with (tmp_path / 'out' / 'tracks.csv').open(newline='') as file:
-        tracks = {row['track_id']: row for row in csv.DictReader(file)}
+    tracks = {row['track_id']: row for row in rows_in(tmp_path / 'out' / 'tracks.csv')}
     assert list(tracks['2'])[:6] == [
         'track_id', 'class_name', 'boxes', 'refined', 'kept', 'risk_m',
     ]  # fmt: skip
