@@ -73,3 +73,9 @@ def opened_page(url, expected='', ready='html[data-ready]', **context):
         page.wait_for_selector(ready, timeout=60_000)
         yield page
     assert [line for line in errors if not expected or expected not in line] == []
+
+
+def press(page, key, until, **options):
+    """Press a key, and wait until an expression holds on the page."""
+    page.keyboard.press(key)
+    page.wait_for_function(until, **options)

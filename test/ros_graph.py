@@ -58,9 +58,11 @@ class Graph:
         self.processes.append(process)
         return process
 
-    def run(self, records, *ros_args, kind=DETECTIONS, command=(NODE,), base=RELIABLE):
+    def run(
+        self, records, *ros_args, kind=DETECTIONS, command=(NODE,), base=RELIABLE, connects=True
+    ):
         """
-        Return a node that is connected to publishers of the topics of a recording.
+        Return a node, connected to publishers of the topics of a recording unless told otherwise.
 
         It has the lists ``early``, ``final`` and ``diagnostics``, which fill with its messages.
 
@@ -73,7 +75,8 @@ class Graph:
         ]
         node = self.start(*base, *ros_args, command=command)
         node.early, node.final, node.diagnostics = collected
-        self.wait_until_connected()
+        if connects:
+            self.wait_until_connected()
         return node
 
     def start_player(self, path, boxes_topic='/boxes'):

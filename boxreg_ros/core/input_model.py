@@ -6,7 +6,6 @@ docs/method.md, section Input model, has the formulas.
 """
 
 from collections.abc import Sequence
-from math import sqrt
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config, FaceConfig, KINDS
@@ -36,8 +35,10 @@ from numpy.typing import NDArray
 Inputs = NDArray[np.void]
 FACE_GROUPS = ([0, 1], [2, 3], [4], [5])
 """Faces with one labelling margin: ends, sides, top, bottom."""
-MARGIN_FIELDS = ('margin', 'margin_variance', 'spread', 'occlusion_inset', 'range_inset')
-"""Fields of `INPUTS` that follow from face observations."""
+FIRST_FACES = np.array([faces[0] for faces in FACE_GROUPS])
+"""The first face of each group."""
+GROUP_OF_FACE = np.repeat(np.arange(len(FACE_GROUPS)), [len(faces) for faces in FACE_GROUPS])
+"""The group of each face."""
 QUARTILES_TO_DEVIATION = 0.74
 """Standard deviation over interquartile range. Derived: 1 / 1.349 for a Gaussian."""
 MIDMEAN_FACTOR = 1.2
@@ -52,39 +53,41 @@ GAP_DEVIATIONS = {
 
 class Pooled(NamedTuple):
     """
-    A quantity that differs from track to track: its normal-inverse-chi-squared distribution (M15).
+    Quantities that differ from track to track: normal-inverse-chi-squared distributions (M15).
 
     Attributes
     ----------
-    mean, variance : float
-        Of the mean over all tracks [m], and the variance of this estimate [m^2].
-    between : float
-        Variance between tracks [m^2].
+    mean, variance : array, shape (m,)
+        Of the means over all tracks [m], and the variances of these estimates [m^2].
+    between : array, shape (m,)
+        Variances between tracks [m^2].
 
     """
 
-    mean: float
-    variance: float
-    between: float
+    mean: Floats
+    variance: Floats
+    between: Floats
 
     def given(self, values: Floats, prior_tracks: float) -> 'Pooled':
         """
-        Return the posterior, by one value of each track, robustly.
+        Return the posterior, by the values (n, m) of n tracks, robustly; NaN is left out.
 
         The variance of the prior counts as that of `prior_tracks`.
 
         """
-        n = len(values)
-        if n < MIN_HITS:
-            return self
-        values = np.sort(values)
-        deviation = QUARTILES_TO_DEVIATION * (values[n - 1 - n // 4] - values[n // 4])
-        between = (prior_tracks * self.between + n * deviation**2) / (prior_tracks + n)
+        values = np.sort(values, axis=0)  # NaN comes last
+        n = np.isfinite(values).sum(0)
+        quarter, rank, face = n // 4, np.arange(len(values))[:, None], np.arange(len(n))
+        first, last = values[quarter, face], values[n - 1 - quarter, face]
+        between = prior_tracks * self.between + n * (QUARTILES_TO_DEVIATION * (last - first)) ** 2
+        between /= prior_tracks + n
         information = n / (MIDMEAN_FACTOR * between)
         variance = 1 / (1 / self.variance + information)
-        middle = values[n // 4 : n - n // 4].mean()
+        is_middle = (quarter <= rank) & (rank < n - quarter)
+        middle = np.where(is_middle, values, 0.0).sum(0) / (n - 2 * quarter).clip(1)
         mean = variance * (self.mean / self.variance + information * middle)
-        return Pooled(float(mean), float(variance), float(between))
+        is_known = n >= MIN_HITS
+        return Pooled(*np.where(is_known, (mean, variance, between), self))
 
 
 class InputModel:
@@ -123,7 +126,7 @@ class InputModel:
     ) -> None:
         self.constants = numbers or constants.CONSTANTS
         self._estimates_margins = config.learn
-        self._occlusion_insets = (config.inset_ends, config.inset_sides, 0.0, 0.0)
+        self._occlusion_insets = np.array([config.inset_ends, config.inset_sides, 0.0, 0.0])
         # Of each track of each kind: what it shows, and its last input residuals.
         unknown = np.full((self.constants.max_fits, 9), np.nan)
         self._tracks = [TrackRows(np.zeros((), TRACK), self.constants.max_tracks) for _ in KINDS]
@@ -174,7 +177,7 @@ class InputModel:
         distance, weight = terms['distance'], terms['visibility']
         occluded, distant = np.moveaxis(terms['inset_shares'], 2, 0)
         margin, occlusion_inset, range_inset = (
-            inputs[name][kinds][:, None] for name in ('margin', *MARGIN_FIELDS[3:])
+            inputs[name][kinds][:, None] for name in ('margin', 'occlusion_inset', 'range_inset')
         )
         occluded = occluded * (occlusion_inset > 0)  # the bottom is observed by the road
         is_visible = occluded < numbers.min_share / 2
@@ -259,8 +262,7 @@ class InputModel:
             residuals, kinds = residuals[:0], kinds[:0]
         set_noise(inputs, residuals, kinds, self._past_noise, self.constants)
         inputs['spread'] = 1.0
-        for faces, inset in zip(FACE_GROUPS, self._occlusion_insets, strict=True):
-            inputs['occlusion_inset'][:, faces] = inset
+        inputs['occlusion_inset'] = self._occlusion_insets[GROUP_OF_FACE]
         settings = settings_of_kinds(config)
         of_faces = self.constants.with_settings(config).face_deviations
         for k in range(len(KINDS)):
@@ -288,22 +290,22 @@ class InputModel:
         bias = settings['pose'][:SIZE] * inputs['deviation'][:SIZE] * parts[:SIZE]
         half_extent = settings['extent'] * inputs['extent_error'] * parts[-SIZE:] * extents / 2
         along_axes = settings['gap_spread'] ** 2 + bias**2 + half_extent**2
-        sums, strength = tracks['sums'], self.constants.half_weight
-        margin, variance, spread, occluded, distant = (inputs[name] for name in MARGIN_FIELDS)
-        for faces, deviation, inset in zip(
-            FACE_GROUPS, deviations, self._occlusion_insets, strict=True
-        ):
-            of_face = max(face_deviations[faces[0]], settings['roughness'])
-            prior = Pooled(0.0, deviation**2, along_axes[faces[0] // 2] + of_face**2)
-            gaps = prior.given(_means(sums[:, 0], faces), strength)
-            beyond = sums[:, 2].copy()
-            beyond[:, 0] -= gaps.mean * beyond[:, 1]
-            distant[faces] = prior.given(_means(beyond, faces), strength).mean
-            if self._estimates_margins:
-                margin[faces], variance[faces] = gaps.mean, gaps.variance
-                spread[faces] = sqrt(gaps.between / prior.between)
-                of_insets = prior._replace(mean=inset)
-                occluded[faces] = of_insets.given(_means(sums[:, 1], faces), strength).mean
+        of_face = np.maximum(face_deviations, settings['roughness'])[FIRST_FACES]
+        between = along_axes[FIRST_FACES // 2] + of_face**2
+        prior = Pooled(np.zeros(len(between)), np.square(deviations), between)
+        # Of each track, quantity and group of faces: the sums of value, count and share.
+        sums = np.add.reduceat(tracks['sums'], FIRST_FACES, axis=-1)
+        strength = self.constants.half_weight
+        gaps = prior.given(_means(sums[:, 0]), strength)
+        sums[:, 2, 0] -= gaps.mean * sums[:, 2, 1]
+        inputs['range_inset'] = prior.given(_means(sums[:, 2]), strength).mean[GROUP_OF_FACE]
+        if self._estimates_margins:
+            inputs['margin'] = gaps.mean[GROUP_OF_FACE]
+            inputs['margin_variance'] = gaps.variance[GROUP_OF_FACE]
+            inputs['spread'] = np.sqrt(gaps.between / between)[GROUP_OF_FACE]
+            of_insets = prior._replace(mean=self._occlusion_insets)
+            insets = of_insets.given(_means(sums[:, 1]), strength).mean
+            inputs['occlusion_inset'] = insets[GROUP_OF_FACE]
 
     def add_noise(self, residuals: Floats, kind: Ints) -> None:
         """Add the noise of whole tracks, by their residuals (B, N, 9) (M16)."""
@@ -339,11 +341,12 @@ class InputModel:
         return means
 
 
-def _means(sums: Floats, faces: Sequence[int]) -> Floats:
-    """Return the mean of a quantity over some faces, of each track that shows it (n, 3, 6)."""
-    total, count, share = sums[..., faces].sum(-1).T
-    is_known = count >= MIN_HITS
-    return np.asarray(total[is_known] / share[is_known])
+def _means(sums: Floats) -> Floats:
+    """Return the mean of a quantity, of each track and group of faces; NaN where it is unknown."""
+    total, count, share = np.moveaxis(sums, 1, 0)
+    means = np.full(count.shape, np.nan)
+    np.divide(total, share, out=means, where=count >= MIN_HITS)
+    return means
 
 
 def _of_all_kinds(known: Sequence[TrackRows]) -> tuple[Floats, Ints]:

@@ -491,37 +491,54 @@ def test_margins_of_one_kind_do_not_change_those_of_others():
     np.testing.assert_allclose(offsets_of(model, 'pedestrian')['margin'], -0.1, atol=0.02)
 
 
+def pooled(*of_face):
+    """Return the distribution of the gaps of one face: mean, its variance, that of tracks."""
+    return Pooled(*np.array(of_face)[:, None])
+
+
 def test_gaps_of_many_tracks_give_margin_and_scatter():
     # 800 tracks with margins of 0.04 m scatter by 0.078 m, as is expected: they show the mean to
     # 1.1 * 0.078 / sqrt(800) m. Twice the scatter is found as well.
     gaps = np.random.default_rng(0).normal(0.04, 0.078, 800)
-    found = Pooled(0.0, 0.05**2, 0.078**2).given(gaps, HALF_WEIGHT)
-    np.testing.assert_allclose(found.mean, 0.04, atol=3 * found.variance**0.5)
+    found = pooled(0.0, 0.05**2, 0.078**2).given(gaps[:, None], HALF_WEIGHT)
+    np.testing.assert_allclose(found.mean, 0.04, atol=3 * found.variance.item() ** 0.5)
     np.testing.assert_allclose(found.variance**0.5, 1.1 * 0.078 / 800**0.5, rtol=0.1)
     np.testing.assert_allclose(found.between**0.5, 0.078, rtol=0.1)
-    twice = Pooled(0.0, 0.05**2, 0.078**2).given(2 * gaps, HALF_WEIGHT)
+    twice = pooled(0.0, 0.05**2, 0.078**2).given(2 * gaps[:, None], HALF_WEIGHT)
     np.testing.assert_allclose(twice.between**0.5, 0.156, rtol=0.1)
 
 
 def test_the_posterior_of_gaps_by_hand():
     # Quartiles of 0 and 0.2 m: a deviation of 0.148 m. The prior counts for 14 tracks, these for
     # 8. The mean has precisions of 1 / .05^2 before and of 8 tracks after.
-    found = Pooled(0.02, 0.05**2, 0.1**2).given(np.repeat([0.0, 0.2], 4), HALF_WEIGHT)
+    gaps = np.repeat([[0.0], [0.2]], 4, axis=0)
+    found = pooled(0.02, 0.05**2, 0.1**2).given(gaps, HALF_WEIGHT)
     between = (14 * 0.1**2 + 8 * 0.148**2) / 22
     weight = 8 / 1.2 / between
     np.testing.assert_allclose(found.between, between)
     np.testing.assert_allclose(found.variance, 1 / (400 + weight))
     np.testing.assert_allclose(found.mean, (400 * 0.02 + weight * 0.1) / (400 + weight))
-    prior = Pooled(0.02, 0.05**2, 0.1**2)
-    assert prior.given(np.zeros(2), HALF_WEIGHT) == prior
+    prior = pooled(0.02, 0.05**2, 0.1**2)
+    assert prior.given(np.zeros((2, 1)), HALF_WEIGHT) == prior
+
+
+def test_faces_are_shown_by_different_tracks():
+    # The second face is known of 9 of 20 tracks: as if there were only these.
+    gaps = np.random.default_rng(2).normal(0.0, 0.078, (20, 2))
+    gaps[np.arange(20) % 2 == 0, 1] = gaps[1, 1] = np.nan
+    prior = Pooled(*np.tile([[0.02], [0.05**2], [0.1**2]], 2))
+    alone = pooled(0.02, 0.05**2, 0.1**2)
+    for found, seen in zip(np.transpose(prior.given(gaps, HALF_WEIGHT)), gaps.T, strict=True):
+        known = seen[np.isfinite(seen), None]
+        np.testing.assert_allclose(found, np.ravel(alone.given(known, HALF_WEIGHT)))
 
 
 def test_a_bad_track_costs_little():
     gaps = np.random.default_rng(1).normal(0.0, 0.078, 30)
-    prior = Pooled(0.0, 0.05**2, 0.078**2)
-    known = prior.given(gaps, HALF_WEIGHT)
+    prior = pooled(0.0, 0.05**2, 0.078**2)
+    known = prior.given(gaps[:, None], HALF_WEIGHT)
     gaps[0] = 0.5
-    spoilt = prior.given(gaps, HALF_WEIGHT)
+    spoilt = prior.given(gaps[:, None], HALF_WEIGHT)
     assert abs(spoilt.mean - known.mean) < 0.008
     assert abs(spoilt.between / known.between - 1) < 0.2
 

@@ -5,17 +5,8 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from preloaded import LIFECYCLE_NODE
 import pytest
-from ros_graph import (
-    DIAGNOSTICS,
-    ended_cleanly,
-    play,
-    publishers_for,
-    QUICK,
-    records_of,
-    RELIABLE,
-    stamp_of,
-)
-from ros_messages import DETECTIONS, Drive
+from ros_graph import ended_cleanly, QUICK, records_of, stamp_of
+from ros_messages import Drive
 
 COMMAND = (LIFECYCLE_NODE,)
 NODE = '/boxreg_node'
@@ -46,25 +37,24 @@ def wait_until_unsubscribed(graph):
 def test_boxes_are_refined_while_the_node_is_active(graph, tmp_path):
     drive = Drive(sweeps=10)
     records = records_of(drive.write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    final = graph.collect(DETECTIONS, '/refined_boxes_final')
-    node = graph.start(*RELIABLE, *QUICK, command=COMMAND)
+    node = graph.run(records, *QUICK, command=COMMAND, connects=False)
     manager = Manager(graph)
     assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
     assert not any(p.get_subscription_count() for p in graph.publishers.values())
     for _ in range(2):  # the second time all is forgotten: the same stamps are no time jump
         assert manager.change(Transition.TRANSITION_ACTIVATE) == (True, 'active')
         graph.wait_until_connected()
-        play(graph, records, early)
+        node.play(records)
         assert manager.change(Transition.TRANSITION_DEACTIVATE) == (True, 'inactive')
-        graph.wait(lambda: len(final) == 10, 'the final boxes that the node held')
-        assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+        graph.wait(lambda: len(node.final) == 10, 'the final boxes that the node held')
+        assert (
+            [stamp_of(m) for m in node.early] == [stamp_of(m) for m in node.final] == drive.stamps
+        )
         wait_until_unsubscribed(graph)
         assert manager.change(Transition.TRANSITION_CLEANUP) == (True, 'unconfigured')
         assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
-        early.clear()
-        final.clear()
+        node.early.clear()
+        node.final.clear()
     assert manager.change(Transition.TRANSITION_INACTIVE_SHUTDOWN) == (True, 'finalized')
     assert 'time_jump' not in node.output()
     assert ended_cleanly(node)
@@ -72,21 +62,20 @@ def test_boxes_are_refined_while_the_node_is_active(graph, tmp_path):
 
 def test_each_activation_records_its_own_segments(graph, tmp_path):
     records = records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
     folder = tmp_path / 'labels'
-    node = graph.start(*RELIABLE, *QUICK, '-p', f'record_to:={folder}', command=COMMAND)
-    node.diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.run(
+        records, *QUICK, '-p', f'record_to:={folder}', command=COMMAND, connects=False
+    )
     manager = Manager(graph)
     assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
     for _ in range(2):  # the second begins while the recorder completes the first segment
         assert manager.change(Transition.TRANSITION_ACTIVATE) == (True, 'active')
         graph.wait_until_connected()
         graph.wait(node.is_recording, 'the recorder')
-        play(graph, records, early)
+        node.play(records)
         assert manager.change(Transition.TRANSITION_DEACTIVATE) == (True, 'inactive')
         wait_until_unsubscribed(graph)  # else it counts as connected before it is again
-        early.clear()
+        node.early.clear()
         node.diagnostics.clear()
     assert ended_cleanly(node)
     assert 'ERROR' not in node.output()

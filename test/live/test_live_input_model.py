@@ -2,17 +2,7 @@
 
 from boxreg_ros.core.input_statistics import from_text
 from paths import BAGS
-from ros_graph import (
-    ended_cleanly,
-    first_sweeps,
-    graph_in,
-    play,
-    publishers_for,
-    QUICK,
-    records_of,
-    RELIABLE,
-)
-from ros_messages import DETECTIONS
+from ros_graph import ended_cleanly, first_sweeps, graph_in, QUICK, records_of
 
 SWEEPS = 12
 
@@ -22,13 +12,9 @@ def test_a_drive_is_added_to_the_file_of_the_drives_before(tmp_path):
     records = first_sweeps(records_of(BAGS / 'street.mcap', '/detections'), SWEEPS)
     for part, number in ((records, 1), (records[: len(records) // 2], 2)):
         with graph_in(tmp_path) as graph:
-            publishers_for(graph, part)
-            early = graph.collect(DETECTIONS, '/refined_boxes')
-            node = graph.start(
-                *RELIABLE, *QUICK, '-r', 'boxes:=/detections', '-p', f'input_model:={model}'
-            )
-            graph.wait_until_connected()
-            play(graph, part, early)
+            options = ('-r', 'boxes:=/detections', '-p', f'input_model:={model}')
+            node = graph.run(part, *QUICK, *options)
+            node.play(part)
             ended_cleanly(node)
         drives = from_text(model.read_text(), str(model))
         assert len(drives) == number

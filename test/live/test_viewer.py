@@ -12,16 +12,7 @@ from paths import BAGS, SHARE
 import pytest
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
-from ros_graph import (
-    DIAGNOSTICS,
-    first_sweeps,
-    graph_in,
-    play,
-    publishers_for,
-    QUICK,
-    Record,
-    records_of,
-)
+from ros_graph import DIAGNOSTICS, first_sweeps, graph_in, QUICK, Record, records_of
 from ros_messages import DETECTIONS, MARKERS, POINTS, TF, typestore
 from rosbags.rosbag2 import StoragePlugin, Writer
 import yaml
@@ -53,19 +44,16 @@ def run(tmp_path_factory):
     records = first_sweeps(records_of(BAGS / 'street.mcap', '/detections'), SWEEPS)
     taken = []
     with graph_in(folder) as graph:
-        publishers_for(graph, records)
-        early = graph.collect(DETECTIONS, '/refined_boxes')
         for topic in OUTPUTS:
             record_topic(graph, topic, taken)
-        graph.start(
-            *QUICK, '-p', SHORT, '-p', f'record_to:={folder / "labels"}',
+        node = graph.run(
+            records, *QUICK, '-p', SHORT, '-p', f'record_to:={folder / "labels"}',
             '-p', 'transform_timeout:=20.0', '-r', 'boxes:=detections',
-            '-p', 'qos_overrides./points.subscription.reliability:=reliable',
+            '-p', 'qos_overrides./points.subscription.reliability:=reliable', base=(),
         )  # fmt: skip
-        graph.wait_until_connected()
         for topic in INPUTS:  # until now, the subscribers of its topics were those of the node
             record_topic(graph, topic, taken)
-        play(graph, records, early)
+        node.play(records)
         graph.wait(lambda: is_complete(taken), 'markers of all boxes and of the recording')
         published = {topic for topic, _ in graph.node.get_topic_names_and_types()}
     return Run(write(folder / 'bag', taken), taken, published)

@@ -8,7 +8,7 @@ from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.server import review_server
-from browser import NEEDS_BROWSER, opened_page, serving
+from browser import NEEDS_BROWSER, opened_page, press, serving
 import numpy as np
 import pytest
 from ros_messages import Drive, SCENE
@@ -172,8 +172,7 @@ def test_missing_clouds_and_damaged_images_are_said_where_they_are(tmp_path):
         assert '64FC3' in page.inner_text('#drive-cameras')
         page.click('#tab-tracks')
         page.locator('#top').focus()
-        page.keyboard.press('a')
-        page.wait_for_function('log.count === 1')
+        press(page, 'a', 'log.count === 1')
 
 
 @pytest.mark.parametrize('encoding', ['protobuf', 'json'])

@@ -7,6 +7,7 @@ from boxreg_ros.labels import Provenance, writer_for
 from boxreg_ros.offline.relabel import relabel, Request
 from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
+from mcap_files import add_messages
 from msg_adapters import adapter_for
 import numpy as np
 import pytest
@@ -158,18 +159,7 @@ def test_attachments_metadata_and_sequence_numbers_are_copied(tmp_path):
     path = tmp_path / 'rich.mcap'
     writer = McapWriter(str(path))
     writer.start('ros2')
-    with plain.open('rb') as file:
-        channels = {}
-        for schema, channel, message in make_reader(file).iter_messages():
-            if channel.topic not in channels:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.topic] = writer.register_channel(
-                    channel.topic, channel.message_encoding, number, channel.metadata
-                )
-            writer.add_message(
-                channels[channel.topic], message.log_time, message.data,
-                message.publish_time - 5, 42,
-            )  # fmt: skip
+    add_messages(writer, plain, early_ns=5, sequence=42)
     writer.add_attachment(1, 2, 'calibration.json', 'application/json', b'{}')
     writer.add_metadata('weather', {'rain': 'no'})
     writer.finish()

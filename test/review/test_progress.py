@@ -8,7 +8,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
 from boxreg_ros.review.progress import progress_of
 from boxreg_ros.review.server import review_server
-from browser import NEEDS_BROWSER, opened_page, serving
+from browser import NEEDS_BROWSER, opened_page, press, serving
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -114,8 +114,7 @@ def test_several_drives_are_reviewed_under_one_address(outs):
         other.click('#drives a')
         other.wait_for_selector('html[data-ready]')
         assert other.evaluate("notePage('')") == [taken]
-        page.keyboard.press('a')
-        page.wait_for_function('log.count === 1')
+        press(page, 'a', 'log.count === 1')
         page.wait_for_function('location.pathname === "/1/"')
         page.click('#all-drives')
         page.wait_for_selector('#drives')

@@ -25,7 +25,7 @@ from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, RefinedBoxes
-from browser import NEEDS_BROWSER, opened_page, serving
+from browser import NEEDS_BROWSER, opened_page, press, serving
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -576,8 +576,7 @@ def test_slider_keys_and_links_step_through_a_track(result):
         assert page.evaluate("document.getElementById('top').toDataURL()") != before
         page.wait_for_function("location.hash.includes('stamp=') && view.space && view.charts")
         page.keyboard.press('ArrowDown')
-        page.keyboard.press('ArrowUp')
-        page.wait_for_function('view.part !== null')
+        press(page, 'ArrowUp', 'view.part !== null')
         for mode in ('after', 'before', 'sweep'):
             page.keyboard.press('m')
             assert page.input_value('#mode') == mode
@@ -623,8 +622,7 @@ def test_decisions_and_a_pin_are_made_by_keys_and_the_mouse(server):
         page.keyboard.press('z')
         page.wait_for_selector('[data-do=accept][aria-pressed=true]')
         page.fill('#comment', SCRIPT)
-        page.keyboard.press('Enter')
-        page.wait_for_function('judgementOf(current())?.comment')
+        press(page, 'Enter', 'judgementOf(current())?.comment')
         page.evaluate('step(6)')
         page.keyboard.press('e')
         before = page.evaluate('view.edit.slice()')
@@ -667,8 +665,7 @@ def test_a_box_is_decided_about_and_commented_on_beside_its_track(server):
         page.wait_for_selector('[data-do=unsure-box][aria-pressed=true]')
         page.keyboard.press('Shift+C')
         page.keyboard.type('hidden')
-        page.keyboard.press('Enter')
-        page.wait_for_function('judgementOfBox()?.comment')
+        press(page, 'Enter', 'judgementOfBox()?.comment')
         assert page.locator('[data-do=accept][aria-pressed=true]').count() == 1
         selected = page.locator('#rows tr[aria-selected=true] .decision')
         assert selected.inner_text() == 'accept, 1 box'
@@ -687,18 +684,15 @@ def test_decisions_can_be_listed_and_undone_from_another_track(server):
         first, second = page.evaluate('DATA.tracks.map(track => track.id)')
         page.keyboard.press('c')
         page.keyboard.type('look')
-        page.keyboard.press('Enter')
-        page.wait_for_function('log.held.size === 1')
+        press(page, 'Enter', 'log.held.size === 1')
         cells = page.locator('#rows .decision')
         assert cells.all_inner_texts() == ['comment', '']
         page.select_option('#f-decision', 'open')
         assert page.inner_text('#f-count') == '1 of 2 tracks, 1 decided'
         # The list has lost the open track: the next one is that which took its place.
         page.locator('#top').focus()
-        page.keyboard.press('ArrowDown')
-        page.wait_for_function(f"current().id === '{second}'")
-        page.keyboard.press('z')
-        page.wait_for_function(f"current().id === '{first}'")
+        press(page, 'ArrowDown', f"current().id === '{second}'")
+        press(page, 'z', f"current().id === '{first}'")
         assert page.evaluate('log.held.size') == 0
         page.click('#f-clear')
 

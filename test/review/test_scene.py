@@ -16,7 +16,7 @@ from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_d
 from boxreg_ros.review.fit import fitted
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray
-from browser import NEEDS_BROWSER, opened_page, serving
+from browser import NEEDS_BROWSER, opened_page, press, serving
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -78,8 +78,7 @@ def add_car(page, drive):
     page.select_option('#scene-class', 'car')
     page.wait_for_function("scene.fit.class === 'car'")
     page.locator('#scene-view').focus()
-    page.keyboard.press('Enter')
-    page.wait_for_function("!$('tracks').hidden && current()?.id === '2'", timeout=60_000)
+    press(page, 'Enter', "!$('tracks').hidden && current()?.id === '2'", timeout=60_000)
 
 
 def stamps_of(table, track_id):
@@ -107,25 +106,21 @@ def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serv
         assert (seed.kind, seed.track_id, seed.value, seed.who) == ('add', '2', 'car', 'anna')
         assert seed.stamp_ns == drive.stamps[7]
         # Undone, and added again.
-        page.keyboard.press('z')
-        page.wait_for_function('TRACKS.length === 1')
+        press(page, 'z', 'TRACKS.length === 1')
         assert read_decisions(out / DECISIONS)[-1].kind == 'withdraw'
         add_car(page, drive)
         # A correction is a second box that it is followed from.
         page.keyboard.press('Home')
         page.keyboard.press('e')
         page.keyboard.press('Shift+ArrowRight')
-        page.keyboard.press('Enter')
-        page.wait_for_function("view.part.status.filter(one => one === 'human').length === 2")
+        press(page, 'Enter', "view.part.status.filter(one => one === 'human').length === 2")
         assert page.evaluate('view.row') == 0
         assert 'human' in page.inner_text('#clock')
         page.evaluate('step(5)')
-        page.keyboard.press('Shift+D')
-        page.wait_for_function('current().deleted === 1')
+        press(page, 'Shift+D', 'current().deleted === 1')
         page.keyboard.press('k')
         page.fill('#ask-text', 'van')
-        page.keyboard.press('Enter')
-        page.wait_for_function("current().class === 'van'")
+        press(page, 'Enter', "current().class === 'van'")
         page.keyboard.press('r')
         assert 'no input to keep' in page.inner_text('#failure')
         # The page opened again follows it again.
@@ -135,8 +130,7 @@ def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serv
             ['1', 'car'],
             ['2', 'van'],
         ]
-        page.keyboard.press('Control+s')
-        page.wait_for_function("$('notice').textContent.includes('boxes in')", timeout=120_000)
+        press(page, 'Control+s', "$('notice').textContent.includes('boxes in')", timeout=120_000)
     again = out.with_name('out.corrected')
     table = BoxTable.read(again / 'boxes.csv')
     rows = [row for row, name in enumerate(table.track_ids) if name == '2']
@@ -160,8 +154,7 @@ def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serv
         page.evaluate('step(11)')
         page.keyboard.press('e')
         page.keyboard.press('PageUp')
-        page.keyboard.press('Enter')
-        page.wait_for_function("view.part.status.filter(one => one === 'human').length === 3")
+        press(page, 'Enter', "view.part.status.filter(one => one === 'human').length === 3")
     assert read_decisions(again / DECISIONS)[-1].kind == 'add'
 
 
@@ -225,12 +218,10 @@ def test_a_drive_without_boxes_is_labelled_from_its_recording_alone(tmp_path, pr
             click_on_points(page, parked)
             offered = np.array(page.evaluate('scene.fit.box'))
             assert np.linalg.norm(offered[:2] - parked[:2]) < 1.5
-            page.keyboard.press('Enter')
-            page.wait_for_function("!$('tracks').hidden && current()?.id === '1'")
+            press(page, 'Enter', "!$('tracks').hidden && current()?.id === '1'")
             # From a track, at its sweep.
             page.wait_for_function('view.row === 4')
-            page.keyboard.press('i')
-            page.wait_for_function('scene.isAdding && scene.sweep.stamp === DATA.stamps[4]')
+            press(page, 'i', 'scene.isAdding && scene.sweep.stamp === DATA.stamps[4]')
             click_on_points(page, moving)
             page.select_option('#scene-class', 'car')
             page.wait_for_function("scene.fit?.class === 'car'")
@@ -254,10 +245,8 @@ def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, out, serve):
         open_scene(page, 3)
         # All points of the sweep: those of both cars, one of which has no box.
         assert page.evaluate('[scene.sweep.points.length, scene.boxes.length]') == [720, 1]
-        page.keyboard.press(' ')
-        page.wait_for_function(f'scene.at === {NUM_SWEEPS - 1} && !scene.isPlaying')
-        page.keyboard.press('Home')
-        page.wait_for_function('scene.at === 0 && scene.sweep.stamp === DATA.stamps[0]')
+        press(page, ' ', f'scene.at === {NUM_SWEEPS - 1} && !scene.isPlaying')
+        press(page, 'Home', 'scene.at === 0 && scene.sweep.stamp === DATA.stamps[0]')
         box = drive.truth[drive.stamps[0]][0]
         click_at(page, box[0], box[1])
         page.wait_for_function("!$('tracks').hidden && view.cloud")
@@ -277,10 +266,8 @@ def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, out, serve):
         open_scene(page, 0)
         assert page.inner_text('#scene-proposals option') == '1 proposed'
         page.locator('#scene-view').focus()
-        page.keyboard.press('p')
-        page.wait_for_function('scene.fit')
-        page.keyboard.press('Enter')
-        page.wait_for_function("!$('tracks').hidden && current()?.class === 'van'", timeout=60_000)
+        press(page, 'p', 'scene.fit')
+        press(page, 'Enter', "!$('tracks').hidden && current()?.class === 'van'", timeout=60_000)
         assert page.evaluate('[view.row, openProposals().length]') == [6, 0]
     (out / DECISIONS).unlink()
     narrow = {'viewport': {'width': 390, 'height': 844}, 'color_scheme': 'dark'}
@@ -296,8 +283,7 @@ def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, out, serve):
         text = page.inner_text('#failure')
         assert str(recording) in text and 'Put the recording back' in text
         page.click('#tab-tracks')
-        page.keyboard.press('a')
-        page.wait_for_function('log.count === 1')
+        press(page, 'a', 'log.count === 1')
 
 
 def test_a_run_follows_added_objects_beside_its_other_steps(drive, tmp_path, capsys):

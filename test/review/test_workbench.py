@@ -15,7 +15,7 @@ from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
-from browser import NEEDS_BROWSER, opened_page, serving
+from browser import NEEDS_BROWSER, opened_page, press, serving
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -80,8 +80,7 @@ def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
         assert sorted(ids_of(page)) == ['1', '2']
         lengths = 'TRACKS.map(track => track.path.length).sort((a, b) => a - b)'
         open_track(page, '1', 8)
-        page.keyboard.press('s')
-        page.wait_for_function('TRACKS.length === 3')
+        press(page, 's', 'TRACKS.length === 3')
         assert sorted(ids_of(page)) == ['1', '1_2', '2']
         page.wait_for_function("current().id === '1_2'")
         assert page.evaluate(lengths) == [6, 8, 14]
@@ -97,8 +96,7 @@ def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
         open_track(page, '1', 2)
         page.keyboard.press('b')
         page.evaluate('step(4)')
-        page.keyboard.press('Shift+D')
-        page.wait_for_function('current().deleted === 3')
+        press(page, 'Shift+D', 'current().deleted === 3')
         assert page.evaluate('view.mark') is None
         page.evaluate('step(3)')
         page.click(DO.format('delete-box'))
@@ -107,12 +105,10 @@ def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
         # All is undone, in steps, and done again.
         page.wait_for_function('log.made.length === 5')
         for count, deleted in ((4, 3), (3, 0)):
-            page.keyboard.press('z')
-            page.wait_for_function(f'log.made.length === {count}')
+            press(page, 'z', f'log.made.length === {count}')
             assert page.evaluate('current().deleted') == deleted
         for count in (2, 1, 0):
-            page.keyboard.press('z')
-            page.wait_for_function(f'log.made.length === {count}')
+            press(page, 'z', f'log.made.length === {count}')
         page.wait_for_function('TRACKS.length === 2 && log.held.size === 0')
         open_track(page, '1', 8)
         page.click(DO.format('split'))
@@ -123,10 +119,8 @@ def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
         page.wait_for_selector('#ask[open]')
         proposed = page.locator('#ask-proposals button').first.inner_text()
         assert proposed == '1_2 car: 0.1 s and 0.0 m apart'
-        page.keyboard.press('Enter')
-        page.wait_for_function('TRACKS.length === 2')
-        page.keyboard.press('z')
-        page.wait_for_function('TRACKS.length === 3')
+        press(page, 'Enter', 'TRACKS.length === 2')
+        press(page, 'z', 'TRACKS.length === 3')
         assert sorted(ids_of(page)) == ['1', '1_2', '2']
 
 
@@ -136,20 +130,16 @@ def test_labels_are_written_with_all_decisions_without_a_terminal(server):
     stamps = [stamp for (stamp,) in boxes_of(before, '1', 'stamps_ns')]
     with opened_page(server.address + '#track=1') as page:
         open_track(page, '1', 8)
-        page.keyboard.press('s')
-        page.wait_for_function("current().id === '1_2'")
+        press(page, 's', "current().id === '1_2'")
         page.keyboard.press('k')
         answer(page, 'van')
         page.wait_for_function("current().class === 'van'")
         open_track(page, '1', 3)
-        page.keyboard.press('Shift+D')
-        page.wait_for_function('current().deleted === 1')
+        press(page, 'Shift+D', 'current().deleted === 1')
         open_track(page, '2', 0)
-        page.keyboard.press('d')
-        page.wait_for_function('isGone(current())')
+        press(page, 'd', 'isGone(current())')
         assert page.locator('#rows tr.gone').count() == 1
-        page.keyboard.press('Control+s')
-        page.wait_for_function("$('notice').textContent.includes('boxes in')", timeout=120_000)
+        press(page, 'Control+s', "$('notice').textContent.includes('boxes in')", timeout=120_000)
         assert page.locator('#failure').is_hidden()
     again = out.with_name('out.corrected')
     table = BoxTable.read(again / 'boxes.csv')
@@ -183,8 +173,7 @@ def test_labels_that_cannot_be_written_leave_all_as_it_was(server, made):
     (made / 'drive').rename(hidden)
     try:
         with opened_page(server.address + '#track=1', expected='400') as page:
-            page.keyboard.press('d')
-            page.wait_for_function('isGone(current())')
+            press(page, 'd', 'isGone(current())')
             page.click('#save-button')
             page.wait_for_selector('#failure:not([hidden])', timeout=120_000)
             text = page.inner_text('#failure')
@@ -219,8 +208,7 @@ def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path, preloaded_
         running(out, max_bytes=200_000) as (process, address),
         opened_page(address + '#track=1', expected='Failed to load resource') as page,
     ):
-        page.keyboard.press('d')
-        page.wait_for_function('isGone(current())')
+        press(page, 'd', 'isGone(current())')
         page.keyboard.press('Control+s')  # the report is larger
         page.wait_for_selector('#failure:not([hidden])', timeout=120_000)
         text = page.inner_text('#failure')
@@ -240,8 +228,7 @@ def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path, preloaded_
     ):
         assert page.evaluate('log.count') == len(read_decisions(log))
         assert page.evaluate('isGone(current())')
-        page.keyboard.press('Control+s')
-        page.wait_for_function("$('notice').textContent.includes('Writing')")
+        press(page, 'Control+s', "$('notice').textContent.includes('Writing')")
         page.wait_for_timeout(1500)
         page.context.close()
         process.kill()
@@ -251,8 +238,7 @@ def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path, preloaded_
         opened_page(address, expected='40') as page,
     ):
         for _ in range(30):
-            page.keyboard.press('Control+s')
-            page.wait_for_function('!view.isSaving', timeout=120_000)
+            press(page, 'Control+s', '!view.isSaving', timeout=120_000)
             if 'boxes in' in page.inner_text('#notice'):
                 break
             page.wait_for_timeout(1000)  # the command that was left is still at work
@@ -332,8 +318,7 @@ def test_a_correction_shows_its_figures_is_typed_and_undone_in_steps(server):
         assert page.evaluate(LEAVING)  # the browser asks before it is lost
         page.keyboard.press('l')
         page.fill('#n-width', '3')
-        page.keyboard.press('Enter')
-        page.wait_for_function('view.edit[4] === 3')
+        press(page, 'Enter', 'view.edit[4] === 3')
         page.locator('#top').focus()
         page.keyboard.press('z')
         assert page.evaluate('view.edit[4]') == pytest.approx(width)
@@ -357,8 +342,7 @@ def test_a_correction_shows_its_figures_is_typed_and_undone_in_steps(server):
 def test_a_track_is_solved_again_with_its_pin_within_the_page(server):
     out = server.log_paths[0].parent
     with opened_page(server.address + '#track=1') as page:
-        page.keyboard.press('o')
-        page.wait_for_function("$('notice').textContent.includes('pinned boxes')", timeout=120_000)
+        press(page, 'o', "$('notice').textContent.includes('pinned boxes')", timeout=120_000)
         page.evaluate('step(6)')
         page.keyboard.press('e')
         page.fill('#n-length', str(page.evaluate('view.edit[3] + 0.4')))
@@ -366,8 +350,7 @@ def test_a_track_is_solved_again_with_its_pin_within_the_page(server):
         page.locator('#top').focus()
         page.keyboard.press('Enter')
         page.wait_for_selector(DO.format('unpin'))
-        page.keyboard.press('o')
-        page.wait_for_function("$('notice').textContent.includes('1 pinned box')", timeout=60_000)
+        press(page, 'o', "$('notice').textContent.includes('1 pinned box')", timeout=60_000)
         assert 'solved again' in page.inner_text('#legend')
         solved = page.evaluate('[...view.solved]')
         part = page.evaluate('({ ...view.part, points: [...view.part.points] })')
@@ -419,8 +402,7 @@ def test_one_key_accepts_and_opens_the_next_open_track(server):
     with opened_page(server.address + '#tracks') as page:
         first = page.evaluate('current().id')
         page.locator('#top').focus()
-        page.keyboard.press('Enter')
-        page.wait_for_function(f"current().id !== '{first}'")
+        press(page, 'Enter', f"current().id !== '{first}'")
         page.click(DO.format('next'))
         page.wait_for_function('log.count === 2')
         assert page.inner_text('#f-count') == '2 of 2 tracks, 2 decided'

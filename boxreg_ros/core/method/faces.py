@@ -204,7 +204,7 @@ def fill_insets(origins, ring_height, tangent, inputs, constants, shares, inset,
     for sensor in range(1, len(origins)):
         reach = min(reach, sqrt(origins[sensor, 0] ** 2 + origins[sensor, 1] ** 2))
     beyond = 0.0 if isnan(reach) else (reach - constants.near_range) / constants.range_span
-    beyond = min(max(beyond, 0.0), constants.max_range_share)
+    beyond = max(beyond, 0.0)
     for face in range(6):
         u = tangent[face] + constants.edge_lead[face]
         occluded = 0.5 - 0.5 * u / sqrt(u**2 + constants.visibility_softness)
@@ -213,7 +213,7 @@ def fill_insets(origins, ring_height, tangent, inputs, constants, shares, inset,
         by_range = shares[1, face] * inputs.range_inset[face]
         inset[face] = occluded * inputs.occlusion_inset[face] + by_range
         seen = 1.0 if tangent[face] > 0.0 else constants.occluded_weight
-        weight[face] = seen / (1.0 + (by_range / constants.range_half_weight) ** 2)
+        weight[face] = seen / (1.0 + (by_range / constants.face_deviations[face]) ** 2)
     inset[TOP] += ring_height / 2
     weight[TOP] /= 1.0 + ring_height**2 / 12 / constants.face_deviations[TOP] ** 2
 
