@@ -123,17 +123,7 @@ PICTURES = {
 
 
 def car_picture(recording: Path, result: Path) -> bytes:
-    """
-    Return a PNG file with the points of one vehicle before and after registration.
-
-    Parameters
-    ----------
-    recording : Path
-        The recording.
-    result : Path
-        The folder that ``boxreg relabel`` wrote for it.
-
-    """
+    """Return a PNG file with the points of one vehicle before and after ``boxreg relabel``."""
     refined = BoxTable.read(result / 'boxes.csv')
     drive = Drive.of(Recording([recording]), refined)
     track = most_shifted_vehicle(changes_of(drive.boxes, refined))
@@ -148,22 +138,7 @@ def car_picture(recording: Path, result: Path) -> bytes:
 
 
 def points_picture(track: TrackChanges, points: Sequence[Floats]) -> bytes:
-    """
-    Draw the points of all sweeps in the input boxes and in the refined boxes of a track.
-
-    Parameters
-    ----------
-    track : TrackChanges
-        The track.
-    points : sequence of n arrays, shape (M_i, 3)
-        Points near each box in the fixed frame [m].
-
-    Returns
-    -------
-    picture : bytes
-        A PNG file.
-
-    """
+    """Return a PNG file of the points (M_i, 3) of all sweeps [m] in both boxes of a track."""
     from matplotlib.figure import Figure
 
     before = in_boxes(track.given, points, track.is_flipped)
@@ -214,12 +189,8 @@ def changes_of(given: Sequence[BoxArray], refined: BoxTable) -> list[TrackChange
     """
     Return the tracks of a run before and after registration, by descending mean shift.
 
-    Parameters
-    ----------
-    given : sequence of BoxArray
-        The input in the fixed frame, one array per stamp.
-    refined : BoxTable
-        The result, with the boxes of each stamp in the order of the input.
+    The input is in the fixed frame, one array per stamp; the result has the boxes of each stamp in
+    the same order.
 
     """
     changes = Changes(refined.frame_id)

@@ -47,31 +47,19 @@ def parameters() -> str:
     )
 
 
-def label_formats() -> str:
-    """Return one row for each label format."""
-    return table(formats.FORMAT_COLUMNS, formats.rows())
-
-
-def datasets() -> str:
-    """Return one row for each data set."""
-    return table(formats.DATASET_COLUMNS, formats.dataset_rows())
-
-
-def messages() -> str:
-    """Return one row for each message type with boxes."""
-    return table(registry.MESSAGE_COLUMNS, registry.rows())
-
-
-def counters() -> str:
-    """Return one row for each reason why a box or a cloud is not used."""
-    rows = [(one.value, one.unit, one.meaning, one.remedy) for one in Reason]
-    return table(('counter', 'counts', 'meaning', 'remedy'), rows)
-
-
 TABLES = {
     'parameters.md': {'': parameters},
-    'formats.md': {'messages': messages, 'labels': label_formats, 'datasets': datasets},
-    'troubleshooting.md': {'': counters},
+    'formats.md': {
+        'messages': lambda: table(registry.MESSAGE_COLUMNS, registry.rows()),
+        'labels': lambda: table(formats.FORMAT_COLUMNS, formats.rows()),
+        'datasets': lambda: table(formats.DATASET_COLUMNS, formats.dataset_rows()),
+    },
+    'troubleshooting.md': {
+        '': lambda: table(
+            ('counter', 'counts', 'meaning', 'remedy'),
+            [(one.value, one.unit, one.meaning, one.remedy) for one in Reason],
+        )
+    },
 }
 """The tables that each page holds, by the names of the marks around them."""
 

@@ -1,14 +1,8 @@
-"""
-All tables of the stored measurements, one function for each kind of measurements.
-
-`docs/results.py` writes the rows to decide by into the pages; the site folds these tables below
-them (`docs/site_hooks.py`), and ``python docs/results.py --all KIND`` prints them.
-
-"""
+"""All tables of the stored measurements, one function for each kind of `results.KINDS`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 import json
 import math
 from pathlib import Path
@@ -39,18 +33,6 @@ DATA = {
 PART_OF_RUN = re.compile(' (?:at the start|in the middle|at the end)')
 SHOWN_LOSS = 0.001
 """Smaller changes of mean IoU are within the scatter of noise seeds."""
-
-
-def all_tables(store: Path, kind: str) -> Iterable[str]:
-    """Yield for each measurement of a kind its title, its command and its tables."""
-    if kind == 'ablation':
-        yield f'{_ingredients()}\n'
-    for data, document in measurements(store, kind):
-        title = title_of(data)
-        if title:
-            yield f'**{title}**\n'
-        yield origin(document)
-        yield from (f'{part}\n' for part in TABLES[kind](document['results']))
 
 
 def measurements(store: Path, kind: str) -> list[tuple[str, Any]]:
@@ -91,8 +73,22 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], alignment: str =
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Return a number with some digits, '-' without one."""
+    """Return a number with some digits, whole ones as they are; '-' without one."""
+    if isinstance(value, int):
+        return str(value)
     return '-' if value is None else f'{value:.{digits}f}'
+
+
+def grid(corner: str, columns: Any, rows: Any) -> str:
+    """
+    Return a table of numbers, a row for each mapping in `rows` by its name.
+
+    `columns` are the keys of its numbers; as a mapping, keys by title.
+
+    """
+    keys = columns.values() if isinstance(columns, dict) else columns
+    cells = [[name, *(number(row.get(key)) for key in keys)] for name, row in rows.items()]
+    return table([corner, *columns], cells)
 
 
 def signed(value: float, digits: int) -> str:
@@ -100,7 +96,7 @@ def signed(value: float, digits: int) -> str:
     return f'{round(value, digits) + 0.0:+.{digits}f}'
 
 
-def _accuracy(results: Any) -> Iterable[str]:
+def accuracy(results: Any) -> Iterable[str]:
     """Yield the table of scores of each recording, and 3D IoU by range and number of points."""
     for methods in results.values():
         measured = {name: row for name, row in methods.items() if not isinstance(row, str)}
@@ -144,20 +140,19 @@ def _parts(measured: Any) -> tuple[list[str], list[list[str]]]:
 def _compared(measured: Any) -> Iterable[str]:
     """Yield the table of the differences between methods."""
     rows = [
-        [f'{name} - {other}', scope, *_difference(found)]
+        [
+            f'{name} - {other}',
+            scope,
+            *_gain(found),
+            str(found['tracks']),
+            str(found['tracks_ahead']),
+        ]
         for name, row in measured.items()
         for scope, others in row.get('differences', {}).items()
         for other, found in others.items()
     ]
     if rows:
         yield table(['difference', 'objects', 'BEV', '3D', 'tracks', 'ahead'], rows)
-
-
-def _difference(found: Any) -> Iterable[str]:
-    """Yield both differences with their standard errors, and the numbers of tracks."""
-    yield from _gain(found)
-    yield str(found['tracks'])
-    yield str(found['tracks_ahead'])
 
 
 def _gain(found: Any) -> Iterable[str]:
@@ -184,7 +179,7 @@ def _classes(measured: Any) -> str:
     return table(['BEV / 3D IoU by class (boxes)', *header], rows)
 
 
-def _kinds_of_objects(results: Any) -> Iterable[str]:
+def kinds_of_objects(results: Any) -> Iterable[str]:
     """Yield what each class gains over the input and over smoothing, one table per recording."""
     for drives, found in results.items():
         rows = []
@@ -197,28 +192,24 @@ def _kinds_of_objects(results: Any) -> Iterable[str]:
         yield table([f'{drives}: class (boxes)', 'estimate', *columns], rows)
 
 
-def _paper(results: Any) -> Iterable[str]:
+def paper(results: Any) -> Iterable[str]:
     """Yield Table I of each mode."""
     for mode, methods in results.items():
         measured = {name: row for name, row in methods.items() if not isinstance(row, str)}
         pose = ['x', 'y', 'z', 'roll', 'pitch', 'yaw'] if mode == '3d' else ['x', 'y', 'yaw']
-        columns = (*pose, 'iou', 'iou_first', 'iou_last', 'iou_full')
-        rows = [
-            [name, *(number(row.get(column)) for column in columns)]
-            for name, row in measured.items()
-        ]
         iou = '3D IoU' if mode == '3d' else 'BEV IoU'
-        titles = (iou, *(f'{iou}, {part}' for part in ('first', 'last', 'full windows')))
-        yield table([f'mode: {mode}', *pose, *titles], rows)
+        columns = {name: name for name in pose} | {iou: 'iou'}
+        columns |= {f'{iou}, {part}': f'iou_{part}' for part in ('first', 'last')}
+        yield grid(f'mode: {mode}', columns | {f'{iou}, full windows': 'iou_full'}, measured)
 
 
-def _ingredients() -> str:
+def ingredients() -> str:
     """Return the table of the ingredients that are switched off."""
     rows = [[name, item.meaning] for name, item in INGREDIENTS.items() if name != WHOLE]
     return table(['without', 'the change'], rows, '---')
 
 
-def _ablation(results: Any) -> Iterable[str]:
+def ablation(results: Any) -> Iterable[str]:
     """Yield for each recording the losses without an ingredient, the largest first."""
     order = results.pop('greedy', [])
     for found in results.values():
@@ -247,11 +238,10 @@ def _ablation(results: Any) -> Iterable[str]:
         yield table(['without all of', 'largest loss'], [[a, signed(b, 4)] for a, b in order])
 
 
-def _sensitivity(results: Any) -> Iterable[str]:
+def sensitivity(results: Any) -> Iterable[str]:
     """Yield the loss of every setting and constant, largest first; those without one as a list."""
     baseline = results['baseline']
-    rows = [[name, number(o['iou_bev']), number(o['iou_3d'])] for name, o in baseline.items()]
-    yield table([f'estimate: {results["estimate"]}', 'BEV', '3D'], rows)
+    yield grid(f'estimate: {results["estimate"]}', {'BEV': 'iou_bev', '3D': 'iou_3d'}, baseline)
     largest: dict[str, float] = {}
     rows = []
     failures = []
@@ -273,48 +263,29 @@ def _sensitivity(results: Any) -> Iterable[str]:
         yield f'Not possible, since the value is an index or a quantile: {", ".join(failures)}.'
 
 
-def _tracks(results: Any) -> Iterable[str]:
+def tracks(results: Any) -> Iterable[str]:
     """Yield the scores after each completing step, one table per recording."""
-    keys = (
-        ('recall', 'recall'),
-        ('precision', 'precision'),
-        ('ids per object', 'ids_per_object'),
-        ('HOTA', 'hota'),
-        ('IDF1', 'idf1'),
-        ('added', 'added'),
-        ('3D IoU of added', 'added_iou'),
-        ('ghosts rejected', 'ghosts_rejected'),
-        ('others rejected', 'lost'),
-    )
+    found = {'recall': 'recall', 'precision': 'precision', 'ids per object': 'ids_per_object'}
+    added = {'added': 'added', '3D IoU of added': 'added_iou'}
+    columns = found | {'HOTA': 'hota', 'IDF1': 'idf1'} | added
+    columns |= {'ghosts rejected': 'ghosts_rejected', 'others rejected': 'lost'}
     for rows in results.values():
-        lines = [
-            [name, *(number(row[key], 0 if key == 'added' else 3) for _, key in keys)]
-            for name, row in rows.items()
-        ]
-        yield table(['', *(title for title, _ in keys)], lines)
-        yield from _kinds(rows)
+        yield grid('', columns, rows)
+        first, *_, last = rows  # before the tracks were broken, and at last
+        by_kind = {
+            f'{name}: {kind}': scores
+            for name in (first, last)
+            for kind, scores in rows[name]['by_kind'].items()
+        }
+        yield grid('by kind', found | added | {'3D IoU of others': 'given_iou'}, by_kind)
 
 
-def _kinds(rows: Any) -> Iterable[str]:
-    """Yield the scores by kind of object: of the tracks before they were broken, and at last."""
-    first, *_, last = rows
-    keys = ('recall', 'precision', 'ids_per_object', 'added', 'added_iou', 'given_iou')
-    lines = [
-        [f'{name}: {kind}', *(number(scores[key], 0 if key == 'added' else 3) for key in keys)]
-        for name in (first, last)
-        for kind, scores in rows[name]['by_kind'].items()
-    ]
-    found = ('recall', 'precision', 'ids per object')
-    titles = (*found, 'added', '3D IoU of added', '3D IoU of others')
-    yield table(['by kind', *titles], lines)
-
-
-def _figures(results: Any) -> Iterable[str]:
+def figures(results: Any) -> Iterable[str]:
     """Yield a plain table of names and values."""
     yield table(['', ''], flat(results))
 
 
-def _node(results: Any) -> Iterable[str]:
+def node(results: Any) -> Iterable[str]:
     """Yield the figures of one run, or of several runs side by side."""
     runs: dict[str, dict[str, str]] = {}
     for name, value in flat(results):
@@ -330,28 +301,26 @@ def _node(results: Any) -> Iterable[str]:
     yield table(['', ''], alone.items())
 
 
-def _lidars(results: Any) -> Iterable[str]:
+def lidars(results: Any) -> Iterable[str]:
     """Yield the accuracy of each way to record several LiDARs."""
-    rows = [[name, number(found['bev']), number(found['3d'])] for name, found in results.items()]
-    yield table(['recorded', 'BEV', '3D'], rows)
+    yield grid('recorded', {'BEV': 'bev', '3D': '3d'}, results)
 
 
-def _highway(results: Any) -> Iterable[str]:
+def highway(results: Any) -> Iterable[str]:
     """Yield the accuracy of each method by speed, one table per time of the boxes."""
     for convention, found in results.items():
-        speeds = next(iter(found.values()))
-        rows = [[name, *map(number, values.values())] for name, values in found.items()]
-        yield table([f'boxes of the time of {convention}', *speeds], rows)
+        speeds = tuple(next(iter(found.values())))
+        yield grid(f'boxes of the time of {convention}', speeds, found)
 
 
-def _points(results: Any) -> Iterable[str]:
+def points(results: Any) -> Iterable[str]:
     """Yield the scores of labels of points, one column for each kind of boxes."""
     scores = dict.fromkeys(score for found in results.values() for score in found)
-    rows = [[score, *(number(found.get(score)) for found in results.values())] for score in scores]
-    yield table(['', *results], rows)
+    by_score = {score: {name: of.get(score) for name, of in results.items()} for score in scores}
+    yield grid('', tuple(results), by_score)
 
 
-def _review(results: Any) -> Iterable[str]:
+def review(results: Any) -> Iterable[str]:
     """Yield the share of bad tracks at the top of each list, per recording and input, and pins."""
     pinned = []
     for recording, inputs in results.items():
@@ -376,7 +345,7 @@ def _review(results: Any) -> Iterable[str]:
     yield table(header, pinned)
 
 
-def _labeller(results: Any) -> Iterable[str]:
+def labeller(results: Any) -> Iterable[str]:
     """Yield the errors before and after the review of a planted drive, and what it takes."""
     stages = (('planted', 'planted'), ('relabelled', 'after `boxreg relabel`'),
               ('reviewed', 'after the review'))  # fmt: skip
@@ -391,7 +360,7 @@ def _labeller(results: Any) -> Iterable[str]:
     )
 
 
-def _covariance(results: Any) -> Iterable[str]:
+def covariance(results: Any) -> Iterable[str]:
     """Yield coverage and NEES of each variable, by estimate and class, one table per recording."""
     for recording, estimates in results.items():
         rows = [
@@ -441,7 +410,7 @@ def cells_of_kinds(estimates: Any) -> list[tuple[str, Any, str]]:
 def _consistent_cells(estimates: Any) -> Iterable[str]:
     """Yield how many cells of the kinds are consistent, and which are not."""
     cells = cells_of_kinds(estimates)
-    low, high = CONSISTENT_NEES
+    _, high = CONSISTENT_NEES
     coverage = [group['coverage'][variable] for _, group, variable in cells]
     nees = [group['nees'][variable] for _, group, variable in cells]
     overconfident = [
@@ -449,17 +418,16 @@ def _consistent_cells(estimates: Any) -> Iterable[str]:
         for (name, group, variable), value in zip(cells, nees, strict=True)
         if value - high > SIGNIFICANT * (group['nees_error'][variable] or math.inf)
     ]
-    for count in (
-        len(cells),
-        sum(0.9 <= part <= 0.98 for part in coverage),
-        sum(part > 0.98 for part in coverage),
-        sum(part < 0.9 for part in coverage),
-        sum(low <= value <= high for value in nees),
-        sum(value < low for value in nees),
-        sum(value > high for value in nees),
-    ):
-        yield str(count)
+    within, less, more = within_band(coverage, (0.9, 0.98))
+    yield from (str(len(cells)), within, more, less, *within_band(nees, CONSISTENT_NEES))
     yield ', '.join(overconfident) or 'none'
+
+
+def within_band(values: Sequence[float], band: tuple[float, float]) -> tuple[str, str, str]:
+    """Return how many values are within a band, less, and more."""
+    low, high = band
+    less, more = sum(value < low for value in values), sum(value > high for value in values)
+    return str(len(values) - less - more), str(less), str(more)
 
 
 def cells_and_chance(results: Any) -> str:
@@ -486,7 +454,7 @@ def cells_and_chance(results: Any) -> str:
     )
 
 
-def _scale(results: Any) -> Iterable[str]:
+def scale(results: Any) -> Iterable[str]:
     """Yield the main figures with their meaning, and all figures."""
     job, large, workers, fleet = (results[name] for name in ('job', 'large', 'workers', 'fleet'))
     used = [workers[name]['cores_used'] for name in ('one', 'two')]
@@ -542,12 +510,10 @@ def recording_size(measured: Any) -> str:
     )
 
 
-def _load(results: Any) -> Iterable[str]:
+def load(results: Any) -> Iterable[str]:
     """Yield latency and accuracy by number of tracks, one table per way to treat overload."""
     for policy, rows in results.items():
-        names = list(next(iter(rows.values())))
-        lines = [[tracks, *(number(row[name]) for name in names)] for tracks, row in rows.items()]
-        yield table([f'{policy}: tracks', *names], lines)
+        yield grid(f'{policy}: tracks', tuple(next(iter(rows.values()))), rows)
 
 
 def flat(results: Any) -> Iterable[list[str]]:
@@ -567,26 +533,3 @@ def _named(results: Any, prefix: str = '') -> Iterable[tuple[str, str]]:
             yield f'{prefix}{name}', plain(value)
         else:
             yield f'{prefix}{name}', str(value)
-
-
-TABLES: dict[str, Callable[[Any], Iterable[str]]] = {
-    'real': _accuracy,
-    'kinds': _kinds_of_objects,
-    'tracks': _tracks,
-    'paper': _paper,
-    'ablation': _ablation,
-    'sensitivity': _sensitivity,
-    'highway': _highway,
-    'points': _points,
-    'lidars': _lidars,
-    'covariance': _covariance,
-    'review': _review,
-    'labeller': _labeller,
-    'report': _figures,
-    'speed': _figures,
-    'load': _load,
-    'scale': _scale,
-    'kills': _figures,
-    'node': _node,
-}
-"""The tables of one measurement, for each kind of measurements."""

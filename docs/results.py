@@ -8,18 +8,19 @@ Write the tables of `docs/results.md` and `docs/results/` from the stored measur
 A measurement is the output of ``boxreg bench`` or of ``test/measure``, stored as
 ``KIND_DATA.json``, for example ``real_pandaset_002_a.json`` of ``boxreg bench real pandaset_002_a
 --json``. A page has the rows that a reader decides by, between two marks; the text around them is
-written by hand. The page of a kind is ``KIND.md``, or the one that `PAGES` has for it.
-`docs/results.md` has the main figures of each kind. `result_tables` has all tables.
+written by hand. `KINDS` has the page of each kind and its tables; `docs/results.md` has the main
+figures of each.
 
 """
 
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 from boxreg_ros import __version__
 from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE
@@ -29,37 +30,27 @@ from boxreg_ros.offline.consistency import (
     CONSISTENT_NEES,
 )
 from generate import between_marks
+import result_tables
 from result_tables import (
-    all_tables,
     cells_and_chance,
-    cells_of_kinds,
-    consistent,
     DATA,
+    grid,
     measurements,
-    MIN_TRACKS,
     number,
-    plain,
     signed,
     table,
-    TABLES,
-    title_of,
     with_error,
+    within_band,
 )
 
+Documents = Iterable[tuple[str, Any]]
+"""Data name and content of measurements."""
 DOCS = Path(__file__).resolve().parent
 STORE = DOCS / 'results'
 OVERVIEW = DOCS / 'results.md'
 FOLDED = 'All tables: `python docs/results.py --all {}`'
 """The site folds all tables of a kind in place of this line."""
 
-PAGES = {
-    **dict.fromkeys(('kinds', 'points', 'highway', 'lidars', 'paper'), 'scenes'),
-    **dict.fromkeys(('covariance', 'review', 'labeller'), 'certainty'),
-    **dict.fromkeys(('ablation', 'sensitivity'), 'ablation'),
-    **dict.fromkeys(('speed', 'scale', 'report'), 'speed'),
-    **dict.fromkeys(('node', 'load', 'kills'), 'node'),
-}
-"""Page of the kinds of measurements that share one; the others have a page of their name."""
 MAIN_METHODS = (
     'input', 'smoothing only', 'ICP on box points', 'paper, track',
     'ours, early', 'ours, final', 'ours, track',
@@ -73,7 +64,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """Write the pages or check them, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1] if __doc__ else None)
     parser.add_argument('--check', action='store_true', help='write nothing; 1 if out of date')
-    parser.add_argument('--all', metavar='KIND', choices=TABLES, help='print all tables of a kind')
+    parser.add_argument('--all', metavar='KIND', choices=KINDS, help='print all tables of a kind')
     args = parser.parse_args(words)
     if args.all:
         print('\n'.join(all_tables(STORE, args.all)))
@@ -93,10 +84,13 @@ def main(words: Sequence[str] | None = None) -> int:
 
 def pages(store: Path) -> dict[Path, str]:
     """Return the text of each page for the measurements in a folder."""
-    parts = [(OVERVIEW, '', _overview(store))]
-    for kind in TABLES:
-        page = STORE / f'{PAGES.get(kind, kind)}.md'
-        parts.append((page, kind if kind in PAGES else '', _deciding(store, kind)))
+    parts = [
+        (OVERVIEW, name, [f'{part}\n' for part in section(store)])
+        for name, section in OVERVIEW_SECTIONS.items()
+    ]
+    for name, kind in KINDS.items():
+        section = name if kind.page in SHARED else ''
+        parts.append((STORE / f'{kind.page}.md', section, _deciding(store, name)))
     written: dict[Path, str] = {}
     for page, section, lines in parts:
         text = written.get(page) or page.read_text(encoding='utf-8')
@@ -106,30 +100,35 @@ def pages(store: Path) -> dict[Path, str]:
 
 def _deciding(store: Path, kind: str) -> Iterable[str]:
     """Yield the rows of a kind to decide by, and the place of all tables; these where few."""
-    if kind in DECIDING:
-        yield from (f'{part}\n' for part in DECIDING[kind](measurements(store, kind)))
-        yield FOLDED.format(kind)
-    else:
+    deciding = KINDS[kind].deciding
+    if deciding is None:
         yield from all_tables(store, kind)
+    else:
+        yield from (f'{part}\n' for part in deciding(measurements(store, kind)))
+        yield FOLDED.format(kind)
 
 
-def _overview(store: Path) -> Iterable[str]:
-    """Yield the main tables of `docs/results.md`."""
+def all_tables(store: Path, kind: str) -> Iterable[str]:
+    """Yield for each measurement of a kind its title, its command and its tables."""
+    if kind == 'ablation':
+        yield f'{result_tables.ingredients()}\n'
+    for data, document in measurements(store, kind):
+        title = result_tables.title_of(data)
+        if title:
+            yield f'**{title}**\n'
+        yield result_tables.origin(document)
+        yield from (f'{part}\n' for part in KINDS[kind].tables(document['results']))
+
+
+def _recordings(store: Path) -> Iterable[str]:
+    """Yield the recordings, and the version that has measured them."""
     recordings = [[f'`{name}`', *texts] for name, texts in DATA.items()]
     yield table(['recording', 'title', 'content'], recordings, '---')
-    yield f'\nMeasured by version {__version__}, where no other one is named.'
-    yield ''
-    for section in (_mean_ious, _gains, _completion, _coverage, _ranking, _times):
-        yield from (f'{part}\n' for part in section(store))
+    yield f'Measured by version {__version__}, where no other one is named.'
 
 
 def _mean_ious(store: Path) -> Iterable[str]:
     """Yield the mean 3D IoU of the main methods on each recording."""
-    yield '## Accuracy'
-    yield (
-        'Mean 3D IoU (number of true boxes). [Accuracy](results/real.md) has the other scores, '
-        '[Ablation](results/ablation.md) the loss without each ingredient.'
-    )
     rows = []
     for data, document in measurements(store, 'real'):
         for methods in document['results'].values():
@@ -140,11 +139,6 @@ def _mean_ious(store: Path) -> Iterable[str]:
 
 def _gains(store: Path) -> Iterable[str]:
     """Yield the gain of 3D IoU of each class on the simulated streets."""
-    yield '## Classes'
-    yield (
-        'Mean 3D IoU minus that of the input and of smoothing, with standard errors over tracks. '
-        '[Gain of each class](results/scenes.md) has the other recordings.'
-    )
     document = dict(measurements(store, 'kinds'))['']
     for drives, classes in document['results'].items():
         rows = []
@@ -161,12 +155,6 @@ def _gains(store: Path) -> Iterable[str]:
 
 def _completion(store: Path) -> Iterable[str]:
     """Yield the scores of broken tracks, of completed ones, and of tracks never broken."""
-    yield '## Completed tracks'
-    yield (
-        'Broken tracks as they are given -> with `--complete`; in brackets those of the same '
-        'tracks before they were broken, the best that completion can restore. '
-        '[Completed tracks](results/tracks.md) has ghosts, distant misses and the node.'
-    )
     rows = []
     for data, document in measurements(store, 'tracks'):
         if data in DATA:  # without other breaks
@@ -187,11 +175,6 @@ def _change(before: Any, after: Any, key: str, digits: int = 3) -> str:
 
 def _coverage(store: Path) -> Iterable[str]:
     """Yield the part of the errors within two standard deviations, for each recording."""
-    yield '## Covariances'
-    yield (
-        'Part of the errors of whole tracks within two standard deviations; 0.95 is consistent. '
-        '[Covariances](results/certainty.md) has squared errors and the other estimates.'
-    )
     rows = []
     for _, document in measurements(store, 'covariance'):
         for recording, estimates in document['results'].items():
@@ -204,12 +187,6 @@ def _coverage(store: Path) -> Iterable[str]:
 
 def _ranking(store: Path) -> Iterable[str]:
     """Yield the share of bad tracks in the first fifth of each list, for each recording."""
-    yield '## Review list'
-    yield (
-        'Share of the worst tracks that are in the first fifth of the list: by risk, and by the '
-        'orders it is compared with. [Review list](results/certainty.md#review-list) has shorter '
-        'parts of the lists, and the gain of one corrected box.'
-    )
     rows = []
     for _, document in measurements(store, 'review'):
         for recording, inputs in document['results'].items():
@@ -224,12 +201,6 @@ def _ranking(store: Path) -> Iterable[str]:
 
 def _times(store: Path) -> Iterable[str]:
     """Yield the main figures of speed, memory and latency beside their aims."""
-    yield '## Speed'
-    yield (
-        'On two cores of a CPU. [Speed](results/speed.md) has all figures, '
-        '[The live node under load](results/node.md#under-load) latencies, '
-        '[Scale](results/speed.md#scale) core-hours of a fleet.'
-    )
     ((_, speed),) = measurements(store, 'speed')
     ((_, load),) = measurements(store, 'load')
     found = speed['results']
@@ -270,7 +241,7 @@ def _times(store: Path) -> Iterable[str]:
     yield table(['', 'measured', 'aim'], rows)
 
 
-def _accuracy(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _accuracy(documents: Documents) -> Iterable[str]:
     """Yield the scores on each recording, and the gains over tracks."""
     header = 'BEV 3D R@0.7 R@0.8 ATE ASE AOE flips jitter'
     gains = []
@@ -282,7 +253,7 @@ def _accuracy(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
                 ious = (row['iou_bev'], row['iou_3d'], *row['recall_3d'][1:])
                 others = (row[key] for key in ('ate', 'ase', 'aoe', 'flips', 'jitter'))
                 rows.append([name, *map(number, (*ious, *others))])
-            yield table([title_of(data), *header.split()], rows)
+            yield table([result_tables.title_of(data), *header.split()], rows)
             of = {name: methods[name]['differences']['all'] for name in MAIN_METHODS[-2:]}
             pairs = (
                 ('ours, final', 'input'), ('ours, final', 'smoothing, final'),
@@ -297,7 +268,7 @@ def _accuracy(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
     yield table(['3D IoU (tracks), tracks ahead', *columns], gains)
 
 
-def _kinds_of_objects(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _kinds_of_objects(documents: Documents) -> Iterable[str]:
     """Yield the gain of each class over input and smoothing: that has some tracks, or a loss."""
     rows = []
     for data, document in documents:
@@ -310,7 +281,9 @@ def _kinds_of_objects(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
                     final['input'], final['smoothing, final'],
                     track['input'], track['smoothing only'],
                 )  # fmt: skip
-                if final['input']['tracks'] < MIN_TRACKS and all(g['iou_3d'] > 0 for g in found):
+                if final['input']['tracks'] < result_tables.MIN_TRACKS and all(
+                    g['iou_3d'] > 0 for g in found
+                ):
                     continue
                 start = f'{data.replace("_", " ")}: {name} ({final["input"]["boxes"]})'
                 rows.append([start, *(with_error(gain, 'iou_3d') for gain in found)])
@@ -318,7 +291,7 @@ def _kinds_of_objects(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
     yield table(['3D IoU: class (boxes)', *columns], rows)
 
 
-def _tracks(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _tracks(documents: Documents) -> Iterable[str]:
     """Yield the scores before and after completion for each kind of breaks, in one table."""
     rows = []
     for data, document in documents:
@@ -329,33 +302,34 @@ def _tracks(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
                 for key in ('recall', 'precision', 'ids_per_object', 'hota')
             ]
             others = (number(after[key]) for key in ('added_iou', 'ghosts_rejected', 'lost'))
-            rows.append([title_of(data), *scores, f'{after["added"]}', *others])
+            rows.append([result_tables.title_of(data), *scores, f'{after["added"]}', *others])
     scores = ['recall', 'precision', 'ids per object', 'HOTA']
     yield table(
         ['', *scores, 'added', '3D IoU of added', 'ghosts rejected', 'others rejected'], rows
     )
 
 
-def _paper(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _paper(documents: Documents) -> Iterable[str]:
     """Yield the main rows of Table I of each mode."""
     ((_, document),) = documents
     for mode, methods in document['results'].items():
         pose = ['x', 'y', 'z', 'roll', 'pitch', 'yaw'] if mode == '3d' else ['x', 'y', 'yaw']
+        columns = {name: name for name in pose}
+        columns['3D IoU' if mode == '3d' else 'BEV IoU'] = 'iou'
         names = (
             'initial, published', 'refined, published', 'input', 'smoothing only',
             'paper, track', 'ours, final', 'ours, track', 'held extents, final',
         )  # fmt: skip
-        rows = [[name, *(number(methods[name].get(c)) for c in (*pose, 'iou'))] for name in names]
-        yield table([f'mode: {mode}', *pose, '3D IoU' if mode == '3d' else 'BEV IoU'], rows)
+        yield grid(f'mode: {mode}', columns, {name: methods[name] for name in names})
 
 
-def _ablation(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _ablation(documents: Documents) -> Iterable[str]:
     """Yield the losses of 3D IoU without each ingredient on all recordings, the largest first."""
     losses: dict[str, list[list[float]]] = {name: [] for name in INGREDIENTS if name != WHOLE}
     titles = []
     for data, document in documents:
         estimates = document['results'][data].values()
-        titles.append(title_of(data))
+        titles.append(result_tables.title_of(data))
         for name, found in losses.items():
             found.append([rows[WHOLE]['iou_3d'] - rows[name]['iou_3d'] for rows in estimates])
     rows = [
@@ -370,12 +344,12 @@ def _loss(value: float) -> str:
     return signed(1000 * value, 0)
 
 
-def _sensitivity(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _sensitivity(documents: Documents) -> Iterable[str]:
     """Yield the numbers with the largest losses on all recordings."""
     names: list[str] = []
     found: dict[tuple[str, str], dict[str, float]] = {}
     for data, document in documents:
-        names.append(title_of(data))
+        names.append(result_tables.title_of(data))
         for loss in document['results']['losses']:
             if not loss['failure']:
                 key = (f'`{loss["name"]}`', f'{loss["factor"]:g}')
@@ -388,7 +362,7 @@ def _sensitivity(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
     yield table(['setting or constant', 'factor', *names], rows)
 
 
-def _highway(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _highway(documents: Documents) -> Iterable[str]:
     """Yield the accuracy of each method by the time of the boxes and the speed."""
     ((_, document),) = documents
     results = document['results']
@@ -401,18 +375,18 @@ def _highway(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
     yield table(['3D IoU', *columns], rows)
 
 
-def _points(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _points(documents: Documents) -> Iterable[str]:
     """Yield the main scores of labels of points, with boxes of the input and refined ones."""
     scores = ('IoU moving', 'IoU vehicle instances', 'unknown', 'shadows in the map')
     rows = []
     for data, document in documents:
         found = document['results']
         cells = [_change(found['input'], found['ours, track'], score) for score in scores]
-        rows.append([title_of(data) or data.replace('_', ' '), *cells])
+        rows.append([result_tables.title_of(data) or data.replace('_', ' '), *cells])
     yield table(['', *scores], rows)
 
 
-def _covariance(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _covariance(documents: Documents) -> Iterable[str]:
     """Yield the NEES of all objects, and the count of cells within the band."""
     ((_, document),) = documents
     results = document['results']
@@ -420,21 +394,17 @@ def _covariance(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
     low, high = CONSISTENT_NEES
     for recording, estimates in results.items():
         for estimate, groups in estimates.items():
-            found = (cell.partition(', ')[2] for cell in consistent(groups['all']))
+            found = (cell.partition(', ')[2] for cell in result_tables.consistent(groups['all']))
             rows.append([f'{recording}, {estimate}', *found])
-        cells = cells_of_kinds(estimates)
+        cells = result_tables.cells_of_kinds(estimates)
         nees = [group['nees'][variable] for _, group, variable in cells]
-        band = (
-            sum(low <= value <= high for value in nees),
-            sum(value < low for value in nees), sum(value > high for value in nees),
-        )  # fmt: skip
-        counts.append([recording, str(len(cells)), *map(str, band)])
+        counts.append([recording, str(len(nees)), *within_band(nees, CONSISTENT_NEES)])
     yield table(['NEES', *CONSISTENCY_VARIABLES], rows)
     yield table(['cells of kinds', 'cells', f'NEES {low:g} to {high:g}', 'less', 'more'], counts)
     yield cells_and_chance(results)
 
 
-def _review(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _review(documents: Documents) -> Iterable[str]:
     """Yield what one pinned box of each of the worst tracks changes."""
     ((_, document),) = documents
     rows = []
@@ -447,7 +417,7 @@ def _review(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
     yield table(['one box of each pinned', '3D IoU', 'of 1 - IoU removed'], rows)
 
 
-def _report(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _report(documents: Documents) -> Iterable[str]:
     """Yield how smoothly a report of 1,000 tracks moves, by both ways to draw."""
     ((_, document),) = documents
     (page,) = (of for name, of in document['results'].items() if name.startswith('1,000 tracks'))
@@ -459,7 +429,7 @@ def _report(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
     yield table(['1,000 tracks of 80 boxes', *ways], rows)
 
 
-def _speed(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _speed(documents: Documents) -> Iterable[str]:
     """Yield the parts of a tick and of a run."""
     ((_, document),) = documents
     found = document['results']
@@ -472,13 +442,13 @@ def _speed(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
     yield table(['a window', *ways], [['[ms]', *(number(solver[name], 2) for name in ways)]])
 
 
-def _scale(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _scale(documents: Documents) -> Iterable[str]:
     """Yield the main figures with their meaning."""
     ((_, document),) = documents
-    yield next(iter(TABLES['scale'](document['results'])))
+    yield next(iter(result_tables.scale(document['results'])))
 
 
-def _node(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _node(documents: Documents) -> Iterable[str]:
     """Yield the main figures of the node in each run, side by side."""
     figures = (
         'early published [%]', 'final published [%]', 'latency p50 [ms]', 'latency p99 [ms]',
@@ -493,19 +463,22 @@ def _node(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
             if figure in figures and 'recorder' not in run and not run.endswith('2'):
                 runs.setdefault(run or data.replace('_', ' '), {})[figure] = value
     rows = [
-        [figure, *(plain(run[figure]) if figure in run else '-' for run in runs.values())]
+        [
+            figure,
+            *(result_tables.plain(run[figure]) if figure in run else '-' for run in runs.values()),
+        ]
         for figure in figures
     ]
     yield table(['', *runs], rows)
 
 
-def _load(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _load(documents: Documents) -> Iterable[str]:
     """Yield latency and accuracy by number of tracks with the default deadline."""
     ((_, document),) = documents
-    yield next(iter(TABLES['load']({'deadline': document['results']['deadline']})))
+    yield from result_tables.load({'deadline': document['results']['deadline']})
 
 
-def _kills(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
+def _kills(documents: Documents) -> Iterable[str]:
     """Yield the time of the boxes that are lost with each process."""
     ((_, document),) = documents
     killed: dict[str, dict[str, str]] = {}
@@ -518,25 +491,53 @@ def _kills(documents: Iterable[tuple[str, Any]]) -> Iterable[str]:
     yield table(['', *figures], rows)
 
 
-DECIDING: dict[str, Callable[[Iterable[tuple[str, Any]]], Iterable[str]]] = {
-    'real': _accuracy,
-    'kinds': _kinds_of_objects,
-    'tracks': _tracks,
-    'paper': _paper,
-    'ablation': _ablation,
-    'sensitivity': _sensitivity,
-    'highway': _highway,
-    'points': _points,
-    'covariance': _covariance,
-    'review': _review,
-    'report': _report,
-    'speed': _speed,
-    'scale': _scale,
-    'node': _node,
-    'load': _load,
-    'kills': _kills,
+OVERVIEW_SECTIONS = {
+    'recordings': _recordings,
+    'accuracy': _mean_ious,
+    'classes': _gains,
+    'completion': _completion,
+    'coverage': _coverage,
+    'ranking': _ranking,
+    'times': _times,
 }
-"""The rows to decide by of all measurements of a kind; the other kinds have few rows."""
+"""The parts of `OVERVIEW`, by the names of their marks."""
+
+
+class Kind(NamedTuple):
+    """A kind of measurements."""
+
+    page: str
+    """Several kinds share one, each under its name."""
+    tables: Callable[[Any], Iterable[str]]
+    """All tables of one measurement."""
+    deciding: Callable[[Documents], Iterable[str]] | None
+    """The rows to decide by of all measurements; None where these are few."""
+
+
+KINDS = {
+    'real': Kind('real', result_tables.accuracy, _accuracy),
+    'kinds': Kind('scenes', result_tables.kinds_of_objects, _kinds_of_objects),
+    'tracks': Kind('tracks', result_tables.tracks, _tracks),
+    'paper': Kind('scenes', result_tables.paper, _paper),
+    'ablation': Kind('ablation', result_tables.ablation, _ablation),
+    'sensitivity': Kind('ablation', result_tables.sensitivity, _sensitivity),
+    'highway': Kind('scenes', result_tables.highway, _highway),
+    'points': Kind('scenes', result_tables.points, _points),
+    'lidars': Kind('scenes', result_tables.lidars, None),
+    'covariance': Kind('certainty', result_tables.covariance, _covariance),
+    'review': Kind('certainty', result_tables.review, _review),
+    'labeller': Kind('certainty', result_tables.labeller, None),
+    'report': Kind('speed', result_tables.figures, _report),
+    'speed': Kind('speed', result_tables.figures, _speed),
+    'load': Kind('node', result_tables.load, _load),
+    'scale': Kind('speed', result_tables.scale, _scale),
+    'kills': Kind('node', result_tables.figures, _kills),
+    'node': Kind('node', result_tables.node, _node),
+}
+SHARED = {
+    name for name, count in Counter(kind.page for kind in KINDS.values()).items() if count > 1
+}
+"""Pages that several kinds share."""
 
 
 if __name__ == '__main__':

@@ -21,8 +21,7 @@ from mkdocs.structure.files import File, Files
 import ziamath
 
 sys.path.insert(0, str(Path(__file__).parent))
-from result_tables import all_tables
-from results import FOLDED, STORE
+from results import all_tables, FOLDED, STORE
 
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.+?)\\[)\]]</\1>', re.DOTALL)
 """A formula as pymdownx.arithmatex marks it, in a line or in a block of its own."""

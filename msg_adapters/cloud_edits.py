@@ -7,22 +7,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from boxreg_ros.structures import Floats
-from msg_adapters.pointcloud import DTYPES
+from msg_adapters.pointcloud import DTYPES, NUMBERS
 from msg_adapters.poses import replaced
 import numpy as np
 from numpy.typing import NDArray
 
-NUMBERS = {kind: number for number, kind in DTYPES.items()}
-"""Kind of dtype -> ``PointField.datatype``."""
-
 
 def with_points(msg: Any, is_kept: NDArray[np.bool_]) -> Any:
-    """
-    Return a cloud with some of its points, in the same layout and under the same header.
-
-    `is_kept` (height * width,) is row by row; points that are not finite count, too.
-
-    """
+    """Return a cloud with some of its points, `is_kept` (height * width,), in the same layout."""
     if is_kept.all():
         return msg
     kept = np.compress(is_kept, _bytes_of(msg), axis=0)  # a quarter of the time of an index

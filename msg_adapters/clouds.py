@@ -14,7 +14,7 @@ from typing import Any
 import zlib
 
 from boxreg_ros.errors import UnsupportedMessage
-from msg_adapters.pointcloud import bytes_of, DTYPES
+from msg_adapters.pointcloud import bytes_of, DTYPES, NUMBERS
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,8 +35,6 @@ DRACO_METHOD, DRACO_KD_TREE = 8, 1
 """Byte of a Draco point cloud with its encoding method, and the method that sorts points."""
 COLOR_FIELDS = ('rgb', 'rgba')
 """Fields that the publisher of draco_point_cloud_transport splits into four numbers."""
-NUMBERS = {kind: number for number, kind in DTYPES.items()}
-"""Kind of dtype -> ``PointField.datatype``."""
 LIVOX_FIELDS = {'x': 'f4', 'y': 'f4', 'z': 'f4', 'reflectivity': 'u1', 'offset_time': 'u4'}
 """Fields of Livox's ``CustomPoint`` that are read; ``offset_time`` is in ns."""
 
@@ -85,11 +83,9 @@ def _decompressed(msg: Any) -> Any:
     raw = DECOMPRESSORS[msg.format](data, size)
     if len(raw) < size:
         raise _damaged(msg.format, len(data), f'{len(raw)} of {size} bytes of the cloud')
-    return SimpleNamespace(
-        header=msg.header, height=msg.height, width=msg.width, fields=msg.fields,
-        is_bigendian=msg.is_bigendian, point_step=msg.point_step, row_step=msg.row_step,
-        data=raw, is_dense=msg.is_dense,
-    )  # fmt: skip
+    names = ('header', 'height', 'width', 'fields', 'is_bigendian', 'point_step', 'row_step')
+    own = {name: getattr(msg, name) for name in (*names, 'is_dense')}
+    return SimpleNamespace(**own, data=raw)
 
 
 def _inflated(data: bytes, size: int) -> bytes:
@@ -149,11 +145,7 @@ def _draco_cloud(msg: Any) -> Any:
     for name, length, end in zip(names, lengths, ends, strict=True):
         values = np.stack(columns[end - length : end], axis=1)
         table[name] = values.reshape(table[name].shape)
-    return SimpleNamespace(
-        header=msg.header, height=1, width=len(table), fields=msg.fields, is_bigendian=False,
-        point_step=msg.point_step, row_step=table.nbytes, data=table.view(np.uint8),
-        is_dense=msg.is_dense,
-    )  # fmt: skip
+    return _cloud_of(msg.header, msg.fields, table, msg.is_dense)
 
 
 def _layout(msg: Any, names: Sequence[str], lengths: Sequence[int]) -> np.dtype[Any]:
@@ -228,10 +220,17 @@ def _cloud_of_columns(header: Any, columns: Sequence[tuple[str, NDArray[Any]]]) 
         number = NUMBERS[kind.str[1:]]
         fields.append(SimpleNamespace(name=name, offset=offset, datatype=number, count=1))
         offset += kind.itemsize
+    return _cloud_of(header, fields, table)
+
+
+def _cloud_of(
+    header: Any, fields: Sequence[Any], table: NDArray[Any], is_dense: bool = False
+) -> Any:
+    """Return the points of a table, whose columns are the fields, as a cloud of one row."""
     return SimpleNamespace(
         header=header, height=1, width=len(table), fields=fields, is_bigendian=False,
-        point_step=table.dtype.itemsize, row_step=table.nbytes, data=table.view(np.uint8),
-        is_dense=False,
+        point_step=table.itemsize, row_step=table.nbytes, data=table.view(np.uint8),
+        is_dense=is_dense,
     )  # fmt: skip
 
 

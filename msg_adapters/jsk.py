@@ -19,12 +19,7 @@ REQUIRED_FIELDS = ('header', 'pose', 'dimensions', 'value', 'label')
 
 
 def from_msg(msg: Any) -> BoxArray:
-    """
-    Return the boxes of a BoundingBoxArray.
-
-    Raises UnsupportedMessage if a box is in another frame than the array, or a field is missing.
-
-    """
+    """Return the boxes of a BoundingBoxArray; UnsupportedMessage if they are in several frames."""
     poses.require_fields('BoundingBoxArray', msg.boxes[:1], REQUIRED_FIELDS)
     header = poses.common_header('BoundingBoxArray', msg.header, msg.boxes)
     return BoxArray(

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.structures import Floats, Ints, Sweep
-from msg_adapters.point_layout import (
-    AUTO,
-    layout_of,
-    MAX_TIME_OFFSET,
-    PointLayout,
-    reading_of,
-    seconds_of,
-    time_field_of,
-)
+from msg_adapters import point_layout
+from msg_adapters.point_layout import AUTO
 from msg_adapters.poses import stamp_ns
 import numpy as np
 from numpy.typing import NDArray
 
 DTYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 """``PointField.datatype`` -> dtype of numpy."""
+NUMBERS = {kind: number for number, kind in DTYPES.items()}
 INTENSITY_FIELDS = ('intensity', 'i', 'reflectivity')
 
 
@@ -47,7 +41,7 @@ def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
         return Sweep(stamp, msg.header.frame_id, np.zeros((0, 3), np.float32))
     fields = _fields(msg)
     kinds = _kinds(fields)
-    time_field = time_field_of(kinds)
+    time_field = point_layout.time_field_of(kinds)
     names = ['x', 'y', 'z']
     if time_field:
         names.append(time_field)
@@ -62,7 +56,7 @@ def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
     if time_field:
         raw_times = table[time_field].ravel()  # contiguous: it is read several times
         known_times = raw_times if is_finite.all() else raw_times[is_finite]
-        times = _seconds(known_times, stamp, layout_of(kinds), time_unit)
+        times = _seconds(known_times, stamp, point_layout.layout_of(kinds), time_unit)
     if not is_finite.all():
         columns = columns[:, is_finite]
     return Sweep(stamp, msg.header.frame_id, columns.T, times)
@@ -74,20 +68,22 @@ def described(msg: Any, time_unit: str = AUTO) -> str:
         return 'empty'
     fields = _fields(msg)
     kinds = _kinds(fields)
-    layout = layout_of(kinds)
+    layout = point_layout.layout_of(kinds)
     name = f'unknown layout ({", ".join(fields)})' if layout is None else layout.name
-    time_field = time_field_of(kinds)
+    time_field = point_layout.time_field_of(kinds)
     if not time_field:
         return f'{name}: no times of the points'
     raw = _table(msg, [fields[time_field]])[time_field].ravel()
     raw = raw[np.isfinite(raw)]
-    reading = reading_of(raw, stamp_ns(msg.header), layout, time_unit) if raw.size else None
+    reading = (
+        point_layout.reading_of(raw, stamp_ns(msg.header), layout, time_unit) if raw.size else None
+    )
     if reading is None:
         return (
             f'{name}: times in {time_field} are not used: in no unit are they within '
-            f'{MAX_TIME_OFFSET:g} s of the stamp'
+            f'{point_layout.MAX_TIME_OFFSET:g} s of the stamp'
         )
-    duration = np.ptp(seconds_of(raw, stamp_ns(msg.header), reading))
+    duration = np.ptp(point_layout.seconds_of(raw, stamp_ns(msg.header), reading))
     origin = 'absolute' if reading.is_absolute else 'relative to the stamp'
     return f'{name}: times in {time_field}, {reading.unit}, {origin}, over {duration:.3f} s'
 
@@ -96,9 +92,7 @@ def finite_rows(msg: Any) -> Ints | None:
     """Return the rows (M,) of the points of `from_msg` in the message; None if these are all."""
     if not msg.width * msg.height:
         return None
-    fields = _fields(msg)
-    table = _table(msg, [fields[key] for key in 'xyz'])
-    is_finite = np.logical_and.reduce([np.isfinite(table[key].reshape(-1)) for key in 'xyz'])
+    is_finite = _is_finite(_table(msg, list(map(_fields(msg).__getitem__, 'xyz'))))
     return None if is_finite.all() else np.flatnonzero(is_finite)
 
 
@@ -120,12 +114,11 @@ def intensities(msg: Any) -> Floats | None:
     if not msg.width * msg.height:
         return None
     fields = _fields(msg)
-    name = _first(INTENSITY_FIELDS, fields)
+    name = next((name for name in INTENSITY_FIELDS if name in fields), None)
     if name is None:
         return None
     table = _table(msg, [fields[key] for key in (*'xyz', name)])
-    is_finite = np.logical_and.reduce([np.isfinite(table[key].reshape(-1)) for key in 'xyz'])
-    values = table[name].reshape(-1)[is_finite].astype(np.float64)
+    values = table[name].reshape(-1)[_is_finite(table)].astype(np.float64)
     return np.nan_to_num(values, posinf=0, neginf=0)
 
 
@@ -156,8 +149,10 @@ def _kinds(fields: Mapping[str, Any]) -> dict[str, str]:
     return {name: DTYPES.get(field.datatype, '') for name, field in fields.items()}
 
 
-def _first(names: Sequence[str], fields: Mapping[str, Any]) -> str | None:
-    return next((name for name in names if name in fields), None)
+def _is_finite(table: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which points of a table have finite coordinates, row by row."""
+    columns = [np.isfinite(table[key].reshape(-1)) for key in 'xyz']
+    return np.asarray(np.logical_and.reduce(columns))
 
 
 def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
@@ -217,18 +212,18 @@ def _check_field(field: Any, point_step: int) -> None:
 
 
 def _seconds(
-    raw: NDArray[Any], stamp: int, layout: PointLayout | None, unit: str
+    raw: NDArray[Any], stamp: int, layout: point_layout.PointLayout | None, unit: str
 ) -> Floats | None:
     """Return point times (M,) relative to the stamp [s]; see the notes of `from_msg`."""
     if not raw.size:
         return np.zeros(0)
     is_known = np.isfinite(raw)
     known = raw if is_known.all() else raw[is_known]
-    reading = reading_of(known, stamp, layout, unit) if known.size else None
+    reading = point_layout.reading_of(known, stamp, layout, unit) if known.size else None
     if reading is None:
         return None
     if known is raw:
-        return seconds_of(raw, stamp, reading)
+        return point_layout.seconds_of(raw, stamp, reading)
     times = np.zeros(raw.shape)
-    times[is_known] = seconds_of(known, stamp, reading)
+    times[is_known] = point_layout.seconds_of(known, stamp, reading)
     return times

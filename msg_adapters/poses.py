@@ -48,12 +48,7 @@ def require_fields(kind: str, items: Iterable[Any], names: Sequence[str]) -> Non
 
 
 def common_header(kind: str, header: Any, items: Sequence[Any]) -> Any:
-    """
-    Return the header of an array, or that of its items if the array has no frame.
-
-    Raises UnsupportedMessage if an item names another frame.
-
-    """
+    """Return the header of an array, or its items'; UnsupportedMessage for several frames."""
     header = header if header.frame_id or not items else items[0].header
     for item in items:
         frame = item.header.frame_id
@@ -66,12 +61,7 @@ def common_header(kind: str, header: Any, items: Sequence[Any]) -> Any:
 
 
 def common_stamp_and_frame(kind: str, headers: Iterable[tuple[int, str]]) -> tuple[int, str]:
-    """
-    Return stamp [ns] and frame of boxes that have a header each; 0 and '' for no boxes.
-
-    Raises UnsupportedMessage if they differ.
-
-    """
+    """Return the one stamp [ns] and frame of boxes, 0 and '' for none; else UnsupportedMessage."""
     found = set(headers)
     if len(found) > 1:
         names = ', '.join(f'{frame!r} at {stamp} ns' for stamp, frame in sorted(found))

@@ -185,12 +185,7 @@ class SerializedAdapter:
 def serialized_adapter_for(
     type_name: str, convention: Convention, kind: Any, deserialize: Callable[[bytes, Any], Any]
 ) -> Adapter | None:
-    """
-    Return the adapter of serialised messages of a type; None if there is none, or no numba.
-
-    Errors are those of `adapter_for`; see `SerializedAdapter`.
-
-    """
+    """Return the adapter of serialised messages, as `adapter_for`; None if there is none."""
     inner = adapter_for(type_name, replace(STANDARD, associate=convention.associate))
     if type_name not in BOX_FIELDS or walker() is None:
         return None
@@ -400,6 +395,25 @@ def _jsk_labels(fields: Fields) -> BoxLabels:
     return [''] * len(classes), classes, scores
 
 
+DETECTED_OBJECTS = BoxFields(
+    ('header.frame_id',),
+    KINEMATICS + 'pose_with_covariance.pose.position.x',
+    'objects.shape.dimensions.x',
+    _autoware_labels,
+    others=(*AUTOWARE_FIELDS, HAS_COVARIANCE),
+    covariance=KINEMATICS + 'pose_with_covariance.covariance',
+    is_ordinary=_has_no_cylinder,
+    has_angles=_is_oriented,
+    write=_write_detected,
+)
+OBJECT_ARRAY = BoxFields(
+    ('header.frame_id', 'objects.header.frame_id'),
+    'objects.pose.position.x',
+    DIMENSIONS,
+    _object_labels,
+    others=OBJECT_FIELDS,
+    is_ordinary=_has_boxes_only,
+)
 BOX_FIELDS = {
     'vision_msgs/msg/Detection3DArray': BoxFields(
         ('header.frame_id', 'detections.header.frame_id'),
@@ -416,44 +430,16 @@ BOX_FIELDS = {
     'vision_msgs/msg/BoundingBox3DArray': BoxFields(
         ('header.frame_id',), 'boxes.center.position.x', 'boxes.size.x', _without_labels
     ),
-    'autoware_perception_msgs/msg/TrackedObjects': BoxFields(
-        ('header.frame_id',),
-        KINEMATICS + 'pose_with_covariance.pose.position.x',
-        'objects.shape.dimensions.x',
-        _tracked_labels,
+    'autoware_perception_msgs/msg/TrackedObjects': replace(
+        DETECTED_OBJECTS,
+        labels=_tracked_labels,
         others=(*AUTOWARE_FIELDS, ACCELERATION_FIELD, 'objects.object_id.uuid'),
-        covariance=KINEMATICS + 'pose_with_covariance.covariance',
-        is_ordinary=_has_no_cylinder,
-        has_angles=_is_oriented,
         write=_write_tracked,
     ),
-    'autoware_perception_msgs/msg/DetectedObjects': BoxFields(
-        ('header.frame_id',),
-        KINEMATICS + 'pose_with_covariance.pose.position.x',
-        'objects.shape.dimensions.x',
-        _autoware_labels,
-        others=(*AUTOWARE_FIELDS, HAS_COVARIANCE),
-        covariance=KINEMATICS + 'pose_with_covariance.covariance',
-        is_ordinary=_has_no_cylinder,
-        has_angles=_is_oriented,
-        write=_write_detected,
-    ),
-    'derived_object_msgs/msg/ObjectArray': BoxFields(
-        ('header.frame_id', 'objects.header.frame_id'),
-        'objects.pose.position.x',
-        DIMENSIONS,
-        _object_labels,
-        others=OBJECT_FIELDS,
-        is_ordinary=_has_boxes_only,
-    ),
-    'derived_object_msgs/msg/ObjectWithCovarianceArray': BoxFields(
-        ('header.frame_id', 'objects.header.frame_id'),
-        'objects.pose.pose.position.x',
-        DIMENSIONS,
-        _object_labels,
-        others=OBJECT_FIELDS,
-        covariance='objects.pose.covariance',
-        is_ordinary=_has_boxes_only,
+    'autoware_perception_msgs/msg/DetectedObjects': DETECTED_OBJECTS,
+    'derived_object_msgs/msg/ObjectArray': OBJECT_ARRAY,
+    'derived_object_msgs/msg/ObjectWithCovarianceArray': replace(
+        OBJECT_ARRAY, pose='objects.pose.pose.position.x', covariance='objects.pose.covariance'
     ),
     'foxglove_msgs/msg/SceneUpdate': BoxFields(
         ('entities.frame_id',),

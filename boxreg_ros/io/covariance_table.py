@@ -74,12 +74,7 @@ class CovarianceWriter:
 
 
 def read_covariances(path: Path) -> dict[tuple[int, str], BoxCovariance]:
-    """
-    Read a table of covariances; of rows with one stamp and track id the first counts.
-
-    Raises RecordingError if the file cannot be read, or a column or a number is missing.
-
-    """
+    """Read a table of covariances, the first row of a stamp and id; RecordingError if damaged."""
     try:
         with path.open(newline='', encoding='utf-8-sig') as file:
             found: dict[tuple[int, str], BoxCovariance] = {}

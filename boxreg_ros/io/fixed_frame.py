@@ -20,7 +20,7 @@ from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.items import Item, ItemSource, not_measured, Stage, Wanted
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MISSING, MergedSweep
 from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
-from boxreg_ros.io.transforms import inverse, sweep_to_frame, TransformTree
+from boxreg_ros.io.transforms import inverse, sweep_to_frame
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from msg_adapters.convention import Convention, STANDARD
@@ -91,22 +91,14 @@ class FixedFrameItems:
         self._jumps = JumpConfirmation[Item]()
         self._restarts = False
         self.session = Session(convention, config, placement=source.placement)
+        self.tree = self.session.tree
         with stage('read'):
-            self.session.fixed_frame = source.choose_fixed_frame(self.tree, fixed_frame)
+            self.fixed_frame = source.choose_fixed_frame(self.tree, fixed_frame)
+        self.session.fixed_frame = self.fixed_frame
         self.counts: Counter[str] = Counter()
         self.missing_transforms = 0
         self.first_missing_transform = ''
         self.first_unplaced = ''
-
-    @property
-    def tree(self) -> TransformTree:
-        """Return the transforms, up to the last item that was read."""
-        return self.session.tree
-
-    @property
-    def fixed_frame(self) -> str:
-        """Return the fixed frame."""
-        return self.session.fixed_frame
 
     def read(
         self, *, with_clouds: bool = True, with_intensities: bool = False
@@ -137,12 +129,7 @@ class FixedFrameItems:
             return None
 
     def stored_cloud(self, item: MovedItem, frame_id: str) -> StoredCloud:
-        """
-        Return a cloud for label files: merged ones in `frame_id`, a single one in its own frame.
-
-        The times of its points are those by which it was moved.
-
-        """
+        """Return a cloud for label files, a merged one in `frame_id`, with its times as moved."""
         moved = item.moved
         given = item.given
         assert isinstance(given, Sweep)

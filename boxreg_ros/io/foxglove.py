@@ -82,13 +82,8 @@ def ros_type(schema_name: str) -> str:
     return ROS_TYPES.get(schema_name, schema_name)
 
 
-def decoder_of(origin: str, topic: str, schema: Schema) -> Callable[[bytes], Any]:
-    """Return the function that decodes the messages of a channel; errors name origin and topic."""
-    return _Decoder(origin, topic, schema)
-
-
-class _Decoder:
-    """Decodes the messages of one channel; each may be JSON or protobuf."""
+class ChannelDecoder:
+    """Decodes the messages of one channel, each JSON or protobuf; errors name origin and topic."""
 
     def __init__(self, origin: str, topic: str, schema: Schema) -> None:
         self._origin = f'{origin}: messages on {topic!r}'
@@ -96,6 +91,7 @@ class _Decoder:
         self._decode: Callable[[bytes], Any] | None = None
 
     def __call__(self, data: bytes) -> Any:
+        """Return a message as ROS has it where it is converted."""
         if data[:1] == b'{':
             message = _from_json(data, self._schema.name)
         else:

@@ -79,13 +79,7 @@ class RecordedImages:
                 self.cameras.append(self._camera(topic, frame_id, message))
 
     def nearest(self, camera: ImageCamera, stamp_ns: int) -> Image:
-        """
-        Return the image of a camera that is nearest to a stamp.
-
-        Raises RecordingError if there is none within the second of `NEAR`, and UnsupportedMessage
-        if its encoding is not known.
-
-        """
+        """Return the image of a camera nearest to a stamp; RecordingError if none is in `NEAR`."""
         middle_ns = stamp_ns + self._delays[camera.topic]
         for seconds in NEAR:
             reach_ns = round(seconds * 1e9)

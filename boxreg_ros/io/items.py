@@ -66,12 +66,7 @@ EVERYTHING = Wanted()
 def requested_part(
     source: str, begin_ns: int, end_ns: int, start: float | None, end: float | None
 ) -> tuple[int, int]:
-    """
-    Return begin and end of the part of a drive from `start` to `end` [s], in nanoseconds.
-
-    Raises RecordingError if it is empty.
-
-    """
+    """Return begin and end [ns] of the part from `start` to `end` [s]; RecordingError if empty."""
     first_ns = begin_ns + round((start or 0.0) * 1e9)
     behind_ns = end_ns if end is None else min(end_ns, begin_ns + round(end * 1e9))
     if first_ns >= behind_ns:

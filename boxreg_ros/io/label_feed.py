@@ -110,12 +110,7 @@ class RecorderStatus:
 
 
 def segment_limit(text: str) -> tuple[float, bool]:
-    """
-    Return the length of a segment [s or bytes], and whether it is in bytes.
-
-    Raises ConfigError if the text is not a positive number with a unit of `UNITS`.
-
-    """
+    """Return the length of a segment [s or bytes], and whether it is in bytes, or ConfigError."""
     found = re.fullmatch(r'\s*(\d+(?:\.\d+)?)\s*([a-zA-Z]+)\s*', text)
     if found is None or found[2] not in UNITS or float(found[1]) <= 0:
         raise ConfigError(

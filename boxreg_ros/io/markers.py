@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import count
 from textwrap import fill
 from types import SimpleNamespace
@@ -20,7 +20,6 @@ from boxreg_ros.structures import (
     LENGTH,
     REFINED,
     RefinedBoxes,
-    Z,
 )
 from msg_adapters.poses import quaternions_of
 import numpy as np
@@ -50,8 +49,7 @@ ARROW, CUBE, SPHERE, LINE_STRIP, TEXT = 0, 1, 2, 4, 9
 OUTLINE = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
 """Signs of x and y along the outline of a face."""
 ADD, DELETE, DELETEALL = 0, 2, 3
-BUDGET = Reason.BUDGET
-"""Reason of boxes that there was no time for, see `reasons`."""
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 class _Shown:
@@ -134,7 +132,9 @@ class MarkerBoard:
             box = refined.boxes.boxes[i]
             is_given = i < len(before)
             is_refined = refined.status[i] in COLOURS
-            colour = _colour_of(refined.status[i], refined.reasons[i])
+            colour = COLOURS.get(refined.status[i], ORANGE)
+            if refined.reasons[i] == Reason.BUDGET:
+                colour = YELLOW
             spread = refined.covariances[i, :2, :2] if is_refined else np.zeros((2, 2))
             grey = m.Marker(header=header, ns='input', id=number, action=DELETE)
             if is_given:
@@ -185,69 +185,66 @@ class MarkerBoard:
         return m.Header(stamp=m.Time(sec=sec, nanosec=nanosec), frame_id=boxes.frame_id)
 
 
-def _colour_of(status: str, reason: str) -> Colour:
-    """Return the colour of a box by what was done with it."""
-    return YELLOW if reason == BUDGET else COLOURS.get(status, ORANGE)
-
-
 def _cube(
     m: Any, header: Any, ns: str, number: int, box: Floats, quaternion_xyzw: Floats, colour: Colour
 ) -> Any:
-    length, width, height = _plain(box[BOX_EXTENT])
-    return m.Marker(
-        header=header, ns=ns, id=number, type=CUBE, action=ADD,
-        pose=_pose(m, box[BOX_CENTER], quaternion_xyzw),
-        scale=m.Vector3(x=length, y=width, z=height), color=_colour(m, colour),
-    )  # fmt: skip
+    pose = _pose(m, box[BOX_CENTER], quaternion_xyzw)
+    return _marker(m, header, ns, number, CUBE, pose, box[BOX_EXTENT], colour)
 
 
 def _outline(m: Any, header: Any, number: int, box: Floats, quaternion_xyzw: Floats) -> Any:
     """Return the outline of the bottom face: it hides no colour of the box above it."""
-    length, width, height = _plain(box[BOX_EXTENT])
-    return m.Marker(
-        header=header, ns=FINAL, id=number, type=LINE_STRIP, action=ADD,
-        pose=_pose(m, box[BOX_CENTER], quaternion_xyzw), scale=m.Vector3(x=0.1),
-        color=_colour(m, CYAN),
-        points=[m.Point(x=x * length / 2, y=y * width / 2, z=-height / 2) for x, y in OUTLINE],
-    )  # fmt: skip
+    length, width, height = map(float, box[BOX_EXTENT])
+    points = [m.Point(x=x * length / 2, y=y * width / 2, z=-height / 2) for x, y in OUTLINE]
+    pose = _pose(m, box[BOX_CENTER], quaternion_xyzw)
+    return _marker(m, header, FINAL, number, LINE_STRIP, pose, (0.1, 0, 0), CYAN, points=points)
 
 
 def _arrow(m: Any, header: Any, number: int, box: Floats, quaternion_xyzw: Floats) -> Any:
     """Return an arrow from the centre along the heading, beyond the front."""
-    return m.Marker(
-        header=header, ns='heading', id=number, type=ARROW, action=ADD,
-        pose=_pose(m, box[BOX_CENTER], quaternion_xyzw),
-        scale=m.Vector3(x=0.8 * float(box[LENGTH]), y=0.15, z=0.15), color=_colour(m, WHITE),
-    )  # fmt: skip
+    pose = _pose(m, box[BOX_CENTER], quaternion_xyzw)
+    scale = (0.8 * box[LENGTH], 0.15, 0.15)
+    return _marker(m, header, 'heading', number, ARROW, pose, scale, WHITE)
 
 
 def _ellipse(m: Any, header: Any, number: int, box: Floats, spread: Floats) -> Any:
     """Return the covariance (2, 2) of x and y as a disc on the roof; a dot where it is zero."""
     variances, axes = np.linalg.eigh(spread)
-    across, along = _plain(2 * ELLIPSE_DEVIATIONS * np.sqrt(variances.clip(0)) + 1e-3)
+    across, along = 2 * ELLIPSE_DEVIATIONS * np.sqrt(variances.clip(0)) + 1e-3
     half = 0.5 * np.arctan2(axes[1, 1], axes[0, 1])  # eigenvalues ascend
-    above = box[BOX_CENTER].copy()
-    above[Z] += 0.5 * box[HEIGHT]
-    return m.Marker(
-        header=header, ns='covariance', id=number, type=SPHERE, action=ADD,
-        pose=_pose(m, above, np.array([0.0, 0.0, np.sin(half), np.cos(half)])),
-        scale=m.Vector3(x=along, y=across, z=0.02), color=_colour(m, BLUE),
-    )  # fmt: skip
+    above = box[BOX_CENTER] + [0, 0, 0.5 * box[HEIGHT]]
+    pose = _pose(m, above, (0, 0, np.sin(half), np.cos(half)))
+    return _marker(m, header, 'covariance', number, SPHERE, pose, (along, across, 0.02), BLUE)
 
 
 def _text(m: Any, header: Any, number: int, box: Floats, text: str) -> Any:
-    above = box[BOX_CENTER].copy()
-    above[Z] += 0.5 * box[HEIGHT] + 0.5
+    pose = _pose(m, box[BOX_CENTER] + [0, 0, 0.5 * box[HEIGHT] + 0.5])
+    return _marker(m, header, 'id', number, TEXT, pose, (0, 0, 0.8), WHITE, text=text)
+
+
+def _marker(
+    m: Any,
+    header: Any,
+    ns: str,
+    number: int,
+    kind: int,
+    pose: Any,
+    scale: Iterable[float],
+    colour: Colour,
+    **fields: Any,
+) -> Any:
+    """Return a marker; messages take plain floats only."""
+    x, y, z = map(float, scale)
+    color = m.ColorRGBA(**dict(zip('rgba', colour, strict=True)))
     return m.Marker(
-        header=header, ns='id', id=number, type=TEXT, action=ADD,
-        pose=_pose(m, above, np.array([0.0, 0.0, 0.0, 1.0])), scale=m.Vector3(z=0.8),
-        color=_colour(m, WHITE), text=text,
+        header=header, ns=ns, id=number, type=kind, action=ADD, pose=pose,
+        scale=m.Vector3(x=x, y=y, z=z), color=color, **fields,
     )  # fmt: skip
 
 
-def _pose(m: Any, position: Floats, quaternion_xyzw: Floats) -> Any:
-    x, y, z = _plain(position)
-    qx, qy, qz, qw = _plain(quaternion_xyzw)
+def _pose(m: Any, position: Iterable[float], quaternion_xyzw: Iterable[float] = UPRIGHT) -> Any:
+    x, y, z = map(float, position)
+    qx, qy, qz, qw = map(float, quaternion_xyzw)
     return m.Pose(
         position=m.Point(x=x, y=y, z=z), orientation=m.Quaternion(x=qx, y=qy, z=qz, w=qw)
     )
@@ -256,24 +253,13 @@ def _pose(m: Any, position: Floats, quaternion_xyzw: Floats) -> Any:
 def text_marker(frame_id: str, text: str, is_error: bool) -> Any:
     """Return the state of the recording as text above the sensor; an empty text deletes it."""
     m = ros_messages()
-    above = np.array([0.0, 0.0, TEXT_HEIGHT])
-    lines = fill(text, TEXT_WIDTH)
-    marker = m.Marker(
-        header=m.Header(frame_id=frame_id),
-        ns=RECORDING, type=TEXT, action=ADD if text else DELETE,
-        pose=_pose(m, above, np.array([0.0, 0.0, 0.0, 1.0])), scale=m.Vector3(z=0.8),
-        color=_colour(m, RED if is_error else WHITE), text=lines, frame_locked=True,
+    colour = RED if is_error else WHITE
+    marker = _marker(
+        m, m.Header(frame_id=frame_id), RECORDING, 0, TEXT, _pose(m, (0, 0, TEXT_HEIGHT)),
+        (0, 0, 0.8), colour, text=fill(text, TEXT_WIDTH), frame_locked=True,
     )  # fmt: skip
+    marker.action = ADD if text else DELETE
     return m.MarkerArray(markers=[marker])
-
-
-def _plain(values: Floats) -> Iterator[float]:
-    """Yield plain floats: messages take no others."""
-    return map(float, values)
-
-
-def _colour(m: Any, rgba: Colour) -> Any:
-    return m.ColorRGBA(**dict(zip('rgba', rgba, strict=True)))
 
 
 def ros_messages() -> SimpleNamespace:

@@ -10,6 +10,7 @@ from typing import Any
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.storage.reader import is_message, Reader
 from boxreg_ros.io.storage.record import one_line, Record
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
@@ -28,6 +29,9 @@ VISION_DEFINITIONS = {
         'std_msgs/Header header\nvision_msgs/Detection3D[] detections'
     ),
 }
+
+NAMES = {'bool': 'boolean', 'byte': 'octet', 'float32': 'float', 'float64': 'double'}
+"""Names of rclpy where those of definitions differ."""
 
 
 class MessageDecoder:
@@ -68,6 +72,31 @@ class MessageDecoder:
         """Forget the counts."""
         self.unreadable.clear()
         self.first_errors.clear()
+
+
+class RecordedType:
+    """Stand-in for the class of a message type; KeyError if the recording does not define it."""
+
+    def __init__(self, store: Typestore, name: str) -> None:
+        package, _, kind = name.replace('/msg/', '/').partition('/')
+        self.__name__ = name
+        self._fields = store.fielddefs[f'{package}/msg/{kind}'][1]
+
+    def get_fields_and_field_types(self) -> dict[str, str]:
+        """Return the type of each field, as ``double[36]``."""
+        return {name: _field_type(kind) for name, kind in self._fields}
+
+
+def _field_type(kind: Any) -> str:
+    """Return the type of a field."""
+    node, value = kind
+    if node == Nodetype.BASE:
+        return NAMES.get(value[0], str(value[0]))
+    if node == Nodetype.NAME:
+        return str(value).replace('/msg/', '/')
+    element, count = value
+    inner = _field_type(element)
+    return f'{inner}[{count}]' if node == Nodetype.ARRAY else f'sequence<{inner}>'
 
 
 def stock_types() -> Typestore:

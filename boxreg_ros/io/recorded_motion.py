@@ -62,12 +62,7 @@ class RecordedMotion:
             self._decoder.count_unreadable(topic, error)
 
     def first(self, topic: str) -> Any:
-        """
-        Return the first readable message on a topic in the part that is read; None without any.
-
-        Raises UnsupportedMessage if there are messages, and none is readable.
-
-        """
+        """Return the first readable message on a topic; UnsupportedMessage if none of them is."""
         first_error: UnsupportedMessage | None = None
         for record in self._read({topic}, self._start_ns, self._end_ns):
             try:
@@ -139,12 +134,7 @@ class RecordedMotion:
         return self._topics.filled((ODOMETRY_TYPE,))
 
     def _add_odometry(self, tree: TransformTree, frame: str, root: str | None) -> list[str]:
-        """
-        Use the odometry that moves `root`, the topmost frame of TF, or any above `frame`.
-
-        Returns the topics with the frames that they connect.
-
-        """
+        """Use odometry that moves `root`, or any above `frame`; return topics and frames."""
         odometry = []
         relevant = {}
         for topic in self._odometry_topics():

@@ -18,11 +18,10 @@ from boxreg_ros.io.foxglove import encoded
 from boxreg_ros.io.images import RecordedImages
 from boxreg_ros.io.items import EVERYTHING, Item, LOOKAHEAD_NS, requested_part, Wanted
 from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
-from boxreg_ros.io.message_decoder import malformed, MessageDecoder
+from boxreg_ros.io.message_decoder import malformed, MessageDecoder, RecordedType
 from boxreg_ros.io.recorded_motion import RecordedMotion
-from boxreg_ros.io.recorded_type import RecordedType
 from boxreg_ros.io.resync import MessageOrder
-from boxreg_ros.io.storage.files import is_ros1, part_of
+from boxreg_ros.io.storage.files import part_of
 from boxreg_ros.io.storage.reader import Reader
 from boxreg_ros.io.storage.record import Damage, Record
 from boxreg_ros.io.topics import ODOMETRY_TYPE, Topics
@@ -50,8 +49,8 @@ class Recording:
     are not named are found by type, if only one has it. Use as a context manager; a copy can be
     opened again.
 
-    Attributes are those of `ItemSource`; also the `files`, and `part_ns`: begin and end that were
-    asked for, in receive time [ns], None where not.
+    Attributes are those of `ItemSource`; also the `files`, all `topics` with their types, and
+    `part_ns`: begin and end that were asked for, in receive time [ns], None where not.
 
     Raises RecordingError on entering, if a file or topic cannot be read or found; the message
     lists the topics.
@@ -84,10 +83,6 @@ class Recording:
         """Open all files and find the topics."""
         parts = [part_of(path) for path in self._paths]
         self.files = [file for part in parts for file in part.files]
-        if len({is_ros1(file) for file in self.files}) > 1:
-            raise RecordingError(
-                'recordings of ROS 1 and ROS 2 cannot be merged; relabel them one by one'
-            )
         self._reader = Reader(parts)
         try:
             self._find_topics()
@@ -100,14 +95,18 @@ class Recording:
     def _find_topics(self) -> None:
         """Find the topics, and complete the definitions of their messages."""
         self._topics = Topics(self._reader.connections, str(self))
+        self.topics = self._topics.kinds
+        self.is2 = self._reader.is2
         lidars, self.points_topic = self._topics.find_lidars(self._lidars)
         self.placement = SensorPlacement(lidars)
+        self.points_topics = lidars.topics
         self.boxes_topic = ''
         if self.has_boxes:
             self.boxes_topic = self._topics.find_boxes(
                 self._asked_boxes, self._convention.associate
             )
             self._adapter = adapter_for(self.topics[self.boxes_topic], self._convention)
+        self.data_topics = {*self.points_topics, self.boxes_topic}
         if self._asked_odometry:
             self._topics.find('odometry', 'odometry', (ODOMETRY_TYPE,), self._asked_odometry)
         self._decoder = MessageDecoder(self._reader, str(self))
@@ -202,9 +201,7 @@ class Recording:
         replaced = self._adapter.to_msg(message, boxes, covariances)
         if not hasattr(message, '__msgtype__'):
             return encoded(replaced)
-        store, kind = self._reader.typestore, self.topics[self.boxes_topic]
-        encode = store.serialize_cdr if self._reader.is2 else store.serialize_ros1
-        return bytes(encode(replaced, kind))
+        return self._encoded(replaced, self.topics[self.boxes_topic])
 
     def cloud_message(self, topic: str, data: bytes) -> Any:
         """Return a message of a topic of clouds; UnsupportedMessage if it is malformed."""
@@ -213,9 +210,11 @@ class Recording:
 
     def encoded_cloud(self, message: Any) -> bytes:
         """Return the bytes of a PointCloud2 as the recording encodes its messages."""
+        return self._encoded(message, clouds.POINTS_TYPE)
+
+    def _encoded(self, message: Any, kind: str) -> bytes:
         store = self._reader.typestore
-        encode = store.serialize_cdr if self._reader.is2 else store.serialize_ros1
-        return bytes(encode(message, clouds.POINTS_TYPE))
+        return bytes((store.serialize_cdr if self.is2 else store.serialize_ros1)(message, kind))
 
     def received_ns(self, topic: str, received_ns: int, data: bytes) -> int:
         """Return the receive time that a message on a topic of `apart` gets: its cloud's [ns]."""
@@ -256,29 +255,9 @@ class Recording:
         return self._reader.damages
 
     @property
-    def is2(self) -> bool:
-        """Return whether its messages are of ROS 2."""
-        return self._reader.is2
-
-    @property
     def typestore(self) -> Typestore:
         """Return the message definitions of the recording."""
         return self._reader.typestore
-
-    @property
-    def data_topics(self) -> set[str]:
-        """Return the topics of clouds and boxes."""
-        return {*self.points_topics, self.boxes_topic}
-
-    @property
-    def points_topics(self) -> tuple[str, ...]:
-        """Return the topics of clouds."""
-        return self.placement.lidars.topics
-
-    @property
-    def topics(self) -> dict[str, str]:
-        """Return all topics with the types of their messages."""
-        return self._topics.kinds
 
     def choose_fixed_frame(self, tree: TransformTree, fixed_frame: str | None = None) -> str:
         """

@@ -14,12 +14,7 @@ POINT = np.dtype((np.float32, 3))
 
 
 class SweepStore:
-    """
-    The points of sweeps in a temporary file: a drive has more of them than fit the memory.
-
-    Points are stored relative to `origin` (3,), so that float32 is enough [m].
-
-    """
+    """The points of sweeps in a temporary file, in float32 relative to `origin` (3,) [m]."""
 
     def __init__(self) -> None:
         self.stamps_ns: list[int] = []

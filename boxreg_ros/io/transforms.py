@@ -139,13 +139,7 @@ class TransformTree:
         )
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Floats:
-        """
-        Return ``T_target_source`` (4, 4) at a stamp.
-
-        Raises TransformUnavailable if no transforms connect the frames, or one is not known at the
-        stamp.
-
-        """
+        """Return ``T_target_source`` (4, 4) at a stamp, or raise TransformUnavailable."""
         T_target_source = np.eye(4)
         for edge, is_upward in self._route(target, source):
             T = edge.at(stamp_ns, self._max_extrapolation_ns)
@@ -382,12 +376,7 @@ def interpolated(first: Floats, second: Floats, share: float) -> Floats:
 
 
 def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
-    """
-    Return the sweep in another frame.
-
-    The positions of the sensors are moved; of the points, only `T_frame_points` changes.
-
-    """
+    """Return the sweep in another frame; its points stay, but `T_frame_points` changes."""
     R = T_frame_sweep[:3, :3]
     t = T_frame_sweep[:3, 3]
     known = sweep.T_frame_points

@@ -59,12 +59,7 @@ def delete_partial_files(folder: Path) -> None:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """
-    Yield a folder on the disk of temporary files, which is deleted at the end.
-
-    Raises TransferError if that disk is full.
-
-    """
+    """Yield a temporary folder, deleted at the end; TransferError if that disk is full."""
     try:
         with tempfile.TemporaryDirectory() as folder:
             yield Path(folder)

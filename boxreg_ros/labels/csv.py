@@ -79,12 +79,7 @@ class Writer:
 
 
 def _texts(numbers: Floats) -> Iterator[str]:
-    """
-    Yield the cells of each row of `numbers` (n, k) with commas; not finite ones are empty.
-
-    The texts are those of `repr`, which takes ten times as long as orjson.
-
-    """
+    """Yield the cells of rows (n, k) with commas, as of `repr`; not finite ones are empty."""
     flat = numbers.ravel()
     texts = orjson.dumps(flat, option=orjson.OPT_SERIALIZE_NUMPY)[1:-1].decode().split(',')
     low, high = PLAIN_RANGE

@@ -9,16 +9,17 @@ sensor frame; the extents are along x (forward), y (left) and z of the box.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.files import following, from_json, require_single
-from boxreg_ros.labels.folder import FolderWriter, FrameNames
+from boxreg_ros.labels.folder import FolderWriter, frame_name
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame
-from boxreg_ros.labels.records import evidence_of, refined_boxes, UPPER_TRIANGLE
+from boxreg_ros.labels.records import evidence_of, ReadBox, refined_of, UPPER_TRIANGLE
 from boxreg_ros.labels.sidecar import read_sidecar, STAMPS_FILE
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, ROLL
@@ -86,15 +87,6 @@ class Cuboid:
     """As of `evidence_of`, with num_points; of the covariance the upper triangle, row by row."""
 
 
-class ReadCuboid(NamedTuple):
-    """A box as read from a file of a tool; `box` (9,) is in the sensor frame."""
-
-    track_id: str
-    class_name: str
-    box: Floats
-    evidence: Mapping[str, Any]
-
-
 class CuboidWriter(FolderWriter):
     """Write the labels and the cloud of each frame, as the tools share them."""
 
@@ -148,7 +140,7 @@ def read_files(
     labels: Path,
     names: Iterable[str],
     what: str,
-    cuboids_of: Callable[[Any], list[ReadCuboid]],
+    cuboids_of: Callable[[Any], list[ReadBox]],
     has_all: bool = True,
 ) -> Iterator[LabelFrame]:
     """
@@ -159,7 +151,7 @@ def read_files(
 
     """
 
-    def cuboids_by_name(name: str) -> list[ReadCuboid]:
+    def cuboids_by_name(name: str) -> list[ReadBox]:
         file = labels / f'{name}.json'
         if not has_all and not file.exists():
             return []
@@ -171,7 +163,7 @@ def read_files(
 
 
 def read_frames(
-    folder: Path, names: list[str], cuboids_by_name: Callable[[str], list[ReadCuboid]]
+    folder: Path, names: list[str], cuboids_by_name: Callable[[str], list[ReadBox]]
 ) -> Iterator[LabelFrame]:
     """
     Yield the frames of a folder with sidecar files, in the fixed frame where it is known.
@@ -181,8 +173,8 @@ def read_frames(
 
     """
     sidecar = read_sidecar(folder, len(names))
-    namer = FrameNames()
-    order = [namer.of(stamp_ns) for stamp_ns in sidecar.stamps_ns]
+    used: Counter[int] = Counter()
+    order = [frame_name(stamp_ns, used) for stamp_ns in sidecar.stamps_ns]
     if not set(names) <= set(order):  # frames named by another program: one stamp for each
         if len(names) != len(order):
             raise RecordingError(
@@ -193,12 +185,5 @@ def read_frames(
     for index, name in enumerate(order):
         cuboids = cuboids_by_name(name)
         with following(folder, f'attributes as boxreg writes them in frame {name!r}'):
-            refined = refined_boxes(
-                sidecar.stamps_ns[index],
-                sidecar.sensor_frame,
-                [cuboid.track_id for cuboid in cuboids],
-                [cuboid.class_name for cuboid in cuboids],
-                [cuboid.box for cuboid in cuboids],
-                [cuboid.evidence for cuboid in cuboids],
-            )
+            refined = refined_of(sidecar.stamps_ns[index], sidecar.sensor_frame, cuboids)
         yield sidecar.frame(index, refined).moved('fixed')

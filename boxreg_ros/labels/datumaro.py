@@ -13,20 +13,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.labels.cuboids import (
-    box_from_cuboid,
-    Cuboid,
-    cuboid_format,
-    CuboidWriter,
-    read_frames,
-    ReadCuboid,
-)
+from boxreg_ros.labels import cuboids
 from boxreg_ros.labels.files import following, from_json, JsonList
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
-from boxreg_ros.labels.records import TrackNumbers
+from boxreg_ros.labels.records import ReadBox, TrackNumbers
 
 FORMAT = replace(
-    cuboid_format(
+    cuboids.cuboid_format(
         name='datumaro',
         title='Datumaro, CVAT',
         files='annotations/default.json, point_clouds/default/STAMP.pcd',
@@ -41,7 +34,7 @@ SWAPPED_KEY = 'scale_is_height_width_length'
 """Key of the header that states `Options.swap_axes`."""
 
 
-class Writer(CuboidWriter):
+class Writer(cuboids.CuboidWriter):
     """
     Write one item per frame, and the classes when closed.
 
@@ -87,7 +80,7 @@ class Writer(CuboidWriter):
         labels = [{'name': name, 'parent': '', 'attributes': []} for name in self._labels]
         self._items.close({'categories': {'label': {'labels': labels, 'attributes': []}}})
 
-    def _annotation(self, index: int, track_number: int, cuboid: Cuboid) -> dict[str, Any]:
+    def _annotation(self, index: int, track_number: int, cuboid: cuboids.Cuboid) -> dict[str, Any]:
         """Return the annotation of a cuboid; its class is added to the labels."""
         label_id = self._labels.setdefault(cuboid.class_name, len(self._labels))
         attributes = {'track_id': track_number, 'track': cuboid.track_id, 'occluded': False}
@@ -118,7 +111,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
             ]
             for item in sorted(content['items'], key=_order)
         }
-    yield from read_frames(path, list(items), items.__getitem__)
+    yield from cuboids.read_frames(path, list(items), items.__getitem__)
 
 
 def _order(item: dict[str, Any]) -> tuple[int, str]:
@@ -126,10 +119,10 @@ def _order(item: dict[str, Any]) -> tuple[int, str]:
     return int(item.get('attr', {}).get('frame', 0)), str(item['id'])
 
 
-def _cuboid(annotation: dict[str, Any], labels: list[str], is_swapped: bool) -> ReadCuboid:
+def _cuboid(annotation: dict[str, Any], labels: list[str], is_swapped: bool) -> ReadBox:
     attributes = annotation.get('attributes', {})
     scale = annotation['scale']
     extent = scale[::-1] if is_swapped else scale
-    box = box_from_cuboid(annotation['position'], annotation['rotation'], extent)
+    box = cuboids.box_from_cuboid(annotation['position'], annotation['rotation'], extent)
     track = attributes.get('track', attributes.get('track_id', ''))
-    return ReadCuboid(str(track), labels[annotation['label_id']], box, attributes)
+    return ReadBox(str(track), labels[annotation['label_id']], box, attributes)

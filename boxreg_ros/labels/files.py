@@ -16,12 +16,7 @@ JSON_OPTIONS = orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY
 
 
 def require_single(found: Sequence[Path], path: Path, what: str) -> Path:
-    """
-    Return the only entry of `found`, the candidates in `path`.
-
-    Raises RecordingError if there are none or several; `what` names them in the message.
-
-    """
+    """Return the only entry of `found` in `path`; RecordingError, naming `what`, for others."""
     if len(found) != 1:
         names = ', '.join(item.name for item in found) or 'none'
         raise RecordingError(f'{path}: expected one {what}, got {names}; name the path of one')

@@ -48,7 +48,7 @@ class FolderWriter:
         self.number = 0
         self.name = ''
         self.about: dict[str, Any] = asdict(provenance)
-        self._names = FrameNames()
+        self._used_stamps: Counter[int] = Counter()
         self.files = ExitStack()
         self._with_points = options.with_points and self.cloud_file != ''
         for name in self.folders:
@@ -67,7 +67,7 @@ class FolderWriter:
             self.dropped[Reason.NO_TRANSFORM] += len(rows)
             return
         stamp_ns = frame.refined.boxes.stamp_ns
-        self.name = self._names.of(stamp_ns)
+        self.name = frame_name(stamp_ns, self._used_stamps)
         self.about['fixed_frame'] = frame.fixed_frame
         self.about['sensor_frame'] = frame.sensor_frame
         self.add(frame)
@@ -107,15 +107,9 @@ class FolderWriter:
         write_provenance(self.folder, self.about)
 
 
-class FrameNames:
-    """Names of frames that sort by time: the stamp [ns]; a repeated stamp gets ``_1``."""
-
-    def __init__(self) -> None:
-        self._used: Counter[int] = Counter()
-
-    def of(self, stamp_ns: int) -> str:
-        """Return the name of the next frame of this stamp."""
-        number = self._used[stamp_ns]
-        self._used[stamp_ns] += 1
-        name = f'{stamp_ns:019d}'
-        return f'{name}_{number}' if number else name
+def frame_name(stamp_ns: int, used: Counter[int]) -> str:
+    """Return a name that sorts by time: the stamp [ns]; one that is `used` before gets ``_1``."""
+    number = used[stamp_ns]
+    used[stamp_ns] += 1
+    name = f'{stamp_ns:019d}'
+    return f'{name}_{number}' if number else name

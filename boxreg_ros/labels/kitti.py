@@ -9,7 +9,7 @@ of -1. Occlusion is 3, unknown. Stamps and poses are in the files of `sidecar`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,10 +25,10 @@ from boxreg_ros.labels.protocol import (
     Provenance,
     SceneFrames,
 )
-from boxreg_ros.labels.records import refined_boxes, TrackNumbers
-from boxreg_ros.labels.sidecar import read_sidecar
+from boxreg_ros.labels.records import ReadBox, TrackNumbers
+from boxreg_ros.labels.sidecar import numbered_frames, numbered_scene
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, WIDTH
+from boxreg_ros.structures import HEIGHT, LENGTH, WIDTH
 import numpy as np
 
 FORMAT = Format(
@@ -106,6 +106,7 @@ class Writer(FolderWriter):
 class _Line(NamedTuple):
     """A box of a label file; `numbers` are height, width, length, x, y, z and rotation_y."""
 
+    frame: int
     track: str
     class_name: str
     numbers: list[float]
@@ -124,14 +125,9 @@ def read(path: Path) -> Iterator[LabelFrame]:
         found = sorted((path / 'label_02').glob('*.txt'))
         path = require_single(found, path, 'sequence, label_02/NAME.txt')
     folder = absolute(path).parent.parent
-    lines_by_frame = _read_lines(path)
+    lines = _read_lines(path)
     camera = Camera.read(folder / 'calib' / path.name)
-    sidecar = read_sidecar(folder, 1 + max(lines_by_frame, default=-1))
-    for index, stamp_ns in enumerate(sidecar.stamps_ns):
-        lines = lines_by_frame.get(index, [])
-        yield sidecar.frame(
-            index, _refined(lines, stamp_ns, sidecar.sensor_frame, camera, sidecar.tracks)
-        )
+    yield from numbered_frames(folder, _boxes_by_frame(path, lines, camera))
 
 
 def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
@@ -144,23 +140,13 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """
     if path.is_dir():
         path = _file_of_sequence(path, scene.name)
-    lines_by_frame = _read_lines(path)
-    unknown = [number for number in lines_by_frame if str(number) not in scene.stamps_ns]
-    if unknown:
-        raise RecordingError(
-            f'{path}: expected frames 0 to {len(scene.stamps_ns) - 1} of sequence {scene.name}, '
-            f'got frame {max(unknown)}; name the file of this sequence'
-        )
+    lines = _read_lines(path)
     if scene.camera is None:
         raise RecordingError(
             f'{path}: expected the calibration of a camera, which the scene {scene.name!r} '
             f'lacks; read it with a scene of kitti-tracking'
         )
-    tracks = read_provenance(absolute(path).parent.parent).get('tracks', {})
-    for number, stamp_ns in scene.stamps_ns.items():
-        lines = lines_by_frame.get(int(number), [])
-        refined = _refined(lines, stamp_ns, scene.sensor_frame, scene.camera, tracks)
-        yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame)
+    yield from numbered_scene(path, _boxes_by_frame(path, lines, scene.camera), scene)
 
 
 def _file_of_sequence(folder: Path, name: str) -> Path:
@@ -174,28 +160,9 @@ def _file_of_sequence(folder: Path, name: str) -> Path:
     )
 
 
-def _refined(
-    lines: list[_Line],
-    stamp_ns: int,
-    frame_id: str,
-    camera: Camera,
-    tracks: Mapping[str, str],
-) -> RefinedBoxes:
-    """Return the boxes of a frame; `tracks` are track ids by the numbers in the file."""
-    numbers = np.array([line.numbers for line in lines]).reshape(-1, 7)
-    return refined_boxes(
-        stamp_ns,
-        frame_id,
-        [tracks.get(line.track, line.track) for line in lines],
-        [line.class_name for line in lines],
-        _boxes(camera, numbers),
-        [{'score': line.score} for line in lines],
-    )
-
-
-def _read_lines(path: Path) -> dict[int, list[_Line]]:
-    """Return the lines of a label file by frame; their order within a frame is kept."""
-    lines_by_frame: dict[int, list[_Line]] = {}
+def _read_lines(path: Path) -> list[_Line]:
+    """Return the lines of a label file, in their order."""
+    lines = []
     with following(path, '17 or 18 columns of KITTI tracking'):
         for text in path.read_text(encoding='utf-8').splitlines():
             words = text.split()
@@ -205,17 +172,25 @@ def _read_lines(path: Path) -> dict[int, list[_Line]]:
             score = float(words[17]) if len(words) > 17 else np.nan
             if len(numbers) != 7:
                 raise ValueError(f'got {len(words)} columns')
-            line = _Line(words[1], words[2], numbers, score)
-            lines_by_frame.setdefault(int(words[0]), []).append(line)
-    return lines_by_frame
+            lines.append(_Line(int(words[0]), words[1], words[2], numbers, score))
+    return lines
 
 
-def _boxes(camera: Camera, numbers: Floats) -> Floats:
-    """Return boxes (n, 9) in the LiDAR frame of the numbers (n, 7) of lines."""
-    extents = numbers[:, [2, 1, 0]]
+def _boxes_by_frame(
+    path: Path, lines: Sequence[_Line], camera: Camera
+) -> dict[int, list[ReadBox]]:
+    """Return the boxes of a label file in the LiDAR frame; tracks have the names beside it."""
+    tracks = read_provenance(absolute(path).parent.parent).get('tracks', {})
+    numbers = np.array([line.numbers for line in lines]).reshape(-1, 7)
     centres = numbers[:, 3:6].copy()
     centres[:, 1] -= numbers[:, 0] / 2
-    return camera.from_upright(centres, numbers[:, 6], extents)
+    boxes = camera.from_upright(centres, numbers[:, 6], numbers[:, [2, 1, 0]])
+    found: dict[int, list[ReadBox]] = {}
+    for line, box in zip(lines, boxes, strict=True):
+        track_id = tracks.get(line.track, line.track)
+        read_box = ReadBox(track_id, line.class_name, box, {'score': line.score})
+        found.setdefault(line.frame, []).append(read_box)
+    return found
 
 
 def _write_calibration(camera: Camera, path: Path) -> None:

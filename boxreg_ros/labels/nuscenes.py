@@ -19,15 +19,7 @@ import zlib
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.transforms import matrix
-from boxreg_ros.labels.files import (
-    following,
-    frame_names,
-    from_json,
-    json_items,
-    json_members,
-    JsonList,
-    require_single,
-)
+from boxreg_ros.labels import files
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import (
     absolute,
@@ -79,7 +71,9 @@ class Writer(FolderWriter):
         super().__init__(folder, provenance, options)
         self._tables = folder / self.version
         self._tables.mkdir()
-        self._streams = {name: JsonList(self._tables / f'{name}.json') for name in STREAMED_TABLES}
+        self._streams = {
+            name: files.JsonList(self._tables / f'{name}.json') for name in STREAMED_TABLES
+        }
         self._held_rows: dict[str, dict[str, Any]] = {}  # by table
         self._held_annotations: dict[str, dict[str, Any]] = {}  # by instance key
         self._instances: dict[str, dict[str, Any]] = {}
@@ -103,7 +97,7 @@ class Writer(FolderWriter):
         for stream in self._streams.values():
             stream.close()
         for name, rows in self._closing_tables().items():
-            rows_file = JsonList(self._tables / f'{name}.json')
+            rows_file = files.JsonList(self._tables / f'{name}.json')
             for row in rows:
                 rows_file.append(row)
             rows_file.close()
@@ -293,19 +287,19 @@ def read(path: Path) -> Iterator[LabelFrame]:
     found = [path]
     if not (path / 'sample.json').exists():
         found = sorted(file.parent for file in path.glob('*/sample.json'))
-    tables = require_single(found, path, 'folder with the tables of nuScenes')
-    with following(tables, 'the tables of nuScenes'):
+    tables = files.require_single(found, path, 'folder with the tables of nuScenes')
+    with files.following(tables, 'the tables of nuScenes'):
         yield from _read_tables(tables)
 
 
 def _read_tables(tables: Path) -> Iterator[LabelFrame]:
-    instances = {item['token']: item for item in from_json(tables / 'instance.json')}
+    instances = {item['token']: item for item in files.from_json(tables / 'instance.json')}
     poses = _poses(tables)
     annotations: dict[str, list[dict[str, Any]]] = {}
-    for item in from_json(tables / 'sample_annotation.json'):
+    for item in files.from_json(tables / 'sample_annotation.json'):
         annotations.setdefault(item['sample_token'], []).append(item)
-    samples = sorted(from_json(tables / 'sample.json'), key=lambda item: item['timestamp'])
-    fixed_frame, sensor_frame = frame_names(tables.parent)
+    samples = sorted(files.from_json(tables / 'sample.json'), key=lambda item: item['timestamp'])
+    fixed_frame, sensor_frame = files.frame_names(tables.parent)
     names = _category_names(tables)
     for sample in samples:
         items = annotations.get(sample['token'], [])
@@ -322,7 +316,7 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
 
     """
     read_boxes = _scene_annotations if path.is_dir() else _scene_results
-    with following(path, 'the tables or results of nuScenes'):
+    with files.following(path, 'the tables or results of nuScenes'):
         boxes_by_sample = read_boxes(path, scene)
     for token in scene.stamps_ns:
         yield LabelFrame(boxes_by_sample[token], scene.fixed_frame, scene.sensor_frame)
@@ -331,11 +325,11 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
 def _scene_annotations(tables: Path, scene: SceneFrames) -> dict[str, RefinedBoxes]:
     """Return the annotations of a scene by sample."""
     annotations: dict[str, list[dict[str, Any]]] = {token: [] for token in scene.stamps_ns}
-    for item in json_items(tables / 'sample_annotation.json'):
+    for item in files.json_items(tables / 'sample_annotation.json'):
         if item['sample_token'] in annotations:
             annotations[item['sample_token']].append(item)
     used = {item['instance_token'] for items in annotations.values() for item in items}
-    rows = json_items(tables / 'instance.json')
+    rows = files.json_items(tables / 'instance.json')
     instances = {item['token']: item for item in rows if item['token'] in used}
     names = _category_names(tables)
     return {
@@ -348,7 +342,7 @@ def _scene_results(path: Path, scene: SceneFrames) -> dict[str, RefinedBoxes]:
     """Return the detections or tracked boxes of a scene by sample."""
     results: dict[str, list[dict[str, Any]]] = {}
     others = 0
-    for token, items in json_members(path, 'results'):
+    for token, items in files.json_members(path, 'results'):
         if token in scene.stamps_ns:
             results[token] = items
         else:
@@ -374,7 +368,7 @@ def _scene_results(path: Path, scene: SceneFrames) -> dict[str, RefinedBoxes]:
 
 
 def _category_names(tables: Path) -> dict[str, str]:
-    return {item['token']: item['name'] for item in from_json(tables / 'category.json')}
+    return {item['token']: item['name'] for item in files.from_json(tables / 'category.json')}
 
 
 def _annotated(
@@ -424,16 +418,16 @@ def _stamp_ns(sample: dict[str, Any], annotations: list[dict[str, Any]]) -> int:
 
 def _poses(tables: Path) -> dict[str, Floats]:
     """Return the global pose (4, 4) of the LiDAR by sample."""
-    sensors = from_json(tables / 'sensor.json')
+    sensors = files.from_json(tables / 'sensor.json')
     lidars = {sensor['token'] for sensor in sensors if sensor['modality'] == 'lidar'}
     T_ego_lidar = {
         item['token']: pose_matrix(item)
-        for item in from_json(tables / 'calibrated_sensor.json')
+        for item in files.from_json(tables / 'calibrated_sensor.json')
         if item['sensor_token'] in lidars
     }
-    ego_poses = {item['token']: item for item in from_json(tables / 'ego_pose.json')}
+    ego_poses = {item['token']: item for item in files.from_json(tables / 'ego_pose.json')}
     poses = {}
-    for item in from_json(tables / 'sample_data.json'):
+    for item in files.from_json(tables / 'sample_data.json'):
         calibration = item['calibrated_sensor_token']
         if item['is_key_frame'] and calibration in T_ego_lidar:
             T_global_ego = pose_matrix(_row_of(ego_poses, item['ego_pose_token'], 'ego_pose'))

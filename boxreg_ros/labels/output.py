@@ -15,12 +15,7 @@ WITH_REJECTED = ('csv', 'mcap')
 
 
 class LabelOutput:
-    """
-    Write each frame in every format: ``boxes.csv`` always, and one folder per other format.
-
-    Raises ConfigError as `writer_for`, or if a format labels points.
-
-    """
+    """Write each frame in every format, ``boxes.csv`` always; errors are those of `writer_for`."""
 
     def __init__(
         self, folder: Path, formats: Sequence[str], provenance: Provenance, options: Options

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 import hashlib
 import json
@@ -16,7 +16,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.options import option
 from boxreg_ros.reasons import Reason
-from boxreg_ros.structures import BoxArray, Floats, Ints, is_valid_box, RefinedBoxes, Sweep
+from boxreg_ros.structures import Floats, Ints, is_valid_box, RefinedBoxes, Sweep
 import numpy as np
 
 if TYPE_CHECKING:
@@ -82,17 +82,13 @@ class LabelFrame:
         not positive) and ``no_transform`` (no transform to `frame`).
 
         """
-        boxes = self.refined.boxes
-        rows = np.flatnonzero(is_valid_box(boxes.boxes))
+        boxes = self.moved(frame).refined.boxes
+        rows = np.flatnonzero(is_valid_box(self.refined.boxes.boxes))
         dropped[Reason.INVALID_BOX] += len(boxes.boxes) - len(rows)
-        target = self.fixed_frame if frame == 'fixed' else self.sensor_frame
-        if boxes.frame_id == target:
-            return rows, boxes.boxes[rows]
-        is_known = boxes.frame_id in (self.fixed_frame, self.sensor_frame)
-        if self.T_fixed_sensor is None or not is_known:
+        if boxes.frame_id != (self.fixed_frame if frame == 'fixed' else self.sensor_frame):
             dropped[Reason.NO_TRANSFORM] += len(rows)
-            return rows[:0], boxes.boxes[:0]
-        return rows, _boxes_moved(boxes, self.T_fixed_sensor, frame, target).boxes[rows]
+            rows = rows[:0]
+        return rows, boxes.boxes[rows]
 
     def moved(self, frame: str) -> LabelFrame:
         """Return it with its boxes in the 'fixed' or 'sensor' frame, if a transform is known."""
@@ -104,7 +100,8 @@ class LabelFrame:
         is_movable = boxes.frame_id == source and boxes.frame_id != target
         if self.T_fixed_sensor is None or not is_movable:
             return self
-        boxes = _boxes_moved(boxes, self.T_fixed_sensor, frame, target)
+        T = self.T_fixed_sensor if frame == 'fixed' else inverse(self.T_fixed_sensor)
+        boxes = boxes_to_frame(boxes, T, target)
         return replace(self, refined=replace(self.refined, boxes=boxes))
 
 
@@ -180,17 +177,14 @@ class LabelWriter(Protocol):
         """Complete the files."""
 
 
-class WriterFactory(Protocol):
-    """Opens a writer; ``Writer`` of a format module."""
+WriterFactory = Callable[[Path, Provenance, Options], LabelWriter]
+"""
+Opens a writer; ``Writer`` of a format module.
 
-    def __call__(self, folder: Path, provenance: Provenance, options: Options) -> LabelWriter:
-        """
-        Return a writer.
+The folder exists, is empty and belongs to this writer, except for the formats of
+`registry.IN_RESULT_FOLDER`, which share the folder of results.
 
-        `folder` exists, is empty and belongs to this writer, except for the formats of
-        `registry.IN_RESULT_FOLDER`, which share the folder of results.
-
-        """
+"""
 
 
 class FormatModule(Protocol):
@@ -213,22 +207,6 @@ class FormatModule(Protocol):
         """Return the class of the writer."""
 
 
-class ReadableModule(FormatModule, Protocol):
-    """A format module whose files can be read back; only those of data sets have `read_scene`."""
-
-    def read(self, path: Path) -> Iterator[LabelFrame]:
-        """Yield the frames of a label file or folder."""
-
-    def read_scene(self, path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
-        """Yield the frames of one scene in a label file or folder."""
-
-
 def absolute(path: Path) -> Path:
     """Return `path` with a name and parents, which ``.`` lacks; links are not resolved."""
     return Path(os.path.abspath(path))
-
-
-def _boxes_moved(boxes: BoxArray, T_fixed_sensor: Floats, frame: str, target: str) -> BoxArray:
-    """Return boxes of the other frame in the 'fixed' or the 'sensor' frame, named `target`."""
-    T = T_fixed_sensor if frame == 'fixed' else inverse(T_fixed_sensor)
-    return boxes_to_frame(boxes, T, target)

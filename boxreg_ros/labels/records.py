@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import count
-from typing import Any
+from typing import Any, NamedTuple
 
 from boxreg_ros.labels.protocol import INPUT_STATUS
 from boxreg_ros.rotations import rpy_from_quaternion
@@ -18,6 +18,21 @@ FIRST_ASSIGNED_NUMBER = 10**6
 MIN_QUATERNION_NORM = 1e-6
 """A shorter quaternion states no orientation."""
 UPPER_TRIANGLE = np.triu_indices(6)
+
+
+class ReadBox(NamedTuple):
+    """A box (9,) as read from a file; `evidence` as of `refined_boxes`."""
+
+    track_id: str
+    class_name: str
+    box: ArrayLike
+    evidence: Mapping[str, Any] = {}
+
+
+def refined_of(stamp_ns: int, frame_id: str, items: Sequence[ReadBox]) -> RefinedBoxes:
+    """Return the boxes of one stamp [ns]; see `refined_boxes`."""
+    columns = zip(*items, strict=True) if items else [()] * len(ReadBox._fields)
+    return refined_boxes(stamp_ns, frame_id, *map(list, columns))
 
 
 def refined_boxes(

@@ -8,7 +8,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from itertools import chain
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.labels.camera import Camera
@@ -18,7 +18,6 @@ from boxreg_ros.labels.protocol import (
     LabelWriter,
     Options,
     Provenance,
-    ReadableModule,
     SceneFrames,
 )
 from boxreg_ros.labels.segments import segments_of
@@ -44,12 +43,7 @@ COMMAND_LINE_OPTIONS = ('camera', 'with_points', 'swap_axes')
 
 
 def module_of(name: str) -> FormatModule:
-    """
-    Return the module of a format.
-
-    Raises ConfigError if the format does not exist, or needs a package that is not installed.
-
-    """
+    """Return the module of a format; ConfigError if it does not exist, or lacks a package."""
     module = import_format(name)
     for package in module.FORMAT.packages:
         try:
@@ -105,12 +99,7 @@ def check_options(names: Sequence[str], options: Options) -> None:
 def writer_for(
     name: str, out: Path, provenance: Provenance, options: Options | None = None
 ) -> LabelWriter:
-    """
-    Return a writer of this format for the folder of results `out`.
-
-    Raises ConfigError as `module_of`, or if the format needs an option that is not given.
-
-    """
+    """Return a writer of this format for the folder of results `out`; raises as `module_of`."""
     module = module_of(name)
     folder = _folder_of(name, out)
     folder.mkdir(exist_ok=True)
@@ -134,13 +123,13 @@ def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterat
         raise ConfigError(f'format {name!r} can only be written; readable: {able}')
     if not path.exists():
         raise RecordingError(f'labels {str(path)!r}: no such file or folder; correct the path')
-    readable = cast(ReadableModule, module)
+    readable: Any = module
     if scene is not None and hasattr(module, 'read_scene'):
-        return readable.read_scene(path, scene)
-    segments = segments_of(path)
-    if not segments:
-        return readable.read(path)
-    return chain.from_iterable(readable.read(_folder_of(name, part)) for part in segments)
+        parts = [readable.read_scene(path, scene)]
+    else:
+        folders = [_folder_of(name, segment) for segment in segments_of(path)]
+        parts = [readable.read(one) for one in folders or [path]]
+    return chain.from_iterable(parts)
 
 
 def import_format(name: str) -> FormatModule:

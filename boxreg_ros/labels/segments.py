@@ -40,12 +40,7 @@ class IndexRow(NamedTuple):
 
 
 def read_index(folder: Path) -> list[IndexRow]:
-    """
-    Return the segments of a folder, in the order of recording; none without an index.
-
-    Raises RecordingError if the index does not have the columns of `IndexRow`.
-
-    """
+    """Return the segments in the index of a folder, in order; RecordingError for other columns."""
     path = folder / INDEX
     if not path.exists():
         return []

@@ -68,7 +68,7 @@ class Writer(FolderWriter):
         self._times = self.text_file(f'{SEQUENCE_FOLDER}/times.txt')
         self._T_first_fixed: Floats | None = None
         self._first_ns = 0
-        self._numbers: Numbers | None = None
+        self._numbers: NDArray[np.uint32] | None = None
 
     def add(self, frame: LabelFrame) -> None:
         """Write the labels of a sweep, its pose and its time."""
@@ -83,35 +83,28 @@ class Writer(FolderWriter):
         self._poses.write(f'{numbers}\n')
         self._times.write(f'{(stamp_ns - self._first_ns) * 1e-9:.6e}\n')
         if self._numbers is None:
-            self._numbers = Numbers(frame.points)
+            self._numbers = point_numbers(frame.points)
             names = [track.track_id for track in frame.points.tracks]
             self.about['tracks'] = {str(i + 1): name for i, name in enumerate(names)}
-        labels = self._numbers.of(frame.points)
+        labels = self._numbers[frame.points.track]
         labels.tofile(self._sequence / 'labels' / f'{self.number:06d}.label')
 
 
-class Numbers:
+def point_numbers(points: PointLabels) -> NDArray[np.uint32]:
     """
-    The class and the instance of the points of each track; all sweeps have the same tracks.
+    Return the number of the points of each track, of any sweep: all have the same tracks.
 
-    Instances are the rows of the tracks, from 1; 0 for points on none, and beyond `MAX_INSTANCE`.
+    The class, and in the upper 16 bits the instance: the row of the track, from 1; 0 for points on
+    none, and beyond `MAX_INSTANCE`. The last two are those of the track numbers -2 and -1.
 
     """
-
-    def __init__(self, points: PointLabels) -> None:
-        pairs = zip(points.tracks, points.moves.tolist(), strict=True)
-        classes = [class_of(track.class_name, moves) for track, moves in pairs]
-        # The last two entries are those of the track numbers -2 and -1.
-        assert (UNKNOWN, BACKGROUND) == (-2, -1)
-        instances = np.append(np.arange(1, len(classes) + 1), [0, 0])
-        instances[instances > MAX_INSTANCE] = 0
-        numbers = np.array([*classes, UNLABELED, OTHER_OBJECT]) | instances << 16
-        self._numbers = numbers.astype('<u4')
-
-    def of(self, points: PointLabels) -> NDArray[np.uint32]:
-        """Return the class of each point, and its instance in the upper 16 bits, (M,)."""
-        numbers: NDArray[np.uint32] = self._numbers[points.track]
-        return numbers
+    pairs = zip(points.tracks, points.moves.tolist(), strict=True)
+    classes = [class_of(track.class_name, moves) for track, moves in pairs]
+    assert (UNKNOWN, BACKGROUND) == (-2, -1)
+    instances = np.append(np.arange(1, len(classes) + 1), [0, 0])
+    instances[instances > MAX_INSTANCE] = 0
+    numbers = np.array([*classes, UNLABELED, OTHER_OBJECT]) | instances << 16
+    return np.asarray(numbers, '<u4')
 
 
 def class_of(class_name: str, moves: bool) -> int:

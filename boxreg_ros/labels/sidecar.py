@@ -9,13 +9,15 @@ Three files: ``timestamps.txt`` with one stamp per frame [ns]; ``poses.txt`` wit
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, UTC
 from pathlib import Path
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels.files import frame_names, read_provenance
-from boxreg_ros.labels.protocol import LabelFrame
+from boxreg_ros.labels.files import frame_names
+from boxreg_ros.labels.protocol import LabelFrame, SceneFrames
+from boxreg_ros.labels.records import ReadBox, refined_of
 from boxreg_ros.structures import Floats, RefinedBoxes
 import numpy as np
 
@@ -31,8 +33,6 @@ class Sidecar:
     poses: list[Floats | None]
     fixed_frame: str
     sensor_frame: str
-    tracks: dict[str, str]
-    """Track ids by the numbers in the labels."""
 
     def frame(self, index: int, refined: RefinedBoxes) -> LabelFrame:
         """Return a frame with boxes in the sensor frame."""
@@ -40,12 +40,7 @@ class Sidecar:
 
 
 def read_sidecar(folder: Path, count: int, stamps: Path | None = None) -> Sidecar:
-    """
-    Return the stamps and poses of at least `count` frames.
-
-    Raises RecordingError if `stamps` (default: ``timestamps.txt``) is missing or has too few.
-
-    """
+    """Return stamps (of `stamps`, if given) and poses of `count` frames, or RecordingError."""
     path = stamps or folder / STAMPS_FILE
     stamps_ns = read_stamps(path)
     if len(stamps_ns) < count:
@@ -56,17 +51,37 @@ def read_sidecar(folder: Path, count: int, stamps: Path | None = None) -> Sideca
         read_poses(folder / POSES_FILE, len(stamps_ns)),
         fixed_frame,
         sensor_frame,
-        read_provenance(folder).get('tracks', {}),
     )
 
 
+def numbered_frames(
+    folder: Path, boxes_by_frame: Mapping[int, Sequence[ReadBox]], stamps: Path | None = None
+) -> Iterator[LabelFrame]:
+    """Yield the frames of a folder whose boxes have their number; see `read_sidecar`."""
+    sidecar = read_sidecar(folder, 1 + max(boxes_by_frame, default=-1), stamps)
+    for index, stamp_ns in enumerate(sidecar.stamps_ns):
+        refined = refined_of(stamp_ns, sidecar.sensor_frame, boxes_by_frame.get(index, ()))
+        yield sidecar.frame(index, refined)
+
+
+def numbered_scene(
+    path: Path, boxes_by_frame: Mapping[int, Sequence[ReadBox]], scene: SceneFrames
+) -> Iterator[LabelFrame]:
+    """Yield the frames of a scene, whose boxes in `path` have their number."""
+    unknown = [number for number in boxes_by_frame if str(number) not in scene.stamps_ns]
+    if unknown:
+        raise RecordingError(
+            f'{path}: expected frames 0 to {len(scene.stamps_ns) - 1} of {scene.name}, got frame '
+            f'{max(unknown)}; name the labels of this drive'
+        )
+    for number, stamp_ns in scene.stamps_ns.items():
+        boxes = boxes_by_frame.get(int(number), ())
+        refined = refined_of(stamp_ns, scene.sensor_frame, boxes)
+        yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame)
+
+
 def read_stamps(path: Path) -> list[int]:
-    """
-    Return the stamps of a file [ns]: integers, or date and time (UTC) as in KITTI raw.
-
-    Raises RecordingError if there is no such file, or a line is neither.
-
-    """
+    """Return the stamps of a file [ns]: integers, or UTC as in KITTI raw; else RecordingError."""
     try:
         lines = path.read_text(encoding='utf-8').split('\n')
     except OSError:

@@ -12,20 +12,12 @@ from pathlib import Path
 from typing import Any
 from uuid import NAMESPACE_URL, uuid5
 
-from boxreg_ros.labels.cuboids import (
-    box_from_xyz,
-    Cuboid,
-    cuboid_format,
-    CuboidWriter,
-    EVIDENCE_KEY,
-    read_frames,
-    ReadCuboid,
-    single_part,
-)
+from boxreg_ros.labels import cuboids
 from boxreg_ros.labels.files import following, from_json, JsonList, to_json, write_json
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import ReadBox
 
-FORMAT = cuboid_format(
+FORMAT = cuboids.cuboid_format(
     name='supervisely',
     title='Supervisely episodes',
     files='meta.json, episode/annotation.json, episode/pointcloud/STAMP.pcd',
@@ -34,7 +26,7 @@ CUBOID = 'cuboid_3d'
 TAGS = ('track_id', 'status')
 
 
-class Writer(CuboidWriter):
+class Writer(cuboids.CuboidWriter):
     """
     Write one record per frame, and the objects with their tags when closed.
 
@@ -74,7 +66,7 @@ class Writer(CuboidWriter):
         write_json(self.folder / 'key_id_map.json', ids)
         write_json(self._episode / 'frame_pointcloud_map.json', dict(enumerate(self._clouds)))
 
-    def _add_to_object(self, cuboid: Cuboid, number: int) -> str:
+    def _add_to_object(self, cuboid: cuboids.Cuboid, number: int) -> str:
         """Return the key of the object of a cuboid; add its status in frame `number`."""
         suffix = '' if cuboid.track_id else f'{number}/{cuboid.row}'
         key = _key(f'object/{cuboid.class_name}/{cuboid.track_id}/{suffix}')
@@ -107,14 +99,14 @@ def read(path: Path) -> Iterator[LabelFrame]:
     ``timestamps.txt`` in the episode or in the project has one stamp [ns] per frame.
 
     """
-    episode, folder = single_part(path, 'episode', ['annotation.json'])
+    episode, folder = cuboids.single_part(path, 'episode', ['annotation.json'])
     file = episode / 'annotation.json'
     content = from_json(file)
     clouds = from_json(file.with_name('frame_pointcloud_map.json'))
     with following(file, 'cuboids of Supervisely'):
         objects = {item['key']: item for item in content['objects']}
         figures = {str(frame['index']): frame['figures'] for frame in content['frames']}
-        cuboids = {
+        boxes = {
             Path(cloud).stem: [
                 _cuboid(figure, objects[figure['objectKey']])
                 for figure in figures.get(index, ())
@@ -122,19 +114,19 @@ def read(path: Path) -> Iterator[LabelFrame]:
             ]
             for index, cloud in sorted(clouds.items(), key=lambda item: int(item[0]))
         }
-    yield from read_frames(folder, list(cuboids), cuboids.__getitem__)
+    yield from cuboids.read_frames(folder, list(boxes), boxes.__getitem__)
 
 
-def _cuboid(figure: dict[str, Any], parent: dict[str, Any]) -> ReadCuboid:
+def _cuboid(figure: dict[str, Any], parent: dict[str, Any]) -> ReadBox:
     """Return the cuboid of a figure; `parent` is its object."""
     tags = {tag['name']: tag.get('value') for tag in parent.get('tags', ())}
     geometry = figure['geometry']
-    box = box_from_xyz(geometry['position'], geometry['rotation'], geometry['dimensions'])
+    box = cuboids.box_from_xyz(geometry['position'], geometry['rotation'], geometry['dimensions'])
     track_id = str(tags.get('track_id', parent['key']))
-    return ReadCuboid(track_id, parent['classTitle'], box, figure.get(EVIDENCE_KEY, {}))
+    return ReadBox(track_id, parent['classTitle'], box, figure.get(cuboids.EVIDENCE_KEY, {}))
 
 
-def _figure(cuboid: Cuboid, number: int, object_key: str) -> dict[str, Any]:
+def _figure(cuboid: cuboids.Cuboid, number: int, object_key: str) -> dict[str, Any]:
     return {
         'key': _key(f'figure/{number}/{cuboid.row}'),
         'objectKey': object_key,
@@ -144,7 +136,7 @@ def _figure(cuboid: Cuboid, number: int, object_key: str) -> dict[str, Any]:
             'rotation': cuboid.angles,
             'dimensions': cuboid.extent,
         },
-        EVIDENCE_KEY: cuboid.evidence,
+        cuboids.EVIDENCE_KEY: cuboid.evidence,
     }
 
 

@@ -12,26 +12,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.labels.cuboids import (
-    box_from_xyz,
-    Cuboid,
-    cuboid_format,
-    CuboidWriter,
-    EVIDENCE_KEY,
-    read_files,
-    ReadCuboid,
-)
+from boxreg_ros.labels import cuboids
 from boxreg_ros.labels.files import write_json
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import ReadBox
 
-FORMAT = cuboid_format(
+FORMAT = cuboids.cuboid_format(
     name='sustechpoints',
     title='SUSTechPOINTS',
     files='label/STAMP.json, lidar/STAMP.pcd, desc.json',
 )
 
 
-class Writer(CuboidWriter):
+class Writer(cuboids.CuboidWriter):
     """Write one file of labels per frame, and one of points if they are requested."""
 
     folders = ('label', 'lidar')
@@ -50,10 +43,10 @@ class Writer(CuboidWriter):
 def read(path: Path) -> Iterator[LabelFrame]:
     """Yield the frames of a scene with one stamp [ns] per label file in its ``timestamps.txt``."""
     names = {file.stem for file in path.glob('label/*.json')}
-    yield from read_files(path, path / 'label', names, 'boxes of SUSTechPOINTS', _cuboids)
+    yield from cuboids.read_files(path, path / 'label', names, 'boxes of SUSTechPOINTS', _cuboids)
 
 
-def _item(cuboid: Cuboid) -> dict[str, Any]:
+def _item(cuboid: cuboids.Cuboid) -> dict[str, Any]:
     return {
         'psr': {
             'position': cuboid.position,
@@ -63,17 +56,17 @@ def _item(cuboid: Cuboid) -> dict[str, Any]:
         'obj_type': cuboid.class_name,
         'obj_id': cuboid.track_id,
         'obj_attr': '',
-        'annotator': EVIDENCE_KEY,
-        EVIDENCE_KEY: cuboid.evidence,
+        'annotator': cuboids.EVIDENCE_KEY,
+        cuboids.EVIDENCE_KEY: cuboid.evidence,
     }
 
 
-def _cuboids(content: Any) -> list[ReadCuboid]:
+def _cuboids(content: Any) -> list[ReadBox]:
     return [_cuboid(item) for item in (content['objs'] if isinstance(content, dict) else content)]
 
 
-def _cuboid(item: dict[str, Any]) -> ReadCuboid:
+def _cuboid(item: dict[str, Any]) -> ReadBox:
     psr = item['psr']
-    box = box_from_xyz(psr['position'], psr['rotation'], psr['scale'])
-    evidence = item.get(EVIDENCE_KEY, {})
-    return ReadCuboid(str(item['obj_id']), str(item['obj_type']), box, evidence)
+    box = cuboids.box_from_xyz(psr['position'], psr['rotation'], psr['scale'])
+    evidence = item.get(cuboids.EVIDENCE_KEY, {})
+    return ReadBox(str(item['obj_id']), str(item['obj_type']), box, evidence)

@@ -16,18 +16,17 @@ from pathlib import Path
 import re
 import shutil
 from tempfile import TemporaryFile
-from typing import cast, NamedTuple
+from typing import cast
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape, unescape
 
-from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.files import following, to_json
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance, SceneFrames
-from boxreg_ros.labels.records import refined_boxes
-from boxreg_ros.labels.sidecar import read_sidecar
+from boxreg_ros.labels.records import ReadBox
+from boxreg_ros.labels.sidecar import numbered_frames, numbered_scene
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import ADDED, BOX_CENTER, BOX_EXTENT, Floats, RefinedBoxes, ROLL, YAW
+from boxreg_ros.structures import ADDED, BOX_CENTER, BOX_EXTENT, Floats, ROLL, YAW
 import numpy as np
 
 FORMAT = Format(
@@ -164,14 +163,6 @@ class Writer(FolderWriter):
         self._count += 1
 
 
-class _ReadBox(NamedTuple):
-    """A box (9,) of a tracklet in the sensor frame."""
-
-    track_id: str
-    class_name: str
-    box: Floats
-
-
 def read(path: Path) -> Iterator[LabelFrame]:
     """
     Yield the frames of a tracklet file; its stamps are those of `sidecar` or of KITTI raw.
@@ -184,42 +175,18 @@ def read(path: Path) -> Iterator[LabelFrame]:
         path = path / FILE
     boxes_by_frame = _read_boxes(path)
     raw_stamps = path.parent / 'velodyne_points' / 'timestamps.txt'
-    count = 1 + max(boxes_by_frame, default=-1)
-    sidecar = read_sidecar(path.parent, count, raw_stamps if raw_stamps.exists() else None)
-    for index, stamp_ns in enumerate(sidecar.stamps_ns):
-        boxes = boxes_by_frame.get(index, [])
-        yield sidecar.frame(index, _refined(stamp_ns, sidecar.sensor_frame, boxes))
+    stamps = raw_stamps if raw_stamps.exists() else None
+    yield from numbered_frames(path.parent, boxes_by_frame, stamps)
 
 
 def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """Yield the frames of a drive, by the stamps of the data set."""
     if path.is_dir():
         path = path / FILE
-    boxes_by_frame = _read_boxes(path)
-    last = max(boxes_by_frame, default=-1)
-    if last >= len(scene.stamps_ns):
-        raise RecordingError(
-            f'{path}: expected frames 0 to {len(scene.stamps_ns) - 1} of {scene.name}, got frame '
-            f'{last}; name the tracklets of this drive'
-        )
-    for number, stamp_ns in scene.stamps_ns.items():
-        boxes = boxes_by_frame.get(int(number), [])
-        refined = _refined(stamp_ns, scene.sensor_frame, boxes)
-        yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame)
+    yield from numbered_scene(path, _read_boxes(path), scene)
 
 
-def _refined(stamp_ns: int, frame_id: str, boxes: list[_ReadBox]) -> RefinedBoxes:
-    """Return the boxes of a frame."""
-    return refined_boxes(
-        stamp_ns,
-        frame_id,
-        [item.track_id for item in boxes],
-        [item.class_name for item in boxes],
-        [item.box for item in boxes],
-    )
-
-
-def _read_boxes(path: Path) -> dict[int, list[_ReadBox]]:
+def _read_boxes(path: Path) -> dict[int, list[ReadBox]]:
     """Return the boxes of a tracklet file by the index of their frame."""
     with following(path, 'tracklets of KITTI'):
         text = path.read_text(encoding='utf-8')
@@ -232,9 +199,9 @@ def _read_boxes(path: Path) -> dict[int, list[_ReadBox]]:
         return _boxes_by_frame(tree.getroot(), is_swapped)
 
 
-def _boxes_by_frame(root: ElementTree.Element, is_swapped: bool) -> dict[int, list[_ReadBox]]:
+def _boxes_by_frame(root: ElementTree.Element, is_swapped: bool) -> dict[int, list[ReadBox]]:
     """Return the boxes of all tracklets by the index of their frame."""
-    boxes_by_frame: dict[int, list[_ReadBox]] = {}
+    boxes_by_frame: dict[int, list[ReadBox]] = {}
     for number, item in enumerate(root.findall('tracklets/item')):
         track_id = _track_id(item, str(number))
         class_name = (item.findtext('objectType') or '').strip()
@@ -245,7 +212,7 @@ def _boxes_by_frame(root: ElementTree.Element, is_swapped: bool) -> dict[int, li
             box = np.array([*values[:3], *extent, *values[3:]])
             if not is_swapped:
                 box[BOX_CENTER] = _shifted_centres(box[None], extent[2] / 2)[0]
-            boxes_by_frame.setdefault(index, []).append(_ReadBox(track_id, class_name, box))
+            boxes_by_frame.setdefault(index, []).append(ReadBox(track_id, class_name, box))
     return boxes_by_frame
 
 

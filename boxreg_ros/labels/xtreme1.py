@@ -12,20 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.labels.cuboids import (
-    box_from_xyz,
-    Cuboid,
-    cuboid_format,
-    CuboidWriter,
-    EVIDENCE_KEY,
-    read_files,
-    ReadCuboid,
-    single_part,
-)
+from boxreg_ros.labels import cuboids
 from boxreg_ros.labels.files import write_json
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import ReadBox
 
-FORMAT = cuboid_format(
+FORMAT = cuboids.cuboid_format(
     name='xtreme1',
     title='Xtreme1',
     files='scene_1/result/STAMP.json, scene_1/lidar_point_cloud_0/STAMP.pcd',
@@ -35,7 +27,7 @@ RESULT_FOLDER = 'result'
 BOX_TYPE = '3D_BOX'
 
 
-class Writer(CuboidWriter):
+class Writer(cuboids.CuboidWriter):
     """
     Write one file of labels per frame, and one of points if they are requested.
 
@@ -55,7 +47,7 @@ class Writer(CuboidWriter):
         objects = [_object(cuboid, self.name) for cuboid in self.cuboids(frame)]
         if objects:
             path = self.folder / 'scene_1' / RESULT_FOLDER / f'{self.name}.json'
-            write_json(path, {'objects': objects, EVIDENCE_KEY: self._origin})
+            write_json(path, {'objects': objects, cuboids.EVIDENCE_KEY: self._origin})
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
@@ -66,14 +58,16 @@ def read(path: Path) -> Iterator[LabelFrame]:
     the ``result`` folder of the scene has one file per frame.
 
     """
-    scene, folder = single_part(path, 'scene', [RESULT_FOLDER, LIDAR_FOLDER])
+    scene, folder = cuboids.single_part(path, 'scene', [RESULT_FOLDER, LIDAR_FOLDER])
     files = [*scene.glob(f'{RESULT_FOLDER}/*.json'), *scene.glob(f'{LIDAR_FOLDER}/*.pcd')]
     names = {file.stem for file in files}
     labels = scene / RESULT_FOLDER
-    yield from read_files(folder, labels, names, 'objects of Xtreme1', _cuboids, has_all=False)
+    yield from cuboids.read_files(
+        folder, labels, names, 'objects of Xtreme1', _cuboids, has_all=False
+    )
 
 
-def _object(cuboid: Cuboid, frame_name: str) -> dict[str, Any]:
+def _object(cuboid: cuboids.Cuboid, frame_name: str) -> dict[str, Any]:
     return {
         'type': BOX_TYPE,
         'trackId': cuboid.track_id or f'{frame_name}-{cuboid.row}',
@@ -88,26 +82,26 @@ def _object(cuboid: Cuboid, frame_name: str) -> dict[str, Any]:
             'pointN': cuboid.evidence['num_points'],
             'points': [],
         },
-        EVIDENCE_KEY: cuboid.evidence,
+        cuboids.EVIDENCE_KEY: cuboid.evidence,
     }
 
 
-def _cuboids(content: Any) -> list[ReadCuboid]:
+def _cuboids(content: Any) -> list[ReadBox]:
     parts = content if isinstance(content, list) else [content]
     objects = [item for part in parts for item in part['objects']]
     return [_cuboid(item) for item in objects if item.get('type', BOX_TYPE) == BOX_TYPE]
 
 
-def _cuboid(item: dict[str, Any]) -> ReadCuboid:
+def _cuboid(item: dict[str, Any]) -> ReadBox:
     contour = item['contour']
     name = item.get('trackName')
-    if EVIDENCE_KEY not in item:  # an export of Xtreme1: every object has a trackId
+    if cuboids.EVIDENCE_KEY not in item:  # an export of Xtreme1: every object has a trackId
         name = name or item['trackId']
-    box = box_from_xyz(contour['center3D'], contour['rotation3D'], contour['size3D'])
+    box = cuboids.box_from_xyz(contour['center3D'], contour['rotation3D'], contour['size3D'])
     evidence = {
         'score': item.get('modelConfidence'),
         'num_points': contour.get('pointN'),
-        **item.get(EVIDENCE_KEY, {}),
+        **item.get(cuboids.EVIDENCE_KEY, {}),
     }
     class_name = item.get('className') or item.get('modelClass') or ''
-    return ReadCuboid(str(name or ''), str(class_name), box, evidence)
+    return ReadBox(str(name or ''), str(class_name), box, evidence)

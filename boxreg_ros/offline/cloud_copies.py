@@ -14,7 +14,7 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.labels import Provenance
 from boxreg_ros.labels.mcap import OVERLAY
 from boxreg_ros.labels.recording_copy import RawMessage, RecordingCopy
-from boxreg_ros.labels.semantickitti import Numbers
+from boxreg_ros.labels.semantickitti import point_numbers
 from boxreg_ros.offline.point_products import is_kept, LabelledSweep
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stored_sweeps import MergedCloud, StoredPlace
@@ -60,7 +60,7 @@ class CloudCopies:
             for part in place.parts
         }
         self._labelled = labelled
-        self._numbers: Numbers | None = None
+        self._numbers: NDArray[np.uint32] | None = None
         self.unchanged = 0
 
     def write(self, folder: Path, clouds: Path, provenance: Provenance) -> None:
@@ -150,8 +150,8 @@ class CloudCopies:
     def _fields(self, labels: PointLabels) -> dict[str, NDArray[Any]]:
         """Return the values of `FIELDS` of the points of a sweep, (M,) each."""
         if self._numbers is None:
-            self._numbers = Numbers(labels)
-        numbers = self._numbers.of(labels)
+            self._numbers = point_numbers(labels)
+        numbers = self._numbers[labels.track]
         codes = np.zeros(len(labels.track), np.uint8)
         codes[labels.motion == MOVING] = MOVING_CODE
         codes[labels.motion == STOOD] = STOOD_CODE

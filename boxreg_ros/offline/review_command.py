@@ -93,9 +93,9 @@ def _serve(outs: Sequence[Path], args: argparse.Namespace) -> int:
 
 
 def _print_progress(outs: Sequence[Path]) -> int:
-    from boxreg_ros.review.progress import by_risk_left, progress_lines, progress_of
+    from boxreg_ros.review.progress import progress_lines, progress_of
 
-    print('\n'.join(progress_lines(by_risk_left(map(progress_of, outs)))))
+    print('\n'.join(progress_lines([progress_of(out) for out in outs])))
     return 0
 
 

@@ -7,10 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 from boxreg_ros.core.follow import FollowedTrack
-from boxreg_ros.review.box_risk import evidence
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.review.payload import TrackPart, TrackTruth
-from boxreg_ros.review.risk import assess
+from boxreg_ros.review.risk import assess, evidence
 from boxreg_ros.review.scene import DriveScene
 from boxreg_ros.review.tables import TrackRow
 from boxreg_ros.rotations import matrix_from_rpy

@@ -1,4 +1,4 @@
-"""The web application of `boxreg review`: the page, decisions, solving again, label files."""
+"""The web application of `boxreg review`: pages, decisions, solving again, label files."""
 
 from __future__ import annotations
 
@@ -14,27 +14,32 @@ from typing import Any
 
 import anyio
 from boxreg_ros.errors import BoxregError, RecordingError
+from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, WITH_BOX
-from boxreg_ros.review.drives import drives_application
-from boxreg_ros.review.proposals import proposals_of
-from boxreg_ros.review.report import PAGE_VERSION, REPORT
+from boxreg_ros.review.progress import agreement_text, PAUSE, progress_of, total, UNREAD
+from boxreg_ros.review.report import page_environment, PAGE_VERSION, REPORT, style
 from boxreg_ros.review.requests import box_of, json_of, posted, STAMP, stamp_of, text_of
 from boxreg_ros.review.scene import DriveSource
 from boxreg_ros.review.scene_routes import SceneRoutes
 from boxreg_ros.review.solve import ReportParts
 import orjson
+from starlette import responses
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
-from starlette.routing import Route
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
+PROPOSALS = 'proposals.csv'
 MAX_ROWS = 10_000
 """Most decisions of a request: a track that is made of as many parts; chosen."""
 OPEN_SECONDS = 600.0
 """A track is open to one person for so long; chosen: then the person has left."""
+REQUEST_SECONDS = 20.0
+"""A request, its body included, is received within this time; chosen."""
 POLL_SECONDS = 0.25
 """Another program may append to the file: the time until its decisions are seen; chosen."""
 MARK = f'<html lang="en" data-page="{PAGE_VERSION}"'.encode()
@@ -52,6 +57,8 @@ POLICY = (
     "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
+DRIVES_TEMPLATE = 'drives.html.j2'
+DRIVES_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'"
 
 
 def review_application(
@@ -72,9 +79,17 @@ def review_application(
     """
     token = secrets.token_urlsafe(16)
     reviews = [_Review(out, who, is_ending, source) for out, source in results]
-    found = [(review, review.application()) for review in reviews]
-    application = found[0][1] if len(found) == 1 else drives_application(found)
-    return _Guard(application, port, token), token
+    applications = [review.application() for review in reviews]
+    if len(reviews) == 1:
+        return _Guard(applications[0], port, token), token
+
+    async def page(_: Request) -> Response:
+        text = await run_in_threadpool(_page_of_drives, reviews)
+        headers = {'Content-Security-Policy': DRIVES_POLICY}
+        return responses.HTMLResponse(text, headers=headers)
+
+    mounts = [Mount(f'/{number}', app=one) for number, one in enumerate(applications)]
+    return _Guard(Starlette(routes=[Route('/', page), *mounts]), port, token), token
 
 
 class _Guard:
@@ -135,7 +150,7 @@ class _Review:
         self.listeners = 0
         self._open: dict[str, tuple[str, float]] = {}  # tracks by page, and since when
         self._who = who
-        self._proposals = proposals_of(out)
+        self._proposals = _proposals_of(out)
         self._log = DecisionLog(out / DECISIONS)
         self._log_lock = Lock()
         self._save_lock = asyncio.Lock()
@@ -189,7 +204,7 @@ class _Review:
         seen = request.headers.get('last-event-id') or request.query_params.get('seen', '')
         if not (seen.isdecimal() and STAMP.fullmatch(seen)):
             raise RecordingError('seen: expected the number of known decisions')
-        return StreamingResponse(self._stream(int(seen)), media_type='text/event-stream')
+        return responses.StreamingResponse(self._stream(int(seen)), media_type='text/event-stream')
 
     async def note_open(self, request: Request) -> Response:
         """Note the track that a page has open, and return those that others have."""
@@ -306,3 +321,63 @@ async def _refused(_: Request, error: Exception) -> Response:
 
 async def _failed(_: Request, error: Exception) -> Response:
     return PlainTextResponse(f'expected a file that can be written, got: {error}', 500)
+
+
+def _page_of_drives(reviews: Sequence[_Review]) -> str:
+    """Return the page of the progress of all drives, the most risk left first."""
+    found = []
+    problems = []
+    for number, review in enumerate(reviews):
+        try:
+            found.append((progress_of(review.out), number, review.listeners))
+        except BoxregError as error:
+            problems.append(str(error))
+    found.sort(key=lambda row: -row[0].risk_left)
+    drives = [one for one, *_ in found]
+    text: str = page_environment().get_template(DRIVES_TEMPLATE).render(
+        css=style(), drives=[*found, (total(drives), None, 0)], problems=problems,
+        unread=UNREAD, pause=PAUSE, agreement=agreement_text([one.out for one in drives]),
+    )  # fmt: skip
+    return text
+
+
+def _proposals_of(out: Path) -> list[dict[str, Any]]:
+    """Return stamp, class, box and points of the objects that a result proposes, if any."""
+    path = out / PROPOSALS
+    if not path.is_file():
+        return []
+    table = BoxTable.read(path)
+    columns = table.stamps_ns, table.class_names, table.boxes, table.num_points
+    return [
+        {'stamp': str(stamp), 'class': name, 'box': box.tolist(), 'points': int(points)}
+        for stamp, name, box, points in zip(*columns, strict=True)
+    ]
+
+
+class TimedProtocol(H11Protocol):
+    """Close a connection on which no whole request arrives within `REQUEST_SECONDS`."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for the first request."""
+        super().connection_made(transport)
+        self._answered: Any = None
+        self._expire_later()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop waiting."""
+        self._timer.cancel()
+        super().connection_lost(exc)
+
+    def _expire_later(self) -> None:
+        self._timer = self.loop.call_later(REQUEST_SECONDS, self._expire)
+
+    def _expire(self) -> None:
+        """Close the connection unless a request has been received since the last time."""
+        cycle = self.cycle
+        is_received = cycle is not None and not cycle.more_body
+        is_new = cycle is not self._answered or (cycle is not None and not cycle.response_complete)
+        if not (is_received and is_new):
+            self.transport.close()
+            return
+        self._answered = cycle
+        self._expire_later()

@@ -79,12 +79,7 @@ class TrackChanges:
 
 
 class Changes:
-    """
-    Collect all boxes before and after registration, in a few numbers each.
-
-    Boxes that are not in the fixed frame are counted, but their numbers are NaN.
-
-    """
+    """Collect all boxes before and after, in a few numbers each; NaN in other frames."""
 
     def __init__(self, fixed_frame: str) -> None:
         self._fixed_frame = fixed_frame
@@ -146,7 +141,7 @@ class Changes:
         given, boxes, deviations, extent_deviations, face_distances, near_points, early = np.split(
             numbers, [9, 18, 22, 25, 31, 33], axis=1
         )
-        disagreement = _disagreement(boxes, early)
+        disagreement = np.nan_to_num(1 - ious(boxes, early))
         errors = pose_errors(given, boxes)  # of the input, in the axes of the result
         yaw_change = wrap_angle(2 * errors.rotation[:, 2]) / 2  # half turns removed
         change = -np.column_stack([errors.translation, yaw_change])
@@ -214,11 +209,11 @@ def _refined_early(early: RefinedBoxes | None, count: int) -> Floats:
     return found
 
 
-def _disagreement(boxes: Floats, early: Floats) -> Floats:
-    """Return 1 - 3D IoU of two estimates (n, 9), 0 where one is not known, (n,)."""
-    found = np.zeros(len(boxes))
-    both = np.isfinite(boxes).all(axis=1) & np.isfinite(early).all(axis=1)
-    found[both] = 1 - iou_3d(boxes[both], early[both])
+def ious(boxes: Floats, truth: Floats) -> Floats:
+    """Return the 3D IoU of `boxes` and `truth` (n, 9), NaN where one of them is, (n,)."""
+    both = np.isfinite(boxes).all(axis=1) & np.isfinite(truth).all(axis=1)
+    found = np.full(len(boxes), np.nan)
+    found[both] = iou_3d(boxes[both], truth[both])
     return found
 
 

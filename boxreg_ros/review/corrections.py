@@ -57,12 +57,7 @@ class Corrections:
         return [_text_of(scope) for scope in sorted(self._unused, key=str)]
 
     def seeds(self, frame_id: str) -> list[BoxArray]:
-        """
-        Return the boxes of added objects, one array each, in the fixed frame.
-
-        Raises RecordingError if a box was added in another frame.
-
-        """
+        """Return boxes of added objects, an array each; RecordingError for another frame."""
         found = []
         for one in self._additions():
             if one.frame_id != frame_id:

@@ -1,8 +1,9 @@
 """
 ``decisions.csv``: what a person decided about tracks and boxes, one row per decision.
 
-Rows are only appended, so a crash loses at most the rows that are being written. Of several rows
-of one topic about the same boxes the last one holds. Several programs may append to one file.
+Rows are only added, and the file is replaced whole: a crash loses those that are being written at
+most. Of several rows of one topic about the same boxes the last one holds. Several programs may
+add to one file.
 
 """
 
@@ -258,15 +259,16 @@ class DecisionLog:
             self.append_locked(new)
 
     def append_locked(self, new: Sequence[Decision]) -> None:
-        """Write decisions at the end of the file that this log has locked."""
+        """Write decisions behind the last whole row of the file that this log has locked."""
         self._read()
         rows = _encoded(new)
-        text = self._path.read_bytes().decode('utf-8-sig') if self._path.exists() else ''
-        end = _end_of_rows(text)
-        if not end or _version_of(text) < VERSION:
-            self._write_new(_encoded(self.decisions) + rows)
-        else:
-            self._write_at(len(text[:end].encode()) + self._bom(), rows)
+        text = self._path.read_bytes().decode() if self._path.exists() else ''
+        text = text[: _end_of_rows(text)]
+        if not text or _version_of(text.removeprefix('\ufeff')) < VERSION:
+            text = f'{VERSION_LINE}{VERSION}\n' + csv_row(DECISION_COLUMNS)
+            text += _encoded(self.decisions)
+        with written_whole(self._path) as file:
+            file.write(text + rows)
         self.decisions = [*self.decisions, *new]
         self._state = _state_of(self._path)
 
@@ -293,35 +295,17 @@ class DecisionLog:
             self.decisions = read_decisions(self._path) if state else []
             self._state = state
 
-    def _bom(self) -> int:
-        return 3 * self._path.read_bytes().startswith(b'\xef\xbb\xbf')
 
-    def _write_new(self, rows: bytes) -> None:
-        with written_whole(self._path) as file:
-            file.write(f'{VERSION_LINE}{VERSION}\n' + csv_row(DECISION_COLUMNS) + rows.decode())
-
-    def _write_at(self, end: int, rows: bytes) -> None:
-        with open(self._path, 'r+b', buffering=0) as file:
-            file.truncate(end)  # without the part of a row that a crash has left
-            file.seek(end)
-            left = memoryview(rows)
-            try:
-                while left:
-                    left = left[file.write(left) :]
-                os.fsync(file.fileno())
-            except OSError:  # as of a full disk
-                file.truncate(end)
-                raise
-
-
-def _encoded(decisions: Iterable[Decision]) -> bytes:
+def _encoded(decisions: Iterable[Decision]) -> str:
     """Return the rows of decisions; nothing is written for texts that cannot be."""
+    rows = ''.join(csv_row(one.row()) for one in decisions)
     try:
-        return ''.join(csv_row(one.row()) for one in decisions).encode()
+        rows.encode()
     except UnicodeEncodeError as error:
         raise RecordingError(
             f'decision: expected text of Unicode, got half a character: {error}; write it again'
         ) from None
+    return rows
 
 
 def _state_of(path: Path) -> tuple[int, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -87,15 +86,19 @@ class Labels(tuple[LabelTrack, ...]):
     """The tracks that rules are applied to."""
 
     @cached_property
+    def rows(self) -> tuple[Ints, Floats, Ints]:
+        """Return stamp [ns], box and index of the track of all boxes: (n,), (n, 9), (n,)."""
+        stamps_ns = np.concatenate([np.zeros(0, np.int64), *(t.stamps_ns for t in self)])
+        boxes = np.concatenate([np.zeros((0, 9)), *(t.boxes for t in self)])
+        return stamps_ns, boxes, np.repeat(np.arange(len(self)), [len(t.boxes) for t in self])
+
+    @cached_property
     def near_pairs(self) -> Pairs:
         """Return the pairs of boxes whose bounding spheres intersect."""
-        return _near_pairs(self)
+        return _near_pairs(*self.rows)
 
 
-def _near_pairs(tracks: Sequence[LabelTrack]) -> Pairs:
-    stamps_ns = np.concatenate([np.zeros(0, np.int64), *(t.stamps_ns for t in tracks)])
-    boxes = np.concatenate([np.zeros((0, 9)), *(t.boxes for t in tracks)])
-    owner = np.repeat(np.arange(len(tracks)), [len(t.boxes) for t in tracks])
+def _near_pairs(stamps_ns: Ints, boxes: Floats, owner: Ints) -> Pairs:
     radius = np.linalg.norm(boxes[:, BOX_EXTENT], axis=1) / 2
     reach = 2 * radius.max(initial=0.0)
     order = np.lexsort((boxes[:, X], stamps_ns))

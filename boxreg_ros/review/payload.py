@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, Protocol
 import zlib
 
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.review.changes import median, TrackChanges
-from boxreg_ros.review.quality import ious, quality
+from boxreg_ros.review.changes import ious, median, TrackChanges
+from boxreg_ros.review.quality import quality
 from boxreg_ros.review.risk import UNKNOWN_USUAL, Usual
 from boxreg_ros.review.tables import TrackRow
 from boxreg_ros.review.track_points import to_millimetres
@@ -66,12 +66,7 @@ def points_per_box(boxes: int) -> int:
 
 
 class TrackTruth(NamedTuple):
-    """
-    The true boxes of a track (n, 9), and the 3D IoU (n,) of the input and the refined boxes.
-
-    NaN where there is no true box.
-
-    """
+    """True boxes of a track (n, 9), and 3D IoU (n,) of input and refined boxes; NaN without."""
 
     boxes: Floats
     iou_before: Floats

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 import csv
 from dataclasses import dataclass
 from datetime import datetime
@@ -53,12 +53,7 @@ class DriveProgress:
 
 
 def progress_of(out: Path) -> DriveProgress:
-    """
-    Return how far the review of a result is.
-
-    Raises RecordingError if it has no list of tracks, or its decisions cannot be read.
-
-    """
+    """Return how far the review of a result is; RecordingError if its files cannot be read."""
     risks = _risks(out / REVIEW)
     path = out / DECISIONS
     made = read_decisions(path) if path.exists() else []
@@ -74,13 +69,9 @@ def progress_of(out: Path) -> DriveProgress:
     )  # fmt: skip
 
 
-def by_risk_left(drives: Iterable[DriveProgress]) -> list[DriveProgress]:
-    """Return drives in the order to review them: the most risk that nobody has looked at first."""
-    return sorted(drives, key=lambda one: -one.risk_left)
-
-
 def progress_lines(drives: Sequence[DriveProgress]) -> list[str]:
-    """Return a table of drives, their sum, and the agreement of people, as lines."""
+    """Return a table of drives, most risk left first, their sum, and the agreement of people."""
+    drives = sorted(drives, key=lambda one: -one.risk_left)
     head = ' tracks  decided  accepted  unread  risk left  min/track'
     width = max([len(str(one.out)) for one in drives] + [5])
     lines = [f'{"drive":<{width}} {head}  people']

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.observation import GROUND_CLEARANCE
 from boxreg_ros.review.changes import mean, median, TrackChanges
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
@@ -88,11 +87,3 @@ def _filled_cells(track: TrackChanges, boxes: Floats, points: list[Floats]) -> i
     floor = GROUND_CLEARANCE - median(track.boxes[:, HEIGHT]) / 2
     cells = np.floor(every[every[:, Z] > floor] / CELL).astype(np.int64) % CELL_RANGE
     return len(np.unique(cells @ np.array([CELL_RANGE**2, CELL_RANGE, 1])))
-
-
-def ious(boxes: Floats, truth: Floats) -> Floats:
-    """Return the 3D IoU of `boxes` and `truth` (n, 9), NaN where one of them is, (n,)."""
-    both = np.isfinite(boxes).all(axis=1) & np.isfinite(truth).all(axis=1)
-    found = np.full(len(boxes), np.nan)
-    found[both] = iou_3d(boxes[both], truth[both])
-    return found

@@ -44,7 +44,6 @@ PAGE_VERSION = 2
 PACKAGES = ('jinja2', 'plotly')
 PAGE = Path(__file__).parent / 'page'
 TEMPLATE = 'report.html.j2'
-STYLE = 'report.css'
 SCRIPTS = (
     'base', 'geometry', 'log', 'tracks', 'added', 'list', 'overview', 'timeline', 'views',
     'charts', 'edit', 'decide', 'sweeps', 'camera', 'scene', 'keys', 'main',
@@ -121,8 +120,8 @@ def write_report(
     (folder / REPORT).write_text(page, encoding='utf-8', errors='backslashreplace')
 
 
-def _page(**content: Any) -> str:
-    """Return the page with its content, styles and scripts."""
+def page_environment() -> Any:
+    """Return the environment of the templates in `PAGE`."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
@@ -130,16 +129,29 @@ def _page(**content: Any) -> str:
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.filters['code'] = _code
-    css = _as_markup((PAGE / STYLE).read_text(encoding='utf-8'))
-    parts = [(PAGE / f'{name}.js').read_text(encoding='utf-8') for name in SCRIPTS]
-    script = _as_markup('\n'.join(parts))
-    template = environment.get_template(TEMPLATE)
-    return template.render(
-        css=css,
-        script=script,
-        plotly=compressed(_plotly_script()),
-        version=PAGE_VERSION,
-        **content,
+    return environment
+
+
+def style() -> Any:
+    """Return the styles of all pages, not to be escaped."""
+    return _as_markup('report.css')
+
+
+def _page(**content: Any) -> str:
+    """Return the page with its content, styles and scripts."""
+    import plotly
+
+    library = Path(plotly.__file__).parent / 'package_data' / 'plotly.min.js'
+    return str(
+        page_environment()
+        .get_template(TEMPLATE)
+        .render(
+            css=style(),
+            script=_as_markup(*(f'{name}.js' for name in SCRIPTS)),
+            plotly=compressed(library.read_bytes()),
+            version=PAGE_VERSION,
+            **content,
+        )
     )
 
 
@@ -187,13 +199,6 @@ def _by_track(violated: Mapping[str, Sequence[Violation]]) -> dict[str, list[tup
     return found
 
 
-def _plotly_script() -> bytes:
-    """Return the script of Plotly from its package."""
-    import plotly
-
-    return (Path(plotly.__file__).parent / 'package_data' / 'plotly.min.js').read_bytes()
-
-
 def _warnings(summary: Mapping[str, Any]) -> list[str]:
     """Return the warnings at the top of the page."""
     found = [summary['warning']] if summary['warning'] else []
@@ -228,8 +233,8 @@ def _code(text: str) -> Any:
     return Markup(re.sub(r'`([^`]+)`', r'<code>\1</code>', str(escape(text))))
 
 
-def _as_markup(text: str) -> Any:
-    """Return a file of ours as it is: style and script must not be escaped."""
+def _as_markup(*names: str) -> Any:
+    """Return files of ours as they are: style and script must not be escaped."""
     from markupsafe import Markup
 
-    return Markup(text)
+    return Markup('\n'.join((PAGE / name).read_text(encoding='utf-8') for name in names))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import wraps
 from typing import NamedTuple
 
 from boxreg_ros.review.label_tracks import CYCLIST, Labels, LabelTrack, PEDESTRIAN, VEHICLE
@@ -41,8 +42,8 @@ class Rule(NamedTuple):
 RULES: dict[str, Rule] = {}
 """By id."""
 Finder = Callable[[Labels], Iterator[Violation]]
-Place = tuple[int, str] | None
-"""Row of the box at which a track violates a rule, and the text; None if it keeps the rule."""
+Place = Callable[[LabelTrack], tuple[int, str] | None]
+"""Finds the row of the box at which a track violates a rule, and the text; None if it does not."""
 
 
 def violations(tracks: Sequence[LabelTrack]) -> dict[str, list[Violation]]:
@@ -57,26 +58,32 @@ def counts(found: Mapping[str, Sequence[Violation]]) -> dict[str, int]:
     return {name: len(found.get(name, ())) for name in RULES}
 
 
-def _rule(rule_id: str, severity: str, meaning: str, remedy: str) -> Callable[[Finder], Finder]:
-    """Return a decorator that adds a rule."""
+def _rule(severity: str, meaning: str, remedy: str) -> Callable[[Finder], Finder]:
+    """Return a decorator that adds a rule, whose id is the name of its function."""
 
     def add(find: Finder) -> Finder:
+        rule_id = find.__name__.lstrip('_').replace('_', '-')
         RULES[rule_id] = Rule(rule_id, severity, meaning, remedy, find)
         return find
 
     return add
 
 
-def _of_each(find: Callable[[LabelTrack], Place]) -> Finder:
-    """Return the rule that every track keeps for itself."""
+def _of_each(severity: str, meaning: str, remedy: str) -> Callable[[Place], Finder]:
+    """Return a decorator that adds a rule that every track keeps for itself."""
 
-    def find_in_each(tracks: Labels) -> Iterator[Violation]:
-        for track in tracks:
-            place = find(track)
-            if place is not None:
-                yield Violation(track.track_id, int(track.stamps_ns[place[0]]), place[1])
+    def add(find: Place) -> Finder:
+        @_rule(severity, meaning, remedy)
+        @wraps(find)
+        def find_in_each(tracks: Labels) -> Iterator[Violation]:
+            for track in tracks:
+                place = find(track)
+                if place is not None:
+                    yield Violation(track.track_id, int(track.stamps_ns[place[0]]), place[1])
 
-    return find_in_each
+        return find_in_each
+
+    return add
 
 
 SIZE_BOUNDS = {
@@ -88,14 +95,12 @@ SIZE_BOUNDS = {
 from children to large persons with their arms stretched out."""
 
 
-@_rule(
-    'size-outside-class',
+@_of_each(
     WARNING,
     'the extents are those of no object of this class',
     'correct the size or the class of the track',
 )
-@_of_each
-def _size_outside_class(track: LabelTrack) -> Place:
+def _size_outside_class(track: LabelTrack) -> tuple[int, str] | None:
     """Find the first box that is outside the bounds of its class."""
     low, high = np.array(SIZE_BOUNDS[track.kind])
     extents = track.boxes[:, BOX_EXTENT]
@@ -110,14 +115,12 @@ MAX_SIZE_CHANGE = 0.1
 """Largest difference from the median, as part of it. Chosen: twice the error of a detector."""
 
 
-@_rule(
-    'size-changes',
+@_of_each(
     WARNING,
     'the extents of a rigid object change over its track',
     'give all boxes of the track one size',
 )
-@_of_each
-def _size_changes(track: LabelTrack) -> Place:
+def _size_changes(track: LabelTrack) -> tuple[int, str] | None:
     """Find the box of a vehicle whose extents are furthest from their median."""
     if track.kind != VEHICLE or len(track.boxes) < 2:
         return None
@@ -134,14 +137,12 @@ MIN_JUMP = 0.5
 """Smallest deviation from constant velocity that is a jump [m]: more than errors of detectors."""
 
 
-@_rule(
-    'jump',
+@_of_each(
     ERROR,
     'the centre jumps: no road user accelerates like this',
     'correct the box, or split the track if its id has switched to another object',
 )
-@_of_each
-def _jump(track: LabelTrack) -> Place:
+def _jump(track: LabelTrack) -> tuple[int, str] | None:
     """Find the largest jump."""
     steps = track.steps()
     if len(steps.rows) < 2:
@@ -160,14 +161,12 @@ MIN_TURN = 0.1
 """Smallest turn that counts [rad]: more than errors of detectors."""
 
 
-@_rule(
-    'spin',
+@_of_each(
     ERROR,
     'the heading turns faster than a vehicle can, or flips',
     'correct the heading; a turn by 180 degrees is a flip',
 )
-@_of_each
-def _spin(track: LabelTrack) -> Place:
+def _spin(track: LabelTrack) -> tuple[int, str] | None:
     """Find the fastest turn of a vehicle or cyclist."""
     steps = track.steps()
     if track.kind == PEDESTRIAN or not len(steps.rows):
@@ -187,14 +186,12 @@ SLIDING_STEPS = 5
 """Steps of the running median. Chosen: noise of single boxes is no slide."""
 
 
-@_rule(
-    'sliding',
+@_of_each(
     WARNING,
     'a vehicle moves sideways',
     'correct the heading of the track',
 )
-@_of_each
-def _sliding(track: LabelTrack) -> Place:
+def _sliding(track: LabelTrack) -> tuple[int, str] | None:
     """Find the place where a vehicle or cyclist slides fastest."""
     steps = track.steps()
     if track.kind == PEDESTRIAN or len(steps.rows) < SLIDING_STEPS:
@@ -221,16 +218,13 @@ MAX_GROUND_OFFSET = 1.0
 
 
 @_rule(
-    'floating',
     WARNING,
     'a box floats above, or is sunk below, the ground of the boxes around it',
     'correct its height; ignore it on bridges and slopes',
 )
 def _floating(tracks: Labels) -> Iterator[Violation]:
     """Yield the first box of each track that is off the bottoms of the boxes around it."""
-    stamps_ns = np.concatenate([np.zeros(0, np.int64), *(t.stamps_ns for t in tracks)])
-    boxes = np.concatenate([np.zeros((0, 9)), *(t.boxes for t in tracks)])
-    owner = np.repeat(np.arange(len(tracks)), [len(t.boxes) for t in tracks])
+    stamps_ns, boxes, owner = tracks.rows
     bottom = boxes[:, Z] - boxes[:, HEIGHT] / 2
     reported: set[int] = set()
     order = np.argsort(stamps_ns, kind='stable')
@@ -269,7 +263,6 @@ DUPLICATE_IOU = 0.7
 
 
 @_rule(
-    'overlap',
     ERROR,
     'two boxes are in one place',
     'correct position, size or heading of one of them',
@@ -288,7 +281,6 @@ def _overlap(tracks: Labels) -> Iterator[Violation]:
 
 
 @_rule(
-    'duplicate',
     ERROR,
     'one object has two labels',
     'remove one of them, or merge the two tracks',
@@ -317,14 +309,12 @@ MAX_PART_OF_FEW = 0.5
 """Part of the boxes of a track that may have fewer. Chosen."""
 
 
-@_rule(
-    'few-points',
+@_of_each(
     WARNING,
     'most boxes of the track have too few points to check them',
     'look at a camera image, or leave the track out',
 )
-@_of_each
-def _few_points(track: LabelTrack) -> Place:
+def _few_points(track: LabelTrack) -> tuple[int, str] | None:
     """Find that most boxes have too few points; unknown numbers are left out."""
     known = track.num_points >= 0
     few = known & (track.num_points < MIN_LABEL_POINTS)
@@ -342,14 +332,12 @@ MIN_STEPS = 5
 """Fewest steps of a track. Chosen: half a second at 10 Hz; noise of single boxes is no motion."""
 
 
-@_rule(
-    'backward',
+@_of_each(
     WARNING,
     'a vehicle drives backward',
     'turn the heading of the track by 180 degrees',
 )
-@_of_each
-def _backward(track: LabelTrack) -> Place:
+def _backward(track: LabelTrack) -> tuple[int, str] | None:
     """Find that a vehicle or cyclist moves backward most of the time."""
     steps = track.steps()
     if track.kind == PEDESTRIAN or len(steps.rows) < MIN_STEPS:
@@ -370,7 +358,6 @@ MIN_TIME_LEFT = 1.0
 
 
 @_rule(
-    'ends-in-view',
     WARNING,
     'the track ends although its object is in view',
     'extend the track, or merge it with the one that goes on',

@@ -1,21 +1,24 @@
-"""The sweeps of a drive under review, read once when its page first asks for them."""
+"""Sweeps and images of a drive under review, read when its page first asks for them."""
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from tempfile import gettempdir
-from threading import Condition, Thread
+from threading import Condition, Lock, Thread
+from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.follow import follow_points, FollowedTrack, solved
 from boxreg_ros.errors import BoxregError, RecordingError, remedy_of
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
+from boxreg_ros.io.images import Image, ImageCamera, RecordedImages
 from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.sweep_store import SweepStore
+from boxreg_ros.io.transforms import inverse
 from boxreg_ros.rotations import (
     interpolate_rotation,
     matrix_from_rpy,
@@ -48,12 +51,7 @@ class DriveSource:
 
 
 class DriveScene:
-    """
-    The sweeps of a drive, in the fixed frame.
-
-    They are read in a thread, into a temporary file; who asks for one waits for it.
-
-    """
+    """The sweeps of a drive in the fixed frame, read in a thread that callers wait for."""
 
     def __init__(self, source: DriveSource) -> None:
         self._source = source
@@ -81,12 +79,7 @@ class DriveScene:
             return self._store.stamps_ns[row], self._store.origin, self._store[row], sensor
 
     def follow(self, seeds: Sequence[BoxArray]) -> FollowedTrack:
-        """
-        Follow an object through all sweeps from its boxes, and solve its track.
-
-        Raises RecordingError if the recording cannot be read, or no seed can be followed.
-
-        """
+        """Follow an object from its boxes, and solve its track; RecordingError if that fails."""
         with self._changed:
             self._wait(None)
         origin = self._store.origin
@@ -159,14 +152,11 @@ class DriveScene:
         if not self._is_begun:
             self._is_begun = True
             Thread(target=self._read, daemon=True).start()
-        self._changed.wait_for(lambda: self._has(stamp_ns))
+        self._changed.wait_for(lambda: self._is_done or self._has_read(stamp_ns))
         if not self._store.stamps_ns:
             raise RecordingError(self._error or 'recording: expected sweeps, got none')
         if self._error and not self._has_read(stamp_ns):
             raise RecordingError(self._error)
-
-    def _has(self, stamp_ns: int | None) -> bool:
-        return self._is_done or self._has_read(stamp_ns)
 
     def _has_read(self, stamp_ns: int | None) -> bool:
         stamps_ns = self._store.stamps_ns
@@ -211,6 +201,60 @@ class DriveScene:
                 for frame_id, poses in self._poses.items():
                     poses.append(items.pose_of(frame_id, sweep.stamp_ns))
             self._changed.notify_all()
+
+
+class DriveImages:
+    """The images of a recording; it is opened when they are first asked for, and stays open."""
+
+    def __init__(self, source: DriveSource, scene: DriveScene) -> None:
+        self._source = source
+        self._scene = scene
+        self._lock = Lock()
+        self._opened = ExitStack()
+        self._images: RecordedImages | None = None
+        self._is_open = False
+
+    def cameras(self, stamp_ns: int) -> list[dict[str, Any]]:
+        """Return the cameras with their poses at a stamp; none for data sets."""
+        return [
+            {
+                'topic': camera.topic,
+                'size': camera.size,
+                'matrix': camera.matrix,
+                'distortion': camera.distortion,
+                'model': camera.model,
+                'pose': self._T_camera_fixed(camera, stamp_ns),
+            }
+            for camera in self._known()
+        ]
+
+    def image(self, index: int, stamp_ns: int) -> tuple[Image, Floats | None]:
+        """
+        Return the image of a camera nearest to a stamp, and T_camera_fixed (4, 4) at its stamp.
+
+        Raises RecordingError if there is no such camera, or no image nearby.
+
+        """
+        cameras = self._known()
+        if not 0 <= index < len(cameras):
+            raise RecordingError(f'camera: expected one of {len(cameras)}, got {index}')
+        with self._lock:
+            assert self._images is not None
+            found = self._images.nearest(cameras[index], stamp_ns)
+        return found, self._T_camera_fixed(cameras[index], found.stamp_ns)
+
+    def _known(self) -> list[ImageCamera]:
+        with self._lock:
+            if not self._is_open:
+                recording = self._opened.enter_context(self._source.recording())
+                if isinstance(recording, Recording):
+                    self._images = recording.images()
+                self._is_open = True
+            return [] if self._images is None else self._images.cameras
+
+    def _T_camera_fixed(self, camera: ImageCamera, stamp_ns: int) -> Floats | None:
+        pose = self._scene.pose_of(camera.frame_id, stamp_ns)
+        return None if pose is None else inverse(pose)
 
 
 def thinned(points: Sequence[Floats]) -> Floats:

@@ -8,10 +8,9 @@ from typing import Any
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.review.added import added_track
 from boxreg_ros.review.fit import fitted, USUAL_EXTENTS
-from boxreg_ros.review.images import DriveImages
 from boxreg_ros.review.payload import as_json
 from boxreg_ros.review.requests import box_of, numbers_of, posted, stamp_of, text_of
-from boxreg_ros.review.scene import DriveScene, DriveSource, thinned
+from boxreg_ros.review.scene import DriveImages, DriveScene, DriveSource, thinned
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box
 import numpy as np
 from starlette.concurrency import run_in_threadpool

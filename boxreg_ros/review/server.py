@@ -39,7 +39,7 @@ def add_server_arguments(parser: argparse.ArgumentParser) -> None:
 
 def serve(results: Results, port: int, who: str) -> int:
     """Serve until interrupted, or ended by a signal: each decision is saved already."""
-    server = results_server(results, port, who)
+    server = review_server(results, port, who)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
             signal.signal(number, lambda *_: server.shutdown())
@@ -53,16 +53,10 @@ def serve(results: Results, port: int, who: str) -> int:
 
 
 class ReviewServer:
-    """
-    A server for result folders, bound to loopback at `server_port`.
-
-    `address` has the token that opens the page; `log_paths` are the files of the decisions.
-
-    """
+    """A server for result folders on loopback; its `address` has the token that opens the page."""
 
     def __init__(self, results: Results, bound: socket.socket, who: str) -> None:
-        from boxreg_ros.review.application import review_application
-        from boxreg_ros.review.connections import TimedProtocol
+        from boxreg_ros.review.application import review_application, TimedProtocol
         from boxreg_ros.review.decisions import DECISIONS
         from uvicorn import Config, Server
 
@@ -90,19 +84,7 @@ class ReviewServer:
         return self._server.should_exit
 
 
-def review_server(
-    out: Path, port: int, who: str = '', source: DriveSource | None = None
-) -> ReviewServer:
-    """
-    Return a server, bound to loopback, for the report and the decisions of a result folder.
-
-    Errors are those of `results_server`.
-
-    """
-    return results_server([(out, source)], port, who)
-
-
-def results_server(results: Results, port: int, who: str = '') -> ReviewServer:
+def review_server(results: Results, port: int, who: str = '') -> ReviewServer:
     """
     Return a server, bound to loopback, for result folders and their recordings.
 

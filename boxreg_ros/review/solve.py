@@ -14,9 +14,9 @@ import zlib
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.review.box_risk import risks_of_box
 from boxreg_ros.review.payload import as_json
 from boxreg_ros.review.requests import box_of
+from boxreg_ros.review.risk import risks_of_box
 from boxreg_ros.review.track_points import MILLIMETRES
 from boxreg_ros.structures import BOX_EXTENT, Floats, is_valid_box, LENGTH, Z
 import numpy as np
@@ -71,8 +71,9 @@ class ReportParts:
             '1', class_name, np.array(stamps), np.array(boxes), points, np.array(origins),
             pinned=np.isin(stamps, list(pins)),
         )  # fmt: skip
+        config = replace(Config.from_yaml(self._config_path), estimate='track')
         with self._lock:
-            (found,) = refine([track], self._config())
+            (found,) = refine([track], config)
         names = [str(stamp) for stamp in stamps]
         return as_json({'stamps': names, 'boxes': found.boxes, 'status': found.status})
 
@@ -113,9 +114,6 @@ class ReportParts:
         return [
             (given[k], offsets[ends[k] : ends[k + 1]] + center) for k, center in enumerate(centers)
         ]
-
-    def _config(self) -> Config:
-        return replace(Config.from_yaml(self._config_path), estimate='track')
 
     def _rows(self, piece: Mapping[str, Any]) -> list[tuple[int, Floats, Floats, Floats]]:
         """Return the stamps, input boxes, points and sensor positions of a part of a track."""

@@ -77,12 +77,7 @@ class PointCollector:
         return np.array([self._origins[stamp] for stamp in sorted(self._origins)]).reshape(-1, 3)
 
     def points_of(self, track: TrackChanges) -> list[Floats]:
-        """
-        Return the points near each box of a track before or after, n arrays (M_i, 3) [m].
-
-        In the fixed frame, motion-compensated to the stamp of the box.
-
-        """
+        """Return points near each box of a track, moved to its stamp, n arrays (M_i, 3) [m]."""
         is_known = np.asarray(np.isfinite(track.boxes).all(axis=1))
         given = np.where(np.isfinite(track.given), track.given, track.boxes)  # of added boxes
         both = np.stack([given, track.boxes])

@@ -13,6 +13,9 @@ from boxreg_ros.core.refine import refine
 import numpy as np
 from scenes import drive, shared_of, simulated, track_of
 
+CONSTANTS = constants.CONSTANTS
+RECORD = CONSTANTS.with_settings(Config()).record()
+
 
 def refined_tracks():
     """Return refined tracks of a simulated street."""
@@ -45,13 +48,14 @@ def test_extent_covariances_are_symmetric_and_positive():
         assert (np.linalg.eigvalsh(matrices) > 0).all()
 
 
-def unclaimed(variance=0.0, extent=0.0):
+def unclaimed(visibility=0.0, variance=0.0, extent=0.0, count=40, marginalised=0.0):
     """Return the weights of extents and margins of 5 cm, and what (M28) adds to (M26)."""
-    common = np.zeros((), COMMON)[()]
+    terms, common = np.zeros(count, TERMS), np.zeros((), COMMON)[()]
+    terms['visibility'] = visibility
     common['margin_variance'], common['unclaimed'][:3] = variance, extent
     common['W_shared'] = 0.05**-2
     G = np.empty((PIVOT, PIVOT))
-    fill_unclaimed(common, G)
+    fill_unclaimed(count, marginalised, terms, common, 0.0, RECORD, G)
     return 0.05**-2, G
 
 
@@ -86,6 +90,15 @@ def test_errors_of_extents_that_no_weight_claims():
     columns[EXTENT : EXTENT + 3, EXTENT : EXTENT + 3] = np.eye(3) / W
     found = covariance_of(columns, G=G)
     np.testing.assert_allclose(found, np.diag([0.01, 0.02, 0.03]) + 0.05**2 * np.eye(3))
+
+
+def test_correlated_residuals_of_a_face_are_an_error_of_its_margin():
+    # 40 observations in the window and 40 before it, of weight 1/2, count as 40 independent ones;
+    # correlated by c as one in (1 + c) / (1 - c).
+    c = CONSTANTS.residual_correlation
+    W, G = unclaimed(visibility=[0.5, 0, 0, 0, 0, 0], marginalised=40.0)
+    known = W**2 * Config().faces.ends ** 2 / 40 * ((1 + c) / (1 - c) - 1)
+    np.testing.assert_allclose(G[GAP:, GAP:], np.diag([known, 0, 0, 0, 0, 0]))
 
 
 def test_fixed_extents_have_the_errors_of_the_input():

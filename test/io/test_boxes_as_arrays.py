@@ -2,7 +2,7 @@
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.items import Wanted
-from boxreg_ros.io.recorded_type import RecordedType
+from boxreg_ros.io.message_decoder import RecordedType
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.record import Record
 from boxreg_ros.io.transforms import TransformTree

@@ -513,7 +513,7 @@ class Labeller:
 def reviewed(out, truth):
     """Review a result until it is right, write the labels, and return who did it."""
     with (
-        serving(review_server(out, 0, 'script', drive_of(out))) as server,
+        serving(review_server([(out, drive_of(out))], 0, 'script')) as server,
         opened_page(server.address, expected='409') as page,
     ):
         labeller = Labeller(page, truth)

@@ -94,7 +94,7 @@ def test_boxes_are_shown_in_the_nearest_image_of_the_best_camera(tmp_path):
     assert main(['relabel', str(recording), '-o', str(out), '--report', *QUICK]) == 0
     assert b'image/jpeg' not in (out / 'report.html').read_bytes()
     with (
-        serving(review_server(out, 0, 'anna', drive_of(out))) as server,
+        serving(review_server([(out, drive_of(out))], 0, 'anna')) as server,
         opened_page(server.address + '#track=1') as page,
     ):
         for row, image in ((0, 0), (1, 0), (2, 2), (4, 4)):  # 70 ms are nearer than 130
@@ -154,7 +154,7 @@ def test_missing_clouds_and_damaged_images_are_said_where_they_are(tmp_path):
     shutil.rmtree(tmp_path / 'drive')
     drive.write(tmp_path / 'drive')
     with (
-        serving(review_server(out, 0, 'anna', drive_of(out))) as server,
+        serving(review_server([(out, drive_of(out))], 0, 'anna')) as server,
         opened_page(server.address + '#track=1', expected='400') as page,
     ):
         page.wait_for_function("$('camera-text').textContent.includes('damaged')")

@@ -7,7 +7,7 @@ from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
 from boxreg_ros.review.progress import progress_of
-from boxreg_ros.review.server import results_server
+from boxreg_ros.review.server import review_server
 from browser import NEEDS_BROWSER, opened_page, press, serving
 import numpy as np
 import pytest
@@ -96,7 +96,7 @@ def test_progress_counts_decisions_and_the_time_between_them(outs, capsys):
 def test_several_drives_are_reviewed_under_one_address(outs):
     decide(outs[0], Decision('1', None, 'accept', who='anna', when=at(0)))
     with (
-        serving(results_server([(out, None) for out in outs], 0, 'anna')) as server,
+        serving(review_server([(out, None) for out in outs], 0, 'anna')) as server,
         opened_page(server.address, ready='#drives') as page,
     ):
         rows = page.locator('#drives tr').all_inner_texts()

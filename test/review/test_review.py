@@ -323,7 +323,7 @@ def test_report_of_another_version_is_refused(result, tmp_path, capsys):
     page = (out / 'report.html').read_text(encoding='utf-8')
     (out / 'report.html').write_text(page.replace(' data-page="2"', ''), encoding='utf-8')
     with pytest.raises(RecordingError, match='expected a report of this version, got one of'):
-        review_server(out, 0)
+        review_server([(out, None)], 0)
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
@@ -347,10 +347,10 @@ def test_ended_server_names_the_command_that_applies_its_decisions(
 
 def test_busy_port_is_refused(result):
     with (
-        serving(review_server(result[1], 0)) as server,
+        serving(review_server([(result[1], None)], 0)) as server,
         pytest.raises(ConfigError, match=r'expected a free one, got .* --port'),
     ):
-        review_server(result[1], server.server_port)
+        review_server([(result[1], None)], server.server_port)
 
 
 def opened(server, **headers):
@@ -379,7 +379,7 @@ def row(track_id='1', decision='accept', **more):
 def server(result, tmp_path):
     """Return a running server for a copy of a result."""
     out = shutil.copytree(result[1], tmp_path / 'out')
-    with serving(review_server(out, 0)) as found:
+    with serving(review_server([(out, None)], 0)) as found:
         yield found
 
 
@@ -456,7 +456,7 @@ def test_page_and_its_address_are_for_this_browser_alone(server):
 
 
 def test_connection_without_a_request_ends(server, monkeypatch):
-    monkeypatch.setattr('boxreg_ros.review.connections.REQUEST_SECONDS', 0.3)
+    monkeypatch.setattr('boxreg_ros.review.application.REQUEST_SECONDS', 0.3)
     _, headers = opened(server)
     lines = ''.join(f'{name}: {value}\r\n' for name, value in headers.items())
     host = f'Host: 127.0.0.1:{server.server_port}\r\n'
@@ -471,7 +471,7 @@ def test_connection_without_a_request_ends(server, monkeypatch):
 def test_what_others_have_decided_is_not_overwritten_unseen(server):
     """Another tab, another server on the same folder, and decisions about other tracks."""
     assert posted(server, {'seen': 0, 'rows': [row('1', who='anna')]})[0] == 200
-    with serving(review_server(server.log_paths[0].parent, 0)) as second:
+    with serving(review_server([(server.log_paths[0].parent, None)], 0)) as second:
         status, text = posted(second, {'seen': 0, 'rows': [row('1', 'reject')]})
         assert status == 409
         assert "anna has decided about track '1' meanwhile (accept)" in json.loads(text)['message']

@@ -3,9 +3,8 @@
 import csv
 from dataclasses import replace
 
-from boxreg_ros.review.box_risk import risks_of_box
 from boxreg_ros.review.changes import Changes
-from boxreg_ros.review.risk import assess, MIN_COMPARED, Usual
+from boxreg_ros.review.risk import assess, MIN_COMPARED, risks_of_box, Usual
 from boxreg_ros.review.tables import assessed, REVIEW_COLUMNS, write_tables
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 import numpy as np

@@ -51,7 +51,7 @@ def serve():
     """Return a function that serves a result with its recording, and returns the server."""
     with ExitStack() as running:
         yield lambda folder: running.enter_context(
-            serving(review_server(folder, 0, 'anna', drive_of(folder)))
+            serving(review_server([(folder, drive_of(folder))], 0, 'anna'))
         )
 
 

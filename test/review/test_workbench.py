@@ -48,7 +48,7 @@ def made(tmp_path_factory):
 def server(made, tmp_path):
     """Return a running server for a copy of the result."""
     out = shutil.copytree(made / 'out', tmp_path / 'out')
-    with serving(review_server(out, 0, 'anna', drive_of(out))) as found:
+    with serving(review_server([(out, drive_of(out))], 0, 'anna')) as found:
         yield found
 
 
@@ -159,7 +159,7 @@ def test_labels_are_written_with_all_decisions_without_a_terminal(server):
     assert [text.count('"van"') for text in texts] == [0] * 8 + [1] * 6
     # The review goes on in the new folder: the same decisions hold, and are made no second time.
     with (
-        serving(review_server(again, 0)) as second,
+        serving(review_server([(again, None)], 0)) as second,
         opened_page(second.address + '#tracks') as page,
     ):
         assert sorted(ids_of(page)) == ['1', '1_2', '2']

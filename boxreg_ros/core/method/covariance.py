@@ -6,6 +6,7 @@ from boxreg_ros.core.method.arrays import EXTENT, GAP, PIVOT
 from boxreg_ros.core.method.compile import kernel
 from boxreg_ros.core.method.expectation import FACES, HEADING, SIZE
 from boxreg_ros.core.method.rotation import fill_rotation
+from boxreg_ros.core.method.weights import face_deviation
 import numpy as np
 
 MIN_DURATION = 1e-3
@@ -52,22 +53,30 @@ def fill_face_distances(boxes, poses, shared, expected, terms, R, distances):
 
 
 @kernel
-def fill_unclaimed(common, G):
+def fill_unclaimed(length, marginalised, terms, common, shape, constants, G):
     """
     Write the covariance (15, 15) of the gradient by shared variables that no weight claims.
 
     The mean of input extents has the errors that change, too; biases of low-noise input are held
-    closer than they err. The margin of a kind has an error, which opposite faces have in common
+    closer than they err. The margin of a kind has an error, which opposite faces have in common.
+    Consecutive residuals of a face are correlated: the error of their mean is one of its margin
     (M28).
 
     """
-    W = common.W_shared
+    c, W = constants.residual_correlation, common.W_shared
     G[:] = 0.0
     for k in range(GAP):
         G[k, k] = W[k] ** 2 * common.unclaimed[k]
     for face in range(FACES):
+        total = 0.0
+        for n in range(length):
+            total += terms[n].visibility[face]
+        total *= (length + marginalised) / length
         own, opposite = GAP + face, GAP + face + 1 - 2 * (face % 2)
         G[own, own] = W[own] ** 2 * common.margin_variance[face]
+        if total > 0.0:
+            independent = face_deviation(face, shape, constants) ** 2 / total
+            G[own, own] += W[own] ** 2 * independent * 2 * c / (1 - c)
         if face < 4:  # top and bottom have margins of their own
             G[own, opposite] = W[own] * W[opposite] * common.margin_variance[face]
 
@@ -143,10 +152,11 @@ def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, cons
         Of the batch: written for the window.
 
     """
-    length = problem.lengths[b]
+    length, shape = problem.lengths[b], problem.of_class[b].roughness
     distances, free_shared = found.face_distances[b], free[6 * len(poses) :]
     R, G = np.empty((3, 3)), np.empty((PIVOT, PIVOT))
     fill_face_distances(problem.boxes[b], poses, shared, common.shared, terms, R, distances)
-    fill_unclaimed(common, G)
+    marginalised = problem.marginalised_extents[b, 3]
+    fill_unclaimed(length, marginalised, terms, common, shape, constants, G)
     fill_pose_covariances(length, problem.times[b], poses, inverse, G, constants, found.poses[b])
     fill_extent_covariance(inverse.corner, free_shared, common, G, found.extents[b])

@@ -17,6 +17,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.storage.record import Damage, Damages, one_line, Record, shown, span_ns
 from boxreg_ros.io.storage.urls import byte_source_of, ByteSource
 from rosbags.interfaces import Connection
@@ -68,6 +69,14 @@ class StoredMessage(NamedTuple):
     data: bytes | memoryview
     published_ns: int
     sequence: int
+
+
+class RecordPlace(NamedTuple):
+    """A record in the file, without its content; `kind` is its operation code."""
+
+    kind: int
+    first_byte: int
+    end_byte: int
 
 
 class ChunkedFile(ABC):
@@ -133,6 +142,43 @@ class ChunkedFile(ABC):
     @abstractmethod
     def _unpack(self, chunk: Chunk, stored: bytes) -> list[StoredMessage]:
         """Return the messages of a chunk from its bytes; any error means that it is damaged."""
+
+    @abstractmethod
+    def _place_at(self, first_byte: int) -> RecordPlace | None:
+        """Return the record at a position; None where there can be none."""
+
+    @abstractmethod
+    def _next_chunk(self, position: int) -> int:
+        """Return where the next whole chunk begins; the end of the file without."""
+
+    def _places(self, first_byte: int) -> Iterator[RecordPlace]:
+        """Yield the records from a position on; skip and note what is no record."""
+        while first_byte < self.size:
+            place = self._place_at(first_byte)
+            if place is None:
+                following = self._next_chunk(first_byte + 1)
+                self._note('no record', first_byte, following)
+                first_byte = following
+            else:
+                yield place
+                first_byte = place.end_byte
+
+    def _add(self, chunk: Chunk) -> None:
+        """Add a chunk that has messages, with their times and counts."""
+        messages = self._messages_of(chunk)
+        if messages:
+            times = [message.received_ns for message in messages]
+            counts = Counter(message.connection_id for message in messages)
+            self._chunks.append(
+                chunk._replace(start_ns=min(times), last_ns=max(times), counts=counts)
+            )
+
+    def _no_chunk(self, what: str) -> RecordingError:
+        """Return the error of a file in which no chunk was found."""
+        return RecordingError(
+            f'{self.name}: no message can be read; expected {what}, got {self.size} bytes without '
+            f'a whole chunk; copy or record it again'
+        )
 
     def _messages_of(self, chunk: Chunk) -> list[StoredMessage]:
         """Return the messages of a chunk; none, and a damage is noted, if it is damaged."""

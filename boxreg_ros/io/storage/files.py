@@ -89,18 +89,8 @@ def size_of(path: Path) -> int:
     return path.stat().st_size if url_of(path) is None else entry_of(path).size
 
 
-def is_ros1(path: Path) -> bool:
-    """Return whether a file is a ROS 1 bag."""
-    return OPENERS.get(_kind(path)) is Rosbag1File
-
-
 def opened(path: Path) -> StorageFile:
-    """
-    Open a file of a recording; a compressed one is unpacked to a temporary file first.
-
-    Raises RecordingError if it is none, or nothing in it can be read.
-
-    """
+    """Open a file, unpacked first if compressed; RecordingError if nothing can be read."""
     opener = OPENERS.get(_kind(path))
     if opener is None:
         raise RecordingError(
@@ -142,12 +132,7 @@ def _opened_compressed(file: Path, folder: Path, opener: Opener, origin: Path) -
 
 
 class Files:
-    """
-    Several open files of one path as one; see `StorageFile`.
-
-    A file that cannot be opened is noted as a damage, unless none can be.
-
-    """
+    """Several open files of one path as one `StorageFile`; one that does not open is a damage."""
 
     def __init__(self, part: Part) -> None:
         self._files: list[StorageFile] = []

@@ -20,13 +20,8 @@ from typing import Any, NamedTuple
 import zlib
 
 from boxreg_ros.errors import RecordingError, TransferError
-from boxreg_ros.io.storage.chunks import (
-    Chunk,
-    ChunkedFile,
-    MAX_CHUNK_BYTES,
-    MAX_RECORDS,
-    StoredMessage,
-)
+from boxreg_ros.io.storage import chunks
+from boxreg_ros.io.storage.chunks import Chunk, RecordPlace, StoredMessage
 from boxreg_ros.io.storage.record import Definition, one_line
 from lz4.frame import LZ4FrameDecompressor
 from mcap import records
@@ -69,14 +64,6 @@ SCHEMA_FORMATS = {
 }
 
 
-class _Place(NamedTuple):
-    """A record in the file, without its content."""
-
-    opcode: int
-    first_byte: int
-    end_byte: int
-
-
 class _ChunkHead(NamedTuple):
     """What a chunk claims about itself."""
 
@@ -94,7 +81,7 @@ class _ChunkHead(NamedTuple):
     """Number of the compressed bytes."""
 
 
-class McapFile(ChunkedFile):
+class McapFile(chunks.ChunkedFile):
     """
     An open MCAP file; see `ChunkedFile`. It `is_indexed` unless the whole file had to be scanned.
 
@@ -106,7 +93,7 @@ class McapFile(ChunkedFile):
         self._schemas: dict[int, records.Schema] = {}
         self.is_indexed = True
         self._channels: dict[int, records.Channel] = {}
-        self._extras: list[_Place] = []
+        self._extras: list[RecordPlace] = []
         super().__init__(path, origin)
 
     def schema_of(self, connection: Connection) -> records.Schema | None:
@@ -129,13 +116,13 @@ class McapFile(ChunkedFile):
         if not self._chunks:
             return ''
         chunk = self._chunks[0]
-        head = self._chunk_head_at(_Place(Opcode.CHUNK, chunk.first_byte, chunk.end_byte))
+        head = self._chunk_head_at(RecordPlace(Opcode.CHUNK, chunk.first_byte, chunk.end_byte))
         return '' if head is None else head.compression
 
     def extras(self) -> Iterator[records.Attachment | records.Metadata]:
         """Yield the attachments and the metadata; damaged ones are noted and left out."""
         for place in self._extras:
-            kind = records.Attachment if place.opcode == Opcode.ATTACHMENT else records.Metadata
+            kind = records.Attachment if place.kind == Opcode.ATTACHMENT else records.Metadata
             record = self._parsed(kind, place)
             if record is not None:
                 yield record
@@ -179,12 +166,12 @@ class McapFile(ChunkedFile):
             return None
         for record in found:
             self._add_definition(record)
-        chunks = [_indexed_chunk(r) for r in found if isinstance(r, records.ChunkIndex)]
+        listed = [_indexed_chunk(r) for r in found if isinstance(r, records.ChunkIndex)]
         is_complete = (
             len(self._channels) == statistics.channel_count
-            and len(chunks) == statistics.chunk_count
-            and (chunks or not statistics.message_count)
-            and _are_apart(chunks, self.size)
+            and len(listed) == statistics.chunk_count
+            and (listed or not statistics.message_count)
+            and _are_apart(listed, self.size)
         )
         if not is_complete:
             return None
@@ -192,11 +179,11 @@ class McapFile(ChunkedFile):
         any_channel = dict.fromkeys(counts, 1)  # of a chunk without an index of its messages
         self._chunks = [
             chunk if chunk.counts else chunk._replace(counts=any_channel)
-            for chunk in chunks
+            for chunk in listed
             if chunk.counts or chunk.last_ns
         ]
         self._extras = [
-            _Place(
+            RecordPlace(
                 Opcode.ATTACHMENT if isinstance(r, records.AttachmentIndex) else Opcode.METADATA,
                 r.offset,
                 r.offset + r.length,
@@ -228,48 +215,32 @@ class McapFile(ChunkedFile):
         self._channels.clear()
         self._schemas.clear()
         has_end = False
-        group: list[_Place] = []
-        for place in self._places():
-            if place.opcode == Opcode.MESSAGE:
+        group: list[RecordPlace] = []
+        for place in self._places(len(MCAP_MAGIC)):
+            if place.kind == Opcode.MESSAGE:
                 group.append(place)
                 if place.end_byte - group[0].first_byte < GROUP_BYTES:
                     continue
             self._add_chunk(group)
             group = []
-            if place.opcode == Opcode.CHUNK:
+            if place.kind == Opcode.CHUNK:
                 self._add_chunk([place])
-            elif place.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._add_definition(self._parsed(DEFINITIONS[place.opcode], place))
-            elif place.opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
+            elif place.kind in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._add_definition(self._parsed(DEFINITIONS[place.kind], place))
+            elif place.kind in (Opcode.ATTACHMENT, Opcode.METADATA):
                 self._extras.append(place)
-            has_end = has_end or place.opcode == Opcode.DATA_END
+            elif place.kind == Opcode.DATA_END:
+                has_end = True
+                break
         self._add_chunk(group)
         if not has_end:
             if not self._chunks:
-                raise RecordingError(
-                    f'{self.name}: no message can be read; expected an MCAP file, got '
-                    f'{self.size} bytes without a whole chunk; copy or record it again'
-                )
+                raise self._no_chunk('an MCAP file')
             self._note('the recording was interrupted: no end of data', self.size, self.size)
         self._locate_damages()
         return self._count_messages()
 
-    def _places(self) -> Iterator[_Place]:
-        """Yield the records up to the end of the data; skip and note what is no record."""
-        first_byte = len(MCAP_MAGIC)
-        while first_byte < self.size:
-            place = self._place_at(first_byte)
-            if place is None:
-                following = self._next_chunk(first_byte + 1)
-                self._note('no record', first_byte, following)
-                first_byte = following
-                continue
-            yield place
-            if place.opcode == Opcode.DATA_END:
-                return
-            first_byte = place.end_byte
-
-    def _place_at(self, first_byte: int) -> _Place | None:
+    def _place_at(self, first_byte: int) -> RecordPlace | None:
         """Return the record at a position; None where there can be none."""
         head = self._bytes(first_byte, first_byte + HEAD_BYTES)
         if len(head) < HEAD_BYTES:
@@ -278,7 +249,11 @@ class McapFile(ChunkedFile):
         end_byte = first_byte + HEAD_BYTES + length
         # Codes from 128 are for the extensions of others.
         is_known = Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode >= 128
-        return _Place(opcode, first_byte, end_byte) if is_known and end_byte <= self.size else None
+        return (
+            RecordPlace(opcode, first_byte, end_byte)
+            if is_known and end_byte <= self.size
+            else None
+        )
 
     def _next_chunk(self, position: int) -> int:
         """Return where the next whole chunk begins; the end of the file without."""
@@ -294,7 +269,7 @@ class McapFile(ChunkedFile):
             position += SEARCH_BYTES
         return self.size
 
-    def _chunk_head_at(self, place: _Place) -> _ChunkHead | None:
+    def _chunk_head_at(self, place: RecordPlace) -> _ChunkHead | None:
         """Return the head of a chunk; None if it is no chunk."""
         record = self._bytes(place.first_byte, place.first_byte + CHUNK_BEGIN_BYTES + 16)
         size = place.end_byte - place.first_byte
@@ -305,25 +280,18 @@ class McapFile(ChunkedFile):
         is_whole = head.begin + head.stored == size and head.start_ns <= head.last_ns
         return head if is_whole else None
 
-    def _add_chunk(self, places: list[_Place]) -> None:
+    def _add_chunk(self, places: list[RecordPlace]) -> None:
         """Add a chunk, or messages outside of chunks as one, and the definitions in it."""
         if not places:
             return
-        is_chunk = places[0].opcode == Opcode.CHUNK
+        is_chunk = places[0].kind == Opcode.CHUNK
         head = self._chunk_head_at(places[0]) if is_chunk else None
         times_ns = (head.start_ns, head.last_ns) if head else (0, 0)
-        chunk = Chunk(places[0].first_byte, places[-1].end_byte, *times_ns, {}, is_chunk)
-        messages = self._messages_of(chunk)
-        if messages:
-            times = [message.received_ns for message in messages]
-            counts = Counter(message.connection_id for message in messages)
-            self._chunks.append(
-                chunk._replace(start_ns=min(times), last_ns=max(times), counts=counts)
-            )
+        self._add(Chunk(places[0].first_byte, places[-1].end_byte, *times_ns, {}, is_chunk))
 
     # Content ----------------------------------------------------------------------------------
 
-    def _parsed(self, kind: Any, place: _Place) -> Any:
+    def _parsed(self, kind: Any, place: RecordPlace) -> Any:
         """Return the record of a class of `records` at a place; None, and noted, if damaged."""
         content = self._bytes(place.first_byte + HEAD_BYTES, place.end_byte)
         try:
@@ -366,8 +334,8 @@ def _places_in(content: memoryview) -> list[tuple[int, int, int]]:
         end = begin + length
         if not opcode or end > len(content):
             raise RecordingError(f'no record: operation code {opcode}, {length} bytes')
-        if len(places) == MAX_RECORDS:
-            raise RecordingError(f'more than {MAX_RECORDS} records')
+        if len(places) == chunks.MAX_RECORDS:
+            raise RecordingError(f'more than {chunks.MAX_RECORDS} records')
         places.append((opcode, begin, end))
         begin = end
     return places
@@ -400,7 +368,7 @@ def _chunk_head(record: bytes, size: int) -> _ChunkHead:
     begin = name_begin + length + STORED_BYTES.size
     if begin + stored > size:
         raise RecordingError(f'{size} bytes of a chunk of {begin + stored}')
-    if content_size > MAX_CHUNK_BYTES:
+    if content_size > chunks.MAX_CHUNK_BYTES:
         raise RecordingError(f'size of {content_size} bytes')
     return _ChunkHead(start_ns, last_ns, content_size, checksum, compression, begin, stored)
 
@@ -424,8 +392,8 @@ def _content(record: bytes) -> bytes | memoryview:
     return content
 
 
-def _are_apart(chunks: list[Chunk], size: int) -> bool:
+def _are_apart(listed: list[Chunk], size: int) -> bool:
     """Return whether chunk indexes name places in a file of `size` [bytes], each another one."""
-    places = sorted((chunk.first_byte, chunk.end_byte) for chunk in chunks)
+    places = sorted((chunk.first_byte, chunk.end_byte) for chunk in listed)
     are_within = all(first + HEAD_BYTES <= end <= size for first, end in places)
     return are_within and all(before[1] <= behind[0] for before, behind in pairwise(places))

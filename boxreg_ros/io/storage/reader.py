@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from boxreg_ros.errors import BoxregError, RecordingError, UnsupportedMessage
-from boxreg_ros.io.foxglove import decoder_of, FOXGLOVE_ENCODINGS, ros_type
+from boxreg_ros.io.foxglove import ChannelDecoder, FOXGLOVE_ENCODINGS, ros_type
 from boxreg_ros.io.storage.chunks import MAX_CHUNK_BYTES
 from boxreg_ros.io.storage.files import Files, merged_streams, Part
 from boxreg_ros.io.storage.record import Damage, one_line, Record
@@ -101,12 +101,7 @@ class Reader:
             yield from merged_streams(streams)
 
     def deserialize(self, data: bytes, msgtype: str) -> Any:
-        """
-        Return a message; its first byte shows the encoding.
-
-        Raises UnsupportedMessage if the bytes do not follow the definition, or there is none.
-
-        """
+        """Return a message, encoded as its first byte shows, or raise UnsupportedMessage."""
         if msgtype in self._decoders and data[:1] != b'\0':
             return self._decoders[msgtype](data)
         if data[:4] == ZSTD_MAGIC:
@@ -134,7 +129,7 @@ class Reader:
         if schema is None:
             return connection
         kind = ros_type(schema.name)
-        self._decoders[kind] = decoder_of(self._origin, connection.topic, schema)
+        self._decoders[kind] = ChannelDecoder(self._origin, connection.topic, schema)
         return connection._replace(msgtype=kind)
 
 

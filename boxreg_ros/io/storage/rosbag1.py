@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from bz2 import BZ2Decompressor
-from collections import Counter
 from collections.abc import Iterator
 from io import BytesIO
 from itertools import pairwise
 import struct
 
 from boxreg_ros.errors import RecordingError, TransferError
-from boxreg_ros.io.storage.chunks import (
-    Chunk,
-    ChunkedFile,
-    MAX_CHUNK_BYTES,
-    MAX_RECORDS,
-    StoredMessage,
-)
+from boxreg_ros.io.storage import chunks
+from boxreg_ros.io.storage.chunks import Chunk, RecordPlace, StoredMessage
 from boxreg_ros.io.storage.record import one_line
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.interfaces import (
@@ -39,7 +33,7 @@ MAX_HEADER_BYTES = 2**20
 SEARCH_BYTES = 2**20
 
 
-class Rosbag1File(ChunkedFile):
+class Rosbag1File(chunks.ChunkedFile):
     """An open ROS 1 bag; see `ChunkedFile`. Raises RecordingError if it has no whole chunk."""
 
     def _open(self) -> None:
@@ -74,23 +68,11 @@ class Rosbag1File(ChunkedFile):
     def _scan(self) -> None:
         """Find all chunks and connections without the index."""
         self._found: dict[int, Connection] = {}
-        first_byte = len(BAG_MAGIC)
-        while first_byte < self.size:
-            place = self._record_at(first_byte)
-            if place is None:
-                following = self._next_chunk(first_byte + 1)
-                self._note('no record', first_byte, following)
-                first_byte = following
-                continue
-            header, end_byte = place
-            if header.get_uint8('op') == RecordType.CHUNK:
-                self._add_chunk(first_byte, end_byte)
-            first_byte = end_byte
+        for place in self._places(len(BAG_MAGIC)):
+            if place.kind == RecordType.CHUNK:
+                self._add(Chunk(place.first_byte, place.end_byte, 0, 0, {}))
         if not self._chunks:
-            raise RecordingError(
-                f'{self.name}: no message can be read; expected a ROS 1 bag, got {self.size} '
-                f'bytes without a whole chunk; copy or record it again'
-            )
+            raise self._no_chunk('a ROS 1 bag')
         self._locate_damages()
         counts = self._count_messages()
         self.connections = [
@@ -98,29 +80,22 @@ class Rosbag1File(ChunkedFile):
             for number, connection in sorted(self._found.items())
         ]
 
-    def _add_chunk(self, first_byte: int, end_byte: int) -> None:
-        messages = self._messages_of(Chunk(first_byte, end_byte, 0, 0, {}))
-        if messages:
-            times = [message.received_ns for message in messages]
-            counts = Counter(message.connection_id for message in messages)
-            self._chunks.append(Chunk(first_byte, end_byte, min(times), max(times), counts))
-
-    def _record_at(self, first_byte: int) -> tuple[Header, int] | None:
-        """Return header and end of the record at a position; None where there can be none."""
+    def _place_at(self, first_byte: int) -> RecordPlace | None:
+        """Return the record at a position; None where there can be none."""
         try:
             (length,) = struct.unpack('<I', self._bytes(first_byte, first_byte + 4))
             data_byte = first_byte + 4 + length
             if data_byte > self.size or length > MAX_HEADER_BYTES:
                 return None
             header = Header.read(BytesIO(self._bytes(first_byte, data_byte)))
-            header.get_uint8('op')
+            kind = header.get_uint8('op')
             (size,) = struct.unpack('<I', self._bytes(data_byte, data_byte + 4))
         except TransferError:
             raise
         except Exception:  # of the library, for any malformed content
             return None
         end_byte = data_byte + 4 + size
-        return (header, end_byte) if end_byte <= self.size else None
+        return RecordPlace(kind, first_byte, end_byte) if end_byte <= self.size else None
 
     def _next_chunk(self, position: int) -> int:
         """Return where the next whole chunk begins; the end of the file without."""
@@ -132,8 +107,8 @@ class Rosbag1File(ChunkedFile):
                     # The length of the header, which ends behind the mark.
                     (length,) = struct.unpack_from('<I', block, begin)
                     if found - begin <= length <= MAX_HEAD_BYTES:
-                        place = self._record_at(position + begin)
-                        if place is not None and place[0].get_uint8('op') == RecordType.CHUNK:
+                        place = self._place_at(position + begin)
+                        if place is not None and place.kind == RecordType.CHUNK:
                             return position + begin
                 found = block.find(CHUNK_MARK, found + 1)
             # A mark may lie across the blocks, and its header before it.
@@ -145,7 +120,7 @@ class Rosbag1File(ChunkedFile):
         head = Header.read(stream, RecordType.CHUNK)
         data = _sized(stream)
         size = head.get_uint32('size')
-        if size > MAX_CHUNK_BYTES:
+        if size > chunks.MAX_CHUNK_BYTES:
             raise RecordingError(f'size of {size} bytes')
         content = _decompressed(data, head.get_string('compression'), size)
         if len(content) != size:
@@ -153,7 +128,7 @@ class Rosbag1File(ChunkedFile):
         return list(self._stored_messages(BytesIO(content), size))
 
     def _stored_messages(self, stream: BytesIO, size: int) -> Iterator[StoredMessage]:
-        for _ in range(MAX_RECORDS):
+        for _ in range(chunks.MAX_RECORDS):
             if stream.tell() >= size:
                 return
             header = Header.read(stream)
@@ -165,7 +140,7 @@ class Rosbag1File(ChunkedFile):
             elif operation == RecordType.CONNECTION and not self.connections:
                 connection = self._connection(header, Header.read(_with_length(data)))
                 self._found.setdefault(connection.id, connection)
-        raise RecordingError(f'more than {MAX_RECORDS} records')
+        raise RecordingError(f'more than {chunks.MAX_RECORDS} records')
 
     def _connection(self, header: Header, about: Header) -> Connection:
         latching = about.get_string('latching') if 'latching' in about else ''

@@ -179,12 +179,7 @@ def byte_source_of(path: Path) -> ByteSource:
 
 
 def entry_of(path: Path) -> Entry:
-    """
-    Return size and version of a file behind a URL.
-
-    Raises RecordingError if it does not exist, or its server does not answer.
-
-    """
+    """Return size and version of a file behind a URL; RecordingError without an answer."""
     system, name = _system_of(path)
     about = _answer_of(path, lambda: system.info(name, **_limit(system)))
     return _entry(path, about)
