@@ -1,5 +1,7 @@
 """Sweeps and boxes as callers give them: what is converted, and what is refused."""
 
+from dataclasses import replace
+
 from boxreg_ros import BoxArray, BoxRegistrar, Config, ShapeError, Sweep
 from boxreg_ros.structures import is_valid_box
 import numpy as np
@@ -85,3 +87,14 @@ def test_boxes_of_no_object_are_invalid(column):
     boxes[:, column] = values
     assert is_valid_box(boxes).tolist() == [value == below for value in values]
     assert is_valid_box(box)
+
+
+def test_rows_are_taken_with_all_their_columns():
+    values = np.arange(27.0).reshape(3, 9)
+    pinned = np.array([True, False, False])
+    array = BoxArray(0, 'odom', ('a', 'b', 'c'), ('car', 'van', 'bus'), np.arange(3.0), values)
+    array = replace(array, pinned=pinned)
+    taken = array.take([2, 0])
+    assert (taken.track_ids, taken.class_names) == (('c', 'a'), ('bus', 'car'))
+    assert (taken.scores.tolist(), taken.pinned.tolist()) == ([2.0, 0.0], [False, True])
+    np.testing.assert_array_equal(taken.boxes, values[[2, 0]])
