@@ -52,36 +52,22 @@ class End(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FollowedTrack:
-    """
-    One object over time.
-
-    Attributes
-    ----------
-    track_id, class_name : str
-        As of its seeds.
-    rows : array, shape (N,)
-        Rows of the sweeps with a box, ascending.
-    stamps_ns : array, shape (N,)
-        Their stamps [ns].
-    boxes : array, shape (N, 9)
-        In the frame of the points [m, rad].
-    status : tuple of N str
-        ``human`` (a seed), ``interpolated`` (between two seeds) or ``extended`` (beyond them).
-    ends : tuple of End
-        Before the first seed and after the last.
-    problems : tuple of str
-        Seeds that could not be used and why, one line each; without any left, N is 0.
-
-    """
+    """One object over time; N is 0 without a seed that can be used."""
 
     track_id: str
     class_name: str
     rows: Ints
+    """Rows (N,) of the sweeps with a box, ascending."""
     stamps_ns: Ints
+    """Their stamps (N,) [ns]."""
     boxes: Floats
+    """Boxes (N, 9) in the frame of the points [m, rad]."""
     status: tuple[str, ...]
+    """``human`` (a seed), ``interpolated`` (between two seeds) or ``extended`` (beyond them)."""
     ends: tuple[End, ...]
+    """Before the first seed and after the last."""
     problems: tuple[str, ...]
+    """Seeds that could not be used and why, one line each."""
 
 
 def follow(

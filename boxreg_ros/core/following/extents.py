@@ -14,24 +14,12 @@ def faces(
     sweeps: Sequence[Floats], half: Floats, is_of_class: bool, sees_top: NDArray[np.bool_]
 ) -> Floats:
     """
-    Return the faces of a rigid object by the edges of its points.
+    Return smallest and largest x y z (2, 3) of a rigid object by the edges of its points [m].
 
-    Parameters
-    ----------
-    sweeps : sequence of arrays, shape (n_i, 3)
-        Points within `max_growth` of its box in the frame of the box, without the road [m].
-    half : array, shape (3,)
-        Half the extents of the box.
-    is_of_class : bool
-        Whether it is known that a tool gave it the size of its class.
-    sees_top : array, shape (m,)
-        Whether the sensor sees points above the box, by sweep: points of the others end at the
-        limit of its field of view.
-
-    Returns
-    -------
-    faces : array, shape (2, 3)
-        Smallest and largest x y z of the object; -half and half where points show no other.
+    `sweeps` are its points (n_i, 3) in the frame of its box, within `max_growth` and without the
+    road; `half` (3,) are the half extents, which stay where points show no others; `is_of_class`
+    says that a tool gave it the size of its class, `sees_top` (m,) in which sweeps the sensor sees
+    points above the box: those of the others end at the limit of its field of view.
 
     """
     found = np.stack([-half, half])

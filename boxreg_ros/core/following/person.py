@@ -41,21 +41,11 @@ def shown(keyframes: Floats, fits: Floats, variances: Floats, usual: Floats) -> 
     """
     Return the deviations (9,) that keyframes show; the `usual` ones where they show no others.
 
-    Parameters
-    ----------
-    keyframes, fits : array, shape (n, 9)
-        Boxes of a person, and as they were solved.
-    variances : array, shape (n, 9)
-        Of the fits.
-    usual : array, shape (9,)
-        Deviations with which they were solved.
-
-    Notes
-    -----
-    Of each variable the fit is the mean of the keyframe, of variance s0^2, and of all else, of
-    variance p^2, which follows from that of the fit. The residual has the variance (s^2 + p^2)
-    s0^4 / (s0^2 + p^2)^2 for keyframes of the deviation s, and gives s; zero if it is smaller than
-    that of exact keyframes.
+    `keyframes` and `fits` (n, 9) are boxes of a person, and as they were solved with the `usual`
+    deviations (9,); `variances` (n, 9) are those of the fits. Of each variable the fit is the mean
+    of the keyframe, of variance s0^2, and of all else, of variance p^2, which follows from that of
+    the fit. The residual has the variance (s^2 + p^2) s0^4 / (s0^2 + p^2)^2 for keyframes of the
+    deviation s, and gives s; zero if it is smaller than that of exact keyframes.
 
     """
     found = usual.copy()

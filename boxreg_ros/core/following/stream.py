@@ -130,16 +130,9 @@ class FollowedObjects:
 
     def boxes_at(self, stamp_ns: int, sweep_ns: int, others: Floats) -> list[FollowedBox]:
         """
-        Follow all objects to a sweep; return the boxes that points support there.
+        Follow all objects to a sweep; return the boxes at `stamp_ns` that points support there.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            Stamp of the boxes to return [ns].
-        sweep_ns : int
-            That of the sweep, which was added [ns].
-        others : array, shape (n, 9)
-            Boxes of other objects in it.
+        The sweep of the stamp `sweep_ns` was added; `others` (n, 9) are boxes of other objects.
 
         """
         if not (self._waiting or self._objects):

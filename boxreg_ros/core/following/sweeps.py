@@ -28,12 +28,7 @@ class SightLimits:
     """
     How far up the sensor sees in each sweep: by its steepest point.
 
-    Parameters
-    ----------
-    points : sequence of arrays, shape (M, 3)
-        Of each sweep, in the fixed frame [m].
-    origins : array, shape (n, 3)
-        Position of the sensor in each sweep, as the points; NaN if unknown.
+    `origins` (n, 3) are its positions in the frame of the points, NaN if unknown [m].
 
     """
 

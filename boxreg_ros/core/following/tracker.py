@@ -63,40 +63,27 @@ class Seeds(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Way:
-    """
-    Poses from a seed outwards, in one direction in time.
-
-    Attributes
-    ----------
-    row, sign : int
-        The sweep that it is at, and its direction.
-    state : State
-        There.
-    begin, last_seen : float
-        Times of the seed and of the last sweep where points support the pose [s].
-    usual : float
-        Running mean of the score of the fit.
-    poses : dict
-        Pose (4,) by row of the sweep, without that of the seed.
-    seen : set of int
-        Rows where points support the pose; it is predicted in the others.
-    reason : str
-        Why points do not support the pose here, of `sweep_fit.REASONS`; empty if they do.
-    is_over : bool
-        True if it has been lost for too long.
-
-    """
+    """Poses from a seed outwards, in one direction in time."""
 
     row: int
+    """The sweep that it is at."""
     sign: int
+    """Its direction."""
     state: State
     begin: float
+    """Time of the seed [s]."""
     last_seen: float
+    """That of the last sweep where points support the pose [s]."""
     usual: float
+    """Running mean of the score of the fit."""
     poses: dict[int, Floats] = field(default_factory=dict)
+    """Pose (4,) by row of the sweep, without that of the seed."""
     seen: set[int] = field(default_factory=set)
+    """Rows where points support the pose; it is predicted in the others."""
     reason: str = ''
+    """Why points do not support the pose here, of `sweep_fit.REASONS`; empty if they do."""
     is_over: bool = False
+    """Whether it has been lost for too long."""
 
 
 def at_seed(pose: Floats, speed: float) -> State:
@@ -136,20 +123,9 @@ class Owned:
 
 class Follower:
     """
-    Follow one object.
+    Follow one object of a kind of `MOTIONS` through sweeps, from one or more seeds.
 
-    Parameters
-    ----------
-    sweeps : Sweeps
-        All of a drive.
-    seeds : Seeds
-        Of the object, one or more.
-    kind : str
-        One of `MOTIONS`.
-    owned : Owned
-        Boxes of other objects.
-    same : sequence of int
-        Those of them in `owned` that have a seed in one of this object.
+    `owned` are the boxes of other objects; those of `same` have a seed in one of this object.
 
     """
 

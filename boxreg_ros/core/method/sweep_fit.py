@@ -15,52 +15,31 @@ ACCEPTED, FEW_POINTS, NO_FIT, UNCERTAIN, JUMP = range(len(REASONS))
 
 
 class Target(NamedTuple):
-    """
-    An object that is followed.
-
-    Attributes
-    ----------
-    half : array, shape (3,)
-        Half its extents [m].
-    tilt : array, shape (3, 3)
-        Rotation by roll and pitch.
-    road : CropNumbers
-        How the road is found, and how high above it points are of the object.
-    surface : Surface
-        What has been seen of it.
-    is_rigid : bool
-        Whether it fits its surface at any time: limbs move.
-
-    """
+    """An object that is followed."""
 
     half: Any
+    """Half its extents (3,) [m]."""
     tilt: Any
+    """Rotation by roll and pitch (3, 3)."""
     road: Any
+    """How the road is found, and how high above it points are of the object: `CropNumbers`."""
     surface: Any
+    """What has been seen of it."""
     is_rigid: bool
+    """Whether it fits its surface at any time: limbs move."""
 
 
 class Expected(NamedTuple):
-    """
-    Where an object is expected.
-
-    Attributes
-    ----------
-    state : State
-        By its motion.
-    reach : float
-        How far along the heading it is searched after a loss [m]; 0 while it is seen.
-    usual : float
-        Running mean of the score.
-    road : float
-        Height of the road above the bottom of the box [m]; NaN if unknown.
-
-    """
+    """Where an object is expected."""
 
     state: Any
+    """By its motion."""
     reach: float
+    """How far along the heading it is searched after a loss [m]; 0 while it is seen."""
     usual: float
+    """Running mean of the score."""
     road: float
+    """Height of the road above the bottom of the box [m]; NaN if unknown."""
 
 
 class Fit(NamedTuple):
@@ -105,7 +84,7 @@ def find(points, expected, target):
 
     """
     prior, information = expected.state.values[:4].copy(), pose_information(expected.state)
-    own = _around(points, prior, target.half)
+    own = around(points, prior, target.half, FOLLOW.around)
     height = road_below(own, prior, target) - expected.road
     if np.isfinite(height):
         weight = FOLLOW.road_deviation**-2
@@ -126,7 +105,7 @@ def find(points, expected, target):
             start = prior.copy()
             start[0] += n * step * np.cos(prior[3])
             start[1] += n * step * np.sin(prior[3])
-            own = _around(points, start, target.half)
+            own = around(points, start, target.half, FOLLOW.around)
             if (n == 0 and is_lost) or len(own) < FOLLOW.min_points:
                 continue
             other = registered(own, start, prior, information, target, 12)
@@ -146,37 +125,11 @@ def rank(found):
 
 
 @kernel
-def _around(points, pose, half):
-    """Return the points (n, 3) around a pose."""
-    reach = np.hypot(half[0], half[1]) + FOLLOW.crop + FOLLOW.around
-    found = np.empty_like(points)
-    count = 0
-    for n in range(len(points)):
-        if abs(points[n, 0] - pose[0]) >= reach or abs(points[n, 1] - pose[1]) >= reach:
-            continue
-        if abs(points[n, 2] - pose[2]) < half[2] + FOLLOW.crop:
-            found[count] = points[n]
-            count += 1
-    return found[:count]
-
-
-@kernel
 def registered(points, start, prior, information, target, iterations):
     """
-    Return the pose of a box x y z yaw that puts points on its surface, and its tests.
+    Return the pose of a box x y z yaw that puts points (n, 3) on its surface, and its tests.
 
-    Parameters
-    ----------
-    points : array, shape (n, 3)
-        Of the sweep.
-    start, prior : array, shape (4,)
-        Poses.
-    information : array, shape (4, 4)
-        Of the prior.
-    target : Target
-        The object.
-    iterations : int
-        At most.
+    From a `start` (4,), with the `information` (4, 4) of the pose `prior` (4,).
 
     """
     points = np.ascontiguousarray(points[:: 1 + len(points) // FOLLOW.max_sweep_points])
@@ -305,15 +258,8 @@ def fit(points, pose, target):
 
 
 @kernel
-def near(points, pose, half, margin, boxes, same):
-    """
-    Return the points (n, 3), which ascend by x, around a pose, without those of other objects.
-
-    `boxes` (m, 16) have centre, half extents, axes and number of each of these. Not left out are
-    the points of one whose centre is in the box (it is the object itself), or with a number in
-    `same`.
-
-    """
+def around(points, pose, half, margin):
+    """Return the points (n, 3), which ascend by x, around a pose."""
     reach = np.hypot(half[0], half[1]) + FOLLOW.crop + margin
     first = np.searchsorted(points[:, 0], pose[0] - reach)
     last = np.searchsorted(points[:, 0], pose[0] + reach)
@@ -327,7 +273,21 @@ def near(points, pose, half, margin, boxes, same):
             found[count, 1] = points[n, 1]
             found[count, 2] = points[n, 2]
             count += 1
-    found = found[:count]
+    return found[:count]
+
+
+@kernel
+def near(points, pose, half, margin, boxes, same):
+    """
+    Return the points (n, 3) around a pose, without those of other objects.
+
+    `boxes` (m, 16) have centre, half extents, axes and number of each of these. Not left out are
+    the points of one whose centre is in the box (it is the object itself), or with a number in
+    `same`.
+
+    """
+    found = around(points, pose, half, margin)
+    reach = np.hypot(half[0], half[1]) + FOLLOW.crop + margin
     for k in range(len(boxes)):
         other = boxes[k]
         away = np.hypot(other[0] - pose[0], other[1] - pose[1])
