@@ -12,16 +12,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-import sys
 from typing import Any
 
-from boxreg_ros.bench.common import add_scope_arguments, in_scope, line, print_json
+from boxreg_ros.bench.common import add_scope_arguments, in_scope, line, print_json, progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import Scores, summarise
 from boxreg_ros.offline.drive import Drive
 import numpy as np
-from tqdm import tqdm
 
 WHOLE = 'nothing'
 SCORES = ('BEV', '3D', 'R@0.8', 'flips')
@@ -117,10 +115,9 @@ def run(args: argparse.Namespace) -> int:
     """Print accuracy without each ingredient, for every recording and on average."""
     drives = {str(folder): Drive.read(folder) for folder in args.data}
     wanted = [WHOLE, *args.without]
-    quiet = args.json or not sys.stderr.isatty()
     report: dict[str, dict[str, dict[str, Scores]]] = {folder: {} for folder in drives}
     total = len(drives) * len(args.estimate) * len(wanted)
-    with tqdm(total=total, leave=False, disable=quiet) as bar:
+    with progress_bar(total, args) as bar:
         for folder, drive in drives.items():
             for estimate in args.estimate:
                 report[folder][estimate] = {}
@@ -169,13 +166,7 @@ def greedy(
     report: Mapping[str, Mapping[str, Mapping[str, Scores]]],
     args: argparse.Namespace,
 ) -> list[tuple[str, float]]:
-    """
-    Leave out the ingredient that costs least, again and again, up to the loss ``--greedy``.
-
-    Return the names of all that are out so far, with the largest loss of mean 3D IoU of an
-    estimate.
-
-    """
+    """Leave the cheapest ingredient out, again and again; return names so far and their loss."""
     whole = {
         estimate: np.mean([found[estimate][WHOLE].iou_3d for found in report.values()])
         for estimate in args.estimate

@@ -21,7 +21,6 @@ BOXREG = (sys.executable, '-m', 'boxreg_ros.cli')
 """The command in a process of its own, of this environment."""
 NAME_WIDTH = 22  # characters of the first column
 CELL_WIDTH = 9  # characters of each other column
-ESTIMATES = ('early', 'final', 'track')
 
 
 def add_scope_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,15 +35,6 @@ def add_scope_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--classes', nargs='+', default=['car', 'van', 'truck'], metavar='WORD',
         help='only true boxes whose class name holds one of these words (default: car van truck)',
-    )  # fmt: skip
-
-
-def add_estimate_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare which estimate of a box is measured."""
-    parser.add_argument(
-        '--estimate', choices=ESTIMATES, default='track',
-        help='early: newest box of its window; final: `lag` observations later; '
-        'track: from the whole track (default: track)',
     )  # fmt: skip
 
 

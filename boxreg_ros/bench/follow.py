@@ -59,30 +59,16 @@ COLUMN_TITLES = ('true', 'found', '>.5', '3D', '3D all')
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """
-    A track and what is given of it.
-
-    Attributes
-    ----------
-    track_id, class_name : str
-        Of the track.
-    stamps_ns, truth, num_points : array, shape (N,), (N, 9) and (N,)
-        Its true boxes, and the points in them.
-    rows, boxes : array, shape (n,) and (n, 9)
-        Those given, with the error of a person.
-    counted : array, shape (m,)
-        Rows that are scored.
-
-    """
+    """A track of N true boxes and the n of them that are given."""
 
     track_id: str
     class_name: str
     stamps_ns: Ints
-    truth: Floats
-    num_points: Ints
-    rows: Ints
-    boxes: Floats
-    counted: Ints
+    truth: Floats  # (N, 9) true boxes
+    num_points: Ints  # (N,) points in them
+    rows: Ints  # (n,) of those given
+    boxes: Floats  # (n, 9) those given, with the error of a person
+    counted: Ints  # (m,) rows that are scored
 
     @property
     def times(self) -> Floats:

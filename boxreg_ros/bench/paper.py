@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 import math
 from pathlib import Path
 from typing import Any
@@ -65,7 +64,11 @@ class ModeResult:
 
     def means(self) -> dict[str, tuple[float, ...] | str]:
         """Return per method the mean row over the seeds."""
-        return {name: _mean_row(rows) for name, rows in self.rows.items()}
+        means: dict[str, tuple[float, ...] | str] = {}
+        for name, found in self.rows.items():
+            rows = [row for row in found if not isinstance(row, str)]
+            means[name] = tuple(np.mean(rows, axis=0).tolist()) if rows else str(found[0])
+        return means
 
     def groups(self) -> dict[str, dict[str, dict[str, float]]]:
         """Return per method the mean IoU by range and by number of points, of all seeds."""
@@ -164,11 +167,6 @@ def error_row(matches: Matches, mode: str) -> tuple[float, ...]:
     full = iou[Config().window :]
     mean_full = float(full.mean()) if len(full) else math.nan
     return (*map(float, errors), float(iou.mean()), float(iou[0]), float(iou[-1]), mean_full)
-
-
-def _mean_row(found: Sequence[tuple[float, ...] | str]) -> tuple[float, ...] | str:
-    rows = [row for row in found if not isinstance(row, str)]
-    return tuple(np.mean(rows, axis=0).tolist()) if rows else str(found[0])
 
 
 def draw_figures(folder: Path, mode: str, methods: Methods, truth: BoxTable) -> None:

@@ -70,12 +70,7 @@ def require(path: Path, what: str, remedy: str) -> Path:
 
 
 def require_lidars(asked: Sequence[str], names: Sequence[str], main: str = '') -> list[str]:
-    """
-    Return the LiDARs that are asked for, else the main one, else the only one.
-
-    Raises RecordingError if there is no such LiDAR, or several and none is the main one.
-
-    """
+    """Return the LiDARs that are asked for, else the main one, else the only one, or refuse."""
     default = [main] if main else list(names)[: len(names) == 1]
     found = list(asked) or default
     unknown = [name for name in found if name not in names]

@@ -12,15 +12,8 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from boxreg_ros.datasets import kitti
 from boxreg_ros.datasets.files import require, require_lidar
-from boxreg_ros.datasets.kitti import (
-    calibration_lines,
-    exported_poses,
-    oxts_poses,
-    oxts_rows,
-    rigid_transform,
-    sweep_files,
-)
 from boxreg_ros.datasets.protocol import Dataset, Scene
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, SceneFrames
@@ -60,7 +53,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a drive; see `protocol.DatasetModule`."""
     require_lidar(lidars, [DATASET.lidar], DATASET.lidar)
     drive = _drives(root)[name]
-    exported = exported_poses(drive, 1)
+    exported = kitti.exported_poses(drive, 1)
     if exported is None:
         stamps_ns = _stamps(drive / DATASET.lidar / STAMPS_FILE, f'{name}{DRIVE_SUFFIX}.zip')
         pose_stamps_ns, poses = _oxts(drive, name)
@@ -74,7 +67,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
         frames,
         DATASET.lidar,
         np.array(stamps_ns, np.int64),
-        partial(sweep_files, drive / DATASET.lidar / 'data', RAW_DIGITS, stamps_ns),
+        partial(kitti.sweep_files, drive / DATASET.lidar / 'data', RAW_DIGITS, stamps_ns),
         pose_stamps_ns,
         poses,
         partial(frames_of, 'tracklets', labels, frames) if labels.is_file() else None,
@@ -87,24 +80,24 @@ def _oxts(drive: Path, name: str) -> tuple[Ints, Floats]:
     archive = f'{name}{DRIVE_SUFFIX}.zip'
     stamps_ns = np.array(_stamps(drive / 'oxts' / STAMPS_FILE, archive), np.int64)
     folder = require(drive / 'oxts' / 'data', 'the poses', f'unpack {archive}')
-    rows = [oxts_rows(path) for path in sorted(folder.glob('*.txt'))]
+    rows = [kitti.oxts_rows(path) for path in sorted(folder.glob('*.txt'))]
     if len(rows) != len(stamps_ns):
         raise RecordingError(
             f'{folder}: expected {len(stamps_ns)} poses, one per stamp, got {len(rows)}; unpack '
             f'{archive} again'
         )
     calibration = drive.parent / IMU_CALIBRATION_FILE
-    values = calibration_lines(calibration, f'{drive.parent.name}_calib.zip')
+    values = kitti.calibration_lines(calibration, f'{drive.parent.name}_calib.zip')
     R, t = values.get('R', []), values.get('T', [])
     if (len(R), len(t)) != (9, 3):
         raise RecordingError(
             f'{calibration}: expected lines R and T of 9 and 3 numbers, got {len(R)} and '
             f'{len(t)}; unpack it again'
         )
-    T_velo_imu = rigid_transform([*R[:3], t[0], *R[3:6], t[1], *R[6:], t[2]], calibration)
+    T_velo_imu = kitti.rigid_transform([*R[:3], t[0], *R[3:6], t[1], *R[6:], t[2]], calibration)
     # Some drives have stamps of the unit that go back for a moment.
     stamps_ns, order = np.unique(stamps_ns, return_index=True)
-    return stamps_ns, oxts_poses(np.concatenate(rows), T_velo_imu)[order]
+    return stamps_ns, kitti.oxts_poses(np.concatenate(rows), T_velo_imu)[order]
 
 
 def _stamps(path: Path, archive: str) -> list[int]:

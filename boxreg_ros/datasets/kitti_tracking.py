@@ -12,15 +12,8 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from boxreg_ros.datasets import kitti
 from boxreg_ros.datasets.files import require, require_lidar
-from boxreg_ros.datasets.kitti import (
-    calibration_lines,
-    exported_poses,
-    oxts_poses,
-    oxts_rows,
-    rigid_transform,
-    sweep_files,
-)
 from boxreg_ros.datasets.protocol import Dataset, Scene
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, SceneFrames
@@ -78,7 +71,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
         frames,
         DATASET.lidar,
         stamps_ns,
-        partial(sweep_files, clouds, TRACKING_DIGITS, stamps_ns.tolist()),
+        partial(kitti.sweep_files, clouds, TRACKING_DIGITS, stamps_ns.tolist()),
         stamps_ns,
         poses,
         partial(frames_of, 'kitti', labels, frames) if labels.is_file() else None,
@@ -88,20 +81,20 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
 
 def _poses(split: Path, name: str, calibration: Path, count: int) -> tuple[Ints, Floats]:
     """Return stamps (n,) and poses (n, 7) of the LiDAR, one per frame."""
-    exported = exported_poses(split, count)
+    exported = kitti.exported_poses(split, count)
     if exported is not None:
         return exported
     path = require(split / 'oxts' / f'{name}.txt', 'the poses', 'unpack data_tracking_oxts.zip')
-    rows = oxts_rows(path)
+    rows = kitti.oxts_rows(path)
     if len(rows) < count:
         raise RecordingError(
             f'{path}: expected poses of {count} frames, got {len(rows)}; unpack it again'
         )
-    values = calibration_lines(calibration, 'data_tracking_calib.zip')
-    T_velo_imu = rigid_transform(values.get('Tr_imu_velo', []), calibration)
+    values = kitti.calibration_lines(calibration, 'data_tracking_calib.zip')
+    T_velo_imu = kitti.rigid_transform(values.get('Tr_imu_velo', []), calibration)
     # The first stamp is not 0, which stands for a header without one.
     stamps_ns = (1 + np.arange(len(rows), dtype=np.int64)) * PERIOD_NS
-    return stamps_ns, oxts_poses(rows, T_velo_imu)
+    return stamps_ns, kitti.oxts_poses(rows, T_velo_imu)
 
 
 def _split(root: Path) -> Path:

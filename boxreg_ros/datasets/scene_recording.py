@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 from boxreg_ros.datasets.protocol import Scene, SweepFile
 from boxreg_ros.datasets.registry import Address, module_of, open_scene, resolved, scene_files
@@ -36,6 +36,9 @@ class SceneRecording:
 
     has_boxes = True
     odometry_topic: str | None = None
+    apart: ClassVar[dict[str, float]] = {}  # no topic was recorded apart
+    finding = ''
+    damages: ClassVar[list[Damage]] = []  # sweeps that cannot be read are counted
 
     def __init__(
         self,
@@ -75,21 +78,6 @@ class SceneRecording:
     def __str__(self) -> str:
         """Return the address."""
         return str(self._address)
-
-    @property
-    def apart(self) -> dict[str, float]:
-        """Return the topics that were recorded apart: none."""
-        return {}
-
-    @property
-    def finding(self) -> str:
-        """Return what is unusual about the scene as a whole: nothing."""
-        return ''
-
-    @property
-    def damages(self) -> list[Damage]:
-        """Return the damages of files: none; sweeps that cannot be read are counted."""
-        return []
 
     @property
     def topics(self) -> dict[str, int]:

@@ -205,7 +205,9 @@ def _cloud(
             if image is None:
                 continue
             at = np.nonzero(image[..., RANGE] > 0)
-            found = _in_vehicle(image, at, calibration)
+            local = _rays(calibration, image.shape, *at) * image[at][:, RANGE, None]
+            T = calibration.T_vehicle_lidar
+            found = local @ T[:3, :3].T + T[:3, 3]  # in the vehicle when each was measured
             if T_world_pixel is not None:
                 found = _at_stamp(found, T_world_pixel[at], T_world_vehicle)
             points.append(found)
@@ -217,13 +219,6 @@ def _cloud(
         origins=np.array([one.T_vehicle_lidar[:3, 3] for one in calibrations.values()]),
         sensors=np.concatenate(sensors) if len(calibrations) > 1 else None,
     )
-
-
-def _in_vehicle(image: Floats, at: tuple[Any, ...], calibration: _Calibration) -> Floats:
-    """Return the points (M, 3) of the pixels `at` in the vehicle when each was measured [m]."""
-    local = _rays(calibration, image.shape, *at) * image[at][:, RANGE, None]
-    T = calibration.T_vehicle_lidar
-    return np.asarray(local @ T[:3, :3].T + T[:3, 3])
 
 
 def _rays(calibration: _Calibration, shape: tuple[int, ...], rows: Any, columns: Any) -> Floats:

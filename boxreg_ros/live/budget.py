@@ -27,12 +27,9 @@ BATCH_OVERHEAD = 25
 RECENT = 10
 """Last batches and box arrays that times are estimated from; chosen: a second at 10 Hz."""
 OVERRUNS = 300
-"""
-Ticks whose second largest overrun is left as a reserve; derived: the next one exceeds it with a
+"""Ticks whose second largest overrun is left as a reserve; derived: the next one exceeds it with a
 probability of 2 / 301, so that the deadline holds for 99 of 100 box arrays, and one interruption
-of the process in half a minute costs no windows.
-
-"""
+of the process in half a minute costs no windows."""
 LARGEST_RESERVE = 0.5
 """Part of the deadline that the reserve may take; chosen: a longer interruption of the process
 would leave no time for solving in the `OVERRUNS` ticks after it."""
@@ -66,7 +63,7 @@ class TickBudget:
         self._publishing_times = deque[float](maxlen=RECENT)  # [s]
         self._overruns = deque[float](maxlen=OVERRUNS)  # of the planned end [s]
         self._times = deque[float](maxlen=RECENT)  # per window [s]
-        self._owed = 0
+        self.owed = 0  # windows to solve once the early boxes are published
         self._arrivals = deque[float](maxlen=RECENT)
 
     def add_arrival(self, received: float) -> None:
@@ -80,7 +77,7 @@ class TickBudget:
         self._since = since
         self._solved_at = 0.0
         self._planned_end = inf
-        self._owed = 0
+        self.owed = 0
 
     def end(self) -> None:
         """End a tick, unless it has ended: its early boxes are published."""
@@ -97,7 +94,7 @@ class TickBudget:
         `needed` is the number of windows per box array that refine every final box.
 
         """
-        self._owed = min(needed, BATCH_OVERHEAD)
+        self.owed = min(needed, BATCH_OVERHEAD)
         number = 0
         if self._times:
             reserve = max(
@@ -110,14 +107,9 @@ class TickBudget:
             self._planned_end = planned_end
             limit = number
         else:  # the tick is late with any plan, or the first
-            limit = max(1, self._owed)
-        self._owed = max(0, self._owed - limit)
+            limit = max(1, self.owed)
+        self.owed = max(0, self.owed - limit)
         return limit
-
-    @property
-    def owed(self) -> int:
-        """Return how many windows to solve once the early boxes are published."""
-        return self._owed
 
     def spare_windows(self) -> int:
         """Return how many windows fit into the part of the period that no deadline covers."""

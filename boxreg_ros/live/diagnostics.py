@@ -117,26 +117,32 @@ class Health:
             self._static = []
             period = max(now - self._since, 1e-3)
             self._since = now
-        values = {f'{rate} [Hz]': f'{recent[rate] / period:.1f}' for rate in RATES}
+        values: dict[str, object] = {
+            f'{rate} [Hz]': f'{recent[rate] / period:.1f}' for rate in RATES
+        }
         values |= _latency_values('latency', latencies)
         values |= _latency_values('static_points latency', sorted(wait for wait, _ in static))
         values |= _latency_values('static_points CPU', sorted(cpu for _, cpu in static))
-        values |= {key: str(value) for key, value in facts.items()}
-        values |= {key: str(number) for key, number in sorted(counts.items())}
+        values |= facts
+        values |= dict(sorted(counts.items()))
         late = _budget_text(recent)
         if late and self.is_due(Reason.BUDGET):
             self._logger.warning(late)
-        level, message = _level_and_message(recent)
-        return DiagnosticStatus(
-            level=level, name=name, message=message,
-            values=[KeyValue(key=key, value=value) for key, value in values.items()],
-        )  # fmt: skip
+        return diagnosis(name, *_level_and_message(recent), values)
 
     def _log(self, reason: str, text: str) -> None:
         if reason in FAULTS:
             self._logger.error(text)
         else:
             self._logger.warning(text)
+
+
+def diagnosis(
+    name: str, level: bytes, message: str, values: Mapping[str, object]
+) -> DiagnosticStatus:
+    """Return a status for /diagnostics."""
+    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    return DiagnosticStatus(name=name, level=level, message=message, values=pairs)
 
 
 def _awaited(counts: Mapping[str, int], fixed_frame: str) -> str:

@@ -8,13 +8,9 @@ import time
 from typing import Any, NamedTuple
 
 BOXES_PER_CLOUD = 20
-"""
-Capacity for box arrays relative to that for clouds.
-
-Arrays whose cloud was dropped cost no solver time and are published in order with the others, so
-many more of them than of clouds may wait.
-
-"""
+"""Capacity for box arrays relative to that for clouds. Arrays whose cloud was dropped cost no
+solver time and are published in order with the others, so many more of them than of clouds may
+wait."""
 
 
 class Message(NamedTuple):

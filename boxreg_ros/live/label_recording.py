@@ -8,11 +8,11 @@ import os
 from boxreg_ros.config import Config
 from boxreg_ros.io.label_feed import RecorderSettings, Split
 from boxreg_ros.io.markers import text_marker
-from boxreg_ros.live.diagnostics import Health
+from boxreg_ros.live.diagnostics import diagnosis, Health
 from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.params import NodeOptions
 from boxreg_ros.live.recorder_process import RecorderProcess
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
@@ -25,12 +25,8 @@ MIN_SECONDS_LEFT = 600.0
 """A disk that is full sooner is a WARN in /diagnostics [s]; chosen: time to drive to a stop."""
 
 RECORDING_TIME = 3.0
-"""
-Wait for the last segment of recorded labels [s].
-
-The recorder completes it in any case; launch files send SIGTERM after 5 s.
-
-"""
+"""Wait for the last segment of recorded labels [s]. The recorder completes it in any case; launch
+files send SIGTERM after 5 s."""
 
 
 class LabelRecording:
@@ -143,10 +139,7 @@ class LabelRecording:
                 level = DiagnosticStatus.WARN
         if self._error:
             level = DiagnosticStatus.ERROR
-        return DiagnosticStatus(
-            level=level, name=name, message=self.text or 'off',
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-        )  # fmt: skip
+        return diagnosis(name, level, self.text or 'off', values)
 
     async def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._recorder is not None and not self._recorder.has_ended.is_set():

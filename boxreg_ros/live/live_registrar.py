@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ from boxreg_ros.io.session import (
     JumpConfirmation,
     Session,
 )
-from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
+from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.label_tap import LabelTap
@@ -40,23 +40,15 @@ import numpy as np
 CONFIRMATION_TIME = 0.5
 """A message waits this long for the one that confirms a time jump [s]: five sweeps at 10 Hz."""
 SETTLING_TIME = 0.3
-"""
-Time for collecting transforms before the fixed frame is chosen among them [s].
-
-Publishers of /tf at 10 Hz and faster have sent three messages by then.
-
-"""
+"""Time for collecting transforms before the fixed frame is chosen among them [s]. Publishers of
+/tf at 10 Hz and faster have sent three messages by then."""
 BOXES_SILENCE = 3.0
 """After this time without boxes, final boxes are published without further observations [s]."""
 LOST_SHOWN = 10
 """Followed objects that were lost or refused last, of which /diagnostics says why; chosen."""
 CLOUD_SILENCE = 0.5
-"""
-After this time without clouds, boxes that have waited as long are published unrefined [s].
-
-Five periods of a LiDAR of 10 Hz.
-
-"""
+"""After this time without clouds, boxes that have waited as long are published unrefined [s]. Five
+periods of a LiDAR of 10 Hz."""
 
 
 class Outgoing(NamedTuple):
@@ -104,40 +96,16 @@ class LiveRegistrar:
     Register messages as they arrive, and make the messages to publish.
 
     State: a `Session` with the transforms, the registrar, and the input messages whose final
-    boxes have not been published. Not thread-safe.
+    boxes have not been published. Not thread-safe. An empty `fixed_frame` is the topmost frame
+    that the frame of the clouds moves in, chosen once; an empty `output_frame` is that of each
+    message. A message waits `transform_timeout` [s] for transforms that cover its stamp; after
+    that they may be extrapolated a little. Both may change.
 
-    Parameters
-    ----------
-    config : Config
-        Settings of the core; `estimate` must be ``final``.
-    fixed_frame, output_frame : str
-        Frames to refine and to publish in. Empty: the topmost frame that the frame of the clouds
-        moves in, chosen once; and the frame of each input message, which may change.
-    transform_timeout : float
-        How long a message waits for transforms that cover its stamp [s]; may change. After that,
-        transforms may be extrapolated a little.
-    trouble : callable
-        Called with reason, text and count for everything that is not refined here.
-    convention, lidars : Convention and Lidars
-        Of the boxes, whose ids may have to be assigned, and of the clouds.
-    budget : TickBudget, optional
-        Limits the windows that are solved for a box array. Default: all are solved.
-    static_patience : float, optional
-        How long a cloud without moving objects waits for its boxes [s]. Default: no such clouds
-        are made.
-    input_model : str
-        File of what drives have shown of the detector: read now, and written by `save_model`.
-
-    Attributes
-    ----------
-    placement : SensorPlacement
-        Decodes clouds; to be fed by the caller with info messages.
-    adapter : Adapter or None
-        Reads and writes the boxes; to be set before the first of them.
-    tap : LabelTap
-        Records labels, once it has a recorder.
-    static_points : StaticPoints or None
-        Makes clouds without moving objects, if they are asked for.
+    `trouble` is called with reason, text and count for everything that is not refined here.
+    Without a `budget` all windows are solved; without `static_patience` [s], how long clouds
+    wait for their boxes, there are no clouds without moving objects. The file `input_model` of
+    what drives have shown of the detector is read now, and written by `save_model`. The caller
+    feeds `placement` with info messages, and sets `adapter` before the first boxes.
 
     """
 
@@ -160,17 +128,17 @@ class LiveRegistrar:
         self._trouble = trouble
         self.placement = SensorPlacement(lidars)
         self._unknown_frames: set[str] = set()  # of LiDARs; not waited for
-        self._session = Session(convention, config, fixed_frame, self.placement, trouble)
-        self.tap = LabelTap(self._session)
+        self.session = Session(convention, config, fixed_frame, self.placement, trouble)
+        self.tap = LabelTap(self.session)
         self._model_file = Path(input_model).expanduser() if input_model else None
         self._drives: Drives = {}
         if self._model_file is not None and self._model_file.exists():
             self._drives = read_models([self._model_file])
         submit, windows = (None, None) if budget is None else (budget.submit, budget.windows)
-        self._registrar = BoxRegistrar(config, submit, windows, self._drives)
+        self.registrar = BoxRegistrar(config, submit, windows, self._drives)
         self.static_points: StaticPoints | None = None
         if static_patience is not None:
-            self.static_points = StaticPoints(static_patience, self._registrar)
+            self.static_points = StaticPoints(static_patience, self.registrar)
         self._late = LateBoxes()
         self._latency = Latency()
         self._jumps = JumpConfirmation[Item]()
@@ -184,43 +152,19 @@ class LiveRegistrar:
         self._last_boxes = 0.0
 
     @property
-    def tree(self) -> TransformTree:
-        """Return the transforms, to be fed by the caller."""
-        return self._session.tree
-
-    @property
-    def fixed_frame(self) -> str:
-        """Return the frame to refine in; empty while it is not known."""
-        return self._session.fixed_frame
-
-    @property
-    def cloud_frame(self) -> str:
-        """Return the frame of the clouds; to be set by the caller."""
-        return self._session.sensor_frame
-
-    @cloud_frame.setter
-    def cloud_frame(self, frame_id: str) -> None:
-        self._session.sensor_frame = frame_id
-
-    @property
     def config(self) -> Config:
         """Return the settings of the core; see `BoxRegistrar` for those that may change."""
-        return self._registrar.config
+        return self.registrar.config
 
     @config.setter
     def config(self, config: Config) -> None:
-        self._registrar.config = config
-        self._session.config = config
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Return the counters of the registrar; see `BoxRegistrar`."""
-        return self._registrar.counts
+        self.registrar.config = config
+        self.session.config = config
 
     @property
     def facts(self) -> dict[str, object]:
         """Return origin of the ids, latency of the boxes and followed objects, for reports."""
-        facts = {**self._session.facts, 'box latency': self._latency.text}
+        facts = {**self.session.facts, 'box latency': self._latency.text}
         return facts | self._following
 
     def confirm(self, item: Item) -> tuple[list[Item], list[Outgoing]]:
@@ -243,7 +187,7 @@ class LiveRegistrar:
             1,
         )
         ready = self.reset()
-        self.tree.rewind(stamp_ns)
+        self.session.tree.rewind(stamp_ns)
         return confirmed, ready
 
     def release(self, now: float = inf) -> list[Item]:
@@ -269,24 +213,26 @@ class LiveRegistrar:
         """Return whether the transforms of a message have arrived."""
         if self._choose_at is None:
             self._choose_at = now + SETTLING_TIME
-        if not self.fixed_frame and now < self._choose_at:
+        if not self.session.fixed_frame and now < self._choose_at:
             return False
         try:
-            fixed_frame = self._session.require_fixed_frame(content)
+            fixed_frame = self.session.require_fixed_frame(content)
         except TransformUnavailable:
             return False
         stamp_ns = content.stamp_ns
         if isinstance(content, Sweep):
             stamp_ns = self.placement.last_stamp_ns(content)
-        is_covered = self.tree.covers(fixed_frame, content.frame_id, stamp_ns)
+        is_covered = self.session.tree.covers(fixed_frame, content.frame_id, stamp_ns)
         if is_covered and self._changes_frame(content):
-            return self.tree.covers(self.output_frame, fixed_frame, content.stamp_ns)
+            return self.session.tree.covers(self.output_frame, fixed_frame, content.stamp_ns)
         return is_covered
 
     def _is_unknown(self, sweep: Sweep) -> bool:
         """Return whether one of several LiDARs still has no transform after one timeout."""
         frame = sweep.frame_id
-        if frame in self._unknown_frames and self.tree.connects(self.fixed_frame, frame):
+        if frame in self._unknown_frames and self.session.tree.connects(
+            self.session.fixed_frame, frame
+        ):
             self._unknown_frames.remove(frame)
         return frame in self._unknown_frames
 
@@ -304,26 +250,30 @@ class LiveRegistrar:
                 self._seeds.append(item)
                 continue
             try:
-                fixed_frame = self._session.require_fixed_frame(content)
-                T_fixed_item = self.tree.lookup(fixed_frame, content.frame_id, content.stamp_ns)
+                fixed_frame = self.session.require_fixed_frame(content)
+                T_fixed_item = self.session.tree.lookup(
+                    fixed_frame, content.frame_id, content.stamp_ns
+                )
             except TransformUnavailable as error:
                 why = f'box at {content.stamp_ns}: {error}'
-                self._registrar.followed.refused += [(name, why) for name in content.track_ids]
+                self.registrar.followed.refused += [(name, why) for name in content.track_ids]
                 continue
             for row, track_id in enumerate(content.track_ids):
                 self._sources[track_id] = _Detection(item.message, row, content.stamp_ns)
-            self._registrar.follow(boxes_to_frame(content, T_fixed_item, fixed_frame))
+            self.registrar.follow(boxes_to_frame(content, T_fixed_item, fixed_frame))
 
     def _report_followed(self) -> None:
         """Report which objects are followed, where others were lost, and boxes not followed."""
-        followed = self._registrar.followed
+        followed = self.registrar.followed
         lost = {}
         for track_id, why in followed.refused:
             lost[f'not_followed {track_id}'] = why
             self._trouble(Reason.NOT_FOLLOWED, f'{track_id}: {why}', 1)
         for one in followed.lost:
             x, y, z = one.box[:3]
-            place = f'{one.stamp_ns} ns, x {x:.1f} y {y:.1f} z {z:.1f} m in {self.fixed_frame}'
+            place = (
+                f'{one.stamp_ns} ns, x {x:.1f} y {y:.1f} z {z:.1f} m in {self.session.fixed_frame}'
+            )
             lost[f'lost {one.track_id}'] = f'{one.reason} at {place}'
             self._trouble(Reason.LOST, f'{one.track_id}: {one.reason} at {place}', 1)
         followed.refused.clear()
@@ -342,22 +292,25 @@ class LiveRegistrar:
         if is_placeholder(content):
             return self.passed_through(item.message)
         self._start_following(item.received)
-        admitted = self._session.admit(content)
+        admitted = self.session.admit(content)
         if admitted.reason:
             self._report_missing_transform(content, admitted.reason, admitted.detail)
         moved = admitted.moved
         item = item._replace(T_fixed_item=admitted.T_fixed_item)
         if isinstance(content, Sweep):
             if moved is None:
-                self._note_unknown(content)
+                if content.topic and not self.session.tree.connects(
+                    self.session.fixed_frame, content.frame_id
+                ):
+                    self._unknown_frames.add(content.frame_id)  # the other LiDARs do not wait
                 return []
             assert isinstance(moved, Sweep)
-            return self._register(self._session.merged(moved, item))
+            return self._register(self.session.merged(moved, item))
         if moved is not None:
             assert isinstance(moved, BoxArray) and admitted.T_fixed_item is not None
             moved = self._in_time(moved)
             moved = self._with_ticket(item, content, moved, admitted.T_fixed_item)
-        ready = self._outgoing(hand_to_registrar(self._registrar, moved, restarts=False))
+        ready = self._outgoing(hand_to_registrar(self.registrar, moved, restarts=False))
         if moved is None:
             ready += self.passed_through(item.message, Reason.NO_TRANSFORM)
         return ready
@@ -371,11 +324,6 @@ class LiveRegistrar:
             self._trouble(Reason.LATENCY, self._latency.warning, 1)
         return self._late.corrected(boxes, self._latency.seconds)
 
-    def _note_unknown(self, sweep: Sweep) -> None:
-        """Do not let the other LiDARs wait for a frame that TF does not know."""
-        if sweep.topic and not self.tree.connects(self.fixed_frame, sweep.frame_id):
-            self._unknown_frames.add(sweep.frame_id)
-
     def _register(self, complete: list[MergedSweep]) -> list[Outgoing]:
         """Register sweeps; return the messages that are ready to be published."""
         ready: list[Outgoing] = []
@@ -385,16 +333,16 @@ class LiveRegistrar:
             self.tap.add_cloud(sweep, clouds)
             if self.static_points is not None:
                 self.static_points.add_cloud(sweep, clouds)
-            ready += self._outgoing(hand_to_registrar(self._registrar, sweep, restarts=False))
+            ready += self._outgoing(hand_to_registrar(self.registrar, sweep, restarts=False))
         return ready
 
     def lose(self, stamp_ns: int, lidar: str = '') -> list[Outgoing]:
         """Release the boxes that wait for a cloud that was dropped, of one of several LiDARs."""
         nothing = np.zeros((0, 3))
-        sweep = Sweep(stamp_ns, self.fixed_frame, nothing, is_dropped=True, topic=lidar)
+        sweep = Sweep(stamp_ns, self.session.fixed_frame, nothing, is_dropped=True, topic=lidar)
         if lidar:
-            return self._register(self._session.merged(sweep))
-        return self._outgoing(self._registrar.add_sweep(sweep))
+            return self._register(self.session.merged(sweep))
+        return self._outgoing(self.registrar.add_sweep(sweep))
 
     def lose_overdue(self, now: float, cloud_received: float) -> list[Outgoing]:
         """Release boxes that wait for clouds if no clouds have arrived for long."""
@@ -409,7 +357,7 @@ class LiveRegistrar:
         ]
         if not overdue:
             return []
-        ready = self._register(self._session.unmerged())
+        ready = self._register(self.session.unmerged())
         # Beyond the reach of these boxes: a cloud that arrived before them may still be theirs.
         reach = self.config.reach
         return ready + self.lose(max(overdue) + round(reach * 1e9) + 1)
@@ -429,34 +377,24 @@ class LiveRegistrar:
 
     def flush(self) -> list[Outgoing]:
         """Return everything that is held; tracks continue if further boxes arrive."""
-        ready = self._register(self._session.unmerged())
-        return ready + self._outgoing(self._registrar.flush())
-
-    @property
-    def num_waiting(self) -> int:
-        """Return the number of tracks that wait for a window, see `BoxRegistrar.catch_up`."""
-        return self._registrar.num_waiting
+        ready = self._register(self.session.unmerged())
+        return ready + self._outgoing(self.registrar.flush())
 
     def catch_up(self, limit: int) -> list[Outgoing]:
         """Solve up to `limit` tracks that wait, for their final boxes."""
-        return self._outgoing(self._registrar.catch_up(limit))
+        return self._outgoing(self.registrar.catch_up(limit))
 
     def reset(self) -> list[Outgoing]:
         """Forget everything but the transforms; return everything that is held."""
         ready = self.flush()
-        self._forget_detections()
-        if self.static_points is not None:
-            self.static_points.reset()
-        self._registrar.reset()
-        self._session.restart()
-        self._late.restart()
+        self._forget()
         return ready
 
     def save_model(self) -> str:
         """Add this drive to the file of the input model; return where drives in it differ."""
         if self._model_file is None:
             return ''
-        drives = joined([self._drives, self._registrar.statistics()])
+        drives = joined([self._drives, self.registrar.statistics()])
         with written_whole(self._model_file) as file:
             file.write(to_text(drives))
         return '; '.join(disagreements(drives))
@@ -468,12 +406,7 @@ class LiveRegistrar:
         Return the messages made before the error, and all that are held, passed through.
 
         """
-        if self.static_points is not None:
-            self.static_points.reset()
-        self._registrar.reset()
-        self._session.restart()
-        self._late.restart()
-        self._forget_detections()
+        self._forget()
         held = list(self._held)
         self._held.clear()
         self.tap.keep_all(Reason.FAILED)
@@ -488,7 +421,13 @@ class LiveRegistrar:
             ready += self.passed_through(item.message, Reason.FAILED)
         return ready
 
-    def _forget_detections(self) -> None:
+    def _forget(self) -> None:
+        """Forget all but the transforms and the messages that are held."""
+        if self.static_points is not None:
+            self.static_points.reset()
+        self.registrar.reset()
+        self.session.restart()
+        self._late.restart()
         self._detections = {}
         self._seeds = []
         self._sources = {}
@@ -529,8 +468,8 @@ class LiveRegistrar:
         given = content
         if self._changes_frame(content):
             try:
-                T_output_fixed = self.tree.lookup(
-                    self.output_frame, self.fixed_frame, content.stamp_ns
+                T_output_fixed = self.session.tree.lookup(
+                    self.output_frame, self.session.fixed_frame, content.stamp_ns
                 )
             except TransformUnavailable as error:
                 self._report_missing_transform(content, Reason.NO_TRANSFORM, str(error))
@@ -538,8 +477,8 @@ class LiveRegistrar:
             T_output_item = T_output_fixed @ T_fixed_item
             given = boxes_to_frame(content, T_output_item, self.output_frame)
         self._last_boxes = item.received
-        if self._session.finding:
-            self._trouble(Reason.POSE_REFERENCE, self._session.finding, 1)
+        if self.session.finding:
+            self._trouble(Reason.POSE_REFERENCE, self.session.finding, 1)
         pending = _Pending(
             item.message, replace(given, track_ids=moved.track_ids), item.received,
             T_output_fixed, T_output_item, moved.track_ids != content.track_ids,
@@ -583,7 +522,8 @@ class LiveRegistrar:
             self.tap.take(refined)
             if refined.is_final:
                 self._held.remove(pending)
-                self._release_passing()
+                while self._held and isinstance(self._held[0], _Passing):
+                    self._made.append(Outgoing(self._held.popleft().message, True))
         made = self._made
         self._made = []
         return made
@@ -608,11 +548,6 @@ class LiveRegistrar:
             covariances = covariances_to_write(moved)
             message = self.adapter.to_msg(message, moved.boxes, covariances, T_output_item)
         return Outgoing(message, refined.is_final, pending.given, moved, pending.received)
-
-    def _release_passing(self) -> None:
-        """Release the final copies of passing messages that wait for no other any more."""
-        while self._held and isinstance(self._held[0], _Passing):
-            self._made.append(Outgoing(self._held.popleft().message, True))
 
 
 def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:

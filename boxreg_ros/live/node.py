@@ -29,7 +29,6 @@ from msg_adapters import adapter_for, canonical, cdr
 from msg_adapters.clouds import header_of, POINTS_TYPE
 from msg_adapters.concatenation import INFO_TYPE
 from msg_adapters.serialized import serialized_adapter_for
-from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -184,7 +183,7 @@ class BoxregNode(Node):
                 f'{points_type}; decompress them first, or leave static_points out'
             )
         depth = 2 * self._inbox.capacity['points']
-        self.worker.open_static_points(self._topics.publish(POINTS_TYPE, 'static_points', depth))
+        self.worker.static = self._topics.publish(POINTS_TYPE, 'static_points', depth)
 
     def _subscribe_to_points(self, points_type: str, lidars: Lidars) -> None:
         """Subscribe to the clouds of all LiDARs, and to the info on concatenated ones."""
@@ -200,16 +199,15 @@ class BoxregNode(Node):
             callback = partial(self._on_points, lidar)
             self._topics.subscribe(points_type, topic, callback, qos(), is_required=True)
         if lidars.info:
-            self._topics.subscribe(INFO_TYPE, lidars.info, self._on_info, qos(), is_required=True)
+            put = partial(self._inbox.put_event, 'points_info')
+            self._topics.subscribe(INFO_TYPE, lidars.info, put, qos(), is_required=True)
 
     def _subscribe_to_motion(self) -> None:
         """Subscribe to odometry and transforms."""
         qos = QoSProfile(depth=ODOMETRY_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._topics.subscribe('nav_msgs/msg/Odometry', 'odom', self._on_odometry, qos)
-        self._subscribe_to_transforms()
-
-    def _subscribe_to_transforms(self) -> None:
-        """Subscribe to /tf and /tf_static with the QoS of tf2_ros."""
+        put = partial(self._inbox.put_event, 'odom')
+        self._topics.subscribe('nav_msgs/msg/Odometry', 'odom', put, qos)
+        # That of tf2_ros.
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         try:
             for topic, qos in (('/tf', QoSProfile(depth=100)), ('/tf_static', latched)):
@@ -240,7 +238,7 @@ class BoxregNode(Node):
         self.worker.open_boxes(serialized or adapter, early, final)
         qos = QoSProfile(depth=2 * capacity, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._topics.subscribe(
-            type_name, 'boxes', self._on_boxes, qos, is_required=True,
+            type_name, 'boxes', partial(self._receive, 'boxes'), qos, is_required=True,
             is_raw=serialized is not None,
         )  # fmt: skip
         few = QoSProfile(depth=FOLLOW_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
@@ -253,19 +251,10 @@ class BoxregNode(Node):
     def _on_transforms(self, topic: str, msg: Any) -> None:
         self._inbox.put_event(topic, msg.transforms)
 
-    def _on_odometry(self, msg: Odometry) -> None:
-        self._inbox.put_event('odom', msg)
-
-    def _on_info(self, msg: Any) -> None:
-        self._inbox.put_event('points_info', msg)
-
     def _on_points(self, lidar: str, msg: Any) -> None:
         self.worker.cloud_frame = header_of(msg).frame_id
         self.worker.cloud_received = time.monotonic()
         self._receive('points', msg, lidar)
-
-    def _on_boxes(self, msg: Any) -> None:
-        self._receive('boxes', msg)
 
     def _receive(self, topic: str, msg: Any, lidar: str = '') -> None:
         self._health.count(f'{topic}_received')

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 import json
-from typing import Any, NamedTuple
+from typing import Any
 
-from boxreg_ros.config import Config, Setting, settings
+from boxreg_ros.config import Config, Setting, setting, settings
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.label_feed import segment_limit
 from boxreg_ros.io.lidars import Lidars
@@ -17,107 +17,6 @@ from msg_adapters.point_layout import AUTO, TIME_UNIT_CHOICES
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-
-NODE_SETTINGS = (
-    Setting(
-        'boxes_type', '',
-        'message type of the boxes, as package/msg/Type; empty: the first supported type '
-        'published on the topic',
-    ),
-    Setting(
-        'points', (),
-        'topics of the clouds of several LiDARs, which are merged; empty: the topic points',
-    ),
-    Setting(
-        'points_type', POINTS_TYPE, 'message type of the clouds, as package/msg/Type',
-        choices=CLOUD_TYPES,
-    ),
-    Setting(
-        'time_unit', AUTO,
-        'unit of the times of the points; auto: that of the layout, else by magnitude',
-        choices=TIME_UNIT_CHOICES,
-    ),
-    Setting(
-        'sensor_frames', (),
-        'frames of the LiDARs where clouds are in another one: one for each of points, or all '
-        'LiDARs of a single concatenated cloud',
-    ),
-    Setting(
-        'points_info', '',
-        'topic of ConcatenatedPointCloudInfo, which divides a concatenated cloud among its '
-        'LiDARs; empty: none',
-    ),
-    Setting(
-        'pose_reference', 'center',
-        f'point of the box that the pose refers to: {", ".join(REFERENCES)}, or x,y,z as '
-        f'fractions of length, width and height',
-    ),
-    Setting(
-        'size_order', 'lwh', 'order of length, width and height in size x, y, z',
-        choices=SIZE_ORDERS,
-    ),
-    Setting(
-        'forward_axis', 'x+', 'axis of the pose that points forward', choices=tuple(FORWARD)
-    ),
-    Setting('associate', False, 'assign track ids by data association, ignoring those given'),
-    Setting(
-        'fixed_frame', '',
-        'frame to refine in; empty: the root of the tree that the frame of the clouds moves in',
-    ),
-    Setting('output_frame', '', 'frame of the refined boxes; empty: that of the input boxes'),
-    Setting(
-        'transform_timeout', 0.3, 'maximum wait of a cloud or box array for its transform',
-        's', 0.0, 60.0,
-    ),
-    Setting(
-        'deadline', -1.0,
-        'maximum time from complete data to refined boxes: tracks that the solver has no time for '
-        'are kept, and solved first at the next stamp; negative: most of the measured period of '
-        'the boxes',
-        's', -1.0, 3600.0,
-    ),
-    Setting(
-        'backlog', 0.5,
-        'maximum wait of a cloud for those before it, after which it is dropped; of a box array '
-        'ten times that, before it passes through unrefined',
-        's', 0.0, 3600.0,
-    ),
-    Setting(
-        'static_points', False,
-        'also publish static_points: each cloud without the points of moving objects, by the '
-        'early boxes',
-    ),
-    Setting(
-        'static_points_wait', 0.2,
-        'maximum wait of a cloud of static_points for its boxes, after which it passes unchanged',
-        's', 0.0, 60.0,
-    ),
-    Setting(
-        'config_file', 'boxreg_node.yaml', 'file that ~/save_config writes all parameters to'
-    ),
-    Setting(
-        'record_to', '',
-        'folder to write the final boxes to as label files while driving; empty: none are written',
-    ),
-    Setting(
-        'record_formats', ('csv', 'openlabel'),
-        'label formats to record, see `boxreg formats`; csv is always written',
-    ),
-    Setting('record_points', False, 'record the clouds that the formats need, too'),
-    Setting(
-        'record_segment', '60 s',
-        'length of a segment of label files: a number with the unit s, min, h, MB or GB',
-    ),
-    Setting(
-        'input_model', '',
-        'file of what drives have shown of the errors of this detector: read at the start where '
-        'it exists, and written at the end; empty: none',
-    ),
-    Setting(
-        'record_camera', '', 'calibration file, for recorded formats in the frame of a camera'
-    ),
-)  # fmt: skip
-"""Options of the node beside `Config`; `config.NODE_OPTIONS` holds their names."""
 
 DYNAMIC = (
     *('sampling.', 'solver.', 'paper.', 'vehicle.', 'cyclist.', 'pedestrian.'),
@@ -130,33 +29,107 @@ ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 """Prefixes of the parameters that rclpy declares itself."""
 
 
-class NodeOptions(NamedTuple):
-    """Options of the node beside `Config`, described in `NODE_SETTINGS`."""
+@dataclass(frozen=True, slots=True)
+class NodeOptions:
+    """Options of the node beside `Config`; `config.NODE_OPTIONS` holds their names."""
 
-    boxes_type: str
-    points: tuple[str, ...]
-    points_type: str
-    time_unit: str
-    sensor_frames: tuple[str, ...]
-    points_info: str
-    pose_reference: str
-    size_order: str
-    forward_axis: str
-    associate: bool
-    fixed_frame: str
-    output_frame: str
-    transform_timeout: float
-    deadline: float
-    backlog: float
-    static_points: bool
-    static_points_wait: float
-    config_file: str
-    record_to: str
-    record_formats: tuple[str, ...]
-    record_points: bool
-    record_segment: str
-    input_model: str
-    record_camera: str
+    boxes_type: str = setting(
+        '',
+        'message type of the boxes, as package/msg/Type; empty: the first supported type '
+        'published on the topic',
+    )
+    points: tuple[str, ...] = setting(
+        (), 'topics of the clouds of several LiDARs, which are merged; empty: the topic points'
+    )
+    points_type: str = setting(
+        POINTS_TYPE, 'message type of the clouds, as package/msg/Type', choices=CLOUD_TYPES
+    )
+    time_unit: str = setting(
+        AUTO,
+        'unit of the times of the points; auto: that of the layout, else by magnitude',
+        choices=TIME_UNIT_CHOICES,
+    )
+    sensor_frames: tuple[str, ...] = setting(
+        (),
+        'frames of the LiDARs where clouds are in another one: one for each of points, or all '
+        'LiDARs of a single concatenated cloud',
+    )
+    points_info: str = setting(
+        '',
+        'topic of ConcatenatedPointCloudInfo, which divides a concatenated cloud among its '
+        'LiDARs; empty: none',
+    )
+    pose_reference: str = setting(
+        'center',
+        f'point of the box that the pose refers to: {", ".join(REFERENCES)}, or x,y,z as '
+        f'fractions of length, width and height',
+    )
+    size_order: str = setting(
+        'lwh', 'order of length, width and height in size x, y, z', choices=SIZE_ORDERS
+    )
+    forward_axis: str = setting(
+        'x+', 'axis of the pose that points forward', choices=tuple(FORWARD)
+    )
+    associate: bool = setting(False, 'assign track ids by data association, ignoring those given')
+    fixed_frame: str = setting(
+        '', 'frame to refine in; empty: the root of the tree that the frame of the clouds moves in'
+    )
+    output_frame: str = setting('', 'frame of the refined boxes; empty: that of the input boxes')
+    transform_timeout: float = setting(
+        0.3, 'maximum wait of a cloud or box array for its transform', 's', 0.0, 60.0
+    )
+    deadline: float = setting(
+        -1.0,
+        'maximum time from complete data to refined boxes: tracks that the solver has no time for '
+        'are kept, and solved first at the next stamp; negative: most of the measured period of '
+        'the boxes',
+        's',
+        -1.0,
+        3600.0,
+    )
+    backlog: float = setting(
+        0.5,
+        'maximum wait of a cloud for those before it, after which it is dropped; of a box array '
+        'ten times that, before it passes through unrefined',
+        's',
+        0.0,
+        3600.0,
+    )
+    static_points: bool = setting(
+        False,
+        'also publish static_points: each cloud without the points of moving objects, by the '
+        'early boxes',
+    )
+    static_points_wait: float = setting(
+        0.2,
+        'maximum wait of a cloud of static_points for its boxes, after which it passes unchanged',
+        's',
+        0.0,
+        60.0,
+    )
+    config_file: str = setting(
+        'boxreg_node.yaml', 'file that ~/save_config writes all parameters to'
+    )
+    record_to: str = setting(
+        '',
+        'folder to write the final boxes to as label files while driving; empty: none are written',
+    )
+    record_formats: tuple[str, ...] = setting(
+        ('csv', 'openlabel'),
+        'label formats to record, see `boxreg formats`; csv is always written',
+    )
+    record_points: bool = setting(False, 'record the clouds that the formats need, too')
+    record_segment: str = setting(
+        '60 s', 'length of a segment of label files: a number with the unit s, min, h, MB or GB'
+    )
+    input_model: str = setting(
+        '',
+        'file of what drives have shown of the errors of this detector: read at the start where '
+        'it exists, and written at the end; empty: none',
+    )
+    record_camera: str = setting(
+        '', 'calibration file, for recorded formats in the frame of a camera'
+    )
 
     @property
     def convention(self) -> Convention:
@@ -167,6 +140,9 @@ class NodeOptions(NamedTuple):
     def lidars(self) -> Lidars:
         """Return the topics of the clouds and the frames of the LiDARs."""
         return Lidars(self.points, self.sensor_frames, self.points_info, self.time_unit)
+
+
+NODE_SETTINGS = tuple(one.metadata['of']._replace(name=one.name) for one in fields(NodeOptions))
 
 
 def declare(node: Node) -> tuple[Config, NodeOptions]:
@@ -186,9 +162,9 @@ def declare(node: Node) -> tuple[Config, NodeOptions]:
             f'estimate: {given["estimate"]!r} is ignored: the node publishes the early and the '
             f'final estimate'
         )
-    config, options = _updated(Config(), _default_options(), given)
+    config, options = _updated(Config(), NodeOptions(), given)
     config = replace(config, estimate='final')
-    values = [*config.items(), *zip(NODE_SETTINGS, options, strict=True)]
+    values = [*config.items(), *((s, getattr(options, s.name)) for s in NODE_SETTINGS)]
     for item, value in values:
         if item.name in given:
             node.undeclare_parameter(item.name)
@@ -232,11 +208,10 @@ def parameters_yaml(config: Config, options: NodeOptions | None = None) -> str:
     too and ignores the options of the node. `estimate` is left out: the node ignores it.
 
     """
-    if options is None:
-        options = _default_options()
+    options = options or NodeOptions()
     lines = ['/**:', '  ros__parameters:']
-    for item, value in zip(NODE_SETTINGS, options, strict=True):
-        lines.append(_yaml_line(item, '    ', item.name, value))
+    for item in NODE_SETTINGS:
+        lines.append(_yaml_line(item, '    ', item.name, getattr(options, item.name)))
     current_group = ''
     for item, value in config.items():
         group, _, name = item.name.rpartition('.')
@@ -317,18 +292,13 @@ def describe(item: Setting) -> ParameterDescriptor:
     return descriptor
 
 
-def _default_options() -> NodeOptions:
-    defaults: list[Any] = [item.default for item in NODE_SETTINGS]
-    return NodeOptions(*defaults)
-
-
 def _updated(
     config: Config, options: NodeOptions, given: dict[str, Any]
 ) -> tuple[Config, NodeOptions]:
     """Return the settings with the given values, by name, set; other names are ignored."""
     config = config.updated({s.name: given[s.name] for s in settings() if s.name in given})
     own = {s.name: _checked(s, given[s.name]) for s in NODE_SETTINGS if s.name in given}
-    return config, options._replace(**own)
+    return config, replace(options, **own)
 
 
 def _yaml_line(item: Setting, indent: str, name: str, value: Any) -> str:

@@ -24,12 +24,7 @@ ENDING_TIME = 0.9
 
 
 def make_node(program: str, arguments: list[str], is_managed: bool = False) -> BoxregNode:
-    """
-    Initialise ROS and return the node: open, or unconfigured if it is managed.
-
-    `program` is the name in its help text. Errors are those of `BoxregNode`.
-
-    """
+    """Initialise ROS and return the node: open, or unconfigured if it is managed."""
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     parser = argparse.ArgumentParser(
         program, description='Refine boxes live. Parameters: --ros-args -p NAME:=VALUE ...'

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 import json
@@ -14,15 +14,7 @@ import time
 from typing import Any, IO, NamedTuple
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
-from boxreg_ros.io.label_feed import (
-    FinalBoxes,
-    LabelCloud,
-    PROGRAM,
-    RecorderSettings,
-    RecorderStatus,
-    Split,
-    Tick,
-)
+from boxreg_ros.io import label_feed
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.structures import Floats, Sweep
@@ -30,13 +22,8 @@ from msg_adapters import clouds, pointcloud
 import numpy as np
 
 CAPACITY = {'clouds': 50, 'boxes': 1000}
-"""
-Items that may wait for the recorder.
-
-Clouds: five seconds at 10 Hz, 100 MB of a LiDAR with 130,000 points. Boxes need a thousandth of
-that, and are the labels themselves: 100 s.
-
-"""
+"""Items that may wait for the recorder. Clouds: five seconds at 10 Hz, 100 MB of a LiDAR with
+130,000 points. Boxes need a thousandth of that, and are the labels themselves: 100 s."""
 TICK_PERIOD = 1.0
 """Longest time between two items sent, so that the status stays up to date [s]."""
 RESTARTS = 3
@@ -62,7 +49,7 @@ CHECK_TIME = 10.0
 
 def check_recording(camera: str, formats: Sequence[str]) -> None:
     """Let a recorder check parameters, as the node imports no label format; raise ConfigError."""
-    command = [sys.executable, '-m', PROGRAM, camera, *formats]
+    command = [sys.executable, '-m', label_feed.PROGRAM, camera, *formats]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=CHECK_TIME)
     except subprocess.TimeoutExpired:
@@ -85,41 +72,26 @@ class RecorderProcess:
     Start the recorder and send it the items put. Thread-safe; `put` never waits.
 
     A recorder that dies, for want of memory for example, is started again: it then completes the
-    segment that was open, and goes on with the items that wait.
+    segment that was open, and goes on with the items that wait. It is started when its
+    predecessor has ended, which may write to the same folder.
 
-    Parameters
-    ----------
-    settings : RecorderSettings
-        Settings of the recording.
-    health : Health
-        Counts the items that are dropped because the queue is full.
-    on_begin : callable
-        Called once, from another thread, when the recorder is ready to write or has failed.
-    on_end : callable
-        Called once, from another thread, when the recorder has ended, with the error that ended
-        it early; '' for none.
-    predecessor : RecorderProcess, optional
-        The recorder is started when this one has ended, which may write to the same folder.
-
-    Attributes
-    ----------
-    status : RecorderStatus
-        The newest from the recorder.
-    has_ended : threading.Event
-        Set when the recorder has ended.
+    `on_begin` and `on_end` are called once, from another thread: when the recorder is ready to
+    write or has failed, and when it has ended, with the error that ended it early or ''.
+    `status` is the newest from the recorder; items that are dropped because the queue is full
+    are counted.
 
     """
 
     def __init__(
         self,
-        settings: RecorderSettings,
+        settings: label_feed.RecorderSettings,
         health: Health,
         on_begin: Callable[[], None],
         on_end: Callable[[str], None],
         predecessor: RecorderProcess | None = None,
     ) -> None:
         self.settings = settings
-        self.status = RecorderStatus()
+        self.status = label_feed.RecorderStatus()
         self.has_ended = Event()
         self._health = health
         self._on_begin: Callable[[], None] | None = on_begin
@@ -129,13 +101,13 @@ class RecorderProcess:
         self._has_stopped = False  # it sends no more
         self._changed = Condition()
         self._waiting: deque[Any] = deque()
-        self._before = RecorderStatus()  # the totals of recorders that died
+        self._before = label_feed.RecorderStatus()  # the totals of recorders that died
         self._arrays_sent = 0  # to the present one
         self._died_at = deque[float](maxlen=RESTARTS)
-        self._sizes = dict.fromkeys(CAPACITY, 0)
+        self._sizes: Counter[str] = Counter()  # of `_waiting`, by kind
         Thread(target=self._run, args=(predecessor,), daemon=True).start()
 
-    def put(self, item: RawCloud | FinalBoxes | Split) -> None:
+    def put(self, item: RawCloud | label_feed.FinalBoxes | label_feed.Split) -> None:
         """Queue an item; where the queue is full, it is dropped and counted."""
         kind = _kind(item)
         with self._changed:
@@ -144,7 +116,7 @@ class RecorderProcess:
             is_full = kind in CAPACITY and self._sizes[kind] >= CAPACITY[kind]
             if not is_full:
                 self._waiting.append(item)
-                self._sizes[kind] = self._sizes.get(kind, 0) + 1
+                self._sizes[kind] += 1
                 self._changed.notify()
         if is_full:
             self._health.report(
@@ -199,7 +171,8 @@ class RecorderProcess:
         self._has_begun = False
         self._has_stopped = False
         process = subprocess.Popen(
-            [sys.executable, '-m', PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            [sys.executable, '-m', label_feed.PROGRAM],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             process_group=0,  # the SIGINT of a terminal would end it before it ignores signals
         )  # fmt: skip
         assert process.stdin is not None and process.stdout is not None
@@ -230,17 +203,12 @@ class RecorderProcess:
                     if item is None:
                         return
                     _send(_decoded(item), target)
-                    self._arrays_sent += isinstance(item, FinalBoxes)
+                    self._arrays_sent += isinstance(item, label_feed.FinalBoxes)
         except BrokenPipeError:  # the recorder has ended; its last status may state why
             if item is not None:
-                self._put_back(item)
-
-    def _put_back(self, item: Any) -> None:
-        """Return an item that could not be sent to the head of the queue."""
-        with self._changed:
-            self._waiting.appendleft(item)
-            kind = _kind(item)
-            self._sizes[kind] = self._sizes.get(kind, 0) + 1
+                with self._changed:
+                    self._waiting.appendleft(item)
+                    self._sizes[_kind(item)] += 1
 
     def _next(self) -> Any:
         """Return the next item, a `Tick` where there is none for a while, or None at the end."""
@@ -250,17 +218,19 @@ class RecorderProcess:
             if self._has_stopped:
                 return None
             if not self._waiting:
-                return None if self._is_finishing else Tick()
+                return None if self._is_finishing else label_feed.Tick()
             item = self._waiting.popleft()
-            kind = _kind(item)
-            if kind in self._sizes:
-                self._sizes[kind] -= 1
+            self._sizes[_kind(item)] -= 1
             return item
 
     def _read_all(self, source: IO[bytes]) -> None:
         """Read the status of the recorder until it ends."""
         for line in source:
-            self._take_status(line)
+            status = label_feed.RecorderStatus(**json.loads(line))
+            totals: dict[str, Any] = {
+                name: getattr(status, name) + getattr(self._before, name) for name in TOTALS
+            }
+            self.status = replace(status, **totals)
             self._has_begun = True
             if not self.status.error:
                 self._announce()
@@ -274,14 +244,6 @@ class RecorderProcess:
         if on_begin is not None:
             on_begin()
 
-    def _take_status(self, line: bytes) -> None:
-        if line:
-            status = RecorderStatus(**json.loads(line))
-            totals: dict[str, Any] = {
-                name: getattr(status, name) + getattr(self._before, name) for name in TOTALS
-            }
-            self.status = replace(status, **totals)
-
 
 def _send(item: Any, target: IO[bytes]) -> None:
     pickle.dump(item, target, protocol=pickle.HIGHEST_PROTOCOL)
@@ -291,7 +253,7 @@ def _send(item: Any, target: IO[bytes]) -> None:
 def _kind(item: Any) -> str:
     if isinstance(item, RawCloud):
         return 'clouds'
-    return 'boxes' if isinstance(item, FinalBoxes) else 'others'
+    return 'boxes' if isinstance(item, label_feed.FinalBoxes) else 'others'
 
 
 def _decoded(item: Any) -> Any:
@@ -299,7 +261,9 @@ def _decoded(item: Any) -> Any:
     if not isinstance(item, RawCloud):
         return item
     sweep = Sweep(item.sweep.stamp_ns, item.sweep.frame_id, item.sweep.points)  # all it needs
-    return LabelCloud(sweep, item.T_fixed_sweep, _intensities(item.messages), item.needed_from_ns)
+    return label_feed.LabelCloud(
+        sweep, item.T_fixed_sweep, _intensities(item.messages), item.needed_from_ns
+    )
 
 
 def _intensities(messages: Sequence[Any]) -> Floats | None:

@@ -10,9 +10,9 @@ import time
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
-from boxreg_ros.live.diagnostics import Health
+from boxreg_ros.live.diagnostics import diagnosis, Health
 from boxreg_ros.reasons import Reason
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters import canonical
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -88,12 +88,7 @@ class Endpoint:
 
 
 class NodeTopics:
-    """
-    Creates subscriptions and publishers, and compares them with those of other nodes.
-
-    Used by the thread of the executor only.
-
-    """
+    """The topics of the node beside those of others; used by the executor's thread only."""
 
     def __init__(self, node: Node, health: Health) -> None:
         self._node = node
@@ -132,7 +127,9 @@ class NodeTopics:
         kind = import_message(type_name)
         name = self._node.resolve_topic_name(topic)
         endpoint = Endpoint(topic, name, type_name, QoSProfile(depth=depth))
-        events = PublisherEventCallbacks(incompatible_qos=self._on_incompatible_subscription)
+        events = PublisherEventCallbacks(
+            incompatible_qos=lambda _: self._health.count(Reason.QOS_INCOMPATIBLE)
+        )
         _check_overrides(self._node, f'qos_overrides.{name}.publisher')
         endpoint.entity = self._node.create_publisher(
             kind, topic, endpoint.qos, event_callbacks=events,
@@ -193,14 +190,14 @@ class NodeTopics:
             if problem.text not in self._logged:
                 self._log(problem)
         self._logged = {problem.text for problem in problems}
-        values = {_label(item): _described(item) for item in self._endpoints}
+        values = {
+            f'{"subscription" if item.is_input else "publisher"} {item.topic}': _described(item)
+            for item in self._endpoints
+        }
         values |= {f'problem {i}': problem.text for i, problem in enumerate(problems, start=1)}
-        return DiagnosticStatus(
-            name=name,
-            level=max((problem.level for problem in problems), default=DiagnosticStatus.OK),
-            message='; '.join(problem.text for problem in problems) or 'connected',
-            values=[KeyValue(key=key, value=value) for key, value in values.items()],
-        )
+        level = max((problem.level for problem in problems), default=DiagnosticStatus.OK)
+        message = '; '.join(problem.text for problem in problems) or 'connected'
+        return diagnosis(name, level, message, values)
 
     def unpublished(self, topic: str, type_names: set[str]) -> TopicProblem:
         """Return the problem that nobody publishes a topic, with topics of the types wanted."""
@@ -246,9 +243,6 @@ class NodeTopics:
 
     def _on_lost(self, endpoint: Endpoint, event: Any) -> None:
         self._health.count(f'{endpoint.topic}_lost', event.total_count_change)
-
-    def _on_incompatible_subscription(self, event: Any) -> None:
-        self._health.count(Reason.QOS_INCOMPATIBLE)
 
     def _silence(
         self, endpoint: Endpoint, peers: list[TopicEndpointInfo]
@@ -327,12 +321,7 @@ def import_message(type_name: str) -> type:
 
 
 def mismatches(offered: QoSProfile, requested: QoSProfile) -> list[Mismatch]:
-    """
-    Return the policies for which a publisher offers less than a subscription requests.
-
-    A policy that is ``BEST_AVAILABLE`` fits.
-
-    """
+    """Return the policies for which a publisher offers less than a subscription requests."""
     found = []
     for policy, weaker, stronger in (
         ('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
@@ -360,20 +349,16 @@ def _qos_problems(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Iterato
         if not endpoint.is_input:
             publisher, subscription = subscription, publisher
         for policy, offered, requested in mismatches(publisher, subscription):
-            if endpoint.is_input:
-                text = (
-                    f'the publisher of {_nodes([peer])} offers {policy} {offered}, the '
-                    f'subscription of this node requests {requested}; set the parameter '
-                    f'qos_overrides.{endpoint.name}.subscription.{policy} to {offered}, or '
-                    f'change the publisher'
-                )
-            else:
-                text = (
-                    f'the subscription of {_nodes([peer])} requests {policy} {requested}, the '
-                    f'publisher of this node offers {offered}; set the parameter '
-                    f'qos_overrides.{endpoint.name}.publisher.{policy} to {requested}, or change '
-                    f'the subscription'
-                )
+            theirs = 'publisher', 'offers', offered
+            ours = 'subscription', 'requests', requested
+            if not endpoint.is_input:
+                theirs, ours = ours, theirs
+            text = (
+                f'the {theirs[0]} of {_nodes([peer])} {theirs[1]} {policy} {theirs[2]}, the '
+                f'{ours[0]} of this node {ours[1]} {ours[2]}; set the parameter '
+                f'qos_overrides.{endpoint.name}.{ours[0]}.{policy} to {theirs[2]}, or change the '
+                f'{theirs[0]}'
+            )
             yield TopicProblem(DiagnosticStatus.ERROR, f'{endpoint.name}: {text}', is_qos=True)
 
 
@@ -407,10 +392,6 @@ def _nodes(peers: list[TopicEndpointInfo]) -> str:
     """Return the full names of the nodes that endpoints belong to."""
     names = {f'{peer.node_namespace.rstrip("/")}/{peer.node_name}' for peer in peers}
     return ', '.join(sorted(names))
-
-
-def _label(endpoint: Endpoint) -> str:
-    return f'{"subscription" if endpoint.is_input else "publisher"} {endpoint.topic}'
 
 
 def _described(endpoint: Endpoint) -> str:

@@ -38,13 +38,9 @@ BOXES_PATIENCE = 10.0
 NO_TIME = Reason.BOXES_QUEUE_FULL
 """Reason of boxes that the solver has no time for."""
 FULL_COLLECTION_PERIOD = 60.0
-"""
-Time between two collections of all garbage [s]; chosen.
-
-One takes 40 ms with 1,024 tracks, after the boxes of one tick in 600 at 10 Hz. Few cycles survive
-the collection of new objects after each tick, which takes 1 ms.
-
-"""
+"""Time between two collections of all garbage [s]; chosen. One takes 40 ms with 1,024 tracks,
+after the boxes of one tick in 600 at 10 Hz. Few cycles survive the collection of new objects after
+each tick, which takes 1 ms."""
 ACKNOWLEDGEMENT_TIME = 0.4
 """Wait at shutdown for subscribers to acknowledge the last messages, over all publishers [s]."""
 
@@ -55,29 +51,9 @@ class Worker:
 
     The worker alone uses the registrar, its transforms and the markers. It shares the inbox and
     the counters with the executor's thread, which also sets `cloud_frame`, that of the newest
-    cloud, and `cloud_received`, when it arrived (monotonic) [s].
-
-    Parameters
-    ----------
-    live : LiveRegistrar
-        Transforms, registers and makes the messages to publish.
-    inbox, health, logger : Inbox, Health and RcutilsLogger
-        Those of the node.
-    budget : TickBudget
-        That of `live`.
-    backlog : float
-        How long a cloud may wait for the solver [s].
-    markers : Publisher
-        Of the markers.
-
-    Attributes
-    ----------
-    fixed_frame : str
-        Frame that boxes are refined in; empty until it is chosen.
-    tracks : int
-        Number of tracks in the newest boxes.
-    newest_transform_ns : int or None
-        Stamp of the newest transform or odometry.
+    cloud, and `cloud_received`, when it arrived (monotonic) [s]. A cloud may wait `backlog` [s]
+    for the solver. `fixed_frame` is empty until it is chosen, `tracks` counts those of the
+    newest boxes, `newest_transform_ns` is the stamp of the newest transform or odometry.
 
     """
 
@@ -107,7 +83,7 @@ class Worker:
         self._fully_collected_at = time.monotonic()
         self._board = MarkerBoard()
         self._markers = markers
-        self._static: Publisher | None = None
+        self.static: Publisher | None = None  # of clouds without moving objects
         self._early: Publisher | None = None
         self._final: Publisher | None = None
         self._stopping = Event()
@@ -119,10 +95,6 @@ class Worker:
         self._live.adapter = adapter
         self._early = early
         self._final = final
-
-    def open_static_points(self, publisher: Publisher) -> None:
-        """Set the publisher of clouds without moving objects."""
-        self._static = publisher
 
     def facts(self) -> dict[str, object]:
         """Return the facts about the boxes for /diagnostics, beside the counters."""
@@ -145,7 +117,7 @@ class Worker:
             self._publish_static()
             if item is None:
                 item = self._next()
-            self._live.cloud_frame = self.cloud_frame  # may arrive while boxes wait
+            self._live.session.sensor_frame = self.cloud_frame  # may arrive while boxes wait
             if item is None:
                 self._pause()
             elif self._live.is_ready(item, time.monotonic()):
@@ -242,7 +214,7 @@ class Worker:
             self._markers.publish(self._board.clear())
         self._waited = 0.0
         spare = self._budget.spare_windows()
-        if spare > 0 and self._live.num_waiting:
+        if spare > 0 and self._live.registrar.num_waiting:
             self._catch_up(spare)
             return
         period = HELD_PERIOD if self._live.is_holding else IDLE_PERIOD
@@ -262,16 +234,19 @@ class Worker:
         """Handle all events of the inbox, in the order of their arrival."""
         for kind, content in self._inbox.take_events():
             self._take_event(kind, content)
-        self.newest_transform_ns = self._live.tree.newest_ns()
+        self.newest_transform_ns = self._live.session.tree.newest_ns()
 
     def _take_event(self, kind: str, content: Any) -> None:
         match kind:
             case '/tf' | '/tf_static':
-                self._live.tree.add_transforms(content, is_static=kind == '/tf_static')
+                self._live.session.tree.add_transforms(content, is_static=kind == '/tf_static')
             case 'odom':
-                self._live.tree.add_odometry(content)
+                self._live.session.tree.add_odometry(content)
             case 'points_info':
-                self._take_info(content)
+                try:
+                    self._live.placement.add_info(content)
+                except UnsupportedMessage as error:
+                    self._health.report(Reason.UNREADABLE, f'points_info: {error}')
             case 'follow':
                 self._follow(content)
             case 'lost':
@@ -301,19 +276,13 @@ class Worker:
         else:
             self._live.follow(Item(time.monotonic_ns(), boxes, message=message))
 
-    def _take_info(self, message: Any) -> None:
-        try:
-            self._live.placement.add_info(message)
-        except UnsupportedMessage as error:
-            self._health.report(Reason.UNREADABLE, f'points_info: {error}')
-
     def _process(self, item: Item) -> None:
         if isinstance(item.content, BoxArray):
             self._budget.add_arrival(item.received)
         self._budget.begin(max(item.received, self._complete_at))
         ready = self._guarded(partial(self._live.process, item), item)
-        if self.fixed_frame != self._live.fixed_frame:
-            self.fixed_frame = self._live.fixed_frame
+        if self.fixed_frame != self._live.session.fixed_frame:
+            self.fixed_frame = self._live.session.fixed_frame
             self._logger.info(f'fixed frame is {self.fixed_frame!r}')
         self._publish(ready)
         self._catch_up(self._budget.owed)
@@ -345,7 +314,7 @@ class Worker:
             self._health.report_failure(error)
             return self._live.abandon(item)
         finally:
-            self._health.set_core_counts(self._live.counts)
+            self._health.set_core_counts(self._live.registrar.counts)
 
     def _publish(self, ready: list[Outgoing]) -> None:
         for out in ready:
@@ -382,10 +351,10 @@ class Worker:
 
     def _publish_static(self) -> None:
         """Publish clouds without moving objects, and those that wait no longer for their boxes."""
-        if self._live.static_points is None or self._static is None:
+        if self._live.static_points is None or self.static is None:
             return
         for cloud in self._live.static_points.take(time.monotonic()):
-            self._static.publish(cloud.message)
+            self.static.publish(cloud.message)
             self._health.count('static_published')
             self._health.add_static(time.monotonic() - cloud.received, cloud.cpu)
             if cloud.is_late:

@@ -24,9 +24,7 @@ TOPICS = ('lidars', 'boxes', 'odometry', 'pose_reference', 'size_order', 'forwar
 
 
 def add_recordings(
-    parser: argparse.ArgumentParser,
-    several: str = 'several are merged by time',
-    count: str = '+',
+    parser: argparse.ArgumentParser, several: str = 'several are merged by time', count: str = '+'
 ) -> None:
     """Add the recordings."""
     parser.add_argument(

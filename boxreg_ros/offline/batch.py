@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed, ThreadPoolExecutor
-from contextlib import contextmanager, ExitStack
+from contextlib import ExitStack
 from dataclasses import fields, replace
 from math import inf
 from pathlib import Path
@@ -21,16 +21,9 @@ from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.io.lock import locked
 from boxreg_ros.io.storage.urls import url_of
 from boxreg_ros.io.whole_files import written_whole
-from boxreg_ros.offline.arguments import (
-    add_options,
-    add_recordings,
-    Settings,
-    values_of,
-    words_of,
-)
+from boxreg_ros.offline.arguments import add_options, add_recordings, Settings, values_of, words_of
 from boxreg_ros.offline.batch_results import (
     DRIVE_FAILED,
     Result,
@@ -42,7 +35,7 @@ from boxreg_ros.offline.job import Job, jobs_of, LEARNING
 from boxreg_ros.offline.job_process import JobRunner, read_states
 from boxreg_ros.offline.relabel_command import Demands
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import INPUT_MODEL, writing
+from boxreg_ros.offline.result_folder import alone, INPUT_MODEL, writing
 
 ENGINES = ('local', 'ray')
 DRIVE_TIMEOUT = 1800.0
@@ -74,11 +67,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='relabel every drive twice: first into OUT/learning, then beginning with what all '
         'drives have shown of their detector, OUT/input_model.json',
     )  # fmt: skip
-    _add_machine_arguments(parser)
-
-
-def _add_machine_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of machines, and of drives that hang or are killed."""
     parser.add_argument(
         '--shard', type=_shard, default=(1, 1), metavar='I/N',
         help='do only every N-th drive, beginning with the I-th: one part per machine',
@@ -127,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
                     'RECORDING: expected at least one drive, got none; see boxreg batch -h'
                 )
             jobs = drives[index - 1 :: count]
-        with _alone(args.out, part):
+        with alone(args.out / f'.index{part}.lock', f'output {str(args.out)!r}'):
             if args.learn and jobs:
                 args.input_model = (*args.input_model, _learnt(jobs, args))
             rows += [vars(result) for result in _results(jobs, args)]
@@ -136,17 +124,6 @@ def run(args: argparse.Namespace) -> int:
     skipped = sum(row['status'] == UP_TO_DATE for row in rows)
     print(f'{args.out}: {done:,} of {len(rows):,} drives done, {skipped:,} of them earlier')
     return 0 if done == len(rows) else 1
-
-
-@contextmanager
-def _alone(out: Path, part: str) -> Iterator[None]:
-    """Keep other runs from the index, the summary and the report of an output."""
-    if url_of(out) is not None:
-        yield
-        return
-    out.mkdir(parents=True, exist_ok=True)
-    with locked(out / f'.index{part}.lock', f'output {str(out)!r}'):
-        yield
 
 
 def _check(args: argparse.Namespace) -> None:

@@ -103,12 +103,7 @@ def _merged(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def rows_of_shards(out: Path) -> list[dict[str, Any]]:
-    """
-    Return the rows of the indexes of all shards, ordered by drive.
-
-    Raises RecordingError if some are missing, or they are of different numbers of shards.
-
-    """
+    """Return the rows of the indexes of all shards, ordered by drive; refuse missing shards."""
     found = {}
     counts = set()
     names = names_of(out) if url_of(out) else [path.name for path in out.glob('index.*')]

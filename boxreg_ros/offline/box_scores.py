@@ -117,24 +117,12 @@ def match(
     pair: Pairing = by_id,
 ) -> Matches:
     """
-    Compare predictions with true boxes of the same stamp.
+    Compare predictions with true boxes of the same stamp and frame.
 
-    Parameters
-    ----------
-    predicted, truth : BoxTable
-        Boxes in the same frame. Predictions of true boxes that are out of scope are ignored.
-    min_points : int
-        True boxes with fewer points are out of scope.
-    classes : sequence of str
-        True boxes whose class name contains none of these words are out of scope; case is
-        ignored. Empty: all classes are in scope.
-    pair : callable
-        Which prediction belongs to a true box: `by_id` or `by_overlap`.
-
-    Raises
-    ------
-    RecordingError
-        If the frames differ, or the truth has a track id twice at one stamp.
+    True boxes with fewer points, or whose class name has none of the words `classes` (empty:
+    all; case is ignored), are out of scope; their predictions are ignored. `pair` says which
+    prediction belongs to a true box: `by_id` or `by_overlap`. Raises RecordingError if the
+    frames differ, or the truth has a track id twice at one stamp.
 
     """
     if len(predicted.boxes) and len(truth.boxes) and predicted.frame_id != truth.frame_id:
@@ -154,6 +142,8 @@ def match(
     true_boxes = truth.boxes[true_rows]
     stamps = truth.stamps_ns[true_rows]
     tracks = [truth.track_ids[i] for i in true_rows]
+    aligned = true_boxes.copy()
+    aligned[:, BOX_EXTENT] = boxes[:, BOX_EXTENT]
     errors = pose_errors(boxes, true_boxes)
     jitter = _second_difference(stamps, tracks, boxes[:, :3])
     turn_jitter = _second_difference(stamps, tracks, boxes[:, [YAW]], is_angle=True)
@@ -169,7 +159,7 @@ def match(
         translation=_spread(errors.translation, is_matched),
         extent=_spread(errors.extent, is_matched),
         rotation=_spread(errors.rotation, is_matched),
-        scale_iou=_spread(_scale_iou(boxes, true_boxes), is_matched),
+        scale_iou=_spread(iou_3d(aligned, true_boxes), is_matched),
         is_flipped=_spread(errors.is_flipped, is_matched),
         jitter=_spread(jitter, is_matched, np.nan),
         turn_jitter=_spread(turn_jitter, is_matched, np.nan),
@@ -203,13 +193,6 @@ def summarise(matches: Matches, mask: Mask | None = None) -> Scores:
         turn_jitter=_mean(matches.turn_jitter[rows]),
         true_jitter=_mean(matches.true_jitter[rows]),
     )
-
-
-def evaluate(
-    predicted: BoxTable, truth: BoxTable, min_points: int = 0, classes: Sequence[str] = ()
-) -> Scores:
-    """Return the scores over all true boxes in scope; arguments and errors as of `match`."""
-    return summarise(match(predicted, truth, min_points, classes))
 
 
 def has_word(class_name: str, words: Sequence[str]) -> bool:
@@ -248,13 +231,6 @@ def _spread(values: NDArray[Any], is_matched: Mask, absent: float = 0) -> NDArra
     full = np.full((len(is_matched), *values.shape[1:]), absent, dtype=values.dtype)
     full[is_matched] = values
     return full
-
-
-def _scale_iou(boxes: Floats, true_boxes: Floats) -> Floats:
-    """Return the 3D IoU (n,) after alignment of centre and heading."""
-    aligned = true_boxes.copy()
-    aligned[:, BOX_EXTENT] = boxes[:, BOX_EXTENT]
-    return iou_3d(aligned, true_boxes)
 
 
 def _second_difference(

@@ -90,9 +90,9 @@ def _tracks(source: str, config: Config) -> list[LabelTrack]:
     path = Path(source)
     if _is_recording(path):
         from boxreg_ros.io.fixed_frame import input_boxes  # slow to import: it reads bags
-        from boxreg_ros.offline.sources import source_of
+        from boxreg_ros.offline.request import Request
 
-        arrays, _ = input_boxes(source_of([path]))
+        arrays, _ = input_boxes(Request((path,)).recording())
         return _grouped(((array, None) for array in arrays), config)
     from boxreg_ros.labels import frames_of
 
@@ -103,7 +103,7 @@ def _tracks(source: str, config: Config) -> list[LabelTrack]:
 
 def _is_recording(path: Path) -> bool:
     """Return whether a path names a recording or a scene of a data set, not label files."""
-    from boxreg_ros.datasets import address_of
+    from boxreg_ros.datasets.registry import address_of
 
     address = address_of(path)
     if address is not None:

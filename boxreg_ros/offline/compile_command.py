@@ -25,12 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """
-    Compile what has not been compiled yet, and print where it is kept.
+    """Compile what has not been compiled yet, and print where it is kept."""
+    import numba
 
-    Raises BoxregError if numba cannot compile, or cannot keep what it has compiled.
-
-    """
     begun = time.monotonic()
     with warnings.catch_warnings():
         warnings.simplefilter('error', RuntimeWarning)
@@ -41,7 +38,9 @@ def run(args: argparse.Namespace) -> int:
     what = 'nothing to compile'
     if number:
         what = f'compiled {number} functions in {time.monotonic() - begun:.0f} s'
-    print(f'{what}; kept in {_place()}')
+    folder = vars(numba.config)['CACHE_DIR']  # set from the environment, at run time
+    beside = f'{Path(__file__).parents[1]}, beside its sources'
+    print(f'{what}; kept in {folder or beside}')
     return 0
 
 
@@ -54,11 +53,3 @@ def _compile() -> int:
         warm_up_labels(Config())
         cdr.walker()
     return done.functions
-
-
-def _place() -> str:
-    """Return the folder that numba keeps compiled functions in."""
-    import numba
-
-    folder: str = vars(numba.config)['CACHE_DIR']  # set from the environment, at run time
-    return folder or f'{Path(__file__).parents[1]}, beside its sources'

@@ -94,7 +94,10 @@ def table(groups: Mapping[str, Consistency]) -> str:
         ' ' * (width + 16) + columns.rstrip(),
     ]
     for name, group in groups.items():
-        cells = ''.join(_cell(group, variable) for variable in CONSISTENCY_VARIABLES)
+        cells = ''.join(
+            f'{group.coverage[v]:7.2f}{group.nees[v]:6.2f}{"*" if group.is_off(v) else " "}'
+            for v in CONSISTENCY_VARIABLES
+        )
         lines.append(f'{name:{width}}{group.boxes:8d}{group.tracks:8d}{cells}')
     low, high = CONSISTENT_NEES
     lines.append(
@@ -103,12 +106,6 @@ def table(groups: Mapping[str, Consistency]) -> str:
         f'{SIGNIFICANT:g} standard errors over the tracks)'
     )
     return '\n'.join(lines)
-
-
-def _cell(group: Consistency, variable: str) -> str:
-    """Return the cell of a variable."""
-    mark = '*' if group.is_off(variable) else ' '
-    return f'{group.coverage[variable]:7.2f}{group.nees[variable]:6.2f}{mark}'
 
 
 def _normalised(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter, deque
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.fixed_frame import FixedFrameItems, StoredCloud
 from boxreg_ros.io.lidars import SINGLE_LIDAR
-from boxreg_ros.labels import (
-    check_options,
-    frames_of,
-    LabelFrame,
-    Provenance,
-    writer_for,
-)
+from boxreg_ros.labels import check_options, frames_of, LabelFrame, Provenance, writer_for
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline.arguments import add_options, values_of
 from boxreg_ros.offline.request import Request
@@ -29,34 +23,21 @@ from boxreg_ros.offline.sources import label_frame_of
 from boxreg_ros.structures import BoxArray, Sweep
 
 
-@dataclass(slots=True)
-class _Unused:
-    """Number of unreadable messages of a recording, and a line on all that were not used."""
-
-    unreadable: int = 0
-    text: str = ''
-
-
 def convert(request: Request, out: Path) -> dict[str, Any]:
     """
     Write the labels of a request in its formats; return the content of ``summary.json``.
 
     Boxes are written in the fixed frame if the labels or the recording have the sensor poses.
     Recordings, for these poses and the clouds, are needed only where the label files lack them.
-
-    Raises
-    ------
-    ConfigError
-        For formats that do not exist, cannot be read, or lack an option.
-    RecordingError
-        If the labels cannot be read, or a format can represent none of them.
+    Raises ConfigError for formats that do not exist, cannot be read, or lack an option, and
+    RecordingError if the labels cannot be read, or a format can represent none of them.
 
     """
     _check(request)
     source_format, source = _labels(request)
     provenance = Provenance.of(request.recordings or (source,))
     counts: Counter[str] = Counter()
-    unused = _Unused()
+    unused: dict[str, Any] = {'unreadable': 0, 'unused': ''}  # messages of the recording
     with claimed(out), whole_folder(out, request.inputs()) as folder:
         writers = {
             name: writer_for(name, folder, provenance, request.options) for name in request.formats
@@ -77,8 +58,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             'to': list(request.formats),
             'frames': counts['frames'],
             'boxes': counts['boxes'],
-            'unreadable': unused.unreadable,
-            'unused': unused.text,
+            **unused,
             'left_out_of_labels': {name: found for name, found in left_out.items() if found},
             'versions': {'boxreg_ros': __version__},
             'fingerprint': request.fingerprint(),
@@ -123,7 +103,7 @@ def _require_boxes(request: Request, left_out: dict[str, dict[str, int]], num_bo
             )
 
 
-def _read_frames(request: Request, folder: Path, unused: _Unused) -> Iterator[LabelFrame]:
+def _read_frames(request: Request, folder: Path, unused: dict[str, Any]) -> Iterator[LabelFrame]:
     """Yield the labels, in the fixed frame where the transform is known."""
     if request.recordings:
         yield from _read_with_recording(request, folder, unused)
@@ -132,7 +112,9 @@ def _read_frames(request: Request, folder: Path, unused: _Unused) -> Iterator[La
         yield frame.moved('fixed')
 
 
-def _read_with_recording(request: Request, folder: Path, unused: _Unused) -> Iterator[LabelFrame]:
+def _read_with_recording(
+    request: Request, folder: Path, unused: dict[str, Any]
+) -> Iterator[LabelFrame]:
     """Yield the labels with poses and clouds of the recording; note what could not be used."""
     config = Config()
     waiting = deque[LabelFrame]()  # merged clouds are complete later than the boxes of their time
@@ -156,8 +138,7 @@ def _read_with_recording(request: Request, folder: Path, unused: _Unused) -> Ite
                 yield frame
             else:
                 waiting.append(frame)
-        unused.unreadable = recording.unreadable.total()
-        unused.text = items.left_out()
+        unused.update(unreadable=recording.unreadable.total(), unused=items.left_out())
     if spool is not None:
         yield from map(spool.with_cloud, waiting)
         spool.remove()

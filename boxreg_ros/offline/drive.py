@@ -8,7 +8,7 @@ from pathlib import Path
 from boxreg_ros.config import Config
 from boxreg_ros.core.refine import Track
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.datasets import SceneRecording
+from boxreg_ros.datasets.scene_recording import SceneRecording
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import FixedFrameItems
@@ -55,12 +55,7 @@ class Drive:
 
     @classmethod
     def read(cls, folder: Path, lidars: Lidars = SINGLE_LIDAR) -> Drive:
-        """
-        Read the one recording in a folder, of these LiDARs, and the ``truth.csv`` beside it.
-
-        Raises RecordingError if they do not exist, or cannot be read.
-
-        """
+        """Read the recording of these LiDARs in a folder, and the ``truth.csv`` beside it."""
         if not folder.is_dir():
             raise RecordingError(f'{folder}: expected a folder with a recording and truth.csv')
         truth = BoxTable.read(folder / 'truth.csv')

@@ -15,25 +15,13 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance, COVARIANCES, read_covariances
 from boxreg_ros.io.times import time_range
 from boxreg_ros.offline.arguments import add_options, request_from, TOPICS, words_of
-from boxreg_ros.offline.box_scores import (
-    by_overlap,
-    groups,
-    match,
-    RECALLS,
-    Scores,
-    summarise,
-)
+from boxreg_ros.offline.box_scores import by_overlap, groups, match, RECALLS, Scores, summarise
 from boxreg_ros.offline.consistency import consistency
 from boxreg_ros.offline.consistency import table as consistency_table
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import earlier_summary
 from boxreg_ros.offline.sources import true_boxes
-from boxreg_ros.offline.track_scores import (
-    has_trackeval,
-    LEAST_IOU,
-    track_scores,
-    TrackScores,
-)
+from boxreg_ros.offline.track_scores import has_trackeval, LEAST_IOU, track_scores, TrackScores
 from boxreg_ros.structures import is_valid_box, REJECTED
 import numpy as np
 
@@ -97,7 +85,9 @@ def run(args: argparse.Namespace) -> int:
         _print_tables(overall, groups(matches))
         print(_track_lines(tracks))
         if certainty:
-            print(f'\ncovariances of the {_estimate(args.predicted)} estimate')
+            folder = args.predicted if args.predicted.is_dir() else args.predicted.parent
+            estimate = (earlier_summary(folder) or {}).get('estimate', 'written')
+            print(f'\ncovariances of the {estimate} estimate')
             print(consistency_table(certainty))
     return 0 if matches.is_matched.any() else 1
 
@@ -108,12 +98,6 @@ def _covariances(source: Path) -> dict[tuple[int, str], BoxCovariance]:
     path = folder / COVARIANCES
     is_table = source.name == 'boxes.csv' or (source / 'boxes.csv').is_file()
     return read_covariances(path) if is_table and path.is_file() else {}
-
-
-def _estimate(source: Path) -> str:
-    """Return the estimate of a result folder, as in its summary; 'written' without one."""
-    folder = source if source.is_dir() else source.parent
-    return str((earlier_summary(folder) or {}).get('estimate', 'written'))
 
 
 def _track_lines(scores: TrackScores) -> str:
@@ -232,20 +216,11 @@ def table(rows: dict[str, Scores]) -> str:
     titles += ['ATE', 'ASE', 'AOE', 'flips', 'jitter', '(true)']
     width = max(len('boxes of'), *(len(name) for name in rows))
     lines = [' ' * width + ''.join(f'{title:>8}' for title in titles)]
-    for name, scores in rows.items():
-        numbers = (
-            scores.iou_bev,
-            scores.iou_3d,
-            *scores.recall_3d,
-            scores.ate,
-            scores.ase,
-            scores.aoe,
-            scores.flips,
-            scores.jitter,
-            scores.true_jitter,
-        )
+    for name, s in rows.items():
+        numbers = [s.iou_bev, s.iou_3d, *s.recall_3d, s.ate, s.ase, s.aoe]
+        numbers += [s.flips, s.jitter, s.true_jitter]
         cells = ''.join(f'{number:8.3f}' for number in numbers)
-        lines.append(f'{name:{width}}{scores.boxes:8d}{cells}')
+        lines.append(f'{name:{width}}{s.boxes:8d}{cells}')
     return '\n'.join(lines)
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from boxreg_ros.datasets import DATASETS
-from boxreg_ros.datasets import module_of as dataset_module
+from boxreg_ros.datasets.registry import DATASETS
+from boxreg_ros.datasets.registry import module_of as dataset_module
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.labels import can_read, FORMATS, import_format
 
@@ -38,12 +38,7 @@ def dataset_rows() -> list[tuple[str, ...]]:
 
 
 def rows() -> list[tuple[str, ...]]:
-    """
-    Return the conventions of each format, in the columns of `FORMAT_COLUMNS`.
-
-    A format of another package that cannot be imported has its error in place of the title.
-
-    """
+    """Return each format in the columns of `FORMAT_COLUMNS`; its error in place of the title."""
     table: list[tuple[str, ...]] = []
     for name in FORMATS:
         try:
@@ -51,19 +46,9 @@ def rows() -> list[tuple[str, ...]]:
         except ConfigError as error:
             table.append((name, str(error), *[''] * (len(FORMAT_COLUMNS) - 2)))
             continue
-        table.append(
-            (
-                name,
-                form.title,
-                'yes' if can_read(name) else '',
-                form.frame,
-                form.reference,
-                form.sizes,
-                form.rotation,
-                form.files,
-                ', '.join(form.packages),
-            )
-        )
+        conventions = form.frame, form.reference, form.sizes, form.rotation, form.files
+        readable, needs = 'yes' if can_read(name) else '', ', '.join(form.packages)
+        table.append((name, form.title, readable, *conventions, needs))
     return table
 
 

@@ -35,6 +35,7 @@ from boxreg_ros.offline.result_folder import spare_file
 from boxreg_ros.offline.timeline import check_plotly, merged_spans, write_timeline
 
 if TYPE_CHECKING:
+    from boxreg_ros.datasets.registry import Address
     from boxreg_ros.io.items import Item, ItemSource
     from boxreg_ros.io.transforms import Link
 
@@ -65,14 +66,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print what is in the recording; return 1 if it cannot be relabelled."""
-    scenes = _scenes(args.recordings)
-    if scenes:
+    from boxreg_ros.datasets.registry import all_scenes
+    from boxreg_ros.offline.sources import scene_address
+
+    address = scene_address(args.recordings)
+    scenes = [] if address is None else [str(scene) for scene in all_scenes(address)]
+    if len(scenes) > 1:  # none of several is named
         print(json.dumps(scenes) if args.json else '\n'.join(scenes))
         return DONE
     if args.html is not None:
         check_plotly()
         spare_file(args.html, args.recordings)
-    facts = inspect(args)
+    facts = inspect(args, address)
     lines = list(_lines(facts))
     if args.html is not None:
         write_timeline(args.html, facts, lines)
@@ -80,23 +85,18 @@ def run(args: argparse.Namespace) -> int:
     return DONE if facts['command'] else FAILED
 
 
-def inspect(args: argparse.Namespace) -> dict[str, Any]:
+def inspect(args: argparse.Namespace, address: Address | None) -> dict[str, Any]:
     """Return what `boxreg inspect --json` prints; RecordingError if nothing can be read."""
-    from boxreg_ros.offline.sources import scene_address
-
     request = request_from(args)
     source = request.recording()
-    if scene_address(args.recordings) is None:
-        facts = _contents(args.recordings)
-    else:
-        facts = _scene_contents(args.recordings)
+    facts = _contents(args.recordings) if address is None else _scene_contents(address)
     try:
         with source as recording:
             facts |= _sampled(recording, request.convention)
             facts['damage'] = [damage._asdict() for damage in recording.damages]
     except BoxregError as error:
         facts['problems'].append(str(error))
-    facts['command'] = '' if facts['problems'] else _command(args, facts)
+    facts['command'] = '' if facts['problems'] else _command(args, facts, address)
     return facts
 
 
@@ -153,23 +153,10 @@ def _facts(
     }
 
 
-def _scenes(paths: list[Path]) -> list[str]:
-    """Return the addresses of all scenes of a data set, if none of several is named."""
-    from boxreg_ros.datasets import all_scenes
-    from boxreg_ros.offline.sources import scene_address
-
-    address = scene_address(paths)
-    found = [] if address is None else all_scenes(address)
-    return [str(scene) for scene in found] if len(found) > 1 else []
-
-
-def _scene_contents(paths: list[Path]) -> dict[str, Any]:
+def _scene_contents(address: Address) -> dict[str, Any]:
     """Return files, times and numbers of sweeps and boxes of a scene."""
-    from boxreg_ros.datasets import SceneRecording
-    from boxreg_ros.offline.sources import scene_address
+    from boxreg_ros.datasets.scene_recording import SceneRecording
 
-    address = scene_address(paths)
-    assert address is not None
     recording = SceneRecording(address)
     recording.has_boxes = False
     with recording:
@@ -366,12 +353,9 @@ def _gaps(stamps: list[int]) -> list[list[float]]:
     ]
 
 
-def _command(args: argparse.Namespace, facts: dict[str, Any]) -> str:
+def _command(args: argparse.Namespace, facts: dict[str, Any], scene: Address | None) -> str:
     """Return the relabel command with the same recordings and topics."""
-    from boxreg_ros.offline.sources import scene_address
-
     first = args.recordings[0]
-    scene = scene_address([first])
     out = f'out/{first.stem if scene is None else scene.scene or scene.root.name}'
     words = ['boxreg', 'relabel', *map(str, args.recordings), '-o', out]
     words += words_of(args, Request, *TOPICS)

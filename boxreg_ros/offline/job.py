@@ -15,7 +15,7 @@ import shlex
 from typing import Any
 from urllib.parse import urlsplit
 
-from boxreg_ros.datasets import address_of, all_scenes, resolved, scene_files
+from boxreg_ros.datasets.registry import address_of, all_scenes, resolved, scene_files
 from boxreg_ros.errors import BoxregError, ConfigError, RecordingError
 from boxreg_ros.io.storage.urls import entries_of, Entry, url_of
 from boxreg_ros.offline.result_folder import INPUT_MODEL

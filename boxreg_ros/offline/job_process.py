@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 import ctypes
 from dataclasses import dataclass, field
 from functools import partial
@@ -23,13 +23,12 @@ from typing import Any, BinaryIO, TypeVar
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.lock import locked
 from boxreg_ros.io.storage.urls import entries_of, names_of, read_text, url_of, write_text
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.batch_results import DRIVE_DONE, Result, UP_TO_DATE
 from boxreg_ros.offline.job import Job, JOBS
 from boxreg_ros.offline.progress import PIPE
-from boxreg_ros.offline.result_folder import claimed, earlier_summary, whole_summary
+from boxreg_ros.offline.result_folder import alone, claimed, earlier_summary, whole_summary
 
 _T = TypeVar('_T')
 
@@ -70,7 +69,9 @@ class JobRunner:
         if job.problem:
             return result
         try:
-            with self._alone(job):
+            # The process of a run that was killed takes a moment to end.
+            lock = self.out / JOBS / f'{job.name}.lock'
+            with alone(lock, f'drive {job.name}', END_SECONDS):
                 self._settle(job, result)
         except RecordingError as error:
             result.last_line = str(error)
@@ -89,15 +90,6 @@ class JobRunner:
         """End all processes that run."""
         for process in list(self.running):
             process.terminate()
-
-    def _alone(self, job: Job) -> AbstractContextManager[object]:
-        """Keep other runs from the state, the log and the result of a job."""
-        folder = self.out / JOBS
-        if url_of(folder) is not None:
-            return nullcontext()
-        folder.mkdir(parents=True, exist_ok=True)
-        # The process of a run that was killed takes a moment to end.
-        return locked(folder / f'{job.name}.lock', f'drive {job.name}', END_SECONDS)
 
     def _settle(self, job: Job, result: Result) -> None:
         """Relabel a drive if it is not done, and store that it is."""

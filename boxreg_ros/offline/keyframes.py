@@ -7,16 +7,10 @@ from dataclasses import replace
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.follow import (
-    End,
-    follow_points,
-    FollowedTrack,
-    keyframe_deviations,
-)
+from boxreg_ros.core.follow import End, follow_points, FollowedTrack, keyframe_deviations
 from boxreg_ros.core.following.person import DEVIATIONS
 from boxreg_ros.io.sweep_store import SweepStore
-from boxreg_ros.offline.completion import Moved
-from boxreg_ros.offline.every_sweep import Arrivals
+from boxreg_ros.offline.completion import Arrivals, Moved
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from boxreg_ros.tracks.complete import CompletionPlan
@@ -28,27 +22,11 @@ def keyframes(
     items: Iterable[tuple[Moved, bool]], fixed_frame: str, config: Config
 ) -> tuple[CompletionPlan, list[Arrivals], list[FollowedTrack], Floats]:
     """
-    Follow the boxes of a recording through its sweeps.
+    Follow the boxes of a recording through its sweeps, both in the fixed frame.
 
-    Parameters
-    ----------
-    items : iterable of (item, restarts)
-        Sweeps and boxes in the fixed frame, and whether time went back before them.
-    fixed_frame : str
-        That frame.
-    config : Config
-        Classes of the objects.
-
-    Returns
-    -------
-    plan : CompletionPlan
-        What is added, for the arrays of `Arrivals.completed`.
-    parts : list of Arrivals
-        Of the recording between time jumps.
-    tracks : list of FollowedTrack
-        Of all parts.
-    deviations : array, shape (9,)
-        Of the keyframes, see `person.DEVIATIONS`.
+    Items come with whether time went back before them. Return what is added, for the arrays of
+    `Arrivals.completed`, the parts between time jumps, the tracks of all parts, and the
+    deviations (9,) of the keyframes, see `person.DEVIATIONS`.
 
     """
     stores: list[SweepStore] = []
@@ -99,21 +77,8 @@ def add_objects(
     """
     Add the objects of a person to a plan, followed through the sweeps of their part.
 
-    Parameters
-    ----------
-    plan : CompletionPlan
-        For the arrays of `Arrivals.completed`.
-    parts, stores : sequences of Arrivals and SweepStore
-        Between time jumps.
-    corrections : Corrections
-        The decisions of a person.
-    fixed_frame, config
-        As of `keyframes`.
-
-    Returns
-    -------
-    tracks : list of FollowedTrack
-        As they were followed.
+    The plan is for the arrays of `Arrivals.completed`; parts and stores are those between time
+    jumps. Return the tracks as they were followed.
 
     """
     seeds_of: dict[int, list[BoxArray]] = {}

@@ -12,15 +12,7 @@ from boxreg_ros.io.times import time_range
 from boxreg_ros.offline.result_folder import SUMMARY
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.reasons import Reason, REASONS
-from boxreg_ros.structures import (
-    COASTED,
-    EXTENDED,
-    HUMAN,
-    INTERPOLATED,
-    KEPT,
-    REFINED,
-    REJECTED,
-)
+from boxreg_ros.structures import COASTED, EXTENDED, HUMAN, INTERPOLATED, KEPT, REFINED, REJECTED
 
 MAX_NAMED = 5
 """Most tracks that a warning names; chosen."""
@@ -40,7 +32,8 @@ def closing_line(summary: Summary, out: Path) -> str:
         f'{status.get(KEPT, 0):,} kept',
     ]
     if summary.reasons:
-        parts[-1] += f' ({_counts(summary.reasons)})'
+        counts = ', '.join(f'{name} {count:,}' for name, count in summary.reasons.items())
+        parts[-1] += f' ({counts})'
     if summary.heading_flips:
         parts.append(f'{summary.heading_flips:,} heading flips corrected')
     for word in (HUMAN, REJECTED, INTERPOLATED, EXTENDED, COASTED):
@@ -194,7 +187,3 @@ def _why_few_were_refined(summary: Summary) -> str:
         line += f'; remedy: {reason.remedy}'
     ranges = [f'{name} {time_range(*r)}' for name, r in sorted(summary.time_ranges.items())]
     return f'{line}; time ranges: {", ".join(ranges)}'
-
-
-def _counts(counts: dict[str, int]) -> str:
-    return ', '.join(f'{name} {count:,}' for name, count in counts.items())

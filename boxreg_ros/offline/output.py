@@ -11,28 +11,18 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.stamp_order import kept, Slot, StampOrder
 from boxreg_ros.labels import LabelFrame, LabelOutput, Provenance
 from boxreg_ros.labels.cloud_spool import Spool
-from boxreg_ros.offline.background import Background
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.reader import ReadItem, Source, uses_one_core
 from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.workers import Background
 from boxreg_ros.reasons import Reason
 from boxreg_ros.review.corrections import Corrections
-from boxreg_ros.structures import (
-    BoxArray,
-    REFINED,
-    RefinedBoxes,
-    Sweep,
-    YAW,
-)
+from boxreg_ros.structures import BoxArray, REFINED, RefinedBoxes, Sweep, YAW
 import numpy as np
 
 ARRAYS_AHEAD = 256
-"""
-Most results that wait to be written, some 40 kB each with 64 boxes.
-
-A full window of all tracks returns the results of as many stamps at once.
-
-"""
+"""Most results that wait to be written, some 40 kB each with 64 boxes. A full window of all tracks
+returns the results of as many stamps at once."""
 
 
 class Sink:
@@ -69,7 +59,7 @@ class Sink:
         recording = request.recording()
         bags = recording if isinstance(recording, Recording) else None
         options = replace(request.options, recording=bags)
-        self._output = LabelOutput(folder, request.box_formats, provenance, options)
+        self.output = LabelOutput(folder, request.box_formats, provenance, options)
         self.corrections = corrections
         # These import numba, after the fork of the reader.
         from boxreg_ros.review.changes import Changes
@@ -136,13 +126,9 @@ class Sink:
         if self.points is not None:
             self.points.flush()
         with self._clock('write'):
-            self._output.close()
+            self.output.close()
             if self._spool is not None:
                 self._spool.remove()
-
-    def left_out(self) -> dict[str, dict[str, int]]:
-        """Return the number of boxes that a format cannot represent, by format and reason."""
-        return self._output.left_out()
 
     def missing(self) -> int:
         """Return the number of input boxes that have not been written."""
@@ -196,7 +182,7 @@ class Sink:
         added_ids = [self.corrections.origin_of(stamp_ns, track_id) for track_id in added]
         self.changes.add(slot.boxes, refined, early, added_ids)
         with self._clock('write'):
-            self._output.write(self._frame(refined, slot))
+            self.output.write(self._frame(refined, slot))
 
     def _frame(self, refined: RefinedBoxes, slot: Slot) -> LabelFrame:
         """Return all that label writers need about one array, its cloud included."""

@@ -90,19 +90,6 @@ def object_tracks(tracks: Sequence[TrackChanges]) -> list[ObjectTrack]:
     return found
 
 
-def write_point_products(
-    folder: Path,
-    request: Request,
-    sweeps: StoredSweeps,
-    labeller: PointLabeller,
-    fixed_frame: str,
-) -> dict[str, Any]:
-    """Write the formats and clouds of a request; return sweeps and points by their label."""
-    products = _Products(folder, request, sweeps, labeller, fixed_frame)
-    products.write()
-    return products.summary()
-
-
 class LabelledSweep(NamedTuple):
     """A sweep in the fixed frame, its labels, and whether boxes state what is there."""
 
@@ -112,8 +99,8 @@ class LabelledSweep(NamedTuple):
     is_known: bool
 
 
-class _Products:
-    """The files that are written while sweeps are labelled."""
+class PointProducts:
+    """The formats and clouds of a request, written while sweeps are labelled."""
 
     def __init__(
         self,
@@ -143,8 +130,8 @@ class _Products:
         self._labelled = lru_cache(RECENT_SWEEPS)(self._label)
         self._done = 0
 
-    def write(self) -> None:
-        """Label all sweeps and write all files."""
+    def write(self) -> dict[str, Any]:
+        """Label all sweeps and write all files; return sweeps and points by their label."""
         if self._request.cloud_copies:
             self._write_copies()
         self._add_until(len(self._sweeps.places))
@@ -158,9 +145,6 @@ class _Products:
             for row, cloud in self._objects.items():
                 name = _file_name(self._labeller.tracks[row].track_id, row)
                 write_cloud(self._clouds / 'objects' / f'{name}.ply', cloud.points())
-
-    def summary(self) -> dict[str, Any]:
-        """Return the numbers of sweeps and points, and the origin of the maps."""
         facts: dict[str, Any] = dict(self._counts)
         if self._maps and self._origin is not None:
             facts['map_origin'] = self._origin.tolist()

@@ -14,16 +14,20 @@ from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.summary import Summary
-from boxreg_ros.structures import Ints
+from boxreg_ros.structures import Ints, PROPOSED
 import numpy as np
 
 if TYPE_CHECKING:
+    from boxreg_ros.core.point_labels import PointLabeller
+    from boxreg_ros.offline.stored_sweeps import StoredSweeps
     from boxreg_ros.review.changes import TrackChanges
     from boxreg_ros.review.rules import Violation
     from boxreg_ros.review.tables import TrackRow
     from boxreg_ros.review.track_points import PointCollector
     from boxreg_ros.tracks.complete import CompletionPlan, TrackSteps
+    from boxreg_ros.tracks.proposals import Proposal
 
+PROPOSALS = 'proposals.csv'
 STEP_COLUMNS = ('fragments', 'filled', 'extended', 'rejected', 'reclassified', 'ambiguous')
 
 
@@ -138,4 +142,46 @@ def _step_cells(tracks: Sequence[TrackSteps]) -> dict[str, list[int | str]]:
             ' '.join(track.ambiguous),
         ]
         for track in tracks
+    }
+
+
+def write_proposals(
+    folder: Path, sweeps: StoredSweeps, labeller: PointLabeller, fixed_frame: str
+) -> list[dict[str, Any]]:
+    """Write a box of each object that no box covers to `PROPOSALS`; return them, longest first."""
+    from boxreg_ros.tracks.proposals import Proposer  # imports parts of SciPy
+
+    proposer = Proposer()
+    for sweep, _ in sweeps:
+        if sweep is not None and labeller.knows(sweep.stamp_ns):
+            boxes = labeller.objects_at(sweep.stamp_ns).boxes
+            sweep = sweep.in_frame()
+            proposer.add(sweep.stamp_ns, sweep.points, sweep.origin, boxes)
+    found = proposer.proposals()
+    names = [f'missed-{number}' for number in range(1, len(found) + 1)]
+    BoxTable(
+        np.array([one.stamp_ns for one in found], np.int64),
+        fixed_frame,
+        tuple(names),
+        tuple(one.class_name for one in found),
+        np.full(len(found), np.nan),
+        np.array([one.box for one in found]).reshape(-1, 9),
+        (PROPOSED,) * len(found),
+        np.array([one.num_points for one in found], np.int64),
+    ).write(folder / PROPOSALS)
+    return [_as_json(name, one) for name, one in zip(names, found, strict=True)]
+
+
+def _as_json(name: str, one: Proposal) -> dict[str, Any]:
+    x, y, z = one.box[:3].round(2).tolist()
+    return {
+        'track_id': name,
+        'class_name': one.class_name,
+        'stamp_ns': one.stamp_ns,
+        'place': [x, y, z],
+        'sweeps': len(one.stamps_ns),
+        'first_stamp_ns': int(one.stamps_ns[0]),
+        'last_stamp_ns': int(one.stamps_ns[-1]),
+        'points': one.num_points,
+        'speed': round(one.speed, 1),
     }

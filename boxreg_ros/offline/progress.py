@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 import os
 import time
-from typing import TypeVar
 
 PIPE = 'BOXREG_PROGRESS'
 """Environment variable with the descriptor of a pipe that gets a byte for each step forward."""
@@ -28,9 +27,6 @@ class Progress:
 
     def announce(self, activity: str) -> None:
         """Show the activity that the run waits for, until the next `show`."""
-
-
-_T = TypeVar('_T')
 
 
 class Stopwatch:
@@ -56,16 +52,6 @@ class Stopwatch:
     def add(self, stage: str, seconds: float) -> None:
         """Add a time measured elsewhere to a stage."""
         self._seconds[stage] += seconds
-
-    def each(self, stage: str, items: Iterator[_T]) -> Iterator[_T]:
-        """Yield `items` and add the time that the iterator takes to a stage."""
-        end = object()
-        while True:
-            with self(stage):
-                item = next(items, end)
-            if item is end:
-                return
-            yield item  # type: ignore[misc]
 
     def begun(self, stage: str) -> None:
         """Add the time since construction to a stage: the preparation before the work."""

@@ -22,32 +22,22 @@ from boxreg_ros.errors import ConfigError, RecordingError, TransferError
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
 from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.storage.record import Damage
-from boxreg_ros.offline.background import Background
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.sources import label_frame_of
 from boxreg_ros.offline.stored_sweeps import StoredPlace, StoredSweeps
-from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send
+from boxreg_ros.offline.workers import Background, Receive, run_in_worker, Send
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from msg_adapters.clouds import POINTS_TYPE
 import numpy as np
 
 MESSAGES_AHEAD = 4
-"""
-Messages that are read before the receiver has taken those before them: two clouds, their boxes.
-
-Swept: with 1, 2, 8 and 32 a run took 8.2, 7.5, 7.8 and 8.4 s, and each message 1.5 MB.
-
-"""
+"""Messages that are read before the receiver has taken those before them: two clouds, their boxes.
+Swept: with 1, 2, 8 and 32 a run took 8.2, 7.5, 7.8 and 8.4 s, and each message 1.5 MB."""
 LONG = 60.0
-"""
-Recordings of this duration are worth loading numba to read their boxes [s].
-
-Derived: it takes 0.7 s of CPU, in parallel with the other processes, and saves 1.2 ms per message
-of 64 boxes, ten a second.
-
-"""
+"""Recordings of this duration are worth loading numba to read their boxes [s]. Derived: it takes
+0.7 s of CPU, in parallel with the other processes, and saves 1.2 ms per message of 64 boxes, ten a
+second."""
 
 
 SAMPLES = 4
@@ -81,21 +71,12 @@ class Source(NamedTuple):
 class Findings(NamedTuple):
     """Properties of a recording that are known after the last item."""
 
-    counts: Counter[str]  # this and the next two: as of `FixedFrameItems`
-    first_missing_transform: str
-    first_unplaced: str
-    # clouds of each of several topics that were merged, late and missing
-    lidars: dict[str, Counter[str]]
-    # of the clouds of each topic, and how the times of their points are read
-    point_layouts: dict[str, str]
+    counts: Counter[str]  # as of `FixedFrameItems`
+    lidars: dict[str, Counter[str]]  # clouds of each that were merged, late and missing
     unreadable: int  # messages
-    first_unreadable: str  # the first error of each topic
-    # topics that were recorded apart from the clouds, and by how much [s]
-    apart: dict[str, float]
-    damages: list[Damage]  # parts of the files that could not be read
     outside: int  # boxes of label files outside of the part that is read
     warning: str  # finding of the pose check
-    facts: dict[str, Any]  # origin of the ids
+    facts: dict[str, Any]  # fields of the summary that follow from the recording alone
     places: list[StoredPlace]  # of the stored sweeps; empty where none are stored
     seconds: dict[str, float]  # spent in each stage
 
@@ -164,19 +145,22 @@ class RecordingReader:
         """Return the properties that are known after the last item."""
         recording = self._recording
         items = self._items
+        facts = {
+            **items.session.facts,  # origin of the ids
+            'recorded_apart': {topic: round(late, 3) for topic, late in recording.apart.items()},
+            'damage': [damage._asdict() for damage in recording.damages],
+            'point_layouts': recording.placement.layouts,
+            'first_missing_transform': items.first_missing_transform,
+            'first_unplaced': items.first_unplaced,
+            'first_unreadable': '; '.join(map(str, recording.first_errors.values())),
+        }
         return Findings(
             items.counts,
-            items.first_missing_transform,
-            items.first_unplaced,
             items.session.lidar_counts,
-            recording.placement.layouts,
             recording.unreadable.total(),
-            '; '.join(map(str, recording.first_errors.values())),
-            recording.apart,
-            recording.damages,
             recording.outside,
             '; '.join(filter(None, (recording.finding, items.session.finding))),
-            items.session.facts,
+            facts,
             [] if self._sweeps is None else self._sweeps.complete(),
             self._clock.stages(),
         )

@@ -25,7 +25,7 @@ from boxreg_ros.io.compilation import announced_compilation
 from boxreg_ros.io.warm_up import warm_up, warm_up_crop
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.reader import uses_one_core
-from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send, WorkerProcess
+from boxreg_ros.offline.workers import Receive, run_in_worker, Send, WorkerProcess
 
 
 @contextmanager

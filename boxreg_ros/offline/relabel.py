@@ -17,11 +17,11 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.io.storage.urls import url_of
-from boxreg_ros.offline.every_sweep import Arrivals, with_empty_arrays
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.products import (
     checked,
     completed_counts,
+    write_proposals,
     write_run_report,
     write_track_tables,
 )
@@ -38,7 +38,7 @@ from boxreg_ros.offline.result_folder import (
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.review.decisions import DECISIONS, read_decisions
-from boxreg_ros.structures import BoxArray, RefinedBoxes
+from boxreg_ros.structures import BoxArray
 import yaml
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from boxreg_ros.core.method.constants import Constants
     from boxreg_ros.core.registrar import BoxRegistrar, Submit
     from boxreg_ros.io.sweep_store import SweepStore
-    from boxreg_ros.offline.completion import Completion, Moved
+    from boxreg_ros.offline.completion import Arrivals, Completion, Moved
     from boxreg_ros.offline.resume import EstimateJournal
     from boxreg_ros.offline.stored_sweeps import StoredSweeps
     from boxreg_ros.tracks.complete import CompletionPlan
@@ -60,41 +60,27 @@ def relabel(
     """
     Refine all boxes of a recording and write ``boxes.csv``, ``summary.json`` and other files.
 
-    Parameters
-    ----------
-    request : Request
-        Inputs and options.
-    out : Path
-        Result folder. It appears complete or not at all; an earlier result is replaced.
-    progress : Progress, optional
-        Shows the duration of the recording that has been read and its whole duration [s]. Both
-        count once for each time that the recording is read: with completed tracks once more.
-    resume : bool
-        Keep a journal of the run, and go on with that of an interrupted one, see
-        `EstimateJournal`.
+    The folder `out` appears complete or not at all; an earlier result is replaced. `progress`
+    shows the duration of the recording that has been read and its whole duration [s]; both count
+    once for each time that it is read: with completed tracks once more. With `resume` the run
+    keeps a journal, and goes on with that of an interrupted one, see `EstimateJournal`. Returned
+    is the content of ``summary.json``.
 
-    Returns
-    -------
-    summary : Summary
-        The content of ``summary.json``.
-
-    Raises
-    ------
-    RecordingError
-        If the recording lacks something, `out` is not an earlier result, or cannot be written.
-    UnsupportedMessage
-        If none of its clouds, or none of its messages of boxes, can be read.
+    Raises RecordingError if the recording lacks something, or `out` is not an earlier result or
+    cannot be written, and UnsupportedMessage if none of its clouds, or none of its messages of
+    boxes, can be read.
 
     """
     clock = Stopwatch()
     progress = progress or Progress()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
-    corrections = _corrections(request)
+    corrections = Corrections(read_decisions(request.decisions) if request.decisions else ())
     shown = _Passes(progress, 1 + (request.completes or corrections.adds))
     with claimed(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         if request.cloud_copies:
-            _parse_definitions(request)
+            with request.recording():  # both processes need the types of its messages
+                pass
         survey = _survey(request, clock, shown, journal, corrections)
         sweeps = _stored_sweeps(request, out)
         receive = workers.enter_context(
@@ -154,12 +140,6 @@ def relabel(
     return summary
 
 
-def _parse_definitions(request: Request) -> None:
-    """Open the recording once before the process that reads it begins: both need its types."""
-    with request.recording():
-        pass
-
-
 def _stored_sweeps(request: Request, out: Path) -> StoredSweeps | None:
     """Return where the sweeps of a run are stored, on the disk of its results; None if nowhere."""
     if not request.needs_sweeps:
@@ -180,22 +160,20 @@ def _write_points(
     clock: Stopwatch,
 ) -> None:
     """Look for objects without a box, and label the points, by the boxes of all tracks."""
-    from boxreg_ros.offline.point_products import labeller_of, write_point_products
+    from boxreg_ros.offline.point_products import labeller_of, PointProducts
 
     frame = summary.fixed_frame
     tracks = sink.changes.tracks()
     with clock('points'):
         labeller = labeller_of(tracks, sink.array_stamps_ns, registrar, request.config)
     if request.proposals:
-        from boxreg_ros.offline.proposals import write_proposals  # imports parts of SciPy
-
         with clock('proposals'):
             summary.proposals = write_proposals(folder, sweeps, labeller, frame)
     if request.needs_point_labels:
         if request.boxes == NO_TOPIC and not tracks:  # nothing states what is there
             labeller = labeller_of(tracks, (), registrar, request.config)
         with clock('points'):
-            summary.points = write_point_products(folder, request, sweeps, labeller, frame)
+            summary.points = PointProducts(folder, request, sweeps, labeller, frame).write()
 
 
 def _journal(out: Path, fingerprint: str) -> EstimateJournal:
@@ -240,11 +218,6 @@ class _Survey(NamedTuple):
     constants: Constants | None
 
 
-def _corrections(request: Request) -> Corrections:
-    """Return the decisions of a person; none without a file of them."""
-    return Corrections(() if request.decisions is None else read_decisions(request.decisions))
-
-
 def _survey(
     request: Request,
     clock: Stopwatch,
@@ -259,13 +232,7 @@ def _survey(
         receive = workers.enter_context(reader(request))
         from boxreg_ros.core.following.person import numbers
         from boxreg_ros.offline.completion import Completion, first_pass
-        from boxreg_ros.offline.keyframes import (
-            add_objects,
-            arrivals,
-            ends_of,
-            keyframes,
-            stored,
-        )
+        from boxreg_ros.offline.keyframes import add_objects, arrivals, ends_of, keyframes, stored
         from boxreg_ros.tracks.complete import unchanged_plan
 
         recording = ReadAhead(receive)
@@ -330,9 +297,12 @@ def _register(
 ) -> None:
     """Read the recording, register its boxes, with those of the survey, and write them."""
     items = progress.each(recording)
-    completion = None
+    completion, take = None, sink.take
     if survey is not None:
+        from boxreg_ros.offline.completion import with_empty_arrays
+
         completion = survey.completion
+        take = completion.add  # completed tracks wait for the end of the recording
         items = with_empty_arrays(items, survey.parts, recording.source.fixed_frame)
     for item in items:
         with_ticket = sink.expect(item)
@@ -343,17 +313,9 @@ def _register(
                 if sink.points is not None and isinstance(given, BoxArray):
                     sink.points.add(completion.added_boxes(given))
             ready = hand_to_registrar(registrar, moved, item.restarts)
-        _take(ready, completion, sink)
+        take(ready)
     with clock('registrar'):
         ready = registrar.flush()
-    _take(ready, completion, sink)
+    take(ready)
     if completion is not None:
         sink.take(completion.finished())
-
-
-def _take(ready: list[RefinedBoxes], completion: Completion | None, sink: Sink) -> None:
-    """Hand results on; those of completed tracks wait for the end of the recording."""
-    if completion is None:
-        sink.take(ready)
-    else:
-        completion.add(ready)

@@ -44,8 +44,7 @@ class Demands:
     """The options that decide on the exit status of a run that has written its results."""
 
     strict: bool = option(
-        False,
-        'exit with status 1 if a part of the recording could not be read, or has no stamps',
+        False, 'exit with status 1 if a part of the recording could not be read, or has no stamps'
     )
     fail_under: float = option(
         0.0,

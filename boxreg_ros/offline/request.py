@@ -20,7 +20,7 @@ from boxreg_ros.options import option
 from msg_adapters.convention import Convention, STANDARD
 
 if TYPE_CHECKING:
-    from boxreg_ros.datasets import SceneRecording
+    from boxreg_ros.datasets.scene_recording import SceneRecording
     from boxreg_ros.io.recording import Recording
 
 NO_TOPIC = 'none'
@@ -44,12 +44,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """
-    Inputs and options of one relabel run; each command line option is stated by its field.
-
-    Raises ConfigError if an option cannot work, alone or with another one.
-
-    """
+    """Inputs and options of one run, stated by the fields; ConfigError if they cannot work."""
 
     recordings: tuple[Path, ...]  # one drive, merged by time, or a scene of a data set
     lidars: Lidars = SINGLE_LIDAR
@@ -123,9 +118,7 @@ class Request:
     )
     options: Options = field(default_factory=Options)
     label_frame: str | None = option(
-        None,
-        'sensor frame of the label files (default: frame of the clouds)',
-        metavar='FRAME',
+        None, 'sensor frame of the label files (default: frame of the clouds)', metavar='FRAME'
     )
     report: bool = option(
         False, 'also write report.html: every track before and after, to look at in a browser'
@@ -226,16 +219,7 @@ class Request:
         """Return the recording, not yet open."""
         from boxreg_ros.offline.sources import source_of  # imports rosbags
 
-        return source_of(
-            self.recordings,
-            self.lidars,
-            self.boxes,
-            self.odometry,
-            self.start,
-            self.end,
-            self.convention,
-            self.labels,
-        )
+        return source_of(self)
 
     @property
     def box_formats(self) -> tuple[str, ...]:
@@ -326,7 +310,7 @@ class Request:
 
 def _parts_of(path: Path) -> tuple[Path, ...]:
     """Return the files and folders of a path: those of a scene, or the path itself."""
-    from boxreg_ros.datasets import address_of, scene_inputs  # imports rosbags
+    from boxreg_ros.datasets.registry import address_of, scene_inputs  # imports rosbags
 
     address = address_of(path)
     return (path,) if address is None else scene_inputs(address)

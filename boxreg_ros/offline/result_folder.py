@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 import errno
 import hashlib
 import json
@@ -25,8 +25,6 @@ REFUSED_ERRORS = (
 SUMMARY = 'summary.json'
 CONFIG = 'config.yaml'
 INPUT_MODEL = 'input_model.json'
-HASHED_BYTES = 2**18
-"""Part of a file that is read at a time for its SHA-256 [bytes]."""
 FILES = 'files'
 """Field of the summary: size and SHA-256 of each other file, by name."""
 
@@ -41,12 +39,7 @@ def earlier_summary(out: Path) -> dict[str, Any] | None:
 
 
 def whole_summary(out: Path) -> dict[str, Any] | None:
-    """
-    Return the summary of an earlier run; None without one, or if a file is missing or empty.
-
-    Files that someone has changed since count as whole.
-
-    """
+    """Return the summary of an earlier run; None without one, or if a file is missing or empty."""
     summary = earlier_summary(out)
     if summary is None:
         return None
@@ -87,6 +80,14 @@ def spare_file(out: Path, inputs: Iterable[Path]) -> None:
             )
 
 
+def alone(lock: Path, subject: str, seconds: float = 0.0) -> AbstractContextManager[object]:
+    """Keep other runs out by a lock file; object stores have none: a second run goes unnoticed."""
+    if url_of(lock) is not None:
+        return nullcontext()
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    return locked(lock, subject, seconds)
+
+
 @contextmanager
 def claimed(out: Path) -> Iterator[None]:
     """
@@ -116,14 +117,9 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
     """
     Yield a temporary folder that replaces `out` on success and is deleted on failure.
 
-    On success all of it is on the disk itself. The caller has `claimed` the output.
-
-    Raises
-    ------
-    ConfigError
-        If one of `inputs` is in `out`.
-    RecordingError
-        If `out` exists and is not the unchanged result of an earlier run, or cannot be written.
+    On success all of it is on the disk itself. The caller has `claimed` the output. Raises
+    ConfigError if one of `inputs` is in `out`, and RecordingError if that exists and is not the
+    unchanged result of an earlier run, or cannot be written.
 
     """
     if url_of(out) is not None:
@@ -185,7 +181,8 @@ def writing(out: Path) -> Iterator[None]:
 
 def _check_replaceable(out: Path) -> None:
     """Refuse a folder that is not the unchanged result of an earlier run."""
-    if out.exists() and earlier_summary(out) is None and not _is_empty(out):
+    is_empty = out.is_dir() and not any(out.iterdir())
+    if out.exists() and earlier_summary(out) is None and not is_empty:
         raise _other_files(out)
     changed = _changed_since(out)
     if changed is not None:
@@ -226,11 +223,8 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 def _digest(path: Path) -> str:
     """Return the SHA-256 of a file."""
-    digest = hashlib.sha256()
     with path.open('rb', buffering=0) as file:
-        while block := file.read(HASHED_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, 'sha256').hexdigest()
 
 
 def _beside(out: Path, suffix: str) -> Path:
@@ -245,7 +239,3 @@ def _is_near(path: Path, out: Path) -> bool:
         return True
     hidden = str(_beside(whole, ''))
     return str(path.resolve()).startswith(hidden)
-
-
-def _is_empty(folder: Path) -> bool:
-    return folder.is_dir() and not any(folder.iterdir())

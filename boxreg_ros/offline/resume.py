@@ -116,12 +116,7 @@ class EstimateJournal:
 
 
 def journal_path(out: Path) -> Path:
-    """
-    Return the journal of a result folder: beside it, hidden; of a URL, too.
-
-    Raises ConfigError if nothing can be beside it.
-
-    """
+    """Return the hidden journal beside a result folder; of a URL, too."""
     if url_of(out) is None:
         out = out.resolve()
     elif len(out.parts) < 3:  # scheme and bucket

@@ -11,7 +11,6 @@ import sys
 from typing import NoReturn
 
 from boxreg_ros.config import Config
-from boxreg_ros.datasets import SceneRecording
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.files import METADATA
@@ -19,7 +18,7 @@ from boxreg_ros.offline import relabel_command
 from boxreg_ros.offline.arguments import add_options, Settings, values_of, words_of
 from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.offline.result_folder import CONFIG, SUMMARY
-from boxreg_ros.offline.sources import scene_address, source_of
+from boxreg_ros.offline.sources import scene_address
 from boxreg_ros.review.scene import DriveSource
 from boxreg_ros.review.server import add_server_arguments, serve
 from msg_adapters import ADAPTERS
@@ -100,12 +99,7 @@ def _print_progress(outs: Sequence[Path]) -> int:
 
 
 def drive_of(out: Path) -> DriveSource | None:
-    """
-    Return the recording of a result; None for a result that no command has made.
-
-    Raises RecordingError if another version has made it, with options that this one lacks.
-
-    """
+    """Return the recording of a result; None for a result that no command has made."""
     summary = json.loads((out / SUMMARY).read_bytes())
     command, folder = summary.get('command', []), Path(summary.get('folder', '.'))
     if command[:1] != ['relabel']:
@@ -113,26 +107,13 @@ def drive_of(out: Path) -> DriveSource | None:
     parser = _Parser()
     relabel_command.add_arguments(parser)
     args = parser.parse_args([*command[1:], '-o', str(out)])
-    values = values_of(args, Request)
-    paths = [_within(folder, path) for path in args.recordings]
-    labels = values['labels']
-    if labels is not None:
-        labels = labels[0], _within(folder, labels[1])
-
-    def source() -> Recording | SceneRecording:
-        return source_of(
-            paths,
-            values['lidars'],
-            values['boxes'],
-            values['odometry'],
-            values['start'],
-            values['end'],
-            values['convention'],
-            labels,
-        )
-
+    values = values_of(args, Request) | {'report': False}  # to check that imports torch
+    if values['labels'] is not None:
+        name, path = values['labels']
+        values['labels'] = name, _within(folder, path)
+    request = Request(tuple(_within(folder, path) for path in args.recordings), **values)
     config = Config.from_yaml(out / CONFIG)
-    return DriveSource(source, values['convention'], summary['fixed_frame'], config)
+    return DriveSource(request.recording, request.convention, summary['fixed_frame'], config)
 
 
 class _Parser(argparse.ArgumentParser):

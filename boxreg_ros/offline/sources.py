@@ -8,19 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.datasets import Address, address_of, SceneRecording
+from boxreg_ros.datasets.registry import Address, address_of
+from boxreg_ros.datasets.scene_recording import SceneRecording
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.items import EVERYTHING, Item, ItemSource, Wanted
-from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of
 from boxreg_ros.labels.merging import LabelMerger
-from boxreg_ros.offline.request import NO_TOPIC
+from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.structures import BoxArray
-from msg_adapters.convention import Convention, STANDARD
 import numpy as np
 
 
@@ -65,12 +64,7 @@ class UnlabelledRecording(Recording):
 def label_frame_of(
     recording: ItemSource, tree: TransformTree, fixed_frame: str, wish: str | None
 ) -> str:
-    """
-    Return the sensor frame of label files: the frame of the clouds, or `wish`.
-
-    Raises RecordingError if no transforms connect it with the fixed frame.
-
-    """
+    """Return the sensor frame of label files: the frame of the clouds, or `wish`."""
     frame = (wish or recording.sensor_frame()).lstrip('/')
     if not tree.connects(fixed_frame, frame):
         raise RecordingError(
@@ -80,43 +74,25 @@ def label_frame_of(
     return frame
 
 
-def source_of(
-    paths: Sequence[Path],
-    lidars: Lidars = SINGLE_LIDAR,
-    boxes: str | None = None,
-    odometry: str | None = None,
-    start: float | None = None,
-    end: float | None = None,
-    convention: Convention = STANDARD,
-    labels: tuple[str, Path] | None = None,
-) -> Recording | SceneRecording:
-    """
-    Return the recording or the scene of a data set, not yet open; options as of `Recording`.
-
-    With `labels`, a format and a path, the boxes are those of label files. Raises ConfigError if
-    an option does not apply to a scene, or there are several.
-
-    """
-    address = scene_address(paths)
+def source_of(request: Request) -> Recording | SceneRecording:
+    """Return the recording or the scene of a data set that a request names, not yet open."""
+    address = scene_address(request.recordings)
     if address is not None:
-        _check_scene(address, lidars, boxes, odometry, convention)
-        return SceneRecording(address, lidars.topics, start, end, labels)
-    if labels is not None:
-        return LabelledRecording(
-            labels, paths, lidars=lidars, odometry=odometry, start=start, end=end
-        )
-    if boxes == NO_TOPIC:
-        return UnlabelledRecording(paths, lidars=lidars, odometry=odometry, start=start, end=end)
-    return Recording(paths, lidars, boxes, odometry, start, end, convention)
+        _check_scene(address, request)
+        topics = request.lidars.topics
+        return SceneRecording(address, topics, request.start, request.end, request.labels)
+    names = ('lidars', 'odometry', 'start', 'end')
+    options = {name: getattr(request, name) for name in names}
+    if request.labels is not None:
+        return LabelledRecording(request.labels, request.recordings, **options)
+    if request.boxes == NO_TOPIC:
+        return UnlabelledRecording(request.recordings, **options)
+    options |= {'boxes': request.boxes, 'convention': request.convention}
+    return Recording(request.recordings, **options)
 
 
 def scene_address(paths: Sequence[Path]) -> Address | None:
-    """
-    Return the address of a scene among paths; None if all are recordings.
-
-    Raises ConfigError if there are other paths beside it.
-
-    """
+    """Return the address of a scene, which is alone, among paths; None if all are recordings."""
     addresses = [address for address in map(address_of, paths) if address is not None]
     if not addresses:
         return None
@@ -128,20 +104,15 @@ def scene_address(paths: Sequence[Path]) -> Address | None:
     return addresses[0]
 
 
-def _check_scene(
-    address: Address,
-    lidars: Lidars,
-    boxes: str | None,
-    odometry: str | None,
-    convention: Convention,
-) -> None:
+def _check_scene(address: Address, request: Request) -> None:
     """Refuse options of topics."""
+    lidars, convention = request.lidars, request.convention
     if lidars.frames or lidars.info:
         raise ConfigError(
             f'sensor_frames, points_info: expected for recordings with topics only, got {lidars} '
             f'with {address}; leave them out: a data set has the positions of its LiDARs'
         )
-    for name, topic in (('boxes', boxes), ('odometry', odometry)):
+    for name, topic in (('boxes', request.boxes), ('odometry', request.odometry)):
         if topic is not None:
             raise ConfigError(
                 f'{name}: expected for recordings with topics only, got {topic!r} with {address}; '
@@ -155,12 +126,7 @@ def _check_scene(
 
 
 def true_boxes(path: Path) -> BoxTable:
-    """
-    Return true boxes: of a table, or the annotations of a scene of a data set.
-
-    Raises RecordingError if they cannot be read.
-
-    """
+    """Return true boxes: of a table, or the annotations of a scene of a data set."""
     address = address_of(path)
     if address is None:
         return BoxTable.read(path)

@@ -6,7 +6,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import replace
 from difflib import get_close_matches
 import os
 from pathlib import Path
@@ -18,14 +17,7 @@ import time
 from typing import Any, IO
 
 from boxreg_ros.errors import BoxregError, ConfigError, RecordingError
-from boxreg_ros.io.label_feed import (
-    FinalBoxes,
-    LabelCloud,
-    RecorderSettings,
-    RecorderStatus,
-    segment_limit,
-    Split,
-)
+from boxreg_ros.io import label_feed
 from boxreg_ros.io.transforms import TIME_JUMP
 from boxreg_ros.io.whole_files import DISK_ERRORS
 from boxreg_ros.labels import FORMATS, import_format, LabelFrame, module_of
@@ -65,9 +57,9 @@ class Recorder:
 
     """
 
-    def __init__(self, settings: RecorderSettings) -> None:
+    def __init__(self, settings: label_feed.RecorderSettings) -> None:
         self._folder = Path(settings.folder)
-        self._limit, self._limits_bytes = segment_limit(settings.segment)
+        self._limit, self._limits_bytes = label_feed.segment_limit(settings.segment)
         check_formats(settings)
         self._settings = journal_settings(settings)
         cut_off = open_segments(self._folder)  # before one is opened here
@@ -85,11 +77,11 @@ class Recorder:
 
     def take(self, item: Any) -> None:
         """Write an item that the node has sent."""
-        if isinstance(item, LabelCloud):
+        if isinstance(item, label_feed.LabelCloud):
             self._add_cloud(item)
-        elif isinstance(item, FinalBoxes):
+        elif isinstance(item, label_feed.FinalBoxes):
             self._write(item)
-        elif isinstance(item, Split):
+        elif isinstance(item, label_feed.Split):
             self._end_segment()
 
     def finish(self) -> None:
@@ -110,13 +102,8 @@ class Recorder:
             self._segment.abandon()
         delete_remains(self._folder)
 
-    def status(self) -> RecorderStatus:
-        """
-        Return the present state; store the open segment, and end one that is long enough.
-
-        Raises RecordingError if the folder was deleted.
-
-        """
+    def status(self) -> label_feed.RecorderStatus:
+        """Return the present state; store the open segment, and end one that is long enough."""
         self._collect()
         segment = self._segment
         if segment is not None:
@@ -128,26 +115,21 @@ class Recorder:
         if segment is not None and self._limits_bytes and open_bytes >= self._limit:
             self._end_segment()
         left_out = 0 if segment is None else segment.files.left_out
-        return replace(
-            self._counted(),
+        counts: dict[str, Any] = dict(self._written)
+        counts |= {'size': size, 'left_out': self._written['left_out'] + left_out}
+        return label_feed.RecorderStatus(
+            **counts,
             segment='' if segment is None else segment.name,
-            size=size,
             rate=self._growth.rate(size),
             free=shutil.disk_usage(self._folder).free,
-            left_out=self._written['left_out'] + left_out,
         )
 
-    def _counted(self) -> RecorderStatus:
-        """Return a status with the counters only."""
-        counts: dict[str, Any] = dict(self._written)
-        return RecorderStatus(**counts)
-
-    def _add_cloud(self, cloud: LabelCloud) -> None:
+    def _add_cloud(self, cloud: label_feed.LabelCloud) -> None:
         if self._spool is not None:
             self._spool.delete_before(cloud.needed_from_ns)
             self._spool.add(cloud.sweep, cloud.T_fixed_sweep, cloud.intensities)
 
-    def _write(self, final: FinalBoxes) -> None:
+    def _write(self, final: label_feed.FinalBoxes) -> None:
         """Write final boxes to the open segment, or to a new one where that is at its end."""
         frame = LabelFrame(
             final.refined, final.fixed_frame, final.sensor_frame, final.T_fixed_sensor,
@@ -222,7 +204,7 @@ class Growth:
         return max(after - before, 0) / (now - since) if now > since else 0.0
 
 
-def check_formats(settings: RecorderSettings) -> None:
+def check_formats(settings: label_feed.RecorderSettings) -> None:
     """Raise ConfigError for formats that lack a package, an option or a recording."""
     check_each(settings.formats, settings.camera)
     for name in settings.formats:
@@ -272,14 +254,9 @@ def options_of(name: str) -> tuple[str, ...]:
     return module_of(name).FORMAT.options
 
 
-def serve(source: IO[bytes], report: Callable[[RecorderStatus], None]) -> None:
-    """
-    Record what arrives on `source`, until its end.
-
-    Raises BoxregError if nothing can be written, or not any more.
-
-    """
-    settings: RecorderSettings = pickle.load(source)
+def serve(source: IO[bytes], report: Callable[[label_feed.RecorderStatus], None]) -> None:
+    """Record what arrives on `source`, until its end or the first error."""
+    settings: label_feed.RecorderSettings = pickle.load(source)
     folder = Path(settings.folder)
     recorder: Recorder | None = None
     try:
@@ -299,7 +276,7 @@ def serve(source: IO[bytes], report: Callable[[RecorderStatus], None]) -> None:
 
 
 def _record(
-    recorder: Recorder, source: IO[bytes], report: Callable[[RecorderStatus], None]
+    recorder: Recorder, source: IO[bytes], report: Callable[[label_feed.RecorderStatus], None]
 ) -> None:
     """Hand items on until the end of the input; report once per `STATUS_PERIOD`."""
     due = time.monotonic() + STATUS_PERIOD
@@ -363,7 +340,7 @@ def main() -> int:
     try:
         serve(sys.stdin.buffer, _print)
     except BoxregError as error:
-        _print(RecorderStatus(error=' '.join(str(error).split())))
+        _print(label_feed.RecorderStatus(error=' '.join(str(error).split())))
         os._exit(1)  # the files that cannot be written would raise again when they are closed
     return 0
 
@@ -378,7 +355,7 @@ def _check(camera: str, *formats: str) -> int:
     return 0
 
 
-def _print(status: RecorderStatus) -> None:
+def _print(status: label_feed.RecorderStatus) -> None:
     """Write a line of status; the node may have been killed."""
     with suppress(BrokenPipeError):
         sys.stdout.write(status.line())

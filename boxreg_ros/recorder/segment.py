@@ -11,7 +11,6 @@ import re
 import shutil
 from typing import NamedTuple
 
-from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.journal import Journal
 from boxreg_ros.io.label_feed import RecorderSettings
@@ -158,14 +157,8 @@ def journal_settings(settings: RecorderSettings) -> dict[str, str]:
         'with_points': str(settings.with_points).lower(),
         'camera': settings.camera,
         'config_hash': Provenance.of((), settings.config).config_hash,
-        'config': config_text(settings.config),
+        'config': yaml.safe_dump(asdict(settings.config), sort_keys=False),
     }
-
-
-def config_text(config: Config) -> str:
-    """Return settings as YAML."""
-    text: str = yaml.safe_dump(asdict(config), sort_keys=False)
-    return text
 
 
 def open_segments(folder: Path) -> list[Path]:

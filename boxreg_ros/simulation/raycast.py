@@ -117,12 +117,7 @@ def box_planes(extent: Floats) -> Floats:
 
 
 def body(shape: str, extent: Floats) -> list[Floats]:
-    """
-    Return the convex parts of a body that fills a box of `extent` (3,) [m].
-
-    Each has half-spaces n.x <= d in the box frame, (P, 4), rows n and d.
-
-    """
+    """Return the parts of a body of an `extent` (3,): half-spaces n.x <= d as rows (P, 4) [m]."""
     length, width, height = extent
     scales = {(0, 2): (length, height), (0, 1): (length, width), (1, 2): (width, height)}
     parts = []

@@ -41,6 +41,7 @@ INTEGRATION_STEP = 0.01  # of a motion [s]
 
 STREET_SWEEPS = 50
 SENSOR_HEIGHT = 1.8  # in the street [m]
+STREET_SENSOR = Sensor(np.radians(np.linspace(-22, 3, 34)), columns=640)
 PITCH_AMPLITUDE = 0.006  # of the vehicle that carries the sensor [rad]
 
 HIGHWAY_SWEEPS = 40
@@ -127,8 +128,7 @@ def _along_the_street(
     ego = drive(count * SWEEP_PERIOD, (4, -1.75, 0), constant(6), zero)
     ego.poses[:, 2] = SENSOR_HEIGHT
     ego.poses[:, 4] = PITCH_AMPLITUDE * np.sin(2 * ego.times)
-    sensor = Sensor(np.radians(np.linspace(-22, 3, 34)), columns=640)
-    return _scan(actors, ego, sensor, count, rng)
+    return _with_detections(actors, _scanned(actors, ego, STREET_SENSOR, count, rng), rng)
 
 
 def street_actors(rng: np.random.Generator, count: int) -> list[Actor]:
@@ -178,8 +178,8 @@ def highway(
         actors.append(_actor(str(i + 1), plan, count, rng))
     ego = drive(count * SWEEP_PERIOD, (0, 0, 0), constant(speed), zero)
     ego.poses[:, 2] = SENSOR_HEIGHT
-    sensor = Sensor(np.radians(np.linspace(-22, 3, 34)), columns=640)
-    return _scan(actors, ego, replace(sensor, stamp_at=1.0), count, rng, at_sight)
+    sensor = replace(STREET_SENSOR, stamp_at=1.0)
+    return _with_detections(actors, _scanned(actors, ego, sensor, count, rng, at_sight), rng)
 
 
 CURVES = (
@@ -220,9 +220,8 @@ def articulated(rng: np.random.Generator, sweeps: int | None, is_joined: bool) -
     trailers = [_trailer(f'{tractor.track_id}b', tractor, rng) for tractor in tractors]
     ego = drive(count * SWEEP_PERIOD, (0, -1.75, 0), constant(3), zero)
     ego.poses[:, 2] = SENSOR_HEIGHT
-    sensor = Sensor(np.radians(np.linspace(-22, 3, 34)), columns=640)
     parts = (*cars, *tractors, *trailers)
-    scan = _scanned(parts, ego, sensor, count, rng)
+    scan = _scanned(parts, ego, STREET_SENSOR, count, rng)
     if is_joined:
         scan = _joined(scan, len(cars), len(tractors))
     return _with_detections(parts[: len(scan.true_boxes)], scan, rng)
@@ -335,19 +334,6 @@ def drive(
     return Motion(times, np.stack([center[:, 0], center[:, 1], flat, flat, flat, yaw], axis=1))
 
 
-def _scan(
-    actors: Sequence[Actor],
-    ego: Motion,
-    sensor: Sensor,
-    count: int,
-    rng: np.random.Generator,
-    at_sight: bool = False,
-) -> SimulatedScene:
-    """Return the scene of `count` revolutions of a sensor on `ego`; `at_sight` as of `highway`."""
-    scan = _scanned(actors, ego, sensor, count, rng, at_sight)
-    return _with_detections(actors, scan, rng)
-
-
 def _with_detections(
     actors: Sequence[Actor], scan: Scan, rng: np.random.Generator
 ) -> SimulatedScene:
@@ -366,7 +352,7 @@ def _scanned(
     rng: np.random.Generator,
     at_sight: bool = False,
 ) -> Scan:
-    """Return what `count` revolutions of a sensor on `ego` see."""
+    """Return what `count` revolutions of a sensor on `ego` see; `at_sight` as of `highway`."""
     parts = [body(actor.shape, actor.extent) for actor in actors]
     stamps = np.arange(count) * SWEEP_PERIOD
     T_fixed_sensor = to_matrix(ego.at(stamps))

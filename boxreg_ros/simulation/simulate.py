@@ -30,21 +30,9 @@ BREAK_STREAM = 1
 
 def simulate(scenario: str = 'street', seed: int = 0, sweeps: int | None = None) -> SimulatedScene:
     """
-    Return a scene that depends on its arguments only.
+    Return a scene that depends on its arguments only: one sweep every 0.1 s.
 
-    Parameters
-    ----------
-    scenario : str
-        One of `SCENARIOS`.
-    seed : int
-        Of every random choice.
-    sweeps : int, optional
-        Number of sweeps, one every 0.1 s; by default that of the scenario.
-
-    Raises
-    ------
-    ConfigError
-        For an unknown scenario, fewer than one sweep, or a seed below 0.
+    Raises ConfigError for an unknown scenario, fewer than one sweep, or a seed below 0.
 
     """
     if scenario not in SCENARIOS:
@@ -102,13 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """
-    Write a recording and its truth, and print a summary.
-
-    Raises ConfigError if an option is out of range, or both files are the same, and
-    RecordingError if the recording cannot be written.
-
-    """
+    """Write a recording and its truth, and print a summary."""
     truth = args.truth or args.output.with_name(f'{args.output.stem}_truth.csv')
     if truth.resolve() == args.output.resolve():
         raise ConfigError(

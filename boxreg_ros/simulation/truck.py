@@ -17,28 +17,8 @@ from typing import Any, NamedTuple
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.lidars import merged
 from boxreg_ros.io.transforms import inverse, sweep_to_frame
+from boxreg_ros.simulation import raycast, scenarios
 from boxreg_ros.simulation.noise import detector_noise
-from boxreg_ros.simulation.raycast import (
-    Actor,
-    body,
-    Motion,
-    revolution,
-    ROAD,
-    Sensor,
-    SWEEP_PERIOD,
-    to_matrix,
-)
-from boxreg_ros.simulation.scenarios import (
-    constant,
-    drive,
-    EXTENTS,
-    MISS_PROBABILITY,
-    PITCH_AMPLITUDE,
-    ROAD_MARGIN,
-    street_actors,
-    STREET_SWEEPS,
-    zero,
-)
 from boxreg_ros.simulation.scene import (
     boxes_of,
     FIXED_FRAME,
@@ -61,9 +41,8 @@ ROOF_LIDAR = {'lidar_roof': (3.0, 0.0, 3.5)}
 ROOF_STREAM = 2
 """Random stream of the LiDAR on the roof, so that the others do not depend on it."""
 TRUCK_SENSORS = ('corners', 'concatenated', 'concatenated-alone', 'roof')
-"""
-What is recorded: a topic per corner, one concatenated cloud with or without info, or the roof.
-"""
+"""What is recorded: a topic per corner, one concatenated cloud with or without info, or the
+roof."""
 
 
 class TruckScene(NamedTuple):
@@ -72,17 +51,19 @@ class TruckScene(NamedTuple):
     clouds: dict[str, tuple[Sweep, ...]]  # n of each LiDAR, in its frame and at its stamps
     detections: tuple[BoxArray, ...]  # n noisy ones in frame ``base``
     truth: BoxTable  # in frame ``odom``
-    ego: Motion  # of the frame ``base`` in ``odom``
+    ego: raycast.Motion  # of the frame ``base`` in ``odom``
 
 
 def truck_scene(seed: int, sweeps: int | None = None) -> TruckScene:
     """Return the drive of a seed, by default of as many sweeps as the street."""
-    count = sweeps or STREET_SWEEPS
+    count = sweeps or scenarios.STREET_SWEEPS
     rng = np.random.default_rng(seed)
-    actors = street_actors(rng, count)
-    ego = drive(count * SWEEP_PERIOD, (0, -1.75, 0), constant(6), zero)
-    ego.poses[:, 4] = PITCH_AMPLITUDE * np.sin(2 * ego.times)
-    stamps = np.arange(count) * SWEEP_PERIOD
+    actors = scenarios.street_actors(rng, count)
+    ego = scenarios.drive(
+        count * raycast.SWEEP_PERIOD, (0, -1.75, 0), scenarios.constant(6), scenarios.zero
+    )
+    ego.poses[:, 4] = scenarios.PITCH_AMPLITUDE * np.sin(2 * ego.times)
+    stamps = np.arange(count) * raycast.SWEEP_PERIOD
     # (actors, sweeps, 9)
     true_boxes = np.stack([boxes_of(actor, actor.motion.at(stamps)) for actor in actors])
     clouds, owners = _scanned(CORNER_LIDARS, actors, ego, true_boxes, rng)
@@ -90,8 +71,8 @@ def truck_scene(seed: int, sweeps: int | None = None) -> TruckScene:
     roof, _ = _scanned(ROOF_LIDAR, actors, ego, true_boxes, roof_rng)
     whole = [merged(_in_base(parts, ego)) for parts in zip(*clouds.values(), strict=True)]
     scene = make_scene(
-        actors, true_boxes, whole, owners, to_matrix(ego.at(stamps)), detector_noise,
-        MISS_PROBABILITY, rng,
+        actors, true_boxes, whole, owners, raycast.to_matrix(ego.at(stamps)), detector_noise,
+        scenarios.MISS_PROBABILITY, rng,
     )  # fmt: skip
     return TruckScene(clouds | roof, scene.detections, scene.truth, ego)
 
@@ -127,28 +108,30 @@ def _messages(scene: TruckScene, layout: str) -> Iterator[tuple[str, Any, int]]:
 
 def _scanned(
     mounts: dict[str, tuple[float, float, float]],
-    actors: Sequence[Actor],
-    ego: Motion,
+    actors: Sequence[raycast.Actor],
+    ego: raycast.Motion,
     true_boxes: Floats,
     rng: np.random.Generator,
 ) -> tuple[dict[str, tuple[Sweep, ...]], list[Ints]]:
     """Return the clouds of each LiDAR, and the owners of the points of all, per sweep."""
     truck = _truck(ego)
-    parts = [body(actor.shape, actor.extent) for actor in (*actors, truck)]
-    sensor = Sensor(np.radians(np.linspace(-22, 8, 34)), columns=640)
+    parts = [raycast.body(actor.shape, actor.extent) for actor in (*actors, truck)]
+    sensor = raycast.Sensor(np.radians(np.linspace(-22, 8, 34)), columns=640)
     clouds: dict[str, list[Sweep]] = {name: [] for name in mounts}
     owners = []
     for i in range(true_boxes.shape[1]):
         found = []
         for k, (name, at) in enumerate(mounts.items()):
-            stamp = i * SWEEP_PERIOD + k * SWEEP_PERIOD / len(CORNER_LIDARS)
+            stamp = i * raycast.SWEEP_PERIOD + k * raycast.SWEEP_PERIOD / len(CORNER_LIDARS)
             motion = _mounted(ego, at)
-            points, times, owner = revolution([*actors, truck], parts, motion, sensor, stamp, rng)
-            kept = owner != ROAD
+            points, times, owner = raycast.revolution(
+                [*actors, truck], parts, motion, sensor, stamp, rng
+            )
+            kept = owner != raycast.ROAD
             for box in true_boxes[:, i]:
-                kept |= is_near(points, box, ROAD_MARGIN)
+                kept |= is_near(points, box, scenarios.ROAD_MARGIN)
             kept &= owner != len(actors)  # the truck itself
-            T = to_matrix(motion.at(np.array([stamp])))[0]
+            T = raycast.to_matrix(motion.at(np.array([stamp])))[0]
             sweep = make_sweep(stamp, points[kept], times[kept], T)
             clouds[name].append(replace(sweep, frame_id=name))
             found.append(owner[kept])
@@ -156,17 +139,17 @@ def _scanned(
     return {name: tuple(sweeps) for name, sweeps in clouds.items()}, owners
 
 
-def _truck(ego: Motion) -> Actor:
+def _truck(ego: raycast.Motion) -> raycast.Actor:
     """Return the body of the truck, which blocks the view of its LiDARs."""
-    extent = np.array(EXTENTS['truck'])
+    extent = np.array(scenarios.EXTENTS['truck'])
     poses = ego.poses + np.eye(6)[2] * extent[2] / 2
-    return Actor('', 'truck', 'truck', extent, Motion(ego.times, poses))
+    return raycast.Actor('', 'truck', 'truck', extent, raycast.Motion(ego.times, poses))
 
 
-def _mounted(ego: Motion, at: tuple[float, float, float]) -> Motion:
+def _mounted(ego: raycast.Motion, at: tuple[float, float, float]) -> raycast.Motion:
     """Return the motion of a LiDAR at a place on the truck."""
-    T = to_matrix(ego.poses) @ _translation(at)
-    return Motion(ego.times, np.hstack([T[:, :3, 3], ego.poses[:, 3:]]))
+    T = raycast.to_matrix(ego.poses) @ _translation(at)
+    return raycast.Motion(ego.times, np.hstack([T[:, :3, 3], ego.poses[:, 3:]]))
 
 
 def _translation(at: tuple[float, float, float]) -> Floats:
@@ -175,13 +158,13 @@ def _translation(at: tuple[float, float, float]) -> Floats:
     return T
 
 
-def _base_at(ego: Motion, stamp_ns: int) -> Floats:
+def _base_at(ego: raycast.Motion, stamp_ns: int) -> Floats:
     """Return T_odom_base (4, 4) at a stamp."""
-    T: Floats = to_matrix(ego.at(np.array([(stamp_ns - START_NS) * 1e-9])))[0]
+    T: Floats = raycast.to_matrix(ego.at(np.array([(stamp_ns - START_NS) * 1e-9])))[0]
     return T
 
 
-def _in_base(clouds: Sequence[Sweep], ego: Motion) -> list[Sweep]:
+def _in_base(clouds: Sequence[Sweep], ego: raycast.Motion) -> list[Sweep]:
     """Return clouds in the frame base at the stamp of the first, each with its own stamp."""
     T_base_fixed = inverse(_base_at(ego, clouds[0].stamp_ns))
     every = CORNER_LIDARS | ROOF_LIDAR
@@ -193,7 +176,7 @@ def _in_base(clouds: Sequence[Sweep], ego: Motion) -> list[Sweep]:
     return moved
 
 
-def _concatenated(clouds: Sequence[Sweep], ego: Motion) -> Sweep:
+def _concatenated(clouds: Sequence[Sweep], ego: raycast.Motion) -> Sweep:
     """Return one cloud in the frame base; its times are relative to the stamp of each LiDAR."""
     parts = _in_base(clouds, ego)
     times = [np.zeros(0) if part.times is None else part.times for part in parts]

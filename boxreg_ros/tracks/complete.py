@@ -205,16 +205,8 @@ def complete(
     """
     Plan the completed tracks of a recording: the boxes to register in the second pass.
 
-    Parameters
-    ----------
-    given, results : sequences of BoxArray and RefinedBoxes
-        The input boxes and their registration, in the same order.
-    num_points : sequence of arrays, shape (n,)
-        Points above the road in each input box.
-    fixed_frame : str
-        Arrays in another frame stay as they are.
-    config : Config
-        The steps that are on, and their settings.
+    `results` are the registration of the boxes `given`, `num_points` (n,) the points above the
+    road in each; arrays outside of the fixed frame stay as they are.
 
     """
     steps = config.complete
@@ -380,11 +372,11 @@ def _finished(
     covariances = completed(registered.covariances, np.eye(6))
     boxes = completed(registered.boxes.boxes, given.boxes)
     for i, row in enumerate(rows):
-        if array.added[kept[i]].status == HUMAN:
-            boxes[n + i] = array.added[kept[i]].box
-        covariances[n + i] = _covariance_of_added(
-            array.added[kept[i]], registered, row, int(num_points[row])
-        )
+        added = array.added[kept[i]]
+        if added.status == HUMAN:
+            boxes[n + i] = added.box
+        if not num_points[row] or registered.status[row] == KEPT:
+            covariances[n + i] = added.covariance  # of the motion model
     status = [REJECTED] * n
     reasons = [array.rejected.get(row, '') for row in range(n)]
     for i, row in enumerate(taken):
@@ -408,12 +400,3 @@ def _finished(
         completed(registered.face_distances, np.zeros(6)),
         completed(registered.near_points, np.zeros(2, np.int64)),
     )
-
-
-def _covariance_of_added(
-    added: AddedBox, registered: RefinedBoxes, row: int, num_points: int
-) -> Floats:
-    """Return that of the registration, or of the motion model where no points were registered."""
-    if num_points and registered.status[row] != KEPT:
-        return np.asarray(registered.covariances[row])
-    return added.covariance

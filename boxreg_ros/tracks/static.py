@@ -32,7 +32,8 @@ def join_static(tracklets: list[Tracklet], config: Config) -> list[Tracklet]:
             if tracklets[i].last_ns < tracklets[j].first_ns
             and i not in used
             and tracklets[i].model(config) is tracklets[j].model(config)
-            and _is_same_place(places[i], places[j])
+            # A wrong height is no other place, but a pedestrian is no car.
+            and iou_bev(places[i][None], places[j][None])[0] >= SAME_PLACE
         ]
         if not earlier:
             continue
@@ -41,11 +42,6 @@ def join_static(tracklets: list[Tracklet], config: Config) -> list[Tracklet]:
             pairs.append((i, j))
             used.add(i)
     return join_links(tracklets, pairs)
-
-
-def _is_same_place(first: Floats, second: Floats) -> bool:
-    # A wrong height is no other place, but a pedestrian is no car.
-    return bool(iou_bev(first[None], second[None])[0] >= SAME_PLACE)
 
 
 def _is_occupied(place: Floats, after_ns: int, before_ns: int, tracklets: list[Tracklet]) -> bool:

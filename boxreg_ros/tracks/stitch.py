@@ -21,12 +21,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 AMBIGUITY = 6.0
-"""
-Least difference of cost to the next best choice.
-
-Derived: costs are -2 ln of a likelihood, so 6 is a likelihood ratio of 20.
-
-"""
+"""Least difference of cost to the next best choice. Derived: costs are -2 ln of a likelihood, so 6
+is a likelihood ratio of 20."""
 
 
 class Links(NamedTuple):

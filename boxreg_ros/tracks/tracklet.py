@@ -28,12 +28,8 @@ from boxreg_ros.structures import (
 import numpy as np
 
 SWITCH_SPEED = 10.0
-"""
-Deviation from constant velocity beyond half a length that is another object [m/s].
-
-Derived: as in the registrar, no road user changes its velocity by 10 m/s within two boxes.
-
-"""
+"""Deviation from constant velocity beyond half a length that is another object [m/s]. Derived: as
+in the registrar, no road user changes its velocity by 10 m/s within two boxes."""
 UNKNOWN_SPEED = 40.0
 """Greatest speed of an object of which only one box is known [m/s]; chosen: a motorway."""
 
@@ -97,10 +93,7 @@ def joined_tracklets(tracklets: Sequence[Tracklet]) -> Tracklet:
 
 
 def tracklets_of(
-    results: Sequence[RefinedBoxes],
-    num_points: Sequence[Ints],
-    fixed_frame: str,
-    config: Config,
+    results: Sequence[RefinedBoxes], num_points: Sequence[Ints], fixed_frame: str, config: Config
 ) -> list[Tracklet]:
     """
     Return the boxes of a recording, as its results have them, as tracklets in one frame.
@@ -247,7 +240,10 @@ def between(before: EndMotion, after: EndMotion, stamps_ns: Ints) -> Floats:
     s = ((stamps_ns - before.stamp_ns) / duration_ns)[:, None]
     seconds = duration_ns * 1e-9
     chord = (after.box - before.box)[BOX_CENTER] / seconds
-    ends = [_velocity_or(motion, chord) * seconds for motion in (before, after)]
+    ends = [
+        (chord if one.speed_variance >= UNKNOWN_SPEED_DEVIATION**2 else one.velocity) * seconds
+        for one in (before, after)
+    ]  # that of the chord where only one box is known
     boxes = (1 - s) * before.box + s * after.box
     boxes[:, BOX_CENTER] = (
         (1 + 2 * s) * (1 - s) ** 2 * before.box[BOX_CENTER]
@@ -260,11 +256,6 @@ def between(before: EndMotion, after: EndMotion, stamps_ns: Ints) -> Floats:
     for angle in (ROLL, PITCH):
         boxes[:, angle] = before.box[angle]
     return np.asarray(boxes)
-
-
-def _velocity_or(motion: EndMotion, chord: Floats) -> Floats:
-    """Return the velocity at an end; that of the chord where only one box is known."""
-    return chord if motion.speed_variance >= UNKNOWN_SPEED_DEVIATION**2 else motion.velocity
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from boxreg_ros.bench.accuracy import GROUPINGS
 from boxreg_ros.bench.methods import METHODS, run_methods
 from boxreg_ros.bench.paper import ERROR_COLUMNS, error_row
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.offline.box_scores import evaluate, match
+from boxreg_ros.offline.box_scores import match, summarise
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.simulate import simulate
 import numpy as np
@@ -71,7 +71,7 @@ def test_all_methods_return_every_input_box(monkeypatch):
     count = sum(len(array.track_ids) for array in scene.detections)
     for name, boxes in methods.items():
         assert len(boxes.boxes) == count, name
-        assert evaluate(boxes, drive.truth).unmatched == 0
+        assert summarise(match(boxes, drive.truth)).unmatched == 0
     distances = drive.ranges(np.arange(len(drive.truth.boxes)))
     assert 2 < distances.min() < distances.max() < 75
 

@@ -2,8 +2,7 @@
 
 from dataclasses import replace
 
-from boxreg_ros.bench.accuracy import scopes_of
-from boxreg_ros.bench.differences import clustered_error, differences, PairedBoxes
+from boxreg_ros.bench.accuracy import clustered_error, differences, PairedBoxes, scopes_of
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import match
 import numpy as np

@@ -6,7 +6,8 @@ import shutil
 from typing import NamedTuple
 
 from boxreg_ros.cli import main
-from boxreg_ros.datasets import address_of, SceneRecording
+from boxreg_ros.datasets.registry import address_of
+from boxreg_ros.datasets.scene_recording import SceneRecording
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.items import EVERYTHING, ItemSource, Wanted
 from boxreg_ros.io.transforms import move_to_frame, TransformTree

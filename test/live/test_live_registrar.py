@@ -28,22 +28,22 @@ class Live(LiveRegistrar):
             lambda *report: self.reports.append(report), convention, lidars,
         )  # fmt: skip
         self.adapter = adapter_for(DETECTIONS, convention)
-        self.cloud_frame = 'lidar'
+        self.session.sensor_frame = 'lidar'
 
     def feed(self, drive, now=0.0):
         """Process all messages of a drive, each when it is ready; return the output."""
         out = []
         for topic, _, message in drive.items:
             if topic in ('/tf', '/tf_static'):
-                self.tree.add_transforms(message.transforms, topic == '/tf_static')
+                self.session.tree.add_transforms(message.transforms, topic == '/tf_static')
             elif topic == '/odom':
-                self.tree.add_odometry(message)
+                self.session.tree.add_odometry(message)
             else:
                 item = received(topic, message, now, self.adapter)
                 confirmed, ready = self.confirm(item)
                 out += ready
                 for each in confirmed:
-                    assert self.is_ready(each, now + 0.5) or not self.fixed_frame
+                    assert self.is_ready(each, now + 0.5) or not self.session.fixed_frame
                     out += self.process(each)
         return out
 
@@ -62,7 +62,7 @@ def test_each_message_is_published_early_and_final_in_its_input_frame():
     drive = Drive(sweeps=6)
     live = Live()
     out = live.feed(drive) + live.flush()
-    assert live.fixed_frame == 'odom'
+    assert live.session.fixed_frame == 'odom'
     for is_final in (False, True):
         messages = [item.message for item in out if item.is_final == is_final]
         arrays = [vision.from_msg(message) for message in messages]
@@ -136,7 +136,7 @@ def test_a_missed_detection_is_published_behind_the_boxes_of_its_message(type_na
         assert np.abs(array.boxes[1, :3] - drive.truth[array.stamp_ns][0, :3]).max() < 0.3
     others = [item for item in out if item.refined.boxes.stamp_ns != array.stamp_ns]
     assert not any(COASTED in item.refined.status for item in others)
-    assert live.counts[COASTED] == 1
+    assert live.registrar.counts[COASTED] == 1
     assert not live.reports
 
 
@@ -193,13 +193,13 @@ def test_messages_wait_for_their_transforms_until_the_timeout():
     live = Live(timeout=1.0)
     static, *moving = [m for t, _, m in drive.items if t.startswith('/tf')]
     clouds = [received('/points', m, 10.0) for m in items_of(drive, '/points')]
-    live.tree.add_transforms(static.transforms, is_static=True)
+    live.session.tree.add_transforms(static.transforms, is_static=True)
     assert not live.is_ready(clouds[0], 10.0)
-    live.tree.add_transforms(moving[0].transforms)
-    live.tree.add_transforms(moving[1].transforms)
+    live.session.tree.add_transforms(moving[0].transforms)
+    live.session.tree.add_transforms(moving[1].transforms)
     assert not live.is_ready(clouds[1], 10.1)  # the fixed frame is chosen after 0.5 s
     assert live.is_ready(clouds[1], 10.5)
-    assert live.fixed_frame == 'odom'
+    assert live.session.fixed_frame == 'odom'
     assert not live.is_ready(clouds[2], 10.5)
     assert live.is_ready(clouds[2], 11.0)  # timeout: extrapolated by 0.1 s
     assert live.process(clouds[2]) == []
@@ -267,7 +267,7 @@ def test_empty_arrays_without_stamp_cause_no_wait_and_no_report():
 def test_boxes_before_the_first_cloud_are_reported():
     drive = Drive(sweeps=1)
     live = Live()
-    live.cloud_frame = ''
+    live.session.sensor_frame = ''
     out = live.process(received('/boxes', items_of(drive, '/boxes')[0]))
     assert len(out) == 2
     assert 'no point cloud' in live.reports[0][1]
@@ -357,7 +357,7 @@ def test_tracks_restart_after_a_gap():
     out = live.feed(moved(Drive(sweeps=6), 20)) + live.flush()
     assert sum(item.is_final for item in out) == 8  # six, and two held for the lag
     assert not live.reports
-    assert live.counts['short_track'] == 0
+    assert live.registrar.counts['short_track'] == 0
 
 
 def test_a_pause_of_playback_does_not_change_later_boxes():
@@ -447,11 +447,11 @@ def test_boxes_may_be_received_late_and_out_of_order(delay, shuffle):
     out = live.feed(drive) + live.flush()
     finals = [item for item in out if item.is_final]
     assert sorted(vision.from_msg(item.message).stamp_ns for item in finals) == drive.stamps
-    late = live.counts['late']
+    late = live.registrar.counts['late']
     assert (late > 0) == bool(shuffle)
-    assert live.counts['refined'] + live.counts['kept'] == 40
-    assert live.counts['kept'] == late + live.counts['short_track']
-    assert live.counts['no_sweep'] == 0
+    assert live.registrar.counts['refined'] + live.registrar.counts['kept'] == 40
+    assert live.registrar.counts['kept'] == late + live.registrar.counts['short_track']
+    assert live.registrar.counts['no_sweep'] == 0
 
 
 def test_each_of_two_messages_with_one_stamp_is_published():
@@ -462,7 +462,7 @@ def test_each_of_two_messages_with_one_stamp_is_published():
     out = live.feed(drive) + live.flush()
     for is_final in (False, True):
         assert sum(item.is_final == is_final for item in out) == 4
-    assert live.counts['duplicate_stamp'] == 2
+    assert live.registrar.counts['duplicate_stamp'] == 2
 
 
 @pytest.mark.parametrize('yaw', [0.0, 0.7, 2.5])
@@ -491,7 +491,7 @@ def test_a_lidar_that_tf_does_not_know_holds_back_the_others_only_once():
     out, not_ready = [], 0
     for topic, stamp, message in drive.items:
         if topic in ('/tf', '/tf_static'):
-            live.tree.add_transforms(message.transforms, topic == '/tf_static')
+            live.session.tree.add_transforms(message.transforms, topic == '/tf_static')
             continue
         now = (stamp - drive.stamps[0]) / SECOND
         content = (
@@ -500,7 +500,7 @@ def test_a_lidar_that_tf_does_not_know_holds_back_the_others_only_once():
             else live.placement.sweep_of(message, topic)
         )
         item = Item(round(now * 1e9), content, message=message)
-        not_ready += bool(live.fixed_frame) and not live.is_ready(item, now + 0.5)
+        not_ready += bool(live.session.fixed_frame) and not live.is_ready(item, now + 0.5)
         out += live.process(item)
     out += live.flush()
     finals = [item for item in out if item.is_final]
@@ -517,7 +517,7 @@ def test_a_concatenated_cloud_waits_for_its_info_while_there_are_infos():
     live = Live('odom', lidars=Lidars(info='/points_info'))
     for topic, _, message in drive.items:
         if topic in ('/tf', '/tf_static'):
-            live.tree.add_transforms(message.transforms, topic == '/tf_static')
+            live.session.tree.add_transforms(message.transforms, topic == '/tf_static')
     infos = items_of(drive, '/points_info')
     clouds = [
         Item(0, live.placement.sweep_of(message, '/points'), message=message)

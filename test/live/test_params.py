@@ -1,5 +1,7 @@
 """Parameters of the node: declaration, types, bounds, changes at run time and files."""
 
+from dataclasses import replace
+
 from boxreg_ros.config import Config, NODE_OPTIONS, settings
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.live.params import (
@@ -135,7 +137,7 @@ def test_dynamic_parameters_change_within_their_bounds(make_node):
     assert all(result.successful for result in node.set_parameters(changes))
     config, options = changed(*settings_before, [*changes, Parameter('use_sim_time', value=True)])
     assert config == settings_before[0].updated({'solver.rounds': 2})
-    assert options == settings_before[1]._replace(transform_timeout=1.5)
+    assert options == replace(settings_before[1], transform_timeout=1.5)
     (result,) = node.set_parameters([Parameter('solver.rounds', value=0)])
     assert not result.successful
     for bad in (Parameter('solver.rounds', value=0), Parameter('transform_timeout', value='a')):
@@ -156,7 +158,7 @@ def test_written_file_is_read_by_nodes_of_any_name_and_by_relabel(make_node, tmp
     )
     config = config.updated({'cyclist.names': []})
     _, options = declare(make_node())
-    options = options._replace(fixed_frame='map', backlog=9.0)
+    options = replace(options, fixed_frame='map', backlog=9.0)
     path.write_text(parameters_yaml(config, options))
     for name in ('params', '/front/other'):
         arguments = ['--ros-args', '--params-file', str(path)]

@@ -6,7 +6,13 @@ from xml.etree import ElementTree
 
 from boxreg_ros.config import Config
 from boxreg_ros.io.markers import NAMESPACES
-from boxreg_ros.live.params import declare, NODE_SETTINGS, parameters_schema, parameters_yaml
+from boxreg_ros.live.params import (
+    declare,
+    NODE_SETTINGS,
+    NodeOptions,
+    parameters_schema,
+    parameters_yaml,
+)
 from measure.node import PROFILE
 from paths import ROOT, SHARE
 import pytest
@@ -37,7 +43,7 @@ def test_parameter_file_holds_the_defaults_for_any_node(name):
         assert {item.name for item in NODE_SETTINGS} < given
         config, options = declare(node)
         assert config == Config(estimate='final')
-        assert list(options) == [item.default for item in NODE_SETTINGS]
+        assert options == NodeOptions()
         node.destroy_node()
     finally:
         rclpy.shutdown(context=context)

@@ -9,8 +9,13 @@ few pedestrians and cyclists, and the boxes of each share its errors.
 from dataclasses import asdict
 from pathlib import Path
 
-from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES
-from boxreg_ros.bench.differences import Difference, paired, PairedBoxes, REFERENCE_METHODS
+from boxreg_ros.bench.accuracy import (
+    Difference,
+    MIN_CLASS_BOXES,
+    paired,
+    PairedBoxes,
+    REFERENCE_METHODS,
+)
 from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import match

@@ -18,7 +18,7 @@ from functools import partial
 from multiprocessing import get_context
 from typing import NamedTuple
 
-from boxreg_ros.bench.common import add_estimate_argument, add_scope_arguments, class_words
+from boxreg_ros.bench.common import add_scope_arguments, class_words
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method import constants
 from boxreg_ros.errors import ConfigError
@@ -222,6 +222,15 @@ def losses(variations, baseline, outcomes):
         lost = bev - means[0], volume - means[1]
         found.append(Loss(*variation[:4], *map(float, lost), failures[0] if failures else ''))
     return sorted(found, key=lambda loss: -loss.size)
+
+
+def add_estimate_argument(parser):
+    """Declare which estimate of a box is measured."""
+    parser.add_argument(
+        '--estimate', choices=('early', 'final', 'track'), default='track',
+        help='early: newest box of its window; final: `lag` observations later; '
+        'track: from the whole track (default: track)',
+    )  # fmt: skip
 
 
 # --------------------------------------------------------------------------------- command

@@ -17,12 +17,12 @@ from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.offline.box_scores import overlaps
-from boxreg_ros.offline.completion import completed, first_pass
+from boxreg_ros.offline.completion import Completion, first_pass
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.track_scores import track_scores, TrackScores
 from boxreg_ros.review.rules import DUPLICATE_IOU
 from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
-from boxreg_ros.structures import REJECTED
+from boxreg_ros.structures import BoxArray, REJECTED
 import numpy as np
 
 ONE_LABEL = 'with one label'
@@ -169,3 +169,17 @@ def table_of(results):
     table = BoxTable.from_arrays([result.boxes for result in results])
     table = replace(table, status=tuple(word for r in results for word in r.status))
     return table.rows(np.array([status != REJECTED for status in table.status], bool))
+
+
+def completed(items, fixed_frame, config, first=None):
+    """Return the completed tracks of a drive in memory, and the effects of the steps on each."""
+    if first is None:
+        first = first_pass(((item, False) for item in items), config)
+    plan = first.plan(fixed_frame, config)
+    completion = Completion(plan, config)
+    registrar = BoxRegistrar(config)
+    for ticket, item in enumerate(items):
+        moved = replace(item, ticket=ticket) if isinstance(item, BoxArray) else item
+        completion.add(hand_to_registrar(registrar, completion.to_register(moved, False), False))
+    completion.add(registrar.flush())
+    return completion.finished(), plan.tracks

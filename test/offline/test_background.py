@@ -3,7 +3,7 @@
 from threading import Event
 import time
 
-from boxreg_ros.offline.background import Background
+from boxreg_ros.offline.workers import Background
 import pytest
 
 

@@ -11,7 +11,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable, COLUMNS
 from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline import evaluate as cli
-from boxreg_ros.offline.box_scores import evaluate, groups, has_word, match, summarise
+from boxreg_ros.offline.box_scores import groups, has_word, match, summarise
 from boxreg_ros.structures import BoxArray, KEPT, RefinedBoxes
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def run(*words):
 
 
 def test_truth_has_perfect_scores():
-    scores = evaluate(truth_table(), truth_table())
+    scores = summarise(match(truth_table(), truth_table()))
     assert scores.iou_bev == scores.iou_3d == pytest.approx(1, abs=1e-8)
     assert scores.recall_3d == scores.recall_bev == (1, 1, 1)
     assert (scores.boxes, scores.missing, scores.unmatched) == (20, 0, 0)
@@ -60,7 +60,7 @@ def test_scores_of_known_errors():
     car = np.array(truth.class_names) == 'Car'
     boxes[car, 0] += 1.0  # overlap 3 m, union 5 m
     boxes[np.flatnonzero(car)[:3], 8] += np.pi
-    scores = evaluate(replace(truth, boxes=boxes), truth, classes=['car'])
+    scores = summarise(match(replace(truth, boxes=boxes), truth, classes=['car']))
     assert scores.boxes == 10
     assert scores.iou_bev == scores.iou_3d == pytest.approx(0.6, abs=1e-8)
     assert scores.recall_3d == (1, 0, 0)
@@ -75,7 +75,7 @@ def test_scale_error_of_doubled_length():
     truth = truth_table()
     boxes = truth.boxes.copy()
     boxes[:, 3] *= 2
-    scores = evaluate(replace(truth, boxes=boxes), truth)
+    scores = summarise(match(replace(truth, boxes=boxes), truth))
     assert scores.ase == pytest.approx(0.5, abs=1e-8)
     assert scores.ate == 0
 
@@ -102,13 +102,13 @@ def test_missing_and_unmatched_boxes_are_counted():
     truth = truth_table()
     predicted = rows(truth, np.arange(2, 20))  # both boxes of the first stamp are missing
     predicted = replace(predicted, track_ids=('ghost', *predicted.track_ids[1:]))
-    scores = evaluate(predicted, truth)
+    scores = summarise(match(predicted, truth))
     assert (scores.boxes, scores.missing, scores.unmatched) == (20, 3, 1)
     assert scores.iou_3d == pytest.approx(1, abs=1e-8)
     assert scores.recall_3d[2] == pytest.approx(17 / 20)
     broken = predicted.boxes.copy()
     broken[5] = np.nan
-    assert evaluate(replace(predicted, boxes=broken), truth).missing == 4
+    assert summarise(match(replace(predicted, boxes=broken), truth)).missing == 4
 
 
 def test_least_numbers_of_points_belong_to_what_they_begin():
@@ -121,9 +121,9 @@ def test_least_numbers_of_points_belong_to_what_they_begin():
 
 def test_scope_by_points_and_class():
     truth = truth_table()
-    assert evaluate(truth, truth, min_points=100).boxes == 10
-    assert evaluate(truth, truth, min_points=201).boxes == 0
-    assert np.isnan(evaluate(truth, truth, min_points=201).iou_3d)
+    assert summarise(match(truth, truth, min_points=100)).boxes == 10
+    assert summarise(match(truth, truth, min_points=201)).boxes == 0
+    assert np.isnan(summarise(match(truth, truth, min_points=201)).iou_3d)
     assert has_word('Medium-sized Truck', ['car', 'truck'])
     assert has_word('vehicle.car', ['Car'])
     assert not has_word('Cart', ['car'])
@@ -265,7 +265,7 @@ def test_invalid_true_boxes_are_left_out_with_a_warning(tmp_path, capsys):
     boxes = truth.boxes.copy()
     boxes[3, 0], boxes[5, 4] = np.nan, 0
     broken = replace(truth, boxes=boxes)
-    scores = evaluate(truth, broken)
+    scores = summarise(match(truth, broken))
     assert (scores.boxes, scores.missing, scores.unmatched) == (18, 0, 0)
     assert scores.iou_3d == pytest.approx(1, abs=1e-8)
     truth.write(tmp_path / 'boxes.csv')

@@ -6,7 +6,7 @@ import json
 from boxreg_ros.cli import main
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.offline.every_sweep import Arrivals, empty_array
+from boxreg_ros.offline.completion import Arrivals, empty_array
 from boxreg_ros.structures import Sweep
 import numpy as np
 import pytest

@@ -16,7 +16,7 @@ from boxreg_ros.offline import registration_worker as registration
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.registration_worker import registration_worker
 from boxreg_ros.offline.relabel import relabel, Request
-from boxreg_ros.offline.worker_process import run_in_worker
+from boxreg_ros.offline.workers import run_in_worker
 from measure.node import children_of
 import numpy as np
 from paths import ROOT

@@ -8,7 +8,7 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
-from boxreg_ros.offline.box_scores import evaluate
+from boxreg_ros.offline.box_scores import match, summarise
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.simulation import simulate as cli
 from boxreg_ros.simulation.noise import detector_noise, TABLE_ONE
@@ -227,7 +227,7 @@ def test_paper_noise_has_the_errors_of_table_one():
     scores, errors = [], []
     for scene in scenes:
         boxes = BoxTable.from_arrays(scene.fixed_detections())
-        scores.append(evaluate(boxes, scene.truth))
+        scores.append(summarise(match(boxes, scene.truth)))
         R = to_matrix(scene.truth.boxes[:, [0, 1, 2, 6, 7, 8]])[:, :3, :3]
         moved = boxes.boxes[:, :3] - scene.truth.boxes[:, :3]
         errors.append(np.einsum('nij,ni->nj', R, moved))

@@ -1,9 +1,9 @@
 """Small drives with known truth: cars on given paths, their points and the boxes of a detector."""
 
 from boxreg_ros.config import COMPLETE_STEPS
-from boxreg_ros.offline.completion import completed
 from boxreg_ros.structures import BoxArray, Sweep
 from boxreg_ros.tracks.tracklet import Place, Tracklet
+from measure.tracks import completed
 import numpy as np
 from relabel_results import QUICK
 from scenes import EXTENT, returns

@@ -9,14 +9,14 @@ from boxreg_ros.config import COMPLETE_STEPS, Config, KINDS
 from boxreg_ros.core.input_statistics import drive_of, KindStatistics, NOISE, TRACK
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
-from boxreg_ros.offline.completion import completed, first_pass, points_above_road
+from boxreg_ros.offline.completion import first_pass, points_above_road
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.track_scores import track_scores
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import ADDED, Sweep
 from drives import ALL_STEPS, complete, drive, only, path, steps_of
-from measure.tracks import broken, table_of
+from measure.tracks import broken, completed, table_of
 import numpy as np
 import pytest
 from relabel_results import rows_in, rows_of

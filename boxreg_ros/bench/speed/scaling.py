@@ -93,8 +93,8 @@ def crop(config: Config, tracks: int, points: int) -> dict[str, Any]:
         cloud.take(index[is_in], 0), owner[is_in]
 
     result: dict[str, Any] = {
-        'ours': 1e3 * shortest(ours, config),
-        'numpy, box by box': 1e3 * shortest(one_by_one, config),
+        'ours': 1e3 * shortest(ours),
+        'numpy, box by box': 1e3 * shortest(one_by_one),
     }
     try:
         import open3d
@@ -105,9 +105,7 @@ def crop(config: Config, tracks: int, points: int) -> dict[str, Any]:
         open3d.geometry.OrientedBoundingBox(box[:3], R, box[3:6] + 2 * MARGIN)
         for box, R in zip(boxes.boxes, rotations, strict=True)
     ]
-    result['Open3D, box by box'] = 1e3 * shortest(
-        lambda: [whole.crop(box) for box in turned], config
-    )
+    result['Open3D, box by box'] = 1e3 * shortest(lambda: [whole.crop(box) for box in turned])
     return result
 
 
@@ -142,7 +140,7 @@ def _milliseconds(count: int, length: int, points: int, config: Config) -> float
     def once() -> object:
         return solve(problem, config, InputModel(config.faces), is_warm=False)
 
-    return 1e3 * shortest(once, config)
+    return 1e3 * shortest(once)
 
 
 def cores(config: Config, count: int) -> dict[str, float]:

@@ -93,7 +93,7 @@ def cloud_message(points: NDArray[np.floating]) -> SimpleNamespace:
     )  # fmt: skip
 
 
-def shortest(function: Callable[[], object], config: Config, repeats: int = 3) -> float:
+def shortest(function: Callable[[], object], repeats: int = 3) -> float:
     """Return the shortest of several times, after one for warming up [s]."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)

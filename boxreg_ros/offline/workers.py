@@ -1,13 +1,15 @@
 """
-Worker processes: one forked process that runs one function, and messages to and from it.
+Work beside this thread: forked processes that run one function each, and calls in a thread.
 
-Processes and not threads, because the interpreter runs Python code in one thread at a time.
+Processes for Python code, of which the interpreter runs one thread at a time.
 
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
 import gc
@@ -16,7 +18,7 @@ import pickle
 import signal
 import socket
 from traceback import format_exc
-from typing import Any
+from typing import Any, ParamSpec
 
 from boxreg_ros.errors import BoxregError
 
@@ -113,12 +115,7 @@ def _run(serve: Serve, connection: socket.socket) -> None:
 
 
 def _ends(connection: socket.socket) -> tuple[Receive, Send]:
-    """
-    Return functions that receive and send pickled items.
-
-    `multiprocessing.Connection` is not used: it would copy each array once more on either side.
-
-    """
+    """Return functions for pickled items; `multiprocessing` would copy each array once more."""
     reader = connection.makefile('rb')
     writer = connection.makefile('wb')
 
@@ -127,3 +124,44 @@ def _ends(connection: socket.socket) -> tuple[Receive, Send]:
         writer.flush()
 
     return partial(pickle.load, reader), send
+
+
+_P = ParamSpec('_P')
+
+
+class Background:
+    """
+    Call functions one after another in a thread, while the caller goes on.
+
+    At most `most_waiting` calls are incomplete when a call returns to the caller: with 0 it waits
+    for each. `complete` or `abandon` is the end.
+
+    """
+
+    def __init__(self, most_waiting: int) -> None:
+        self._most_waiting = most_waiting
+        self._waiting: deque[Future[object]] = deque()
+        self._thread = ThreadPoolExecutor(1)
+
+    def __call__(
+        self, function: Callable[_P, object], *args: _P.args, **kwargs: _P.kwargs
+    ) -> None:
+        """Call a function after those before it; raise the first exception of an earlier call."""
+        self._waiting.append(self._thread.submit(function, *args, **kwargs))
+        self._wait(self._most_waiting)
+
+    def complete(self) -> None:
+        """Wait for all calls, which must be the last ones; raise the first exception of them."""
+        try:
+            self._wait(0)
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Wait for the call that has begun, and leave out the others."""
+        self._thread.shutdown(cancel_futures=True)
+
+    def _wait(self, most_waiting: int) -> None:
+        """Wait until at most some of the calls are incomplete; raise their exceptions."""
+        while len(self._waiting) > most_waiting:
+            self._waiting.popleft().result()
