@@ -12,14 +12,13 @@ from boxreg_ros.core.following import person
 from boxreg_ros.core.following.between import between
 from boxreg_ros.core.following.sweeps import ascending, nearest, Points, SightLimits, Sweeps
 from boxreg_ros.core.following.tracker import (
-    ARRIVED,
-    END_OF_SWEEPS,
     Follower,
     Owned,
     POSE4,
     Seeds,
     Way,
 )
+from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.core.observation import GOOD_POINTS, NEARBY
 from boxreg_ros.core.refine import RefinedTrack, registered, Track
 from boxreg_ros.errors import ShapeError
@@ -42,9 +41,6 @@ from boxreg_ros.structures import (
 )
 import numpy as np
 from numpy.typing import NDArray
-
-MIN_SEEDS_OF_SAMPLE = 3
-"""Tracks with fewer seeds follow them, and show no deviation of theirs; chosen."""
 
 
 class End(NamedTuple):
@@ -254,7 +250,7 @@ def _followed(
         reason = 'few_points'
         if follower.num_points >= GOOD_POINTS:
             way = follower.way(seed, sign, stop)
-            reason = END_OF_SWEEPS if way.reason == ARRIVED else way.reason
+            reason = way.reason or 'end_of_sweeps'
             for row in _supported(way):
                 poses[row] = way.poses[row]
                 status[row] = EXTENDED
@@ -372,11 +368,11 @@ def keyframe_deviations(
     some, count = [], 0
     for track in tracks:
         seeds = track.status.count(HUMAN)
-        if count < person.SAMPLE and seeds >= MIN_SEEDS_OF_SAMPLE:
+        if count < FOLLOW.sample and seeds >= FOLLOW.min_seeds:
             some.append(_track(track, points, origins))
             count += seeds
     usual = person.DEVIATIONS
-    if count < person.MIN_KEYFRAMES:
+    if count < FOLLOW.min_keyframes:
         return usual
     found = registered(some, config, person.numbers(usual))
     larger: Floats = np.maximum(person.shown(*_fits(some, found), usual), usual)

@@ -22,7 +22,7 @@ from boxreg_ros.live.label_recording import LabelRecording
 from boxreg_ros.live.live_registrar import LiveRegistrar
 from boxreg_ros.live.params import changed, declare, numbers_as_declared, parameters_yaml
 from boxreg_ros.live.recorder_process import check_recording
-from boxreg_ros.live.topics import import_message, NodeTopics
+from boxreg_ros.live.topics import FOLLOW_TOPIC, import_message, NodeTopics
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
 from msg_adapters import adapter_for, canonical, cdr
@@ -243,7 +243,7 @@ class BoxregNode(Node):
         )  # fmt: skip
         few = QoSProfile(depth=FOLLOW_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._topics.subscribe(
-            type_name, '~/follow', partial(self._inbox.put_event, 'follow'), few,
+            type_name, FOLLOW_TOPIC, partial(self._inbox.put_event, 'follow'), few,
             is_raw=serialized is not None,
         )  # fmt: skip
         self.get_logger().info(f'boxes are {type_name}; {self._topics.description()}')

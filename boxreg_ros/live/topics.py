@@ -42,6 +42,8 @@ QOS_OVERRIDES = QoSOverridingOptions(
     [QoSPolicyKind[policy.upper()] for policy in (*QOS_POLICIES, 'depth')]
 )
 """Policies that parameters ``qos_overrides.TOPIC.ENTITY.POLICY`` may set."""
+FOLLOW_TOPIC = '~/follow'
+"""Boxes of a person, whose objects are followed."""
 INFINITE_NS = 9223372036854775807
 """Value of an infinite duration in rmw [ns]."""
 
@@ -177,6 +179,8 @@ class NodeTopics:
                 found.append(_type_problem(endpoint, other_type))
             if endpoint.is_input:
                 found += self._silence(endpoint, peers)
+            if endpoint.topic == FOLLOW_TOPIC and not peers:
+                found += self._unheard(endpoint)
         return found
 
     def report(self, name: str, further: list[TopicProblem]) -> DiagnosticStatus:
@@ -258,6 +262,18 @@ class NodeTopics:
                 f'{endpoint.name}: nothing received yet from {_nodes(peers)}; check that messages '
                 f'are sent, and shared memory and network in between',
             )
+
+    def _unheard(self, endpoint: Endpoint) -> Iterator[TopicProblem]:
+        """Yield a problem for each topic of the same last name and type that nobody reads."""
+        last = endpoint.name.rsplit('/', 1)[-1]
+        for topic, types in self._node.get_topic_names_and_types():
+            is_like = topic.rsplit('/', 1)[-1] == last and endpoint.type_name in types
+            if is_like and not self._node.count_subscribers(topic):
+                yield TopicProblem(
+                    DiagnosticStatus.WARN,
+                    f'{topic}: nobody subscribes to it; this node takes boxes to follow on '
+                    f'{endpoint.name}: publish there',
+                )
 
     def _refines(self, name: str, namespace: str) -> bool:
         """Return whether a node is of this kind, by its services: topics may be remapped."""
@@ -356,6 +372,8 @@ def _type_problem(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> TopicPr
             f'{endpoint.type_name}; change the subscription',
         )
     remedy = f'remap {endpoint.topic} to a topic of the expected type'
+    if endpoint.topic == FOLLOW_TOPIC:
+        remedy = 'publish boxes to follow as the type of boxes'
     if endpoint.topic == 'boxes':
         remedy = 'set boxes_type, or restart the node if the type of the topic has changed'
     return TopicProblem(

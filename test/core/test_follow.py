@@ -4,7 +4,10 @@ from dataclasses import replace
 
 from boxreg_ros import follow, ShapeError
 from boxreg_ros.core.following import person
-from boxreg_ros.core.following.person import corrections, DEVIATIONS, EVIDENCE
+from boxreg_ros.core.following.between import closed
+from boxreg_ros.core.following.person import corrections, DEVIATIONS
+from boxreg_ros.core.following.tracker import Way
+from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.structures import BoxArray, HUMAN, INTERPOLATED
 import numpy as np
@@ -131,8 +134,8 @@ def test_keyframes_are_soft_by_the_error_that_they_show():
 
 def test_bad_keyframes_are_given_less_weight(monkeypatch):
     ious = []
-    for evidence in (EVIDENCE, 1e9):  # without and with the usual deviations in any case
-        monkeypatch.setattr(person, 'EVIDENCE', evidence)
+    for evidence in (FOLLOW.evidence, 1e9):  # without and with the usual deviations in any case
+        monkeypatch.setattr(person, 'FOLLOW', FOLLOW._replace(evidence=evidence))
         truths, tracks, _ = keyframes_of_a_drive(0.12, 0.1, np.radians(4))
         found = [iou_3d(t.boxes, truth[t.rows]) for t, truth in zip(tracks, truths, strict=True)]
         ious.append(np.concatenate(found).mean())
@@ -216,6 +219,30 @@ def test_neighbour_and_road_do_not_pull_a_parked_car():
     ]
     [track] = follow(stamps(N), sweeps, [seed(truth, 0)])
     assert iou_3d(track.boxes, truth[track.rows]).min() > 0.8
+
+
+def test_the_heading_of_a_long_vehicle_stays_where_its_rear_alone_is_seen():
+    rng = np.random.default_rng(11)
+    truth = drive(2 * N, speed=9.0, turn=0.0, start=(60.0, 0.0, 0.0))
+    truth[:, 2:6] = 1.5, 23.0, 2.4, 3.0
+    sweeps = [np.concatenate([road(rng), returns(box, rng, 120, ORIGIN, 0.03)]) for box in truth]
+    box = truth[0] - np.array([*[0.0] * 8, 0.02])
+    one = BoxArray(int(stamps(1)[0]), '', ('tram',), ('tram',), np.ones(1), box[None])
+    [track] = follow(stamps(2 * N), sweeps, [one])
+    assert len(track.rows) == 2 * N
+    assert np.abs(track.boxes[:, 8]).max() < 0.045
+
+
+def test_a_way_may_end_farther_from_a_seed_that_is_later():
+    poses = {row: np.array([float(row), 0.0, 0.0, 0.0]) for row in range(1, 5)}
+    way = Way(4, 1, None, 0.0, 0.4, 1.0, poses)
+    rows, part = np.arange(1, 4), np.array([0.25, 0.5, 0.75])
+    target = np.array([4.0, 0.5, 0.0, 0.0])
+    assert closed(way, rows, part, target, 1.0) is None
+    found = closed(way, rows, part, target, 2.0)
+    np.testing.assert_allclose(found[:, 1], part * 0.5)
+    way.reason = 'few_points'
+    assert closed(way, rows, part, target, 2.0) is None
 
 
 def test_seeds_that_cannot_be_used_are_named_and_the_rest_is_done():

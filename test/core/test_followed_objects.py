@@ -112,3 +112,12 @@ def test_boxes_that_cannot_be_followed_are_named_and_the_rest_is_done():
     assert 'finite' in lines['nan']
     assert 'the nearest is 5.00 s away' in lines['old']
     assert 'the nearest is' in lines['ahead']
+
+
+def test_of_two_ids_of_one_object_the_second_is_named():
+    truth = drive(STEPS)
+    seeds = {2: array(2, {'a': truth[2]}), 5: array(5, {'b': truth[5] + [0.1, *[0.0] * 8]})}
+    found, registrar = run(truth, seeds)
+    assert list(found) == [('a', step) for step in range(2, STEPS)]
+    assert registrar.followed.track_ids == ('a',)
+    assert registrar.followed.refused == [('b', "its object is followed as 'a'")]

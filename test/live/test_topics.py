@@ -102,6 +102,20 @@ def test_wrong_message_type_is_reported(graph):
     assert ended_cleanly(node)
 
 
+def test_boxes_to_follow_of_another_type_or_on_another_topic_are_reported(graph):
+    graph.publisher('std_msgs/msg/String', '/boxreg_node/follow')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start('-p', f'boxes_type:={DETECTIONS}')
+    text = f'/boxreg_node/follow: expected messages of type {DETECTIONS}, got std_msgs/msg/String'
+    remedy = 'publish boxes to follow as the type of boxes'
+    assert '[ERROR]' in reported(graph, node, diagnostics, text, remedy)
+    graph.node.destroy_publisher(graph.publishers.pop('/boxreg_node/follow'))
+    graph.publisher(DETECTIONS, '/boxreg/follow')
+    parts = ('/boxreg/follow: nobody subscribes to it', 'follow on /boxreg_node/follow')
+    assert '[WARN]' in reported(graph, node, diagnostics, *parts)
+    assert ended_cleanly(node)
+
+
 def test_mistyped_remaps_are_reported_with_the_existing_topics(graph):
     graph.publisher(POINTS, '/lidar/points')
     graph.publisher(DETECTIONS, '/tracker/boxes')

@@ -5,21 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from boxreg_ros.core.following.tracker import (
-    ARRIVED,
     Follower,
-    MAX_GAP,
-    MAX_GAP_YAW,
     POSE4,
     Seeds,
     Way,
 )
+from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
-
-MIN_CURVED_TRAVEL = 1.0
-"""Boxes nearer to each other are joined by a line: their headings are no tangents [m]."""
 
 
 def between(follower: Follower, times: Floats, seeds: Seeds, first: int) -> tuple[Ints, Floats]:
@@ -39,14 +34,15 @@ def between(follower: Follower, times: Floats, seeds: Seeds, first: int) -> tupl
     poses = seeds.boxes[:, POSE4]
     way_on = follower.way(first, 1, stop)
     way_back = follower.way(first + 1, -1, start)
-    forwards = _closed(way_on, rows, part, poses[first + 1])
-    backwards = _closed(way_back, rows[::-1], 1 - part[::-1], poses[first])
+    drift = np.sqrt(max(1.0, times[stop] - times[start]))
+    forwards = closed(way_on, rows, part, poses[first + 1], drift)
+    backwards = closed(way_back, rows[::-1], 1 - part[::-1], poses[first], drift)
     if backwards is not None:
         backwards = backwards[::-1]
     lines = list(_lines(times, seeds, first, rows))
     if forwards is not None and backwards is not None:
         blended = _blended(forwards, backwards, part)
-        if (_distances(forwards, backwards) < MAX_GAP).all():
+        if (_distances(forwards, backwards) < 2 * FOLLOW.cell).all():
             return rows, blended
         lines.append(blended)
     lines += [way for way in (forwards, backwards) if way is not None]
@@ -55,13 +51,19 @@ def between(follower: Follower, times: Floats, seeds: Seeds, first: int) -> tupl
     return rows, lines[int(np.argmax(scores))]
 
 
-def _closed(way: Way, rows: Ints, part: Floats, target: Floats) -> Floats | None:
-    """Return the poses (n, 4) of a way moved so that it ends at `target`; None where it is far."""
-    if way.reason != ARRIVED or not len(rows):
+def closed(way: Way, rows: Ints, part: Floats, target: Floats, drift: float) -> Floats | None:
+    """
+    Return the poses (n, 4) of a way moved so that it ends at `target`; None where it is far.
+
+    The gap may be `drift` times that of a second: errors add up as in a random walk.
+
+    """
+    if way.reason or not len(rows):
         return None
     gap = target - list(way.poses.values())[-1]
     gap[3] = wrap_angle(gap[3])
-    if np.linalg.norm(gap[:3]) > MAX_GAP or abs(gap[3]) > MAX_GAP_YAW:
+    distance = float(np.linalg.norm(gap[:3]))
+    if distance > drift * 2 * FOLLOW.cell or abs(gap[3]) > drift * FOLLOW.max_gap_yaw:
         return None
     poses = np.array([way.poses[row] for row in rows.tolist()])
     return poses + part[:, None] * gap
@@ -107,7 +109,7 @@ def _lines(times: Floats, seeds: Seeds, first: int, rows: Ints) -> Iterator[Floa
     part = (wanted - at[first]) / (at[first + 1] - at[first])
     yield ends[0] + part[:, None] * (ends[1] - ends[0])
     travel = ends[1, :2] - ends[0, :2]
-    if np.linalg.norm(travel) < MIN_CURVED_TRAVEL:
+    if np.linalg.norm(travel) < FOLLOW.curved_travel:
         return
     if len(at) > 2:
         yield CubicSpline(at, poses)(wanted)

@@ -4,38 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from numpy.typing import NDArray
-
-MAX_GROWTH = 1.0
-"""A face moves outwards by no more than this [m]; chosen: half the difference of a hatchback and a
-van."""
-MOST_CHANGE = 0.5
-"""And no face by more than this part of half the extent: farther points are of what stands beside;
-chosen."""
-PERSON_ERROR, EDGE_ERROR = 0.3, 0.1
-"""Faces nearer to the edge of the points stay [m]; chosen: the error of a person, the labelling
-margin, and the error of the edge, 0.1. Of boxes with the size of a class the last alone: they are
-known by another object of the same size, or by one face that is farther off."""
-FACE_MARGIN = 0.05
-"""Labelling margin of a face that moves [m]; as the settings of the classes."""
-LEAST_SWEEPS, LEAST_POINTS = 5, 50
-"""Fewer are no evidence for a face; chosen."""
-BIN = 0.1
-"""Points are counted by their distance from the centre in bins of this length [m]."""
-BESIDE_EDGE = 3
-"""Bins on each side of an edge that are compared; chosen: 0.3 m."""
-DENSE, DENSE_OUTSIDE = 30, 20
-"""Points in a bin on its inner side, of all sweeps: fewer end before the object does, since the
-sensor hardly sees so far along it; points outside of the box are evidence by themselves. Swept:
-15 lose PandaSet .01, 50 resimulated drives .01."""
-EMPTY = 0.1
-"""Points on its outer side as part of these; chosen."""
-BEYOND = 0.02
-"""And in all of the box behind it, as part of all: a gap is no edge; chosen."""
-OUTERMOST = 0.98
-"""Quantile of the points beside an edge that counts as the outermost one; chosen."""
 
 
 def faces(
@@ -47,7 +19,7 @@ def faces(
     Parameters
     ----------
     sweeps : sequence of arrays, shape (n_i, 3)
-        Points within `MAX_GROWTH` of its box in the frame of the box, without the road [m].
+        Points within `max_growth` of its box in the frame of the box, without the road [m].
     half : array, shape (3,)
         Half the extents of the box.
     is_of_class : bool
@@ -65,7 +37,7 @@ def faces(
     found = np.stack([-half, half])
     points = np.concatenate(sweeps)
     owner = np.repeat(np.arange(len(sweeps)), [len(one) for one in sweeps])
-    is_within = np.abs(points) < half + BIN
+    is_within = np.abs(points) < half + FOLLOW.bin_length
     steps = np.zeros((2, 3))
     for axis, side in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1)):  # the bottom is on the road
         others = [other for other in range(3) if other != axis]
@@ -74,30 +46,31 @@ def faces(
         if axis == 2:
             own &= sees_top[owner]
         edge = _edge(sign * points[own, axis], owner[own], float(half[axis]))
-        if abs(edge - half[axis]) < MOST_CHANGE * half[axis]:
+        if abs(edge - half[axis]) < FOLLOW.max_change * half[axis]:
             steps[side, axis] = edge - half[axis]
-    is_of_class = is_of_class or bool((np.abs(steps) > PERSON_ERROR).any())
-    steps[np.abs(steps) <= (EDGE_ERROR if is_of_class else PERSON_ERROR)] = 0.0
+    is_of_class = is_of_class or bool((np.abs(steps) > FOLLOW.person_error).any())
+    steps[np.abs(steps) <= (FOLLOW.bin_length if is_of_class else FOLLOW.person_error)] = 0.0
     return found + np.array([[-1.0], [1.0]]) * steps
 
 
 def _edge(outwards: Floats, owner: Ints, half: float) -> float:
     """Return where the points of a side, (n,) from the centre, end; `half` if they do not show."""
-    if len(outwards) < LEAST_POINTS or len(np.unique(owner)) < LEAST_SWEEPS:
+    if len(np.unique(owner)) < FOLLOW.min_sweeps:
         return half
-    num_bins = int(np.ceil((half + MAX_GROWTH) / BIN))
-    row = (outwards / BIN).astype(int)
-    counts = np.bincount(row, minlength=num_bins + BESIDE_EDGE)
-    peak = int(counts[: int(half / BIN) + 2].argmax())  # what stands beside may be denser
-    for edge in range(max(peak + 1, BESIDE_EDGE), num_bins):
-        inside = counts[edge - BESIDE_EDGE : edge].mean()
-        if counts[edge : edge + BESIDE_EDGE].mean() < EMPTY * inside:
+    num_bins = int(np.ceil((half + FOLLOW.max_growth) / FOLLOW.bin_length))
+    row = (outwards / FOLLOW.bin_length).astype(int)
+    counts = np.bincount(row, minlength=num_bins + FOLLOW.edge_bins)
+    within = counts[: int(half / FOLLOW.bin_length) + 2]
+    peak = int(within.argmax())  # what stands beside may be denser
+    for edge in range(max(peak + 1, FOLLOW.edge_bins), num_bins):
+        inside = counts[edge - FOLLOW.edge_bins : edge].mean()
+        if counts[edge : edge + FOLLOW.edge_bins].mean() < FOLLOW.empty * inside:
             break
     else:  # they go on: a wall, or what stands beside
         return half
-    beyond = counts[edge + 1 : int(half / BIN)].sum()
-    least = DENSE if edge * BIN < half else DENSE_OUTSIDE
-    if inside < least or beyond > BEYOND * len(outwards):
+    beyond = counts[edge + 1 : int(half / FOLLOW.bin_length)].sum()
+    least = FOLLOW.dense if edge * FOLLOW.bin_length < half else FOLLOW.dense_outside
+    if inside < least or beyond > FOLLOW.stray * len(outwards):
         return half
-    own = outwards[(row >= edge - BESIDE_EDGE) & (row <= edge)]
-    return float(np.quantile(own, OUTERMOST)) + FACE_MARGIN
+    own = outwards[(row >= edge - FOLLOW.edge_bins) & (row <= edge)]
+    return float(np.quantile(own, 1 - FOLLOW.stray)) + FOLLOW.face_margin

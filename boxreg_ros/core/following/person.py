@@ -11,25 +11,18 @@ from __future__ import annotations
 from boxreg_ros.core.input_noise import LEAST_RATIO
 from boxreg_ros.core.method.arrays import BOX_POSE
 from boxreg_ros.core.method.constants import CONSTANTS, Constants
+from boxreg_ros.core.method.follow_numbers import FOLLOW
+from boxreg_ros.core.method.noise import MAD_TO_DEVIATION
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL
 import numpy as np
 
-POSITION, ANGLE, EXTENT = 0.03, np.radians(1.0), 0.03
-"""Deviations of a box that a person has drawn: centre [m], angles [rad], extents [m]."""
-DEVIATIONS = np.repeat([POSITION, EXTENT, ANGLE], 3)
+POSITION, ANGLE = 0.03, np.radians(1.0)
+"""Deviations of a box that a person has drawn: centre and extents [m], angles [rad]. Measured."""
+DEVIATIONS = np.repeat([POSITION, POSITION, ANGLE], 3)
 """Of the columns of a box [m, rad]."""
 GROUPS = (([0, 1, 2],) * 2, ([3, 4, 5],) * 2, ([8], [6, 7, 8]))
 """Columns of a box that show one deviation, and those it is of: position, extents, angles."""
-SAMPLE = 200
-"""Keyframes that show a larger deviation, before all are solved; chosen: 5 % of error."""
-MIN_KEYFRAMES = 20
-"""Fewer show no deviation; chosen: a fifth of the deviation is its own error."""
-EVIDENCE = 2.0
-"""Deviations that differ by less than this factor count as the usual ones; chosen: estimates from
-keyframes of the usual error, on five recordings, are 0.5 to 1.6 of it."""
-MEDIAN_TO_DEVIATION = 1.48
-"""Standard deviation over the median of absolute values. Derived: Gaussian."""
 
 
 def numbers(deviations: Floats) -> Constants:
@@ -66,15 +59,15 @@ def shown(keyframes: Floats, fits: Floats, variances: Floats, usual: Floats) -> 
 
     """
     found = usual.copy()
-    if len(keyframes) < MIN_KEYFRAMES:
+    if len(keyframes) < FOLLOW.min_keyframes:
         return found
     others = _variances_of_others(variances, usual)
     errors = _residuals(keyframes, fits) * (1 + others / usual**2)
     for columns, of_group in GROUPS:
-        variance = MEDIAN_TO_DEVIATION**2 * np.median(errors[:, columns] ** 2)
+        variance = MAD_TO_DEVIATION**2 * np.median(errors[:, columns] ** 2)
         variance -= np.median(others[:, columns])
         deviation = np.sqrt(max(variance, 0.0))
-        if not 1 / EVIDENCE < deviation / usual[of_group[0]] < EVIDENCE:
+        if not 1 / FOLLOW.evidence < deviation / usual[of_group[0]] < FOLLOW.evidence:
             found[of_group] = deviation
     return found
 

@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.following.sweeps import ascending, nearest, Sweeps
-from boxreg_ros.core.following.tracker import Follower, Owned, POSE4, Seeds, Walk
+from boxreg_ros.core.following.tracker import Follower, Owned, POSE4, Seeds, Way
+from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.core.observation import GOOD_POINTS
+from boxreg_ros.core.support import is_owned
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, Sweep
 import numpy as np
 
-HISTORY_NS = 2 * 10**9
-"""A box may be so much older than the newest sweep [ns]; chosen: who sends it is slow."""
+HISTORY_NS = int(1e9 * FOLLOW.history)
 INTERRUPTED = 'interrupted'
 """Reason for a loss: no sweeps, or no boxes of the stream, for longer than the history."""
 
@@ -39,7 +40,7 @@ class FollowedBox(NamedTuple):
 class _Object:
     class_name: str
     follower: Follower
-    walk: Walk
+    way: Way
     last: tuple[int, Floats]
     """Stamp [ns] and box where points have supported it last."""
 
@@ -81,7 +82,7 @@ class FollowedObjects:
     Follow objects through the sweeps of a stream; all are in one fixed frame.
 
     From the sweep nearest to its box in time, an object is followed as by `follow`, but forwards
-    only, and lost under the same tests.
+    only, and lost under the same tests. Of two in one place, the first goes on.
 
     Parameters
     ----------
@@ -151,13 +152,18 @@ class FollowedObjects:
         owned = Owned()
         owned.add(np.full(len(others), last), others)
         self._start(sweeps, owned)
-        found = []
+        found: list[FollowedBox] = []
         for track_id, one in list(self._objects.items()):
             one.follower.continue_in(sweeps, owned)
             self._step(track_id, one, last)
-            if last in one.walk.seen:
-                travel = one.walk.state.speed * (stamp_ns - sweep_ns) * 1e-9
-                box = one.follower.box(one.walk.poses[last], travel)
+            if last in one.way.seen:
+                travel = one.way.state.speed * (stamp_ns - sweep_ns) * 1e-9
+                box = one.follower.box(one.way.poses[last], travel)
+                same = [other.track_id for other in found if is_owned(box, other.box[None])]
+                if same:
+                    self.refused.append((track_id, f'its object is followed as {same[0]!r}'))
+                    self._objects.pop(track_id, None)
+                    continue
                 owned.add(np.array([last]), box[None])
                 one.last = stamp_ns, box
                 found.append(FollowedBox(track_id, one.class_name, box))
@@ -187,24 +193,24 @@ class FollowedObjects:
             what = f'expected points in it, got {follower.num_points}: correct it, or its frame'
             self._refuse(one, stamp_ns, what)
             return
-        walk = follower.walk(0, 1)
-        walk.poses[row] = one.box[POSE4]
-        walk.seen.add(row)
-        self._objects[one.track_id] = _Object(one.class_name, follower, walk, (stamp_ns, one.box))
+        way = follower.begin(0, 1)
+        way.poses[row] = one.box[POSE4]
+        way.seen.add(row)
+        self._objects[one.track_id] = _Object(one.class_name, follower, way, (stamp_ns, one.box))
 
     def _step(self, track_id: str, one: _Object, last: int) -> None:
         """Follow an object up to a sweep, or delete it where it is lost."""
-        walk = one.walk
-        reason = '' if walk.row in self._arrived.sweeps else INTERRUPTED
-        while walk.row < last and not reason:
-            one.follower.step(walk)
-            reason = walk.reason if walk.is_over else ''
+        way = one.way
+        reason = '' if way.row in self._arrived.sweeps else INTERRUPTED
+        while way.row < last and not reason:
+            one.follower.step(way)
+            reason = way.reason if way.is_over else ''
         if reason:
             self.lost.append(Lost(track_id, *one.last, reason))
             del self._objects[track_id]
-        for row in [row for row in walk.poses if row not in self._arrived.sweeps]:
-            del walk.poses[row]
-            walk.seen.discard(row)
+        for row in [row for row in way.poses if row not in self._arrived.sweeps]:
+            del way.poses[row]
+            way.seen.discard(row)
 
     def _refuse(self, one: FollowedBox, stamp_ns: int, what: str) -> None:
         self.refused.append((one.track_id, f'box at {stamp_ns}: {what}'))

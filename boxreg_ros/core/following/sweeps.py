@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
+from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from numpy.typing import NDArray
-
-MIN_DISTANCE = 2.0
-"""Nearer points do not show how far up the sensor sees [m]: they may be of its vehicle; chosen."""
 
 
 class Points(Protocol):
@@ -50,7 +48,7 @@ class SightLimits:
         if row not in self._slopes:
             steps = self._points[row] - origin
             away = np.hypot(steps[:, 0], steps[:, 1])
-            slopes = steps[away > MIN_DISTANCE, 2] / away[away > MIN_DISTANCE]
+            slopes = steps[away > FOLLOW.min_distance, 2] / away[away > FOLLOW.min_distance]
             self._slopes[row] = float(slopes.max(initial=-np.inf))
         away = float(np.hypot(*(place[:2] - origin[:2])))
         slope = self._slopes[row]

@@ -17,24 +17,16 @@ class FollowNumbers(NamedTuple):
     """Side of a cell [m]."""
     max_cell_points: int = 60
     """A cell takes no more points than this."""
-    rim: float = 0.6
-    """The map of a surface reaches this far outside of the box [m]."""
     line: float = 0.02
     """A neighbourhood with less spread in its second direction is a line [m]."""
-    growth: float = 1.1
+    normal_growth: float = 1.1
     """The normal of a cell is found again after it got so many times its points."""
-    max_cells: int = 20_000
-    """Derived: those of a bus of 12 m."""
 
     # Points of a sweep
     around: float = 0.5
     """Points so far around a start are registered from it [m]."""
     crop: float = 0.7
     """Points so far beside a box belong to its sweep [m]."""
-    crop_above: float = 0.6
-    """And so far above and below it [m]."""
-    beside: float = 0.3
-    """And so much further away are the boxes of others whose points are left out [m]."""
     margin: float = 0.4
     """Points up to this far outside of the box are used [m]."""
     tolerance: float = 0.1
@@ -43,20 +35,14 @@ class FollowNumbers(NamedTuple):
     """A sweep with more points around a box is thinned. Swept: the poses are as good."""
 
     # Registration of a sweep
-    reach: float = 0.3
-    """Largest distance of a point to its part of the surface [m]."""
     deviation: float = 0.05
     """Of a point from the surface [m]."""
     outlier: float = 0.12
     """Distance at which the weight of a point is 1/4 [m]; nearer points fit the surface."""
-    outside_deviation: float = 0.15
-    """Of points outside of the box [m]."""
     effective_points: float = 30.0
     """Evidence of one sweep: more points of one surface are not independent."""
     road_deviation: float = 0.07
     """Of the height of the road beside a box [m]. Swept: 0.05 and 0.1 are as good, 0.2 drifts."""
-    max_step: float = 0.3
-    """Of one iteration [m]."""
 
     # A pose is accepted if all of these hold
     min_points: int = 5
@@ -71,29 +57,96 @@ class FollowNumbers(NamedTuple):
     """[rad]."""
     max_jump: float = 16.0
     """Squared Mahalanobis distance from the prediction."""
-    min_fit_again: float = 0.6
-    """Part of the points that fit, to find an object again after a loss."""
     min_score_again: float = 0.5
     """And of their score before the loss, as a running mean."""
-    min_fit_to_learn: float = 0.7
-    """Points of a sweep with a smaller part that fits are not added to the surface."""
+    min_sure_fit: float = 0.7
+    """Part of the points that fit, to find an object again after a loss, and to add points to the
+    surface."""
 
     # Search along the heading
     jump_cost: float = 0.02
-    """Of a unit of squared Mahalanobis distance, in score, up to `max_jump_cost` of these: a pose
-    at the limit of a jump has to fit a fifth better than one at the prediction."""
-    max_jump_cost: float = 10.0
+    """Of a unit of squared Mahalanobis distance, in score, up to `max_jump` of these."""
     search_below: float = 0.85
     """An object with a smaller part of its usual score is searched along the heading."""
-    search_step: float = 0.4
-    """Distance of the starts after a loss [m]."""
-    max_search: int = 10
-    """Starts in each direction after a loss, at most."""
-    slip_step: float = 0.15
-    """Distance of the starts while it is seen [m]: points further from the surface have hardly
-    any weight."""
-    slips: int = 2
-    """Starts in each direction while it is seen: half the reach of a registration."""
+    max_search: float = 4.0
+    """It is searched so far in each direction after a loss, at most [m]."""
+
+    # Motion
+    overhang: float = 3.0
+    """The rear axle of a vehicle is no farther from its end [m]. Chosen: buses and trams."""
+    steered_length: float = 4.5
+    """The angular acceleration of a longer vehicle is smaller by the square of its length [m].
+    Derived: the turn rate is the speed by the radius, which the wheelbase gives; of a car."""
+    parked_noise: float = 0.1
+    """Factor on the noise of the motion of a parked object."""
+    hold: float = 2.0
+    """An object that is not found for so long is lost [s]."""
+    hold_parked: float = 5.0
+    """And a parked one [s]."""
+    young: float = 1.0
+    """A way of this duration does not yet know its speed well [s]."""
+    young_speed: float = 2.0
+    """Deviation of the speed of a young way after a loss [m/s]."""
+    near_seeds: float = 1.5
+    """Seeds nearer in time give the speed [s]: acceleration changes it by less than 3 m/s."""
+    search_sweeps: int = 5
+    """Sweeps in each direction that a start speed is tested with."""
+    speeds_tested: int = 4
+    """Most likely speeds by the first sweeps that are tested with `search_sweeps`."""
+
+    # Boxes between seeds, and extents
+    max_gap_yaw: float = 0.15
+    """A way has arrived at a seed if its heading differs by less [rad]."""
+    curved_travel: float = 1.0
+    """Boxes nearer to each other are joined by a line: their headings are no tangents [m]."""
+
+    # Extents of a box that was drawn too small or too large
+    max_extent_sweeps: int = 60
+    """Sweeps of a track whose points show the extents."""
+    max_growth: float = 1.0
+    """A face moves outwards by no more than this [m]: half the difference of a hatchback and a
+    van."""
+    max_change: float = 0.5
+    """And no face by more than this part of half the extent: farther points are of what stands
+    beside."""
+    person_error: float = 0.3
+    """Faces nearer to the edge of the points stay [m]: the error of a person, the labelling
+    margin, and the error of the edge, one bin. Of boxes with the size of a class the last alone:
+    they are known by another object of the same size, or by one face that is farther off."""
+    face_margin: float = 0.05
+    """Labelling margin of a face that moves [m]; as the settings of the classes."""
+    min_sweeps: int = 5
+    """Fewer are no evidence for a face."""
+    bin_length: float = 0.1
+    """Points are counted by their distance from the centre in bins of this length [m]."""
+    edge_bins: int = 3
+    """Bins on each side of an edge that are compared: 0.3 m."""
+    dense: int = 30
+    """Points in a bin on its inner side, of all sweeps: fewer end before the object does, since
+    the sensor hardly sees so far along it. Swept: 15 lose PandaSet .01."""
+    dense_outside: int = 20
+    """The same outside of the box, where points are evidence by themselves. Swept: 50 lose
+    re-simulated drives .01."""
+    empty: float = 0.1
+    """Points on its outer side as part of these."""
+    stray: float = 0.02
+    """And in all of the box behind it, as part of all: a gap is no edge. The same part of the
+    points beside an edge is farther out than the face."""
+    min_distance: float = 2.0
+    """Nearer points do not show how far up the sensor sees [m]: they may be of its vehicle."""
+
+    # Keyframes, and streams
+    sample: int = 200
+    """Keyframes that show a larger deviation, before all are solved: 5 % of error."""
+    min_keyframes: int = 20
+    """Fewer show no deviation: a fifth of the deviation is its own error."""
+    min_seeds: int = 3
+    """Tracks with fewer seeds follow them, and show no deviation of theirs."""
+    evidence: float = 2.0
+    """Deviations that differ by less than this factor count as the usual ones: estimates from
+    keyframes of the usual error, on five recordings, are 0.5 to 1.6 of it."""
+    history: float = 2.0
+    """A box may be so much older than the newest sweep [s]: who sends it is slow."""
 
 
 FOLLOW = FollowNumbers()

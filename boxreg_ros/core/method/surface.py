@@ -58,7 +58,7 @@ def insert(points, half, surface):
             continue
         slot = slots[i, j, k] - 1
         if slot < 0:
-            if slots[i, j, k] == FOREIGN or used[0] >= len(moments):
+            if slots[i, j, k] == FOREIGN:
                 continue
             slot = used[0]
             used[0] += 1
@@ -78,7 +78,7 @@ def insert(points, half, surface):
         of_cell[9] += z * z
     for slot in range(used[0]):
         count = moments[slot, 0]
-        if count > FOLLOW.growth * moments[slot, 10]:
+        if count > FOLLOW.normal_growth * moments[slot, 10]:
             means[slot] = moments[slot, 1:4] / count
             normals[slot] = normal_at(means[slot], half, slots, moments)
             moments[slot, 10] = count
@@ -193,7 +193,7 @@ def nearest_cell(x, y, z, surface):
     i, j, k = cell_of(x, y, z, slots)
     if i < 0:
         return -1
-    best = FOLLOW.reach * FOLLOW.reach
+    best = (2 * FOLLOW.cell) ** 2
     found = -1
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):
@@ -213,8 +213,8 @@ def nearest_cell(x, y, z, surface):
 
 def empty_surface(half):
     """Return a map without points for a box with `half` extents (3,)."""
-    cells = FOLLOW.max_cells
-    sides = (2 * np.ceil((half + FOLLOW.rim) / FOLLOW.cell) + 2).astype(np.int64)
+    sides = (2 * np.ceil((half + FOLLOW.margin) / FOLLOW.cell) + 4).astype(np.int64)
+    cells = int(sides.prod())  # their memory is taken when they get points
     return Surface(
         np.zeros(sides, np.int32),
         np.zeros((cells, 3)),

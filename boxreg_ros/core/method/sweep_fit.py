@@ -3,8 +3,10 @@
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.crop import flat_height
 from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.core.method.surface import insert, is_foreign, nearest_cell
+from boxreg_ros.core.method.turn_rate import pose_information
 import numpy as np
 
 REASONS = ('', 'few_points', 'no_fit', 'uncertain', 'jump')
@@ -22,36 +24,43 @@ class Target(NamedTuple):
         Half its extents [m].
     tilt : array, shape (3, 3)
         Rotation by roll and pitch.
-    clearance : float
-        Height above the bottom under which points are of the road [m].
+    road : CropNumbers
+        How the road is found, and how high above it points are of the object.
     surface : Surface
         What has been seen of it.
+    is_rigid : bool
+        Whether it fits its surface at any time: limbs move.
 
     """
 
     half: Any
     tilt: Any
-    clearance: Any
+    road: Any
     surface: Any
+    is_rigid: bool
 
 
 class Expected(NamedTuple):
     """
-    A predicted pose (4,) x y z yaw, and its information (4, 4).
+    Where an object is expected.
 
-    How it is searched: `starts` further ones in each direction, each `step` [m] along the
-    heading. `usual` is the running mean of the score, `road` the height of the road above the
-    bottom of the box.
+    Attributes
+    ----------
+    state : State
+        By its motion.
+    reach : float
+        How far along the heading it is searched after a loss [m]; 0 while it is seen.
+    usual : float
+        Running mean of the score.
+    road : float
+        Height of the road above the bottom of the box [m]; NaN if unknown.
 
     """
 
-    pose: Any
-    information: Any
-    step: float = 0.0
-    starts: int = 0
-    is_lost: bool = False
-    usual: float = 0.0
-    road: float = np.nan
+    state: Any
+    reach: float
+    usual: float
+    road: float
 
 
 class Fit(NamedTuple):
@@ -90,10 +99,12 @@ def find(points, expected, target):
     """
     Return the pose of an object by the points (n, 3) around its prediction, as `registered`.
 
-    After a loss, and where it fits worse than usual, it is searched along the heading.
+    After a loss, and where it fits worse than usual, it is searched along the heading: in steps of
+    a cell while it is seen, since points further from the surface have hardly any weight, and with
+    the deviations of the prediction of a rigid one widened by as much as it fits worse.
 
     """
-    prior, information = expected.pose.copy(), expected.information.copy()
+    prior, information = expected.state.values[:4].copy(), pose_information(expected.state)
     own = _around(points, prior, target.half)
     height = road_below(own, prior, target) - expected.road
     if np.isfinite(height):
@@ -101,21 +112,28 @@ def find(points, expected, target):
         prior[2] += height * weight / (information[2, 2] + weight)
         information[2, 2] += weight
     best = registered(own, prior, prior, information, target, 12)
+    is_lost = expected.reach > 0
     slips = best.fit.inside > FOLLOW.effective_points
     slips = slips and best.fit.score < FOLLOW.search_below * expected.usual
-    if expected.is_lost or slips:
-        for n in range(-expected.starts, expected.starts + 1):
+    if is_lost or slips:
+        step, count = FOLLOW.cell, 2
+        if is_lost:
+            step = 2 * FOLLOW.cell
+            count = int(expected.reach / step)
+        elif target.is_rigid:
+            information *= (best.fit.score / expected.usual) ** 2
+        for n in range(-count, count + 1):
             start = prior.copy()
-            start[0] += n * expected.step * np.cos(prior[3])
-            start[1] += n * expected.step * np.sin(prior[3])
+            start[0] += n * step * np.cos(prior[3])
+            start[1] += n * step * np.sin(prior[3])
             own = _around(points, start, target.half)
-            if n == 0 or len(own) < FOLLOW.min_points:
+            if (n == 0 and is_lost) or len(own) < FOLLOW.min_points:
                 continue
             other = registered(own, start, prior, information, target, 12)
             if rank(other) > rank(best) + FOLLOW.jump_cost:
                 best = other
-    if expected.is_lost and best.reason == ACCEPTED:
-        fits = best.fit.fitting >= FOLLOW.min_fit_again * max(best.fit.matched, 1.0)
+    if is_lost and best.reason == ACCEPTED:
+        fits = best.fit.fitting >= FOLLOW.min_sure_fit * max(best.fit.matched, 1.0)
         if not fits or best.fit.score < FOLLOW.min_score_again * expected.usual:
             return Registered(best.pose, best.covariance, best.fit, best.jump, NO_FIT)
     return best
@@ -124,7 +142,7 @@ def find(points, expected, target):
 @kernel
 def rank(found):
     """Return the score of a registered pose, less what the distance from its prediction costs."""
-    return found.fit.score - FOLLOW.jump_cost * min(found.jump, FOLLOW.max_jump_cost)
+    return found.fit.score - FOLLOW.jump_cost * min(found.jump, FOLLOW.max_jump)
 
 
 @kernel
@@ -136,7 +154,7 @@ def _around(points, pose, half):
     for n in range(len(points)):
         if abs(points[n, 0] - pose[0]) >= reach or abs(points[n, 1] - pose[1]) >= reach:
             continue
-        if abs(points[n, 2] - pose[2]) < half[2] + FOLLOW.crop_above:
+        if abs(points[n, 2] - pose[2]) < half[2] + FOLLOW.crop:
             found[count] = points[n]
             count += 1
     return found[:count]
@@ -172,8 +190,7 @@ def registered(points, start, prior, information, target, iterations):
         gradient = g + information @ (pose - prior)
         step = np.linalg.solve(total, gradient)
         size = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-        if size > FOLLOW.max_step:
-            step *= FOLLOW.max_step / size
+        step *= min(1.0, 2 * FOLLOW.cell / max(size, 1e-9))
         pose = pose - step
         if size < 1e-3 and abs(step[3]) < 5e-4:
             break
@@ -212,7 +229,7 @@ def _system(points, pose, target):
     for n in range(len(points)):
         dx, dy, x, y, z = offset_in_box(points, n, pose, R)
         out_x, out_y = abs(x) - half[0], abs(y) - half[1]
-        if max(out_x, out_y, z - half[2]) > FOLLOW.margin or z < target.clearance - half[2]:
+        if max(out_x, out_y, z - half[2]) > FOLLOW.margin or z < target.road.clearance - half[2]:
             continue
         count += 1
         nx, ny, nz = 0.0, 0.0, 0.0
@@ -234,7 +251,7 @@ def _system(points, pose, target):
             else:
                 ny = np.sign(y)
             w = (1 - min(1.0, r / (FOLLOW.margin - FOLLOW.tolerance)) ** 2) ** 2
-            w /= FOLLOW.outside_deviation**2
+            w /= (3 * FOLLOW.deviation) ** 2
             weights += 1.0
         wx = R[0, 0] * nx + R[0, 1] * ny + R[0, 2] * nz
         wy = R[1, 0] * nx + R[1, 1] * ny + R[1, 2] * nz
@@ -266,7 +283,7 @@ def fit(points, pose, target):
     inside, fitting, beside, matched = 0.0, 0.0, 0.0, 0.0
     for n in range(len(points)):
         _, _, x, y, z = offset_in_box(points, n, pose, R)
-        if z < target.clearance - half[2] or z > half[2] + FOLLOW.tolerance:
+        if z < target.road.clearance - half[2] or z > half[2] + FOLLOW.tolerance:
             continue
         out = max(abs(x) - half[0], abs(y) - half[1])
         if out > FOLLOW.tolerance:
@@ -305,13 +322,12 @@ def near(points, pose, half, margin, boxes, same):
     for n in range(first, last):
         if abs(points[n, 1] - pose[1]) >= reach:
             continue
-        if abs(points[n, 2] - pose[2]) < half[2] + FOLLOW.crop_above:
+        if abs(points[n, 2] - pose[2]) < half[2] + FOLLOW.crop:
             found[count, 0] = points[n, 0]
             found[count, 1] = points[n, 1]
             found[count, 2] = points[n, 2]
             count += 1
     found = found[:count]
-    reach += FOLLOW.beside
     for k in range(len(boxes)):
         other = boxes[k]
         away = np.hypot(other[0] - pose[0], other[1] - pose[1])
@@ -362,7 +378,7 @@ def in_box(points, pose, target, margin):
     for n in range(len(points)):
         _, _, x, y, z = offset_in_box(points, n, pose, R)
         is_inside = max(abs(x) - half[0], abs(y) - half[1], z - half[2]) < margin
-        if is_inside and z > target.clearance - half[2]:
+        if is_inside and z > target.road.clearance - half[2]:
             found[count, 0], found[count, 1], found[count, 2] = x, y, z
             count += 1
     return found[:count]
@@ -379,22 +395,16 @@ def learn(points, pose, target):
 @kernel
 def road_below(points, pose, target):
     """Return the height of the road above the bottom of a box; NaN without points of it [m]."""
-    half = target.half
+    half, road = target.half, target.road
     R = axes(pose, target.tilt)
     heights = np.empty(len(points))
     count = 0
     for n in range(len(points)):
         _, _, x, y, z = offset_in_box(points, n, pose, R)
         out = max(abs(x) - half[0], abs(y) - half[1])
-        height = z + half[2]
-        if 0.05 < out < 1.0 and abs(height) < 0.6:
-            heights[count] = height
+        if road.road_gap < out < road.road_width and abs(z + half[2]) < road.road_range:
+            heights[count] = z + half[2]
             count += 1
-    if count < 5:
-        return np.nan
-    ordered = np.sort(heights[:count])
-    low = ordered[int(0.1 * count)]
-    middle = ordered[int(0.3 * count)]
-    if ordered[int(0.6 * count)] - low > 0.15:
-        return np.nan
-    return middle
+    return flat_height(
+        heights[:count], road.road_quantiles, road.road_flatness, road.min_road_points
+    )
