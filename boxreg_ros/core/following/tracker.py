@@ -22,7 +22,7 @@ from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.core.method.surface import empty_surface, insert_foreign
 from boxreg_ros.core.method.sweep_fit import Expected, Registered, Target
 from boxreg_ros.core.method.turn_rate import SPEED_STATE, State
-from boxreg_ros.core.observation import crop_numbers
+from boxreg_ros.core.observation import crop_numbers, GROUND_CLEARANCE
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, PITCH, ROLL, YAW
 import numpy as np
@@ -35,16 +35,18 @@ class KindOfMotion(NamedTuple):
     """
     Motion of a kind of object: densities of `turn_rate.predict`, largest speed [m/s].
 
-    Of others than rigid objects points do not show the extents: limbs move.
+    Points nearer to the road than `clearance` may be of it [m]. Of others than rigid objects
+    points do not show the extents: limbs move.
     """
 
     noise: Floats
     max_speed: float
     is_rigid: bool = False
+    clearance: float = GROUND_CLEARANCE
 
 
 MOTIONS = {
-    'vehicle': KindOfMotion(np.array([1.0, 0.1, 0.004, 0.01, 1e-4]), 40.0, True),
+    'vehicle': KindOfMotion(np.array([1.0, 0.1, 0.004, 0.01, 1e-4]), 40.0, True, 0.25),
     'cyclist': KindOfMotion(np.array([1.0, 0.4, 0.01, 0.01, 1e-3]), 12.0),
     'pedestrian': KindOfMotion(np.array([0.6, 0.4, 0.02, 0.01, 5e-3]), 3.0),
 }
@@ -139,9 +141,8 @@ class Follower:
         self._same = np.array(same, np.float64)
         half = seeds.boxes[:, BOX_EXTENT].mean(0) / 2
         tilt = matrix_from_rpy(np.append(seeds.boxes[0, [ROLL, PITCH]], 0.0))
-        self._target = Target(
-            half, tilt, crop_numbers(Config()), empty_surface(half), self._kind.is_rigid
-        )
+        road = crop_numbers(Config())._replace(clearance=self._kind.clearance)
+        self._target = Target(half, tilt, road, empty_surface(half), self._kind.is_rigid)
         self._noise, self._pivot = self._kind.noise.copy(), 0.0
         if kind == 'vehicle':
             length = 2 * half[0]
