@@ -6,7 +6,7 @@ from boxreg_ros import follow, ShapeError
 from boxreg_ros.core.following import person
 from boxreg_ros.core.following.between import closed
 from boxreg_ros.core.following.person import corrections, DEVIATIONS
-from boxreg_ros.core.following.tracker import Way
+from boxreg_ros.core.following.tracker import MOTIONS, steering, Way
 from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.structures import BoxArray, HUMAN, INTERPOLATED
@@ -230,7 +230,16 @@ def test_the_heading_of_a_long_vehicle_stays_where_its_rear_alone_is_seen():
     one = BoxArray(int(stamps(1)[0]), '', ('tram',), ('tram',), np.ones(1), box[None])
     [track] = follow(stamps(2 * N), sweeps, [one])
     assert len(track.rows) == 2 * N
-    assert np.abs(track.boxes[:, 8]).max() < 0.045
+    assert np.abs(track.boxes[:, 8]).max() < 0.1
+    noise = MOTIONS['vehicle'].noise
+    for length, pivot, factor in (
+        (4.0, 1.0, 1.0),
+        (9.0, 2.25, 0.25),
+        (23.0, 8.5, (4.5 / 23) ** 2),
+    ):
+        found, own = steering(noise, length)
+        assert own == pivot
+        np.testing.assert_allclose(found / noise, [1.0, factor, 1.0, 1.0, 1.0])
 
 
 def test_a_way_may_end_farther_from_a_seed_that_is_later():

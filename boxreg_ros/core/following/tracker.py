@@ -98,6 +98,13 @@ def is_parked(state: State) -> bool:
     return abs(state.speed) < CONSTANTS.parked_speed
 
 
+def steering(noise: Floats, length: float) -> tuple[Floats, float]:
+    """Return noise and pivot of a vehicle by its length: long ones turn more slowly."""
+    found = noise.copy()
+    found[1] *= min(1.0, FOLLOW.steered_length / length) ** 2
+    return found, max(CONSTANTS.pivot * length, length / 2 - FOLLOW.overhang)
+
+
 class Owned:
     """Boxes of objects that are followed already: their points are of no other object."""
 
@@ -143,11 +150,9 @@ class Follower:
         tilt = matrix_from_rpy(np.append(seeds.boxes[0, [ROLL, PITCH]], 0.0))
         road = crop_numbers(Config())._replace(clearance=self._kind.clearance)
         self._target = Target(half, tilt, road, empty_surface(half), self._kind.is_rigid)
-        self._noise, self._pivot = self._kind.noise.copy(), 0.0
+        self._noise, self._pivot = self._kind.noise, 0.0
         if kind == 'vehicle':
-            length = 2 * half[0]
-            self._pivot = max(CONSTANTS.pivot * length, half[0] - FOLLOW.overhang)
-            self._noise[1] *= min(1.0, FOLLOW.steered_length / length) ** 2
+            self._noise, self._pivot = steering(self._noise, 2 * half[0])
         self._road = np.nan
         self._start_speeds: dict[int, float] = {}
         self.num_points = 0
