@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.follow_numbers import FOLLOW
 import numpy as np
 
@@ -35,7 +35,7 @@ class Surface(NamedTuple):
     moments: Any
 
 
-@kernel
+@loop
 def cell_of(x, y, z, slots):
     """Return the indices of the cell at a place of the box frame; i = -1 outside of the map."""
     nx, ny, nz = slots.shape
@@ -95,7 +95,7 @@ def insert_foreign(points, half, slots):
                 slots[i, j, k] = FOREIGN
 
 
-@kernel
+@loop
 def is_foreign(x, y, z, slots):
     """Return whether a place is foreign, or beside a foreign one."""
     i, j, k = cell_of(x, y, z, slots)
@@ -152,7 +152,7 @@ def normal_at(mean, half, slots, moments):
     return eigenvector(C, values[0])
 
 
-@kernel
+@loop
 def eigenvalues(C):
     """Return the eigenvalues of a symmetric matrix (3, 3), ascending, in closed form."""
     mean = (C[0, 0] + C[1, 1] + C[2, 2]) / 3
@@ -186,7 +186,7 @@ def eigenvector(C, value):
     return best / np.sqrt(most) if most > 0 else best
 
 
-@kernel
+@loop
 def nearest_cell(x, y, z, surface):
     """Return the cell with the nearest mean to a place, or -1 where none is in reach."""
     slots, means = surface.slots, surface.means

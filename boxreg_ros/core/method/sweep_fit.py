@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.crop import flat_height
 from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.core.method.surface import insert, is_foreign, nearest_cell
@@ -172,7 +172,7 @@ def _reason(pose, covariance, found, jump):
 @kernel
 def _system(points, pose, target):
     """Return the normal equations (4, 4) and (4,) of the points at a pose, and their number."""
-    half, surface = target.half, target.surface
+    half, surface, slots = target.half, target.surface, target.surface.slots
     H = np.zeros((4, 4))
     g = np.zeros(4)
     R = axes(pose, target.tilt)
@@ -197,7 +197,7 @@ def _system(points, pose, target):
             weights += robust
         else:
             r = max(out_x, out_y) - FOLLOW.tolerance
-            if r <= 0 or z > half[2] or is_foreign(x, y, z, surface.slots):
+            if r <= 0 or z > half[2] or is_foreign(x, y, z, slots):
                 continue
             if out_x > out_y:
                 nx = np.sign(x)
@@ -219,7 +219,7 @@ def _system(points, pose, target):
     return H * scale, g * scale, count
 
 
-@kernel
+@loop
 def from_surface(x, y, z, slot, surface):
     """Return the signed distance of a place of the box frame from a piece of the surface [m]."""
     nx, ny, nz = surface.normals[slot]
@@ -230,7 +230,7 @@ def from_surface(x, y, z, slot, surface):
 @kernel
 def fit(points, pose, target):
     """Return how points (n, 3) fit a pose, `Fit`."""
-    half, surface = target.half, target.surface
+    half, surface, slots = target.half, target.surface, target.surface.slots
     R = axes(pose, target.tilt)
     hit = np.zeros(surface.used[0], np.bool_)
     inside, fitting, beside, matched = 0.0, 0.0, 0.0, 0.0
@@ -240,7 +240,7 @@ def fit(points, pose, target):
             continue
         out = max(abs(x) - half[0], abs(y) - half[1])
         if out > FOLLOW.tolerance:
-            if out < FOLLOW.margin and not is_foreign(x, y, z, surface.slots):
+            if out < FOLLOW.margin and not is_foreign(x, y, z, slots):
                 beside += 1
             continue
         inside += 1
@@ -316,7 +316,7 @@ def axes(pose, tilt):
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt
 
 
-@kernel
+@loop
 def offset_in_box(points, n, center, R):
     """Return dx, dy of a point from the centre of a box, and x, y, z along the columns of R."""
     dx = points[n, 0] - center[0]
