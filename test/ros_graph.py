@@ -62,9 +62,9 @@ class Graph:
         self, records, *ros_args, kind=DETECTIONS, command=(NODE,), base=RELIABLE, connects=True
     ):
         """
-        Return a node, connected to publishers of the topics of a recording unless told otherwise.
+        Start a node beside publishers of a recording; if it `connects`, wait until it has.
 
-        It has the lists ``early``, ``final`` and ``diagnostics``, which fill with its messages.
+        Its lists ``early``, ``final`` and ``diagnostics`` fill with its messages.
 
         """
         publishers_for(self, records)

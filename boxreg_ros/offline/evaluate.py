@@ -109,10 +109,10 @@ def _track_lines(scores: TrackScores) -> str:
         f'{scores.hota:.3f} (detection {scores.det_a:.3f}, association {scores.ass_a:.3f})'
     ]
     if scores.added:
+        without = f' ({scores.added_ghosts} without a true box)' if scores.added_ghosts else ''
         lines.append(
-            f'{scores.added} added boxes with a mean 3D IoU of {scores.added_iou:.3f}, of which '
-            f'{scores.added_ghosts} have no true box (IoU 0); the others have '
-            f'{scores.given_iou:.3f}'
+            f'{scores.added} added boxes{without} with a mean 3D IoU of {scores.added_iou:.3f}, '
+            f'the others have {scores.given_iou:.3f}'
         )
     return '\n'.join(lines)
 

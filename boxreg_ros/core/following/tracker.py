@@ -37,6 +37,7 @@ class KindOfMotion(NamedTuple):
 
     Points nearer to the road than `clearance` may be of it [m]. Of others than rigid objects
     points do not show the extents: limbs move.
+
     """
 
     noise: Floats
@@ -54,6 +55,8 @@ SEED = np.diag([*[POSITION] * 3, ANGLE, 1.0, 0.1]) ** 2
 """Covariance of the state at a seed, with speed [m/s] and turn rate [rad/s]; chosen."""
 START = np.diag([*[FOLLOW.around] * 2, 0.1, 0.05, 1.0, 1.0]) ** 2
 """Covariance of the starts of a search for the speed [m, rad]; chosen."""
+CROP_NUMBERS = crop_numbers(Config())
+"""How the road is found, as for the boxes of a detector."""
 
 
 class Seeds(NamedTuple):
@@ -148,7 +151,7 @@ class Follower:
         self._same = np.array(same, np.float64)
         half = seeds.boxes[:, BOX_EXTENT].mean(0) / 2
         tilt = matrix_from_rpy(np.append(seeds.boxes[0, [ROLL, PITCH]], 0.0))
-        road = crop_numbers(Config())._replace(clearance=self._kind.clearance)
+        road = CROP_NUMBERS._replace(clearance=self._kind.clearance)
         self._target = Target(half, tilt, road, empty_surface(half), self._kind.is_rigid)
         self._noise, self._pivot = self._kind.noise, 0.0
         if kind == 'vehicle':

@@ -54,11 +54,11 @@ class FollowNumbers(NamedTuple):
     max_deviation: float = 0.35
     """Deviation along the heading [m]."""
     max_yaw_deviation: float = 0.12
-    """[rad]."""
+    """Deviation of the yaw [rad]."""
     max_jump: float = 16.0
     """Squared Mahalanobis distance from the prediction."""
     min_score_again: float = 0.5
-    """And of their score before the loss, as a running mean."""
+    """Part of the running mean of its score, to find an object again after a loss."""
     min_sure_fit: float = 0.7
     """Part of the points that fit, to find an object again after a loss, and to add points to the
     surface."""
@@ -82,7 +82,7 @@ class FollowNumbers(NamedTuple):
     hold: float = 2.0
     """An object that is not found for so long is lost [s]."""
     hold_parked: float = 5.0
-    """And a parked one [s]."""
+    """The same for a parked object [s]."""
     young: float = 1.0
     """A way of this duration does not yet know its speed well [s]."""
     young_speed: float = 2.0
@@ -122,16 +122,16 @@ class FollowNumbers(NamedTuple):
     edge_bins: int = 3
     """Bins on each side of an edge that are compared: 0.3 m."""
     dense: int = 30
-    """Points in a bin on its inner side, of all sweeps: fewer end before the object does, since
-    the sensor hardly sees so far along it. Swept: 15 lose PandaSet .01."""
+    """Points in a bin on the inner side of an edge, of all sweeps: fewer end before the object
+    does, since the sensor hardly sees so far along it. Swept: 15 lose PandaSet .01."""
     dense_outside: int = 20
-    """The same outside of the box, where points are evidence by themselves. Swept: 50 lose
-    re-simulated drives .01."""
+    """The same for an edge outside of the box, where points are evidence by themselves. Swept: 50
+    lose re-simulated drives .01."""
     empty: float = 0.1
-    """Points on its outer side as part of these."""
+    """Points on the outer side of an edge, as part of those on its inner side."""
     stray: float = 0.02
-    """And in all of the box behind it, as part of all: a gap is no edge. The same part of the
-    points beside an edge is farther out than the face."""
+    """Points of the box beyond an edge, as part of all: with more it is a gap. The face has the
+    same part of the points beside the edge outside of it."""
     min_distance: float = 2.0
     """Nearer points do not show how far up the sensor sees [m]: they may be of its vehicle."""
 
