@@ -139,11 +139,9 @@ def test_second_node_continues_after_the_first_was_killed(graph, tmp_path):
         graph.executor.spin_once(timeout_sec=0.05)
     node.kill()
     count = len(shown)
+    left = graph.endpoints()
     second = graph.start(*RELIABLE, *QUICK)
-    graph.wait(lambda: 'boxes are' in second.output(), 'the second node')
-    graph.wait(lambda: graph.publishers['/points'].get_subscription_count() >= 1, 'readers')
-    for _ in range(20):  # discovery in both directions
-        graph.executor.spin_once(timeout_sec=0.05)
+    graph.wait_until_connected(left)
     node.play(records[half:])
     graph.wait(lambda: len(shown) > count, 'markers')
     assert shown[count].markers[0].action == 3  # deletes those of the first node
