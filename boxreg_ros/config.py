@@ -372,12 +372,12 @@ class Config:
     cyclist: ClassConfig = ClassConfig(
         names=('cyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'rider', 'scooter'),
         acceleration=1.5, cornering=1.5, turning=1.0, slip=0.4,
-        shape=0.15, heading=0.15, extent=0.07, gap_spread=0.2,
+        shape=0.15, heading=0.08, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
     pedestrian: ClassConfig = ClassConfig(
         names=('pedestrian', 'person', 'walker', 'people', 'child'),
         acceleration=0.8, cornering=0.8, turning=1.0, slip=0.5,
-        shape=0.2, heading=0.5, extent=0.07, gap_spread=0.2,
+        shape=0.2, heading=0.2, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
 
     def __post_init__(self) -> None:

@@ -26,6 +26,9 @@ from rosbags.highlevel import AnyReader
 
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 PATIENCE = 90.0  # [s]; nodes start slowly on a busy machine
+UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'
+"""Name of the node of an endpoint that is discovered before its node."""
+PLAYER = 'ros_graph:play_recording'
 LAUNCH_PATIENCE = 5.0  # [s]; after SIGINT, ros2 launch then sends SIGTERM
 RELIABLE = [
     part
@@ -80,10 +83,8 @@ class Graph:
         return node
 
     def start_player(self, path, boxes_topic='/boxes'):
-        """Start a process that plays a recording when a line arrives on its standard input."""
-        command = [__file__, str(path), boxes_topic, str(self.domain)]
-        process = NodeProcess(self, command)
-        process.is_ending = True
+        """Start a process that plays a recording once its topics are connected, and stays."""
+        process = NodeProcess(self, [PLAYER, str(path), boxes_topic, str(self.domain)])
         self.processes.append(process)
         return process
 
@@ -109,28 +110,39 @@ class Graph:
         """
         Call a service of a node and return its response.
 
-        A server that has not yet discovered the reader of the client drops its response, and the
-        client does not know. So a call that changes nothing goes first, until it is answered:
-        readers are discovered in the order in which they were made.
+        A server drops its response to a client that it has not discovered.
 
         """
         client = self.node.create_client(kind, service)
-        node = service.rpartition('/')[0]
-        probe = self.node.create_client(GetParameters, f'{node}/get_parameters')
-
-        def is_answered():
-            future = probe.call_async(GetParameters.Request())
-            self.executor.spin_until_future_complete(future, timeout_sec=1.0)
-            return future.done()
-
-        self.wait(probe.service_is_ready, f'the services of {node}')
-        self.wait(is_answered, f'an answer of {node}')
+        self.wait_until_discovered_by(service.rpartition('/')[0])
         self.wait(client.service_is_ready, f'the service {service}')
         future = client.call_async(request)
         self.wait(future.done, f'the response of {service}')
-        self.node.destroy_client(probe)
         self.node.destroy_client(client)
         return future.result()
+
+    def wait_until_discovered_by(self, node):
+        """
+        Wait until a node has discovered all publishers and subscriptions made here.
+
+        A publisher sends nothing to a subscription that it has not discovered, and a subscription
+        drops the messages of a publisher that it has not discovered. Neither is seen from the
+        other side. So the node is asked for its parameters until it answers: it has then
+        discovered the client, which was made last, and endpoints are discovered in the order in
+        which they were made.
+
+        """
+        client = self.node.create_client(GetParameters, f'{node}/get_parameters')
+        futures = []
+
+        def is_answered():
+            futures.append(client.call_async(GetParameters.Request()))
+            self.executor.spin_until_future_complete(futures[-1], timeout_sec=0.3)
+            return any(future.done() for future in futures)
+
+        self.wait(client.service_is_ready, f'the services of {node}')
+        self.wait(is_answered, f'an answer of {node}')
+        self.node.destroy_client(client)
 
     def wait(self, condition, awaited, seconds=PATIENCE):
         """Spin until `condition` holds; an error names `awaited`."""
@@ -152,15 +164,41 @@ class Graph:
             if time.monotonic() < begun + 0.015:  # it did not wait to the end: there was work
                 last_handled = time.monotonic()
 
-    def wait_until_connected(self):
-        """Wait until each publisher here has a subscriber, and each subscription a publisher."""
-        for topic, publisher in self.publishers.items():
-            self.wait(
-                lambda p=publisher: p.get_subscription_count() > 0, f'subscribers of {topic}'
-            )
-        for item in self.node.subscriptions:
-            name = item.topic_name
-            self.wait(lambda n=name: self.node.count_publishers(n) > 0, f'a publisher of {name}')
+    def endpoints(self):
+        """Return the names of the nodes at the other ends of the topics used here, by endpoint."""
+        node = self.node
+        found = {topic: node.get_subscriptions_info_by_topic(topic) for topic in self.publishers}
+        for subscription in node.subscriptions:
+            topic = subscription.topic_name
+            found[topic] = node.get_publishers_info_by_topic(topic)
+        return {
+            (topic, *item.endpoint_gid): f'{item.node_namespace.rstrip("/")}/{item.node_name}'
+            for topic, items in found.items()
+            for item in items
+            if item.node_name != node.get_name()
+        }
+
+    def wait_until_connected(self, left=()):
+        """
+        Wait until each topic used here has an endpoint of another node, which has discovered ours.
+
+        Endpoints that have `left` do not count: those of a node that has ended may still be known.
+
+        """
+
+        def others():
+            return {key: name for key, name in self.endpoints().items() if key not in left}
+
+        def is_connected(topic):
+            publisher = self.publishers.get(topic)
+            is_matched = publisher is None or publisher.get_subscription_count() > 0
+            names = [name for key, name in others().items() if key[0] == topic]
+            return is_matched and names and UNKNOWN_NODE not in ''.join(names)
+
+        for topic in {*self.publishers, *(item.topic_name for item in self.node.subscriptions)}:
+            self.wait(lambda t=topic: is_connected(t), f'the other end of {topic}')
+        for name in set(others().values()):
+            self.wait_until_discovered_by(name)
 
     def outputs(self):
         return [process.output() for process in self.processes]
@@ -351,18 +389,15 @@ def numbers_changed(messages, records):
     return [int((np.abs(change).max(1) > 1e-6).sum()) for change in changes]
 
 
-if __name__ == '__main__':
+def play_recording():
+    """Play a recording in a process of its own, see `Graph.start_player`."""
     recording, topic, domain = sys.argv[1:]
-    everything = records_of(Path(recording), topic)
+    records = records_of(Path(recording), topic)
     player = Graph(Path(recording).parent, int(domain))
-    publishers_for(player, everything)
+    publishers_for(player, records)
     player.wait_until_connected()
-    sys.stdin.readline()
-    # A publisher may find its subscriber before the reverse; messages sent in between are lost.
-    time.sleep(1.0)
-    for one in everything:
-        play(player, [one])
+    for record in records:
+        play(player, [record])
         time.sleep(0.02)
-    for publisher in player.publishers.values():
-        publisher.wait_for_all_acked()
-    player.close()
+    # Messages that were lost are sent again while their publishers exist.
+    signal.pause()

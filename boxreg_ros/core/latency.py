@@ -347,9 +347,9 @@ def _points_near(sweep: Sweep, boxes: Floats, velocity: Floats) -> tuple[Floats,
     beside = np.array([-ahead[Y], ahead[X], 0.0])
     reach = np.abs((centers - middle) @ np.stack([ahead, beside], 1)).max(0)
     reach += np.array([length, width]) / 2 + PATH_REACH
-    there = (middle - t) @ R
+    there = ((middle - t) @ R).tolist()  # numbers of Python: the points stay single precision
     x, y = sweep.points[:, X], sweep.points[:, Y]
-    radius = reach.sum()
+    radius = float(reach.sum())
     near = np.flatnonzero((np.abs(x - there[X]) < radius) & (np.abs(y - there[Y]) < radius))
     offsets = sweep.points[near] @ R.T + (t - middle)
     above = offsets[:, Z] + height / 2

@@ -64,8 +64,15 @@ class BoxesTypeSearch:
             )
             return [TopicProblem(DiagnosticStatus.WARN, f'{self._name}: {text}')]
         if not types and time.monotonic() >= self._since + PATIENCE:
-            return [self._topics.unpublished('boxes', set(ADAPTERS))]
+            return [self._absence()]
         return []
+
+    def _absence(self) -> TopicProblem:
+        """Return the problem that no known node publishes boxes."""
+        if not self._topics.is_published_without_node('boxes'):
+            return self._topics.unpublished('boxes', set(ADAPTERS))
+        text = 'its publishers belong to no known node; set boxes_type if they send boxes'
+        return TopicProblem(DiagnosticStatus.WARN, f'{self._name}: {text}')
 
     def _sorted_out(self, types: set[str]) -> tuple[list[str], list[str]]:
         """Return the types that can be read, sorted, and an error text for each of the others."""

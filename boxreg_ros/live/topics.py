@@ -157,14 +157,25 @@ class NodeTopics:
         return f'subscribed to {"; ".join(subscribed)}. Publishing {"; ".join(published)}'
 
     def types_published(self, topic: str) -> set[str]:
-        """Return the message types that are published on a topic, but for refined boxes."""
+        """
+        Return the message types that are published on a topic, but for refined boxes.
+
+        A publisher is discovered before its node, which may be of this kind: until then its type
+        is left out.
+
+        """
         publishers = self._node.get_publishers_info_by_topic(topic)
-        return {p.topic_type for p in publishers if not self._refines(*_node_of(p))}
+        return {p.topic_type for p in publishers if self._refines(*_node_of(p)) is False}
 
     def refiners(self, topic: str) -> str:
         """Return the names of the nodes of this kind that publish on a topic; '' for none."""
         publishers = self._node.get_publishers_info_by_topic(topic)
         return _nodes([p for p in publishers if self._refines(*_node_of(p))])
+
+    def is_published_without_node(self, topic: str) -> bool:
+        """Return whether a topic has publishers whose node is not known."""
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        return any(self._refines(*_node_of(p)) is None for p in publishers)
 
     def problems(self) -> list[TopicProblem]:
         """Return the reasons why messages do not arrive now, on any topic of the node."""
@@ -287,15 +298,28 @@ class NodeTopics:
                     f'{endpoint.name}: publish there',
                 )
 
-    def _refines(self, name: str, namespace: str) -> bool:
-        """Return whether a node is of this kind, by its services: topics may be remapped."""
+    def _refines(self, name: str, namespace: str) -> bool | None:
+        """
+        Return whether a node is of this kind, by its services: topics may be remapped.
+
+        None for a node that is not known yet, or no longer. DDS announces the readers of requests
+        apart from the writers, and the writers in the order in which they were made. So a node
+        whose publisher of boxes is known also has known writers of responses, made before it.
+
+        """
         try:
             services = self._node.get_service_names_and_types_by_node(name, namespace)
-        except RuntimeError:  # it has ended in the meantime
-            return False
-        offered = {service for service, _ in services}
+            writers = self._node.get_publisher_names_and_types_by_node(
+                name, namespace, no_demangle=True
+            )
+        except RuntimeError:
+            return None
+        known = {known for known, _ in (*services, *writers)}
         prefix = f'{namespace.rstrip("/")}/{name}'
-        return {f'{prefix}/save_config', f'{prefix}/start_recording'} <= offered
+        return all(
+            known & {f'{prefix}/{service}', f'rr{prefix}/{service}Reply'}
+            for service in ('save_config', 'start_recording')
+        )
 
     def _published_topics(self, type_names: set[str]) -> list[str]:
         """Return the topics of given types that nodes publish, those of refined boxes excluded."""

@@ -190,11 +190,9 @@ def test_second_node_continues_after_the_first_was_killed(graph, tmp_path):
         graph.executor.spin_once(timeout_sec=0.05)
     node.kill()
     count = len(shown)
+    left = graph.endpoints()
     second = graph.start(*RELIABLE, *QUICK)
-    graph.wait(lambda: 'boxes are' in second.output(), 'the second node')
-    graph.wait(lambda: graph.publishers['/points'].get_subscription_count() >= 1, 'readers')
-    for _ in range(20):  # discovery in both directions
-        graph.executor.spin_once(timeout_sec=0.05)
+    graph.wait_until_connected(left)
     node.play(records[half:])
     graph.wait(lambda: len(shown) > count, 'markers')
     assert shown[count].markers[0].action == 3  # deletes those of the first node
@@ -256,18 +254,28 @@ def without(topic, first, last, sweeps):
         pytest.param(
             without('/points', 6, 9, 16), [0, 0, *[2] * 4, *[0] * 4, *[2] * 6], id='LiDAR restarts'
         ),
-        # The last transform is extrapolated by up to 0.2 s.
-        pytest.param(
-            without('/tf', 4, 13, 20), [0, 0, *[2] * 4, *[0] * 8, *[2] * 6], id='TF stops for 1 s'
-        ),
     ],
 )
 def test_boxes_are_refined_again_after_a_disturbance(graph, tmp_path, drive, refined):
     """With two tracks: the number of early boxes refined at each sweep."""
     records = records_of(drive.write(tmp_path / 'drive'))
-    node = graph.run(records, *QUICK, '-p', 'transform_timeout:=0.1')
+    node = graph.run(records, *QUICK, '-p', 'transform_timeout:=20.0')
     node.play(records)
     assert ended_cleanly(node)
+    assert numbers_changed(node.early, records) == refined
+
+
+def test_boxes_are_refined_again_after_tf_stopped_for_a_second(graph, tmp_path):
+    """The last transform is extrapolated by up to 0.2 s."""
+    records = records_of(without('/tf', 4, 13, 20).write(tmp_path / 'drive'))
+    node = graph.run(records, *QUICK, '-p', 'transform_timeout:=1.0')
+    ends = [i + 1 for i, record in enumerate(records) if record.topic == '/boxes']
+    node.play(records[: ends[3]])
+    play(graph, records[ends[3] : ends[13]])  # all wait for transforms at the same time
+    graph.wait(lambda: len(node.early) == 14, 'boxes without transforms')
+    node.play(records[ends[13] :])
+    assert ended_cleanly(node)
+    refined = [0, 0, *[2] * 4, *[0] * 8, *[2] * 6]
     assert numbers_changed(node.early, records) == refined
 
 

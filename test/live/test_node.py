@@ -140,8 +140,9 @@ def test_boxes_without_a_fixed_frame_are_published_unchanged(graph, tmp_path):
     node.early.clear()
     node.final.clear()
     settings = ('-p', 'fixed_frame:=lidar', '-p', f'boxes_type:={DETECTIONS}')
+    left = graph.endpoints()
     second = graph.start(*RELIABLE, *QUICK, *settings)
-    graph.wait_until_connected()
+    graph.wait_until_connected(left)
     node.play(records)
     assert ended_cleanly(second)
     assert len(node.final) == 4

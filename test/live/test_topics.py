@@ -1,7 +1,12 @@
 """Topics of the real node over DDS: QoS, types, silence and remaps in log and /diagnostics."""
 
-from boxreg_ros.live.topics import import_message, mismatches
+from types import SimpleNamespace
+
+from boxreg_ros.live.boxes_type import BoxesTypeSearch
+from boxreg_ros.live.diagnostics import Health
+from boxreg_ros.live.topics import import_message, mismatches, NodeTopics
 from diagnostic_msgs.msg import DiagnosticStatus
+from msg_adapters.convention import Convention
 from preloaded import CODE, IMPATIENT_NODE
 import pytest
 from rclpy.duration import Duration
@@ -14,6 +19,7 @@ from ros_graph import (
     QUICK,
     records_of,
     RELIABLE,
+    UNKNOWN_NODE,
     values_of,
 )
 from ros_messages import DETECTIONS, Drive, MARKERS, POINTS
@@ -145,10 +151,61 @@ def test_outputs_of_another_node_are_not_taken_for_inputs(graph):
     third = graph.start(*chained, '-r', '/diagnostics:=/third/diagnostics')
     parts = ('/refined_boxes', 'refined boxes of /boxreg_node', 'set boxes_type')
     assert '[WARN]' in reported(graph, third, diagnostics, *parts)
-    graph.wait(lambda: '/track: nobody publishes it' in second.output(), 'a proposal')
-    assert 'a fitting type: /tracks;' in second.output()
+    proposal = '/track: nobody publishes it; published topics of a fitting type: /tracks;'
+    graph.wait(lambda: proposal in second.output(), 'a proposal')
     assert 'boxes are' not in third.output()
     assert all(ended_cleanly(node) for node in (first, second, third))
+
+
+class DiscoveredPart:
+    """A node that has discovered a publisher of boxes, and of its node not all."""
+
+    def __init__(self):
+        self.name = UNKNOWN_NODE
+        self.services = []
+        self.writers = []
+
+    def get_publishers_info_by_topic(self, topic):
+        return [SimpleNamespace(topic_type=DETECTIONS, node_name=self.name, node_namespace='/')]
+
+    def get_service_names_and_types_by_node(self, name, namespace):
+        if name == UNKNOWN_NODE:
+            raise RuntimeError(name)
+        return [(service, []) for service in self.services]
+
+    def get_publisher_names_and_types_by_node(self, name, namespace, no_demangle):
+        assert no_demangle
+        return [(writer, []) for writer in self.writers]
+
+
+@pytest.fixture
+def discovered():
+    """Return what is discovered, and a search for the type of boxes that was made long ago."""
+    discovered = DiscoveredPart()
+    search = BoxesTypeSearch(NodeTopics(discovered, Health(None)), '/boxes', Convention())
+    search._since -= 60.0
+    return discovered, search
+
+
+def test_boxes_of_a_node_not_yet_discovered_are_awaited(discovered):
+    part, search = discovered
+    assert [search.step() for _ in range(3)] == [''] * 3
+    (problem,) = search.problems()
+    assert problem.text.startswith('/boxes: its publishers belong to no known node; set boxes_t')
+    part.name, part.services = 'tracker', ['/tracker/get_parameters']
+    assert [search.step() for _ in range(2)] == ['', DETECTIONS]
+
+
+@pytest.mark.parametrize('known', ['requests', 'responses', 'one of each'])
+def test_refined_boxes_are_known_by_either_half_of_the_services(discovered, known):
+    part, search = discovered
+    names = ['/boxreg_node/start_recording', '/boxreg_node/save_config']
+    part.name = 'boxreg_node'
+    part.services = {'requests': names, 'responses': [], 'one of each': names[:1]}[known]
+    part.writers = [f'rr{name}Reply' for name in names if name not in part.services]
+    assert [search.step() for _ in range(3)] == [''] * 3
+    (problem,) = search.problems()
+    assert 'nothing but the refined boxes of /boxreg_node' in problem.text
 
 
 def test_silent_publishers_are_reported_until_they_publish(graph):
