@@ -5,17 +5,18 @@ Each is forked from one process that has them, which saves seconds of every star
 
 """
 
-from contextlib import suppress
+from contextlib import chdir, suppress
+from functools import cache
 from importlib import import_module
 import json
-from multiprocessing import connection, get_context
+from multiprocessing import connection, forkserver, get_context
 import os
 import signal
 import socket
 import sys
 from threading import Thread
 
-from paths import ROOT
+from paths import ROOT, TEST
 
 BOXREG = 'boxreg_ros.cli:command'
 NODE = 'boxreg_ros.live.main:main'
@@ -29,6 +30,19 @@ MODULES = (
 
 context = get_context('forkserver')
 context.set_forkserver_preload([*MODULES, __name__])
+
+
+@cache
+def start_server():
+    """
+    Start the process that the others are forked from.
+
+    Python 3.11 does not give it the paths of modules, and skips the modules that it does not
+    find: it finds those of the tests in its folder.
+
+    """
+    with chdir(TEST):
+        forkserver.ensure_running()
 
 
 class PreloadedProcess:
@@ -49,6 +63,7 @@ class PreloadedProcess:
     """
 
     def __init__(self, entry_point, arguments, environment, log):
+        start_server()
         given = (entry_point, arguments, environment, log)
         self._process = context.Process(target=_run, args=given)
         self._process.start()
@@ -103,6 +118,7 @@ class PreloadedPython:
     """
 
     def __init__(self, path):
+        start_server()
         address = f'\0boxreg-{os.getpid()}-{id(self)}'
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(address)

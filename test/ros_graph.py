@@ -28,6 +28,7 @@ DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 PATIENCE = 90.0  # [s]; nodes start slowly on a busy machine
 UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'
 """Name of the node of an endpoint that is discovered before its node."""
+PLAYER = 'ros_graph:play_recording'
 LAUNCH_PATIENCE = 5.0  # [s]; after SIGINT, ros2 launch then sends SIGTERM
 RELIABLE = [
     part
@@ -82,10 +83,8 @@ class Graph:
         return node
 
     def start_player(self, path, boxes_topic='/boxes'):
-        """Start a process that plays a recording when a line arrives on its standard input."""
-        command = [__file__, str(path), boxes_topic, str(self.domain)]
-        process = NodeProcess(self, command)
-        process.is_ending = True
+        """Start a process that plays a recording once its topics are connected, and stays."""
+        process = NodeProcess(self, [PLAYER, str(path), boxes_topic, str(self.domain)])
         self.processes.append(process)
         return process
 
@@ -390,16 +389,15 @@ def numbers_changed(messages, records):
     return [int((np.abs(change).max(1) > 1e-6).sum()) for change in changes]
 
 
-if __name__ == '__main__':
+def play_recording():
+    """Play a recording in a process of its own, see `Graph.start_player`."""
     recording, topic, domain = sys.argv[1:]
-    everything = records_of(Path(recording), topic)
+    records = records_of(Path(recording), topic)
     player = Graph(Path(recording).parent, int(domain))
-    publishers_for(player, everything)
+    publishers_for(player, records)
     player.wait_until_connected()
-    sys.stdin.readline()
-    for one in everything:
-        play(player, [one])
+    for record in records:
+        play(player, [record])
         time.sleep(0.02)
-    for publisher in player.publishers.values():
-        publisher.wait_for_all_acked()
-    player.close()
+    # Messages that were lost are sent again while their publishers exist.
+    signal.pause()

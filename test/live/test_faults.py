@@ -203,18 +203,28 @@ def without(topic, first, last, sweeps):
         pytest.param(
             without('/points', 6, 9, 16), [0, 0, *[2] * 4, *[0] * 4, *[2] * 6], id='LiDAR restarts'
         ),
-        # The last transform is extrapolated by up to 0.2 s.
-        pytest.param(
-            without('/tf', 4, 13, 20), [0, 0, *[2] * 4, *[0] * 8, *[2] * 6], id='TF stops for 1 s'
-        ),
     ],
 )
 def test_boxes_are_refined_again_after_a_disturbance(graph, tmp_path, drive, refined):
     """With two tracks: the number of early boxes refined at each sweep."""
     records = records_of(drive.write(tmp_path / 'drive'))
-    node = graph.run(records, *QUICK, '-p', 'transform_timeout:=0.1')
+    node = graph.run(records, *QUICK, '-p', 'transform_timeout:=20.0')
     node.play(records)
     assert ended_cleanly(node)
+    assert numbers_changed(node.early, records) == refined
+
+
+def test_boxes_are_refined_again_after_tf_stopped_for_a_second(graph, tmp_path):
+    """The last transform is extrapolated by up to 0.2 s."""
+    records = records_of(without('/tf', 4, 13, 20).write(tmp_path / 'drive'))
+    node = graph.run(records, *QUICK, '-p', 'transform_timeout:=1.0')
+    ends = [i + 1 for i, record in enumerate(records) if record.topic == '/boxes']
+    node.play(records[: ends[3]])
+    play(graph, records[ends[3] : ends[13]])  # all wait for transforms at the same time
+    graph.wait(lambda: len(node.early) == 14, 'boxes without transforms')
+    node.play(records[ends[13] :])
+    assert ended_cleanly(node)
+    refined = [0, 0, *[2] * 4, *[0] * 8, *[2] * 6]
     assert numbers_changed(node.early, records) == refined
 
 

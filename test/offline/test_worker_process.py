@@ -286,7 +286,7 @@ def test_workers_end_when_the_parent_is_killed(tmp_path):
         time.sleep(0.01)
     process.kill()
     process.wait()
-    left = [Path(f'/proc/{child}') for child in children]
+    left = [Path(f'/proc/{child}/exe') for child in children]  # none after the end of a process
     assert len(left) == 2
     while any(path.exists() for path in left):
         time.sleep(0.05)
