@@ -14,14 +14,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import words_of
-from boxreg_ros.core.point_labels import BACKGROUND, ObjectTrack, UNKNOWN
 from boxreg_ros.labels import nuscenes
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.structures import Ints, RefinedBoxes
 import numpy as np
+
+if TYPE_CHECKING:
+    from boxreg_ros.core.point_labels import ObjectTrack
 
 FORMAT = replace(
     nuscenes.FORMAT,
@@ -112,6 +114,8 @@ class Writer(nuscenes.Writer):
 
 def codes_of(tracks: Sequence[ObjectTrack]) -> Ints:
     """Return 1000 times the category plus the instance of the points of each track."""
+    from boxreg_ros.core.point_labels import BACKGROUND, UNKNOWN  # numba: the recorder has none
+
     counts: Counter[str] = Counter()
     codes = []
     for track in tracks:

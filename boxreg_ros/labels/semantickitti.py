@@ -11,15 +11,18 @@ are those of the LiDAR, relative to the first one; the calibration is the identi
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from boxreg_ros.config import words_of
-from boxreg_ros.core.point_labels import BACKGROUND, PointLabels, UNKNOWN
 from boxreg_ros.io.transforms import inverse
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.structures import Floats
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from boxreg_ros.core.point_labels import PointLabels
 
 FORMAT = Format(
     name='semantickitti',
@@ -98,6 +101,8 @@ def point_numbers(points: PointLabels) -> NDArray[np.uint32]:
     none, and beyond `MAX_INSTANCE`. The last two are those of the track numbers -2 and -1.
 
     """
+    from boxreg_ros.core.point_labels import BACKGROUND, UNKNOWN  # numba: the recorder has none
+
     pairs = zip(points.tracks, points.moves.tolist(), strict=True)
     classes = [class_of(track.class_name, moves) for track, moves in pairs]
     assert (UNKNOWN, BACKGROUND) == (-2, -1)

@@ -392,6 +392,18 @@ def test_settings_that_cannot_work_are_named(tmp_path, changes, error):
     assert not list(tmp_path.iterdir())
 
 
+def test_checking_formats_imports_no_large_library():
+    """A recorder starts beside the node, and checks its parameters while it waits."""
+    code = (
+        'import sys\n'
+        'from boxreg_ros.recorder.main import check_each\n'
+        "check_each(('csv',), '')\n"
+        "print(*{'numba', 'rosbags', 'scipy', 'torch'} & set(sys.modules))\n"
+    )
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ('\n', '')
+
+
 def test_index_that_was_edited_is_named(tmp_path):
     record(settings_of(tmp_path), [final_boxes(0)])
     (tmp_path / 'index.csv').write_text('segment,frames\nsegment_000001,many\n')
