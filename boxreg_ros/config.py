@@ -222,7 +222,11 @@ class ClassConfig:
         0.0, 'labelling margin: bottom face below the road', 'm', -2.0, 2.0
     )
     gap_spread: float = setting(
-        0.05, 'standard deviation of the labelling margins between objects', 'm', 1e-4, 1.0
+        0.05,
+        'standard deviation of the labelling margins between objects, but that of the road',
+        'm',
+        1e-4,
+        1.0,
     )
 
 

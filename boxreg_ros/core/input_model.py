@@ -289,9 +289,10 @@ class InputModel:
         parts = np.array([constant_part(c, 1.0) for c in inputs['correlation'].tolist()])
         bias = settings['pose'][:SIZE] * inputs['deviation'][:SIZE] * parts[:SIZE]
         half_extent = settings['extent'] * inputs['extent_error'] * parts[-SIZE:] * extents / 2
-        along_axes = settings['gap_spread'] ** 2 + bias**2 + half_extent**2
+        along_axes = bias**2 + half_extent**2
+        spread = np.array([*[settings['gap_spread']] * 3, self.constants.road_spread])
         of_face = np.maximum(face_deviations, settings['roughness'])[FIRST_FACES]
-        between = along_axes[FIRST_FACES // 2] + of_face**2
+        between = spread**2 + along_axes[FIRST_FACES // 2] + of_face**2
         prior = Pooled(np.zeros(len(between)), np.square(deviations), between)
         # Of each track, quantity and group of faces: the sums of value, count and share.
         sums = np.add.reduceat(tracks['sums'], FIRST_FACES, axis=-1)

@@ -70,8 +70,8 @@ def labelling_margins(drive: Drive, config: Config) -> dict[str, Measured]:
     """
     Estimate the labelling margins and insets of faces at the true boxes of a drive [m].
 
-    Its input boxes are not used; `config` has the margins to begin with. Margins are by the kinds
-    of objects there are, insets of all kinds together; NaN without evidence.
+    Its input boxes are not used; `config` has the margins to begin with. Margins and their spread
+    are by the kinds of objects there are, insets of all kinds together; NaN without evidence.
 
     """
     kinds: dict[str, list[Window]] = {}
@@ -82,7 +82,22 @@ def labelling_margins(drive: Drive, config: Config) -> dict[str, Measured]:
         means = _means_of_tracks(kinds, config)
         found = {name: Measured.median(values) for name, values in means.items()}
         config = config.updated(_valid(found))
-    return found
+    return found | {f'{kind}.gap_spread': _margin_spread(kind, found, config) for kind in kinds}
+
+
+def _margin_spread(kind: str, margins: Mapping[str, Measured], config: Config) -> Measured:
+    """
+    Return the deviation of the margins of a kind between objects, of ends, sides and top [m].
+
+    The setting counts as some tracks (M15): three equal margins do not make the next one equal.
+
+    """
+    found = [margins[f'{kind}.{name}'] for name in GAPS[:-1]]
+    tracks = min(measured.tracks for measured in found)
+    before, prior = getattr(config, kind).gap_spread, CONSTANTS.half_weight
+    measured = np.mean([measured.spread**2 for measured in found])
+    variance = (prior * before**2 + tracks * measured) / (prior + tracks)
+    return Measured(float(np.sqrt(variance)), np.nan, tracks)
 
 
 def _means_of_tracks(

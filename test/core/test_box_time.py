@@ -81,9 +81,9 @@ def test_points_of_two_lidars_are_compared_at_their_own_times(known):
     assert evidence.votes == {known: 1}
 
 
-def mean_ious(speed, at_sight):
+def mean_ious(speed, at_sight, seed):
     """Return the mean 3D IoU of each estimate on a highway at some speed [m/s]."""
-    drive = Drive.from_scene(highway(np.random.default_rng(0), 25, at_sight, speed))
+    drive = Drive.from_scene(highway(np.random.default_rng(seed), 25, at_sight, speed))
     keys = list(zip(drive.truth.stamps_ns, drive.truth.track_ids, strict=True))
     tables = [drive.registered(Config(estimate=estimate)) for estimate in ('final', 'track')]
     means = {}
@@ -98,8 +98,9 @@ def mean_ious(speed, at_sight):
 
 @pytest.mark.parametrize('at_sight', [False, True], ids=['stamp', 'sight'])
 def test_fast_vehicles_are_as_accurate_as_slow_ones(at_sight):
-    # The same scene at 5 and at 30 m/s, with boxes of either time.
-    slow, fast = (mean_ious(speed, at_sight) for speed in (5.0, 30.0))
-    assert set(slow) == {'early', 'final', 'track'}
-    for estimate, mean in slow.items():
-        assert fast[estimate] > mean - 0.01, estimate
+    # The same scenes at 5 and at 30 m/s, with boxes of either time: the mean of two draws, which
+    # differ by 0.02.
+    draws = [[mean_ious(speed, at_sight, seed) for seed in (0, 1)] for speed in (5.0, 30.0)]
+    for estimate in ('early', 'final', 'track'):
+        slow, fast = ([means[estimate] for means in of_speed] for of_speed in draws)
+        assert np.mean(fast) > np.mean(slow) - 0.01, estimate

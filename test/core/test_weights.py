@@ -105,13 +105,14 @@ def test_independent_errors_have_nearly_no_constant_part():
 
 
 def test_margins_differ_as_those_of_like_objects_do():
-    # Margins of cars that differ half as much as expected: those of a car do, too; those of a
-    # truck as the settings say, since its squared distance from cars counts 12 times.
+    # Margins of cars that differ half as much as expected: those of a car do, too, the one of the
+    # road included; those of a truck as the settings say, since its squared distance from cars
+    # counts 12 times.
     problem = car_problem(np.concatenate([drive(6)[None], drive(6)[None]]))
     problem.boxes[1, :, 3:6] *= np.array([4.0, 2.0, 2.0])
     median = np.log(problem.boxes[0, 0, 3:6])
     inputs = no_inputs(spread=0.5, median=median, margin_variance=0.02**2)
-    usual = CONFIG.vehicle.gap_spread
+    usual = np.array([CONFIG.vehicle.gap_spread] * 5 + [CONSTANTS.road_spread])
     car, truck = (expected_of(problem, inputs, b)['deviation'][GAP:PIVOT] for b in (0, 1))
     np.testing.assert_allclose(car, usual / 2)
     np.testing.assert_allclose(truck, usual * np.sqrt(1 - 0.75 / 12.53), rtol=1e-3)
@@ -144,7 +145,7 @@ def test_robust_prior_of_labelling_margins_by_hand():
     shared[GAP + 2] += 2 * car.gap_spread
     _, found = weighed(problem, common, shared, visibility=visibility, distance=distance)
     z, half = car.height, car.extent * drive(1)[0, 5] / 2
-    known = np.full(6, car.gap_spread)
+    known = np.array([car.gap_spread] * 5 + [CONSTANTS.road_spread])
     known[2] *= 2**0.5
     known[4] *= (1 + 0.3**2 / (car.gap_spread**2 + z**2 + half**2) / 4) ** 0.5
     np.testing.assert_allclose(found['W_shared'][GAP:PIVOT] ** -0.5, known, rtol=1e-9)

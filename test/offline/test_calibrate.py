@@ -88,6 +88,27 @@ def test_each_kind_has_its_own_margins(scene):
         assert found[f'cyclist.{name}'].tracks + found[f'vehicle.{name}'].tracks <= 22
 
 
+def test_spread_of_margins_between_objects(scene, plain):
+    # Each track has margins of its own, with a deviation of 0.1 m beside that of the bodies s. The
+    # setting of 0.05 m counts as 14 of 14 + n tracks.
+    drive = Drive.from_scene(scene)
+    rng = np.random.default_rng(3)
+    boxes = drive.truth.boxes.copy()
+    for name in set(drive.truth.track_ids):
+        rows = np.array(drive.truth.track_ids) == name
+        own = dict(zip(GAPS, rng.normal(0.3, 0.1, 4), strict=True))
+        boxes[rows] = drawn(drive.truth.rows(rows), own).boxes
+    found = labelling_margins(replace(drive, truth=replace(drive.truth, boxes=boxes)), Config())
+    assert 'vehicle.gap_spread' in calibrated(Config(), found)
+    before, after = plain['vehicle.gap_spread'], found['vehicle.gap_spread']
+    n = after.tracks
+    assert n >= 10
+    bodies = np.mean([plain[f'vehicle.{name}'].spread ** 2 for name in GAPS[:3]])
+    expected = np.sqrt((14 * 0.05**2 + n * (bodies + 0.1**2)) / (14 + n))
+    assert after.value == pytest.approx(expected, rel=0.25)
+    assert before.value < 0.06 < after.value
+
+
 def test_margins_do_not_depend_on_the_start(scene, plain):
     begin = Config().updated(
         {'vehicle.gap_ends': 0.3, 'vehicle.gap_top': -0.1, 'faces.learn': False}

@@ -7,7 +7,7 @@ And evidence of the points about its extents, after a round (M18).
 
 from math import exp, isfinite, log, sqrt
 
-from boxreg_ros.core.method.arrays import ANCHOR, BIAS, EXTENT, GAP, PIVOT, POSE, SIDESLIP
+from boxreg_ros.core.method.arrays import ANCHOR, BIAS, BOTTOM, EXTENT, GAP, PIVOT, POSE, SIDESLIP
 from boxreg_ros.core.method.compile import kernel
 
 SIZE, FACES = 3, 6
@@ -128,7 +128,8 @@ def fill_shared(b, problem, inputs, constants, mean, common):
     for face in range(FACES):
         shared[GAP + face] = of_class.gaps[face] + inputs.margin[face]
         between = 1 + (inputs.spread[face] ** 2 - 1) / (1 + distance)
-        deviation[GAP + face] = of_class.gap_spread * sqrt(between)
+        spread = constants.road_spread if face == BOTTOM else of_class.gap_spread
+        deviation[GAP + face] = spread * sqrt(between)
         common.margin_variance[face] = inputs.margin_variance[face]
     shared[PIVOT] = deviation[PIVOT] = mean[0] * constants.pivot
     deviation[ANCHOR:SIDESLIP] = 1.0
