@@ -45,7 +45,9 @@ def test_example_reduces_the_position_error_as_its_page_shows(name):
     source = source[source.index(f'\n{start}') + 1 : source.index("\nprint('")]
     assert f'```python\n{source}```\n' in page
     shown = block_after(page[page.index(source) :], '```text\n')
-    # Digits may differ between processors; names and counts may not.
+    # Digits may differ a little between processors; names and counts may not.
+    for key, value in ERROR.findall(shown):
+        assert float(value) == pytest.approx(errors.get(key, given), rel=0.2), key
     assert re.sub(r'0\.\d+', '', shown) == re.sub(r'0\.\d+', '', output)
 
 

@@ -179,7 +179,9 @@ def _by_track(arrays: Sequence[BoxArray]) -> dict[str, list[_Seed]]:
     for array in sorted(arrays, key=lambda array: array.stamp_ns):
         for i, name in enumerate(array.track_ids):
             if not name:
-                raise ShapeError('seeds: expected a track id for each box, got an empty one')
+                raise ShapeError(
+                    'seeds: expected a track id for each box, got an empty one; add it'
+                )
             seed = _Seed(array.stamp_ns, array.class_names[i], array.boxes[i])
             found.setdefault(name, []).append(seed)
     return found

@@ -84,6 +84,11 @@ class RecordedMotion:
         `frame`.
 
         """
+        if not frame:
+            raise RecordingError(
+                f'{self._decoder.origin}: expected clouds with a frame, got an empty frame_id; '
+                f'set it in the driver of the LiDAR'
+            )
         for record in self._read(self._topics.static_transforms, None, None):
             self.add(tree, record)
         if wanted is not None and wanted.lstrip('/') == frame:

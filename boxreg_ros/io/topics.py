@@ -16,6 +16,7 @@ ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
 INFO_SUFFIX = '_info'
 """Autoware publishes the info on a topic of clouds under its name with this suffix."""
 SEVERAL_LIDARS = ', or merge several LiDARs: repeat --points'
+WITHOUT_BOXES = ', or boxreg relabel --labels FORMAT:PATH or --boxes none'
 
 
 class Topics:
@@ -78,6 +79,7 @@ class Topics:
         raise RecordingError(
             f'{self._origin}: no {content}, expected a topic of type {" or ".join(types)}; '
             f'there: {there or "no topics"}; give a recording that has one'
+            f'{WITHOUT_BOXES if role == "boxes" else ""}'
         )
 
     def _checked(

@@ -20,7 +20,7 @@ import sys
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ConfigError
+from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.storage.urls import url_of
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.arguments import add_options, add_recordings, Settings, values_of, words_of
@@ -35,7 +35,7 @@ from boxreg_ros.offline.job import Job, jobs_of, LEARNING
 from boxreg_ros.offline.job_process import JobRunner, read_states
 from boxreg_ros.offline.relabel_command import Demands
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import alone, INPUT_MODEL, writing
+from boxreg_ros.offline.result_folder import alone, earlier_summary, INPUT_MODEL, writing
 
 ENGINES = ('local', 'ray')
 DRIVE_TIMEOUT = 1800.0
@@ -108,6 +108,11 @@ def run(args: argparse.Namespace) -> int:
             rows = rows_of_shards(args.out)
         else:
             _check(args)
+            if earlier_summary(args.out) is not None:
+                raise RecordingError(
+                    f'output {str(args.out)!r}: expected a folder for all drives, got the result '
+                    f'of one, whose summary and report would be lost; choose another with -o'
+                )
             known = {name: one['recordings'] for name, one in read_states(args.out).items()}
             drives = jobs_of(args.recordings, known)
             if not drives:

@@ -95,7 +95,7 @@ def table(groups: Mapping[str, Consistency]) -> str:
     ]
     for name, group in groups.items():
         cells = ''.join(
-            f'{group.coverage[v]:7.2f}{group.nees[v]:6.2f}{"*" if group.is_off(v) else " "}'
+            f'{group.coverage[v]:7.2f} {group.nees[v]:5.2f}{"*" if group.is_off(v) else " "}'
             for v in CONSISTENCY_VARIABLES
         )
         lines.append(f'{name:{width}}{group.boxes:8d}{group.tracks:8d}{cells}')

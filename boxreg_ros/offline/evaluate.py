@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
             f'that is not positive'
         )
     if not len(matches.is_matched):
-        names = ', '.join(sorted(set(truth.class_names)))
+        names = ', '.join(sorted(set(truth.class_names))) or 'no boxes'
         raise RecordingError(
             f'{args.truth}: expected true boxes in scope, got none of {len(truth.boxes)}; lower '
             f'--min-points or choose other --classes; the table has {names}'

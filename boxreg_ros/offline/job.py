@@ -134,7 +134,7 @@ def names_of(
     names = {drive: earlier[drive] for drive in drives if drive in earlier}
     taken = RESERVED | set(names.values())
     taken |= {name for name, paths in known.items() if all(map(_is_there, paths))}
-    parts = {drive: _parts(drive[0]) for drive in drives if drive not in names}
+    parts = {drive: _parts(drive[0]) for drive in drives}
     plain = Counter((*part[:-1], _plain(part[-1])) for part in parts.values())
     for drive, (*folders, last) in parts.items():
         if plain[*folders, _plain(last)] == 1:  # else the suffix distinguishes it
@@ -142,10 +142,14 @@ def names_of(
     depths = dict.fromkeys(parts, 1)
     while True:
         found = {drive: '_'.join(parts[drive][-depth:]) for drive, depth in depths.items()}
-        uses = Counter(found.values())
-        same = [drive for drive, name in found.items() if uses[name] > 1 or name in taken]
+        uses = Counter(found.values())  # of drives that are done, too: shards agree at any time
+        same = [
+            drive
+            for drive, name in found.items()
+            if uses[name] > 1 or (name in taken and drive not in names)
+        ]
         if not same:
-            return names | found
+            return found | names
         if all(depths[drive] >= len(parts[drive]) for drive in same):
             raise ConfigError(
                 f'drives: expected each to have a name of its own, got {str(same[0][0])!r} and '

@@ -31,12 +31,14 @@ def closing_line(summary: Summary, out: Path) -> str:
         f'{status.get(REFINED, 0):,} refined',
         f'{status.get(KEPT, 0):,} kept',
     ]
+    if REJECTED in status:
+        parts[-1] += f' and {status[REJECTED]:,} rejected'
     if summary.reasons:
         counts = ', '.join(f'{name} {count:,}' for name, count in summary.reasons.items())
         parts[-1] += f' ({counts})'
     if summary.heading_flips:
         parts.append(f'{summary.heading_flips:,} heading flips corrected')
-    for word in (HUMAN, REJECTED, INTERPOLATED, EXTENDED, COASTED):
+    for word in (HUMAN, INTERPOLATED, EXTENDED, COASTED):
         if word in status:
             parts.append(f'{status[word]:,} {word}')
     line = (

@@ -12,7 +12,6 @@ from boxreg_ros.io.times import time_range
 from boxreg_ros.offline.notes import closing_line, MAX_NAMED
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.structures import Ints, PROPOSED
 import numpy as np
@@ -88,13 +87,14 @@ def write_run_report(
     rows: Sequence[TrackRow],
     violated: Mapping[str, Sequence[Violation]],
     points: PointCollector,
+    truth: BoxTable | None,
     clock: Stopwatch,
 ) -> None:
     """Write the report and add its time to the summary."""
     from boxreg_ros.review.report import write_report
 
     with clock('report'):
-        truth = _truth(request, [row.track for row in rows], summary)
+        truth = _fitting(truth, request.truth, [row.track for row in rows], summary)
         line = closing_line(summary, out)
         write_report(
             folder, line, summary.as_json(), request.config, rows, violated, points, truth
@@ -102,11 +102,12 @@ def write_run_report(
     summary.seconds = clock.seconds()
 
 
-def _truth(request: Request, tracks: Sequence[TrackChanges], summary: Summary) -> BoxTable | None:
+def _fitting(
+    truth: BoxTable | None, path: Path | None, tracks: Sequence[TrackChanges], summary: Summary
+) -> BoxTable | None:
     """Return the true boxes for the report; None, with a warning, where they do not fit."""
-    if request.truth is None:
+    if truth is None:
         return None
-    truth = true_boxes(request.truth)
     stamps = np.concatenate([np.zeros(0, np.int64), *(track.stamps_ns for track in tracks)])
     names = {track.track_id for track in tracks}
     problem = ''
@@ -119,7 +120,7 @@ def _truth(request: Request, tracks: Sequence[TrackChanges], summary: Summary) -
     if not problem:
         return truth
     line = (
-        f'truth {str(request.truth)!r}: expected {problem}; the report is written without it: '
+        f'truth {str(path)!r}: expected {problem}; the report is written without it: '
         f'give the true boxes of this drive to --truth'
     )
     summary.warning = '; '.join(filter(None, (summary.warning, line)))

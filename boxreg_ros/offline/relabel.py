@@ -35,6 +35,7 @@ from boxreg_ros.offline.result_folder import (
     whole_folder,
     write_summary,
 )
+from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.review.decisions import DECISIONS, read_decisions
@@ -75,13 +76,16 @@ def relabel(
     progress = progress or Progress()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
     corrections = Corrections(read_decisions(request.decisions) if request.decisions else ())
+    # What cannot be read is refused before the work.
+    truth = true_boxes(request.truth) if request.report and request.truth is not None else None
+    drives = _other_drives(request)
     shown = _Passes(progress, 1 + (request.completes or corrections.adds))
     with claimed(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         if request.cloud_copies:
             with request.recording():  # both processes need the types of its messages
                 pass
-        survey = _survey(request, clock, shown, journal, corrections)
+        survey = _survey(request, clock, shown, journal, corrections, drives)
         sweeps = _stored_sweeps(request, out)
         receive = workers.enter_context(
             reader(request, None if survey is None else survey.latency, sweeps)
@@ -92,7 +96,6 @@ def relabel(
         from boxreg_ros.io.input_models import disagreements
         from boxreg_ros.offline.registration_worker import registration_worker
 
-        drives = _other_drives(request)
         recording = ReadAhead(receive)
         if survey is None:
             clock.begun('start')
@@ -125,7 +128,9 @@ def relabel(
             summary.seconds = clock.seconds()
             if sink.points is not None:
                 sink.points.settle(registrar.box_time.resolved(request.config))
-                write_run_report(folder, out, request, summary, rows, violated, sink.points, clock)
+                write_run_report(
+                    folder, out, request, summary, rows, violated, sink.points, truth, clock
+                )
             if request.decisions is not None:
                 copyfile(request.decisions, folder / DECISIONS)  # a review goes on from there
             taught = registrar.statistics(request.drive_name())
@@ -224,6 +229,7 @@ def _survey(
     progress: _Passes,
     journal: EstimateJournal | None,
     corrections: Corrections,
+    drives: Drives,
 ) -> _Survey | None:
     """Read the recording a first time and plan its whole tracks; None where none is completed."""
     if not (request.completes or corrections.adds):
@@ -256,7 +262,6 @@ def _survey(
                 registration_worker(request.config, clock, progress.progress.announce)
             )
             submit = _journaled(submit, journal)
-            drives = _other_drives(request)
             first = first_pass(items, request.config, submit, fixed_frame, drives)
             plan, parts = first.plan(fixed_frame, request.config), first.parts
         else:
@@ -275,6 +280,8 @@ def _survey(
 
 def _other_drives(request: Request) -> Drives:
     """Return what other drives have shown; this one, made before, would count twice."""
+    if not request.input_model:
+        return {}  # numba is imported while the recording is opened
     from boxreg_ros.io.input_models import read_models
 
     drives = read_models(request.input_model)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 UNUSED_PREFIXES = ('sweep_', 'boxes_')
 """Counters of the registrar with these prefixes count unused messages and not kept boxes."""
-NO_BOXES = 'no boxes in this part of the recording: nothing was refined; see --start and --end'
+NO_BOXES = 'no boxes in the input, or in its part by --start and --end: nothing was refined'
 
 
 @dataclass(slots=True)

@@ -218,6 +218,16 @@ def test_a_stationary_sensor_needs_the_fixed_frame_as_an_option(tmp_path):
     assert read(path, fixed_frame='base')[2] == 'base', 'connected by static transforms'
 
 
+def test_clouds_without_a_frame_are_refused(tmp_path):
+    drive = Drive()
+    for topic, _, message in drive.items:
+        if topic == '/points':
+            message.header.frame_id = ''
+    path = drive.write(tmp_path / 'drive')
+    for wanted in (None, ''):
+        assert 'got an empty frame_id; set it in the driver' in error_of(path, fixed_frame=wanted)
+
+
 def test_an_unknown_fixed_frame_is_refused(tmp_path):
     text = error_of(Drive().write(tmp_path / 'drive'), fixed_frame='world')
     assert "'world'" in text
@@ -305,6 +315,7 @@ def test_a_recording_without_clouds_or_boxes_is_refused(tmp_path, topic, kind):
     text = error_of(drive.write(tmp_path / 'drive'))
     assert f'no {kind}' in text
     assert '/tf (tf2_msgs/msg/TFMessage)' in text
+    assert ('--boxes none' in text) == (kind == 'boxes')
 
 
 def test_topics_without_messages_are_named(tmp_path):

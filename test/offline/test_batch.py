@@ -161,6 +161,11 @@ def test_each_drive_has_a_name_of_its_own_in_any_order(tmp_path):
         [tmp_path / p for p in ('x/c.mcap', 'y/x.mcap.zstd', 'v/b_c.mcap')], known
     )
     assert (c.name, x.name, other.name) == ('x_c', 'y_x', 'v_b_c')
+    # Nor does the time of a shard matter: one of two drives may be done.
+    some = NAMES[:6]
+    known = {name: [str(tmp_path / path)] for path, name in some[::2]}
+    jobs = jobs_of([tmp_path / path for path, _ in some], known)
+    assert [job.name for job in jobs] == [name for _, name in some]
     # Where the names are the same with all folders, nothing is begun.
     paths = [tmp_path / path for path in ('a_b/c.mcap', 'a/b_c.mcap', 'x/c.mcap', 'v/b_c.mcap')]
     with pytest.raises(ConfigError, match='expected each to have a name of its own'):
@@ -178,6 +183,9 @@ def test_the_result_of_another_drive_is_not_replaced(tmp_path, capsys):
     first.rename(copy)  # moved: it is the same drive
     assert main(['batch', str(copy), '-o', str(out), *QUICK]) == 0
     assert '1 of them earlier' in capsys.readouterr().out
+    single = out / 'drive'
+    assert main(['batch', str(copy), '-o', str(single), *QUICK]) == 1
+    assert 'expected a folder for all drives, got the result of one' in capsys.readouterr().err
     copy.unlink()
     other = Drive(sweeps=7).write(tmp_path / 'c' / 'drive')
     assert main(['batch', str(other), '-o', str(out), *QUICK]) == 1

@@ -6,7 +6,7 @@ from pathlib import Path
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import CovarianceWriter, read_covariances
-from boxreg_ros.offline.consistency import _over
+from boxreg_ros.offline.consistency import _over, table
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 import numpy as np
 import pytest
@@ -98,6 +98,8 @@ def test_nees_counts_tracks_and_marks_what_is_no_chance(tmp_path, capsys):
     squared = np.repeat(errors[:, None] ** 2, 7, axis=1)
     group = _over(squared, tracks, np.ones(8, bool))
     assert group.tracks == 4
+    wide = table({'car': group._replace(nees=dict.fromkeys(group.nees, 171.33))})
+    assert wide.count(' 171.33') == 7  # apart from the coverage
     error = np.std(errors[::2] ** 2, ddof=1) / 2
     assert group.nees_error['yaw'] == pytest.approx(error)
     assert group.is_off('yaw')

@@ -224,6 +224,9 @@ def test_command_prints_scores(tmp_path, capsys):
     assert '10 true boxes, 2 missing' in text
     with pytest.raises(RecordingError, match='expected true boxes in scope, got none of 20'):
         run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--classes', 'tank')
+    rows(truth_table(), []).write(tmp_path / 'none.csv')
+    with pytest.raises(RecordingError, match=r'got none of 0; .* the table has no boxes'):
+        run(tmp_path / 'boxes.csv', tmp_path / 'none.csv')
 
 
 def test_boxes_in_another_frame_are_left_out(tmp_path, capsys):

@@ -11,7 +11,7 @@ import zlib
 
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ConfigError
+from boxreg_ros.errors import BoxregError, ConfigError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.notes import closing_line
 from boxreg_ros.offline.progress import Progress
@@ -276,6 +276,17 @@ def test_truth_of_another_drive_is_left_out_with_a_warning(tmp_path, capsys):
     for word in (str(truth), 'expected', 'got', '--truth'):
         assert word in line
     assert not Page(out / 'report.html').data['has_truth']
+
+
+def test_truth_and_input_models_that_cannot_be_read_are_refused_before_the_work(tmp_path):
+    recording = Drive(sweeps=6).write(tmp_path / 'drive')
+    junk = tmp_path / 'junk'
+    junk.write_text('no table')
+    shown = Progress()
+    shown.show = lambda *_: pytest.fail('the recording was read')
+    for options in ({'report': True, 'truth': junk}, {'keyframes': True, 'input_model': (junk,)}):
+        with pytest.raises(BoxregError, match='junk'):
+            relabel(Request((recording,), **options), tmp_path / 'out', shown)
 
 
 def test_risks_and_violations_of_each_track_are_shown(tmp_path):

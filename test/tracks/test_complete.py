@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import replace
 import json
+import re
 
 from boxreg_ros import cli
 from boxreg_ros.config import COMPLETE_STEPS, Config, KINDS
@@ -227,7 +228,9 @@ def test_command_line(tmp_path, capsys):
     out = str(tmp_path / 'out')
     settings = ['--set', 'solver.rounds=1', '--formats', 'csv']
     assert cli.main(['relabel', str(recording), '-o', out, '--complete', *settings]) == 0
-    assert ' interpolated' in capsys.readouterr().out
+    line = capsys.readouterr().out
+    assert ' interpolated' in line
+    assert re.search(r'\d+ kept and \d+ rejected \(ghost \d+', line), line
     assert cli.main(['evaluate', out, str(tmp_path / 'street_truth.csv'), '--json']) == 0
     tracks = json.loads(capsys.readouterr().out)['tracks']
     assert tracks['added'] > 10
