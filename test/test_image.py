@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 from compiled import fill_cache
-from paths import ROOT
+from paths import BAGS, ROOT
 import pytest
 from ros_graph import ended_cleanly, graph_in
 
@@ -78,6 +78,52 @@ def test_the_first_start_of_a_node_says_that_it_compiles(cache, tmp_path):
         assert ended_cleanly(node)
     lines = [line for line in node.output().splitlines() if 'compiling the solver' in line]
     assert lines and '[INFO]' in lines[0]
+
+
+FIRST_DRIVE = """\
+import sys
+from msg_adapters import vision
+from boxreg_ros.config import Config
+from boxreg_ros.io.items import Item
+from boxreg_ros.io.warm_up import warm_up, warm_up_followed
+from boxreg_ros.live.live_registrar import LiveRegistrar
+from numba.core.dispatcher import Dispatcher
+from pathlib import Path
+from rosbags.highlevel import AnyReader
+
+def kernels():
+    modules = [m for name, m in sys.modules.items() if name.startswith('boxreg_ros.core.method')]
+    found = [(k, f) for m in modules for k, f in vars(m).items() if isinstance(f, Dispatcher)]
+    return {(name, str(one)) for name, function in found for one in function.signatures}
+
+config = Config(estimate='final')
+warm_up(config)
+warm_up_followed(config)
+before = kernels()
+live = LiveRegistrar(config, 'odom', '', 0.0, print)
+live.adapter = vision
+with AnyReader([Path(sys.argv[1])]) as reader:
+    for connection, at, data in reader.messages():
+        message = reader.deserialize(data, connection.msgtype)
+        if connection.topic == '/tf':
+            live.session.tree.add_transforms(message.transforms)
+        elif connection.topic == '/points':
+            live.process(Item(at, live.placement.sweep_of(message, ''), message=message))
+        elif connection.topic == '/detections':
+            live.process(Item(at, vision.from_msg(message), message=message))
+        if at > 1_700_000_000_800_000_000:
+            break
+assert live.registrar.counts['boxes'] > 100
+print(sorted(kernels() - before))
+"""
+
+
+def test_the_first_drive_needs_no_kernel_beyond_those_of_the_start():
+    done = subprocess.run(
+        [sys.executable, '-c', FIRST_DRIVE, str(BAGS / 'street.mcap')], cwd=ROOT,
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.stdout == '[]\n', done.stdout + done.stderr
 
 
 def test_compile_fails_where_nothing_can_be_kept(tmp_path):

@@ -19,7 +19,7 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
     Libraries are imported and kernels loaded, or compiled at the very first start, for the
     objective, estimate and mode of the stream to come. Six stamps of a window of four cover cold,
     warm and full windows, or two rounds of a whole track; a few iterations of the solver are
-    enough.
+    enough. The points of the last sweep have times.
 
     """
     quick = Config(
@@ -28,7 +28,9 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
         paper=PaperConfig(iterations=2),
     )  # fmt: skip
     registrar = BoxRegistrar(quick, submit)
-    for sweep, boxes in zip(*_passing_car(), strict=True):
+    sweeps, arrays = _passing_car()
+    sweeps[-1] = replace(sweeps[-1], times=np.full(len(sweeps[-1].points), 0.1))
+    for sweep, boxes in zip(sweeps, arrays, strict=True):
         registrar.add_sweep(replace(sweep, points=sweep.points.astype(np.float32)))
         registrar.add_boxes(boxes)
     registrar.flush()

@@ -9,7 +9,7 @@ import time
 import traceback
 
 from boxreg_ros.reasons import FAULTS, Reason, REDUCE_LOAD
-from boxreg_ros.structures import REFINED
+from boxreg_ros.structures import COASTED, REFINED
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
@@ -101,7 +101,7 @@ class Health:
         """Log what the node waits for, every `LOG_PERIOD` until its first refined box."""
         with self._lock:
             counts = self._counts + self._core_counts
-        if not counts[REFINED] and self.is_due(WAITING):
+        if not (counts[REFINED] or counts[COASTED]) and self.is_due(WAITING):
             self._logger.info(f'waiting for {_awaited(counts, fixed_frame)}; no box refined yet')
 
     def status(self, name: str, facts: Mapping[str, object]) -> DiagnosticStatus:
@@ -152,7 +152,7 @@ def _awaited(counts: Mapping[str, int], fixed_frame: str) -> str:
         return f'messages on {" and ".join(missing)}'
     if not fixed_frame:
         return 'transforms from the frame of the clouds to a fixed frame'
-    reasons = [reason for reason in Reason if reason.unit == 'box']
+    reasons = [one for one in Reason if one.unit == 'box' or one is Reason.UNREADABLE]
     why = max(reasons, key=lambda name: counts.get(name, 0))
     if not counts.get(why):
         return 'enough observations of a track'
@@ -180,7 +180,7 @@ def _level_and_message(recent: Counter[str]) -> tuple[bytes, str]:
     late = _budget_text(recent)
     if late:
         return DiagnosticStatus.WARN, late
-    if recent['kept'] and not recent['refined']:
+    if recent['kept'] and not (recent[REFINED] or recent[COASTED]):
         box_reasons = [reason for reason in Reason if reason.unit == 'box']
         why = max(box_reasons, key=lambda name: recent[name])
         text = f'no box was refined; most often {why}: {why.meaning}'
@@ -198,7 +198,7 @@ def _budget_text(recent: Counter[str]) -> str:
 
 def _level_and_message_of(worst: Reason, recent: Counter[str]) -> tuple[bytes, str]:
     """Return level and message where `worst` is the gravest reason of the period."""
-    is_idle = bool(recent['boxes_received']) and not recent['refined']
+    is_idle = bool(recent['boxes_received']) and not (recent[REFINED] or recent[COASTED])
     level = DiagnosticStatus.ERROR if is_idle or worst in FAULTS else DiagnosticStatus.WARN
     text = f'{worst}: {worst.meaning}; {worst.remedy}'
     if worst in REASONS_WITHOUT_CLOUDS and not recent['points_received']:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf
+import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.input_statistics import Drives, joined, to_text
 from boxreg_ros.core.latency import LateBoxes, Latency, set_latency
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.errors import TransformUnavailable, UnsupportedMessage
+from boxreg_ros.errors import ConfigError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.input_models import disagreements, read_models
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import Lidars, MergedSweep, SensorPlacement, SINGLE_LIDAR
@@ -132,6 +133,12 @@ class LiveRegistrar:
         self.tap = LabelTap(self.session)
         self._model_file = Path(input_model).expanduser() if input_model else None
         self._drives: Drives = {}
+        if self._model_file is not None and not os.access(self._model_file.parent, os.W_OK):
+            raise ConfigError(
+                f'input_model: expected a file in a folder that can be written to, where it is '
+                f'written at the end, got {str(self._model_file)!r}; make the folder, or choose '
+                f'another'
+            )
         if self._model_file is not None and self._model_file.exists():
             self._drives = read_models([self._model_file])
         submit, windows = (None, None) if budget is None else (budget.submit, budget.windows)
@@ -143,7 +150,7 @@ class LiveRegistrar:
         self._latency = Latency()
         self._jumps = JumpConfirmation[Item]()
         self._held: deque[_Pending | _Passing] = deque()  # in order of arrival; first: pending
-        self._detections: dict[str, _Detection] = {}  # by track id, while tracks may coast
+        self._detections: dict[str, _Detection] = {}  # by track id
         self._seeds: list[Item] = []  # of `follow`, without their transforms yet
         self._sources: dict[str, _Detection] = {}  # the box that each followed object began with
         self._following: dict[str, object] = {}
@@ -490,18 +497,18 @@ class LiveRegistrar:
 
     def _earlier_detections(self, message: Any, boxes: BoxArray) -> dict[str, _Detection]:
         """Return the last detections of tracks that miss one in `boxes`; note those of `boxes`."""
-        oldest_ns = boxes.stamp_ns - round(self.config.coast * 1e9)
+        # `coast` may become larger while tracks without a detection wait for their end.
+        oldest_ns = boxes.stamp_ns - round((self.config.coast + self.config.max_gap) * 1e9)
         own = set(boxes.track_ids)
         earlier = {
             track_id: detection
             for track_id, detection in self._detections.items()
             if detection.stamp_ns >= oldest_ns and track_id not in own
         }
-        if self.config.coasts:
-            self._detections = earlier | {
-                track_id: _Detection(message, row, boxes.stamp_ns)
-                for row, track_id in enumerate(boxes.track_ids)
-            }
+        self._detections = earlier | {
+            track_id: _Detection(message, row, boxes.stamp_ns)
+            for row, track_id in enumerate(boxes.track_ids)
+        }
         return earlier
 
     def _changes_frame(self, content: Sweep | BoxArray) -> bool:

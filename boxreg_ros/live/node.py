@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 import gc
 from pathlib import Path
+from threading import Thread
 import time
 from typing import Any
 
@@ -30,11 +32,14 @@ from msg_adapters.clouds import header_of, POINTS_TYPE
 from msg_adapters.concatenation import INFO_TYPE
 from msg_adapters.serialized import serialized_adapter_for
 from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 NAME = 'boxreg_node'
@@ -77,6 +82,8 @@ class BoxregNode(Node):
         self.add_pre_set_parameters_callback(partial(numbers_as_declared, self))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
+        self._refused: dict[str, str] = {}
+        self._check_beside_messages()
         self._health = Health(self.get_logger())
         config, options = self._settings
         self._inbox = Inbox(config.queue, max(1, len(options.lidars.topics)))
@@ -111,7 +118,7 @@ class BoxregNode(Node):
 
         """
         _, options = self._settings
-        self._refuse_loop()
+        self._refuse_loop(options.static_points)
         self._topics = NodeTopics(self, self._health)
         self._opened.callback(self._topics.close)
         self._markers = self._topics.publish(
@@ -165,13 +172,17 @@ class BoxregNode(Node):
 
     # ------------------------------------------------------------ topics
 
-    def _refuse_loop(self) -> None:
+    def _refuse_loop(self, has_static_points: bool) -> None:
         """Raise ConfigError if the node would take its own output for its input."""
-        name = self.resolve_topic_name('boxes')
-        for output in ('refined_boxes', 'refined_boxes_final'):
+        outputs = ('refined_boxes', 'refined_boxes_final', 'refined_markers')
+        pairs = [('boxes', output) for output in outputs]
+        if has_static_points:
+            pairs.append(('points', 'static_points'))
+        for given, output in pairs:
+            name = self.resolve_topic_name(given)
             if self.resolve_topic_name(output) == name:
                 raise ConfigError(
-                    f'boxes: expected the topic of a tracker, got {name!r}, where this node '
+                    f'{given}: expected the topic of another node, got {name!r}, where this node '
                     f'publishes {output}; correct the remap'
                 )
 
@@ -283,14 +294,56 @@ class BoxregNode(Node):
             response.message = str(path)
         return response
 
+    def _check_beside_messages(self) -> None:
+        """Receive messages while a request to set parameters waits for the check of a recorder."""
+        group = ReentrantCallbackGroup()
+        for service in self.services:
+            if service.srv_type in (SetParameters, SetParametersAtomically):
+                service.callback_group = group
+                group.add_entity(service)
+                checked: Any = partial(self._set_when_checked, service.callback)
+                service.callback = checked
+
+    async def _set_when_checked(
+        self, set_now: Callable[[Any, Any], Any], request: Any, response: Any
+    ) -> Any:
+        """Answer a request to set parameters."""
+        given = [Parameter.from_parameter_msg(one) for one in request.parameters]
+        checked = Future()
+
+        def check() -> None:
+            checked.set_result({one.name: self._refusal(one) for one in given})
+            if self.executor is not None:
+                self.executor.wake()
+
+        if {one.name for one in given} & set(CHECKED_BY_RECORDER):
+            Thread(target=check, daemon=True).start()
+            self._refused = await checked
+        response = set_now(request, response)
+        self._refused = {}
+        return response
+
+    def _refusal(self, parameter: Parameter) -> str:
+        """Return why a recorder cannot use a parameter; '' if it can, or has no use for it."""
+        if parameter.name not in CHECKED_BY_RECORDER:
+            return ''
+        try:
+            _, options = changed(*self._settings, [parameter])
+            if parameter.name == 'record_camera':
+                check_recording(options.record_camera, ())
+            else:
+                check_recording('', options.record_formats)
+        except ConfigError as error:
+            return str(error)
+        return ''
+
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
-            _, options = changed(*self._settings, parameters)
-            if {parameter.name for parameter in parameters} & set(CHECKED_BY_RECORDER):
-                check_recording(options.record_camera, options.record_formats)
+            changed(*self._settings, parameters)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
+        reason = '; '.join(filter(None, (self._refused.get(one.name) for one in parameters)))
+        return SetParametersResult(successful=not reason, reason=reason)
 
     def _take_parameters(self, parameters: list[Parameter]) -> None:
         self._settings = changed(*self._settings, parameters)

@@ -150,8 +150,9 @@ def declare(node: Node) -> tuple[Config, NodeOptions]:
     Declare all parameters of a node; return the settings of the core and the options.
 
     The node is made with ``automatically_declare_parameters_from_overrides``: this way integers
-    are accepted for real parameters, and unknown names can be reported. `estimate` is ignored
-    with a warning: the node publishes both early and final estimates. Raises ConfigError for a
+    are accepted for real parameters, and unknown names can be reported. `estimate` and the steps
+    of `complete` are ignored with a warning: the node publishes both early and final estimates,
+    before a track is whole. Raises ConfigError for a
     value of the wrong type or out of its bounds, by name.
 
     """
@@ -163,7 +164,13 @@ def declare(node: Node) -> tuple[Config, NodeOptions]:
             f'final estimate'
         )
     config, options = _updated(Config(), NodeOptions(), given)
-    config = replace(config, estimate='final')
+    if config.complete.steps:
+        names = ', '.join(f'complete.{step}' for step in config.complete.steps)
+        node.get_logger().warning(
+            f'{names}: ignored, since the node does not wait for whole tracks; for missed '
+            f'detections set coast'
+        )
+    config = replace(config, estimate='final', complete=Config().complete)
     values = [*config.items(), *((s, getattr(options, s.name)) for s in NODE_SETTINGS)]
     for item, value in values:
         if item.name in given:

@@ -111,14 +111,15 @@ class NodeTopics:
 
         With reliability ``BEST_AVAILABLE``, rclpy chooses by the publishers that exist when it
         subscribes. The subscription is created anew when one comes that offers less. Raises
-        ConfigError for a wrong QoS override, UnsupportedMessage if the message package is
-        missing.
+        ConfigError for a wrong QoS override and for a topic that the node uses with another type,
+        UnsupportedMessage if the message package is missing.
 
         """
         name = self._node.resolve_topic_name(topic)
         endpoint = Endpoint(
             topic, name, type_name, qos, callback, is_required, has_overrides, is_raw
         )
+        self._refuse_two_types(endpoint)
         self._create_subscription(endpoint)
         self._endpoints.append(endpoint)
 
@@ -130,6 +131,7 @@ class NodeTopics:
         events = PublisherEventCallbacks(
             incompatible_qos=lambda _: self._health.count(Reason.QOS_INCOMPATIBLE)
         )
+        self._refuse_two_types(endpoint)
         _check_overrides(self._node, f'qos_overrides.{name}.publisher')
         endpoint.entity = self._node.create_publisher(
             kind, topic, endpoint.qos, event_callbacks=events,
@@ -221,6 +223,16 @@ class NodeTopics:
             DiagnosticStatus.WARN,
             f'{name}: nobody publishes it; published topics of a fitting type: {there}; {remedy}',
         )
+
+    def _refuse_two_types(self, endpoint: Endpoint) -> None:
+        """Raise ConfigError for a topic that the node uses with another type already."""
+        for other in self._endpoints:
+            if other.name == endpoint.name and other.type_name != endpoint.type_name:
+                raise ConfigError(
+                    f'{endpoint.topic}: expected a topic of its own, got {other.name!r}, which '
+                    f'this node uses as {other.topic} with type {other.type_name}; correct the '
+                    f'remap'
+                )
 
     def _create_subscription(self, endpoint: Endpoint) -> None:
         """Create the subscription of an endpoint, in place of the one it has."""

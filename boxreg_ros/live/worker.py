@@ -209,6 +209,7 @@ class Worker:
             return
         now = time.monotonic()
         if self._live.is_silent(now):
+            self._catch_up(self._live.registrar.num_waiting)
             self._publish(self._guarded(self._live.flush))
         if self._board.is_showing and self._live.has_ceased(now):
             self._markers.publish(self._board.clear())

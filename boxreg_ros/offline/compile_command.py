@@ -12,7 +12,7 @@ import warnings
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.io.compilation import announced_compilation
-from boxreg_ros.io.warm_up import warm_up, warm_up_follower, warm_up_labels
+from boxreg_ros.io.warm_up import warm_up, warm_up_followed, warm_up_follower, warm_up_labels
 from msg_adapters import cdr
 
 COMPILED_ESTIMATES = ('final', 'track')
@@ -50,6 +50,7 @@ def _compile() -> int:
         for estimate, mode in product(COMPILED_ESTIMATES, MODES):
             warm_up(Config.from_dict({'estimate': estimate, 'mode': mode}))
         warm_up_follower(Config.from_dict({'estimate': 'track'}))
+        warm_up_followed(Config())
         warm_up_labels(Config())
         cdr.walker()
     return done.functions

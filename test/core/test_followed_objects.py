@@ -19,7 +19,7 @@ def array(step, boxes):
     return BoxArray(stamp_ns, 'odom', ids, ('car',) * len(ids), np.ones(len(ids)), rows)
 
 
-def run(truth, seeds, detected=lambda step: {}, gone=()):
+def run(truth, seeds, detected=lambda step: {}, gone=(), parked=None):
     """
     Return the final boxes (id, step) -> box that the registrar adds, and the registrar.
 
@@ -33,6 +33,8 @@ def run(truth, seeds, detected=lambda step: {}, gone=()):
         Boxes of the detector at a step, by id.
     gone : sequence of int
         Steps without points of the object.
+    parked : array, shape (9,), optional
+        Box of another object, with points at every step.
 
     """
     rng = np.random.default_rng(0)
@@ -41,6 +43,8 @@ def run(truth, seeds, detected=lambda step: {}, gone=()):
     for step, stamp_ns in enumerate(stamps(STEPS).tolist()):
         road = np.column_stack([rng.uniform(-20, 40, (3000, 2)), rng.normal(0, 0.01, 3000)])
         clouds = [road] if step in gone else [road, returns(truth[step], rng)]
+        if parked is not None:
+            clouds.append(returns(parked, rng))
         origin = np.array([0.0, 0.0, 1.5])
         if step in seeds:
             registrar.follow(seeds[step])
@@ -121,3 +125,12 @@ def test_of_two_ids_of_one_object_the_second_is_named():
     assert list(found) == [('a', step) for step in range(2, STEPS)]
     assert registrar.followed.track_ids == ('a',)
     assert registrar.followed.refused == [('b', "its object is followed as 'a'")]
+
+
+def test_an_object_that_drifts_does_not_end_one_that_is_seen_all_the_time():
+    truth = drive(STEPS, speed=8.0, turn=0.0)
+    parked = truth[16]
+    seeds = {2: array(2, {'drifting': truth[2], 'parked': parked})}
+    found, registrar = run(truth, seeds, gone=range(9, STEPS), parked=parked)
+    assert [step for name, step in found if name == 'parked'] == list(range(2, STEPS))
+    assert registrar.followed.track_ids == ('parked',)

@@ -47,7 +47,8 @@ def test_level_and_message_are_those_of_the_most_severe_reason():
     assert status.message.startswith('no_sweep') and 'stamp' in status.message
     health.count('failed')
     assert health.status('node', {}).level == DiagnosticStatus.ERROR
-    for name, level in (('refined', DiagnosticStatus.WARN), ('kept', DiagnosticStatus.ERROR)):
+    warn, error = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+    for name, level in (('refined', warn), ('coasted', warn), ('kept', error)):
         health.count('boxes_received')
         health.count('late')
         health.count(name)
@@ -140,6 +141,8 @@ def test_node_logs_its_missing_inputs_until_its_first_refined_box(monkeypatch):
     assert 'messages on boxes' in text_after(5)
     health.count('boxes_received')
     assert 'transforms' in text_after(10, frame='')
+    health.count('unreadable', 2)
+    assert 'most often unreadable' in text_after(10)
     health.set_core_counts({'short_track': 3})
     assert 'short_track' in text_after(10)
     health.set_core_counts({'refined': 1})

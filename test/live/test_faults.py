@@ -11,6 +11,7 @@ from measure import MEASURE
 from measure.node import vitals
 from msg_adapters import vision
 import numpy as np
+from preloaded import CODE
 import pytest
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
@@ -19,6 +20,7 @@ from ros_domain import next_domain
 from ros_graph import (
     DIAGNOSTICS,
     ended_cleanly,
+    first_sweeps,
     numbers_changed,
     play,
     play_in_time,
@@ -101,6 +103,55 @@ def test_parameters_and_services_at_run_time(graph, tmp_path):
     assert timeout.double_value == 1.0
     assert ended_cleanly(again)
     assert 'unknown parameters' not in again.output()
+
+
+SLOW_CHECK = """
+import sys, time
+from pathlib import Path
+from boxreg_ros.live import node
+
+def check_recording(camera, formats):
+    end = time.monotonic() + 20
+    while not Path({played!r}).exists() and time.monotonic() < end:
+        time.sleep(0.05)
+
+node.check_recording = check_recording
+from boxreg_ros.live.main import main
+sys.exit(main())
+"""
+
+
+def test_boxes_are_published_while_a_recorder_checks_a_parameter(graph, tmp_path):
+    played = tmp_path / 'played'
+    records = records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
+    node = graph.run(records, *QUICK, command=(CODE, SLOW_CHECK.format(played=str(played))))
+    client = graph.node.create_client(SetParameters, '/boxreg_node/set_parameters')
+    graph.wait(client.service_is_ready, 'the service')
+    formats = Parameter('record_formats', value=['csv']).to_parameter_msg()
+    answer = client.call_async(SetParameters.Request(parameters=[formats]))
+    node.play(records)
+    assert not answer.done()
+    played.touch()
+    graph.wait(answer.done, 'the answer')
+    assert answer.result().results[0].successful
+    assert ended_cleanly(node)
+
+
+def test_coast_may_be_set_while_the_node_runs(graph, tmp_path):
+    drive = Drive(sweeps=9)
+    for index in (5, 6):
+        drive.replace('/boxes', index, lambda message: message.detections.pop(0))
+    records = records_of(drive.write(tmp_path / 'drive'))
+    node = graph.run(records, *QUICK)
+    begun = first_sweeps(records, 6)
+    node.play(begun)
+    request = SetParameters.Request(parameters=[Parameter('coast', value=0.5).to_parameter_msg()])
+    (result,) = graph.call(SetParameters, '/boxreg_node/set_parameters', request).results
+    assert result.successful
+    node.play(records[len(begun) :])
+    assert ended_cleanly(node)
+    assert 'failed' not in node.output()
+    assert [len(message.detections) for message in node.early] == [2] * 5 + [1] + [2] * 3
 
 
 def test_time_jump_with_sim_time_and_silence_after_it(graph, tmp_path):

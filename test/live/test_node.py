@@ -337,6 +337,26 @@ def test_boxes_beyond_the_deadline_are_kept_and_no_cloud_is_dropped(graph, tmp_p
     assert numbers_changed(node.final, records)[1:29] == [2] * 28  # by a window of the next stamp
 
 
+WITHOUT_SPARE_TIME = """
+import sys
+from boxreg_ros.live.budget import TickBudget
+TickBudget.spare_windows = lambda self: 0  # as on a slow machine
+from boxreg_ros.live.main import main
+sys.exit(main())
+"""
+
+
+def test_tracks_that_wait_are_solved_when_the_boxes_end(graph, tmp_path):
+    drive, records = thirty_stamps(tmp_path)
+    options = (*QUICK, '-p', 'deadline:=0.001')
+    node = graph.run(records, *options, command=(CODE, WITHOUT_SPARE_TIME))
+    node.play(records)
+    graph.wait(lambda: len(node.final) == 30, 'final boxes after a silence')
+    assert ended_cleanly(node)
+    assert [stamp_of(m) for m in node.final] == drive.stamps
+    assert numbers_changed(node.final, records)[1:] == [2] * 29
+
+
 def test_a_node_without_any_parameter_refines_a_track_at_every_stamp(graph, tmp_path):
     """The default deadline leaves at least one window a stamp, on the slowest machine."""
     drive, records = thirty_stamps(tmp_path)
@@ -433,7 +453,10 @@ def refused(tmp_path_factory):
         'deadline': ['--ros-args', '-p', 'deadline:=0'],
         'list': ['--ros-args', '-p', 'vehicle.names:=[]'],
         'loop': ['--ros-args', '-r', 'boxes:=refined_boxes'],
+        'markers': ['--ros-args', '-r', 'boxes:=refined_markers'],
+        'types': ['--ros-args', '-p', f'boxes_type:={DETECTIONS}', '-r', 'boxes:=points'],
         'segment': ['--ros-args', '-p', 'record_segment:=1 week'],
+        'model': ['--ros-args', '-p', 'input_model:=/nowhere/model.json'],
     }
     folder = tmp_path_factory.mktemp('refused')
     started = {
@@ -457,7 +480,10 @@ def refused(tmp_path_factory):
         ('deadline', 2, ('deadline', 'more than 0 s', 'got 0')),
         ('list', 2, ('vehicle.names', "['']")),
         ('loop', 2, ('boxes', "'/refined_boxes'", 'correct the remap')),
+        ('markers', 2, ('boxes', "'/refined_markers'", 'correct the remap')),
+        ('types', 2, ('boxes', "'/points'", 'which this node uses as points')),
         ('segment', 2, ('record_segment', "'1 week'", '60 s')),
+        ('model', 2, ('input_model', "'/nowhere/model.json'", 'make the folder')),
     ],
 )
 def test_invalid_arguments_are_reported_in_one_line(refused, case, status, words):

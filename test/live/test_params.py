@@ -99,6 +99,11 @@ def test_node_and_relabel_read_the_same_file(make_node, tmp_path):
     assert config.solver.rounds == 2 and not config.faces.learn
 
 
+def test_steps_for_whole_tracks_do_not_turn_coasting_off(make_node):
+    config, _ = declare(make_node(**{'coast': 0.5, 'complete.fill': True}))
+    assert config.coasts
+
+
 @pytest.mark.parametrize(
     'name, value, words',
     [

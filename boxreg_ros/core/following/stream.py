@@ -82,7 +82,8 @@ class FollowedObjects:
     Follow objects through the sweeps of a stream; all are in one fixed frame.
 
     From the sweep nearest to its box in time, an object is followed as by `follow`, but forwards
-    only, and lost under the same tests. Of two in one place, the first goes on.
+    only, and lost under the same tests. Of two in one place, the one goes on that has been seen in
+    more of the last sweeps, else the first.
 
     Parameters
     ----------
@@ -146,7 +147,9 @@ class FollowedObjects:
         owned.add(np.full(len(others), last), others)
         self._start(sweeps, owned)
         found: list[FollowedBox] = []
-        for track_id, one in list(self._objects.items()):
+        # Points belong to the object that has been seen in more of the last sweeps.
+        by_support = sorted(self._objects.items(), key=lambda item: -len(item[1].way.seen))
+        for track_id, one in by_support:
             one.follower.continue_in(sweeps, owned)
             self._step(track_id, one, last)
             if last in one.way.seen:
