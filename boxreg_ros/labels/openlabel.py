@@ -224,7 +224,8 @@ def _read_frame(
     if stamp_ns is None:
         stamp_ns = round(float(properties['timestamp']) * 1e9)
     transforms = list(properties.get('transforms', {}).values())
-    for system, items in _cuboids_by_system(frame).items():
+    without: dict[str, list[Any]] = {item['dst']: [] for item in transforms[:1]}  # no object
+    for system, items in (_cuboids_by_system(frame) or without).items():
         refined = refined_boxes(
             int(stamp_ns),
             system,

@@ -272,6 +272,8 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         _check_output(args)
     truth = true_boxes(args.truth)
+    if not len(truth.boxes):
+        raise RecordingError(f'{args.truth}: expected true boxes, got none; give another table')
     recording = request.recording()
     recording.has_boxes = not args.no_boxes
     drive = Drive.of(recording, truth, AT_ONCE, config)

@@ -226,7 +226,8 @@ class _Sample:
         self.classes.update(content.class_names)
         for name in content.track_ids:
             self.without_id += not name
-            self.tracks[name].append(content.stamp_ns)
+            if name:
+                self.tracks[name].append(content.stamp_ns)
 
 
 def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:

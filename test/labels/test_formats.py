@@ -490,6 +490,16 @@ def test_boxes_without_track_id_are_not_merged(tmp_path, name):
     assert [len(f.refined.status) for f in frames_of(name, folder)] == [3, 3]
 
 
+def test_openlabel_keeps_frames_without_an_object(tmp_path):
+    frames = [frame_of([IN_FIXED] * n, list('ab')[:n], STAMP + i) for i, n in enumerate((2, 0, 1))]
+    _, folder = written('openlabel', tmp_path, frames)
+    found = [
+        (f.refined.boxes.stamp_ns, f.refined.boxes.track_ids)
+        for f in frames_of('openlabel', folder)
+    ]
+    assert found == [(STAMP, ('a', 'b')), (STAMP + 1, ()), (STAMP + 2, ('a',))]
+
+
 @pytest.mark.parametrize('name', READABLE_FORMATS)
 def test_empty_drive_round_trips(tmp_path, name):
     _, folder = written(name, tmp_path, [])

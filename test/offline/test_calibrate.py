@@ -301,6 +301,9 @@ def test_truth_of_another_time_is_refused(street, scene, tmp_path, capsys):
     arguments = ['calibrate', str(street), '--truth', str(tmp_path / 'truth.csv')]
     assert cli.main(arguments) == 1
     assert 'are stamps and frame those of the recording?' in capsys.readouterr().err
+    truth.rows(truth.stamps_ns < 0).write(tmp_path / 'none.csv')
+    assert cli.main([*arguments[:-1], str(tmp_path / 'none.csv')]) == 1
+    assert 'expected true boxes, got none' in capsys.readouterr().err
     assert cli.main([*arguments, '-o', str(tmp_path / 'nowhere' / 'margins.yaml')]) == 2
     assert 'in a folder that is there' in capsys.readouterr().err, 'before any work'
     assert cli.main([*arguments, '-o', str(tmp_path)]) == 2

@@ -76,6 +76,7 @@ def test_warnings_gaps_and_damage(tmp_path, capsys):
     assert '1 gaps' in out
     assert 'damage: ' in out and 'interrupted' in out
     assert 'warning: 60 boxes have no track id' in out
+    assert '  0 tracks' in out
     assert 'away from the nearest cloud' in out
     assert ' --associate --complete' in out.splitlines()[-1]
 
