@@ -8,6 +8,7 @@ from pathlib import Path
 import sys
 from typing import Self, TYPE_CHECKING
 
+from boxreg_ros.io.compilation import COMPILING
 from boxreg_ros.offline.arguments import (
     add_options,
     add_recordings,
@@ -122,7 +123,12 @@ def _status(summary: Summary, demands: Demands) -> int:
 
 
 class ProgressBar(Progress):
-    """A bar on stderr, where that is a terminal; use as a context manager."""
+    """
+    A bar on stderr, where that is a terminal; use as a context manager.
+
+    Elsewhere only that the solver is compiled is said, once: it takes longer than most runs.
+
+    """
 
     def __enter__(self) -> Self:
         """Show the bar."""
@@ -131,6 +137,7 @@ class ProgressBar(Progress):
         tqdm.monitor_interval = 0  # no thread beside this one, which forks
         is_hidden = not sys.stderr.isatty()
         self._done = 0.0
+        self._is_silent = is_hidden
         self._bar = tqdm(total=1.0, unit='s', disable=is_hidden, leave=False, bar_format=BAR)
         return self
 
@@ -149,5 +156,8 @@ class ProgressBar(Progress):
 
     def announce(self, activity: str) -> None:
         """Show the activity that the run waits for beside the bar."""
+        if self._is_silent and activity == COMPILING:
+            self._is_silent = False
+            print(f'boxreg: {activity}', file=sys.stderr)
         self._bar.set_description_str(f'({activity})')
         advanced()

@@ -16,6 +16,7 @@ from boxreg_ros.offline import registration_worker as registration
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.registration_worker import registration_worker
 from boxreg_ros.offline.relabel import relabel, Request
+from boxreg_ros.offline.relabel_command import ProgressBar
 from boxreg_ros.offline.workers import run_in_worker
 from measure.node import children_of
 import numpy as np
@@ -196,6 +197,14 @@ def test_the_first_compilation_is_announced():
     assert texts == [COMPILING]
     compile_something(None)
     assert texts == [COMPILING]
+
+
+def test_a_run_without_a_terminal_says_once_that_it_compiles(capsys):
+    with ProgressBar() as bar:
+        for _ in range(2):
+            bar.announce(COMPILING)
+            bar.announce('compiling the solver: 9 functions in 10 s')
+    assert capsys.readouterr().err == f'boxreg: {COMPILING}\n'
 
 
 def test_compilation_in_the_worker_is_announced_while_its_estimates_are_awaited(
