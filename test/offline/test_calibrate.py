@@ -94,7 +94,7 @@ def test_spread_of_margins_between_objects(scene, plain):
     drive = Drive.from_scene(scene)
     rng = np.random.default_rng(3)
     boxes = drive.truth.boxes.copy()
-    for name in set(drive.truth.track_ids):
+    for name in sorted(set(drive.truth.track_ids)):
         rows = np.array(drive.truth.track_ids) == name
         own = dict(zip(GAPS, rng.normal(0.3, 0.1, 4), strict=True))
         boxes[rows] = drawn(drive.truth.rows(rows), own).boxes
