@@ -152,8 +152,8 @@ def declare(node: Node) -> tuple[Config, NodeOptions]:
     The node is made with ``automatically_declare_parameters_from_overrides``: this way integers
     are accepted for real parameters, and unknown names can be reported. `estimate` and the steps
     of `complete` are ignored with a warning: the node publishes both early and final estimates,
-    before a track is whole. Raises ConfigError for a
-    value of the wrong type or out of its bounds, by name.
+    before a track is whole. Raises ConfigError for a value of the wrong type or out of its bounds,
+    by name.
 
     """
     parameters: dict[str, Any] = node.get_parameters_by_prefix('')  # wrong annotation in rclpy
