@@ -51,9 +51,6 @@ COMMANDS = {
     ),
     'simulate': Command('simulation.simulate', 'make a recording with known true boxes'),
     'bench': Command('bench.main', 'measure accuracy and speed'),
-    'recover': Command(
-        'recorder.recover_command', 'complete labels of a drive whose recording was cut off'
-    ),
     'compile': Command('offline.compile_command', 'compile the method now, for images and robots'),
     'node': Command('live.main', 'run the live node (where there is no ros2 run)'),
 }

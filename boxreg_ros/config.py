@@ -28,8 +28,7 @@ NODE_OPTIONS = (
     *('boxes_type', 'points', 'points_type', 'time_unit', 'sensor_frames', 'points_info'),
     *('pose_reference', 'size_order', 'forward_axis', 'associate', 'fixed_frame'),
     *('output_frame', 'transform_timeout', 'deadline', 'backlog', 'static_points'),
-    *('static_points_wait', 'config_file', 'record_to'),
-    *('record_formats', 'record_points', 'record_segment', 'input_model', 'record_camera'),
+    *('static_points_wait', 'config_file', 'input_model'),
     *('use_sim_time', 'start_type_description_service', 'qos_overrides'),
 )
 """Parameters of the node that a parameter file of ROS may contain in addition to `Config`."""

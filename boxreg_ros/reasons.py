@@ -8,9 +8,6 @@ REDUCE_LOAD = (
     '`sampling.points`, publish fewer boxes, use more CPU cores (`solver.threads`), or give the '
     'node cores of its own, see "Priority and cores"'
 )
-REDUCE_RECORDING = (
-    'record to a faster disk, fewer `record_formats`, or without clouds (`record_points:=false`)'
-)
 ENLARGE_TRANSPORT = 'see "Large clouds"'
 CHECK_TRANSFORMS = 'see "Requirements of your TF tree and stamps"'
 
@@ -76,26 +73,6 @@ class Reason(StrEnum):
         'message',
         'published unchanged because the solver is slower than the data',
         REDUCE_LOAD,
-    )
-    BOXES_UNRECORDED = (
-        'boxes_unrecorded',
-        'message',
-        'not written to the label files: the recorder, or its disk, is slower than the data; the '
-        'boxes are published as always',
-        REDUCE_RECORDING,
-    )
-    CLOUDS_UNRECORDED = (
-        'clouds_unrecorded',
-        'cloud',
-        'not written beside the labels: the recorder, or its disk, is slower than the data',
-        REDUCE_RECORDING,
-    )
-    RECORDER_RESTARTED = (
-        'recorder_restarted',
-        'restart',
-        'the recorder of labels was ended from outside, for want of memory for example, and '
-        'started again; its segment was completed, box arrays under way to it may be lost',
-        'give the machine more memory, or record fewer `record_formats`',
     )
     STATIC_UNCHANGED = (
         'static_unchanged',

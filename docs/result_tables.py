@@ -285,22 +285,6 @@ def figures(results: Any) -> Iterable[str]:
     yield table(['', ''], flat(results))
 
 
-def node(results: Any) -> Iterable[str]:
-    """Yield the figures of one run, or of several runs side by side."""
-    runs: dict[str, dict[str, str]] = {}
-    for name, value in flat(results):
-        run, _, figure = name.partition(': ')
-        if not run.endswith(('recording 1', 'recording 2')):
-            run, figure = '', name
-        runs.setdefault(run, {})[figure] = value
-    alone = runs.pop('', {})
-    if runs:
-        figures = list(dict.fromkeys(figure for run in runs.values() for figure in run))
-        rows = [[figure, *(run.get(figure, '-') for run in runs.values())] for figure in figures]
-        yield table(['', *runs], rows)
-    yield table(['', ''], alone.items())
-
-
 def lidars(results: Any) -> Iterable[str]:
     """Yield the accuracy of each way to record several LiDARs."""
     yield grid('recorded', {'BEV': 'bev', '3D': '3d'}, results)

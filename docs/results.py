@@ -457,15 +457,9 @@ def _node(documents: Documents) -> Iterable[str]:
     figures = (
         'early published [%]', 'final published [%]', 'latency p50 [ms]', 'latency p99 [ms]',
         'latency max [ms]', 'memory at the start [MB]', 'memory at the end [MB]',
-        'handles at the start', 'handles at the end', 'cores used', 'recorded [MB]',
-        'box arrays not recorded',
+        'handles at the start', 'handles at the end', 'cores used',
     )  # fmt: skip
-    runs: dict[str, Any] = {}
-    for data, document in documents:
-        for name, value in document['results'].items():
-            run, _, figure = name.rpartition(': ')
-            if figure in figures and 'recorder' not in run and not run.endswith('2'):
-                runs.setdefault(run or data.replace('_', ' '), {})[figure] = value
+    runs = {data.replace('_', ' '): document['results'] for data, document in documents}
     rows = [
         [
             figure,
@@ -480,19 +474,6 @@ def _load(documents: Documents) -> Iterable[str]:
     """Yield latency and accuracy by number of tracks with the default deadline."""
     ((_, document),) = documents
     yield from result_tables.load({'deadline': document['results']['deadline']})
-
-
-def _kills(documents: Documents) -> Iterable[str]:
-    """Yield the time of the boxes that are lost with each process."""
-    ((_, document),) = documents
-    killed: dict[str, dict[str, str]] = {}
-    for name, value in document['results'].items():
-        process, of_process, figure = name.partition(': ')
-        if of_process:
-            killed.setdefault(process, {})[figure] = f'{value:.2g}'
-    rows = [[process, *found.values()] for process, found in killed.items()]
-    figures = list(next(iter(killed.values())))
-    yield table(['', *figures], rows)
 
 
 OVERVIEW_SECTIONS = {
@@ -535,8 +516,7 @@ KINDS = {
     'speed': Kind('speed', result_tables.figures, _speed),
     'load': Kind('node', result_tables.load, _load),
     'scale': Kind('speed', result_tables.scale, _scale),
-    'kills': Kind('node', result_tables.figures, _kills),
-    'node': Kind('node', result_tables.node, _node),
+    'node': Kind('node', result_tables.figures, _node),
 }
 SHARED = {
     name for name, count in Counter(kind.page for kind in KINDS.values()).items() if count > 1

@@ -237,16 +237,6 @@ class NodeProcess:
         """Return the newest values of the status as a dict of texts."""
         return values_of(self.diagnostics)
 
-    def recording(self):
-        """Return the newest state of the recording in /diagnostics, as level, text and values."""
-        every = [status for message in self.diagnostics for status in message.status]
-        status = [one for one in every if one.name.endswith(': recording')][-1]
-        return status.level, status.message, {v.key: v.value for v in status.values}
-
-    def is_recording(self):
-        """Return whether the recorder has started: what it has not taken before ends is lost."""
-        return self.diagnostics and float(self.recording()[2].get('disk free [GB]', 0)) > 0
-
     def output(self):
         return self._log.read_text() if self._log.exists() else ''
 

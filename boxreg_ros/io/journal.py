@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import errno
-from functools import partial
 from io import BytesIO
 from itertools import count
 import os
@@ -23,12 +22,10 @@ import zlib
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.storage.urls import delete_files, names_of, read_bytes, url_of, write_bytes
-from boxreg_ros.io.whole_files import store
 
 TRUSTED_PACKAGES = ('boxreg_ros', 'numpy')
 TRUSTED_NAMES = (
     *('Constants', 'Estimate', 'Estimates', 'MarginalisationPrior', 'TrackRows'),
-    *('LabelFrame', 'RefinedBoxes', 'BoxArray', 'Sweep'),
     *('ndarray', 'dtype', 'scalar', '_reconstruct', '_frombuffer'),
 )
 """Names that an object may refer to: a pickle of others could run any code."""
@@ -89,15 +86,6 @@ class Journal:
         self._count = kept
         return kept
 
-    def sync(self) -> None:
-        """Wait until all objects are on the disk itself, where they survive a power cut."""
-        store([self._log, self.path, self.path.parent])
-
-    @property
-    def is_deleted(self) -> bool:
-        """Return whether someone has deleted or moved the file; writing would still succeed."""
-        return not self.path.exists()
-
     def delete(self) -> None:
         """Delete the journal and close it."""
         self._unlink()  # first: SQLite then does not tidy up the file
@@ -108,10 +96,8 @@ class Journal:
         self._database.close()
 
     def _open(self) -> None:
-        # Autocommit; the recorder closes its segments in a second thread.
-        connect = partial(sqlite3.connect, isolation_level=None, check_same_thread=False)
         try:
-            self._database = connect(self.path)
+            self._database = sqlite3.connect(self.path, isolation_level=None)  # autocommit
             for statement in SETUP:
                 self._database.execute(statement)
         except sqlite3.OperationalError as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import count
-from textwrap import fill
 from types import SimpleNamespace
 from typing import Any
 
@@ -33,18 +32,12 @@ CYAN = (0.1, 0.8, 1.0, 1.0)
 BLUE = (0.2, 0.5, 1.0, 0.6)
 VIOLET = (0.6, 0.3, 0.9, 0.45)
 WHITE = (1.0, 1.0, 1.0, 1.0)
-RED = (0.9, 0.1, 0.1, 1.0)
 COLOURS = {REFINED: GREEN, COASTED: VIOLET}
 """By status; kept boxes are orange, or yellow where there was no time for them."""
 BOX_NAMESPACES = ('input', 'refined', 'heading', 'id', 'covariance')
 FINAL = 'final'
-RECORDING = 'recording'
-NAMESPACES = (*BOX_NAMESPACES, FINAL, RECORDING)
+NAMESPACES = (*BOX_NAMESPACES, FINAL)
 ELLIPSE_DEVIATIONS = 2.0  # that the ellipse of a covariance reaches out to
-TEXT_HEIGHT = 3.0
-"""Height of the state of the recording above the sensor [m]; chosen."""
-TEXT_WIDTH = 30
-"""Longest line of that text [characters]; chosen: about 12 m, so that it hides few boxes."""
 ARROW, CUBE, SPHERE, LINE_STRIP, TEXT = 0, 1, 2, 4, 9
 OUTLINE = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
 """Signs of x and y along the outline of a face."""
@@ -248,18 +241,6 @@ def _pose(m: Any, position: Iterable[float], quaternion_xyzw: Iterable[float] = 
     return m.Pose(
         position=m.Point(x=x, y=y, z=z), orientation=m.Quaternion(x=qx, y=qy, z=qz, w=qw)
     )
-
-
-def text_marker(frame_id: str, text: str, is_error: bool) -> Any:
-    """Return the state of the recording as text above the sensor; an empty text deletes it."""
-    m = ros_messages()
-    colour = RED if is_error else WHITE
-    marker = _marker(
-        m, m.Header(frame_id=frame_id), RECORDING, 0, TEXT, _pose(m, (0, 0, TEXT_HEIGHT)),
-        (0, 0, 0.8), colour, text=fill(text, TEXT_WIDTH), frame_locked=True,
-    )  # fmt: skip
-    marker.action = ADD if text else DELETE
-    return m.MarkerArray(markers=[marker])
 
 
 def ros_messages() -> SimpleNamespace:

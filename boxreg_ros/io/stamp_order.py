@@ -45,11 +45,6 @@ class StampOrder:
         """Return the number of box arrays that are held."""
         return len(self._by_stamp)
 
-    @property
-    def first_ns(self) -> int | None:
-        """Return the smallest stamp that is held [ns]; None if there is none."""
-        return self._by_stamp[0].stamp_ns if self._by_stamp else None
-
     def expect(self, slot: Slot, ticket: object = None) -> None:
         """Add a box array; its `ticket` returns with the result, which a slot may have already."""
         insort(self._by_stamp, slot, key=lambda slot: slot.stamp_ns)
@@ -65,12 +60,6 @@ class StampOrder:
         slot = self._by_ticket.pop(ticket, None)
         if slot is not None:
             slot.result = result
-
-    def keep_all(self, reason: str) -> None:
-        """Give all box arrays without a result their input boxes, kept for a reason."""
-        for slot in self._by_ticket.values():
-            slot.result = kept(slot.boxes, reason)
-        self._by_ticket.clear()
 
     def ready(self) -> Iterator[tuple[Slot, RefinedBoxes]]:
         """Remove and yield the box arrays up to the first without a result."""

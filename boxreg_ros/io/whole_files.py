@@ -51,12 +51,6 @@ def written_whole(path: Path) -> Iterator[TextIO]:
         partial.unlink(missing_ok=True)
 
 
-def delete_partial_files(folder: Path) -> None:
-    """Delete what killed processes left of `written_whole`, where nobody else writes now."""
-    for path in folder.glob('.*.partial'):
-        path.unlink()
-
-
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
     """Yield a temporary folder, deleted at the end; TransferError if that disk is full."""

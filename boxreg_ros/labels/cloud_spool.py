@@ -54,7 +54,7 @@ class Spool:
         none. Stamps [ns] of box arrays are not smaller than in the call before.
 
         """
-        self.delete_before(stamp_ns)
+        self._delete_before(stamp_ns)
         nearest = min(self._stamps, key=lambda stamp: abs(stamp - stamp_ns), default=None)
         if nearest is None or abs(nearest - stamp_ns) > self._max_offset_ns:
             return None, None
@@ -80,7 +80,7 @@ class Spool:
         """Delete the folder with the clouds that are left."""
         shutil.rmtree(self._folder)
 
-    def delete_before(self, stamp_ns: int) -> None:
+    def _delete_before(self, stamp_ns: int) -> None:
         """Delete the clouds that are too old for boxes of a stamp [ns] and of all later ones."""
         first = bisect_left(self._stamps, stamp_ns - self._max_offset_ns)
         for stamp_ns in self._stamps[:first]:

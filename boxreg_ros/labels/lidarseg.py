@@ -114,7 +114,7 @@ class Writer(nuscenes.Writer):
 
 def codes_of(tracks: Sequence[ObjectTrack]) -> Ints:
     """Return 1000 times the category plus the instance of the points of each track."""
-    from boxreg_ros.core.point_labels import BACKGROUND, UNKNOWN  # numba: the recorder has none
+    from boxreg_ros.core.point_labels import BACKGROUND, UNKNOWN  # numba, which reading needs not
 
     counts: Counter[str] = Counter()
     codes = []

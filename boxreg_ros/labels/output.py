@@ -1,4 +1,4 @@
-"""Label files of one drive in several formats, written by `boxreg relabel` and by the recorder."""
+"""Label files of one drive in several formats."""
 
 from __future__ import annotations
 

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import entry_points
-from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,7 +19,6 @@ from boxreg_ros.labels.protocol import (
     Provenance,
     SceneFrames,
 )
-from boxreg_ros.labels.segments import segments_of
 
 BUILT_IN = {
     name: f'boxreg_ros.labels.{name}'
@@ -108,7 +106,7 @@ def writer_for(
 
 def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterator[LabelFrame]:
     """
-    Yield the frames of a label file or folder, or of all segments of a recording of labels.
+    Yield the frames of a label file or folder.
 
     Boxes whose file states no status or covariance have the status ``input`` and the unit matrix.
     A scene of a data set, whose boxes are then read, completes the facts of the files.
@@ -124,12 +122,12 @@ def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterat
     if not path.exists():
         raise RecordingError(f'labels {str(path)!r}: no such file or folder; correct the path')
     readable: Any = module
+    frames: Iterator[LabelFrame]
     if scene is not None and hasattr(module, 'read_scene'):
-        parts = [readable.read_scene(path, scene)]
+        frames = readable.read_scene(path, scene)
     else:
-        folders = [_folder_of(name, segment) for segment in segments_of(path)]
-        parts = [readable.read(one) for one in folders or [path]]
-    return chain.from_iterable(parts)
+        frames = readable.read(path)
+    return frames
 
 
 def import_format(name: str) -> FormatModule:

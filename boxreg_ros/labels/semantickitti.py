@@ -101,7 +101,7 @@ def point_numbers(points: PointLabels) -> NDArray[np.uint32]:
     none, and beyond `MAX_INSTANCE`. The last two are those of the track numbers -2 and -1.
 
     """
-    from boxreg_ros.core.point_labels import BACKGROUND, UNKNOWN  # numba: the recorder has none
+    from boxreg_ros.core.point_labels import BACKGROUND, UNKNOWN  # numba, which reading needs not
 
     pairs = zip(points.tracks, points.moves.tolist(), strict=True)
     classes = [class_of(track.class_name, moves) for track, moves in pairs]

@@ -10,7 +10,6 @@ from typing import Any
 from uuid import uuid4
 
 from boxreg_ros.errors import BoxregError, UnsupportedMessage
-from boxreg_ros.live.label_recording import RECORDING_TIME
 from boxreg_ros.live.node import BoxregNode
 from boxreg_ros.live.topics import import_message
 from boxreg_ros.live.worker import Worker
@@ -124,7 +123,6 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
             self._bond.end()
         self.worker.stop()
         self._drained.wait()
-        self.recording.wait(RECORDING_TIME)
         self.close_topics()
         return TransitionCallbackReturn.SUCCESS
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf
 import os
@@ -15,7 +14,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.input_statistics import Drives, joined, to_text
 from boxreg_ros.core.latency import LateBoxes, Latency, set_latency
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.errors import ConfigError, TransformUnavailable, UnsupportedMessage
+from boxreg_ros.errors import ConfigError, TransformUnavailable
 from boxreg_ros.io.input_models import disagreements, read_models
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import Lidars, MergedSweep, SensorPlacement, SINGLE_LIDAR
@@ -29,7 +28,6 @@ from boxreg_ros.io.session import (
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.budget import TickBudget
-from boxreg_ros.live.label_tap import LabelTap
 from boxreg_ros.live.static_points import StaticPoints
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, COASTED, Floats, REFINED, RefinedBoxes, Sweep
@@ -130,7 +128,6 @@ class LiveRegistrar:
         self.placement = SensorPlacement(lidars)
         self._unknown_frames: set[str] = set()  # of LiDARs; not waited for
         self.session = Session(convention, config, fixed_frame, self.placement, trouble)
-        self.tap = LabelTap(self.session)
         self._model_file = Path(input_model).expanduser() if input_model else None
         self._drives: Drives = {}
         if self._model_file is not None and not os.access(self._model_file.parent, os.W_OK):
@@ -319,7 +316,7 @@ class LiveRegistrar:
             moved = self._with_ticket(item, content, moved, admitted.T_fixed_item)
         ready = self._outgoing(hand_to_registrar(self.registrar, moved, restarts=False))
         if moved is None:
-            ready += self.passed_through(item.message, Reason.NO_TRANSFORM)
+            ready += self.passed_through(item.message)
         return ready
 
     def _in_time(self, boxes: BoxArray) -> BoxArray:
@@ -337,7 +334,6 @@ class LiveRegistrar:
         for sweep, parts in complete:
             clouds = [part for part in parts if part is not None]
             self._late.add_sweep(sweep)
-            self.tap.add_cloud(sweep, clouds)
             if self.static_points is not None:
                 self.static_points.add_cloud(sweep, clouds)
             ready += self._outgoing(hand_to_registrar(self.registrar, sweep, restarts=False))
@@ -416,7 +412,6 @@ class LiveRegistrar:
         self._forget()
         held = list(self._held)
         self._held.clear()
-        self.tap.keep_all(Reason.FAILED)
         ready = self._made
         self._made = []
         for waiting in held:
@@ -425,7 +420,7 @@ class LiveRegistrar:
             ready += self.last(waiting.message)
         is_held = item is None or any(waiting.message is item.message for waiting in held)
         if item is not None and isinstance(item.content, BoxArray) and not is_held:
-            ready += self.passed_through(item.message, Reason.FAILED)
+            ready += self.passed_through(item.message)
         return ready
 
     def _forget(self) -> None:
@@ -439,20 +434,12 @@ class LiveRegistrar:
         self._seeds = []
         self._sources = {}
 
-    def passed_through(self, message: Any, reason: str = '') -> list[Outgoing]:
+    def passed_through(self, message: Any) -> list[Outgoing]:
         """Return an input message as early boxes and, once those before it are, as final."""
-        return [Outgoing(message, False), *self.last(message, reason)]
+        return [Outgoing(message, False), *self.last(message)]
 
-    def last(self, message: Any, reason: str = '') -> list[Outgoing]:
-        """
-        Return an input message as final boxes, or hold it behind those before it.
-
-        `reason` is that of its boxes in label files; empty: they are in none.
-
-        """
-        if reason and self.adapter is not None:
-            with suppress(UnsupportedMessage):
-                self.tap.add_kept(self.adapter.from_msg(message), reason)
+    def last(self, message: Any) -> list[Outgoing]:
+        """Return an input message as final boxes, or hold it behind those before it."""
         if not self._held:
             return [Outgoing(message, True)]
         self._held.append(_Passing(message))
@@ -492,7 +479,6 @@ class LiveRegistrar:
             self._earlier_detections(item.message, moved), self._latency.seconds != 0,
         )  # fmt: skip
         self._held.append(pending)
-        self.tap.expect(pending, moved, T_fixed_item)
         return replace(moved, ticket=pending)
 
     def _earlier_detections(self, message: Any, boxes: BoxArray) -> dict[str, _Detection]:
@@ -526,7 +512,6 @@ class LiveRegistrar:
             if self.static_points is not None and not pending.is_early_out:
                 self.static_points.add_boxes(refined)
             pending.is_early_out = True
-            self.tap.take(refined)
             if refined.is_final:
                 self._held.remove(pending)
                 while self._held and isinstance(self._held[0], _Passing):

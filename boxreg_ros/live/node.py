@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 import gc
 from pathlib import Path
-from threading import Thread
 import time
 from typing import Any
 
@@ -20,10 +18,8 @@ from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.inbox import Inbox
-from boxreg_ros.live.label_recording import LabelRecording
 from boxreg_ros.live.live_registrar import LiveRegistrar
 from boxreg_ros.live.params import changed, declare, numbers_as_declared, parameters_yaml
-from boxreg_ros.live.recorder_process import check_recording
 from boxreg_ros.live.topics import FOLLOW_TOPIC, import_message, NodeTopics
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
@@ -32,14 +28,11 @@ from msg_adapters.clouds import header_of, POINTS_TYPE
 from msg_adapters.concatenation import INFO_TYPE
 from msg_adapters.serialized import serialized_adapter_for
 from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 NAME = 'boxreg_node'
@@ -51,8 +44,6 @@ ODOMETRY_DEPTH = 50
 """Queue size of `odom`: a second at the rate of common odometry sources."""
 FOLLOW_DEPTH = 10
 """Queue size of `~/follow`, where a person publishes."""
-CHECKED_BY_RECORDER = ('record_formats', 'record_camera')
-"""Parameters whose values are known to the recorder alone."""
 FINALS_MARGIN = 10
 """Queue size of the boxes beyond what may be published at once at the end."""
 
@@ -66,8 +57,7 @@ class BoxregNode(Node):
 
     Callbacks run in the thread of the executor. They put messages and events into the inbox and
     return at once. `worker`, made by `open_topics`, runs in the thread of `run_worker` and does
-    the rest. `recording` writes the final boxes as label files, where that is asked for. Raises
-    ConfigError if a parameter has a wrong value.
+    the rest. Raises ConfigError if a parameter has a wrong value.
 
     """
 
@@ -82,12 +72,9 @@ class BoxregNode(Node):
         self.add_pre_set_parameters_callback(partial(numbers_as_declared, self))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
-        self._refused: dict[str, str] = {}
-        self._check_beside_messages()
         self._health = Health(self.get_logger())
         config, options = self._settings
         self._inbox = Inbox(config.queue, max(1, len(options.lidars.topics)))
-        self.recording = LabelRecording(self, self._inbox, self._health, lambda: self._settings)
         self._opened = ExitStack()
 
     def configure(self) -> None:
@@ -133,10 +120,6 @@ class BoxregNode(Node):
         )  # fmt: skip
         if options.static_points:
             self._open_static_points(options.points_type)
-        self.recording.offer_services()
-        self._opened.callback(self.recording.withdraw_services)
-        if options.record_to:
-            self.recording.start()
         self._subscribe_to_points(options.points_type, options.lidars)
         self._subscribe_to_motion()
         for name, callback in (
@@ -294,56 +277,12 @@ class BoxregNode(Node):
             response.message = str(path)
         return response
 
-    def _check_beside_messages(self) -> None:
-        """Receive messages while a request to set parameters waits for the check of a recorder."""
-        group = ReentrantCallbackGroup()
-        for service in self.services:
-            if service.srv_type in (SetParameters, SetParametersAtomically):
-                service.callback_group = group
-                group.add_entity(service)
-                checked: Any = partial(self._set_when_checked, service.callback)
-                service.callback = checked
-
-    async def _set_when_checked(
-        self, set_now: Callable[[Any, Any], Any], request: Any, response: Any
-    ) -> Any:
-        """Answer a request to set parameters."""
-        given = [Parameter.from_parameter_msg(one) for one in request.parameters]
-        checked = Future()
-
-        def check() -> None:
-            checked.set_result({one.name: self._refusal(one) for one in given})
-            if self.executor is not None:
-                self.executor.wake()
-
-        if {one.name for one in given} & set(CHECKED_BY_RECORDER):
-            Thread(target=check, daemon=True).start()
-            self._refused = await checked
-        response = set_now(request, response)
-        self._refused = {}
-        return response
-
-    def _refusal(self, parameter: Parameter) -> str:
-        """Return why a recorder cannot use a parameter; '' if it can, or has no use for it."""
-        if parameter.name not in CHECKED_BY_RECORDER:
-            return ''
-        try:
-            _, options = changed(*self._settings, [parameter])
-            if parameter.name == 'record_camera':
-                check_recording(options.record_camera, ())
-            else:
-                check_recording('', options.record_formats)
-        except ConfigError as error:
-            return str(error)
-        return ''
-
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
             changed(*self._settings, parameters)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        reason = '; '.join(filter(None, (self._refused.get(one.name) for one in parameters)))
-        return SetParametersResult(successful=not reason, reason=reason)
+        return SetParametersResult(successful=True)
 
     def _take_parameters(self, parameters: list[Parameter]) -> None:
         self._settings = changed(*self._settings, parameters)
@@ -378,14 +317,7 @@ class BoxregNode(Node):
             **self.worker.facts(),
             **self._inbox.sizes(),
         }
-        message = DiagnosticArray(
-            status=[
-                self._health.status(f'{name}: registration', facts),
-                topics,
-                self.recording.diagnosis(f'{name}: recording'),
-            ]
-        )
+        registration = self._health.status(f'{name}: registration', facts)
+        message = DiagnosticArray(status=[registration, topics])
         message.header.stamp = now.to_msg()
         self._diagnostics.publish(message)
-        if self._markers.get_subscription_count() and self.worker.cloud_frame:
-            self.recording.show(self._markers, self.worker.cloud_frame)

@@ -9,7 +9,6 @@ from typing import Any
 
 from boxreg_ros.config import Config, Setting, setting, settings
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.io.label_feed import segment_limit
 from boxreg_ros.io.lidars import Lidars
 from msg_adapters import CLOUD_TYPES, POINTS_TYPE
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS
@@ -21,7 +20,7 @@ from rclpy.parameter import Parameter
 DYNAMIC = (
     *('sampling.', 'solver.', 'paper.', 'vehicle.', 'cyclist.', 'pedestrian.'),
     *('max_gap', 'coast', 'min_observations', 'output_frame', 'transform_timeout', 'deadline'),
-    *('config_file', 'record_'),
+    'config_file',
 )
 """Prefixes of the parameters that may change while the node runs."""
 READ_ONLY = 'read-only: windows, threads or subscriptions are built from it at start-up'
@@ -110,25 +109,10 @@ class NodeOptions:
     config_file: str = setting(
         'boxreg_node.yaml', 'file that ~/save_config writes all parameters to'
     )
-    record_to: str = setting(
-        '',
-        'folder to write the final boxes to as label files while driving; empty: none are written',
-    )
-    record_formats: tuple[str, ...] = setting(
-        ('csv', 'openlabel'),
-        'label formats to record, see `boxreg formats`; csv is always written',
-    )
-    record_points: bool = setting(False, 'record the clouds that the formats need, too')
-    record_segment: str = setting(
-        '60 s', 'length of a segment of label files: a number with the unit s, min, h, MB or GB'
-    )
     input_model: str = setting(
         '',
         'file of what drives have shown of the errors of this detector: read at the start where '
         'it exists, and written at the end; empty: none',
-    )
-    record_camera: str = setting(
-        '', 'calibration file, for recorded formats in the frame of a camera'
     )
 
     @property
@@ -340,8 +324,6 @@ def _checked(item: Setting, value: Any) -> Any:
     if type(value) is not kind:
         raise ConfigError(f'{item.name}: expected {kind.__name__} ({item.meaning}), got {value!r}')
     item.check(value)
-    if item.name == 'record_segment':
-        segment_limit(value)
     if item.name == 'deadline' and value == 0:
         raise ConfigError(
             'deadline: expected more than 0 s, or a negative number for most of the measured '

@@ -7,11 +7,9 @@ from collections.abc import Callable
 from functools import partial
 import os
 import signal
-import sys
 from threading import Event, Thread
 import time
 
-from boxreg_ros.live.label_recording import RECORDING_TIME
 from boxreg_ros.live.lifecycle import BoxregLifecycleNode
 from boxreg_ros.live.node import BoxregNode
 import rclpy
@@ -70,13 +68,6 @@ def run(node: BoxregNode) -> list[Exception]:
     else:
         node.destroy_node()
         shut_down()
-    if not node.recording.wait(RECORDING_TIME):
-        lost = node.recording.lost
-        print(
-            f'the recorder completes the last segment in {node.recording.folder}'
-            f'{lost and f"; lost: {lost}"}',
-            file=sys.stderr,
-        )
     return failures
 
 

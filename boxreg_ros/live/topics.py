@@ -318,7 +318,7 @@ class NodeTopics:
         prefix = f'{namespace.rstrip("/")}/{name}'
         return all(
             known & {f'{prefix}/{service}', f'rr{prefix}/{service}Reply'}
-            for service in ('save_config', 'start_recording')
+            for service in ('save_config', 'reset')
         )
 
     def _published_topics(self, type_names: set[str]) -> list[str]:

@@ -35,8 +35,6 @@ IDLE_PERIOD = 1.0
 """Longest pause while nothing is held [s]."""
 BOXES_PATIENCE = 10.0
 """Boxes wait for the solver this many times longer than clouds before they pass through."""
-NO_TIME = Reason.BOXES_QUEUE_FULL
-"""Reason of boxes that the solver has no time for."""
 FULL_COLLECTION_PERIOD = 60.0
 """Time between two collections of all garbage [s]; chosen. One takes 40 ms with 1,024 tracks,
 after the boxes of one tick in 600 at 10 Hz. Few cycles survive the collection of new objects after
@@ -153,7 +151,7 @@ class Worker:
         if message is None:
             return
         if message.topic == 'passing':
-            self._publish(self._live.last(message.content, NO_TIME))
+            self._publish(self._live.last(message.content))
         elif self._is_overdue(message):
             self.drop(message)
         else:
@@ -254,10 +252,6 @@ class Worker:
                 self._publish(self._guarded(partial(self._live.lose, *content)))
             case 'reset':
                 self._publish(self._guarded(self._live.reset))
-            case 'record':
-                self._live.tap.start(content)
-            case 'end_recording':
-                self._live.tap.finish()
             case 'settings':
                 self._live.config, options = content
                 self._live.output_frame = options.output_frame.lstrip('/')
@@ -368,15 +362,14 @@ class Worker:
         self._publish(self._guarded(self._live.flush))
         for waiting in (item, *self._confirmed, *self._live.release()):
             if waiting is not None and not isinstance(waiting.content, Sweep):
-                self._publish(self._live.passed_through(waiting.message, NO_TIME))
+                self._publish(self._live.passed_through(waiting.message))
         message = self._inbox.take()
         while message is not None:
             if message.topic == 'boxes':
-                self._publish(self._live.passed_through(message.content, NO_TIME))
+                self._publish(self._live.passed_through(message.content))
             elif message.topic == 'passing':
-                self._publish(self._live.last(message.content, NO_TIME))
+                self._publish(self._live.last(message.content))
             message = self._inbox.take()
-        self._live.tap.finish()
         self._save_model()
         self._publish_static()
         self._markers.publish(self._board.clear())

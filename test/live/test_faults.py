@@ -11,7 +11,6 @@ from measure import MEASURE
 from measure.node import vitals
 from msg_adapters import vision
 import numpy as np
-from preloaded import CODE
 import pytest
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
@@ -103,38 +102,6 @@ def test_parameters_and_services_at_run_time(graph, tmp_path):
     assert timeout.double_value == 1.0
     assert ended_cleanly(again)
     assert 'unknown parameters' not in again.output()
-
-
-SLOW_CHECK = """
-import sys, time
-from pathlib import Path
-from boxreg_ros.live import node
-
-def check_recording(camera, formats):
-    end = time.monotonic() + 20
-    while not Path({played!r}).exists() and time.monotonic() < end:
-        time.sleep(0.05)
-
-node.check_recording = check_recording
-from boxreg_ros.live.main import main
-sys.exit(main())
-"""
-
-
-def test_boxes_are_published_while_a_recorder_checks_a_parameter(graph, tmp_path):
-    played = tmp_path / 'played'
-    records = records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
-    node = graph.run(records, *QUICK, command=(CODE, SLOW_CHECK.format(played=str(played))))
-    client = graph.node.create_client(SetParameters, '/boxreg_node/set_parameters')
-    graph.wait(client.service_is_ready, 'the service')
-    formats = Parameter('record_formats', value=['csv']).to_parameter_msg()
-    answer = client.call_async(SetParameters.Request(parameters=[formats]))
-    node.play(records)
-    assert not answer.done()
-    played.touch()
-    graph.wait(answer.done, 'the answer')
-    assert answer.result().results[0].successful
-    assert ended_cleanly(node)
 
 
 def test_coast_may_be_set_while_the_node_runs(graph, tmp_path):

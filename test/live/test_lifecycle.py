@@ -1,6 +1,5 @@
 """The lifecycle node as a process, over DDS."""
 
-from boxreg_ros.labels.segments import read_index
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from preloaded import LIFECYCLE_NODE
@@ -58,29 +57,6 @@ def test_boxes_are_refined_while_the_node_is_active(graph, tmp_path):
     assert manager.change(Transition.TRANSITION_INACTIVE_SHUTDOWN) == (True, 'finalized')
     assert 'time_jump' not in node.output()
     assert ended_cleanly(node)
-
-
-def test_each_activation_records_its_own_segments(graph, tmp_path):
-    records = records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
-    folder = tmp_path / 'labels'
-    node = graph.run(
-        records, *QUICK, '-p', f'record_to:={folder}', command=COMMAND, connects=False
-    )
-    manager = Manager(graph)
-    assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
-    for _ in range(2):  # the second begins while the recorder completes the first segment
-        assert manager.change(Transition.TRANSITION_ACTIVATE) == (True, 'active')
-        graph.wait_until_connected()
-        graph.wait(node.is_recording, 'the recorder')
-        node.play(records)
-        assert manager.change(Transition.TRANSITION_DEACTIVATE) == (True, 'inactive')
-        wait_until_unsubscribed(graph)  # else it counts as connected before it is again
-        node.early.clear()
-        node.diagnostics.clear()
-    assert ended_cleanly(node)
-    assert 'ERROR' not in node.output()
-    # The recorder completes the last segment after its node.
-    graph.wait(lambda: [row.frames for row in read_index(folder)] == [6, 6], 'both segments')
 
 
 def test_a_transition_that_the_state_does_not_have_is_refused(graph):

@@ -455,7 +455,6 @@ def refused(tmp_path_factory):
         'loop': ['--ros-args', '-r', 'boxes:=refined_boxes'],
         'markers': ['--ros-args', '-r', 'boxes:=refined_markers'],
         'types': ['--ros-args', '-p', f'boxes_type:={DETECTIONS}', '-r', 'boxes:=points'],
-        'segment': ['--ros-args', '-p', 'record_segment:=1 week'],
         'model': ['--ros-args', '-p', 'input_model:=/nowhere/model.json'],
     }
     folder = tmp_path_factory.mktemp('refused')
@@ -482,7 +481,6 @@ def refused(tmp_path_factory):
         ('loop', 2, ('boxes', "'/refined_boxes'", 'correct the remap')),
         ('markers', 2, ('boxes', "'/refined_markers'", 'correct the remap')),
         ('types', 2, ('boxes', "'/points'", 'which this node uses as points')),
-        ('segment', 2, ('record_segment', "'1 week'", '60 s')),
         ('model', 2, ('input_model', "'/nowhere/model.json'", 'make the folder')),
     ],
 )

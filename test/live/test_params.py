@@ -115,7 +115,6 @@ def test_steps_for_whole_tracks_do_not_turn_coasting_off(make_node):
         ('transform_timeout', -1.0, ('transform_timeout', '0', '-1')),
         ('backlog', 'x', ('backlog', 'float', 'x')),
         ('boxes_type', 3, ('boxes_type', 'str', '3')),
-        ('record_segment', 5, ('record_segment', 'a number with the unit s', 'got 5')),
         ('faces.learn', 1, ('faces.learn', 'bool', '1')),
     ],
 )

@@ -199,7 +199,7 @@ def test_boxes_of_a_node_not_yet_discovered_are_awaited(discovered):
 @pytest.mark.parametrize('known', ['requests', 'responses', 'one of each'])
 def test_refined_boxes_are_known_by_either_half_of_the_services(discovered, known):
     part, search = discovered
-    names = ['/boxreg_node/start_recording', '/boxreg_node/save_config']
+    names = ['/boxreg_node/reset', '/boxreg_node/save_config']
     part.name = 'boxreg_node'
     part.services = {'requests': names, 'responses': [], 'one of each': names[:1]}[known]
     part.writers = [f'rr{name}Reply' for name in names if name not in part.services]

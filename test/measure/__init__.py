@@ -25,7 +25,6 @@ MEASUREMENTS = {
     'scale': 'core hours and memory per hour, and a simulated fleet',
     'load': 'latency and accuracy of the live node by number of tracks',
     'node': 'latency and memory of the live node, over DDS',
-    'kills': 'loss of recorded labels when a process is killed',
     'renew': 'run the command of each stored measurement again, and store its output',
 }
 """Modules of this package, each with `ARGUMENTS` and `run`, and their summaries."""

@@ -8,7 +8,7 @@ publishing the later of cloud and boxes until the refined boxes arrive at the ob
 """
 
 import argparse
-from contextlib import contextmanager, ExitStack, suppress
+from contextlib import contextmanager, ExitStack
 from functools import partial
 import os
 from pathlib import Path
@@ -20,11 +20,9 @@ from threading import Thread
 import time
 
 from boxreg_ros.bench.common import BOXREG
-from boxreg_ros.errors import BoxregError, ConfigError
-from boxreg_ros.labels import module_of
+from boxreg_ros.errors import BoxregError
 from boxreg_ros.structures import LENGTH, ROLL, YAW
 from measure import MEASURE
-from measure.recorded import RecordedLabels
 import numpy as np
 from paths import SHARE
 from ros_messages import Messages, POINTS
@@ -41,8 +39,6 @@ ROAD_SIZE = 160.0  # side of the square with the other points [m]
 BOX_ERRORS = (0.1, 0.1, 0.05, 0.1, 0.1, 0.1, 0.0, 0.0, 0.03)  # standard deviations [m, rad]
 CDR_HEADER = 4  # bytes before the first member of a serialised message
 FIRST_MARKER = 8  # bytes before the first marker: the header and the length of the list
-COMPLETION_TIME = 60.0  # for the last segment of recorded labels [s]
-RECORDING_TURNS = 2  # runs without and with recording
 SETTLED_AFTER = 60.0  # queues, pools of memory and the heap have their size by then [s]
 LAST_TIME = 30.0  # wait for the last messages, on a busy machine [s]
 SAMPLE_PERIOD = 1.0  # of memory, handles, threads and CPU time of the node [s]
@@ -58,9 +54,6 @@ ARGUMENTS = {
         {'choices': ('large', 'default')},
     ),
     '--set': ([], 'parameter of the node', {'metavar': 'KEY:=VALUE', 'action': 'append'}),
-    '--record': (str, 'formats: also record labels in them, with their clouds'),
-    '--compare': (False, 'alternate runs without and with --record, and divide their latencies'),
-    '--keep-gigabytes': (float('inf'), 'delete the oldest segments beyond, once counted [GB]'),
     '--role': (str, argparse.SUPPRESS, {'choices': ('publish',)}),
     '--log': (Path, argparse.SUPPRESS),
 }
@@ -74,9 +67,7 @@ def run(args):
         raise BoxregError(f'{error}: source a ROS 2 installation') from None
     if args.role:
         return publish(args)
-    if args.compare and args.record is None:
-        raise ConfigError('--compare: expected --record with formats, got none; add it')
-    return compare(args) if args.compare else measure(args)
+    return measure(args)
 
 
 # ---------------------------------------------------------------- process of the publisher
@@ -213,46 +204,23 @@ def _marker_array(boxes):
 # ----------------------------------------------------------------- process of the observer
 
 
-def compare(args):
-    """Measure without and with recording in turn, and return the latencies of all runs."""
-    formats = args.record
-    report = {}
-    for turn in range(RECORDING_TURNS):
-        for args.record in (None, formats):
-            kind = 'recording' if args.record else 'not recording'
-            report |= {f'{kind} {turn + 1}: {k}': v for k, v in measure(args).items()}
-    for name in ('p50', 'p99'):
-        key = f': latency {name} [ms]'
-        sums = [
-            sum(report[f'{kind} {turn + 1}{key}'] for turn in range(RECORDING_TURNS))
-            for kind in ('recording', 'not recording')
-        ]
-        report[f'{name} with / without recording'] = sums[0] / sums[1]
-    return report
-
-
 def measure(args, keeps_messages=False):
     """Run node and publisher, and return the report of the observer."""
     set_environment(args.transport)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         arrivals = stack.enter_context(observer(keeps_messages))
-        labels = RecordedLabels(folder / 'labels', 1e9 * args.keep_gigabytes, args.points)
-        parameters = [*args.set, *recording_parameters(args.record, folder / 'labels')]
-        node = stack.enter_context(process(node_command(parameters), folder / 'node.log'))
+        node = stack.enter_context(process(node_command(args.set), folder / 'node.log'))
         load = os.getloadavg()[0]
         publisher = stack.enter_context(
             process(publisher_command(args, folder / 'sent'), folder / 'sent.log')
         )
         samples = []
-        recorder_samples = []
         while publisher.poll() is None:
             if node.poll() is not None:
                 raise BoxregError(f'the node ended: {(folder / "node.log").read_text()}')
             if arrivals['early']:
                 samples.append(vitals(node.pid))
-                recorder_samples += [vitals(child) for child in children_of(node.pid)]
-            labels.update()
             time.sleep(SAMPLE_PERIOD)
         if publisher.returncode:
             raise BoxregError(f'the publisher failed: {(folder / "sent.log").read_text()}')
@@ -261,14 +229,10 @@ def measure(args, keeps_messages=False):
         _await_last(sent, arrivals)
         shutdown_time = _ended(node)
         log = (folder / 'node.log').read_text()
-        recorded = recording(labels, args.record, sent) if args.record else {}
-        if recorder_samples:
-            recorded |= {f'recorder: {k}': v for k, v in growth(recorder_samples).items()}
     return {
         'load before, during': f'{load:.2f}, {os.getloadavg()[0]:.2f}',
         **results(sent, arrivals, args.rate),
         **growth(samples),
-        **recorded,
         'shutdown [s]': shutdown_time,
         'exit status': node.returncode,
         'log lines': len(log.splitlines()),
@@ -360,32 +324,6 @@ def results(sent, arrivals, rate):
     return report
 
 
-def recording_parameters(formats, folder):
-    """Return the parameters of a node that records labels and clouds; none without formats."""
-    if formats is None:
-        return []
-    return [f'record_to:={folder}', f'record_formats:=[{formats}]', 'record_points:=true']
-
-
-def recording(labels, formats, sent):
-    """Wait for the last segment; return what is recorded of the box arrays sent."""
-    deadline = time.monotonic() + COMPLETION_TIME
-    while labels.has_open_segment and time.monotonic() < deadline:
-        time.sleep(0.1)  # the recorder completes the last segment after the node has ended
-    labels.update()
-    with_clouds = sum(
-        'with_points' in module_of(name).FORMAT.options for name in formats.split(',')
-    )
-    return {
-        'recorded box arrays': float(len(labels.stamps)),
-        'recorded cloud files': float(labels.cloud_files),
-        'box arrays not recorded': float(len(set(sent[:, 0].tolist()) - labels.stamps)),
-        'cloud files not recorded': float(with_clouds * len(sent) - labels.cloud_files),
-        'recorded segments': float(len(labels.rows)),
-        'recorded [MB]': 1e-6 * sum(row.size for row in labels.rows),
-    }
-
-
 def growth(samples):
     """
     Return memory, handles, threads and cores used by the node.
@@ -404,15 +342,6 @@ def growth(samples):
         'threads': float(samples[end][2]),
         'cores used': cpu_time / SAMPLE_PERIOD / max(1, end - begin),
     }
-
-
-def children_of(pid):
-    """Return the processes that a process has started, in any of its threads."""
-    found = []
-    for children in Path(f'/proc/{pid}/task').glob('*/children'):
-        with suppress(FileNotFoundError):  # the thread may have ended
-            found += map(int, children.read_text().split())
-    return found
 
 
 def vitals(pid):

@@ -32,7 +32,7 @@ def test_every_measurement_declares_options(name):
     parser = argparse.ArgumentParser()
     measure.add_arguments(parser, import_module(f'measure.{name}').ARGUMENTS)
     is_simulated = name in (
-        'highway', 'kills', 'lidars', 'load', 'node', 'report', 'kinds', 'points', 'labeller',
+        'highway', 'lidars', 'load', 'node', 'report', 'kinds', 'points', 'labeller',
     )  # fmt: skip
     parser.parse_args([] if is_simulated else ['folder'])
 

@@ -1,1 +1,0 @@
-"""Label files while driving: the process beside the live node, its segments and their recovery."""
