@@ -96,8 +96,6 @@ setup(
     extras_require={
         # Point clouds that are compressed by Draco.
         'compressed': ['DracoPy>=2,<3'],
-        # A baseline of `boxreg bench`, and its figures.
-        'bench': ['matplotlib', 'small-gicp'],
         # Data sets as recordings: tables of nuScenes, pickles of PandaSet, tables of Arrow.
         'datasets': ['ijson>=3.2', 'pandas>=2', 'pyarrow'],
         # Label formats that are tables of Arrow: parquet, argoverse2, waymo.

@@ -50,7 +50,6 @@ COMMANDS = {
         'offline.calibrate', 'estimate the labelling margins from labelled tracks'
     ),
     'simulate': Command('simulation.simulate', 'make a recording with known true boxes'),
-    'bench': Command('bench.main', 'measure accuracy and speed'),
     'compile': Command('offline.compile_command', 'compile the method now, for images and robots'),
     'node': Command('live.main', 'run the live node (where there is no ros2 run)'),
 }

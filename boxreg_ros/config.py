@@ -252,7 +252,7 @@ class CompleteConfig:
 @dataclass(frozen=True, slots=True)
 class Ingredients:
     """
-    Parts of the method that `boxreg bench ablation` switches off, one at a time.
+    Parts of the method that `measure ablation` switches off, one at a time.
 
     For measurement only: no settings, so neither parameters of the node nor part of a written
     configuration. Each docstring states the effect of True.
@@ -542,7 +542,7 @@ def _unknown(prefix: str, key: str, known: Mapping[str, Any]) -> str:
     group, dot, last = key.partition('.')
     if dot and is_dataclass(known.get(group)):
         return f'{name}: expected a nested group; write {group}: {{{last}: ...}}'
-    names = ', '.join(sorted(set(known) - {'ingredients'}))  # for `boxreg bench ablation` alone
+    names = ', '.join(sorted(set(known) - {'ingredients'}))  # for `measure ablation` alone
     similar = get_close_matches(key, known, 1)
     proposal = f'; did you mean {prefix}{similar[0]}?' if similar else ''
     return f'{name}: no such setting; expected one of {names}{proposal}'

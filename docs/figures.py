@@ -31,6 +31,7 @@ from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, RefinedBoxes, ROLL, Sweep, X, Y, Z
 from browser import BROWSER_OPTIONS, BROWSERS
 import matplotlib
+from measure import MEASURE
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -107,11 +108,9 @@ def densest_vehicle(result: Path) -> str:
 
 def draw_paper(runs: Path, target: Path) -> None:
     """Draw the boxes of the paper's experiment: true, input and refined."""
-    boxreg(
-        'bench', 'paper', '--seeds', 20, '--methods', 'smoothing', 'paper', 'ours',
-        '-o', 'bench', folder=runs,
-    )  # fmt: skip
-    shutil.copyfile(runs / 'bench' / 'paper_3d_trajectory.png', target)
+    words = ['paper', '--seeds', '20', '--methods', 'smoothing', 'paper', 'ours']
+    subprocess.run([*MEASURE, *words, '--output', str(runs)], check=True)
+    shutil.copyfile(runs / 'paper_3d_trajectory.png', target)
 
 
 PICTURES = {

@@ -11,13 +11,13 @@ from statistics import NormalDist
 from typing import Any
 
 from boxreg_ros import __version__
-from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE
 from boxreg_ros.config import KINDS
 from boxreg_ros.offline.consistency import (
     CONSISTENCY_VARIABLES,
     CONSISTENT_NEES,
     SIGNIFICANT,
 )
+from measure.ablation import INGREDIENTS, WHOLE
 
 MIN_TRACKS = 3
 """Fewest tracks of a cell whose standard error is trusted."""
@@ -110,6 +110,8 @@ def accuracy(results: Any) -> Iterable[str]:
         yield f'{measured["input"]["boxes"]} true boxes.'
         yield table(['', *header.split()], rows)
         yield table(*_parts(measured))
+        if 'as_people' in measured['input']:
+            yield _as_people(measured)
         if 'by_class' in measured['input']:
             yield _classes(measured)
         yield from _compared(measured)
@@ -135,6 +137,17 @@ def _parts(measured: Any) -> tuple[list[str], list[list[str]]]:
         rows[name] += [number(found['iou_bev']), number(found['iou_3d'])]
         rows[name].append(number(found['yaw_degrees'], 2))
     return header, list(rows.values())
+
+
+def _as_people(measured: Any) -> str:
+    """Return BEV and 3D IoU by range as labels of people are compared with each other."""
+    ranges = list(measured['input']['as_people'])
+    rows = []
+    for name, row in measured.items():
+        found = [row['as_people'].get(label, {}) for label in ranges]
+        pairs = [f'{number(x.get("iou_bev"))}/{number(x.get("iou_3d"))}' for x in found]
+        rows.append([name, *pairs])
+    return table(['BEV / 3D IoU as of labels of people', *(f'{x} m' for x in ranges)], rows)
 
 
 def _compared(measured: Any) -> Iterable[str]:

@@ -5,11 +5,10 @@ Write the tables of `docs/results.md` and `docs/results/` from the stored measur
     python docs/results.py --check       exit with status 1 if a page is not what would be written
     python docs/results.py --all KIND    print all tables of a kind of measurements
 
-A measurement is the output of ``boxreg bench`` or of ``test/measure``, stored as
-``KIND_DATA.json``, for example ``real_pandaset_002_a.json`` of ``boxreg bench real pandaset_002_a
---json``. A page has the rows that a reader decides by, between two marks; the text around them is
-written by hand. `KINDS` has the page of each kind and its tables; `docs/results.md` has the main
-figures of each.
+A measurement is the output of ``python test/measure``, stored as ``KIND_DATA.json``, for example
+``real_pandaset_002_a.json`` of ``python test/measure real pandaset_002_a --json``. A page has the
+rows that a reader decides by, between two marks; the text around them is written by hand. `KINDS`
+has the page of each kind and its tables; `docs/results.md` has the main figures of each.
 
 """
 
@@ -22,14 +21,15 @@ from pathlib import Path
 import sys
 from typing import Any, NamedTuple
 
+sys.path.append(str(Path(__file__).resolve().parents[1] / 'test'))  # the room of `measure`
 from boxreg_ros import __version__
-from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE
-from boxreg_ros.bench.speed.command import WANTED
 from boxreg_ros.offline.consistency import (
     CONSISTENCY_VARIABLES,
     CONSISTENT_NEES,
 )
 from generate import between_marks
+from measure.ablation import INGREDIENTS, WHOLE
+from measure.speed import WANTED
 import result_tables
 from result_tables import (
     cells_and_chance,

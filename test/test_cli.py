@@ -326,9 +326,7 @@ def test_errors_of_files_have_the_remedy_of_their_cause(tmp_path, capsys, words,
     assert remedy in line
 
 
-@pytest.mark.parametrize(
-    'command', [['--help'], [], ['relabel', '--help'], ['relable'], ['bench', '--help']]
-)
+@pytest.mark.parametrize('command', [['--help'], [], ['relabel', '--help'], ['relable']])
 def test_parsing_imports_no_large_library(command):
     code = (
         'import sys\n'
@@ -367,7 +365,7 @@ def test_an_internal_exception_is_one_line_and_is_raised_with_debug(tmp_path, ca
 def test_help_and_version(capsys):
     status, out, _ = boxreg(capsys, '--help')
     assert status == 0
-    assert all(name in out for name in ('relabel', 'evaluate', 'simulate', 'bench', 'node'))
+    assert all(name in out for name in ('relabel', 'evaluate', 'simulate', 'batch', 'node'))
     status, out, _ = boxreg(capsys, '--version')
     assert (status, out.split()[0]) == (0, 'boxreg')
     status, out, _ = boxreg(capsys, 'relabel', '--help')

@@ -11,7 +11,7 @@ import zlib
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.offline.drive import Drive
+from measure.drives import Drive
 import numpy as np
 from paths import BAGS, ROOT
 import pytest

@@ -22,11 +22,10 @@ MAY_IMPORT = {
     'tracks': {BASE, 'core', 'io', 'msg_adapters'},
     'review': {BASE, 'core', 'io', 'msg_adapters'},
     'offline': {
-        *(BASE, 'core', 'io', 'labels', 'datasets', 'simulation', 'tracks', 'review'),
+        *(BASE, 'core', 'io', 'labels', 'datasets', 'tracks', 'review'),
         'msg_adapters',
     },
 }
-MAY_IMPORT['bench'] = {*MAY_IMPORT['offline'], 'offline'}
 FRONT_DOORS = {ROOT / 'boxreg_ros' / '__init__.py', ROOT / 'boxreg_ros' / 'cli.py'}
 """They offer what lies behind them, in any room, and import it when it is asked for."""
 FILES = sorted(

@@ -3,7 +3,7 @@ The clouds and boxes of a recording in the fixed frame: the one way to read a re
 
 `FixedFrameItems` confirms time jumps, moves every item and merges the clouds of several LiDARs.
 `boxreg relabel` hands the items to the registrar; `calibrate`, `convert`, `evaluate` and
-`bench real` read the same ones.
+`measure real` read the same ones.
 
 """
 

@@ -23,7 +23,7 @@ LONGEST_PERIOD = 1.0
 """A longer time between two box arrays is a pause [s]; chosen: the slowest sensors run at 2 Hz."""
 BATCH_OVERHEAD = 25
 """Time of a batch that does not depend on its size, in windows; measured with
-`boxreg bench speed`: 10 ms beside 0.4 ms a window."""
+`measure speed`: 10 ms beside 0.4 ms a window."""
 RECENT = 10
 """Last batches and box arrays that times are estimated from; chosen: a second at 10 Hz."""
 OVERRUNS = 300

@@ -8,9 +8,9 @@ from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.problem import NO_RANGE
 from boxreg_ros.core.registration import register
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.reasons import Reason
 from boxreg_ros.simulation.simulate import simulate
+from measure.drives import Drive
 import numpy as np
 import pytest
 from scenes import drive, problem_of, track_of, window_of

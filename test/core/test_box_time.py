@@ -5,9 +5,9 @@ from dataclasses import replace
 from boxreg_ros.config import Config
 from boxreg_ros.core.box_time import BoxTimeEvidence, MIN_VOTES, motion_to_sight, swept
 from boxreg_ros.core.metrics import iou_3d
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.scenarios import highway
 from boxreg_ros.structures import Sweep
+from measure.drives import Drive
 import numpy as np
 import pytest
 from scenes import observation

@@ -7,9 +7,9 @@ from boxreg_ros.core import latency
 from boxreg_ros.core.latency import LateBoxes, NOTABLE, OBJECTS_COMPARED
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.scenarios import highway
 from boxreg_ros.structures import BoxArray
+from measure.drives import Drive
 import numpy as np
 from paths import BAGS
 import pytest

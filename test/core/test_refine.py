@@ -5,10 +5,10 @@ from dataclasses import replace
 from boxreg_ros import Config, refine, Track
 from boxreg_ros.core.metrics import iou_3d, iou_bev, pose_errors
 from boxreg_ros.errors import ConfigError, ShapeError
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.simulation.noise import detector_noise
 from boxreg_ros.structures import is_valid_box
+from measure.drives import Drive
 import numpy as np
 import pytest
 from scenes import cut, drive, simulated, stamps, track_of

@@ -1,16 +1,23 @@
-"""Measurements for the pages of results; users have those of `boxreg bench`."""
+"""Measurements for the pages of results, and their command."""
 
 import argparse
 from importlib import import_module
 import json
 from pathlib import Path
 import sys
+from typing import Any
 
 from boxreg_ros.allocation import collect_rarely, keep_freed_memory
-from boxreg_ros.bench import common
 from boxreg_ros.errors import BoxregError
+from boxreg_ros.offline.evaluate import finite
+from measure.common import print_json, PROGRAM
 
 MEASUREMENTS = {
+    'real': 'accuracy of each method on recordings with known truth',
+    'paper': "the paper's experiment: its Table I and two figures",
+    'follow': 'whole tracks from one box or a few of each object',
+    'ablation': 'accuracy without each ingredient of the method',
+    'speed': 'time per tick, per box and per window, and of relabel',
     'kinds': 'gain of each class of objects, with standard errors',
     'proposals': 'objects without boxes that are proposed, and false alarms',
     'tracks': 'broken tracks before and after each completing step',
@@ -32,7 +39,6 @@ RECORDINGS = (Path, 'folder: one recording and truth.csv', {'nargs': '+'})
 """The argument of those that measure on recordings."""
 METAVARS = {int: 'N', float: 'S', Path: 'DATA'}
 """Of arguments by type, where they state no other."""
-PROGRAM = 'python test/measure'
 MEASURE = (sys.executable, str(Path(__file__).parent))
 """The command in a process of its own, of this environment."""
 
@@ -75,7 +81,7 @@ def main(words: list[str]) -> int:
     module = import_module(f'measure.{name}')
     parser = argparse.ArgumentParser(f'{PROGRAM} {name}', description=f'{MEASUREMENTS[name]}.')
     add_arguments(parser, module.ARGUMENTS)
-    common.add_json_argument(parser)
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
     args = parser.parse_args(options)
     keep_freed_memory()
     collect_rarely()
@@ -87,7 +93,16 @@ def main(words: list[str]) -> int:
     if results is None:
         return 0
     if args.json:
-        common.print_json(results, PROGRAM)
+        print_json(results)
     else:
-        print(json.dumps(common.finite(results), indent=2))
+        print(shown(name, finite(results)))
     return 0
+
+
+def shown(name: str, results: Any) -> str:
+    """Return results as the tables of their page, or indented where they have none."""
+    from results import KINDS  # which imports measurements itself
+
+    if name not in KINDS:
+        return json.dumps(results, indent=2)
+    return '\n\n'.join(KINDS[name].tables(results))

@@ -3,7 +3,8 @@
 from pathlib import Path
 import sys
 
-sys.path[0] = str(Path(__file__).resolve().parents[1])  # modules here import each other by package
+TEST = Path(__file__).resolve().parents[1]
+sys.path[:1] = [str(TEST), str(TEST.parent / 'docs')]  # of this package, and of the tables
 
 from measure import main  # noqa: E402
 

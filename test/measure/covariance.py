@@ -5,15 +5,15 @@ Of early, final and track estimates, for every class, along the axes of the true
 
 """
 
-from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance
 from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.consistency import consistency
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.structures import REFINED
 from measure import RECORDINGS
+from measure.drives import Drive
+from measure.real import MIN_CLASS_BOXES
 import numpy as np
 
 ARGUMENTS = {'data': RECORDINGS}

@@ -7,10 +7,10 @@ find out which (`sampling.box_time`).
 
 """
 
-from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.offline.box_scores import match
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.scenarios import highway
+from measure.drives import Drive
+from measure.methods import run_methods
 import numpy as np
 
 SPEEDS = (5.0, 30.0)

@@ -9,18 +9,18 @@ few pedestrians and cyclists, and the boxes of each share its errors.
 from dataclasses import asdict
 from pathlib import Path
 
-from boxreg_ros.bench.accuracy import (
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.box_scores import match
+from boxreg_ros.simulation.simulate import simulate
+from measure.drives import Drive
+from measure.methods import run_methods
+from measure.real import (
     Difference,
     MIN_CLASS_BOXES,
     paired,
     PairedBoxes,
     REFERENCE_METHODS,
 )
-from boxreg_ros.bench.methods import run_methods
-from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.offline.box_scores import match
-from boxreg_ros.offline.drive import Drive
-from boxreg_ros.simulation.simulate import simulate
 import numpy as np
 
 COMPARED = ('smoothing', 'ours')

@@ -16,7 +16,6 @@ import subprocess
 from tempfile import TemporaryDirectory
 import time
 
-from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
@@ -25,6 +24,7 @@ from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, REJECTED, YAW
 from browser import end_shared_browser, opened_page, serving
+from measure.common import BOXREG
 import numpy as np
 
 STREET = Path(__file__).parents[2] / 'bags'

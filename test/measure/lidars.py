@@ -31,7 +31,7 @@ WAYS = {
 }
 """Name -> layout of `TRUCK_SENSORS`, and how it is read."""
 MIN_POINTS = 100
-"""True boxes with fewer points of all corners are left out, as in `boxreg bench real`."""
+"""True boxes with fewer points of all corners are left out, as in `measure real`."""
 ARGUMENTS = {
     '--seeds': (3, 'number of drives'),
     '--sweeps': (int, 'sweeps of a drive'),

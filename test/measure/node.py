@@ -19,10 +19,10 @@ from tempfile import TemporaryDirectory
 from threading import Thread
 import time
 
-from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.structures import LENGTH, ROLL, YAW
 from measure import MEASURE
+from measure.common import BOXREG
 import numpy as np
 from paths import SHARE
 from ros_messages import Messages, POINTS
@@ -90,7 +90,7 @@ def scene(args, turn, rng):
     """Return the points (M, 3) and noisy boxes (n, 9) of a sweep, in the sensor frame."""
     boxes = true_boxes(args, turn)
     phase = boxes[:, YAW]
-    # Cars make at most half of the points, as in `boxreg bench speed`.
+    # Cars make at most half of the points, as in `measure speed`.
     points_per_car = min(POINTS_PER_CAR, args.points // (2 * args.tracks))
     local = rng.uniform(-0.5, 0.5, (args.tracks, points_per_car, 3))  # (n, points, xyz)
     near = -np.sign(boxes[:, :2])  # the end and the side that roughly face the sensor
@@ -125,7 +125,7 @@ def publish(args):
     clouds = [_cloud_bytes(points) for points, _ in scenes]
     arrays = [_marker_array(boxes) for _, boxes in scenes]
     rclpy.init(args=[])
-    node = rclpy.create_node('bench_publisher')
+    node = rclpy.create_node('measure_publisher')
     best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
     to_points = node.create_publisher(PointCloud2, 'points', best_effort)
     turns = round(args.seconds * args.rate)
@@ -405,7 +405,7 @@ def observer(keeps_messages=False):
                 arrivals['counters'][item.key] = int(item.value)
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C ends the run
-    node = rclpy.create_node('bench_observer')
+    node = rclpy.create_node('measure_observer')
     for name, topic in (('early', 'refined_boxes'), ('final', 'refined_boxes_final')):
         node.create_subscription(
             MarkerArray, topic, partial(add_arrival, name), QoSProfile(depth=1000), raw=True

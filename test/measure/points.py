@@ -15,16 +15,16 @@ from pathlib import Path
 import time
 from typing import NamedTuple
 
-from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.point_labels import MOVING, ObjectTrack, PointLabeller
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.point_products import MAP_VOXEL
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import LENGTH, ROLL
+from measure.drives import Drive
+from measure.methods import run_methods
 import numpy as np
 
 SCENARIOS = ('street', 'highway')

@@ -11,9 +11,9 @@ import time
 
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.offline.completion import points_above_road
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.tracks.proposals import Proposer
 from measure import RECORDINGS
+from measure.drives import Drive
 import numpy as np
 
 PARTS = 3

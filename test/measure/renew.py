@@ -12,9 +12,9 @@ import shlex
 import subprocess
 import sys
 
-from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.errors import RecordingError
-from measure import MEASURE, PROGRAM
+from measure import MEASURE
+from measure.common import PROGRAM
 from paths import ROOT
 
 STORE = ROOT / 'docs' / 'results'
@@ -40,10 +40,5 @@ def run(args):
 
 def resolved(command):
     """Return a stored command as words that run in any folder, by the Python of this process."""
-    if command.startswith(PROGRAM):
-        program = MEASURE
-        words = shlex.split(command.removeprefix(PROGRAM))
-    else:
-        program = BOXREG
-        words = shlex.split(command)[1:]
-    return [*program, *(str(ROOT / word) if (ROOT / word).is_file() else word for word in words)]
+    words = shlex.split(command.removeprefix(PROGRAM))
+    return [*MEASURE, *(str(ROOT / word) if (ROOT / word).is_file() else word for word in words)]

@@ -13,11 +13,11 @@ from pathlib import Path
 import subprocess
 from tempfile import TemporaryDirectory
 
-from boxreg_ros.bench.common import BOXREG
-from boxreg_ros.bench.speed.recordings import write_traffic
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.review.report import REPORT
 from browser import launched
+from measure.common import BOXREG
+from measure.speed.recordings import write_traffic
 import numpy as np
 
 COMPOSITORS = {'processor': ('--disable-gpu-compositing',), 'emulated GPU': ()}

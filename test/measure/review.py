@@ -15,7 +15,6 @@ from boxreg_ros.core.metrics import iou_3d, pose_errors
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.offline.consistency import CONSISTENCY_VARIABLES
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.review.changes import Changes, median
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.review.decisions import Decision
@@ -23,6 +22,7 @@ from boxreg_ros.review.risk import assess, Usual
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, ROLL, X, YAW, Z
 from measure import RECORDINGS
+from measure.drives import Drive
 import numpy as np
 
 CUTS = (0.01, 0.05, 0.1, 0.2)

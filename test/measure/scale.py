@@ -18,12 +18,12 @@ from tempfile import TemporaryDirectory
 import time
 from typing import NamedTuple
 
-from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.offline.job_process import JobRunner
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from measure.common import BOXREG
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
 

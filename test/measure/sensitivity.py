@@ -18,12 +18,13 @@ from functools import partial
 from multiprocessing import get_context
 from typing import NamedTuple
 
-from boxreg_ros.bench.common import add_scope_arguments, class_words
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method import constants
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.offline.box_scores import match, summarise
-from boxreg_ros.offline.drive import Drive
+from measure import RECORDINGS
+from measure.common import class_words, SCOPE
+from measure.drives import Drive
 import numpy as np
 import torch
 
@@ -235,7 +236,8 @@ def add_estimate_argument(parser):
 
 # --------------------------------------------------------------------------------- command
 ARGUMENTS = {
-    'scope': add_scope_arguments,
+    'data': RECORDINGS,
+    **SCOPE,
     '--estimate': add_estimate_argument,
     '--objective': ('robust', 'that whose numbers are varied', {'choices': ('robust', PAPER)}),
     '--only': (['*'], "names, as in 'faces.*' or 'parked_*'", {'nargs': '+'}),

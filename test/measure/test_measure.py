@@ -7,13 +7,13 @@ import json
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.review.changes import Changes
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 import measure
 from measure import renew, scale
+from measure.drives import Drive
 from measure.review import _without_constant_error, with_pins
 from measure.tracks import ONE_LABEL, rows_with_one_label, scores_by_kind
 import numpy as np
@@ -32,7 +32,8 @@ def test_every_measurement_declares_options(name):
     parser = argparse.ArgumentParser()
     measure.add_arguments(parser, import_module(f'measure.{name}').ARGUMENTS)
     is_simulated = name in (
-        'highway', 'lidars', 'load', 'node', 'report', 'kinds', 'points', 'labeller',
+        'paper', 'speed', 'highway', 'lidars', 'load', 'node', 'report', 'kinds', 'points',
+        'labeller',
     )  # fmt: skip
     parser.parse_args([] if is_simulated else ['folder'])
 
@@ -40,19 +41,20 @@ def test_every_measurement_declares_options(name):
 def test_a_stored_measurement_is_renewed_by_its_command(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(renew, 'STORE', tmp_path)
     stored = tmp_path / 'street.json'
-    command = 'boxreg inspect bags/street.mcap --json'
+    command = 'python test/measure kinds --seeds 0 --json'
     stored.write_text(json.dumps({'command': command}), encoding='utf-8')
     assert measure.main(['renew', str(tmp_path), '--only', 'str*']) == 0
     document = json.loads(stored.read_text(encoding='utf-8'))
     assert document['command'] == command
-    assert document['fixed_frame'] == 'odom'
+    assert document['results'] == {}
     assert renew.resolved('python test/measure tracks street')[1:] == [
         measure.MEASURE[1], 'tracks', 'street',
     ]  # fmt: skip
-    failing = json.dumps({'command': 'boxreg bench real absent --json'})
+    command = 'python test/measure real absent --json'
+    failing = json.dumps({'command': command})
     stored.write_text(failing, encoding='utf-8')
     assert measure.main(['renew', str(tmp_path)]) == 1
-    assert 'boxreg bench real absent --json: ended with exit status 1' in capfd.readouterr().err
+    assert f'{command}: ended with exit status 1' in capfd.readouterr().err
     assert stored.read_text(encoding='utf-8') == failing
 
 

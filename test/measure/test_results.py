@@ -5,7 +5,7 @@ import re
 import shutil
 
 from boxreg_ros.config import Config
-import measure
+from measure.common import PROGRAM
 from measure.sensitivity import variations_of_constants
 from paths import ROOT
 import pytest
@@ -80,9 +80,8 @@ def test_numbers_without_an_effect_exist():
 def test_stored_measurement_names_version_and_command(path):
     document = json.loads(path.read_text(encoding='utf-8'))
     kind = path.stem.partition('_')[0]
-    program = measure.PROGRAM if kind in measure.MEASUREMENTS else 'boxreg bench'
-    assert document['command'].startswith(f'{program} {kind}')
-    anywhere = document['command'].removeprefix(program).replace('bags/', '')
+    assert document['command'].startswith(f'{PROGRAM} {kind}')
+    anywhere = document['command'].removeprefix(PROGRAM).replace('bags/', '')
     assert '/' not in anywhere  # no path of one machine
     assert document['version']
     assert kind in results.KINDS

@@ -2,8 +2,8 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.method import constants
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.simulate import simulate
+from measure.drives import Drive
 from measure.sensitivity import (
     changed_constant,
     kinds_of,

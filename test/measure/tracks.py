@@ -18,11 +18,11 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.offline.box_scores import overlaps
 from boxreg_ros.offline.completion import Completion, first_pass
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.track_scores import track_scores, TrackScores
 from boxreg_ros.review.rules import DUPLICATE_IOU
 from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
 from boxreg_ros.structures import BoxArray, REJECTED
+from measure.drives import Drive
 import numpy as np
 
 ONE_LABEL = 'with one label'

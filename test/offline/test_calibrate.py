@@ -14,9 +14,9 @@ from boxreg_ros.offline.calibrate import (
     labelling_margins,
     Measured,
 )
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import BoxArray
+from measure.drives import Drive
 import numpy as np
 import pytest
 from ros_messages import Drive as Recorded

@@ -8,8 +8,8 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.offline.drive import Drive
 from lidar_drives import LidarDrive, LIDARS, SPEED
+from measure.drives import Drive
 import numpy as np
 import pytest
 from ros_messages import SECOND

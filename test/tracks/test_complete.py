@@ -11,12 +11,12 @@ from boxreg_ros.core.input_statistics import drive_of, KindStatistics, NOISE, TR
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.completion import first_pass, points_above_road
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.track_scores import track_scores
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import ADDED, Sweep
 from drives import ALL_STEPS, complete, drive, only, path, steps_of
+from measure.drives import Drive
 from measure.tracks import broken, completed, table_of
 import numpy as np
 import pytest

@@ -180,7 +180,7 @@ class Constants(NamedTuple):
     uses_shape: bool = True
     """Whether the observations of a window are tied by the rigid shape of their track."""
     residuals: tuple[bool, ...] = (True,) * len(RESIDUALS)
-    """Which of `RESIDUALS` are used; `boxreg bench ablation` leaves some out."""
+    """Which of `RESIDUALS` are used; `measure ablation` leaves some out."""
 
     def with_settings(self, config: Any) -> 'Constants':
         """Return these numbers with the settings of a `Config`."""

@@ -35,7 +35,7 @@ class Residual(NamedTuple):
     is_robust : bool
         Whether (M24) down-weights it as a whole.
     name : str
-        Of the switch of `boxreg bench ablation`, and in docs/method.md.
+        Of the switch of `measure ablation`, and in docs/method.md.
 
     """
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import replace
 from time import process_time
 
-from boxreg_ros.bench.speed.streams import make_windows, shortest
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.method import round as method
@@ -23,6 +22,7 @@ from boxreg_ros.core.refine import refine, Track
 from boxreg_ros.core.solver import Batch, Objective, solve, SolverPlan, start
 from boxreg_ros.core.window import Window
 from boxreg_ros.structures import BOX_EXTENT, Floats, POSE
+from measure.speed.streams import make_windows, shortest
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,11 +1,10 @@
-"""`boxreg bench follow` end to end on a small scene."""
+"""`measure follow` end to end on a small scene."""
 
-import argparse
 import json
 
-from boxreg_ros.bench import main as bench
-from boxreg_ros.bench.follow import CASES, KEYFRAMES, OFF_SIZE, ONE, ONE_OF_CLASS, TWO
 from boxreg_ros.simulation.simulate import simulate
+from measure import main
+from measure.follow import CASES, KEYFRAMES, OFF_SIZE, ONE, ONE_OF_CLASS, TWO
 import numpy as np
 import pytest
 from scenes import write_scene
@@ -24,14 +23,8 @@ def folder(tmp_path_factory):
     return folder
 
 
-def run(*words):
-    parser = argparse.ArgumentParser()
-    bench.add_arguments(parser)
-    return bench.run(parser.parse_args([str(word) for word in words]))
-
-
 def test_follow_is_scored_beside_lines_and_constant_velocity(folder, capsys):
-    assert run('follow', folder, '--json') == 0
+    assert main(['follow', str(folder), '--json']) == 0
     report = json.loads(capsys.readouterr().out)['results'][str(folder)]
     assert set(CASES) <= set(report)
     for case in (ONE, ONE_OF_CLASS, *OFF_SIZE):
@@ -50,9 +43,6 @@ def test_follow_is_scored_beside_lines_and_constant_velocity(folder, capsys):
 
 
 def test_exact_keyframes_come_back(folder, capsys):
-    assert run('follow', folder, '--exact') == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert 'true boxes' in lines[0]
-    after = lines[lines.index(next(line for line in lines if line.startswith('2 Hz'))) :]
-    follow = next(line for line in after if 'follow' in line).split()
-    assert float(follow[-1]) > 0.985
+    assert main(['follow', str(folder), '--exact']) == 0
+    (report,) = json.loads(capsys.readouterr().out).values()
+    assert report['2 Hz']['follow']['iou_all'] > 0.985

@@ -1,4 +1,4 @@
-"""`boxreg bench paper`: the paper's Table I beside ours, over several seeds, and two figures."""
+"""`measure paper`: the paper's Table I beside ours, over several seeds, and two figures."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ import math
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.bench.accuracy import iou_and_group_values, iou_by_group, print_groups
-from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
-from boxreg_ros.bench.methods import add_method_argument, Methods, run_methods
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError, ConfigError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import match, Matches
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import Floats, LENGTH, ROLL, WIDTH
+from measure.drives import Drive
+from measure.methods import METHOD_OPTION, Methods, run_methods
+from measure.real import iou_and_group_values, iou_by_group
 import numpy as np
 
 VARIABLES = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
@@ -78,49 +77,30 @@ class ModeResult:
         }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench paper`."""
-    parser.add_argument(
-        '--seeds', type=int, default=3, metavar='N', help='repetitions (default: 3)'
-    )
-    parser.add_argument(
-        '--steps', type=int, metavar='N', help='boxes per repetition (default: all 100)'
-    )
-    parser.add_argument(
-        '-o', '--output', type=Path, default=Path('out/bench'), metavar='DIR',
-        help='folder for the figures (default: out/bench)',
-    )  # fmt: skip
-    add_method_argument(parser)
-    add_json_argument(parser)
+ARGUMENTS = {
+    '--seeds': (3, 'repetitions'),
+    '--steps': (int, 'boxes per repetition (default: all 100)'),
+    '--output': (Path('out/paper'), 'folder for the figures', {'metavar': 'DIR'}),
+    '--methods': METHOD_OPTION,
+}
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print Table I and draw the two figures, which need matplotlib."""
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    """Return Table I and draw the two figures, which need matplotlib."""
     if args.seeds < 1:
         raise ConfigError(f'--seeds: expected 1 or more, got {args.seeds}')
     results: dict[str, ModeResult] = {}
-    with progress_bar(len(PAPER_SCENARIOS) * args.seeds * len(args.methods), args) as bar:
-        for mode, scenario in PAPER_SCENARIOS.items():
-            results[mode] = ModeResult()
-            for seed in range(args.seeds):
-                drive = Drive.from_scene(simulate(scenario, seed, args.steps))
-                methods = run_methods(drive, mode, args.methods, bar.update)
-                results[mode].add(drive, methods, mode)
-                if 'ours' in args.methods:
-                    results[mode].add(drive, _with_held_extents(drive, mode), mode)
-                if seed == 0:
-                    draw_figures(args.output, mode, methods, drive.truth)
-    if args.json:
-        print_json({mode: _report(mode, result) for mode, result in results.items()})
-        return 0
-    for mode, result in results.items():
-        _print_table(mode, result)
-    print(
-        f'{args.seeds} seeds. Mean absolute errors [m, rad], x along and y across the vehicle; '
-        f'mean IoU of all boxes, of the first and of the last box, and of those after the first '
-        f'{Config().window}. Figures: {args.output}'
-    )
-    return 0
+    for mode, scenario in PAPER_SCENARIOS.items():
+        results[mode] = ModeResult()
+        for seed in range(args.seeds):
+            drive = Drive.from_scene(simulate(scenario, seed, args.steps))
+            methods = run_methods(drive, mode, args.methods)
+            results[mode].add(drive, methods, mode)
+            if 'ours' in args.methods:
+                results[mode].add(drive, _with_held_extents(drive, mode), mode)
+            if seed == 0:
+                draw_figures(args.output, mode, methods, drive.truth)
+    return {mode: _report(mode, result) for mode, result in results.items()}
 
 
 def _with_held_extents(drive: Drive, mode: str) -> Methods:
@@ -134,7 +114,7 @@ def _with_held_extents(drive: Drive, mode: str) -> Methods:
 
 
 def _report(mode: str, result: ModeResult) -> dict[str, Any]:
-    """Return the content of ``--json`` of one mode."""
+    """Return the rows of one mode."""
     groups = result.groups()
     report: dict[str, Any] = {}
     for name, row in (PUBLISHED[mode] | result.means()).items():
@@ -143,15 +123,6 @@ def _report(mode: str, result: ModeResult) -> dict[str, Any]:
         else:
             report[name] = dict(zip(ERROR_COLUMNS, row, strict=False)) | groups.get(name, {})
     return report
-
-
-def _print_table(mode: str, result: ModeResult) -> None:
-    iou = 'IoU 3D' if mode == '3d' else 'IoU BEV'
-    print(line(f'Table I, {mode}', (*VARIABLES, iou, 'first', 'last', 'full')))
-    for name, row in (PUBLISHED[mode] | result.means()).items():
-        print(line(name, row))
-    print_groups(result.groups(), iou)
-    print()
 
 
 def error_row(matches: Matches, mode: str) -> tuple[float, ...]:

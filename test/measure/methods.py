@@ -9,14 +9,12 @@ parameters, and nothing else uses them.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.refine import Track
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix, wrap_angle
 from boxreg_ros.structures import (
     BOX_EXTENT,
@@ -31,6 +29,7 @@ from boxreg_ros.structures import (
     Y,
     YAW,
 )
+from measure.drives import Drive
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
@@ -336,25 +335,13 @@ BASELINES: dict[str, tuple[str, Callable[[Track], Floats]]] = {
     'icp': ('ICP on box points', icp),
 }
 METHODS = (*BASELINES, 'paper', 'ours')
+METHOD_OPTION = ([*METHODS], 'only some of', {'nargs': '+', 'choices': METHODS})
 
 Methods = dict[str, BoxTable | str]
 """Boxes by the name of their method, or the reason why the method did not run."""
 
 
-def add_method_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--methods``."""
-    parser.add_argument(
-        '--methods', nargs='+', choices=METHODS, default=METHODS, metavar='METHOD',
-        help=f'only some of {", ".join(METHODS)}',
-    )  # fmt: skip
-
-
-def run_methods(
-    drive: Drive,
-    mode: str = '3d',
-    wanted: Sequence[str] = METHODS,
-    done: Callable[[], object] = lambda: None,
-) -> Methods:
+def run_methods(drive: Drive, mode: str = '3d', wanted: Sequence[str] = METHODS) -> Methods:
     """Return the boxes of the `wanted` methods, the input first; baselines ignore `mode`."""
     methods: Methods = {'input': BoxTable.from_arrays(drive.boxes)}
     needs_tracks = not BASELINES.keys().isdisjoint(wanted)
@@ -369,7 +356,6 @@ def run_methods(
             methods[name] = _run_baseline(baseline, tracks, drive)
         else:
             methods |= _registered(method, mode, drive)
-        done()
     return methods
 
 

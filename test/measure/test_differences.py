@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-from boxreg_ros.bench.accuracy import clustered_error, differences, PairedBoxes, scopes_of
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import match
+from measure.real import clustered_error, differences, PairedBoxes, scopes_of
 import numpy as np
 import pytest
 

@@ -1,14 +1,13 @@
-"""`boxreg bench ablation`: every ingredient that is switched off changes the boxes."""
+"""`measure ablation`: every ingredient that is switched off changes the boxes."""
 
 from dataclasses import fields
 import json
 
-from boxreg_ros import cli
-from boxreg_ros.bench import ablation as bench_ablation
-from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE, without
 from boxreg_ros.config import Ingredients, settings
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.simulate import simulate
+from measure import main
+from measure.ablation import INGREDIENTS, merged, WHOLE, without
+from measure.drives import Drive
 import numpy as np
 import pytest
 from scenes import write_scene
@@ -60,17 +59,14 @@ def test_every_switch_is_used():
 
 
 def test_losses_are_printed(tmp_path, scene, capsys):
-    for name in ('a', 'b'):
-        (tmp_path / name).mkdir()
-        write_scene(tmp_path / name / 'recording.mcap', scene)
-        scene.truth.write(tmp_path / name / 'truth.csv')
-    options = ['--without', 'one extent', '--min-points', '50']
-    folders = [str(tmp_path / name) for name in ('a', 'b')]
-    assert cli.main(['bench', 'ablation', *folders, *options]) == 0
+    write_scene(tmp_path / 'recording.mcap', scene)
+    scene.truth.write(tmp_path / 'truth.csv')
+    options = ['ablation', str(tmp_path), '--without', 'one extent', '--min-points', '50']
+    assert main(options) == 0
     text = capsys.readouterr().out
-    assert text.count('\none extent ') == 6  # both recordings and their mean, of two estimates
-    assert 'mean of 2 recordings, track' in text
-    assert cli.main(['bench', 'ablation', folders[0], *options, '--json']) == 0
+    assert text.startswith('| without | final: 3D | final: loss ')
+    assert text.count('\n| one extent | 0.') == 1
+    assert main([*options, '--json']) == 0
     (found,) = json.loads(capsys.readouterr().out)['results'].values()
     assert set(found) == {'final', 'track'}
     for rows in found.values():
@@ -81,7 +77,7 @@ def test_losses_are_printed(tmp_path, scene, capsys):
 def test_ingredients_are_left_out_one_after_the_other():
     settings = [INGREDIENTS[name].settings for name in ('rigid shape', 'road', 'slip and pivot')]
     known = {'ingredients.without': ('rigid shape', 'slip'), 'ingredients.road': False}
-    assert bench_ablation.merged(settings) == known
+    assert merged(settings) == known
 
 
 def test_estimates_differ(drive, whole):
@@ -89,10 +85,3 @@ def test_estimates_differ(drive, whole):
     for one, other in ((newest, final), (final, whole), (newest, whole)):
         assert len(one.boxes) == len(other.boxes)
         assert np.abs(one.boxes - other.boxes).max() > 1e-3
-
-
-def test_losses_by_hand():
-    rows = {WHOLE: [0.9, 0.8, 0.7, 0.01], 'input bias': [0.85, 0.81, 0.7, 0.03]}
-    cells = bench_ablation.table(rows)[2].split()[1:]
-    assert cells[1::2] == ['0.850', '0.810', '0.700', '0.030']
-    assert cells[2::2] == ['(+0.050)', '(-0.010)', '(+0.000)', '(+0.020)']

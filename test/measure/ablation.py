@@ -1,5 +1,5 @@
 """
-`boxreg bench ablation`: accuracy with each ingredient of the method switched off.
+`measure ablation`: accuracy with each ingredient of the method switched off.
 
 An ingredient is switched off by settings, or by one of `config.Ingredients`: each of the
 residuals of `core.method.residuals` by its name. Both estimates are measured, since some
@@ -14,15 +14,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from boxreg_ros.bench.common import add_scope_arguments, in_scope, line, print_json, progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import Scores, summarise
-from boxreg_ros.offline.drive import Drive
+from measure import RECORDINGS
+from measure.common import in_scope, SCOPE
+from measure.drives import Drive
 import numpy as np
 
 WHOLE = 'nothing'
-SCORES = ('BEV', '3D', 'R@0.8', 'flips')
 ABLATED_ESTIMATES = ('final', 'track')
 
 
@@ -92,73 +92,58 @@ INGREDIENTS = {
 }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench ablation`."""
-    add_scope_arguments(parser)
-    parser.add_argument(
-        '--without', nargs='+', choices=list(INGREDIENTS)[1:], default=list(INGREDIENTS)[1:],
-        metavar='INGREDIENT', help=f'only some of {", ".join(list(INGREDIENTS)[1:])}',
-    )  # fmt: skip
-    parser.add_argument(
-        '--estimate', nargs='+', choices=('early', *ABLATED_ESTIMATES), default=ABLATED_ESTIMATES,
-        help='early (newest box), final (fixed lag), track (full sequence); default: final track',
-    )  # fmt: skip
-    parser.add_argument(
-        '--greedy', type=float, metavar='LOSS',
-        help='also leave out the ingredient that costs least on average, then the next one beside '
-        'it, as long as the mean 3D IoU of an estimate falls by less than this',
-    )  # fmt: skip
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
+ARGUMENTS = {
+    'data': RECORDINGS,
+    **SCOPE,
+    '--without': (
+        [*INGREDIENTS][1:],
+        'only some of the ingredients',
+        {'nargs': '+', 'choices': [*INGREDIENTS][1:], 'metavar': 'INGREDIENT'},
+    ),
+    '--estimate': (
+        [*ABLATED_ESTIMATES],
+        'early (newest box), final (fixed lag), track (full sequence)',
+        {'nargs': '+', 'choices': ('early', *ABLATED_ESTIMATES)},
+    ),
+    '--greedy': (
+        float,
+        'also leave out the ingredient that costs least on average, then the next one beside it, '
+        'as long as the mean 3D IoU of an estimate falls by less than this',
+        {'metavar': 'LOSS'},
+    ),
+}
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print accuracy without each ingredient, for every recording and on average."""
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the scores without each ingredient, of each estimate on each recording."""
     drives = {str(folder): Drive.read(folder) for folder in args.data}
-    wanted = [WHOLE, *args.without]
-    report: dict[str, dict[str, dict[str, Scores]]] = {folder: {} for folder in drives}
-    total = len(drives) * len(args.estimate) * len(wanted)
-    with progress_bar(total, args) as bar:
-        for folder, drive in drives.items():
-            for estimate in args.estimate:
-                report[folder][estimate] = {}
-                for name in wanted:
-                    found = without(INGREDIENTS[name].settings, drive, estimate)
-                    scores = summarise(in_scope(found, drive.truth, args))
-                    report[folder][estimate][name] = scores
-                    bar.update()
-    order = greedy(drives, report, args) if args.greedy is not None else []
-    if args.json:
-        plain: dict[str, Any] = {
-            folder: {
-                estimate: {name: asdict(scores) for name, scores in rows.items()}
-                for estimate, rows in found.items()
+    report = {
+        folder: {
+            estimate: {
+                name: _scores(INGREDIENTS[name].settings, drive, estimate, args)
+                for name in (WHOLE, *args.without)
             }
-            for folder, found in report.items()
+            for estimate in args.estimate
         }
-        print_json(plain | {'greedy': order} if order else plain)
-        return 0
-    for estimate in args.estimate:
-        _print_estimate(estimate, {folder: found[estimate] for folder, found in report.items()})
-    for names, loss in order:
-        print(f'{loss:+.4f} without {names}')
-    print('In brackets the loss. Without')
-    for name in args.without:
-        print(f'  {name}: {INGREDIENTS[name].meaning}')
-    return 0
+        for folder, drive in drives.items()
+    }
+    plain: dict[str, Any] = {
+        folder: {
+            estimate: {name: asdict(scores) for name, scores in rows.items()}
+            for estimate, rows in found.items()
+        }
+        for folder, found in report.items()
+    }
+    if args.greedy is not None:
+        plain['greedy'] = greedy(drives, report, args)
+    return plain
 
 
-def _print_estimate(estimate: str, report: Mapping[str, Mapping[str, Scores]]) -> None:
-    """Print the tables of one estimate: of each recording, and of their mean."""
-    for folder, rows in report.items():
-        print(f'{folder}, {estimate}: {rows[WHOLE].boxes} true boxes')
-        print('\n'.join(table({name: figures(scores) for name, scores in rows.items()})) + '\n')
-    if len(report) > 1:
-        means = {
-            name: np.mean([figures(rows[name]) for rows in report.values()], axis=0).tolist()
-            for name in next(iter(report.values()))
-        }
-        print(f'mean of {len(report)} recordings, {estimate}')
-        print('\n'.join(table(means)) + '\n')
+def _scores(
+    settings: Mapping[str, Any], drive: Drive, estimate: str, args: argparse.Namespace
+) -> Scores:
+    """Return the scores of an estimate with settings that switch ingredients off."""
+    return summarise(in_scope(without(settings, drive, estimate), drive.truth, args))
 
 
 def greedy(
@@ -176,10 +161,7 @@ def greedy(
         settings = merged([INGREDIENTS[name].settings for name in names])
         losses = []
         for estimate in args.estimate:
-            scores = [
-                summarise(in_scope(without(settings, drive, estimate), drive.truth, args)).iou_3d
-                for drive in drives.values()
-            ]
+            scores = [_scores(settings, drive, estimate, args).iou_3d for drive in drives.values()]
             losses.append(whole[estimate] - np.mean(scores))
         return float(max(losses))
 
@@ -209,19 +191,3 @@ def without(settings: Mapping[str, Any], drive: Drive, estimate: str = 'track') 
     """Return the boxes of an estimate with the settings that switch an ingredient off."""
     run = 'track' if estimate == 'track' else 'final'  # one run gives final and early boxes
     return drive.registered(Config(estimate=run).updated(settings))[estimate]
-
-
-def figures(scores: Scores) -> list[float]:
-    """Return the scores of `SCORES`."""
-    return [scores.iou_bev, scores.iou_3d, scores.recall_3d[-1], scores.flips]
-
-
-def table(rows: Mapping[str, Sequence[float]]) -> list[str]:
-    """Return lines of scores, each followed by its loss against that of `WHOLE`."""
-    lines = [line('without', [cell for name in SCORES for cell in (name, '')])]
-    for name, row in rows.items():
-        worse = np.subtract(rows[WHOLE], row) * [1, 1, 1, -1]  # more flips are worse
-        costs = ['' if name == WHOLE else f'({cost:+.3f})' for cost in worse.round(3) + 0.0]
-        pairs = zip(row, costs, strict=True)
-        lines.append(line(name, [cell for pair in pairs for cell in pair]))
-    return lines

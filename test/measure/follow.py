@@ -1,5 +1,5 @@
 """
-`boxreg bench follow`: whole tracks from a few boxes of each object, against interpolation.
+`measure follow`: whole tracks from a few boxes of each object, against interpolation.
 
 The boxes given are true ones with the error of a person. One box: the first with
 `MIN_SEED_RETURNS`, and every later box counts; of another size, such as that of its class, the
@@ -15,19 +15,18 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.core.follow import follow
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.refine import refine
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.completion import points_above_road
-from boxreg_ros.offline.drive import Drive
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, Ints, ROLL, YAW
+from measure import RECORDINGS
+from measure.drives import Drive
 import numpy as np
 from scipy.interpolate import CubicSpline
 
@@ -54,7 +53,11 @@ CLASS_SIZES = {
 """Sizes that tools give a new box, by class or kind: length, width, height [m]."""
 TURN, DISTANCE_OF_TURN = np.radians(20.0), 5.0
 """Objects whose heading changes so much [rad] while they drive so far [m] turn."""
-COLUMN_TITLES = ('true', 'found', '>.5', '3D', '3D all')
+ARGUMENTS = {
+    'data': RECORDINGS,
+    '--seed': (0, 'of the errors'),
+    '--exact': (False, 'give the true boxes, without the error of a person'),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,48 +79,16 @@ class Given:
         return np.asarray((self.stamps_ns - self.stamps_ns[0]) * 1e-9, np.float64)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench follow`."""
-    parser.add_argument(
-        'data', type=Path, nargs='+', metavar='DATA', help='folder: one recording and truth.csv'
-    )
-    parser.add_argument(
-        '--seed', type=int, default=0, metavar='N', help='seed of the errors (default: 0)'
-    )
-    parser.add_argument(
-        '--exact', action='store_true', help='give the true boxes, without the error of a person'
-    )
-    add_json_argument(parser)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Print one table per recording."""
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the scores of each case on each recording."""
     report: dict[str, Any] = {}
-    with progress_bar(len(args.data) * len(CASES), args) as bar:
-        for folder in args.data:
-            drive = Drive.read(folder)
-            report[str(folder)] = rows = {}
-            if not args.json:
-                bar.clear()
-                print(f'{folder}: {len(drive.truth.boxes):,} true boxes')
-            for case in CASES:
-                given = list(_given(drive, case, args.seed, args.exact))
-                for title, scores in _scores(drive, case, given, args.seed).items():
-                    rows[title] = scores
-                    if not args.json:
-                        bar.clear()
-                        _print(title, scores)
-                bar.update()
-    if args.json:
-        print_json(report)
-    return 0
-
-
-def _print(case: str, scores: Mapping[str, Mapping[str, float]]) -> None:
-    print(line(case, COLUMN_TITLES))
-    for name, row in scores.items():
-        true, *others = row.values()
-        print(line(f'  {name}', (f'{true:,}', *others)))
+    for folder in args.data:
+        drive = Drive.read(folder)
+        report[str(folder)] = rows = {}
+        for case in CASES:
+            given = list(_given(drive, case, args.seed, args.exact))
+            rows.update(_scores(drive, case, given, args.seed))
+    return report
 
 
 def _given(drive: Drive, case: str, seed: int, is_exact: bool) -> Iterator[Given]:

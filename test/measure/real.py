@@ -1,5 +1,5 @@
 """
-`boxreg bench real`: the accuracy of every method on recordings with known truth.
+`measure real`: the accuracy of every method on recordings with known truth.
 
 All methods of a table get the same sweeps and the same boxes, in the same run.
 
@@ -12,25 +12,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 import math
-from pathlib import Path
 from typing import Any
 
-from boxreg_ros.bench.common import (
-    add_json_argument,
-    add_scope_arguments,
-    class_words,
-    in_scope,
-    line,
-    print_json,
-    progress_bar,
-)
-from boxreg_ros.bench.methods import add_method_argument, Methods, run_methods
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.offline.arguments import add_options, values_of
-from boxreg_ros.offline.box_scores import groups, Mask, match, Matches, RECALLS, Scores, summarise
-from boxreg_ros.offline.drive import Drive
+from boxreg_ros.offline.box_scores import groups, Mask, match, Matches, Scores, summarise
 from boxreg_ros.structures import Floats
+from measure import RECORDINGS
+from measure.common import class_words, in_scope, SCOPE
+from measure.drives import Drive
+from measure.methods import METHOD_OPTION, Methods, run_methods
 import numpy as np
 
 RANGE_GROUPS = (0, 20, 40, 80, math.inf)  # [m]
@@ -40,14 +32,12 @@ MIN_CLASS_BOXES = 20
 MIN_PATH_EXTENT = 2.0
 """Least extent of the path of an object that moves [m]. Chosen: labels of parked cars wander by
 .26 m on KITTI, and nothing that drives stays within 2 m."""
-PEOPLE = {'all': (0.880, 0.809), '0-30': (0.913, 0.858)}
-"""BEV and 3D IoU of people who box objects again with the public labels of Waymo, by range [m].
-Literature: Qi et al., Offboard 3D Object Detection from Point Cloud Sequences (3DAL), CVPR 2021,
-appendix G, table 13."""
 PEOPLE_RANGES = {'all': (0, math.inf), '0-30': (0, 30), '30-50': (30, 50), '50+': (50, math.inf)}
 MIN_PAIR_IOU = 0.03
-"""Least 3D IoU of a box and a label that are compared by that protocol; of the same table."""
-GROUPINGS = {'by_range': 'by range [m]', 'by_points': 'by points'}
+"""Least 3D IoU of a box and a label that are compared as two labels of people are. Literature: Qi
+et al., Offboard 3D Object Detection from Point Cloud Sequences, CVPR 2021, appendix G, table
+13."""
+GROUPINGS = ('by_range', 'by_points')
 
 Groups = dict[str, dict[str, float]]
 """Mean IoU by the key of a grouping, and by the label of a bin."""
@@ -55,28 +45,21 @@ Report = dict[str, Any]
 """What ``--json`` has of a recording: by method its scores, or the reason why it did not run."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench real`."""
-    add_scope_arguments(parser)
-    add_method_argument(parser)
-    add_options(parser, Lidars)
-    add_json_argument(parser)
+ARGUMENTS = {
+    'data': RECORDINGS,
+    **SCOPE,
+    '--methods': METHOD_OPTION,
+    '--lidars': lambda parser: add_options(parser, Lidars),
+}
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print the scores of each method, one table per recording."""
+def run(args: argparse.Namespace) -> dict[str, Report]:
+    """Return the scores of each method on each recording."""
     report: dict[str, Report] = {}
-    with progress_bar(len(args.data) * len(args.methods), args) as bar:
-        for folder in args.data:
-            drive = Drive.read(folder, Lidars(**values_of(args, Lidars)))
-            methods = run_methods(drive, '3d', args.methods, bar.update)
-            report[str(folder)] = measured(drive, methods, args)
-            if not args.json:
-                bar.clear()
-                print_report(folder, report[str(folder)])
-    if args.json:
-        print_json(report)
-    return 0
+    for folder in args.data:
+        drive = Drive.read(folder, Lidars(**values_of(args, Lidars)))
+        report[str(folder)] = measured(drive, run_methods(drive, '3d', args.methods), args)
+    return report
 
 
 def measured(drive: Drive, methods: Methods, args: argparse.Namespace) -> Report:
@@ -118,7 +101,7 @@ def scores_by_class(boxes: BoxTable, truth: BoxTable) -> dict[str, dict[str, flo
 
 
 def as_by_people(drive: Drive, matches: Matches) -> dict[str, dict[str, float]]:
-    """Return number, BEV and 3D IoU by range of pairs as `PEOPLE` were compared."""
+    """Return number, BEV and 3D IoU by range of pairs as labels of people are compared."""
     ranges = drive.ranges(matches.rows)
     is_pair = matches.is_matched & (matches.iou_3d > MIN_PAIR_IOU)
     found = {}
@@ -142,61 +125,6 @@ def scopes_of(matches: Matches, truth: BoxTable) -> dict[str, Mask]:
     return {'all': whole, 'moving': moving} if moving.any() else {'all': whole}
 
 
-def print_report(folder: Path, report: Report) -> None:
-    """Print the tables of one recording."""
-    ran = {name: one for name, one in report.items() if not isinstance(one, str)}
-    print(f'{folder}: {ran["input"]["boxes"]} true boxes')
-    recalls = [f'R@{level}' for level in RECALLS]
-    print(line('', ('BEV', '3D', *recalls, 'ATE', 'ASE', 'AOE', 'flips', 'jitter')))
-    for name, one in report.items():
-        if isinstance(one, str):
-            print(line(name, one))
-            continue
-        errors = [one[error] for error in ('ate', 'ase', 'aoe', 'flips', 'jitter')]
-        print(line(name, (one['iou_bev'], one['iou_3d'], *one['recall_3d'], *errors)))
-    print_groups(ran, '3D')
-    print()
-    _print_people(ran)
-    _print_differences(ran)
-    for class_name, scores in ran['input']['by_class'].items():
-        print(line(f'{class_name}: {scores["boxes"]} true boxes with points', ''))
-        print(line('', ('BEV', '3D')))
-        for name, one in ran.items():
-            print(line(name, [one['by_class'][class_name][iou] for iou in ('iou_bev', 'iou_3d')]))
-    print()
-
-
-def _print_people(ran: Report) -> None:
-    """Print the agreement with the labels as that of people is published, and theirs."""
-    print(f'boxes with a point, pairs above {MIN_PAIR_IOU} IoU, by range [m]')
-    for row, (iou, title) in enumerate((('iou_bev', 'BEV'), ('iou_3d', '3D'))):
-        print(line(title, list(PEOPLE_RANGES)))
-        for name, one in ran.items():
-            known = [one['as_people'].get(label, {}).get(iou, math.nan) for label in PEOPLE_RANGES]
-            print(line(name, known))
-        people = [PEOPLE.get(label, (math.nan, math.nan))[row] for label in PEOPLE_RANGES]
-        print(line('people, on Waymo', people))
-
-
-def _print_differences(ran: Report) -> None:
-    """Print IoU and median yaw error of moving objects, and the differences between methods."""
-    if 'moving' in ran['input']:
-        boxes = ran['input']['moving']['boxes']
-        print(line(f'moving: {boxes} boxes', ('BEV', '3D', 'yaw [deg]')))
-        for name, one in ran.items():
-            print(line(name, [one['moving'][key] for key in ('iou_bev', 'iou_3d', 'yaw_degrees')]))
-    for scope in ran['input']['differences']:
-        for name, one in ran.items():
-            if one['differences'][scope]:
-                title = f'{name}, {scope}, minus'
-                print(line(title, ('BEV', '+-', '3D', '+-', 'tracks', 'ahead')))
-            for other, d in one['differences'][scope].items():
-                numbers = [d['iou_bev'], d['iou_bev_error'], d['iou_3d'], d['iou_3d_error']]
-                counts = (str(d['tracks']), str(d['tracks_ahead']))
-                print(line(other, (*(f'{number:.4f}' for number in numbers), *counts)))
-    print()
-
-
 def iou_and_group_values(drive: Drive, matches: Matches, mode: str) -> Floats:
     """Return (n, 3): IoU, NaN without prediction, range [m] and points of each true box."""
     iou = matches.iou_3d if mode == '3d' else matches.iou_bev
@@ -218,15 +146,6 @@ def iou_by_group(rows: Floats) -> Groups:
             if mask.any():
                 by_group[grouping][label] = float(iou[mask].mean())
     return by_group
-
-
-def print_groups(found: Mapping[str, Any], iou: str) -> None:
-    """Print the `iou_by_group` that each method has; `iou` names the kind of IoU."""
-    for grouping, title in GROUPINGS.items():
-        labels = list(dict.fromkeys(key for one in found.values() for key in one[grouping]))
-        print(line(f'{iou} {title}', labels))
-        for name, one in found.items():
-            print(line(name, [one[grouping].get(label, math.nan) for label in labels]))
 
 
 REFERENCE_METHODS = {

@@ -9,13 +9,6 @@ import sys
 from time import perf_counter
 from typing import Any
 
-from boxreg_ros.bench.speed.streams import (
-    cloud_message,
-    make_windows,
-    shortest,
-    SWEEP_PERIOD,
-    traffic,
-)
 from boxreg_ros.config import Config
 from boxreg_ros.core import observation as sampling
 from boxreg_ros.core.input_model import InputModel
@@ -27,8 +20,16 @@ from boxreg_ros.core.solver import solve
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, sweep_to_frame
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import ROLL, Sweep
+from measure.speed.streams import (
+    cloud_message,
+    make_windows,
+    shortest,
+    SWEEP_PERIOD,
+    traffic,
+)
 from msg_adapters import pointcloud
 import numpy as np
+from paths import TEST
 
 NO_OPEN3D = 'Open3D is not installed: pip install open3d'
 
@@ -152,7 +153,7 @@ def cores(config: Config, count: int) -> dict[str, float]:
             pinned = ','.join(map(str, available[:number]))
             code = f'from {__name__} import pinned; pinned({{{pinned}}}, {count})'
             done = subprocess.run(
-                [sys.executable, '-c', code], capture_output=True, text=True, check=True
+                [sys.executable, '-c', code], cwd=TEST, capture_output=True, text=True, check=True
             )
             result[f'{number} cores'] = float(done.stdout)
     return result

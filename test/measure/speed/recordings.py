@@ -14,10 +14,10 @@ import subprocess
 import tempfile
 from time import perf_counter, sleep
 
-from boxreg_ros.bench.common import BOXREG
-from boxreg_ros.bench.speed.streams import SWEEP_PERIOD, traffic
 from boxreg_ros.simulation.writer import write_recording
 from boxreg_ros.structures import Sweep
+from measure.common import BOXREG
+from measure.speed.streams import SWEEP_PERIOD, traffic
 import numpy as np
 
 BYTES_PER_POINT = 20

@@ -1,7 +1,7 @@
 """The baselines on known answers: a smoother, a rectangle fit per sweep, and ICP."""
 
-from boxreg_ros.bench.methods import ctra_smoothed, icp, l_shaped, smoothed, smoothed_live
 from boxreg_ros.core.refine import Track
+from measure.methods import ctra_smoothed, icp, l_shaped, smoothed, smoothed_live
 import numpy as np
 import pytest
 

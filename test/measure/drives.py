@@ -1,0 +1,132 @@
+"""Drives with known truth, simulated or read from a folder, and their refined boxes in memory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.refine import Track
+from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.session import hand_to_registrar
+from boxreg_ros.io.transforms import sweep_to_frame
+from boxreg_ros.offline import drive
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.simulation.scene import SimulatedScene
+from boxreg_ros.structures import (
+    BOX_EXTENT,
+    BoxArray,
+    Floats,
+    Ints,
+    LENGTH,
+    RefinedBoxes,
+    ROLL,
+    Sweep,
+    WIDTH,
+)
+import numpy as np
+
+NEARBY_MARGIN = 1.0
+"""Points up to this distance outside of a box are passed to the baselines [m]."""
+
+
+class Drive(drive.Drive):
+    """A drive that is registered in memory, as no command does."""
+
+    __slots__ = ()
+
+    @classmethod
+    def from_scene(cls, scene: SimulatedScene) -> Drive:
+        """Return a simulated drive."""
+        sweeps = zip(scene.sweeps, scene.T_fixed_sensor, strict=True)
+        moved = tuple(sweep_to_frame(sweep, T, 'odom') for sweep, T in sweeps)
+        return cls(moved, tuple(scene.fixed_detections()), scene.truth)
+
+    @classmethod
+    def read(cls, folder: Path, lidars: Lidars = SINGLE_LIDAR) -> Drive:
+        """Read the recording of these LiDARs in a folder, and the ``truth.csv`` beside it."""
+        if not folder.is_dir():
+            raise RecordingError(f'{folder}: expected a folder with a recording and truth.csv')
+        truth = BoxTable.read(folder / 'truth.csv')
+        found = [p for p in sorted(folder.iterdir()) if p.suffix in ('.mcap', '.bag', '.db3')]
+        found = found or [p.parent for p in sorted(folder.glob('*/metadata.yaml'))]
+        if len(found) != 1:
+            raise RecordingError(f'{folder}: expected one recording in it, got {len(found)}')
+        return cls.of(Recording(found, lidars), truth)
+
+    def registered(self, config: Config) -> dict[str, BoxTable]:
+        """Return refined boxes by estimate: 'early' and that of `config`, from one run."""
+        return {
+            name: BoxTable.from_arrays([result.boxes for result in results])
+            for name, results in self.refined(config).items()
+        }
+
+    def refined(self, config: Config) -> dict[str, list[RefinedBoxes]]:
+        """Return the same with covariances and status, one result for each box array."""
+        registrar = BoxRegistrar(config)
+        results: list[RefinedBoxes] = []
+        items: list[Sweep | BoxArray] = [*self.sweeps, *self.boxes]
+        for item in sorted(items, key=lambda item: item.stamp_ns):
+            results += hand_to_registrar(registrar, item, restarts=False)
+        results += registrar.flush()
+        found: dict[str, list[RefinedBoxes]] = {}
+        for result in results:
+            estimate = config.estimate if result.is_final else 'early'
+            found.setdefault(estimate, []).append(result)
+        return dict(sorted(found.items()))
+
+    def tracks(self) -> list[Track]:
+        """Return the boxes as tracks, with the points around each."""
+        moved = replace(self, sweeps=tuple(sweep.in_frame() for sweep in self.sweeps))
+        rows: dict[str, list[tuple[BoxArray, int]]] = {}
+        for array in self.boxes:
+            for i, track_id in enumerate(array.track_ids):
+                rows.setdefault(track_id, []).append((array, i))
+        tracks = []
+        for track_id, places in rows.items():
+            boxes = np.array([array.boxes[i] for array, i in places])
+            stamps = np.array([array.stamp_ns for array, _ in places])
+            near = moved.sweeps_at(stamps)
+            rows_near = [_nearby(sweep, box) for sweep, box in zip(near, boxes, strict=True)]
+            pairs = list(zip(near, rows_near, strict=True))
+            points = [sweep.points[nearby] for sweep, nearby in pairs]
+            origins = np.array([_main_origin(sweep, nearby) for sweep, nearby in pairs])
+            array, i = places[0]
+            tracks.append(Track(track_id, array.class_names[i], stamps, boxes, points, origins))
+        return tracks
+
+    def ranges(self, rows: Ints) -> Floats:
+        """Return the horizontal distance (n,) of the true boxes in `rows` to a sensor [m]."""
+        near = self.sweeps_at(self.truth.stamps_ns[rows])
+        centers = self.truth.boxes[rows, :2]
+        return np.array(
+            [
+                np.linalg.norm(center - _origins(sweep)[:, :2], axis=1).min()
+                for sweep, center in zip(near, centers, strict=True)
+            ]
+        )
+
+
+def _nearby(sweep: Sweep, box: Floats) -> Ints:
+    """Return the rows of the points within `NEARBY_MARGIN` of a box."""
+    reach = np.hypot(box[LENGTH], box[WIDTH]) / 2 + 2 * NEARBY_MARGIN
+    near = np.flatnonzero((np.abs(sweep.points[:, :2] - box[:2]) < reach).all(axis=1))
+    local = (sweep.points[near] - box[:3]) @ matrix_from_rpy(box[ROLL:])
+    return near[(np.abs(local) < box[BOX_EXTENT] / 2 + NEARBY_MARGIN).all(axis=1)]
+
+
+def _origins(sweep: Sweep) -> Floats:
+    """Return the positions (K, 3) of the sensors of a sweep [m]."""
+    return sweep.origin[None] if sweep.origins is None else sweep.origins
+
+
+def _main_origin(sweep: Sweep, rows: Ints) -> Floats:
+    """Return the position (3,) of the sensor that measured most of some points [m]."""
+    if sweep.sensors is None or not len(rows):
+        return sweep.origin
+    row = int(np.bincount(sweep.sensors[rows]).argmax())
+    return np.asarray(_origins(sweep)[row])
