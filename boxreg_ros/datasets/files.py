@@ -2,27 +2,118 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 from boxreg_ros.datasets.protocol import Cloud
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
-from boxreg_ros.labels.clouds import BIN_COLUMNS
-from boxreg_ros.rotations import quaternion_from_matrix
-from boxreg_ros.structures import Floats
+from boxreg_ros.io.transforms import inverse
+from boxreg_ros.labels.clouds import BIN_COLUMNS, read_pcd, SUFFIXES
+from boxreg_ros.rotations import matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix
+from boxreg_ros.structures import Floats, Ints
+from msg_adapters import pointcloud
 import numpy as np
 from numpy.typing import NDArray
 
 
-def read_bin(path: Path, suffix: str) -> Cloud:
+def read_cloud(path: Path, stamp_ns: int, kind: str = '', columns: int = 5) -> Cloud:
+    """
+    Return the cloud of a file, in the format of its name.
+
+    Parameters
+    ----------
+    path : Path
+        Its name ends in ``.pcd``, ``.pcd.bin`` or ``.bin``.
+    stamp_ns : int
+        Stamp of the sweep [ns]; times of points are relative to it.
+    kind : str
+        Format of files with another name: ``pcd``, ``pcd.bin`` or ``bin``.
+    columns : int
+        Numbers per point of ``.bin`` and ``.pcd.bin``.
+
+    Returns
+    -------
+    cloud : Cloud
+        Of the finite points. PCD files may have times, and intensities by the names that messages
+        use.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If the file is missing, damaged, or of another format.
+
+    """
+    suffix = next((suffix for suffix in SUFFIXES if path.name.endswith(suffix)), f'.{kind}')
+    if suffix == '.pcd':
+        return _read_pcd_cloud(path, stamp_ns)
+    if suffix in BIN_COLUMNS:
+        return read_bin(path, columns)
+    raise UnsupportedMessage(
+        f'{path}: expected a cloud in .pcd, .pcd.bin or .bin, got the format {kind!r}; write it '
+        f'as PCD'
+    )
+
+
+def _read_pcd_cloud(path: Path, stamp_ns: int) -> Cloud:
+    """Return the cloud of a PCD file, whose fields are read as those of a PointCloud2."""
+    try:
+        table = read_pcd(path)
+    except OSError as error:
+        raise missing_sweep(path, error) from None
+    message = _as_message(table, stamp_ns)
+    try:
+        sweep = pointcloud.from_msg(message)
+        intensities = pointcloud.intensities(message)
+    except UnsupportedMessage as error:
+        raise UnsupportedMessage(f'{path}: {error}') from None
+    return Cloud(sweep.points, intensities, sweep.times)
+
+
+def _as_message(table: NDArray[Any], stamp_ns: int) -> SimpleNamespace:
+    """Return the points of a PCD file (M,) with the attributes of a PointCloud2."""
+    kinds = {}
+    for name in table.dtype.names or ():
+        kind = table.dtype[name]
+        if not kind.shape:
+            # PointCloud2 has no integers of 64 bits; absolute times in them keep 0.3 us.
+            kinds[name] = '<f8' if kind.kind in 'iu' and kind.itemsize == 8 else kind.str
+    packed = np.zeros(len(table), list(kinds.items()))
+    for name in kinds:
+        packed[name] = table[name]
+    offsets: Mapping[str, Any] = packed.dtype.fields or {}
+    fields = [
+        SimpleNamespace(
+            name=name, offset=offsets[name][1], datatype=pointcloud.NUMBERS[kind[1:]], count=1
+        )
+        for name, kind in kinds.items()
+    ]
+    stamp = SimpleNamespace(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp, frame_id=''), height=1, width=len(packed),
+        fields=fields, is_bigendian=False, point_step=packed.dtype.itemsize,
+        row_step=packed.nbytes, data=packed.tobytes(),
+    )  # fmt: skip
+
+
+def read_bin(path: Path, columns: int) -> Cloud:
     """
     Return the cloud of a BIN file: rows of little-endian float32 that begin x y z intensity.
 
-    Their number of columns is that of `suffix` in `BIN_COLUMNS`. Raises UnsupportedMessage if
-    the file is missing or is not a whole number of rows.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    columns : int
+        Numbers per point, at least 4.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If the file is missing or is not a whole number of rows.
 
     """
-    columns = BIN_COLUMNS[suffix]
     try:
         numbers = np.fromfile(path, '<f4')
     except OSError as error:
@@ -53,6 +144,44 @@ def finite_cloud(
     return Cloud(
         points, intensities, times, np.zeros((1, 3)) if origins is None else origins, sensors
     )
+
+
+def at_stamp(
+    points: Floats, times: Floats, stamp_ns: int, pose_stamps_ns: Ints, T_fixed_frame: Floats
+) -> Floats:
+    """
+    Return points in a moving frame at one stamp.
+
+    Parameters
+    ----------
+    points : array, shape (M, 3)
+        In the frame, each when it was measured [m].
+    times : array, shape (M,)
+        Of measurement relative to the stamp [s].
+    stamp_ns : int
+        Stamp of the result [ns].
+    pose_stamps_ns : array, shape (P,)
+        Stamps of the poses, ascending [ns].
+    T_fixed_frame : array, shape (P, 4, 4)
+        Poses of the frame in a fixed one; interpolated, and held before the first and after the
+        last.
+
+    Returns
+    -------
+    points : array, shape (M, 3)
+        In the frame at the stamp [m].
+
+    """
+    after = (pose_stamps_ns - stamp_ns) * 1e-9  # (P,) [s]
+    first = max(int(np.searchsorted(after, min(times.min(), 0.0), side='right')) - 1, 0)
+    last = min(int(np.searchsorted(after, max(times.max(), 0.0))) + 1, len(after))
+    knots = inverse(T_fixed_frame[first]) @ T_fixed_frame[first:last]  # (K, 4, 4), small motions
+    motion = np.hstack([knots[:, :3, 3], rpy_from_matrix(knots[:, :3, :3])])  # (K, 6)
+    at = np.append(times, 0.0)
+    moved = np.stack([np.interp(at, after[first:last], column) for column in motion.T], axis=1)
+    R = matrix_from_rpy(moved[:, 3:])  # (M + 1, 3, 3), the last is at the stamp
+    placed = np.einsum('mij,mj->mi', R[:-1], points) + moved[:-1, :3]
+    return np.asarray((placed - moved[-1, :3]) @ R[-1])
 
 
 def missing_sweep(path: Path, error: OSError) -> UnsupportedMessage:

@@ -8,15 +8,16 @@ six of its 30 columns. They become metres by a Mercator projection about the fir
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
 from boxreg_ros.datasets.files import pose_rows, read_bin, require
-from boxreg_ros.datasets.protocol import SweepFile
-from boxreg_ros.errors import RecordingError, unreadable
+from boxreg_ros.datasets.protocol import Cloud, SweepFile
+from boxreg_ros.errors import RecordingError, unreadable, UnsupportedMessage
 from boxreg_ros.io.transforms import inverse
-from boxreg_ros.labels.sidecar import POSES_FILE, read_poses, read_stamps, STAMPS_FILE
+from boxreg_ros.labels.clouds import BIN_COLUMNS
+from boxreg_ros.labels.sidecar import POSES_FILE, read_poses, STAMPS_FILE, whole_stamps
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
@@ -63,7 +64,7 @@ def exported_poses(folder: Path, count: int) -> tuple[Ints, Floats] | None:
     """Return stamps and known poses of our own exports, without OXTS; None for other folders."""
     if not (folder / POSES_FILE).is_file():
         return None
-    stamps_ns = np.array(read_stamps(folder / STAMPS_FILE), np.int64)
+    stamps_ns = np.array(whole_stamps(folder / STAMPS_FILE), np.int64)
     poses = read_poses(folder / POSES_FILE, len(stamps_ns))
     known = [i for i, pose in enumerate(poses) if pose is not None]
     if not known or len(stamps_ns) < count:
@@ -74,11 +75,29 @@ def exported_poses(folder: Path, count: int) -> tuple[Ints, Floats] | None:
     return stamps_ns[known], pose_rows([pose for pose in poses if pose is not None])
 
 
-def sweep_files(folder: Path, digits: int, stamps_ns: Sequence[int]) -> Iterator[SweepFile]:
-    """Yield the sweeps of a folder, one per stamp; the file name is the number of the frame."""
+def sweep_files(
+    folder: Path, digits: int, stamps_ns: Sequence[int], without_stamp: Container[int] = ()
+) -> Iterator[SweepFile]:
+    """
+    Yield the sweeps of a folder; the file name is the number of the frame.
+
+    Frames `without_stamp` have none in the data set, which left them out; their `stamps_ns` are
+    interpolated. One of them that has a file is yielded, and cannot be read.
+
+    """
     for number, stamp_ns in enumerate(stamps_ns):
         path = folder / f'{number:0{digits}d}.bin'
-        yield SweepFile(stamp_ns, partial(read_bin, path, '.bin'))
+        if number not in without_stamp:
+            yield SweepFile(stamp_ns, partial(read_bin, path, BIN_COLUMNS['.bin']))
+        elif path.is_file():
+            yield SweepFile(stamp_ns, partial(_refuse_unstamped, path))
+
+
+def _refuse_unstamped(path: Path) -> Cloud:
+    raise UnsupportedMessage(
+        f'{path}: expected a stamp in line {1 + int(path.stem)} of timestamps.txt, got a blank '
+        f'line; write it there, or remove the sweep'
+    )
 
 
 def rigid_transform(numbers: Sequence[float], path: Path) -> Floats:

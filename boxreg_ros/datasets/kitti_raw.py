@@ -2,7 +2,8 @@
 KITTI raw, synchronised and rectified, as its archives are unpacked: one folder per day.
 
 Sweeps have the stamp at which the LiDAR faces forward; poses are interpolated between those of
-the GPS/IMU unit. The LiDAR turns while the vehicle moves, which is not compensated.
+the GPS/IMU unit. The LiDAR turns while the vehicle moves, which is not compensated. Some drives
+lack sweeps, and have blank lines for their stamps: these frames keep their number.
 
 """
 
@@ -18,7 +19,7 @@ from boxreg_ros.datasets.protocol import Dataset, Scene
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, SceneFrames
 from boxreg_ros.labels.files import frame_names
-from boxreg_ros.labels.sidecar import read_stamps, STAMPS_FILE
+from boxreg_ros.labels.sidecar import filled_stamps, read_stamps, STAMPS_FILE
 from boxreg_ros.labels.tracklets import FILE
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
@@ -55,19 +56,23 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     drive = _drives(root)[name]
     exported = kitti.exported_poses(drive, 1)
     if exported is None:
-        stamps_ns = _stamps(drive / DATASET.lidar / STAMPS_FILE, f'{name}{DRIVE_SUFFIX}.zip')
+        given_ns = _stamps(drive / DATASET.lidar / STAMPS_FILE, f'{name}{DRIVE_SUFFIX}.zip')
         pose_stamps_ns, poses = _oxts(drive, name)
     else:
         pose_stamps_ns, poses = exported
-        stamps_ns = _stamps(drive / STAMPS_FILE, 'the export')
+        given_ns = _stamps(drive / STAMPS_FILE, 'the export')
+    stamps_ns = filled_stamps(given_ns, len(given_ns))
+    without_stamp = {number for number, stamp_ns in enumerate(given_ns) if stamp_ns is None}
+    clouds = drive / DATASET.lidar / 'data'
+    sweeps = partial(kitti.sweep_files, clouds, RAW_DIGITS, stamps_ns, without_stamp)
     names = {str(number): stamp_ns for number, stamp_ns in enumerate(stamps_ns)}
     frames = SceneFrames(name, names, *frame_names(drive, 'map', DATASET.lidar))
     labels = drive / FILE
     return Scene(
         frames,
         DATASET.lidar,
-        np.array(stamps_ns, np.int64),
-        partial(kitti.sweep_files, drive / DATASET.lidar / 'data', RAW_DIGITS, stamps_ns),
+        np.array([sweep.stamp_ns for sweep in sweeps()], np.int64),
+        sweeps,
         pose_stamps_ns,
         poses,
         partial(frames_of, 'tracklets', labels, frames) if labels.is_file() else None,
@@ -78,14 +83,18 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
 def _oxts(drive: Path, name: str) -> tuple[Ints, Floats]:
     """Return stamps (n,) and poses (n, 7) of the LiDAR at the stamps of the GPS/IMU unit."""
     archive = f'{name}{DRIVE_SUFFIX}.zip'
-    stamps_ns = np.array(_stamps(drive / 'oxts' / STAMPS_FILE, archive), np.int64)
+    stamps = enumerate(_stamps(drive / 'oxts' / STAMPS_FILE, archive))
+    stamp_of = {number: stamp_ns for number, stamp_ns in stamps if stamp_ns is not None}
     folder = require(drive / 'oxts' / 'data', 'the poses', f'unpack {archive}')
-    rows = [kitti.oxts_rows(path) for path in sorted(folder.glob('*.txt'))]
-    if len(rows) != len(stamps_ns):
+    files = {int(path.stem): path for path in folder.glob('*.txt') if path.stem.isdigit()}
+    if files.keys() != stamp_of.keys():
+        first = min(files.keys() ^ stamp_of.keys())
         raise RecordingError(
-            f'{folder}: expected {len(stamps_ns)} poses, one per stamp, got {len(rows)}; unpack '
-            f'{archive} again'
+            f'{folder}: expected a pose for each of {len(stamp_of)} stamps, got {len(files)} '
+            f'poses, the first difference is at frame {first}; unpack {archive} again'
         )
+    stamps_ns = np.array([stamp_of[number] for number in sorted(files)], np.int64)
+    rows = [kitti.oxts_rows(files[number]) for number in sorted(files)]
     calibration = drive.parent / IMU_CALIBRATION_FILE
     values = kitti.calibration_lines(calibration, f'{drive.parent.name}_calib.zip')
     R, t = values.get('R', []), values.get('T', [])
@@ -100,10 +109,10 @@ def _oxts(drive: Path, name: str) -> tuple[Ints, Floats]:
     return stamps_ns, kitti.oxts_poses(np.concatenate(rows), T_velo_imu)[order]
 
 
-def _stamps(path: Path, archive: str) -> list[int]:
-    """Return the stamps of a file [ns]."""
+def _stamps(path: Path, archive: str) -> list[int | None]:
+    """Return the stamps of a file [ns]; None where a line is blank."""
     stamps_ns = read_stamps(require(path, 'the stamps', f'unpack {archive}'))
-    if not stamps_ns:
+    if not any(stamps_ns):
         raise RecordingError(f'{path}: expected stamps, got none; unpack {archive} again')
     return stamps_ns
 

@@ -2,24 +2,26 @@
 nuScenes, its tables as they are downloaded; T4 and our own exports have the same tables.
 
 The tables are read row by row and only the rows of the scene are held. Sweeps between the key
-frames are read too: 20 Hz, where annotations have 2 Hz.
+frames are read too: 20 Hz, where annotations have 2 Hz. Clouds are read in the format of their
+file names. Those of several LiDARs are in the frame of the ego vehicle, each at its own stamp.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from boxreg_ros.datasets.files import pose_rows, read_bin, require, require_lidar
-from boxreg_ros.datasets.protocol import Dataset, Scene, SweepFile
+from boxreg_ros.datasets.files import at_stamp, pose_rows, read_cloud, require, require_lidars
+from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, SceneFrames
 from boxreg_ros.labels.files import frame_names, from_json, json_items
 from boxreg_ros.labels.nuscenes import pose_matrix
-from boxreg_ros.structures import Floats
+from boxreg_ros.structures import Floats, Ints
 import numpy as np
 
 DATASET = Dataset(
@@ -31,7 +33,12 @@ DATASET = Dataset(
     remedy='unpack its metadata and LiDAR archives into one folder',
     packages=('ijson',),
 )
-CLOUD_SUFFIX = '.pcd.bin'
+EGO_FRAME = 'ego'
+"""Frame of the clouds of several LiDARs."""
+POINT_COLUMNS = 5
+"""Numbers per point of a BIN file: x y z intensity ring; T4 may state more beside a file."""
+POSE_MARGIN_NS = 10**9
+"""Poses are read so long before the first and after the last sweep [ns]; chosen."""
 
 
 def scene_names(root: Path) -> list[str]:
@@ -42,83 +49,227 @@ def scene_names(root: Path) -> list[str]:
 
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
     """Return the folder of the tables of a scene."""
-    return (_tables_of(root, name)[0],)
+    return (tables_of(root, name)[0],)
 
 
 def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a scene; see `protocol.DatasetModule`."""
-    tables, scene = _tables_of(root, name)
+    tables, scene = tables_of(root, name)
+    return scene_of(root, tables, scene, lidars)
+
+
+def scene_of(
+    root: Path,
+    tables: Path,
+    scene: dict[str, Any],
+    lidars: Sequence[str],
+    *,
+    takes_all: bool = False,
+    has_all_poses: bool = False,
+) -> Scene:
+    """
+    Return a scene of tables as those of nuScenes.
+
+    Parameters
+    ----------
+    root, tables : Path
+        The folder of the data set, and that of its tables.
+    scene : dict
+        Row of the table ``scene``.
+    lidars : sequence of str
+        Channels of the LiDARs, the first gives the stamps; by default the only one.
+    takes_all : bool
+        Whether the default is all LiDARs.
+    has_all_poses : bool
+        Whether ``ego_pose`` has the motion of the vehicle, and not one pose per sweep. Then poses
+        are at their own stamps, and the motion during a sweep is compensated where its points have
+        times.
+
+    Raises
+    ------
+    RecordingError
+        If a table or row is missing, or there is no such LiDAR.
+
+    """
     try:
-        return _scene(root, tables, scene, lidars)
+        sensors = _lidars(tables, lidars, takes_all)
+        return _scene(root, tables, scene, sensors, has_all_poses)
     except (KeyError, TypeError, ValueError) as error:
         raise RecordingError(
             f'{tables}: expected the tables of nuScenes: {type(error).__name__} {error}'
         ) from None
 
 
-def _scene(root: Path, tables: Path, scene: dict[str, Any], lidars: Sequence[str]) -> Scene:
+class _Lidars(NamedTuple):
+    """The LiDARs of a scene."""
+
+    channels: tuple[str, ...]
+    mounts: dict[str, tuple[str, Floats]]
+    """Channel and pose (4, 4) in the vehicle by the token of the calibration."""
+
+
+class _Motion(NamedTuple):
+    """Poses of the vehicle, or of the LiDAR, in the global frame."""
+
+    stamps_ns: Ints  # (P,) ascending
+    T_global: Floats  # (P, 4, 4)
+
+
+def _scene(
+    root: Path, tables: Path, scene: dict[str, Any], lidars: _Lidars, has_all_poses: bool
+) -> Scene:
     """Return a scene of a row of the table ``scene``."""
     samples = {
         row['token']: row['timestamp'] * 1000
         for row in _rows(tables, 'sample')
         if row['scene_token'] == scene['token']
     }
-    channel, calibrations = _lidar(tables, lidars)
-    sweeps = [
-        row
-        for row in _rows(tables, 'sample_data')
-        if row['sample_token'] in samples and row['calibrated_sensor_token'] in calibrations
-    ]
+    sweeps = _sweeps_of_scene(tables, samples, lidars)
+    names = ', '.join(lidars.channels)
     if not sweeps:
         raise RecordingError(
-            f'{tables / "sample_data.json"}: expected sweeps of {channel} in {scene["name"]}, got '
+            f'{tables / "sample_data.json"}: expected sweeps of {names} in {scene["name"]}, got '
             f'none; {DATASET.remedy}'
         )
-    sweeps.sort(key=_stamp_ns)
-    # The stamp of a sample is that of its sweep, which our own exports have in nanoseconds.
-    stamps_ns = samples | {
-        row['sample_token']: _stamp_ns(row) for row in sweeps if row['is_key_frame']
-    }
+    is_single = len(lidars.channels) == 1
+    is_in_ego = has_all_poses or not is_single
+    stamps_ns = dict(samples)
+    if not is_in_ego:
+        # The stamp of a sample is that of its sweep, which our own exports have in nanoseconds.
+        stamps_ns |= {row['sample_token']: _stamp_ns(row) for row in sweeps if row['is_key_frame']}
     by_time = dict(sorted(stamps_ns.items(), key=lambda item: item[1]))
-    frames = SceneFrames(scene['name'], by_time, *frame_names(root, 'map', channel))
-    sweep_stamps_ns = np.array([_stamp_ns(row) for row in sweeps], np.int64)
+    sensor_frame = EGO_FRAME if is_in_ego else names
+    frames = SceneFrames(scene['name'], by_time, *frame_names(root, 'map', sensor_frame))
+    if has_all_poses:
+        motion = _motion(tables, sweeps)
+    else:
+        motion = _motion_at_sweeps(tables, sweeps, None if is_in_ego else lidars)
     annotations = tables / 'sample_annotation.json'
     has_annotations = annotations.is_file() and next(json_items(annotations), None) is not None
     return Scene(
         frames,
-        channel,
-        sweep_stamps_ns,
-        partial(_sweep_files, root, sweeps),
-        sweep_stamps_ns,
-        _poses(tables, sweeps, calibrations),
+        names,
+        np.array([_stamp_ns(row) for row in sweeps], np.int64),
+        partial(
+            _sweep_files,
+            root,
+            sweeps,
+            lidars if is_in_ego else None,
+            motion if has_all_poses else None,
+        ),
+        motion.stamps_ns,
+        pose_rows(list(motion.T_global)),
         partial(frames_of, 'nuscenes', tables, frames) if has_annotations else None,
         without_boxes=str(annotations),
+        lidars=() if is_single else lidars.channels,
     )
 
 
-def _lidar(tables: Path, lidars: Sequence[str]) -> tuple[str, dict[str, Floats]]:
-    """Return the channel of the LiDAR, and its poses (4, 4) in the vehicle by their tokens."""
+def _lidars(tables: Path, asked: Sequence[str], takes_all: bool) -> _Lidars:
+    """Return the LiDARs that are asked for, else the only one, or all where that is the rule."""
     channels = {
         row['token']: row['channel']
         for row in from_json(tables / 'sensor.json')
         if row['modality'] == 'lidar'
     }
-    channel = require_lidar(lidars, sorted(set(channels.values())))
-    calibrations = {
-        row['token']: pose_matrix(row)
-        for row in from_json(tables / 'calibrated_sensor.json')
-        if channels.get(row['sensor_token']) == channel
-    }
-    return channel, calibrations
+    names = sorted(set(channels.values()))
+    chosen = tuple(require_lidars(asked or (names if takes_all else ()), names))
+    mounts = {}
+    for row in from_json(tables / 'calibrated_sensor.json'):
+        channel = channels.get(row['sensor_token'])
+        if channel in chosen:
+            mounts[row['token']] = channel, pose_matrix(row)
+    return _Lidars(chosen, mounts)
 
 
-def _sweep_files(root: Path, sweeps: list[dict[str, Any]]) -> Iterator[SweepFile]:
+def _sweeps_of_scene(
+    tables: Path, samples: Mapping[str, int], lidars: _Lidars
+) -> list[dict[str, Any]]:
+    """
+    Return the rows of ``sample_data`` with the clouds of a scene, in the order of time.
+
+    Sweeps between the key frames of T4 name no sample. They are of the scene if a sweep that names
+    one of its samples is linked with them, or if there is no other scene.
+
+    """
+    found: dict[str, dict[str, Any]] = {}
+    without_sample: dict[str, dict[str, Any]] = {}
+    is_only_scene = len(list(_rows(tables, 'scene'))) == 1
+    for row in _rows(tables, 'sample_data'):
+        if row['calibrated_sensor_token'] not in lidars.mounts:
+            continue
+        if row['sample_token'] in samples or (is_only_scene and not row['sample_token']):
+            found[row['token']] = row
+        elif not row['sample_token']:
+            without_sample[row['token']] = row
+    reached = list(found.values()) if without_sample else []
+    while reached:
+        row = reached.pop()
+        for token in (row['prev'], row['next']):
+            linked = without_sample.pop(token, None)
+            if linked is not None:
+                found[token] = linked
+                reached.append(linked)
+    return sorted(found.values(), key=_stamp_ns)
+
+
+def _sweep_files(
+    root: Path, sweeps: list[dict[str, Any]], lidars: _Lidars | None, motion: _Motion | None
+) -> Iterator[SweepFile]:
+    """Yield the sweeps; with `lidars` in the frame of the vehicle, compensated by `motion`."""
     for row in sweeps:
-        yield SweepFile(_stamp_ns(row), partial(read_bin, root / row['filename'], CLOUD_SUFFIX))
+        read = partial(_cloud, root, row)
+        if lidars is None:
+            yield SweepFile(_stamp_ns(row), read)
+            continue
+        channel, T_ego_lidar = lidars.mounts[row['calibrated_sensor_token']]
+        yield SweepFile(
+            _stamp_ns(row), partial(_cloud_in_ego, read, T_ego_lidar, motion, _stamp_ns(row)),
+            channel if len(lidars.channels) > 1 else '',
+        )  # fmt: skip
 
 
-def _poses(tables: Path, sweeps: list[dict[str, Any]], calibrations: dict[str, Floats]) -> Floats:
-    """Return the poses (P, 7) of the LiDAR in the global frame, one per sweep."""
+def _cloud(root: Path, row: dict[str, Any]) -> Cloud:
+    """Return the cloud of a row of ``sample_data`` in the frame of its LiDAR."""
+    columns = POINT_COLUMNS
+    about = row.get('info_filename')
+    if about and (root / about).is_file():
+        columns = int(from_json(root / about).get('num_pts_feats', POINT_COLUMNS))
+    return read_cloud(root / row['filename'], _stamp_ns(row), row['fileformat'], columns)
+
+
+def _cloud_in_ego(
+    read: Callable[[], Cloud], T_ego_lidar: Floats, motion: _Motion | None, stamp_ns: int
+) -> Cloud:
+    """Return a cloud in the frame of the vehicle at its stamp [ns]."""
+    cloud = read()
+    points = cloud.points.astype(np.float64) @ T_ego_lidar[:3, :3].T + T_ego_lidar[:3, 3]
+    if motion is not None and cloud.times is not None and len(points):
+        points = at_stamp(points, cloud.times, stamp_ns, *motion)
+    return replace(cloud, points=points.astype(np.float32), origins=T_ego_lidar[None, :3, 3])
+
+
+def _motion(tables: Path, sweeps: list[dict[str, Any]]) -> _Motion:
+    """Return all poses of the vehicle of the time of the sweeps, at their own stamps."""
+    first_ns = _stamp_ns(sweeps[0]) - POSE_MARGIN_NS
+    last_ns = _stamp_ns(sweeps[-1]) + POSE_MARGIN_NS
+    poses = {
+        row['timestamp'] * 1000: pose_matrix(row)
+        for row in _rows(tables, 'ego_pose')
+        if first_ns <= row['timestamp'] * 1000 <= last_ns
+    }
+    if not poses:
+        raise RecordingError(
+            f'{tables / "ego_pose.json"}: expected poses of the time of the sweeps, from '
+            f'{_stamp_ns(sweeps[0])} to {_stamp_ns(sweeps[-1])} ns, got none; {DATASET.remedy}'
+        )
+    return _ordered(poses)
+
+
+def _motion_at_sweeps(
+    tables: Path, sweeps: list[dict[str, Any]], lidars: _Lidars | None
+) -> _Motion:
+    """Return the poses that sweeps name, at their stamps: of the vehicle, or of `lidars`."""
     wanted = {row['ego_pose_token'] for row in sweeps}
     T_global_ego = {
         row['token']: pose_matrix(row)
@@ -131,11 +282,20 @@ def _poses(tables: Path, sweeps: list[dict[str, Any]], calibrations: dict[str, F
             f'{tables / "ego_pose.json"}: expected the poses of {len(wanted)} sweeps, got '
             f'{len(T_global_ego)}, the first without is {min(missing)}; {DATASET.remedy}'
         )
-    return pose_rows(
-        [
-            T_global_ego[row['ego_pose_token']] @ calibrations[row['calibrated_sensor_token']]
-            for row in sweeps
-        ]
+    poses = {}
+    for row in sweeps:
+        T = T_global_ego[row['ego_pose_token']]
+        if lidars is not None:
+            T = T @ lidars.mounts[row['calibrated_sensor_token']][1]
+        poses[_stamp_ns(row)] = T
+    return _ordered(poses)
+
+
+def _ordered(poses: Mapping[int, Floats]) -> _Motion:
+    """Return poses (4, 4) by their stamps [ns] in the order of time."""
+    stamps_ns = sorted(poses)
+    return _Motion(
+        np.array(stamps_ns, np.int64), np.array([poses[stamp_ns] for stamp_ns in stamps_ns])
     )
 
 
@@ -149,7 +309,7 @@ def _table_folders(root: Path) -> list[Path]:
     return sorted(path.parent for path in root.glob('*/scene.json'))
 
 
-def _tables_of(root: Path, name: str) -> tuple[Path, dict[str, Any]]:
+def tables_of(root: Path, name: str) -> tuple[Path, dict[str, Any]]:
     """Return the tables of a scene, and its row; the mini split comes before the others."""
     for tables in _table_folders(root):
         for row in _rows(tables, 'scene'):

@@ -44,6 +44,7 @@ class SweepFile(NamedTuple):
 
     stamp_ns: int
     read: Callable[[], Cloud]  # raises UnsupportedMessage if the points cannot be read
+    lidar: str = ''  # of `Scene.lidars` that measured it
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +59,8 @@ class Scene:
     poses: Floats  # (P, 7) x y z qx qy qz qw of the frame of the clouds in the fixed frame
     boxes: Callable[[], Iterator[LabelFrame]] | None  # the annotations, if it has any
     without_boxes: str = ''  # file or folder that would have annotations
+    # LiDARs whose sweeps have stamps of their own, to be merged by time; the first gives the stamp
+    lidars: tuple[str, ...] = ()
 
 
 class DatasetModule(Protocol):

@@ -13,6 +13,7 @@ from boxreg_ros.errors import ConfigError, RecordingError
 
 DATASETS = {
     'nuscenes': 'boxreg_ros.datasets.nuscenes',
+    'truckscenes': 'boxreg_ros.datasets.truckscenes',
     'kitti-tracking': 'boxreg_ros.datasets.kitti_tracking',
     'kitti-raw': 'boxreg_ros.datasets.kitti_raw',
     'argoverse2': 'boxreg_ros.datasets.argoverse2',

@@ -11,7 +11,7 @@ from boxreg_ros.datasets.protocol import Scene, SweepFile
 from boxreg_ros.datasets.registry import Address, module_of, open_scene, resolved, scene_files
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.items import EVERYTHING, Item, LOOKAHEAD_NS, requested_part, Wanted
-from boxreg_ros.io.lidars import SensorPlacement
+from boxreg_ros.io.lidars import Lidars, SensorPlacement
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of, LabelFrame
@@ -65,6 +65,7 @@ class SceneRecording:
         self._address = resolved(self._address)
         self._scene: Scene = open_scene(self._address, self._lidars)
         self.points_topic = self._scene.points_topic
+        self.placement = SensorPlacement(Lidars(self._scene.lidars))
         first_ns, last_ns = self._scene.sweep_stamps_ns[[0, -1]].tolist()
         part_ns = requested_part(str(self), first_ns, last_ns + 1, self._start, self._end)
         self.start_ns, self.end_ns = part_ns
@@ -83,6 +84,8 @@ class SceneRecording:
     def topics(self) -> dict[str, int]:
         """Return the number of sweeps of the LiDAR, and of frames with boxes."""
         counts = {self.points_topic: len(self._scene.sweep_stamps_ns)}
+        if self._scene.lidars:
+            counts = dict(Counter(sweep.lidar for sweep in self._scene.sweeps()))
         if self._labels is None and self._scene.boxes is not None:
             counts[ANNOTATIONS] = len(self._scene.frames.stamps_ns)
         return counts
@@ -168,14 +171,15 @@ class SceneRecording:
         try:
             cloud = sweep.read()
         except UnsupportedMessage as error:
-            self.unreadable[self.points_topic] += 1
-            self.first_errors.setdefault(self.points_topic, error)
+            topic = sweep.lidar or self.points_topic
+            self.unreadable[topic] += 1
+            self.first_errors.setdefault(topic, error)
             return None
         self._readable += 1
         origins = None if cloud.sensors is None else cloud.origins
         content = Sweep(
             sweep.stamp_ns, frame_id, cloud.points, cloud.times, cloud.origins.mean(axis=0),
-            origins=origins, sensors=cloud.sensors,
+            topic=sweep.lidar, origins=origins, sensors=cloud.sensors,
         )  # fmt: skip
         return Item(sweep.stamp_ns, content, cloud.intensities if with_intensities else None)
 

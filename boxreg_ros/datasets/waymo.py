@@ -4,17 +4,20 @@ Waymo (perception data set, version 2), as it is downloaded: one folder per comp
 Clouds are both returns of the LiDAR on the roof, and on request of the others, at the front, the
 sides and the rear. Range images become points by the inclination of each row, the azimuth of each
 column and, for the LiDAR on the roof alone, the pose of the vehicle at each pixel. Points are in
-the frame of the vehicle at the stamp. Rows are streamed: one sweep is in memory.
+the frame of the vehicle at the stamp. Rows may be in any order. Those in the order of time are
+streamed; others are copied to a temporary file first, which is mapped: one sweep is in memory.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from boxreg_ros.datasets.files import finite_cloud, pose_rows, require, require_lidars
@@ -76,10 +79,9 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
         row[MICROSECONDS] * 1000: np.reshape(row[VEHICLE_POSE], (4, 4)) for row in rows
     }
     stamps_ns = [micros * 1000 for micros, _ in _by_time(clouds, [], calibrations)]
-    if stamps_ns != sorted(set(stamps_ns)) or not stamps_ns:
+    if not stamps_ns:
         raise RecordingError(
-            f'{clouds}: expected sweeps of {", ".join(names)} in order of time, got '
-            f'{len(stamps_ns)}; {DATASET.remedy}'
+            f'{clouds}: expected sweeps of {", ".join(names)}, got none; {DATASET.remedy}'
         )
     missing = set(stamps_ns) - T_world_vehicle.keys()
     if missing:
@@ -149,11 +151,51 @@ def _calibrations(path: Path, names: Sequence[str]) -> dict[int, _Calibration]:
 def _by_time(
     path: Path, columns: Sequence[str], lasers: Collection[int]
 ) -> Iterator[tuple[int, dict[int, dict[str, Any]]]]:
-    """Yield the time [us] of each sweep and its rows by LiDAR, in the order of the file."""
-    streamed = _streamed(path, [MICROSECONDS, LASER, *columns])
-    wanted = (row for row in streamed if row[LASER] in lasers)
-    for micros, rows in groupby(wanted, itemgetter(MICROSECONDS)):
-        yield micros, {row[LASER]: row for row in rows}
+    """Yield the time [us] of each sweep and its rows by LiDAR, in the order of time."""
+    keys = list(_streamed(path, [MICROSECONDS, LASER]))
+    wanted = [number for number, key in enumerate(keys) if key[LASER] in lasers]
+    order = sorted(wanted, key=lambda number: keys[number][MICROSECONDS])
+    with TemporaryDirectory(prefix='boxreg_') as folder:
+        for micros, rows in groupby(
+            _rows_in_order(path, [MICROSECONDS, LASER, *columns], order, Path(folder)),
+            itemgetter(MICROSECONDS),
+        ):
+            yield micros, {row[LASER]: row for row in rows}
+
+
+def _rows_in_order(
+    path: Path, columns: list[str], order: Sequence[int], folder: Path
+) -> Iterator[dict[str, Any]]:
+    """
+    Yield rows of a Parquet file by their numbers.
+
+    Ascending numbers are streamed. For others the rows are copied to a file in `folder`, since
+    the pages of a Parquet file are only read from their begin.
+
+    """
+    wanted = set(order)
+    if list(order) == sorted(order):
+        for number, row in enumerate(_streamed(path, columns)):
+            if number in wanted:
+                yield row
+        return
+    import pyarrow
+    from pyarrow import ipc
+
+    copy = folder / 'rows.arrow'
+    with _reading(path), pyarrow.OSFile(str(copy), 'wb') as sink:
+        writer = None
+        for number, batch in enumerate(_batches(path, columns)):
+            writer = writer or ipc.new_file(sink, batch.schema)
+            if number in wanted:
+                writer.write_batch(batch)
+        if writer is not None:
+            writer.close()
+    place = {number: row for row, number in enumerate(sorted(wanted))}
+    with pyarrow.memory_map(str(copy)) as source:
+        rows = ipc.open_file(source)
+        for number in order:
+            yield _row(rows.get_batch(place[number]), columns)
 
 
 def _sweeps(
@@ -162,7 +204,7 @@ def _sweeps(
     calibrations: dict[int, _Calibration],
     T_world_vehicle: dict[int, Floats],
 ) -> Iterator[SweepFile]:
-    """Yield the sweeps in the order of the file, with the poses of the same stamps."""
+    """Yield the sweeps in the order of time, with the poses of the same stamps."""
     columns = [f'{image}.{part}' for image in RETURNS for part in ('values', 'shape')]
     poses: Iterator[tuple[int, dict[int, dict[str, Any]]]] = iter(())
     if pixel_poses is not None:
@@ -253,16 +295,34 @@ def _image(row: dict[str, Any], name: str) -> Floats | None:
 
 def _streamed(path: Path, columns: list[str]) -> Iterator[dict[str, Any]]:
     """Yield the rows of a Parquet file one by one, lists as arrays."""
-    import pyarrow
+    with _reading(path):
+        for batch in _batches(path, columns):
+            yield _row(batch, columns)
+
+
+def _batches(path: Path, columns: list[str]) -> Iterator[Any]:
+    """Yield the rows of a Parquet file as batches of one row."""
     from pyarrow import parquet
 
+    with parquet.ParquetFile(path, buffer_size=READ_AHEAD_BYTES, pre_buffer=False) as file:
+        yield from file.iter_batches(1, columns=columns, use_threads=False)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Raise errors of pyarrow as RecordingError."""
+    import pyarrow
+
     try:
-        with parquet.ParquetFile(path, buffer_size=READ_AHEAD_BYTES, pre_buffer=False) as file:
-            for batch in file.iter_batches(1, columns=columns, use_threads=False):
-                yield {name: _value(batch.column(name)) for name in columns}
+        yield
     except (OSError, KeyError, pyarrow.ArrowException) as error:
         text = ' '.join(str(error).split())
         raise RecordingError(f'{path}: cannot be read: {text}; {DATASET.remedy}') from None
+
+
+def _row(batch: Any, columns: list[str]) -> dict[str, Any]:
+    """Return the only row of a batch."""
+    return {name: _value(batch.column(name)) for name in columns}
 
 
 def _value(column: Any) -> Any:

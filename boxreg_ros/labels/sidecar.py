@@ -42,7 +42,7 @@ class Sidecar:
 def read_sidecar(folder: Path, count: int, stamps: Path | None = None) -> Sidecar:
     """Return stamps (of `stamps`, if given) and poses of `count` frames, or RecordingError."""
     path = stamps or folder / STAMPS_FILE
-    stamps_ns = read_stamps(path)
+    stamps_ns = whole_stamps(path, count)
     if len(stamps_ns) < count:
         raise RecordingError(f'{path}: expected a stamp for {count} frames, got {len(stamps_ns)}')
     fixed_frame, sensor_frame = frame_names(folder)
@@ -80,19 +80,52 @@ def numbered_scene(
         yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame)
 
 
-def read_stamps(path: Path) -> list[int]:
-    """Return the stamps of a file [ns]: integers, or UTC as in KITTI raw; else RecordingError."""
+def whole_stamps(path: Path, count: int = 0) -> list[int]:
+    """
+    Return a stamp for each frame of a file [ns]; its format and errors are those of `read_stamps`.
+
+    A frame whose line is blank keeps its number. Its stamp is interpolated between those of its
+    neighbours, and extrapolated at an end. Blank lines at the end are frames up to `count`.
+
+    """
+    return filled_stamps(read_stamps(path), count)
+
+
+def filled_stamps(stamps_ns: Sequence[int | None], count: int = 0) -> list[int]:
+    """Return stamps [ns] with those of blank lines, as `whole_stamps` has them."""
+    known = [number for number, stamp_ns in enumerate(stamps_ns) if stamp_ns is not None]
+    given_ns = [stamp_ns for stamp_ns in stamps_ns if stamp_ns is not None]
+    if len(known) < 2:
+        return given_ns
+    end = max(1 + known[-1], min(count, len(stamps_ns)))
+    if len(known) == end:
+        return given_ns
+    numbers = np.arange(end)
+    after_first_ns = np.array(given_ns) - given_ns[0]
+    filled_ns = np.interp(numbers, known, after_first_ns)
+    period_ns = np.median(np.diff(after_first_ns) / np.diff(known))
+    beyond = np.minimum(numbers - known[0], 0) + np.maximum(numbers - known[-1], 0)
+    return [given_ns[0] + round(offset) for offset in (filled_ns + period_ns * beyond).tolist()]
+
+
+def read_stamps(path: Path) -> list[int | None]:
+    """
+    Return the stamps of a file, one per line [ns]: integers, or UTC as in KITTI raw.
+
+    None for a blank line. Raises RecordingError if the file cannot be read, or a line is neither.
+
+    """
     try:
-        lines = path.read_text(encoding='utf-8').split('\n')
+        lines = path.read_text(encoding='utf-8').splitlines()
     except OSError:
         raise RecordingError(
             f'{path}: not found, and these labels have no stamps of their own; create it with '
             f'one stamp per frame, as whole nanoseconds'
         ) from None
-    stamps = []
-    for number, line in enumerate(filter(str.strip, lines), 1):
+    stamps: list[int | None] = []
+    for number, line in enumerate(lines, 1):
         try:
-            stamps.append(_stamp_ns(line.strip()))
+            stamps.append(_stamp_ns(line.strip()) if line.strip() else None)
         except ValueError:
             raise RecordingError(
                 f'{path}:{number}: expected whole nanoseconds, got {line.strip()!r}'

@@ -11,6 +11,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.stamp_join import joined_stamps
 from boxreg_ros.structures import BoxArray, Ints, Sweep
 import numpy as np
 
@@ -25,7 +26,8 @@ class Drive:
     sweeps: tuple[Sweep, ...]
     boxes: tuple[BoxArray, ...]  # noisy ones
     truth: BoxTable
-    left_out: str = ''  # number of messages that are not used, and why; empty if all are
+    # messages that are not used, and why, and stamps of the truth that are not equal; else empty
+    left_out: str = ''
 
     @classmethod
     def of(
@@ -63,11 +65,15 @@ class Drive:
         if not has_sweeps:
             reason = f': {others}' if others else ''
             raise RecordingError(f'{recording}: expected sweeps, got none{reason}')
+        joined = joined_stamps(
+            truth.stamps_ns, np.array([item.stamp_ns for item in boxes or sweeps], np.int64)
+        )
+        finding = joined.finding('the true boxes', 'the boxes' if boxes else 'the clouds')
         return cls(
             tuple(sorted(sweeps, key=lambda sweep: sweep.stamp_ns)),
             tuple(sorted(boxes, key=lambda array: array.stamp_ns)),
-            truth,
-            others,
+            replace(truth, stamps_ns=joined.stamps_ns),
+            '; '.join(filter(None, (others, finding))),
         )
 
     def sweeps_at(self, stamps_ns: Ints) -> list[Sweep]:

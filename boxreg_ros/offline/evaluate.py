@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+from dataclasses import asdict, replace
 import json
 import math
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance, COVARIANCES, read_covariances
+from boxreg_ros.io.stamp_join import joined_stamps
 from boxreg_ros.io.times import time_range
 from boxreg_ros.offline.arguments import add_options, request_from, TOPICS, words_of
 from boxreg_ros.offline.box_scores import by_overlap, groups, match, RECALLS, Scores, summarise
@@ -56,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
     truth = true_boxes(args.truth)
     predicted = _predicted(args, truth.frame_id)
     _check_same_drive(args, predicted, truth)
+    truth = _joined(args, predicted, truth)
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes, by_overlap)
     if matches.invalid:
@@ -189,6 +191,26 @@ def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:
         f'no predicted box overlaps a true one: {len(stamps)} stamps are in both; compare boxes '
         f'of one recording in one frame'
     )
+
+
+def _joined(args: argparse.Namespace, predicted: BoxTable, truth: BoxTable) -> BoxTable:
+    """Return the true boxes at the stamps of the predicted ones; say what was not equal."""
+    joined = joined_stamps(truth.stamps_ns, predicted.stamps_ns)
+    finding = joined.finding('the true boxes', 'the predicted ones')
+    if finding and not joined.num_common:
+        raise RecordingError(
+            f'{args.truth}: {finding}; give both the stamps of the same clouds, in nanoseconds'
+        )
+    if finding:
+        _warn(finding)
+    without = joined.num_stamps - joined.num_common
+    lonely = len(np.setdiff1d(predicted.stamps_ns, joined.stamps_ns))
+    if without and lonely:
+        _warn(
+            f'{without} of {joined.num_stamps} stamps of the true boxes have no predicted boxes, '
+            f'and {lonely} stamps of these no true ones: are both of the same clouds?'
+        )
+    return replace(truth, stamps_ns=joined.stamps_ns)
 
 
 def _check_same_drive(args: argparse.Namespace, predicted: BoxTable, truth: BoxTable) -> None:

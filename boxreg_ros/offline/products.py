@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.stamp_join import joined_stamps
 from boxreg_ros.io.times import time_range
 from boxreg_ros.offline.notes import closing_line, MAX_NAMED
 from boxreg_ros.offline.progress import Stopwatch
@@ -109,16 +111,19 @@ def _fitting(
     if truth is None:
         return None
     stamps = np.concatenate([np.zeros(0, np.int64), *(track.stamps_ns for track in tracks)])
+    joined = joined_stamps(truth.stamps_ns, stamps)
     names = {track.track_id for track in tracks}
     problem = ''
     if truth.frame_id != summary.fixed_frame:
         problem = f'frame {summary.fixed_frame!r}, got {truth.frame_id!r}'
-    elif len(stamps) and not np.isin(stamps, truth.stamps_ns).any():
+    elif len(stamps) and not joined.num_common:
         problem = f'boxes of {_range_of(stamps)}, got {_range_of(truth.stamps_ns)}'
     elif names.isdisjoint(truth.track_ids):
         problem = f'tracks {sorted(names)[:MAX_NAMED]}, got {truth.track_ids[:MAX_NAMED]}'
+    line = joined.finding('the true boxes', 'the results')
     if not problem:
-        return truth
+        summary.warning = '; '.join(filter(None, (summary.warning, line)))
+        return replace(truth, stamps_ns=joined.stamps_ns)
     line = (
         f'truth {str(path)!r}: expected {problem}; the report is written without it: '
         f'give the true boxes of this drive to --truth'

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import combinations
 from pathlib import Path
@@ -13,6 +13,7 @@ from pathlib import Path
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.io.box_table import BoxTable, unprotected
+from boxreg_ros.io.stamp_join import joined_stamps
 from boxreg_ros.review.decisions import Decision, DECISIONS, held, read_decisions
 from boxreg_ros.review.tables import REVIEW
 from boxreg_ros.structures import Floats, REFINED
@@ -106,11 +107,12 @@ def agreement(outs: Sequence[Path]) -> tuple[Floats, Floats]:
         pins = [one for one in made if one.kind == 'pin' and one.box is not None]
         if not pins:
             continue
+        table = BoxTable.read(out / 'boxes.csv')
+        pins = _at_stamps_of(table, pins)
         drive = str(orjson.loads((out / 'summary.json').read_bytes()).get('fingerprint', out))
         for one in pins:
             assert one.box is not None
             drawn[drive, one.track_id, one.stamp_ns][one.who] = one.box
-        table = BoxTable.read(out / 'boxes.csv')
         rows = zip(table.track_ids, table.stamps_ns.tolist(), table.status, strict=True)
         for row, (track_id, stamp_ns, status) in enumerate(rows):
             if status == REFINED:
@@ -119,6 +121,17 @@ def agreement(outs: Sequence[Path]) -> tuple[Floats, Floats]:
     pairs = [pair for boxes in shared.values() for pair in combinations(boxes, 2)]
     own = [(refined[key], box) for key, boxes in shared.items() if key in refined for box in boxes]
     return _overlaps(pairs), _overlaps(own)
+
+
+def _at_stamps_of(table: BoxTable, pins: Sequence[Decision]) -> list[Decision]:
+    """Return decisions with the stamps of the boxes they are of, see `joined_stamps`."""
+    stamps_ns = [one.stamp_ns for one in pins if one.stamp_ns is not None]
+    joined = joined_stamps(np.array(stamps_ns, np.int64), table.stamps_ns).stamps_ns.tolist()
+    stamp_of = dict(zip(stamps_ns, joined, strict=True))
+    return [
+        one if one.stamp_ns is None else replace(one, stamp_ns=stamp_of[one.stamp_ns])
+        for one in pins
+    ]
 
 
 def _overlaps(pairs: Sequence[tuple[Floats, Floats]]) -> Floats:

@@ -187,6 +187,92 @@ def nuscenes_results(path, task, shift=0.0):
     return path
 
 
+TRUCK_LIDARS = {
+    'LIDAR_TOP_FRONT': (0.0, (1.0, 0.0, 3.0), (1.0, 0.0, 0.0, 0.0)),
+    'LIDAR_LEFT': (0.03, (2.0, 1.2, 2.0), (HALF, 0.0, 0.0, HALF)),
+}
+"""Delay after the frame [s], position in the ego frame and rotation w x y z; yaw 0 and 90."""
+SWEEP_TIMES = (-0.04, 0.04)
+"""The first and the last point of a sweep, relative to its stamp [s]."""
+
+
+def write_pcd(path, columns, encoding='binary'):
+    """Write a PCD file of columns of numbers by name, without other fields."""
+    kinds = {name: values.dtype for name, values in columns.items()}
+    table = np.zeros(len(next(iter(columns.values()))), list(kinds.items()))
+    for name, values in columns.items():
+        table[name] = values
+    lines = [
+        '# .PCD v0.7 - Point Cloud Data file format', 'VERSION 0.7',
+        'FIELDS ' + ' '.join(kinds),
+        'SIZE ' + ' '.join(str(kind.itemsize) for kind in kinds.values()),
+        'TYPE ' + ' '.join(kind.kind.upper() for kind in kinds.values()),
+        'COUNT ' + ' '.join('1' for _ in kinds), f'WIDTH {len(table)}', 'HEIGHT 1',
+        'VIEWPOINT 0 0 0 1 0 0 0', f'POINTS {len(table)}', f'DATA {encoding}', '',
+    ]  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes('\n'.join(lines).encode() + table.tobytes())
+
+
+def truck_points(channel, i):
+    """Return when each point of the face is measured, counted in frames (M,), and its half."""
+    delay = TRUCK_LIDARS[channel][0]
+    across, _ = np.meshgrid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.7, 0.7, 11))
+    half = (across.ravel() > 0) == (channel == 'LIDAR_LEFT')
+    seconds = delay + np.linspace(*SWEEP_TIMES, across.size)
+    return i + seconds / 0.1, half
+
+
+def truckscenes(root, split='v1.2-mini', scene='scene-a-1'):
+    """Write TruckScenes: nuScenes with clouds of two LiDARs as PCD, whose points have times."""
+    nuscenes(root, split, scene)
+    tables = root / split
+    rows = {
+        name: json.loads((tables / f'{name}.json').read_text())
+        for name in ('sample_data', 'sensor', 'calibrated_sensor')
+    }
+    sweeps = [row for row in rows['sample_data'] if 'LIDAR' not in row['filename']]
+    for channel, (delay, position, rotation) in TRUCK_LIDARS.items():
+        rows['sensor'].append({'token': channel, 'channel': channel, 'modality': 'lidar'})
+        rows['calibrated_sensor'].append({
+            'token': f'calibrated {channel}', 'sensor_token': channel,
+            'translation': list(position), 'rotation': list(rotation), 'camera_intrinsic': [],
+        })  # fmt: skip
+        for i in range(FRAMES):
+            micros = (START_NS + i * STEP_NS) // 1000 + round(delay * 1e6)
+            name = f'samples/{channel}/{channel}_{micros}.pcd'
+            frames, half = truck_points(channel, i)
+            points = np.array([face_in_ego(f)[k] for k, f in enumerate(frames)]) - position
+            if channel == 'LIDAR_LEFT':  # its x axis is y of the vehicle
+                points = points[:, [1, 0, 2]] * [1, -1, 1]
+            x, y, z = points[half].astype(np.float32).T
+            times = START_NS // 1000 + np.rint(frames[half] * 1e5).astype(np.uint64)
+            write_pcd(root / name, {
+                'x': x, 'y': y, 'z': z, 'intensity': np.full_like(x, 7.0), 'timestamp': times,
+            })  # fmt: skip
+            sweeps.append({
+                'token': f'{channel}{i}', 'sample_token': f'sample{i - i % 2}',
+                'ego_pose_token': f'pose{i}', 'calibrated_sensor_token': f'calibrated {channel}',
+                'timestamp': micros, 'fileformat': 'pcd', 'is_key_frame': i % 2 == 0,
+                'height': 0, 'width': 0, 'filename': name, 'prev': '', 'next': '',
+            })  # fmt: skip
+    rows['sample_data'] = sweeps
+    rows['sensor'] = [row for row in rows['sensor'] if row['channel'] != 'LIDAR_TOP']
+    steps = np.arange(-10, 10 * FRAMES + 10)  # 100 Hz
+    rows['ego_pose'] = [
+        {
+            'token': f'pose{k}', 'timestamp': START_NS // 1000 + int(k) * 10_000,
+            'rotation': [HALF, 0.0, 0.0, HALF], 'translation': ego_position(k / 10).tolist(),
+        }
+        for k in steps
+    ]  # fmt: skip
+    for name in ('ego_motion_cabin', 'ego_motion_chassis', 'weather_annotation'):
+        rows[name] = []
+    for name, content in rows.items():
+        write_json(tables / f'{name}.json', content)
+    return root
+
+
 KITTI_LATITUDE = 60.0
 """Its cosine is 1/2, which halves the radius of the Mercator projection."""
 KITTI_STEP = 0.5 / np.radians(1.0) / (6378137.0 * 0.5)

@@ -1,5 +1,7 @@
 """Public data sets as recordings: clouds, poses and boxes by hand-derived values."""
 
+import itertools
+import json
 from pathlib import Path
 import re
 import shutil
@@ -203,6 +205,148 @@ def test_several_lidars_of_a_scene_on_the_command_line(tmp_path, capsys):
     capsys.readouterr()
     assert main(['relabel', f'kitti-tracking:{tmp_path / "kitti"}', '-o', f'{out}2', *lidars]) == 1
     assert "LiDARs velodyne, got 'TOP', 'FRONT'" in capsys.readouterr().err
+
+
+def test_several_lidars_of_truckscenes_are_merged_by_time(tmp_path, capsys):
+    """Each point is where it was measured: the motion of the truck during a sweep is undone."""
+    layouts.truckscenes(tmp_path / 'data')
+    address = f'truckscenes:{tmp_path / "data"}#scene-a-1'
+    sweeps, arrays = read(source_of('truckscenes', f'{tmp_path / "data"}#scene-a-1'))
+    assert len(sweeps) == 2 * FRAMES
+    for number, sweep in enumerate(sweeps):
+        i = number // 2
+        delay, position, _ = layouts.TRUCK_LIDARS[sweep.topic]
+        frames, half = layouts.truck_points(sweep.topic, i)
+        assert sweep.stamp_ns == layouts.stamps_ns()[i] + round(delay * 1e9)
+        points = np.array([layouts.face_in_map(f)[k] for k, f in enumerate(frames)])
+        np.testing.assert_allclose(sweep.points, points[half], atol=5e-5)
+        np.testing.assert_allclose(sweep.times, (frames[half] - i) * 0.1 - delay, atol=1e-6)
+        x, y, z = position
+        origin = layouts.ego_position(i + delay / 0.1) + np.array([-y, x, z])
+        np.testing.assert_allclose(sweep.origin, origin, atol=1e-6)
+    np.testing.assert_allclose(arrays[3].boxes, [layouts.car_in_map(6)], atol=2e-6)
+    out = tmp_path / 'out'
+    assert main(['relabel', address, '-o', str(out), '--formats=csv']) == 0
+    lidars = json.loads((out / 'summary.json').read_text())['lidars']
+    assert lidars == {channel: {'merged': FRAMES} for channel in layouts.TRUCK_LIDARS}
+    left = source_of('truckscenes', f'{tmp_path / "data"}#scene-a-1', lidars=['LIDAR_LEFT'])
+    assert len(read(left)[0]) == FRAMES
+    with pytest.raises(RecordingError, match='expected one of the LiDARs LIDAR_LEFT, LIDAR_TOP_'):
+        source_of('nuscenes', f'{tmp_path / "data"}#scene-a-1').__enter__()
+
+
+def test_clouds_of_nuscenes_tables_are_read_by_their_suffix(tmp_path):
+    """PCD and BIN of more columns, as T4 has them, hold the same points as those of nuScenes."""
+    layouts.nuscenes(tmp_path)
+    table = tmp_path / 'v1.0-mini' / 'sample_data.json'
+    rows = json.loads(table.read_text())
+    lidar = [row for row in rows if row['token'].startswith('sweep')]
+    layouts.write_json(tmp_path / 'info.json', {'num_pts_feats': 7})
+    for number, row in enumerate(lidar):
+        points = layouts.face_in_map(number) - layouts.lidar_position(number)
+        name = row['filename'].removesuffix('.pcd.bin')
+        if number % 3 == 0:
+            row['filename'] = f'{name}.pcd'
+            x, y, z = points.astype(np.float32).T
+            layouts.write_pcd(tmp_path / row['filename'], {'x': x, 'y': y, 'z': z})
+        elif number % 3 == 1:
+            row |= {'filename': f'{name}.bin', 'info_filename': 'info.json'}
+            layouts.write_bin(tmp_path / row['filename'], points, 7)
+        else:
+            row |= {'filename': name, 'fileformat': 'pcd.bin'}
+            layouts.write_bin(tmp_path / name, points, 5)
+    layouts.write_json(table, rows)
+    source = source_of('nuscenes', f'{tmp_path}#scene-0061')
+    sweeps, _ = read(source)
+    assert not source.unreadable
+    for i, sweep in enumerate(sweeps):
+        np.testing.assert_allclose(sweep.points, layouts.face_in_map(i), atol=3e-5)
+    assert len(sweeps) == FRAMES
+
+
+@pytest.mark.parametrize('is_linked', [True, False], ids=['linked', 'only scene'])
+def test_sweeps_that_name_no_sample_are_of_the_scene_that_they_are_linked_with(
+    tmp_path, is_linked
+):
+    layouts.nuscenes(tmp_path)
+    tables = tmp_path / 'v1.0-mini'
+    rows = json.loads((tables / 'sample_data.json').read_text())
+    lidar = [row for row in rows if row['token'].startswith('sweep')]
+    for before, after in itertools.pairwise(lidar):
+        if is_linked:
+            before['next'], after['prev'] = after['token'], before['token']
+    for row in lidar:
+        row['sample_token'] = row['sample_token'] if row['is_key_frame'] else ''
+    # A sweep of another scene names no sample either, and is linked with none of this one.
+    stray = lidar[1] | {'token': 'stray', 'timestamp': 1, 'prev': '', 'next': ''}
+    layouts.write_json(tables / 'sample_data.json', [*rows, stray] if is_linked else rows)
+    if not is_linked:
+        scenes = json.loads((tables / 'scene.json').read_text())
+        layouts.write_json(tables / 'scene.json', scenes[:1])
+    sweeps, _ = read(source_of('nuscenes', f'{tmp_path}#scene-0061'))
+    assert [sweep.stamp_ns for sweep in sweeps] == layouts.stamps_ns()
+
+
+LATE_FRAMES = {4, 5, FRAMES - 1}
+"""Frames of KITTI raw without a sweep."""
+
+
+def test_a_blank_stamp_of_kitti_raw_keeps_its_number(tmp_path):
+    layouts.kitti_raw(tmp_path)
+    folder = next(tmp_path.glob('*/*_sync/velodyne_points'))
+    lines = (folder / 'timestamps.txt').read_text().splitlines()
+    for number in LATE_FRAMES:
+        lines[number] = ''
+        (folder / 'data' / f'{number:010d}.bin').unlink()
+    (folder / 'timestamps.txt').write_text('\n'.join(lines) + '\n')
+    source = source_of('kitti-raw', tmp_path)
+    sweeps, arrays = read(source)
+    stamps_ns = [layouts.RAW_START_NS + i * layouts.STEP_NS for i in range(FRAMES)]
+    assert [sweep.stamp_ns for sweep in sweeps] == [
+        stamp_ns for i, stamp_ns in enumerate(stamps_ns) if i not in LATE_FRAMES
+    ]
+    assert not source.unreadable
+    assert [array.stamp_ns for array in arrays] == stamps_ns  # between and behind the others
+    for i, array in enumerate(arrays[:-1]):
+        np.testing.assert_allclose(array.boxes, [raw_box(i)], atol=2e-6)
+
+
+def test_a_sweep_of_kitti_raw_without_a_stamp_is_counted(tmp_path):
+    layouts.kitti_raw(tmp_path)
+    path = next(tmp_path.glob('*/*_sync/velodyne_points/timestamps.txt'))
+    lines = path.read_text().splitlines()
+    lines[0] = ''
+    path.write_text('\n'.join(lines))
+    source = source_of('kitti-raw', tmp_path)
+    sweeps, arrays = read(source)
+    assert len(sweeps) == FRAMES - 1 and len(arrays) == FRAMES
+    assert source.unreadable.total() == 1
+    (error,) = source.first_errors.values()
+    assert 'expected a stamp in line 1 of timestamps.txt, got a blank line' in str(error)
+
+
+def by_laser_then_reversed(table):
+    keys = zip(table['key.laser_name'].to_pylist(), range(len(table)), strict=True)
+    return [row for _, row in sorted(keys, key=lambda key: (key[0], -key[1]))]
+
+
+@pytest.mark.parametrize('part', ['lidar', 'lidar_pose', 'vehicle_pose', 'lidar_box'])
+def test_rows_of_waymo_may_be_in_any_order_and_in_several_groups(tmp_path, part):
+    from pyarrow import parquet
+
+    layouts.waymo(tmp_path)
+    (path,) = (tmp_path / 'training' / part).iterdir()
+    table = parquet.read_table(path)
+    shuffled = np.random.default_rng(1).permutation(len(table))
+    order = by_laser_then_reversed(table) if part == 'lidar' else shuffled
+    parquet.write_table(table.take(order), path, row_group_size=5)
+    source = source_of('waymo', tmp_path, lidars=['TOP', 'FRONT'])
+    sweeps, arrays = read(source)
+    assert not source.unreadable
+    assert [sweep.stamp_ns for sweep in sweeps] == layouts.stamps_ns()
+    for i, sweep in enumerate(sweeps):
+        np.testing.assert_allclose(sweep.points[:-1], layouts.waymo_points(i), atol=3e-5)
+        np.testing.assert_allclose(arrays[i].boxes, [layouts.car_in_map(i)], atol=2e-6)
 
 
 def test_times_of_points_are_seconds_after_the_stamp(tmp_path):

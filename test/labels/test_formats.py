@@ -566,13 +566,13 @@ def test_provenance_names_recordings_in_utf8(tmp_path, monkeypatch):
 
 
 def test_timestamps_of_kitti_raw(tmp_path):
-    from boxreg_ros.labels.sidecar import read_stamps
+    from boxreg_ros.labels.sidecar import whole_stamps
 
     path = tmp_path / 'timestamps.txt'
     # 2011-09-26 13:02:25 UTC is 15243 days and 46945 s after the epoch.
     path.write_text('2011-09-26 13:02:25.951199337\n1316955745951199337\n\n')
     seconds = 15243 * 86400 + 46945
-    assert read_stamps(path) == [seconds * 10**9 + 951199337, 1316955745951199337]
+    assert whole_stamps(path) == [seconds * 10**9 + 951199337, 1316955745951199337]
 
 
 def test_missing_camera_or_package_errors_name_the_remedy(tmp_path, monkeypatch):

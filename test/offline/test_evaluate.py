@@ -9,6 +9,7 @@ import re
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable, COLUMNS
+from boxreg_ros.io.stamp_join import joined_stamps
 from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline import evaluate as cli
 from boxreg_ros.offline.box_scores import groups, has_word, match, summarise
@@ -258,9 +259,51 @@ def test_tables_without_a_common_stamp_are_explained(tmp_path, capsys):
     )
     with pytest.raises(RecordingError, match=re.escape(expected)):
         run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv')
-    replace(truth, stamps_ns=truth.stamps_ns + 10).write(tmp_path / 'boxes.csv')
-    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 1
-    assert 'overlaps a true one: 0 stamps are in both' in capsys.readouterr().err
+    replace(truth, stamps_ns=truth.stamps_ns + STEP // 5).write(tmp_path / 'boxes.csv')
+    expected = (
+        r'none of 10 stamps of the true boxes is one of the predicted ones, the nearest is 0.02'
+    )
+    with pytest.raises(RecordingError, match=expected):
+        run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv')
+
+
+@pytest.mark.parametrize(
+    ('unit', 'origin', 'largest'), [(1_000, 789, 0.789), (1_000_000, 456_789, 456.789)]
+)
+@pytest.mark.parametrize('rounded', [10, 5], ids=['all', 'partly'])
+def test_stamps_that_other_programs_rounded_are_joined(
+    tmp_path, capsys, unit, origin, largest, rounded
+):
+    truth = truth_table()
+    exact = truth.stamps_ns + 1_700_000_000 * 10**9 + origin
+    replace(truth, stamps_ns=exact).write(tmp_path / 'boxes.csv')
+    cut = np.where(np.arange(20) // 2 < rounded, exact // unit * unit, exact)
+    replace(truth, stamps_ns=cut).write(tmp_path / 'truth.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--json') == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)['recall_3d'] == [1.0, 1.0, 1.0]
+    expected = (
+        f'{rounded} of 10 stamps of the true boxes are up to {largest} us from those of the '
+        f'predicted ones: joined with the nearest'
+    )
+    assert expected in printed.err
+
+
+def test_a_stamp_is_joined_with_one_other_at_most():
+    own = np.array([0, 700_000, 10**9, 2 * 10**9 + 1_000_001])
+    found = joined_stamps(own, np.array([600_000, 2 * 10**9]))
+    assert found.stamps_ns.tolist() == [0, 600_000, 10**9, 2 * 10**9 + 1_000_001]
+    assert (found.num_common, found.num_moved, found.largest_offset_ns) == (1, 1, 100_000)
+
+
+def test_other_stamps_on_both_sides_are_said(tmp_path, capsys):
+    truth = truth_table()
+    truth.write(tmp_path / 'truth.csv')
+    shifted = truth.stamps_ns + np.where(np.arange(20) < 8, 0, STEP // 5)
+    replace(truth, stamps_ns=shifted).write(tmp_path / 'boxes.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
+    expected = '6 of 10 stamps of the true boxes have no predicted boxes, and 6 stamps of these'
+    assert expected in capsys.readouterr().err
 
 
 def test_invalid_true_boxes_are_left_out_with_a_warning(tmp_path, capsys):

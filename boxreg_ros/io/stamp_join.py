@@ -1,0 +1,94 @@
+"""
+Stamps of boxes of another file joined with those of ours: the one place of it.
+
+Other programs round stamps to microseconds, to milliseconds, or to doubles of seconds (0.2 us).
+So a stamp is taken for the nearest one of the other file within `LARGEST_OFFSET_NS`.
+
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from boxreg_ros.structures import Ints
+import numpy as np
+
+LARGEST_OFFSET_NS = 1_000_000
+"""Stamps so close are the same one [ns]; derived: a stamp whose milliseconds were cut off."""
+
+
+class JoinedStamps(NamedTuple):
+    """Stamps (n,) of one file in terms of those of another."""
+
+    stamps_ns: Ints
+    """(n,), each replaced by that of the other file where one is near [ns]."""
+    num_stamps: int
+    """Different stamps."""
+    num_common: int
+    """Those that have one in the other file."""
+    num_moved: int
+    """Those of them that were not equal to the nanosecond."""
+    largest_offset_ns: int
+    """Largest difference that was bridged [ns]."""
+    nearest_ns: int | None
+    """Smallest difference of a stamp without another; None if all have one, or there is none."""
+
+    def finding(self, what: str, others: str) -> str:
+        """Return in words that stamps were not equal, or have no other; empty if all are equal."""
+        if not self.num_common and self.nearest_ns is not None:
+            return (
+                f'none of {self.num_stamps} stamps of {what} is one of {others}, the nearest is '
+                f'{self.nearest_ns * 1e-9:.6f} s away'
+            )
+        if not self.num_moved:
+            return ''
+        return (
+            f'{self.num_moved} of {self.num_stamps} stamps of {what} are up to '
+            f'{self.largest_offset_ns / 1000:g} us from those of {others}: joined with the nearest'
+        )
+
+
+def joined_stamps(stamps_ns: Ints, others_ns: Ints) -> JoinedStamps:
+    """
+    Return stamps joined with those of another file.
+
+    Parameters
+    ----------
+    stamps_ns : array, shape (n,)
+        Stamps of the rows of a file [ns], in any order, repeated.
+    others_ns : array, shape (m,)
+        Those of the other file.
+
+    Returns
+    -------
+    joined : JoinedStamps
+        A stamp takes that of the nearest other one within `LARGEST_OFFSET_NS`, unless a stamp
+        nearer to it takes that.
+
+    """
+    own = np.unique(stamps_ns)
+    others = np.unique(others_ns)
+    if not len(own) or not len(others):
+        return JoinedStamps(stamps_ns, len(own), 0, 0, 0, None)
+    nearest = _nearest(own, others)
+    is_mutual = _nearest(others, own)[nearest] == np.arange(len(own))
+    offsets = np.abs(others[nearest] - own)
+    is_common = is_mutual & (offsets <= LARGEST_OFFSET_NS)
+    joined = np.where(is_common, others[nearest], own)
+    is_moved = is_common & (offsets > 0)
+    return JoinedStamps(
+        joined[np.searchsorted(own, stamps_ns)],
+        len(own),
+        int(is_common.sum()),
+        int(is_moved.sum()),
+        int(offsets[is_moved].max(initial=0)),
+        None if is_common.all() else int(offsets[~is_common].min()),
+    )
+
+
+def _nearest(stamps_ns: Ints, among_ns: Ints) -> Ints:
+    """Return the row of the nearest of ascending stamps (m,) to each stamp (n,)."""
+    after = np.searchsorted(among_ns, stamps_ns).clip(0, len(among_ns) - 1)
+    before = (after - 1).clip(0)
+    is_before = stamps_ns - among_ns[before] < among_ns[after] - stamps_ns
+    return np.where(is_before, before, after)
