@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
+import hashlib
+import json
 from math import isnan, nan
 from operator import attrgetter
 from pathlib import Path
@@ -404,6 +406,12 @@ class Config:
     def coasts(self) -> bool:
         """Return whether boxes are added online; whole tracks are filled from both sides."""
         return self.coast > 0 and self.estimate != 'track' and not self.complete.steps
+
+    @property
+    def digest(self) -> str:
+        """Return the first 16 digits of the SHA-256 of all settings as JSON."""
+        text = json.dumps(asdict(self), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def items(self) -> Iterator[tuple[Setting, Any]]:
         """Yield every setting with its value; names of groups are dotted."""

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
-import hashlib
-import json
+from dataclasses import dataclass, replace
 import os
 from pathlib import Path
 from typing import Protocol, TYPE_CHECKING
@@ -127,7 +125,7 @@ class Provenance:
     recordings: tuple[str, ...] = ()
     """Their file names."""
     config_hash: str = ''
-    """First 16 digits of the SHA-256 of the configuration as JSON; empty if none was used."""
+    """`Config.digest` of the configuration; empty if none was used."""
     tool: str = 'boxreg_ros'
     """That made the labels."""
     version: str = __version__
@@ -135,10 +133,7 @@ class Provenance:
     @classmethod
     def of(cls, recordings: tuple[Path, ...], config: Config | None = None) -> Provenance:
         """Return the provenance of labels of `recordings`, made with `config`."""
-        digest = ''
-        if config is not None:
-            text = json.dumps(asdict(config), sort_keys=True)
-            digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+        digest = '' if config is None else config.digest
         names = (absolute(path).name for path in recordings)
         # File names may contain bytes that are not UTF-8; label files may not.
         return cls(tuple(n.encode('utf-8', 'backslashreplace').decode() for n in names), digest)

@@ -25,7 +25,7 @@ BUILT_IN = {
     for name in (
         *('csv', 'parquet', 'openlabel', 'kitti', 'tracklets', 'nuscenes', 't4', 'argoverse2'),
         *('waymo', 'sustechpoints', 'datumaro', 'supervisely', 'xtreme1', 'mcap'),
-        *('semantickitti', 'lidarseg'),
+        *('semantickitti', 'lidarseg', 'recording'),
     )
 }
 GROUP = 'boxreg_ros.labels'
@@ -64,7 +64,11 @@ def labels_points(name: str) -> bool:
 
 
 def require_boxes(names: Sequence[str]) -> None:
-    """Raise ConfigError if one of the formats labels points."""
+    """Raise ConfigError if one of the formats labels points, or can only be read."""
+    for name in names:
+        if not hasattr(module_of(name), 'Writer'):
+            able = ', '.join(other for other in FORMATS if hasattr(import_format(other), 'Writer'))
+            raise ConfigError(f'format {name!r} can only be read; to write: {able}')
     for name in filter(labels_points, names):
         raise ConfigError(
             f'format {name!r} labels the points of clouds: expected formats of boxes; write it '
@@ -119,9 +123,10 @@ def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterat
     if not can_read(name):
         able = ', '.join(other for other in FORMATS if can_read(other))
         raise ConfigError(f'format {name!r} can only be written; readable: {able}')
-    if not path.exists():
-        raise RecordingError(f'labels {str(path)!r}: no such file or folder; correct the path')
     readable: Any = module
+    files = readable.drive_of(path) if hasattr(module, 'drive_of') else path
+    if not files.exists():
+        raise RecordingError(f'labels {str(files)!r}: no such file or folder; correct the path')
     frames: Iterator[LabelFrame]
     if scene is not None and hasattr(module, 'read_scene'):
         frames = readable.read_scene(path, scene)

@@ -14,7 +14,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.input_statistics import Drives, joined, to_text
 from boxreg_ros.core.latency import LateBoxes, Latency, set_latency
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.errors import ConfigError, TransformUnavailable
+from boxreg_ros.errors import ConfigError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.input_models import disagreements, read_models
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import Lidars, MergedSweep, SensorPlacement, SINGLE_LIDAR
@@ -25,6 +25,7 @@ from boxreg_ros.io.session import (
     JumpConfirmation,
     Session,
 )
+from boxreg_ros.io.stamp_order import kept
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.budget import TickBudget
@@ -58,6 +59,7 @@ class Outgoing(NamedTuple):
     given: BoxArray | None = None  # in the frame of the message; None if it is passed through
     refined: RefinedBoxes | None = None
     received: float | None = None  # when the input arrived [s]
+    in_fixed: RefinedBoxes | None = None  # the same as `refined`, as the registrar returns it
 
 
 class _Detection(NamedTuple):
@@ -445,6 +447,20 @@ class LiveRegistrar:
         self._held.append(_Passing(message))
         return []
 
+    def labels_passed_through(self, message: Any) -> RefinedBoxes | None:
+        """Return the boxes of a message that passed through as kept; None for unreadable ones."""
+        assert self.adapter is not None  # it has read the message
+        try:
+            boxes = self.adapter.from_msg(message)
+        except UnsupportedMessage:
+            return None
+        fixed_frame = self.session.fixed_frame
+        try:
+            T_fixed_boxes = self.session.tree.lookup(fixed_frame, boxes.frame_id, boxes.stamp_ns)
+        except TransformUnavailable:
+            return kept(boxes, Reason.NO_TRANSFORM)
+        return kept(boxes_to_frame(boxes, T_fixed_boxes, fixed_frame), Reason.BOXES_QUEUE_FULL)
+
     def _report_missing_transform(
         self, content: Sweep | BoxArray, reason: Reason, detail: str
     ) -> None:
@@ -539,7 +555,7 @@ class LiveRegistrar:
         if is_changed or T_output_item is not None or pending.has_new_ids or pending.is_late:
             covariances = covariances_to_write(moved)
             message = self.adapter.to_msg(message, moved.boxes, covariances, T_output_item)
-        return Outgoing(message, refined.is_final, pending.given, moved, pending.received)
+        return Outgoing(message, refined.is_final, pending.given, moved, pending.received, refined)
 
 
 def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:

@@ -11,6 +11,7 @@ from typing import Any
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.compilation import announced_compilation
+from boxreg_ros.io.label_messages import LABELS_TOPIC, LABELS_TYPE
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.warm_up import warm_up, warm_up_followed, warm_up_labels
 from boxreg_ros.io.whole_files import written_whole
@@ -229,6 +230,7 @@ class BoxregNode(Node):
         at_end = FINALS_MARGIN + config.lag + capacity  # published at once at the end
         early = self._topics.publish(type_name, 'refined_boxes', at_end)
         final = self._topics.publish(type_name, 'refined_boxes_final', at_end)
+        self.worker.labels = self._topics.publish(LABELS_TYPE, LABELS_TOPIC, at_end)
         self.worker.open_boxes(serialized or adapter, early, final)
         qos = QoSProfile(depth=2 * capacity, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._topics.subscribe(

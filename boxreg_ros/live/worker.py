@@ -12,6 +12,7 @@ from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.items import Item
+from boxreg_ros.io.label_messages import LabelMessage, to_text
 from boxreg_ros.io.markers import MarkerBoard
 from boxreg_ros.io.session import is_placeholder
 from boxreg_ros.live.budget import TickBudget
@@ -26,6 +27,7 @@ from msg_adapters.poses import stamp_ns
 from rclpy.duration import Duration
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.publisher import Publisher
+from std_msgs.msg import String
 
 TRANSFORM_PERIOD = 0.02
 """Longest pause between two looks whether the transforms of a message have arrived [s]."""
@@ -84,6 +86,7 @@ class Worker:
         self.static: Publisher | None = None  # of clouds without moving objects
         self._early: Publisher | None = None
         self._final: Publisher | None = None
+        self.labels: Publisher | None = None  # of all that label files hold of final boxes
         self._stopping = Event()
         self._confirmed: deque[Item] = deque()
         self._logged_layouts: set[str] = set()
@@ -260,6 +263,18 @@ class Worker:
             case _:
                 raise ValueError(f'kind: expected that of an event, got {kind!r}')
 
+    def _publish_labels(self, out: Outgoing) -> None:
+        """Publish all that label files hold of final boxes, while somebody subscribes."""
+        if self.labels is None or not self.labels.get_subscription_count():
+            return
+        refined = out.in_fixed
+        if refined is None:
+            refined = self._live.labels_passed_through(out.message)
+        if refined is not None:
+            fixed_frame = self._live.session.fixed_frame
+            content = LabelMessage(refined, fixed_frame, self._live.config.digest)
+            self.labels.publish(String(data=to_text(content)))
+
     def _follow(self, message: Any) -> None:
         assert self._live.adapter is not None  # set before boxes are subscribed to
         try:
@@ -317,6 +332,8 @@ class Worker:
             assert publisher is not None  # made before boxes are subscribed to
             publisher.publish(out.message)
             self._health.count('final_published' if out.is_final else 'early_published')
+            if out.is_final:
+                self._publish_labels(out)
             if not out.is_final and out.received is not None:
                 self._budget.end()
                 self._health.add_latency(time.monotonic() - out.received)

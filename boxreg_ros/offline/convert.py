@@ -1,4 +1,4 @@
-"""`boxreg convert`: label files of one format written in others."""
+"""`boxreg convert`: label files of one format, or a recording of the node, written in others."""
 
 from __future__ import annotations
 
@@ -16,11 +16,15 @@ from boxreg_ros.io.fixed_frame import FixedFrameItems, StoredCloud
 from boxreg_ros.io.lidars import SINGLE_LIDAR
 from boxreg_ros.labels import check_options, frames_of, LabelFrame, Provenance, writer_for
 from boxreg_ros.labels.cloud_spool import Spool
+from boxreg_ros.labels.recording import config_hash, drive_of
 from boxreg_ros.offline.arguments import add_options, values_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
 from boxreg_ros.offline.sources import label_frame_of
 from boxreg_ros.structures import BoxArray, Sweep
+
+FORMAT_OF_NODE = 'recording'
+"""Format of labels that are messages of a recording, which also has the clouds and poses."""
 
 
 def convert(request: Request, out: Path) -> dict[str, Any]:
@@ -35,9 +39,12 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
     """
     _check(request)
     source_format, source = _labels(request)
-    provenance = Provenance.of(request.recordings or (source,))
+    provenance = replace(
+        Provenance.of(request.recordings or (source,)),
+        config_hash=config_hash(source) if source_format == FORMAT_OF_NODE else '',
+    )
     counts: Counter[str] = Counter()
-    unused: dict[str, Any] = {'unreadable': 0, 'unused': ''}  # messages of the recording
+    unused: dict[str, Any] = {'unreadable': 0, 'unused': '', 'damage': []}  # of the recording
     with claimed(out), whole_folder(out, request.inputs()) as folder:
         writers = {
             name: writer_for(name, folder, provenance, request.options) for name in request.formats
@@ -130,7 +137,8 @@ def _read_with_recording(
                 continue
             refined = item.items[0].refined
             assert refined is not None  # boxes of label files have it
-            if isinstance(item.moved, BoxArray):
+            # To move boxes within the fixed frame would change their last digits.
+            if isinstance(item.moved, BoxArray) and item.given.frame_id != fixed_frame:
                 refined = replace(refined, boxes=item.moved)
             T_fixed_sensor = items.pose_of(sensor_frame, item.given.stamp_ns)
             frame = LabelFrame(refined, fixed_frame, sensor_frame, T_fixed_sensor)
@@ -138,7 +146,10 @@ def _read_with_recording(
                 yield frame
             else:
                 waiting.append(frame)
-        unused.update(unreadable=recording.unreadable.total(), unused=items.left_out())
+        unused.update(
+            unreadable=recording.unreadable.total(), unused=items.left_out(),
+            damage=[str(damage) for damage in recording.damages],
+        )  # fmt: skip
     if spool is not None:
         yield from map(spool.with_cloud, waiting)
         spool.remove()
@@ -156,7 +167,9 @@ def _with_clouds(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `run`."""
-    parser.add_argument('source', type=Path, metavar='SOURCE', help='label file or folder')
+    parser.add_argument(
+        'source', type=Path, metavar='SOURCE', help='labels, or a recording of the node'
+    )
     parser.add_argument(
         '-o',
         '--out',
@@ -187,8 +200,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert, and print one line with the counts."""
+    recordings = tuple(args.recording)
+    if args.source_format == FORMAT_OF_NODE and not recordings:
+        recordings = (drive_of(args.source),)
     request = Request(
-        tuple(args.recording),
+        recordings,
         labels=(args.source_format, args.source),
         formats=args.target_formats,
         **values_of(args, Request),
@@ -203,5 +219,7 @@ def run(args: argparse.Namespace) -> int:
         parts.append(f'{name} leaves out {reasons}')
     if summary['unused']:
         parts.append(summary['unused'])
+    if summary['damage']:
+        parts.append(f'damaged, and read as far as possible: {"; ".join(summary["damage"])}')
     print('; '.join(parts))
     return 0

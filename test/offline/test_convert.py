@@ -24,7 +24,7 @@ R_rect: 1 0 0 0 1 0 0 0 1
 Tr_velo_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0
 """
 
-NO_STATUS = {'kitti', 'tracklets', 'mcap'}
+NO_STATUS = {'kitti', 'tracklets', 'mcap', 'recording'}
 WITH_STATUS = tuple(
     sorted(name for name in FORMATS if not labels_points(name) and name not in NO_STATUS)
 )
