@@ -19,6 +19,7 @@ from boxreg_ros.datasets.files import at_stamp, pose_rows, read_cloud, require, 
 from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, SceneFrames
+from boxreg_ros.labels.clouds import BIN_COLUMNS
 from boxreg_ros.labels.files import frame_names, from_json, json_items
 from boxreg_ros.labels.nuscenes import pose_matrix
 from boxreg_ros.structures import Floats, Ints
@@ -33,10 +34,8 @@ DATASET = Dataset(
     remedy='unpack its metadata and LiDAR archives into one folder',
     packages=('ijson',),
 )
-EGO_FRAME = 'ego'
+MERGED_FRAME = 'ego'
 """Frame of the clouds of several LiDARs."""
-POINT_COLUMNS = 5
-"""Numbers per point of a BIN file: x y z intensity ring; T4 may state more beside a file."""
 POSE_MARGIN_NS = 10**9
 """Poses are read so long before the first and after the last sweep [ns]; chosen."""
 
@@ -138,7 +137,7 @@ def _scene(
         # The stamp of a sample is that of its sweep, which our own exports have in nanoseconds.
         stamps_ns |= {row['sample_token']: _stamp_ns(row) for row in sweeps if row['is_key_frame']}
     by_time = dict(sorted(stamps_ns.items(), key=lambda item: item[1]))
-    sensor_frame = EGO_FRAME if is_in_ego else names
+    sensor_frame = MERGED_FRAME if is_in_ego else names
     frames = SceneFrames(scene['name'], by_time, *frame_names(root, 'map', sensor_frame))
     if has_all_poses:
         motion = _motion(tables, sweeps)
@@ -231,10 +230,10 @@ def _sweep_files(
 
 def _cloud(root: Path, row: dict[str, Any]) -> Cloud:
     """Return the cloud of a row of ``sample_data`` in the frame of its LiDAR."""
-    columns = POINT_COLUMNS
+    columns = BIN_COLUMNS['.pcd.bin']
     about = row.get('info_filename')
     if about and (root / about).is_file():
-        columns = int(from_json(root / about).get('num_pts_feats', POINT_COLUMNS))
+        columns = int(from_json(root / about).get('num_pts_feats', columns))  # of T4
     return read_cloud(root / row['filename'], _stamp_ns(row), row['fileformat'], columns)
 
 
