@@ -218,6 +218,47 @@ def skip_package_init(name):
     sys.modules[name] = package
 
 
+def av2_precision(folder):
+    """Return the average precision of the cuboids of a log as detections of themselves."""
+    from av2.evaluation.detection.eval import evaluate
+    from av2.evaluation.detection.utils import DetectionCfg
+    import pandas as pd
+
+    table = pd.read_feather(Path(folder, 'annotations.feather'))
+    table['log_id'] = 'log'
+    table['num_interior_pts'] = table['num_interior_pts'].clip(1)
+    configuration = DetectionCfg(eval_only_roi_instances=False)
+    detections = table.assign(score=table['score'])
+    scores = evaluate(detections, table, configuration, n_jobs=1)[2]
+    return {name: float(value) for name, value in scores['AP'].items() if value > 0}
+
+
+def nuscenes_precision(folder, version):
+    """Return the average precision of annotations as detections of themselves, by class."""
+    from nuscenes.eval.common.data_classes import EvalBoxes
+    from nuscenes.eval.common.utils import center_distance
+    from nuscenes.eval.detection.algo import accumulate, calc_ap
+    from nuscenes.eval.detection.data_classes import DetectionBox
+    from nuscenes.eval.detection.utils import category_to_detection_name
+    from nuscenes.nuscenes import NuScenes
+
+    data = NuScenes(version, folder, verbose=False)
+    boxes = EvalBoxes()
+    for row in data.sample_annotation:
+        name = category_to_detection_name(row['category_name'])
+        if name is not None:
+            boxes.add_boxes(row['sample_token'], [DetectionBox(
+                row['sample_token'], tuple(row['translation']), tuple(row['size']),
+                tuple(row['rotation']), (0.0, 0.0), num_pts=row['num_lidar_pts'],
+                detection_name=name, detection_score=row['score'],
+            )])  # fmt: skip
+    found = {box.detection_name for box in boxes.all}
+    return {
+        name: float(calc_ap(accumulate(boxes, boxes, name, center_distance, 0.5), 0.0, 0.0))
+        for name in found
+    }
+
+
 def av2(path):
     """Return centre, extents, rotation and vertices of every cuboid."""
     from av2.structures.cuboid import CuboidList

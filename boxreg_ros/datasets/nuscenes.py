@@ -21,7 +21,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, SceneFrames
 from boxreg_ros.labels.clouds import BIN_COLUMNS
 from boxreg_ros.labels.files import frame_names, from_json, json_items
-from boxreg_ros.labels.nuscenes import pose_matrix
+from boxreg_ros.labels.nuscenes import own_values, pose_matrix
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
 
@@ -192,11 +192,13 @@ def _sweeps_of_scene(
 
     """
     found: dict[str, dict[str, Any]] = {}
+    own = own_values(tables.parent)
     without_sample: dict[str, dict[str, Any]] = {}
     is_only_scene = len(list(_rows(tables, 'scene'))) == 1
     for row in _rows(tables, 'sample_data'):
         if row['calibrated_sensor_token'] not in lidars.mounts:
             continue
+        row |= own.get(row['token'], {})
         if row['sample_token'] in samples or (is_only_scene and not row['sample_token']):
             found[row['token']] = row
         elif not row['sample_token']:

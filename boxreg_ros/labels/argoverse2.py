@@ -2,8 +2,8 @@
 Argoverse 2: Feather tables of one log, boxes in the frame of the ego vehicle.
 
 The sensor frame is written as the ego vehicle frame, with an identity calibration;
-``--label-frame`` chooses another frame. Status, reason, score and covariance are additional
-columns.
+``--label-frame`` chooses another frame. Status, reason, score, covariance and the class name as
+given are additional columns.
 
 """
 
@@ -41,7 +41,7 @@ FORMAT = Format(
     rotation='quaternion w x y z',
     files='annotations.feather, city_SE3_egovehicle.feather, calibration/, sensors/',
     packages=('pyarrow',),
-    options=('with_points',),
+    options=('with_points', 'class_map'),
 )
 POSE_COLUMNS = dict.fromkeys(('qw', 'qx', 'qy', 'qz', 'tx_m', 'ty_m', 'tz_m'), 'double')
 EXTENT_COLUMNS = dict.fromkeys(('length_m', 'width_m', 'height_m'), 'double')
@@ -53,6 +53,8 @@ ANNOTATION_COLUMNS = {
     **POSE_COLUMNS,
     'num_interior_pts': 'int64',
 }
+GIVEN_CLASS = 'class_name'
+"""Column with the name of which `category` is the translation."""
 POINT_COLUMNS = {'intensity': 'uint8', 'laser_number': 'uint8', 'offset_ns': 'int32'}
 NEEDED_COLUMNS = sorted(ANNOTATION_COLUMNS.keys() - {'track_uuid', 'num_interior_pts'})
 """Detections that are submitted lack the others."""
@@ -68,12 +70,13 @@ LIDAR_NAME = 'up_lidar'
 class Writer(FolderWriter):
     """Write annotations and poses in batches."""
 
+    form = 'argoverse2'
     folders = ('calibration',)
     cloud_file = 'sensors/lidar/{name}.feather'
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
-        columns = ANNOTATION_COLUMNS | EVIDENCE_COLUMNS
+        columns = ANNOTATION_COLUMNS | EVIDENCE_COLUMNS | {GIVEN_CLASS: 'string'}
         self._annotations = self.table(FEATHER_FILE, columns, to_json(self.about))
         self._poses = self.table(EGO_POSES_FILE, {'timestamp_ns': 'int64'} | POSE_COLUMNS)
         calibration = self.table(CALIBRATION_FILE, {'sensor_name': 'string'} | POSE_COLUMNS)
@@ -89,12 +92,13 @@ class Writer(FolderWriter):
             self._annotations.add(
                 array.stamp_ns,
                 array.track_ids[row],
-                array.class_names[row],
+                self.class_names.of(array.class_names[row]),
                 *box[BOX_EXTENT],
                 *quaternion,
                 *box[BOX_CENTER],
                 int(refined.num_points[row]),
                 *evidence_of(refined, row).values(),
+                array.class_names[row],
             )
         if frame.T_fixed_sensor is not None:
             self._poses.add(array.stamp_ns, *_pose_values(frame.T_fixed_sensor))
@@ -162,7 +166,7 @@ def _refined(table: Any, frame_id: str) -> Iterator[RefinedBoxes]:
             stamp_ns,
             frame_id,
             [item.get('track_uuid') or '' for item in items],
-            [item['category'] for item in items],
+            [item.get(GIVEN_CLASS) or item['category'] for item in items],
             boxes_from_quaternions(poses_xyz_xyzw[:, :3], extents, poses_xyz_xyzw[:, 3:]),
             [item | {'num_points': item.get('num_interior_pts')} for item in items],
         )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TextIO
 
 from boxreg_ros.labels.arrow import Table
+from boxreg_ros.labels.class_names import ClassNames
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import write_provenance
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
@@ -39,6 +40,8 @@ class FolderWriter:
     """Whether a frame without a cloud gets an empty file, because the tool needs one."""
     needs_pose: ClassVar[bool] = False
     """Whether frames without a pose of the sensor are dropped."""
+    form: ClassVar[str] = ''
+    """Name of the format, by which class names are translated; empty if they stay as given."""
     has_sidecar: ClassVar[bool] = False
     """Whether stamps and poses are written beside the labels, as in `sidecar`."""
 
@@ -50,6 +53,7 @@ class FolderWriter:
         self.about: dict[str, Any] = asdict(provenance)
         self._used_stamps: Counter[int] = Counter()
         self.files = ExitStack()
+        self.class_names = ClassNames(self.form, options.class_map if self.form else None)
         self._with_points = options.with_points and self.cloud_file != ''
         for name in self.folders:
             (folder / name).mkdir(parents=True)
@@ -104,6 +108,8 @@ class FolderWriter:
         """Complete the files."""
         self.finish()
         self.files.close()
+        if self.class_names.translated:
+            self.about['class_names'] = self.class_names.translated
         write_provenance(self.folder, self.about)
 
 

@@ -39,14 +39,9 @@ FORMAT = Format(
     sizes='height width length',
     rotation="rotation_y about the camera's y; roll and pitch are lost",
     files='label_02/, calib/, velodyne/',
-    options=('camera', 'with_points'),
+    options=('camera', 'with_points', 'class_map'),
 )
 SEQUENCE = '0000'
-KITTI_CLASSES = {
-    name.lower(): name
-    for name in ('Car', 'Van', 'Truck', 'Pedestrian', 'Person_sitting', 'Cyclist', 'Tram', 'Misc')
-}
-"""Class names as the benchmark spells them; others are written unchanged."""
 INSIDE_IMAGE, TRUNCATED, OUTSIDE_IMAGE = 0, 1, 2
 """Values of truncation."""
 UNKNOWN_OCCLUSION = 3
@@ -63,6 +58,7 @@ class Writer(FolderWriter):
 
     """
 
+    form = 'kitti'
     folders = ('label_02', 'calib')
     cloud_file = f'velodyne/{SEQUENCE}/{{number:06d}}.bin'
     has_sidecar = True
@@ -73,6 +69,7 @@ class Writer(FolderWriter):
         _write_calibration(self._camera, folder / 'calib' / f'{SEQUENCE}.txt')
         self._file = self.text_file(f'label_02/{SEQUENCE}.txt')
         self._tracks = TrackNumbers()
+        self._given_classes: dict[str, str] = {}  # by number of the track and class as written
 
     def add(self, frame: LabelFrame) -> None:
         """Add the lines of a frame."""
@@ -93,7 +90,10 @@ class Writer(FolderWriter):
             if np.isfinite(array.scores[row]):
                 numbers.append(array.scores[row])
             track = self._tracks.of(array.track_ids[row])
-            name = _kitti_class(array.class_names[row])
+            given = array.class_names[row]
+            name = '_'.join(self.class_names.of(given).split()) or 'Misc'
+            if name != given:
+                self._given_classes[f'{track} {name}'] = given
             self._file.write(f'{self.number} {track} {name} {truncation[i]} {UNKNOWN_OCCLUSION} ')
             self._file.write(' '.join(f'{value:.6f}' for value in numbers) + '\n')
 
@@ -101,6 +101,8 @@ class Writer(FolderWriter):
         """Name the tracks."""
         if names := self._tracks.names():
             self.about['tracks'] = names
+        if self._given_classes:
+            self.about['given_classes'] = self._given_classes
 
 
 class _Line(NamedTuple):
@@ -180,7 +182,8 @@ def _boxes_by_frame(
     path: Path, lines: Sequence[_Line], camera: Camera
 ) -> dict[int, list[ReadBox]]:
     """Return the boxes of a label file in the LiDAR frame; tracks have the names beside it."""
-    tracks = read_provenance(absolute(path).parent.parent).get('tracks', {})
+    about = read_provenance(absolute(path).parent.parent)
+    tracks, given = about.get('tracks', {}), about.get('given_classes', {})
     numbers = np.array([line.numbers for line in lines]).reshape(-1, 7)
     centres = numbers[:, 3:6].copy()
     centres[:, 1] -= numbers[:, 0] / 2
@@ -188,7 +191,8 @@ def _boxes_by_frame(
     found: dict[int, list[ReadBox]] = {}
     for line, box in zip(lines, boxes, strict=True):
         track_id = tracks.get(line.track, line.track)
-        read_box = ReadBox(track_id, line.class_name, box, {'score': line.score})
+        class_name = given.get(f'{line.track} {line.class_name}', line.class_name)
+        read_box = ReadBox(track_id, class_name, box, {'score': line.score})
         found.setdefault(line.frame, []).append(read_box)
     return found
 
@@ -204,9 +208,3 @@ def _write_calibration(camera: Camera, path: Path) -> None:
         for name, values in parts.items():
             numbers = ' '.join(f'{value:.12e}' for value in values.ravel())
             file.write(f'{name}: {numbers}\n')
-
-
-def _kitti_class(class_name: str) -> str:
-    """Return a class name without spaces, as the benchmark spells it."""
-    name = '_'.join(class_name.split()) or 'Misc'
-    return KITTI_CLASSES.get(name.lower(), name)

@@ -12,12 +12,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from boxreg_ros.config import words_of
 from boxreg_ros.labels import nuscenes
+from boxreg_ros.labels.class_names import NUSCENES, official
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.structures import Ints, RefinedBoxes
 import numpy as np
@@ -33,32 +32,8 @@ FORMAT = replace(
     options=(),
     has_points=True,
 )
-CATEGORIES = (
-    'noise', 'animal', 'human.pedestrian.adult', 'human.pedestrian.child',
-    'human.pedestrian.construction_worker', 'human.pedestrian.personal_mobility',
-    'human.pedestrian.police_officer', 'human.pedestrian.stroller',
-    'human.pedestrian.wheelchair', 'movable_object.barrier', 'movable_object.debris',
-    'movable_object.pushable_pullable', 'movable_object.trafficcone',
-    'static_object.bicycle_rack', 'vehicle.bicycle', 'vehicle.bus.bendy', 'vehicle.bus.rigid',
-    'vehicle.car', 'vehicle.construction', 'vehicle.emergency.ambulance',
-    'vehicle.emergency.police', 'vehicle.motorcycle', 'vehicle.trailer', 'vehicle.truck',
-    'flat.driveable_surface', 'flat.other', 'flat.sidewalk', 'flat.terrain', 'static.manmade',
-    'static.other', 'static.vegetation', 'vehicle.ego',
-)  # fmt: skip
-"""Categories of nuScenes-lidarseg by their index; the devkit knows no others."""
-UNKNOWN_CATEGORY = CATEGORIES.index('noise')
-BACKGROUND_CATEGORY = CATEGORIES.index('static.other')
-CATEGORY_OF_WORDS = (
-    (('motorcycle', 'motorcyclist', 'motorbike'), 'vehicle.motorcycle'),
-    (('cyclist', 'bicyclist', 'rider', 'bicycle', 'bike'), 'vehicle.bicycle'),
-    (('child',), 'human.pedestrian.child'),
-    (('pedestrian', 'person', 'adult', 'human'), 'human.pedestrian.adult'),
-    (('bus',), 'vehicle.bus.rigid'),
-    (('trailer',), 'vehicle.trailer'),
-    (('construction',), 'vehicle.construction'),
-    (('truck', 'lorry'), 'vehicle.truck'),
-    (('animal',), 'animal'),
-)
+UNKNOWN_CATEGORY = NUSCENES.index('noise')
+BACKGROUND_CATEGORY = NUSCENES.index('static.other')
 OTHER_CATEGORY = 'vehicle.car'
 """Other class names are those of vehicles, as everywhere in the package."""
 MAX_PANOPTIC_INSTANCE = 999
@@ -73,7 +48,7 @@ class Writer(nuscenes.Writer):
         self._rows: dict[str, list[dict[str, str]]] = {'lidarseg': [], 'panoptic': []}
         for name in self._rows:
             (folder / name / self.version).mkdir(parents=True)
-        for name in CATEGORIES:
+        for name in NUSCENES:
             self._categories[name] = self._token('category', name)
         self._codes: Ints | None = None
 
@@ -122,20 +97,13 @@ def codes_of(tracks: Sequence[ObjectTrack]) -> Ints:
         name = category_of(track.class_name)
         counts[name] += 1
         instance = counts[name] if counts[name] <= MAX_PANOPTIC_INSTANCE else 0
-        codes.append(1000 * CATEGORIES.index(name) + instance)
+        codes.append(1000 * NUSCENES.index(name) + instance)
     # The last two entries are those of the track numbers -2 and -1.
     assert (UNKNOWN, BACKGROUND) == (-2, -1)
     ends = [1000 * UNKNOWN_CATEGORY, 1000 * BACKGROUND_CATEGORY]
     return np.array([*codes, *ends], np.uint16)
 
 
-@cache
 def category_of(class_name: str) -> str:
     """Return the category of objects with a class name."""
-    if class_name in CATEGORIES:
-        return class_name
-    words = words_of(class_name)
-    for names, category in CATEGORY_OF_WORDS:
-        if not words.isdisjoint(names):
-            return category
-    return OTHER_CATEGORY
+    return official(class_name, NUSCENES, OTHER_CATEGORY)

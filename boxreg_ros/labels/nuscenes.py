@@ -3,8 +3,9 @@ nuScenes: its thirteen tables with one scene, boxes in the global frame. T4 is a
 
 The sensor frame is written as the ego vehicle frame, with an identity calibration;
 ``--label-frame`` chooses another frame. A sample is a box array with a known pose. Additional
-columns of annotations are status, reason, score, covariance and the stamp in nanoseconds, of
-sweeps the stamp, of instances the track id. A track that changes its class is several instances.
+columns of annotations are status, reason, score, covariance, the class name as given and the stamp
+in nanoseconds, of sweeps the stamp, of instances the track id. A track that changes its class is
+several instances. T4 has these values in a file beside its tables.
 
 """
 
@@ -45,10 +46,12 @@ FORMAT = Format(
     sizes='width length height',
     rotation='quaternion w x y z',
     files='v1.0-boxreg/, samples/, maps/',
-    options=('with_points',),
+    options=('with_points', 'class_map'),
 )
 STREAMED_TABLES = ('sample', 'sample_data', 'sample_annotation', 'ego_pose')
 """Tables that grow with the recording; their rows are written one by one."""
+OWN_VALUES = 'boxreg_values.json'
+"""Values without a column in the tables of T4, by the token of their row."""
 EMPTY_MAP = 'maps/empty.png'
 
 
@@ -61,6 +64,7 @@ class Writer(FolderWriter):
 
     """
 
+    form = 'nuscenes'
     version = 'v1.0-boxreg'
     channel = 'LIDAR_TOP'
     cloud_file = 'samples/LIDAR_TOP/{number:05d}.pcd.bin'
@@ -120,10 +124,11 @@ class Writer(FolderWriter):
                 'scene_token': self._token('scene'),
             },
         )
+        sweep = self._token('sample_data', self.number)
         self._link(
             'sample_data',
             {
-                'token': self._token('sample_data', self.number),
+                'token': sweep,
                 'sample_token': sample,
                 'ego_pose_token': pose,
                 'calibrated_sensor_token': self._token('calibrated_sensor'),
@@ -136,7 +141,7 @@ class Writer(FolderWriter):
                 'prev': '',
                 'next': '',
                 'is_valid': True,
-                'stamp_ns': stamp_ns,
+                **self._own_columns(sweep, {'stamp_ns': stamp_ns}),
             },
         )
         qx, qy, qz, qw = quaternion_from_matrix(T_fixed_sensor[:3, :3]).tolist()
@@ -165,7 +170,7 @@ class Writer(FolderWriter):
         keys_in_sample: set[str] = set()
         for row, centre, size, quaternion in places:
             track_id = array.track_ids[row]
-            class_name = array.class_names[row]
+            class_name = self.class_names.of(array.class_names[row])
             key = f'{track_id}\0{class_name}'
             is_single = not track_id or key in keys_in_sample  # no identity
             if is_single:
@@ -173,6 +178,8 @@ class Writer(FolderWriter):
                 key = f'\0{self._num_single}'
             keys_in_sample.add(key)
             token = self._token('annotation', f'{sample} {key}')
+            own = self._evidence(refined, row) | {'stamp_ns': array.stamp_ns}
+            own['class_name'] = array.class_names[row]
             annotation = {
                 'token': token,
                 'sample_token': sample,
@@ -186,13 +193,16 @@ class Writer(FolderWriter):
                 'num_radar_pts': 0,
                 'prev': '',
                 'next': '',
-                **self._evidence(refined, row),
-                'stamp_ns': array.stamp_ns,
+                **self._own_columns(token, own),
             }
             if is_single:
                 self._streams['sample_annotation'].append(annotation)
             else:
                 self._link('sample_annotation', annotation, key)
+
+    def _own_columns(self, token: str, values: dict[str, Any]) -> dict[str, Any]:
+        """Return the columns for values that the devkit does not know; it ignores them."""
+        return values
 
     def _evidence(self, refined: RefinedBoxes, row: int) -> dict[str, Any]:
         """Return what an annotation states beside the columns of the devkit."""
@@ -296,8 +306,10 @@ def _read_tables(tables: Path) -> Iterator[LabelFrame]:
     instances = {item['token']: item for item in files.from_json(tables / 'instance.json')}
     poses = _poses(tables)
     annotations: dict[str, list[dict[str, Any]]] = {}
+    own = own_values(tables.parent)
     for item in files.from_json(tables / 'sample_annotation.json'):
-        annotations.setdefault(item['sample_token'], []).append(item)
+        whole = item | own.get(item['token'], {})
+        annotations.setdefault(item['sample_token'], []).append(whole)
     samples = sorted(files.from_json(tables / 'sample.json'), key=lambda item: item['timestamp'])
     fixed_frame, sensor_frame = files.frame_names(tables.parent)
     names = _category_names(tables)
@@ -325,9 +337,10 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
 def _scene_annotations(tables: Path, scene: SceneFrames) -> dict[str, RefinedBoxes]:
     """Return the annotations of a scene by sample."""
     annotations: dict[str, list[dict[str, Any]]] = {token: [] for token in scene.stamps_ns}
+    own = own_values(tables.parent)
     for item in files.json_items(tables / 'sample_annotation.json'):
         if item['sample_token'] in annotations:
-            annotations[item['sample_token']].append(item)
+            annotations[item['sample_token']].append(item | own.get(item['token'], {}))
     used = {item['instance_token'] for items in annotations.values() for item in items}
     rows = files.json_items(tables / 'instance.json')
     instances = {item['token']: item for item in rows if item['token'] in used}
@@ -367,6 +380,12 @@ def _scene_results(path: Path, scene: SceneFrames) -> dict[str, RefinedBoxes]:
     return found
 
 
+def own_values(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return what our exports of T4 state beside the tables, by token; empty for others."""
+    path = folder / OWN_VALUES
+    return {item['token']: item for item in files.json_items(path)} if path.is_file() else {}
+
+
 def _category_names(tables: Path) -> dict[str, str]:
     return {item['token']: item['name'] for item in files.from_json(tables / 'category.json')}
 
@@ -384,7 +403,10 @@ def _annotated(
         stamp_ns,
         frame_id,
         [track.get('instance_name') or track['token'] for track in tracks],
-        [_row_of(names, track['category_token'], 'category') for track in tracks],
+        [
+            item.get('class_name') or _row_of(names, track['category_token'], 'category')
+            for item, track in zip(items, tracks, strict=True)
+        ],
         _boxes_of(items),
         [item | {'num_points': item['num_lidar_pts']} for item in items],
     )

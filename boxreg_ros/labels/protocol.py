@@ -155,6 +155,12 @@ class Options:
     swap_axes: bool = option(
         False, 'write the extents in the order that Datumaro and CVAT display them'
     )
+    class_map: Path | None = option(
+        None,
+        'class names to write, a YAML file of lines CLASS: NAME; beside those of the evaluation',
+        metavar='FILE',
+        parse=Path,
+    )
     recording: Recording | None = None
     """Source, open or closed, for formats that copy it."""
 

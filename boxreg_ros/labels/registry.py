@@ -11,6 +11,7 @@ from typing import Any, cast
 
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.labels.camera import Camera
+from boxreg_ros.labels.class_names import ClassNames
 from boxreg_ros.labels.protocol import (
     FormatModule,
     LabelFrame,
@@ -36,7 +37,7 @@ FORMATS = BUILT_IN | {
 """Name on the command line -> module that implements `protocol.FormatModule`."""
 IN_RESULT_FOLDER = ('csv', 'mcap')
 """Formats of a single file that is written into the folder of results itself."""
-COMMAND_LINE_OPTIONS = ('camera', 'with_points', 'swap_axes')
+COMMAND_LINE_OPTIONS = ('camera', 'with_points', 'swap_axes', 'class_map')
 """Fields of `protocol.Options` that a user sets by name."""
 
 
@@ -94,6 +95,8 @@ def check_options(names: Sequence[str], options: Options) -> None:
                 f'({", ".join(able)}), got {", ".join(names)}; add one, or leave it out'
             )
     for name in names:
+        if 'class_map' in module_of(name).FORMAT.options:
+            ClassNames(name, options.class_map)  # raises for other names
         if 'camera' in module_of(name).FORMAT.options:
             Camera.read(options.camera, f'format {name}')
 

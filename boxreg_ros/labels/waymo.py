@@ -32,6 +32,7 @@ FORMAT = Format(
     rotation='heading about z; roll and pitch are lost',
     files='lidar_box/, vehicle_pose/',
     packages=('pyarrow',),
+    options=('class_map',),
 )
 SEGMENT = 'key.segment_context_name'
 MICROSECONDS = 'key.frame_timestamp_micros'
@@ -76,6 +77,7 @@ TYPE_NAMES = ('', 'vehicle', 'pedestrian', 'sign', 'cyclist')
 class Writer(FolderWriter):
     """Write boxes and poses in batches."""
 
+    form = 'waymo'
     folders = ('lidar_box', 'vehicle_pose')
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
@@ -99,7 +101,7 @@ class Writer(FolderWriter):
                 *box[BOX_CENTER],
                 *box[BOX_EXTENT],
                 float(wrap_angle(box[YAW])),
-                _type(array.class_names[row]),
+                _type(self.class_names.of(array.class_names[row])),
                 int(refined.num_points[row]),
                 *[None] * len(UNUSED_COLUMNS),
                 array.stamp_ns,

@@ -27,12 +27,14 @@ import sys
 import tracemalloc
 from xml.etree import ElementTree
 
+from boxreg_ros import __version__
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import COLUMNS
 from boxreg_ros.io.transforms import inverse
 from boxreg_ros.labels import (
     arrow,
     can_read,
+    check_options,
     FORMATS,
     frames_of,
     LabelFrame,
@@ -240,13 +242,132 @@ def test_nuscenes(tmp_path, name, version):
     assert row['translation'] == [13.0, 8.0, 2.0]
     assert row['size'] == [2.0, 4.0, 1.6]
     np.testing.assert_allclose(row['rotation'], [w, x, y, z], atol=1e-9)
+    if name == 't4':  # its devkit refuses columns that it does not know
+        (_, own) = json.loads((folder / 'boxreg_values.json').read_text())
+        assert own['token'] == row['token']
+        model = {'name': f'boxreg_ros {__version__}', 'score': 0.75, 'uncertainty': None}
+        assert (row['automatic_annotation'], row['autolabel_metadata']) == (True, [model])
+        row |= own
     assert (row['num_lidar_pts'], row['status'], row['score']) == (42, 'refined', 0.75)
+    assert row['class_name'] == 'Car'
     np.testing.assert_allclose(np.reshape(row['covariance'], (6, 6)), COVARIANCE)
     (sample,) = json.loads((folder / version / 'sample.json').read_text())
     assert sample['timestamp'] == 1_700_000_000_123_457
     (pose,) = json.loads((folder / version / 'ego_pose.json').read_text())
     assert pose['translation'] == [10.0, 2.0, 1.0]
     np.testing.assert_allclose(pose['rotation'], [sqrt(0.5), 0, 0, sqrt(0.5)], atol=1e-9)
+
+
+T4_COLUMNS = {
+    'sample_annotation': 'token sample_token instance_token attribute_tokens visibility_token '
+    'translation size rotation num_lidar_pts num_radar_pts next prev velocity acceleration '
+    'automatic_annotation autolabel_metadata',
+    'sample_data': 'token sample_token ego_pose_token calibrated_sensor_token filename fileformat '
+    'width height timestamp is_key_frame next prev is_valid info_filename autolabel_metadata',
+    'sample': 'token timestamp scene_token next prev',
+    'ego_pose': 'token translation rotation timestamp twist acceleration geocoordinate',
+    'instance': 'token category_token instance_name nbr_annotations first_annotation_token '
+    'last_annotation_token',
+    'category': 'token name description index has_orientation has_number',
+    'calibrated_sensor': 'token sensor_token translation rotation camera_intrinsic '
+    'camera_distortion',
+    'sensor': 'token channel modality',
+    'scene': 'token name description log_token nbr_samples first_sample_token last_sample_token',
+    'log': 'token logfile vehicle data_captured location',
+    'map': 'token log_tokens category filename',
+    'visibility': 'token level description',
+    'attribute': 'token name description',
+}
+"""Columns that t4-devkit 0.8.0 takes; it raises for others. The registry has only 0.1.0 of it."""
+
+
+def test_t4_has_no_columns_that_its_devkit_refuses(tmp_path):
+    places = [[13.0 + 0.5 * i**2, *IN_FIXED[1:]] for i in range(4)]
+    stamps = [STAMP + i * 5 * 10**8 for i in range(3)] + [STAMP + 10**10]
+    frames = [frame_of([box], stamp_ns=stamp) for box, stamp in zip(places, stamps, strict=True)]
+    human = replace(frames[1].refined, status=('human',))
+    frames[1] = replace(frames[1], refined=human)
+    _, folder = written('t4', tmp_path, frames)
+    tables = {path.stem: json.loads(path.read_text()) for path in folder.glob('annotation/*')}
+    assert tables.keys() == T4_COLUMNS.keys()
+    for name, rows in tables.items():
+        for row in rows:
+            assert row.keys() <= set(T4_COLUMNS[name].split())
+    rows = sorted(tables['sample_annotation'], key=lambda row: row['translation'][0])
+    # 0, 0.5, 2 and 4.5 m after 0, 0.5, 1 and 10 s: the last one is after a gap.
+    assert [row['velocity'] for row in rows] == [[1, 0, 0], [2, 0, 0], [3, 0, 0], None]
+    assert [row['automatic_annotation'] for row in rows] == [True, False, True, True]
+    assert rows[1]['autolabel_metadata'] is None
+    (again, *_) = frames_of('t4', folder)
+    assert (again.refined.boxes.stamp_ns, again.refined.reasons) == (STAMP, ('',))
+
+
+OFFICIAL_CLASSES = {
+    'nuscenes': {
+        'Car': 'vehicle.car', 'truck': 'vehicle.truck', 'VEHICLE.CAR': 'vehicle.car',
+        'Pedestrian': 'human.pedestrian.adult', 'REGULAR_VEHICLE': 'vehicle.car',
+        'CONSTRUCTION_CONE': 'movable_object.trafficcone', 'ufo': 'ufo',
+        'Van': 'vehicle.bus.rigid',
+    },
+    'argoverse2': {
+        'Car': 'REGULAR_VEHICLE', 'vehicle.bus.bendy': 'ARTICULATED_BUS', 'bicycle': 'BICYCLE',
+        'rider': 'BICYCLIST', 'box_truck': 'BOX_TRUCK', 'ufo': 'ufo', 'Van': 'BUS',
+    },
+    'kitti': {
+        'vehicle.car': 'Car', 'PEDESTRIAN': 'Pedestrian', 'vehicle.bus.rigid': 'Misc',
+        'two words': 'two_words', 'Van': 'Truck',
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('name', OFFICIAL_CLASSES)
+def test_class_names_are_those_of_the_evaluation_and_ours_are_read_back(tmp_path, name):
+    class_map = tmp_path / 'classes.yaml'
+    class_map.write_text(
+        'nuscenes: {Van: vehicle.bus.rigid}\nargoverse2: {Van: BUS}\nkitti: {Van: Truck}\n'
+    )
+    classes = OFFICIAL_CLASSES[name]
+    frames = [
+        frame_of(tracks=(str(i),), stamp_ns=STAMP + i * 10**6, class_name=given)
+        for i, given in enumerate(classes)
+    ]
+    _, folder = written(name, tmp_path / 'out', frames, class_map=class_map)
+    found = [frame.refined.boxes.class_names for frame in frames_of(name, folder)]
+    assert found == [(given,) for given in classes]
+    if name == 'nuscenes':
+        tables = folder / 'v1.0-boxreg'
+        rows = json.loads((tables / 'category.json').read_text())
+        assert {row['name'] for row in rows} == set(classes.values())
+    elif name == 'argoverse2':
+        rows = import_module('pyarrow.feather').read_table(folder / 'annotations.feather')
+        assert rows['category'].to_pylist() == list(classes.values())
+    else:
+        lines = (folder / 'label_02/0000.txt').read_text().splitlines()
+        assert [line.split()[2] for line in lines] == list(classes.values())
+    about = json.loads((folder / 'boxreg.json').read_text())['class_names']
+    assert about['Van'] == classes['Van'] and 'ufo' not in about
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('car: BUSS', "'car': expected a class of the format 'argoverse2' .*, got 'BUSS'"),
+        ('[car]', 'expected lines CLASS: NAME'),
+        ('car: [', 'not a map of class names'),
+        (None, 'No such file'),
+    ],
+)
+def test_a_wrong_class_map_is_refused(tmp_path, text, message):
+    path = tmp_path / 'classes.yaml'
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        check_options(['argoverse2'], Options(class_map=path))
+
+
+def test_a_class_map_needs_a_format_that_uses_it(tmp_path):
+    with pytest.raises(ConfigError, match='--class-map: expected a format that uses it'):
+        check_options(['csv'], Options(class_map=tmp_path))
 
 
 def test_two_boxes_of_one_track_in_a_sample_of_nuscenes_are_two_instances(tmp_path):
@@ -271,7 +392,8 @@ def test_argoverse2(tmp_path):
     _, folder = written('argoverse2', tmp_path)
     (row,) = feather.read_table(folder / 'annotations.feather').to_pylist()
     x, y, z, w = XYZW_SENSOR
-    assert (row['timestamp_ns'], row['track_uuid'], row['category']) == (STAMP, '7', 'Car')
+    assert (row['timestamp_ns'], row['track_uuid']) == (STAMP, '7')
+    assert (row['category'], row['class_name']) == ('REGULAR_VEHICLE', 'Car')
     assert [row[f'{side}_m'] for side in ('length', 'width', 'height')] == EXTENT
     quaternion = [row[name] for name in ('qw', 'qx', 'qy', 'qz')]
     np.testing.assert_allclose(quaternion, [w, x, y, z], atol=1e-9)
@@ -606,14 +728,14 @@ def test_nuscenes_devkit_reads_the_labels(tmp_path):
     sweep = Sweep(STAMP, 'lidar', POINTS)
     later = [14.0, *IN_FIXED[1:]]  # 1 m in 0.5 s
     frames = [frame_of(sweep=sweep), frame_of([later], stamp_ns=STAMP + 5 * 10**8)]
-    for name, version, channel in (
-        ('nuscenes', 'v1.0-boxreg', 'LIDAR_TOP'),
-        ('t4', 'annotation', 'LIDAR_CONCAT'),
+    for name, version, channel, class_name in (
+        ('nuscenes', 'v1.0-boxreg', 'LIDAR_TOP', 'vehicle.car'),
+        ('t4', 'annotation', 'LIDAR_CONCAT', 'Car'),
     ):
         _, folder = written(name, tmp_path / name, frames, with_points=True)
         first, second = consumer('nuscenes', folder, version)
         assert first['channel'] == channel
-        assert (first['name'], first['num_points']) == ('Car', 42)
+        assert (first['name'], first['num_points']) == (class_name, 42)
         np.testing.assert_allclose(first['wlh'], [2.0, 4.0, 1.6])
         np.testing.assert_allclose(first['local'], [6, -3, 1], atol=1e-9)
         in_fixed = (T_FIXED_SENSOR @ np.c_[CORNERS, np.ones(8)].T).T[:, :3]
@@ -640,12 +762,24 @@ def test_t4_devkit_reads_the_labels(tmp_path):
     assert found['sample_data'][0]['fileformat'] == 'pcd.bin'
 
 
+def test_the_evaluations_of_the_devkits_count_our_classes(tmp_path):
+    """The exported boxes as detections of themselves: the average precision is that of truth."""
+    frames = [
+        frame_of([[*IN_FIXED[:3], 4.0, 2.0, 1.6, 0, 0, 0.3 * i]], stamp_ns=STAMP + i * 10**8)
+        for i in range(4)
+    ]
+    _, folder = written('argoverse2', tmp_path, frames)
+    assert consumer('av2_precision', folder)['REGULAR_VEHICLE'] == pytest.approx(1.0)
+    _, folder = written('nuscenes', tmp_path, frames)
+    assert consumer('nuscenes_precision', folder, 'v1.0-boxreg') == {'car': pytest.approx(1.0)}
+
+
 def test_av2_reads_labels_pose_and_sweep(tmp_path):
     frames = [frame_of(sweep=Sweep(STAMP, 'lidar', POINTS))]
     _, folder = written('argoverse2', tmp_path, frames, with_points=True)
     (cuboid,) = consumer('av2', folder / 'annotations.feather')
     log = consumer('av2_log', folder, STAMP)
-    assert (cuboid['category'], cuboid['stamp_ns']) == ('Car', STAMP)
+    assert (cuboid['category'], cuboid['stamp_ns']) == ('REGULAR_VEHICLE', STAMP)
     np.testing.assert_allclose(cuboid['center'], [6, -3, 1], atol=1e-9)
     np.testing.assert_allclose(cuboid['lwh'], EXTENT)
     np.testing.assert_allclose(np.array(cuboid['matrix']).T, AXES, atol=1e-9)
