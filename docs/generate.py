@@ -52,6 +52,7 @@ TABLES = {
     'formats.md': {
         'messages': lambda: table(registry.MESSAGE_COLUMNS, registry.rows()),
         'labels': lambda: table(formats.FORMAT_COLUMNS, formats.rows()),
+        'reading': lambda: table(formats.READING_COLUMNS, formats.reading_rows()),
         'datasets': lambda: table(formats.DATASET_COLUMNS, formats.dataset_rows()),
     },
     'troubleshooting.md': {

@@ -38,6 +38,9 @@ DATASET = Dataset(
     remedy='download the whole log',
     lidar='lidar',
     packages=('pyarrow',),
+    reads='sweeps, poses, annotations',
+    leaves_out='cameras, maps',
+    read_back='av2 0.3.6',
 )
 SENSOR_POSES_FILE = 'calibration/egovehicle_SE3_sensor.feather'
 LIDAR_NAMES = ('up_lidar', 'down_lidar')

@@ -32,6 +32,9 @@ DATASET = Dataset(
     labels='tracklets',
     remedy='unpack its archives into one folder',
     lidar='velodyne_points',
+    reads='synchronised clouds, OXTS, tracklets',
+    leaves_out='cameras, unsynchronised drives',
+    read_back='pykitti 0.3.1',
 )
 DRIVE_SUFFIX = '_sync'
 RAW_DIGITS = 10

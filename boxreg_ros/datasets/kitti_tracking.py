@@ -30,6 +30,9 @@ DATASET = Dataset(
     labels='kitti',
     remedy='unpack its archives into one folder',
     lidar='velodyne',
+    reads='clouds, OXTS, labels',
+    leaves_out='cameras, regions DontCare',
+    read_back='pykitti 0.3.1',
 )
 PERIOD_NS = 100_000_000
 """Time between two frames [ns]: the LiDAR turns ten times a second."""

@@ -33,6 +33,9 @@ DATASET = Dataset(
     labels='nuscenes',
     remedy='unpack its metadata and LiDAR archives into one folder',
     packages=('ijson',),
+    reads='the LiDARs of a scene, `.pcd.bin`, `.bin` and `.pcd`, key frames and sweeps',
+    leaves_out='cameras, radar, maps, lidarseg',
+    read_back='nuscenes-devkit 1.2.0',
 )
 MERGED_FRAME = 'ego'
 """Frame of the clouds of several LiDARs."""

@@ -38,6 +38,8 @@ DATASET = Dataset(
     remedy='unpack the archive of this part again',
     lidar='pandar64',
     packages=('pandas',),
+    reads='clouds of both LiDARs, cuboids',
+    leaves_out='cameras, semantic segmentation',
 )
 SENSOR_IDS = {'pandar64': 0, 'pandarGT': 1}
 """LiDAR -> value of ``d`` of points and of ``cuboids.sensor_id``, which may be -1: for both."""

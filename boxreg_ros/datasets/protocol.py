@@ -25,6 +25,9 @@ class Dataset:
     remedy: str  # how to complete a folder with missing files
     lidar: str = ''  # name of the main one; '' if the scene states it
     packages: tuple[str, ...] = ()  # of pip, beyond those of boxreg_ros itself
+    reads: str = ''  # what is read, in a few words
+    leaves_out: str = ''  # what the data set has beside it
+    read_back: str = ''  # library and version that has the same clouds or poses, in the tests
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,9 @@ DATASET = replace(
     name='truckscenes',
     title='MAN TruckScenes',
     scene='scene-0044384af3d8494e913fb8b14915239e-3',
+    reads='the LiDARs of a scene, times of points',
+    leaves_out='cameras, radar, motion of cabin and chassis',
+    read_back='truckscenes-devkit 1.2.0',
 )
 
 

@@ -42,6 +42,9 @@ DATASET = Dataset(
     remedy='download it again',
     lidar='TOP',
     packages=('pyarrow',),
+    reads='range images of the LiDARs asked for, both returns, rows in any order',
+    leaves_out='cameras, segmentation, version 1',
+    read_back='waymo-open-dataset 1.6.7 (columns)',
 )
 LASERS = {'TOP': 1, 'FRONT': 2, 'SIDE_LEFT': 3, 'SIDE_RIGHT': 4, 'REAR': 5}
 """LiDAR -> value of the column `LASER`."""

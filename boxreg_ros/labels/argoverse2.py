@@ -42,6 +42,8 @@ FORMAT = Format(
     files='annotations.feather, city_SE3_egovehicle.feather, calibration/, sensors/',
     packages=('pyarrow',),
     options=('with_points', 'class_map'),
+    reads='annotations of a log; detections of many logs',
+    read_back='av2 0.3.6',
 )
 POSE_COLUMNS = dict.fromkeys(('qw', 'qx', 'qy', 'qz', 'tx_m', 'ty_m', 'tz_m'), 'double')
 EXTENT_COLUMNS = dict.fromkeys(('length_m', 'width_m', 'height_m'), 'double')

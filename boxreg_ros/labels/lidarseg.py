@@ -31,6 +31,7 @@ FORMAT = replace(
     files='v1.0-boxreg/, lidarseg/, panoptic/, samples/, maps/',
     options=(),
     has_points=True,
+    read_back='nuscenes-devkit 1.2.0',
 )
 UNKNOWN_CATEGORY = NUSCENES.index('noise')
 BACKGROUND_CATEGORY = NUSCENES.index('static.other')

@@ -47,6 +47,9 @@ FORMAT = Format(
     rotation='quaternion w x y z',
     files='v1.0-boxreg/, samples/, maps/',
     options=('with_points', 'class_map'),
+    reads='annotations of all scenes; results of the detection and the tracking task',
+    leaves_out='attributes, visibility, velocities, radar',
+    read_back='nuscenes-devkit 1.2.0',
 )
 STREAMED_TABLES = ('sample', 'sample_data', 'sample_annotation', 'ego_pose')
 """Tables that grow with the recording; their rows are written one by one."""

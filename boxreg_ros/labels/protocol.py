@@ -50,6 +50,12 @@ class Format:
     """Fields of `Options` that the writer uses."""
     has_points: bool = False
     """Whether it labels points; then ``boxreg relabel`` alone writes it."""
+    reads: str = ''
+    """What is read of files of others, in a few words."""
+    leaves_out: str = ''
+    """What these files may have beside it, and is not read."""
+    read_back: str = ''
+    """Library and version that our files were read by, in the tests."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,11 @@ import numpy as np
 __all__ = ['FORMAT', 'read', 'read_scene', 'Writer']
 
 FORMAT = replace(
-    nuscenes.FORMAT, name='t4', title='T4', files='annotation/, data/LIDAR_CONCAT/, maps/'
+    nuscenes.FORMAT,
+    name='t4',
+    title='T4',
+    files='annotation/, data/LIDAR_CONCAT/, maps/',
+    read_back='t4-devkit 0.1.0; 0.8.0 by hand',
 )
 LONGEST_STEP = 1.5
 """No velocity is stated across longer gaps [s]; that of the devkit of nuScenes."""

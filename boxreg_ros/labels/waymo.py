@@ -33,6 +33,9 @@ FORMAT = Format(
     files='lidar_box/, vehicle_pose/',
     packages=('pyarrow',),
     options=('class_map',),
+    reads='lidar_box of a segment, rows in any order',
+    leaves_out='speed, acceleration, difficulty, camera boxes',
+    read_back='waymo-open-dataset 1.6.7',
 )
 SEGMENT = 'key.segment_context_name'
 MICROSECONDS = 'key.frame_timestamp_micros'
