@@ -15,7 +15,7 @@ from boxreg_ros.io.storage.mcap import McapFile
 from boxreg_ros.io.storage.record import Damage, one_line, Record, span_ns, StorageFile
 from boxreg_ros.io.storage.rosbag1 import Rosbag1File
 from boxreg_ros.io.storage.sqlite import SqliteFile
-from boxreg_ros.io.storage.urls import download, entries_of, entry_of, url_of
+from boxreg_ros.io.storage.urls import entries_of, entry_of, url_of
 from boxreg_ros.io.whole_files import temporary_folder
 from mcap.records import Schema
 from rosbags.interfaces import Connection
@@ -110,7 +110,9 @@ def opened(path: Path) -> StorageFile:
 
 
 def _opened_remote(path: Path, opener: Opener) -> StorageFile:
-    """Open a file behind a URL: MCAP by ranges, a copy of other formats."""
+    """Open a file behind a URL: MCAP by blocks, a copy of other formats."""
+    from boxreg_ros.io.storage.remote_file import download  # fsspec takes 0.5 s
+
     if opener is McapFile and path.suffix not in COMPRESSED:
         return opener(path, None)
     with temporary_folder() as folder:

@@ -1,33 +1,46 @@
 """
-MCAP files: read by their index, or scanned record by record where the index is missing or damaged.
+MCAP files, read by the mcap package.
 
-The mcap library parses the summary, definitions, attachments and metadata. Its readers stop at the
-first error, and unpack what a chunk holds and not what it claims. Here a damaged chunk is left out
-and noted, and after a damaged record the next plausible chunk is searched for.
+With a whole summary only the chunks that are asked for are read; else the file is gone through
+once from its begin, as far as its records are whole. Each chunk is unpacked by itself: one that
+fails is left out and noted, where the readers of the package would end.
 
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Iterator
-from io import BytesIO
-from itertools import pairwise
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
+from io import BytesIO, SEEK_END
+from operator import itemgetter
 from pathlib import Path
-import re
-import struct
 from typing import Any, NamedTuple
 import zlib
 
 from boxreg_ros.errors import RecordingError, TransferError
-from boxreg_ros.io.storage import chunks
-from boxreg_ros.io.storage.chunks import Chunk, RecordPlace, StoredMessage
-from boxreg_ros.io.storage.record import Definition, one_line
-from lz4.frame import LZ4FrameDecompressor
+from boxreg_ros.io.storage.byte_file import ByteFile
+from boxreg_ros.io.storage.record import (
+    Damage,
+    Damages,
+    Definition,
+    one_line,
+    Record,
+    shown,
+    span_ns,
+)
 from mcap import records
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
-from mcap.stream_reader import StreamReader
+from mcap.data_stream import RecordBuilder
+from mcap.exceptions import EndOfFile
+from mcap.reader import FOOTER_SIZE, make_reader
+from mcap.stream_reader import (
+    CRCValidationError,
+    get_chunk_data_stream,
+    MAGIC_SIZE,
+    StreamReader,
+)
+from mcap.summary import Summary
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -35,66 +48,132 @@ from rosbags.interfaces import (
     MessageDefinitionFormat,
 )
 from rosbags.typesys.msg import normalize_msgtype
-import zstandard
 
-MCAP_MAGIC = b'\x89MCAP0\r\n'
-RECORD_HEAD = struct.Struct('<BQ')
-"""Operation code and length in front of each record."""
-HEAD_BYTES = RECORD_HEAD.size
-FOOTER_BYTES = HEAD_BYTES + 20
-CHUNK_HEAD = struct.Struct('<QQQII')
-"""First and last receive time, size, checksum, and length of the name of the compression."""
-STORED_BYTES = struct.Struct('<Q')
-"""Number of compressed bytes, behind the name of the compression."""
-MESSAGE_HEAD = struct.Struct('<HIQQ')
-"""Channel, sequence, receive and publish time."""
-COMPRESSIONS = ('', 'lz4', 'zstd')
-CHUNK_BEGIN = re.compile(rb'\x06.{4}\0{4}.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)', re.DOTALL)
-"""Begin of a chunk of less than 4 GB with one of these compressions."""
-CHUNK_BEGIN_BYTES = HEAD_BYTES + CHUNK_HEAD.size + 4
-DEFINITIONS: dict[int, Any] = {Opcode.SCHEMA: records.Schema, Opcode.CHANNEL: records.Channel}
+CHECKSUM_SIZE = 4
 GROUP_BYTES = 2**22
-"""Messages outside of chunks are grouped to chunks of this size [bytes], as writers do."""
-SEARCH_BYTES = 2**20
+"""Messages outside of chunks are grouped to parts of this size [bytes], as writers do."""
+SKIPPED_BYTES = 64
+"""
+Fields of later versions and records of others that may be skipped without a word [bytes].
+
+The package skips both, and with them what a damaged length or kind makes of a chunk: even one of a
+single message is larger.
+
+"""
+_end = RecordBuilder()
+records.Footer(0, 0, 0).write(_end)
+END = _end.end()
+"""A footer, at which readers end."""
 SCHEMA_FORMATS = {
     'ros2msg': MessageDefinitionFormat.MSG,
     'ros1msg': MessageDefinitionFormat.MSG,
     'ros2idl': MessageDefinitionFormat.IDL,
     'omgidl': MessageDefinitionFormat.IDL,
 }
+REMEDY = 'copy it again, or mend it: mcap recover'
 
 
-class _ChunkHead(NamedTuple):
-    """What a chunk claims about itself."""
+class Chunk(NamedTuple):
+    """A part of the file with messages: a chunk, or some messages outside of chunks."""
 
+    first_byte: int
+    end_byte: int
+    """End of its byte range in the file."""
     start_ns: int
     last_ns: int
     """Receive time of its last message, as `start_ns` of the first [ns]."""
-    size: int
-    checksum: int
-    """Of its content, as `size`."""
-    compression: str
-    """One of `COMPRESSIONS`."""
-    begin: int
-    """Of the compressed bytes in the record."""
-    stored: int
-    """Number of the compressed bytes."""
+    counts: Mapping[int, int]
+    """Number of messages by channel; 1 for each channel where only these are known."""
 
 
-class McapFile(chunks.ChunkedFile):
+class McapFile:
     """
-    An open MCAP file; see `ChunkedFile`. It `is_indexed` unless the whole file had to be scanned.
+    An open MCAP file; see `StorageFile`. It `is_indexed` unless the whole file was gone through.
 
-    Raises RecordingError if there is no message in it, and it is not a whole MCAP file.
+    Parameters
+    ----------
+    path
+        A file of this machine, or behind a URL.
+    origin
+        The file that `path` was unpacked from, to name in messages.
+
+    Raises
+    ------
+    RecordingError
+        If there is no message in it, and it is not a whole MCAP file.
+    TransferError
+        If bytes of it cannot be read from their disk or server; while messages are read, too.
 
     """
 
     def __init__(self, path: Path, origin: Path | None = None) -> None:
-        self._schemas: dict[int, records.Schema] = {}
+        self.name = shown(path, origin)
+        self.damages: Damages = {}
+        self.compression = ''
         self.is_indexed = True
+        self._schemas: dict[int, records.Schema] = {}
         self._channels: dict[int, records.Channel] = {}
-        self._extras: list[RecordPlace] = []
-        super().__init__(path, origin)
+        self._chunks: list[Chunk] = []
+        self._extras: list[int] = []
+        self._file = ByteFile(path)
+        try:
+            counts = self._read_summary()
+            if counts is None:
+                self.is_indexed = False
+                counts = self._scan()
+        except BaseException:
+            self.close()
+            raise
+        self.connections = [
+            self._connection(channel, counts.get(number, 0))
+            for number, channel in sorted(self._channels.items())
+        ]
+        self.start_time, self.end_time = span_ns(
+            [(chunk.start_ns, chunk.last_ns + 1) for chunk in self._chunks]
+        )
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def messages(
+        self, connections: Collection[Connection], start: int | None, stop: int | None
+    ) -> Iterator[Record]:
+        """Yield the messages on `connections`, ordered by receive time; see `StorageFile`."""
+        wanted = {connection.id: connection for connection in connections}
+        waiting: list[tuple[int, int, Record]] = []
+        chunks = [
+            chunk
+            for chunk in sorted(self._chunks, key=lambda chunk: chunk.start_ns)
+            if not wanted.keys().isdisjoint(chunk.counts)
+            and (start is None or start <= chunk.last_ns)
+            and (stop is None or chunk.start_ns < stop)
+        ]
+        for chunk in chunks:
+            due = bisect_left(waiting, chunk.start_ns, key=_time)
+            for _, _, record in waiting[:due]:
+                yield record
+            del waiting[:due]
+            for message in self._messages_of(chunk):
+                time_ns = message.log_time
+                is_within = (start is None or start <= time_ns) and (
+                    stop is None or time_ns < stop
+                )
+                if is_within and message.channel_id in wanted:
+                    record = Record(
+                        wanted[message.channel_id], time_ns, message.data,
+                        message.publish_time, message.sequence,
+                    )  # fmt: skip
+                    waiting.append((time_ns, chunk.first_byte, record))
+            waiting.sort(key=_time_and_place)
+        for _, _, record in waiting:
+            yield record
+
+    def spans(self) -> Iterator[tuple[int, int, int]]:
+        """Yield connection id, first and last receive time [ns] of chunks with its messages."""
+        for chunk in self._chunks:
+            for number in chunk.counts:
+                yield number, chunk.start_ns, chunk.last_ns
 
     def schema_of(self, connection: Connection) -> records.Schema | None:
         """Return the schema of a connection's channel; None without."""
@@ -110,30 +189,17 @@ class McapFile(chunks.ChunkedFile):
             tuple(channel.metadata.items()),
         )
 
-    @property
-    def compression(self) -> str:
-        """Return the compression of the first chunk, one of `COMPRESSIONS`; '' without chunks."""
-        if not self._chunks:
-            return ''
-        chunk = self._chunks[0]
-        head = self._chunk_head_at(RecordPlace(Opcode.CHUNK, chunk.first_byte, chunk.end_byte))
-        return '' if head is None else head.compression
-
     def extras(self) -> Iterator[records.Attachment | records.Metadata]:
         """Yield the attachments and the metadata; damaged ones are noted and left out."""
-        for place in self._extras:
-            kind = records.Attachment if place.kind == Opcode.ATTACHMENT else records.Metadata
-            record = self._parsed(kind, place)
-            if record is not None:
+        for first_byte in self._extras:
+            try:
+                record: Any = self._record_at(first_byte)
+            except TransferError:
+                raise
+            except Exception as error:  # of the library, for any malformed content
+                self._note(f'damaged attachment or metadata ({one_line(error)})', first_byte)
+            else:
                 yield record
-
-    def _open(self) -> None:
-        counts = self._read_index()
-        if counts is None:
-            self.is_indexed = False
-            counts = self._scan()
-        for number, channel in sorted(self._channels.items()):
-            self.connections.append(self._connection(channel, counts.get(number, 0)))
 
     def _connection(self, channel: records.Channel, count: int) -> Connection:
         schema = self._schemas.get(channel.schema_id)
@@ -148,252 +214,272 @@ class McapFile(chunks.ChunkedFile):
             ConnectionExtRosbag2(channel.message_encoding, []), self,
         )  # fmt: skip
 
-    # Index ------------------------------------------------------------------------------------
+    # Summary ----------------------------------------------------------------------------------
 
-    def _read_index(self) -> dict[int, int] | None:
+    def _read_summary(self) -> dict[int, int] | None:
         """
         Read the summary at the end of the file; return the number of messages by channel.
 
-        None where the summary is missing, damaged, or does not list all chunks and channels.
+        None where it is missing, damaged, or does not list all chunks, channels and schemas.
 
         """
         try:
-            found = self._summary_records()
-            statistics = next(r for r in found if isinstance(r, records.Statistics))
+            summary = self._checked_summary()
+            if summary is None or summary.statistics is None:
+                return None
+            counts = summary.statistics.channel_message_counts
+            if not _lists_all_chunks(summary, self._file.size):
+                return None
+            self._schemas, self._channels = summary.schemas, summary.channels
+            for index in summary.chunk_indexes:
+                chunk = _indexed(index, counts)
+                has_messages = index.message_index_offsets or index.message_end_time
+                if has_messages or self._messages_of(chunk):
+                    self._chunks.append(chunk)
+            if not self._find_definitions(summary.statistics.channel_count):
+                return None
         except TransferError:
             raise
         except Exception:  # of the library, for any malformed content; the scan reports it
             return None
-        for record in found:
-            self._add_definition(record)
-        listed = [_indexed_chunk(r) for r in found if isinstance(r, records.ChunkIndex)]
-        is_complete = (
-            len(self._channels) == statistics.channel_count
-            and len(listed) == statistics.chunk_count
-            and (listed or not statistics.message_count)
-            and _are_apart(listed, self.size)
-        )
-        if not is_complete:
-            return None
-        counts: dict[int, int] = statistics.channel_message_counts
-        any_channel = dict.fromkeys(counts, 1)  # of a chunk without an index of its messages
-        self._chunks = [
-            chunk if chunk.counts else chunk._replace(counts=any_channel)
-            for chunk in listed
-            if chunk.counts or chunk.last_ns
-        ]
-        self._extras = [
-            RecordPlace(
-                Opcode.ATTACHMENT if isinstance(r, records.AttachmentIndex) else Opcode.METADATA,
-                r.offset,
-                r.offset + r.length,
-            )
-            for r in found
-            if isinstance(r, records.AttachmentIndex | records.MetadataIndex)
-        ]
+        if summary.chunk_indexes:
+            self.compression = summary.chunk_indexes[0].compression
+        self._extras = [index.offset for index in summary.attachment_indexes]
+        self._extras += [index.offset for index in summary.metadata_indexes]
         return counts
 
-    def _summary_records(self) -> list[records.McapRecord]:
-        """Return the records of the summary; the library checks no checksum of theirs."""
-        footer_byte = self.size - FOOTER_BYTES - len(MCAP_MAGIC)
-        end = self._bytes(footer_byte, self.size)
-        if self._bytes(0, len(MCAP_MAGIC)) != MCAP_MAGIC or end[FOOTER_BYTES:] != MCAP_MAGIC:
-            raise RecordingError('expected the magic bytes of MCAP at begin and end')
-        footer = _read(records.Footer.read, end[HEAD_BYTES:])
-        summary = self._bytes(footer.summary_start, footer_byte)
-        # The checksum covers the summary and the footer without the checksum itself.
-        checksum = zlib.crc32(summary + end[: FOOTER_BYTES - 4])
-        if footer.summary_crc not in (0, checksum):
-            raise RecordingError('expected a summary of its checksum')
-        reader = StreamReader(BytesIO(summary + end), skip_magic=True, emit_chunks=True)
-        return list(reader.records)
+    def _checked_summary(self) -> Summary | None:
+        """Return the summary; None if it has another checksum, which the library leaves out."""
+        summary = make_reader(self._file).get_summary()  # type: ignore[arg-type]
+        end = self._file.seek(-MAGIC_SIZE - CHECKSUM_SIZE, SEEK_END)
+        self._file.seek(-MAGIC_SIZE - FOOTER_SIZE, SEEK_END)
+        footer: Any = next(self._records())
+        self._file.seek(footer.summary_start)
+        checksum = zlib.crc32(self._file.read(end - footer.summary_start))
+        return summary if footer.summary_crc in (0, checksum) else None
+
+    def _find_definitions(self, channel_count: int) -> bool:
+        """Search the chunks for channels and schemas that the summary does not repeat."""
+        for chunk in self._chunks:
+            if self._is_defined(channel_count):
+                break
+            self._messages_of(chunk)
+        return self._is_defined(channel_count)
+
+    def _is_defined(self, channel_count: int) -> bool:
+        needed = {channel.schema_id for channel in self._channels.values()}
+        return len(self._channels) == channel_count and needed <= {0, *self._schemas}
 
     # Scan -------------------------------------------------------------------------------------
 
-    def _scan(self) -> Counter[int]:
-        """Find all chunks without the index; return the number of messages by channel."""
-        self._channels.clear()
-        self._schemas.clear()
-        has_end = False
-        group: list[RecordPlace] = []
-        for place in self._places(len(MCAP_MAGIC)):
-            if place.kind == Opcode.MESSAGE:
-                group.append(place)
-                if place.end_byte - group[0].first_byte < GROUP_BYTES:
-                    continue
-            self._add_chunk(group)
-            group = []
-            if place.kind == Opcode.CHUNK:
-                self._add_chunk([place])
-            elif place.kind in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._add_definition(self._parsed(DEFINITIONS[place.kind], place))
-            elif place.kind in (Opcode.ATTACHMENT, Opcode.METADATA):
-                self._extras.append(place)
-            elif place.kind == Opcode.DATA_END:
-                has_end = True
-                break
-        self._add_chunk(group)
-        if not has_end:
-            if not self._chunks:
-                raise self._no_chunk('an MCAP file')
-            self._note('the recording was interrupted: no end of data', self.size, self.size)
-        self._locate_damages()
-        return self._count_messages()
-
-    def _place_at(self, first_byte: int) -> RecordPlace | None:
-        """Return the record at a position; None where there can be none."""
-        head = self._bytes(first_byte, first_byte + HEAD_BYTES)
-        if len(head) < HEAD_BYTES:
-            return None
-        opcode, length = RECORD_HEAD.unpack(head)
-        end_byte = first_byte + HEAD_BYTES + length
-        # Codes from 128 are for the extensions of others.
-        is_known = Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode >= 128
-        return (
-            RecordPlace(opcode, first_byte, end_byte)
-            if is_known and end_byte <= self.size
-            else None
-        )
-
-    def _next_chunk(self, position: int) -> int:
-        """Return where the next whole chunk begins; the end of the file without."""
-        while position < self.size:
-            # Chunks that begin in this block, one behind the other or within a damaged one.
-            block = self._bytes(position, position + SEARCH_BYTES + CHUNK_BEGIN_BYTES + 4)
-            found = CHUNK_BEGIN.search(block)
-            while found is not None and found.start() < SEARCH_BYTES:
-                place = self._place_at(position + found.start())
-                if place is not None and self._chunk_head_at(place) is not None:
-                    return place.first_byte
-                found = CHUNK_BEGIN.search(block, found.start() + 1)
-            position += SEARCH_BYTES
-        return self.size
-
-    def _chunk_head_at(self, place: RecordPlace) -> _ChunkHead | None:
-        """Return the head of a chunk; None if it is no chunk."""
-        record = self._bytes(place.first_byte, place.first_byte + CHUNK_BEGIN_BYTES + 16)
-        size = place.end_byte - place.first_byte
+    def _scan(self) -> dict[int, int]:
+        """Go through all records; return the number of messages by channel."""
+        self._schemas, self._channels, self._chunks = {}, {}, []
+        self.damages.clear()
+        end_byte = 0
         try:
-            head = _chunk_head(record, size)
-        except (struct.error, RecordingError):
-            return None
-        is_whole = head.begin + head.stored == size and head.start_ns <= head.last_ns
-        return head if is_whole else None
+            for first_byte, end_byte, found in self._parts():
+                self._add_part(first_byte, end_byte, found)
+                if isinstance(found[0], records.DataEnd):
+                    break
+        except TransferError:
+            raise
+        except CRCValidationError as error:
+            if not self.damages:  # else it is that of a chunk
+                self._note(f'damaged data ({one_line(error)})', 0, self._file.tell())
+        except Exception as error:  # of the library, for any malformed content
+            self._end_scan(error, end_byte)
+        counts: Counter[int] = Counter()
+        for chunk in self._chunks:
+            counts.update(chunk.counts)
+        return counts
 
-    def _add_chunk(self, places: list[RecordPlace]) -> None:
-        """Add a chunk, or messages outside of chunks as one, and the definitions in it."""
-        if not places:
-            return
-        is_chunk = places[0].kind == Opcode.CHUNK
-        head = self._chunk_head_at(places[0]) if is_chunk else None
-        times_ns = (head.start_ns, head.last_ns) if head else (0, 0)
-        self._add(Chunk(places[0].first_byte, places[-1].end_byte, *times_ns, {}, is_chunk))
+    def _parts(self) -> Iterator[tuple[int, int, list[records.McapRecord]]]:
+        """Yield begin, end and content of the records; messages outside of chunks together."""
+        first_byte, end_byte = 0, 0
+        group: list[records.McapRecord] = []
+        self._file.seek(0)
+        try:
+            for record in self._records(skip_magic=False):
+                are_loose = all(isinstance(one, records.Message) for one in (*group[:1], record))
+                if group and not (are_loose and end_byte - first_byte < GROUP_BYTES):
+                    yield first_byte, end_byte, group
+                    first_byte, group = end_byte, []
+                group.append(record)
+                here = self._file.tell()
+                skipped = here - end_byte - _size_of(record)
+                if skipped > SKIPPED_BYTES:
+                    self._note(f'{skipped} bytes of an unknown kind', end_byte, here)
+                end_byte = here
+        except Exception:  # what is whole before it is read
+            if group:
+                yield first_byte, end_byte, group
+            raise
+        yield first_byte, end_byte, group
+
+    def _add_part(self, first_byte: int, end_byte: int, found: list[records.McapRecord]) -> None:
+        """Add one record, or messages outside of chunks."""
+        first = found[0]
+        place = Chunk(first_byte, end_byte, 0, 0, {})
+        if isinstance(first, records.Schema):
+            self._schemas[first.id] = first
+        elif isinstance(first, records.Channel):
+            self._channels.setdefault(first.id, first)
+        elif isinstance(first, records.Attachment | records.Metadata):
+            self._extras.append(first_byte)
+        elif isinstance(first, records.Chunk):
+            self.compression = self.compression or first.compression
+            times = first.message_start_time, first.message_end_time
+            place = place._replace(start_ns=times[0], last_ns=times[1])
+            self._add_chunk(place, self._unpacked(first, place))
+        elif isinstance(first, records.Message):
+            messages = [one for one in found if isinstance(one, records.Message)]
+            self._note_unknown(messages, place)
+            self._add_chunk(place, messages)
+
+    def _add_chunk(self, place: Chunk, messages: list[records.Message]) -> None:
+        """Add a part with messages, with their times and counts."""
+        if messages:
+            times = [message.log_time for message in messages]
+            counts = Counter(message.channel_id for message in messages)
+            self._chunks.append(
+                place._replace(start_ns=min(times), last_ns=max(times), counts=counts)
+            )
+
+    def _end_scan(self, error: Exception, end_byte: int) -> None:
+        """Note the bytes behind the last whole record, or raise if there is nothing before."""
+        if not self._chunks:
+            raise RecordingError(
+                f'{self.name}: no message can be read; expected an MCAP file, got '
+                f'{self._file.size} bytes without a whole chunk ({one_line(error)}); {REMEDY} '
+                f'{self.name}'
+            ) from None
+        reason = 'interrupted or damaged: no whole record from here on'
+        if not isinstance(error, EndOfFile):
+            reason += f' ({one_line(error)})'
+        last_ns = max(chunk.last_ns for chunk in self._chunks)
+        self._note(f'{reason}; {REMEDY}', end_byte, self._file.size, last_ns, last_ns)
 
     # Content ----------------------------------------------------------------------------------
 
-    def _parsed(self, kind: Any, place: RecordPlace) -> Any:
-        """Return the record of a class of `records` at a place; None, and noted, if damaged."""
-        content = self._bytes(place.first_byte + HEAD_BYTES, place.end_byte)
+    def _records(self, skip_magic: bool = True) -> Iterator[records.McapRecord]:
+        """Return the records from this place on; from the magic bytes on with their checksum."""
+        stream: Any = self._file
+        reader = StreamReader(
+            stream, skip_magic=skip_magic, emit_chunks=True, validate_crcs=not skip_magic
+        )
+        return reader.records
+
+    def _record_at(self, first_byte: int) -> records.McapRecord:
+        self._file.seek(first_byte)
+        return next(self._records())
+
+    def _messages_of(self, place: Chunk) -> list[records.Message]:
+        """Return the messages of a part; none, and a damage is noted, if it is damaged."""
         try:
-            return _read(kind.read, content)
+            self._file.seek(place.first_byte)
+            found = _records_in(self._file.read(place.end_byte - place.first_byte))
+        except TransferError:
+            raise
         except Exception as error:  # of the library, for any malformed content
-            reason = f'damaged {kind.__name__.lower()} ({one_line(error)})'
-            self._note(reason, place.first_byte, place.end_byte)
-            return None
+            self._note_chunk(error, place)
+            return []
+        if isinstance(found[0], records.Chunk):
+            return self._unpacked(found[0], place)
+        return [record for record in found if isinstance(record, records.Message)]
 
-    def _add_definition(self, record: object) -> None:
-        if isinstance(record, records.Schema):
-            self._schemas[record.id] = record
-        elif isinstance(record, records.Channel):
-            self._channels.setdefault(record.id, record)
+    def _unpacked(self, chunk: records.Chunk, place: Chunk) -> list[records.Message]:
+        """Return the messages of a chunk, or note it; add the channels and schemas in it."""
+        try:
+            times = chunk.message_start_time, chunk.message_end_time
+            if self.is_indexed and times != (place.start_ns, place.last_ns):
+                raise RecordingError('its times are not those of the index')
+            stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+            content = _records_in(stream.read(size))
+        except Exception as error:  # of the library or of a decompressor
+            self._note_chunk(error, place)
+            return []
+        messages = [record for record in content if isinstance(record, records.Message)]
+        for record in content:
+            if isinstance(record, records.Schema):
+                self._schemas.setdefault(record.id, record)
+            elif isinstance(record, records.Channel):
+                self._channels.setdefault(record.id, record)
+        self._note_unknown(messages, place)
+        return messages
 
-    def _unpack(self, chunk: Chunk, stored: bytes) -> list[StoredMessage]:
-        content = memoryview(_content(stored) if chunk.is_compressible else stored)
-        found = []
-        for opcode, begin, end in _places_in(content):
-            if opcode == Opcode.MESSAGE:
-                if begin + MESSAGE_HEAD.size > end:
-                    raise RecordingError(f'a message of {end - begin} bytes')
-                channel, sequence, received_ns, published_ns = MESSAGE_HEAD.unpack_from(
-                    content, begin
-                )
-                data = content[begin + MESSAGE_HEAD.size : end]
-                found.append(StoredMessage(channel, received_ns, data, published_ns, sequence))
-            elif opcode in DEFINITIONS and not self.is_indexed:
-                self._add_definition(_read(DEFINITIONS[opcode].read, content[begin:end]))
-        return found
+    def _note_unknown(self, messages: list[records.Message], place: Chunk) -> None:
+        """Note messages whose channel is defined nowhere before them."""
+        count = sum(message.channel_id not in self._channels for message in messages)
+        if count:
+            self._note(f'{count} messages of unknown channels', *place[:4])
 
+    def _note_chunk(self, error: Exception, place: Chunk) -> None:
+        self._file.check_unchanged()
+        self._note(f'damaged chunk ({one_line(error)})', *place[:4])
 
-def _places_in(content: memoryview) -> list[tuple[int, int, int]]:
-    """Return operation code, begin and end of the records in a chunk."""
-    places: list[tuple[int, int, int]] = []
-    begin = 0
-    while begin < len(content):
-        opcode, length = RECORD_HEAD.unpack_from(content, begin)
-        begin += HEAD_BYTES
-        end = begin + length
-        if not opcode or end > len(content):
-            raise RecordingError(f'no record: operation code {opcode}, {length} bytes')
-        if len(places) == chunks.MAX_RECORDS:
-            raise RecordingError(f'more than {chunks.MAX_RECORDS} records')
-        places.append((opcode, begin, end))
-        begin = end
-    return places
-
-
-def _read(read: Callable[[ReadDataStream], Any], content: bytes | memoryview) -> Any:
-    """Return a record that the library parses."""
-    return read(ReadDataStream(BytesIO(content)))
+    def _note(
+        self,
+        reason: str,
+        first_byte: int,
+        end_byte: int | None = None,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> None:
+        self.damages[Damage(self.name, reason, first_byte, end_byte, start_ns, end_ns)] = None
 
 
-def _indexed_chunk(index: records.ChunkIndex) -> Chunk:
-    """Return the chunk of a chunk index; without counts if its messages have no index."""
+_time = itemgetter(0)
+_time_and_place = itemgetter(0, 1)
+
+
+def _indexed(index: records.ChunkIndex, ids: Collection[int]) -> Chunk:
+    """Return the chunk of a chunk index; with all `ids` of channels, if it does not list them."""
     first_byte = index.chunk_start_offset
-    times_ns = index.message_start_time, index.message_end_time
-    counts = dict.fromkeys(index.message_index_offsets, 1)
-    return Chunk(first_byte, first_byte + index.chunk_length, *times_ns, counts)
+    listed = index.message_index_offsets
+    return Chunk(
+        first_byte, first_byte + index.chunk_length,
+        index.message_start_time, index.message_end_time,
+        dict.fromkeys(listed or ids, 1),
+    )  # fmt: skip
 
 
-def _chunk_head(record: bytes, size: int) -> _ChunkHead:
-    """Return the head of a chunk record of `size` bytes; RecordingError if it is none."""
-    if record[:1] != bytes([Opcode.CHUNK]):
-        raise RecordingError('no chunk at the place that the index names')
-    start_ns, last_ns, content_size, checksum, length = CHUNK_HEAD.unpack_from(record, HEAD_BYTES)
-    name_begin = HEAD_BYTES + CHUNK_HEAD.size
-    compression = record[name_begin : name_begin + min(length, 16)].decode('latin1')
-    if compression not in COMPRESSIONS:
-        names = ', '.join(map(repr, COMPRESSIONS))
-        raise RecordingError(f'compression: expected one of {names}, got {compression!r}')
-    (stored,) = STORED_BYTES.unpack_from(record, name_begin + length)
-    begin = name_begin + length + STORED_BYTES.size
-    if begin + stored > size:
-        raise RecordingError(f'{size} bytes of a chunk of {begin + stored}')
-    if content_size > chunks.MAX_CHUNK_BYTES:
-        raise RecordingError(f'size of {content_size} bytes')
-    return _ChunkHead(start_ns, last_ns, content_size, checksum, compression, begin, stored)
+def _records_in(content: bytes) -> list[records.McapRecord]:
+    """
+    Return the records of some bytes; EndOfFile if the last one is not whole.
+
+    The package takes the bytes that are left for the rest of a record. One that is too long thus
+    swallows the footer that is put behind the bytes here.
+
+    """
+    found: list[records.McapRecord] = []
+    for record in StreamReader(BytesIO(content + END), skip_magic=True, emit_chunks=True).records:
+        if isinstance(record, records.Footer):
+            return found
+        found.append(record)
+    raise EndOfFile
 
 
-def _content(record: bytes) -> bytes | memoryview:
-    """Return the content of a chunk; RecordingError if it is not what the chunk claims."""
-    head = _chunk_head(record, len(record))
-    content: bytes | memoryview = memoryview(record)[head.begin : head.begin + head.stored]
-    # Not a byte more than claimed is unpacked: a few bytes may be compressed from any number.
-    if head.compression == 'zstd':
-        claimed = zstandard.frame_content_size(content)
-        if claimed not in (-1, head.size):
-            raise RecordingError(f'{claimed} bytes in a chunk of {head.size}')
-        content = zstandard.decompress(content, head.size)
-    elif head.compression == 'lz4':
-        content = LZ4FrameDecompressor().decompress(content, head.size + 1)
-    if len(content) != head.size:
-        raise RecordingError(f'{len(content)} bytes in a chunk of {head.size}')
-    if head.checksum and zlib.crc32(content) != head.checksum:
-        raise RecordingError('its content is not that of its checksum')
-    return content
+def _size_of(record: Any) -> int:
+    """Return the bytes of a record with the fields that the package knows."""
+    builder = RecordBuilder()
+    if not hasattr(record, 'data'):
+        record.write(builder)
+        return builder.count
+    replace(record, data=b'').write(builder)
+    return builder.count + len(record.data)
 
 
-def _are_apart(listed: list[Chunk], size: int) -> bool:
-    """Return whether chunk indexes name places in a file of `size` [bytes], each another one."""
-    places = sorted((chunk.first_byte, chunk.end_byte) for chunk in listed)
-    are_within = all(first + HEAD_BYTES <= end <= size for first, end in places)
-    return are_within and all(before[1] <= behind[0] for before, behind in pairwise(places))
+def _lists_all_chunks(summary: Summary, size: int) -> bool:
+    """Return whether the chunk indexes of a summary are whole, each of another place."""
+    statistics = summary.statistics
+    assert statistics is not None
+    places = sorted((i.chunk_start_offset, i.chunk_length) for i in summary.chunk_indexes)
+    ends = [first + length for first, length in places]
+    are_apart = all(end <= first for end, (first, _) in zip(ends, places[1:], strict=False))
+    return (
+        len(places) == statistics.chunk_count
+        and bool(places or not statistics.message_count)
+        and are_apart
+        and max(ends, default=0) <= size
+    )

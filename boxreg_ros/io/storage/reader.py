@@ -10,7 +10,6 @@ from typing import Any
 
 from boxreg_ros.errors import BoxregError, RecordingError, UnsupportedMessage
 from boxreg_ros.io.foxglove import ChannelDecoder, FOXGLOVE_ENCODINGS, ros_type
-from boxreg_ros.io.storage.chunks import MAX_CHUNK_BYTES
 from boxreg_ros.io.storage.files import Files, merged_streams, Part
 from boxreg_ros.io.storage.record import Damage, one_line, Record
 from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
@@ -24,6 +23,8 @@ MESSAGE_MARKS = ('__msgtype__', 'DESCRIPTOR', 'get_fields_and_field_types')
 """Class attributes of messages: of rosbags, of protobuf, of rclpy."""
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 """Begin of a message that rosbag2 has compressed; CDR begins with 0 and 0 to 3."""
+MAX_MESSAGE_BYTES = 2**30
+"""Compressed messages that claim to be larger are damaged [bytes]."""
 IDL_SEPARATOR = '=' * 80 + '\n'
 Definitions = tuple[tuple[str, MessageDefinition], ...]
 """Names of types and their definitions; code is made of them for 50 ms."""
@@ -189,9 +190,9 @@ def _decompressed(data: bytes) -> bytes:
     """Return a message that was compressed by itself."""
     try:
         size = zstandard.frame_content_size(data)
-        if size > MAX_CHUNK_BYTES:
+        if size > MAX_MESSAGE_BYTES:
             raise UnsupportedMessage(f'compressed message of {size} bytes')
-        return zstandard.decompress(data, MAX_CHUNK_BYTES if size < 0 else size)
+        return zstandard.decompress(data, MAX_MESSAGE_BYTES if size < 0 else size)
     except zstandard.ZstdError as error:
         raise UnsupportedMessage(one_line(error)) from None
 
