@@ -96,6 +96,18 @@ def test_a_truncated_file_without_chunks_is_read_up_to_its_end(tmp_path, drive, 
     assert damages
 
 
+def test_a_chunk_that_claims_too_much_is_left_out(tmp_path, whole):
+    data = bytearray(whole.read_bytes())
+    first, _ = chunk_places(whole)[5]
+    at = first + 9 + 16  # opcode and length; first and last time
+    data[at : at + 8] = struct.pack('<Q', 2**31)
+    path = tmp_path / 'damaged.mcap'
+    path.write_bytes(data)
+    _, _, damages = read(path)
+    assert damages[0].first_byte == first
+    assert 'size of 2147483648 bytes' in damages[0].reason
+
+
 @pytest.mark.parametrize('has_index', [True, False])
 def test_a_damaged_chunk_is_left_out(tmp_path, drive, whole, has_index):
     first, length = chunk_places(whole)[5]

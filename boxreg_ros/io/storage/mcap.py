@@ -48,10 +48,13 @@ from rosbags.interfaces import (
     MessageDefinitionFormat,
 )
 from rosbags.typesys.msg import normalize_msgtype
+import zstandard
 
 CHECKSUM_SIZE = 4
 GROUP_BYTES = 2**22
 """Messages outside of chunks are grouped to parts of this size [bytes], as writers do."""
+MAX_CHUNK_BYTES = 2**30
+"""Chunks that claim to be larger are damaged [bytes]; writers make chunks of 1 to 16 MB."""
 SKIPPED_BYTES = 64
 """
 Fields of later versions and records of others that may be skipped without a word [bytes].
@@ -394,6 +397,7 @@ class McapFile:
             times = chunk.message_start_time, chunk.message_end_time
             if self.is_indexed and times != (place.start_ns, place.last_ns):
                 raise RecordingError('its times are not those of the index')
+            _check_size(chunk)
             stream, size = get_chunk_data_stream(chunk, validate_crc=True)
             content = _records_in(stream.read(size))
         except Exception as error:  # of the library or of a decompressor
@@ -442,6 +446,15 @@ def _indexed(index: records.ChunkIndex, ids: Collection[int]) -> Chunk:
         index.message_start_time, index.message_end_time,
         dict.fromkeys(listed or ids, 1),
     )  # fmt: skip
+
+
+def _check_size(chunk: records.Chunk) -> None:
+    """Raise RecordingError if a chunk of a few bytes claims to hold any number."""
+    size = chunk.uncompressed_size
+    if chunk.compression == 'zstd':  # lz4 packs 255 bytes into one at most
+        size = max(size, zstandard.frame_content_size(chunk.data))
+    if size > MAX_CHUNK_BYTES:
+        raise RecordingError(f'size of {size} bytes')
 
 
 def _records_in(content: bytes) -> list[records.McapRecord]:
