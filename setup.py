@@ -81,7 +81,7 @@ setup(
     # Tried with the versions of constraints.txt and of constraints-jazzy.txt.
     python_requires='>=3.11,<3.15',
     install_requires=[
-        'lz4>=4,<5',
+        'apsw',  # of rosbags, whose version it follows
         'mcap>=1.6,<2',
         'numba>=0.59,<1',
         'numpy>=1.26,<3',
