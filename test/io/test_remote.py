@@ -174,7 +174,7 @@ def impatient(monkeypatch):
 
 @pytest.fixture
 def small_blocks(monkeypatch):
-    monkeypatch.setattr(remote_file, 'BLOCK_BYTES', 2**15)
+    monkeypatch.setattr(remote_file, 'REQUEST_BYTES', 2**15)
 
 
 @pytest.mark.parametrize('fault', [None, 'error', 'cut', 'short'])
@@ -299,7 +299,7 @@ def test_a_slice_takes_little_more_than_its_bytes(large, store, sent):
     read_slice('s3://drives/large.mcap')
     needed = bytes_of_a_slice(large)
     for answers in (server.sent, sent):
-        assert 0.5 * needed < sum(answers) < needed + 4 * remote_file.BLOCK_BYTES
+        assert 0.5 * needed < sum(answers) < needed + 4 * remote_file.REQUEST_BYTES
 
 
 @pytest.mark.parametrize('storage', ['sqlite3', 'rosbag1'])
@@ -474,7 +474,7 @@ def test_blocks_are_read_once(tmp_path):
         assert file.read(4) == b'\xfe\xff\0\1'
         file.seek(256)
         assert file.read(4) == bytes(range(4))
-        assert server.sent == [remote_file.BLOCK_BYTES] * 2
+        assert server.sent == [remote_file.REQUEST_BYTES] * 2
         file.seek(-1, SEEK_END)
         assert file.read(1) == b'\xff'
         with pytest.raises(EndOfFile):

@@ -10,7 +10,7 @@ from boxreg_ros.errors import TransferError
 from boxreg_ros.io.storage.urls import answer_of, entry_of, limit_of, system_of, url_of
 from fsspec.spec import AbstractBufferedFile
 
-BLOCK_BYTES = 2**22
+REQUEST_BYTES = 2**22
 """Read at a time; chosen: at 50 MB/s it takes as long as an object store takes to answer."""
 CACHE_BLOCKS = 16
 """Blocks that are kept: the first are read for topics and transforms, then again."""
@@ -37,7 +37,7 @@ class RemoteFile(AbstractBufferedFile):  # type: ignore[misc]  # fsspec has no t
         self._entry = entry_of(path)
         system, name = system_of(path)
         super().__init__(
-            system, name, block_size=BLOCK_BYTES, cache_type='blockcache',
+            system, name, block_size=REQUEST_BYTES, cache_type='blockcache',
             cache_options={'maxblocks': CACHE_BLOCKS}, size=self._entry.size,
         )  # fmt: skip
 
@@ -72,7 +72,7 @@ def download(path: Path, target: Path) -> None:
     """Copy a file behind a URL to this machine: by blocks, or whole where the server has none."""
     with closing(RemoteFile(path)) as source, target.open('wb') as copy:
         try:
-            shutil.copyfileobj(source, copy, BLOCK_BYTES)
+            shutil.copyfileobj(source, copy, REQUEST_BYTES)
         except _WholeFile:
             copy.seek(0)
             answer_of(path, lambda: source.fs.get_file(source.path, str(target)))

@@ -37,7 +37,7 @@ Steps of sqlite's machine that a query over a whole table may take, and more for
 A row takes some fifty steps and has 40 bytes at least, most have thousands.
 
 """
-SPARE_BYTES = 2**20
+VIEW_BYTES = 2**20
 """What a value may have more than its file: the text of the views above."""
 
 
@@ -152,7 +152,7 @@ def _prepared(path: Path) -> Iterator[None]:
         # Pages that refer to each other in a circle have no end.
         calls = iter(range(1 + STEPS_PER_BYTE * size // QUERY_STEPS))
         database.set_progress_handler(lambda: next(calls, None) is None, QUERY_STEPS)
-        database.limit(apsw.SQLITE_LIMIT_LENGTH, min(size + SPARE_BYTES, 2**31 - 1))
+        database.limit(apsw.SQLITE_LIMIT_LENGTH, min(size + VIEW_BYTES, 2**31 - 1))
         database.execute(KNOWN_DEFINITIONS)
 
     apsw.connection_hooks.append(prepare)
