@@ -181,6 +181,46 @@ class Reason(StrEnum):
         'its boxes are displaced from their points; the log has the figures',
         'set `pose_reference`, `size_order` or `forward_axis` as the log suggests',
     )
+    TRACK_IDS_JUMP = (
+        'track_ids_jump',
+        'message',
+        'its track ids go from object to object, such as ids that are the row in the message; the '
+        'log has the figures',
+        'set `associate`, or run a tracker before this node',
+    )
+    CLOCK_OFFSET = (
+        'clock_offset',
+        'message',
+        'the clock of its stamps is off from that of the motion, or of the clouds; the log has '
+        'the figure',
+        'synchronise the clocks (PTP or NTP), or set `clock_offset` or `boxes_offset` as the log '
+        'suggests',
+    )
+    FIXED_FRAME_JUMPS = (
+        'fixed_frame_jumps',
+        'message',
+        'a localisation corrects the fixed frame in steps, and all boxes step with it',
+        'set `fixed_frame` to the smooth frame that the log names, `odom` by REP 105',
+    )
+    SENSOR_POSITION = (
+        'sensor_position',
+        'message',
+        'the clouds are registered into a frame that does not move, whose origin is taken for the '
+        'LiDAR',
+        'set `sensor_frames` as the log suggests',
+    )
+    TRANSFORM_FAULT = (
+        'transform_fault',
+        'message',
+        'a publisher of TF makes a mistake that moves clouds and boxes; the log names the frames',
+        CHECK_TRANSFORMS,
+    )
+    POINT_TIMES = (
+        'point_times',
+        'message',
+        'the times of the points of its clouds are not those of a sweep; the log has the figures',
+        'correct the driver of the LiDAR, or set `time_unit`',
+    )
     LATENCY = (
         'latency',
         'message',

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import permutations
-from math import pi
+from math import isfinite, pi
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.options import option
@@ -45,7 +45,7 @@ The sign follows the letter: YAML reads ``y`` as a boolean, a command line ``-y`
 
 @dataclass(frozen=True, slots=True)
 class Convention:
-    """Meaning of pose and size on one topic; ConfigError if a value is not one of those."""
+    """Meaning of pose, size and stamp on one topic; ConfigError if a value is not one of those."""
 
     pose_reference: str = option(
         'center',
@@ -66,6 +66,13 @@ class Convention:
     associate: bool = option(
         False, 'replace the track ids of the input: associate boxes over time'
     )
+    stamp_offset: float = option(
+        0.0,
+        'added to the stamps of the boxes, where their clock is behind that of the clouds [s]',
+        flag='--boxes-offset',
+        metavar='S',
+        parse=float,
+    )
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -74,6 +81,10 @@ class Convention:
                 raise ConfigError(
                     f'{name}: expected one of {", ".join(known)}, got {getattr(self, name)!r}'
                 )
+        if not isfinite(self.stamp_offset):
+            raise ConfigError(
+                f'stamp_offset: expected seconds, got {self.stamp_offset}; leave it out for none'
+            )
         _ = self.reference
 
     @property
@@ -101,7 +112,13 @@ class Convention:
         changed = self._rotated(boxes.boxes, FORWARD[self.forward_axis])
         changed[:, BOX_EXTENT] = boxes.boxes[:, self._columns]
         changed[:, BOX_CENTER] -= self._offsets(changed)
-        return replace(boxes, boxes=changed)
+        return self._stamped(replace(boxes, boxes=changed))
+
+    def _stamped(self, boxes: BoxArray) -> BoxArray:
+        """Return boxes with the stamp that theirs means; an array without a stamp has none."""
+        if not self.stamp_offset or boxes.stamp_ns <= 0:
+            return boxes
+        return replace(boxes, stamp_ns=boxes.stamp_ns + round(self.stamp_offset * 1e9))
 
     def from_centers(self, boxes: BoxArray) -> BoxArray:
         """Return boxes with the pose at their centre in this convention."""

@@ -17,6 +17,7 @@ from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of, LabelFrame
 from boxreg_ros.labels.merging import LabelMerger
 from boxreg_ros.structures import Sweep
+from msg_adapters.convention import Convention, STANDARD
 import numpy as np
 
 ANNOTATIONS = 'annotations'
@@ -47,12 +48,14 @@ class SceneRecording:
         start: float | None = None,
         end: float | None = None,
         labels: tuple[str, Path] | None = None,
+        convention: Convention = STANDARD,
     ) -> None:
         self._address = address
         self._dataset = module_of(address.dataset).DATASET
         self._lidars = lidars
         self._start, self._end = start, end
         self._labels = labels
+        self._convention = convention
         self.boxes_topic = '' if labels else ANNOTATIONS
         self.unreadable: Counter[str] = Counter()
         self.first_errors: dict[str, UnsupportedMessage] = {}
@@ -155,7 +158,7 @@ class SceneRecording:
         """Return the boxes to refine, by stamp."""
         scene = self._scene
         if self._labels is not None:
-            return frames_of(*self._labels, scene.frames)
+            return frames_of(*self._labels, scene.frames, self._convention)
         if scene.boxes is not None:
             return scene.boxes()
         remedy = 'give label files with --labels'

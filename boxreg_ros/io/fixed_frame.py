@@ -171,7 +171,7 @@ class FixedFrameItems:
     def _moved(self, item: Item) -> Iterator[MovedItem]:
         """Yield an item in the fixed frame, or the sweeps that are complete with its cloud."""
         with self._stage('transform'):
-            admitted = self.session.admit(item.content)
+            admitted = self.session.admit(item.content, item.received_ns)
         self._count(item.content, admitted)
         item = item._replace(T_fixed_item=admitted.T_fixed_item)
         if not self._is_merging or not isinstance(item.content, Sweep):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
-from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, Floats, is_valid_box
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, Floats, Ints, is_valid_box
 import numpy as np
 
 CENTER_STD = 0.3
@@ -20,6 +21,16 @@ GATE = 20.0
 Largest squared distance of a box to its track, in standard deviations.
 
 Centre and extents have six degrees of freedom: chi-square has 99.7 % below 20.
+
+"""
+MIN_JUMPS = 5
+"""Jumps of ids from object to object that a finding needs; chosen."""
+MIN_JUMP_SHARE = 0.03
+"""
+Share of the boxes at which ids jump.
+
+Chosen: trackers switch below 1 % of their boxes; ids that are the rows of a message, 10 % and
+more.
 
 """
 
@@ -60,6 +71,17 @@ class _Track:
         self.extent = box[BOX_EXTENT]
 
 
+class Costs(NamedTuple):
+    """How well the boxes of an array fit the tracks before it."""
+
+    rows: Ints
+    """(n,) rows of the valid boxes in their array."""
+    track_ids: list[str]
+    """Of the tracks before it."""
+    values: Floats
+    """(n, tracks) squared distances in standard deviations."""
+
+
 class Tracker:
     """
     Assign ids that stay with the object; ids of the input are not used.
@@ -67,7 +89,7 @@ class Tracker:
     Boxes are assigned to the predictions of the tracks with least total cost, within a gate. A box
     without a track starts one; a track without a box for longer than `max_gap` [s], which may
     change, ends. The result depends on the order of calls only. `count` ids have been assigned so
-    far.
+    far; `costs` are those of the last array.
 
     """
 
@@ -80,6 +102,7 @@ class Tracker:
         """End all tracks; ids that were assigned are not used again."""
         self._tracks: list[_Track] = []
         self._newest_ns: int | None = None
+        self.costs = Costs(np.zeros(0, np.int64), [], np.zeros((0, 0)))
 
     def identify(self, boxes: BoxArray) -> BoxArray:
         """
@@ -106,6 +129,7 @@ class Tracker:
         # Costs are cut off at the gate: a pair beyond it costs as much as no pair.
         pairs = zip(*linear_sum_assignment(np.minimum(costs, GATE)), strict=True)
         found = {int(rows[i]): self._tracks[k] for i, k in pairs if costs[i, k] < GATE}
+        self.costs = Costs(rows, [track.track_id for track in self._tracks], costs)
         for row in rows.tolist():
             track = found.get(row)
             if track is None:
@@ -120,10 +144,76 @@ class Tracker:
 
     def _costs(self, stamp_ns: int, boxes: Floats) -> Floats:
         """Return the squared distances (boxes, tracks) in standard deviations."""
-        costs = np.zeros((len(boxes), len(self._tracks)))
-        for k, track in enumerate(self._tracks):
-            center, covariance = track.predicted(stamp_ns)
-            away = np.square(boxes[:, BOX_CENTER] - center).sum(axis=1)
-            unlike = np.square(np.log(boxes[:, BOX_EXTENT] / track.extent)).sum(axis=1)
-            costs[:, k] = away / (covariance[0, 0] + CENTER_STD**2) + unlike / LOG_EXTENT_STD**2
+        if not self._tracks:
+            return np.zeros((len(boxes), 0))
+        predicted = [track.predicted(stamp_ns) for track in self._tracks]
+        centers = np.array([center for center, _ in predicted])
+        variances = np.array([covariance[0, 0] for _, covariance in predicted])
+        extents = np.array([track.extent for track in self._tracks])
+        away = np.square(boxes[:, None, BOX_CENTER] - centers).sum(axis=2)
+        unlike = np.square(np.log(boxes[:, None, BOX_EXTENT] / extents)).sum(axis=2)
+        costs: Floats = away / (variances + CENTER_STD**2) + unlike / LOG_EXTENT_STD**2
         return costs
+
+
+class IdCheck:
+    """
+    Detect ids that jump from object to object: rows of a message, ids that are given anew.
+
+    Boxes are also associated by their motion alone. An id jumps where its box does not fit the
+    track that had the id before, and is associated with that of another object. `finding` says so
+    once enough have; it is empty before.
+
+    """
+
+    def __init__(self, max_gap: float) -> None:
+        self._tracker = Tracker(max_gap)
+        self.jumps = 0
+        self.boxes = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all tracks, after a time jump; counts stay."""
+        self._tracker.forget()
+        self._id_of: dict[str, str] = {}  # of the input, by that of the association
+
+    def add(self, boxes: BoxArray) -> None:
+        """
+        Add the next boxes.
+
+        Parameters
+        ----------
+        boxes : BoxArray
+            In a fixed frame, with the ids of the input; those without an id do not count.
+
+        """
+        associated = self._tracker.identify(boxes).track_ids
+        costs = self._tracker.costs
+        column_of = {
+            self._id_of[name]: column
+            for column, name in enumerate(costs.track_ids)
+            if name in self._id_of
+        }
+        known = set(costs.track_ids)
+        for row, cost in zip(costs.rows.tolist(), costs.values, strict=True):
+            own = column_of.get(boxes.track_ids[row])
+            if own is None or not boxes.track_ids[row]:
+                continue
+            self.boxes += 1
+            is_others = associated[row] != costs.track_ids[own] and associated[row] in known
+            self.jumps += bool(is_others and cost[own] >= GATE)
+        self._id_of = {name: self._id_of[name] for name in known if name in self._id_of}
+        self._id_of |= {
+            name: given for name, given in zip(associated, boxes.track_ids, strict=True) if name
+        }
+
+    @property
+    def finding(self) -> str:
+        """Return that the ids jump; empty if they do not, or too few boxes are known."""
+        if self.jumps < MIN_JUMPS or self.jumps < MIN_JUMP_SHARE * self.boxes:
+            return ''
+        return (
+            f'track ids jump from object to object, at {self.jumps} of {self.boxes} boxes: '
+            f'expected one id for each object over time, got ids such as the row of a box in its '
+            f'message'
+        )

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import combinations
 import shlex
 from typing import Any
 
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.items import LOOKAHEAD_NS
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder
+from boxreg_ros.io.motion_check import JumpSearch
 from boxreg_ros.io.storage.record import Record
-from boxreg_ros.io.topics import ODOMETRY_TYPE, Topics
+from boxreg_ros.io.topics import (
+    namespace_of,
+    nearest_namespace,
+    ODOMETRY_TYPE,
+    TF_TYPES,
+    Topics,
+)
 from boxreg_ros.io.transforms import TransformTree
 
 TF_SEARCH_NS = 10 * 10**9
 """Odometry is used if TF does not connect the frames in this first part of a recording [ns]."""
+
+WHOLE_SECONDS = 60.0
+"""A recording of this duration is searched for jumps of its fixed frame as a whole [s]; chosen."""
+SEARCH_PARTS = 8
+"""Parts of a longer one that are searched; chosen: as many as a minute of driving needs."""
+SEARCH_SECONDS = 6.0
+"""Their duration [s]; a localisation makes corrections every few seconds."""
 
 ReadTopics = Callable[[Collection[str], int | None, int | None], Iterator[Record]]
 """Yields the messages on some topics, received from a time to another [ns], in order."""
@@ -24,7 +39,9 @@ class RecordedMotion:
     """
     Transforms and odometry of a recording, in the part from begin to end of receive time [ns].
 
-    `odometry_topic` is the one that was asked for, then the one in use.
+    `odometry_topic` is the one that was asked for, then the one in use. Of TF the topics are used
+    that `tf` names, one or several; else those of all namespaces, but for others that state the
+    same frames as the namespace of the clouds. `notes` say what was chosen.
 
     """
 
@@ -35,17 +52,94 @@ class RecordedMotion:
         read: ReadTopics,
         part_ns: tuple[int, int],
         odometry_topic: str | None,
+        points_topics: Sequence[str] = (),
+        tf: Sequence[str] = (),
     ) -> None:
         self._topics = topics
         self._decoder = decoder
         self._read = read
         self._start_ns, self._end_ns = part_ns
         self.odometry_topic = odometry_topic
+        self._points_topics = points_topics
+        self._asked_tf = tf
+        self._transforms: set[str] | None = None
+        self.notes: dict[str, str] = {}
+
+    @property
+    def transforms(self) -> set[str]:
+        """
+        Return the topics of TF in use.
+
+        Raises RecordingError if `tf` names a topic that has none, or if two namespaces state
+        different motions of one frame and the clouds are in neither.
+
+        """
+        if self._transforms is None:
+            self._transforms = self._choose_transforms()
+        return self._transforms
 
     @property
     def topics(self) -> set[str]:
         """Return the topics in use."""
-        return self._topics.transforms | ({self.odometry_topic} if self.odometry_topic else set())
+        return self.transforms | ({self.odometry_topic} if self.odometry_topic else set())
+
+    def _choose_transforms(self) -> set[str]:
+        """Return the topics of TF to use."""
+        known = self._topics.transforms
+        for topic in self._asked_tf:
+            self._topics.find('tf', 'transforms', TF_TYPES, topic)
+        if self._asked_tf:
+            spaces = set(map(namespace_of, self._asked_tf))
+            static = {t for t in self._topics.static_transforms if namespace_of(t) in spaces}
+            return static | set(self._asked_tf)
+        spaces = {namespace_of(topic) for topic in self._topics.filled(TF_TYPES)}
+        if len(spaces) < 2:
+            return known
+        stated = {space: self._stated(space) for space in sorted(spaces)}
+        own = nearest_namespace(self._points_topics, spaces)
+        if own is None:
+            self._refuse_rivals(stated)
+            return known
+        rivals = [space for space in stated if space != own and stated[own].shares(stated[space])]
+        if not rivals:
+            return known
+        others = {topic for topic in known if namespace_of(topic) in rivals}
+        names = ', '.join(sorted(others))
+        self.notes['tf'] = (
+            f'several publishers state the same frames: transforms are those of '
+            f'{own or ""}/tf, in the namespace of the clouds, without {names}; choose others with '
+            f'--tf TOPIC'
+        )
+        return known - others
+
+    def _refuse_rivals(self, stated: Mapping[str, _Stated]) -> None:
+        """Raise RecordingError if two namespaces state different poses of one frame."""
+        for (first, one), (second, other) in combinations(stated.items(), 2):
+            frame = one.difference(other)
+            if frame:
+                raise RecordingError(
+                    f'{self._decoder.origin}: expected one publisher of the frame {frame!r}, got '
+                    f'different transforms on {first}/tf and {second}/tf, as of two robots; '
+                    f'choose those of the clouds with --tf {first}/tf or --tf {second}/tf'
+                )
+
+    def _stated(self, space: str) -> _Stated:
+        """Return the moving transforms of a namespace at the begin of the recording."""
+        found = _Stated()
+        moving = self._topics.transforms - self._topics.static_transforms
+        topics = {topic for topic in moving if namespace_of(topic) == space}
+        first_ns: int | None = None
+        for record in self._read(topics, None, None):
+            first_ns = record.received_ns if first_ns is None else first_ns
+            if record.received_ns > first_ns + TF_SEARCH_NS:
+                break
+            try:
+                message = self._decoder.message(record)
+                with malformed(f'topic {record.connection.topic!r}'):
+                    found.add(message.transforms)
+            except UnsupportedMessage:
+                continue  # it is counted when it is read for good
+        return found
 
     def add(self, tree: TransformTree, record: Record) -> None:
         """Add a message of `topics` to `tree`, or count it as unreadable."""
@@ -54,10 +148,10 @@ class RecordedMotion:
             message = self._decoder.message(record)
             with malformed(f'topic {topic!r}'):
                 if record.connection.msgtype == ODOMETRY_TYPE:
-                    tree.add_odometry(message)
+                    tree.add_odometry(message, record.received_ns)
                 else:
                     is_static = topic in self._topics.static_transforms
-                    tree.add_transforms(message.transforms, is_static)
+                    tree.add_transforms(message.transforms, is_static, record.received_ns)
         except UnsupportedMessage as error:
             self._decoder.count_unreadable(topic, error)
 
@@ -77,7 +171,8 @@ class RecordedMotion:
         """
         Choose between TF and odometry, and return the fixed frame.
 
-        It is `wanted`, or the topmost frame that the `frame` of a LiDAR moves in. The empty `tree`
+        It is `wanted`, or the topmost frame that the `frame` of a LiDAR moves smoothly in: frames
+        that a localisation corrects in steps are left out, which `notes` say. The empty `tree`
         then holds the static and the first moving transforms.
 
         Raises RecordingError if no motion is known, or no transforms connect `wanted` with
@@ -89,7 +184,7 @@ class RecordedMotion:
                 f'{self._decoder.origin}: expected clouds with a frame, got an empty frame_id; '
                 f'set it in the driver of the LiDAR'
             )
-        for record in self._read(self._topics.static_transforms, None, None):
+        for record in self._read(self._static, None, None):
             self.add(tree, record)
         if wanted is not None and wanted.lstrip('/') == frame:
             return frame
@@ -100,7 +195,7 @@ class RecordedMotion:
             odometry = self._add_odometry(tree, frame, found)
             found = _fixed_frame(tree, frame, wanted)
         if found is not None:
-            return found
+            return found if wanted is not None else self._smooth_frame(tree, frame, found)
         origin = self._decoder.origin
         known = f'TF: {tree}; odometry: {", ".join(odometry) or "none"}'
         if wanted is not None:
@@ -113,6 +208,44 @@ class RecordedMotion:
             f'{frame!r}; {known}; if it does not move, set --fixed-frame {shlex.quote(frame)}'
         )
 
+    @property
+    def _static(self) -> set[str]:
+        """Return the topics of static transforms in use."""
+        return self.transforms & self._topics.static_transforms
+
+    def _smooth_frame(self, tree: TransformTree, frame: str, found: str) -> str:
+        """Return the topmost frame, from `found` on, that does not jump."""
+        self.notes.pop('frame', None)
+        moving = [edge for edge in tree.route(found, frame) if not tree.is_constant(edge)]
+        if len(moving) < 2:
+            return found
+        jumps = JumpSearch()
+        for begin_ns, end_ns in self._searched_parts():
+            part = TransformTree(buffer_duration=WHOLE_SECONDS + 2 * SEARCH_SECONDS)
+            for record in self._read(self._static, None, None):
+                self.add(part, record)
+            for record in self._read(self.topics - self._static, begin_ns, end_ns):
+                self.add(part, record)
+            jumps.look(part, found, frame)
+        smooth = jumps.smooth_frame(tree, found, frame)
+        if smooth != found:
+            steps = max(jumps.steps.values(), key=lambda one: one.largest)
+            self.notes['frame'] = (
+                f'fixed frame is {smooth!r}, not {found!r}, which jumps: {steps}; set '
+                f'--fixed-frame {shlex.quote(found)} to refine in it all the same'
+            )
+        return smooth
+
+    def _searched_parts(self) -> list[tuple[int, int]]:
+        """Return begin and end of the parts that are searched for jumps [ns]."""
+        length_ns = self._end_ns - self._start_ns
+        if length_ns <= WHOLE_SECONDS * 1e9:
+            return [(self._start_ns, self._end_ns)]
+        duration_ns = round(SEARCH_SECONDS * 1e9)
+        step_ns = (length_ns - duration_ns) // (SEARCH_PARTS - 1)
+        begins = [self._start_ns + number * step_ns for number in range(SEARCH_PARTS)]
+        return [(begin_ns, begin_ns + duration_ns) for begin_ns in begins]
+
     def _search_transforms(
         self, tree: TransformTree, frame: str, wanted: str | None
     ) -> str | None:
@@ -122,7 +255,7 @@ class RecordedMotion:
         until_ns = self._end_ns
         if self._odometry_topics():
             until_ns = min(until_ns, begin_ns + TF_SEARCH_NS)
-        for record in self._read(self._topics.transforms, begin_ns, None):
+        for record in self._read(self.transforms, begin_ns, None):
             if record.received_ns > until_ns:
                 break
             self.add(tree, record)
@@ -150,6 +283,15 @@ class RecordedMotion:
             odometry.append(f'{topic} ({message.header.frame_id} -> {child})')
             if child == root or (root is None and tree.connects(child, frame)):
                 relevant[topic] = message
+        own = nearest_namespace(self._points_topics, set(map(namespace_of, relevant)))
+        near = [topic for topic in relevant if namespace_of(topic) == own]
+        if len(relevant) > len(near) == 1:
+            others = ', '.join(topic for topic in relevant if topic not in near)
+            self.notes['odometry'] = (
+                f'odometry is that of {near[0]}, in the namespace of the clouds, not of {others}; '
+                f'choose another with --odometry'
+            )
+            relevant = {near[0]: relevant[near[0]]}
         if len(relevant) > 1:
             raise RecordingError(
                 f'{self._decoder.origin}: TF alone does not lead to a fixed frame, and several '
@@ -159,6 +301,42 @@ class RecordedMotion:
             self.odometry_topic = topic
             tree.add_odometry(message)
         return odometry
+
+
+class _Stated:
+    """Poses of frames that the publishers of a namespace state."""
+
+    def __init__(self) -> None:
+        self._poses: dict[str, set[tuple[str, int, tuple[float, ...]]]] = {}
+
+    def add(self, transforms: Iterable[Any]) -> None:
+        """Add the transforms of a TFMessage."""
+        for item in transforms:
+            at, turn = item.transform.translation, item.transform.rotation
+            values = (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)
+            pose = tuple(round(float(value), 6) for value in values)
+            stamp = item.header.stamp
+            stated = item.header.frame_id, stamp.sec * 10**9 + stamp.nanosec, pose
+            self._poses.setdefault(item.child_frame_id.lstrip('/'), set()).add(stated)
+
+    def shares(self, other: _Stated) -> bool:
+        """Return whether another namespace states the same frames, and is no copy of this one."""
+        return any(self._poses[child] != other._poses[child] for child in self._common(other))
+
+    def difference(self, other: _Stated) -> str:
+        """Return a frame of which another namespace states other poses; empty if none."""
+        for child in self._common(other):
+            mine, theirs = (
+                {(parent, pose) for parent, _, pose in stated._poses[child]}
+                for stated in (self, other)
+            )
+            is_copy = bool(self._poses[child] & other._poses[child])
+            if mine != theirs and not is_copy:
+                return child
+        return ''
+
+    def _common(self, other: _Stated) -> list[str]:
+        return sorted(self._poses.keys() & other._poses.keys())
 
 
 def _fixed_frame(tree: TransformTree, frame: str, wanted: str | None) -> str | None:

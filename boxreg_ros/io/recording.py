@@ -68,8 +68,12 @@ class Recording:
         start: float | None = None,
         end: float | None = None,
         convention: Convention = STANDARD,
+        tf: Sequence[str] = (),
+        clock_offset: float = 0.0,
     ) -> None:
         self._convention = convention
+        self._asked_tf = tf
+        self._clock_offset = clock_offset
         self._paths = [Path(path) for path in paths]
         self._lidars = lidars
         self._sensor_frame = ''
@@ -127,8 +131,9 @@ class Recording:
             None if self._end is None else self.end_ns,
         )
         self._motion = RecordedMotion(
-            topics, self._decoder, self._read, part_ns, self._asked_odometry
-        )
+            topics, self._decoder, self._read, part_ns, self._asked_odometry,
+            self.points_topics, self._asked_tf,
+        )  # fmt: skip
 
     def __exit__(self, *_: object) -> None:
         """Close all files."""
@@ -240,6 +245,10 @@ class Recording:
     @property
     def finding(self) -> str:
         """Return what is unusual about the recordings as a whole; empty if nothing is."""
+        return '; '.join(filter(None, (self._pauses(), *self._motion.notes.values())))
+
+    def _pauses(self) -> str:
+        """Return that there are pauses between the recordings; empty if there are none."""
         parts = self._timeline.parts_ns
         if len(parts) == 1:
             return ''
@@ -271,6 +280,7 @@ class Recording:
         the clouds.
 
         """
+        tree.clock_offset = self._clock_offset
         first_error: RecordingError | None = None
         for frame in self._sensor_frames():  # the others go on where TF does not know one
             try:
@@ -381,7 +391,9 @@ class Recording:
             stamped = getattr(message, 'transforms', [message])
             with malformed(f'topic {connection.topic!r}'):
                 header = clouds.header_of(stamped[0]) if len(stamped) else None
-                return header and (poses.stamp_ns(header) or None)
+            stamp_ns = 0 if header is None else poses.stamp_ns(header)
+            is_motion = connection.topic not in self.data_topics
+            return (stamp_ns and stamp_ns + is_motion * round(self._clock_offset * 1e9)) or None
         except UnsupportedMessage:
             return None
 

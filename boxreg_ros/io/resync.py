@@ -17,6 +17,7 @@ from itertools import islice
 
 from boxreg_ros.io.storage.reader import Reader
 from boxreg_ros.io.storage.record import Record
+from msg_adapters import ADAPTERS
 from rosbags.interfaces import Connection
 
 APART_NS = 10**9
@@ -103,10 +104,27 @@ class MessageOrder:
         key = id(connection.owner), connection.id
         if key not in self._known:
             late_ns = self._late_ns(connection)
-            self._known[key] = abs(late_ns) > APART_NS
+            is_apart = abs(late_ns) > APART_NS
+            self._known[key] = is_apart and not self._has_other_clock(connection, late_ns)
             if self._known[key]:
                 self.apart.setdefault(connection.topic, late_ns * 1e-9)
         return self._known[key]
+
+    def _has_other_clock(self, connection: Connection, late_ns: int) -> bool:
+        """
+        Return whether a topic was recorded with the clouds, but stamped by another clock.
+
+        Its receive times then begin and end with those of the clouds, its stamps do not. Boxes
+        that are late may also be those of a slow detector, whose stamps are right.
+
+        """
+        if late_ns > 0 and connection.msgtype in ADAPTERS:
+            return False
+        begin_ns, end_ns = self._reader.span_ns(connection)
+        due = [stamp_ns + (self._delay_ns or 0) for _, stamp_ns in self._ends(connection)]
+        received = abs(begin_ns - self._begin_ns) + abs(end_ns - self._end_ns)
+        stamped = abs(due[0] - self._begin_ns) + abs(due[-1] - self._end_ns)
+        return received < stamped / 2
 
     def _late_ns(self, connection: Connection) -> int:
         """Return the larger delay of the first and the last message [ns]; 0 if unknown."""

@@ -16,8 +16,11 @@ from typing import Generic, NamedTuple, TYPE_CHECKING, TypeVar
 from boxreg_ros.config import Config
 from boxreg_ros.core.matching import AT_ONCE
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.id_assignment import Tracker
+from boxreg_ros.io.axis_check import AxisCheck
+from boxreg_ros.io.findings import Finding
+from boxreg_ros.io.id_assignment import IdCheck, Tracker
 from boxreg_ros.io.lidars import ignore, MergedSweep, Report, SensorPlacement, SweepMerger
+from boxreg_ros.io.motion_check import MotionCheck
 from boxreg_ros.io.pose_check import PoseCheck
 from boxreg_ros.io.transforms import move_to_frame, TIME_JUMP, TransformTree
 from boxreg_ros.reasons import Reason
@@ -136,7 +139,11 @@ class Session:
         topics = self._placement.lidars.topics
         if len(topics) > 1:
             self._merger = SweepMerger(topics, config.merge_span, report)
-        self.restart()
+        lidars = self._placement.lidars
+        self._motion_check = MotionCheck(self.tree, bool(lidars.frames or lidars.info))
+        self._id_check = None if convention.associate else IdCheck(config.max_gap)
+        self._axis_check = AxisCheck(convention, self._is_vehicle)
+        self._pose_check = PoseCheck(self._convention, AT_ONCE)
 
     @property
     def config(self) -> Config:
@@ -152,19 +159,33 @@ class Session:
     def restart(self) -> None:
         """Forget all but the transforms; ids that were assigned are not used again."""
         self._pose_check = PoseCheck(self._convention, AT_ONCE)
+        self._motion_check.restart()
+        self._axis_check.forget()
+        if self._id_check is not None:
+            self._id_check.forget()
         if self._merger is not None:
             self._merger.reset()
         if self._tracker is not None:
             self._tracker.forget()
 
-    def admit(self, item: Sweep | BoxArray) -> Admitted:
-        """Return a sweep or boxes in the fixed frame, with ids."""
+    def admit(self, item: Sweep | BoxArray, received_ns: int | None = None) -> Admitted:
+        """
+        Return a sweep or boxes in the fixed frame, with ids.
+
+        Parameters
+        ----------
+        item : Sweep or BoxArray
+            In the frame of its message.
+        received_ns : int or None
+            When it was received [ns], by the clock of the transforms in `tree`.
+
+        """
         if is_placeholder(item):
             return Admitted(None, None)
         try:
-            T_fixed_item = self.tree.lookup(
-                self.require_fixed_frame(item), item.frame_id, item.stamp_ns
-            )
+            fixed_frame = self.require_fixed_frame(item)
+            self._motion_check.add(item, fixed_frame, received_ns)
+            T_fixed_item = self.tree.lookup(fixed_frame, item.frame_id, item.stamp_ns)
         except TransformUnavailable as error:
             is_sweep = isinstance(item, Sweep)
             missing = Reason.SWEEP_WITHOUT_TRANSFORM if is_sweep else Reason.NO_TRANSFORM
@@ -174,8 +195,12 @@ class Session:
         if isinstance(moved, Sweep):
             moved, reason, detail = self._placement.placed(moved, self.tree)
         self._pose_check.add(moved)
-        if self._tracker is not None and isinstance(moved, BoxArray):
-            moved = self._tracker.identify(moved)
+        if isinstance(moved, BoxArray):
+            if self._tracker is not None:
+                moved = self._tracker.identify(moved)
+            if self._id_check is not None:
+                self._id_check.add(moved)
+            self._axis_check.add(moved)
         return Admitted(moved, T_fixed_item, reason, detail)
 
     def merged(self, sweep: Sweep, extra: object = None) -> list[MergedSweep]:
@@ -225,9 +250,27 @@ class Session:
         return found
 
     @property
+    def findings(self) -> list[Finding]:
+        """Return the faults of the input, and guesses about it, that were found so far."""
+        found = [*self._motion_check.findings.values()]
+        axes = self._axis_check.finding
+        # Points show which horizontal extent is which, motion also which axis points forward.
+        poses = axes or self._pose_check.finding
+        if poses:
+            found.append(Finding(Reason.POSE_REFERENCE, poses))
+        ids = '' if self._id_check is None else self._id_check.finding
+        if ids:
+            how = 'set associate:=true (boxreg relabel: --associate)'
+            found.append(Finding(Reason.TRACK_IDS_JUMP, f'{ids}; {how}'))
+        return found
+
+    @property
     def finding(self) -> str:
-        """Return the fault that the pose check has found; empty if it has found none."""
-        return self._pose_check.finding
+        """Return all findings in one line; empty if there are none."""
+        return '; '.join(found.text for found in self.findings)
+
+    def _is_vehicle(self, class_name: str) -> bool:
+        return self._config.kind(class_name) in ('vehicle', 'cyclist')
 
     @property
     def facts(self) -> dict[str, object]:

@@ -19,6 +19,27 @@ SEVERAL_LIDARS = ', or merge several LiDARs: repeat --points'
 WITHOUT_BOXES = ', or boxreg relabel --labels FORMAT:PATH or --boxes none'
 
 
+def namespace_of(topic: str) -> str:
+    """Return the namespace of a topic, without a slash at its end: empty for ``/tf``."""
+    return topic.rpartition('/')[0]
+
+
+def nearest_namespace(topics: Collection[str], spaces: Collection[str]) -> str | None:
+    """
+    Return the longest of some namespaces that all topics are in; None if there is none.
+
+    Parameters
+    ----------
+    topics : collection of str
+        Names with their namespaces, as ``/r1/lidar/points``.
+    spaces : collection of str
+        Namespaces as of `namespace_of`; the empty one has all topics in it.
+
+    """
+    fitting = [space for space in spaces if all(topic.startswith(f'{space}/') for topic in topics)]
+    return max(fitting, key=len, default=None)
+
+
 class Topics:
     """Topics of a recording; `kinds` has all of them, sorted, with the types of their messages."""
 

@@ -9,11 +9,13 @@ precedence; odometry is used where TF does not connect two frames.
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.io.clocks import Arrivals
 from boxreg_ros.rotations import (
     interpolate_rotation,
     matrix_from_quaternion,
@@ -40,6 +42,16 @@ A stamp this far before the newest is a time jump [s].
 Longer than any message is late on its way, shorter than a recording that is played in a loop.
 
 """
+ONCE = 1.0
+"""
+A single sample of a frame counts as static once others are so much newer [s].
+
+Chosen: ten periods of a publisher of 10 Hz, within what is read ahead of a recording.
+
+"""
+CHANGES_OF_PARENT = 3
+"""Changes between parents of a moving frame that two publishers make; chosen: a frame that is
+attached to another and back again has changed twice."""
 FRAMES_BEFORE_CLEANUP = 500
 """
 Number of frames that starts the search for those not updated for `BUFFER_DURATION`.
@@ -92,7 +104,10 @@ class TransformTree:
     `buffer_duration` [s]. After a time jump of a pair, new samples replace the old ones. Between
     samples, however far apart, positions are interpolated linearly and orientations along the
     shortest rotation, as tf2 does; up to `max_extrapolation` [s] outside of them the motion is
-    extrapolated. Not thread-safe.
+    extrapolated. A moving frame with one sample only counts as static once others are newer. Of a
+    frame that has two parents at once, the transforms to both are kept. Not thread-safe.
+
+    `clock_offset` [s] is added to the stamps of moving frames as they arrive.
 
     """
 
@@ -100,32 +115,51 @@ class TransformTree:
         self,
         max_extrapolation: float = MAX_EXTRAPOLATION,
         buffer_duration: float = BUFFER_DURATION,
+        clock_offset: float = 0.0,
     ) -> None:
         self._max_extrapolation_ns = round(max_extrapolation * 1e9)
         self._buffer_ns = round(buffer_duration * 1e9)
+        self.clock_offset = clock_offset
         self.clear()
 
     def clear(self) -> None:
         """Forget all frames and transforms."""
-        self._tf: dict[str, _Edge] = {}
-        self._odometry: dict[str, _Edge] = {}
-        self._routes: dict[tuple[str, str], list[tuple[_Edge, bool]]] = {}
+        self._tf: dict[str, Edge] = {}
+        self._odometry: dict[str, Edge] = {}
+        self._of_other_parents: dict[tuple[str, str], Edge] = {}
+        self._parent_changes: Counter[str] = Counter()
+        self._parents: dict[str, list[str]] = {}  # of children with several, as they came
+        self._routes: dict[tuple[str, str], list[tuple[Edge, bool]]] = {}
         self._frames_limit = FRAMES_BEFORE_CLEANUP
 
-    def add_transforms(self, transforms: Iterable[Any], is_static: bool = False) -> None:
-        """Add the ``geometry_msgs/TransformStamped`` of one TFMessage."""
+    def add_transforms(
+        self, transforms: Iterable[Any], is_static: bool = False, received_ns: int | None = None
+    ) -> None:
+        """
+        Add the transforms of one TFMessage.
+
+        Parameters
+        ----------
+        transforms : iterable of geometry_msgs/TransformStamped
+            As rclpy, rosbags or mcap decode them.
+        is_static : bool
+            Whether they are of ``/tf_static``: valid at all times.
+        received_ns : int or None
+            When the message was received [ns], for the comparison of clocks.
+
+        """
         for item in transforms:
             position, turn = item.transform.translation, item.transform.rotation
-            self._add(self._tf, item, position, turn, is_static)
+            self._add(self._tf, item, position, turn, is_static, received_ns)
 
     def add_pose(self, parent: str, child: str, stamp_ns: int, pose: Floats) -> None:
         """Add the pose of `child` in `parent` at a stamp: x y z qx qy qz qw."""
         self._add_to(self._tf, _name(parent), _name(child), stamp_ns, tuple(pose.tolist()), False)
 
-    def add_odometry(self, msg: Any) -> None:
+    def add_odometry(self, msg: Any, received_ns: int | None = None) -> None:
         """Add a ``nav_msgs/Odometry``: the pose of its child frame in its header's frame."""
         pose = msg.pose.pose
-        self._add(self._odometry, msg, pose.position, pose.orientation, False)
+        self._add(self._odometry, msg, pose.position, pose.orientation, False, received_ns)
 
     def rewind(self, stamp_ns: int) -> None:
         """Forget samples of moving frames that are later than a stamp that time went back to."""
@@ -142,7 +176,7 @@ class TransformTree:
         """Return ``T_target_source`` (4, 4) at a stamp, or raise TransformUnavailable."""
         T_target_source = np.eye(4)
         for edge, is_upward in self._route(target, source):
-            T = edge.at(stamp_ns, self._max_extrapolation_ns)
+            T = edge.at(stamp_ns, self._max_extrapolation_ns, self._is_once(edge, stamp_ns))
             T_target_source = (T if is_upward else inverse(T)) @ T_target_source
         return T_target_source
 
@@ -157,31 +191,75 @@ class TransformTree:
     def covers(self, target: str, source: str, stamp_ns: int) -> bool:
         """Return whether `lookup` would neither fail nor extrapolate."""
         return self.connects(target, source) and all(
-            edge.covers(stamp_ns) for edge, _ in self._route(target, source)
+            self._is_once(edge) or edge.covers(stamp_ns) for edge, _ in self._route(target, source)
         )
+
+    def route(self, target: str, source: str) -> list[Edge]:
+        """Return the pairs of frames from `source` to `target`; empty if nothing connects them."""
+        if not self.connects(target, source):
+            return []
+        return [edge for edge, _ in self._route(target, source)]
+
+    def moving_below(self, frame: str) -> list[str]:
+        """Return the frames that move in `frame` or below it, and have no others below, sorted."""
+        children: dict[str, list[Edge]] = {}
+        for edge in self._edges():
+            children.setdefault(edge.parent, []).append(edge)
+        found = set()
+        queue = [(_name(frame), False)]
+        seen = {_name(frame)}
+        for parent, is_moving in queue:
+            below = children.get(parent, [])
+            if is_moving and not below:
+                found.add(parent)
+            for edge in below:
+                if edge.child not in seen:
+                    seen.add(edge.child)
+                    queue.append((edge.child, is_moving or not self.is_constant(edge)))
+        return sorted(found)
+
+    def is_constant(self, edge: Edge) -> bool:
+        """Return whether a pair of frames is static, or has been published once so far."""
+        return edge.is_static or self._is_once(edge)
+
+    def other_parents(self, edge: Edge) -> list[str]:
+        """Return the other parents that transforms of the child of a pair have, sorted."""
+        if not self._has_two_parents(edge.child):
+            return []
+        edges = (self._tf.get(edge.child), *self._of_other_parents.values())
+        parents = {one.parent for one in edges if one is not None and one.child == edge.child}
+        return sorted(parents - {edge.parent})
 
     def fixed_frame(self, source: str) -> str | None:
         """
         Return the topmost frame that `source` moves in.
 
         It is the root of TF if a transform on the way to it moves; else the header frame of the
-        odometry that moves this root, or that is connected with `source` in another way. None
-        if no motion is known.
+        odometry that moves this root, or that is connected with `source` in another way; else the
+        root if other frames move in `source`, which does not move then. None if no motion is
+        known.
 
         """
         source = _name(source)
-        top, path = source, []
-        while top in self._tf and self._tf[top] not in path:
-            path.append(self._tf[top])
-            top = path[-1].parent
+        path = self.path(source)
+        top = path[-1].parent if path else source
         if top in self._odometry:
             return self._odometry[top].parent
-        if any(not edge.is_static for edge in path):
+        if not all(map(self.is_constant, path)):
             return top
         for edge in self._odometry.values():
             if self.connects(edge.parent, source):
                 return edge.parent
-        return None
+        return top if self.moving_below(source) else None
+
+    def path(self, source: str) -> list[Edge]:
+        """Return the pairs of frames from `source` up to the root of TF."""
+        top = _name(source)
+        path: list[Edge] = []
+        while top in self._tf and self._tf[top] not in path:
+            path.append(self._tf[top])
+            top = path[-1].parent
+        return path
 
     def __str__(self) -> str:
         """Return all pairs of parent and child."""
@@ -210,44 +288,112 @@ class TransformTree:
         return sorted({name for edge in self._edges() for name in (edge.parent, edge.child)})
 
     def _add(
-        self, edges: dict[str, _Edge], item: Any, position: Any, turn: Any, is_static: bool
+        self,
+        edges: dict[str, Edge],
+        item: Any,
+        position: Any,
+        turn: Any,
+        is_static: bool,
+        received_ns: int | None,
     ) -> None:
         parent, child = _name(item.header.frame_id), _name(item.child_frame_id)
         if not parent or not child:
             return  # refused by tf2, too; errors of lookups list the known transforms
         stamp_ns = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
+        if not is_static:
+            stamp_ns += round(self.clock_offset * 1e9)
         pose = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
-        self._add_to(edges, parent, child, stamp_ns, pose, is_static)
+        edge = self._add_to(edges, parent, child, stamp_ns, pose, is_static)
+        if received_ns is not None and not edge.is_static:
+            edge.arrivals.add(received_ns, stamp_ns)
 
     def _add_to(
         self,
-        edges: dict[str, _Edge],
+        edges: dict[str, Edge],
         parent: str,
         child: str,
         stamp_ns: int,
         pose: tuple[float, ...],
         is_static: bool,
-    ) -> None:
+    ) -> Edge:
         edge = edges.get(child)
-        if edge is None or edge.parent != parent:
-            edge = edges[child] = _Edge(parent, child, self._buffer_ns)
+        if edge is None:
+            edge = edges[child] = Edge(parent, child, self._buffer_ns)
             self._routes.clear()
+        elif edge.parent != parent:
+            edge = self._of_another_parent(edges, edge, parent, is_static)
         edge.is_static |= is_static
         edge.add(stamp_ns, pose)
         if len(edges) > self._frames_limit:
             oldest_ns = stamp_ns - self._buffer_ns
             for name in [name for name, edge in edges.items() if edge.is_older(oldest_ns)]:
                 del edges[name]
+            for key in [k for k, e in self._of_other_parents.items() if e.is_older(oldest_ns)]:
+                del self._of_other_parents[key]
             self._frames_limit = max(FRAMES_BEFORE_CLEANUP, 2 * len(edges))
+        return edge
 
-    def _edges(self) -> list[_Edge]:
-        return [*self._tf.values(), *self._odometry.values()]
+    def _of_another_parent(
+        self, edges: dict[str, Edge], edge: Edge, parent: str, is_static: bool
+    ) -> Edge:
+        """
+        Return the edge of a child that comes with another parent than that of `edge`.
 
-    def _route(self, target: str, source: str) -> list[tuple[_Edge, bool]]:
+        It takes the place of `edge`: the frame was attached to another one. Where two publishers
+        state two parents all the time, both edges stay, and one that moves has precedence, else
+        the one that was known first.
+
+        """
+        child = edge.child
+        other = self._of_other_parents.get((parent, child))
+        if self._has_two_parents(child) and other is not None:
+            return other
+        self._routes.clear()
+        self._parent_changes[child] += 1
+        parents = self._parents.setdefault(child, [edge.parent])
+        if parent not in parents:
+            parents.append(parent)
+        if edge.is_static or is_static:  # a static frame is attached once
+            self._parent_changes[child] = CHANGES_OF_PARENT
+        if not self._has_two_parents(child) or other is None:
+            other = Edge(parent, child, self._buffer_ns)  # samples of an earlier time are old
+        self._of_other_parents[edge.parent, child] = edge
+        self._of_other_parents[parent, child] = other
+        used = other
+        if self._has_two_parents(child):
+            static_of = {edge.parent: edge.is_static, parent: is_static}
+            first = min((p for p in parents if p in static_of), key=static_of.__getitem__)
+            used = edge if first == edge.parent else other
+        edges[child] = used
+        del self._of_other_parents[used.parent, child]
+        return other
+
+    def _has_two_parents(self, child: str) -> bool:
+        return self._parent_changes[child] >= CHANGES_OF_PARENT
+
+    def _is_once(self, edge: Edge, stamp_ns: int = 0) -> bool:
+        """Return whether a moving pair has been published once, long before others or a stamp."""
+        if not edge.may_be_constant:
+            return False
+        newest_ns = max(self.newest_ns() or 0, stamp_ns)
+        return newest_ns - edge.stamps[0] >= round(ONCE * 1e9)
+
+    def _edges(self) -> list[Edge]:
+        return [*self._tf_edges(), *self._odometry.values()]
+
+    def _tf_edges(self) -> list[Edge]:
+        """Return the edges of TF; those to other parents only where a frame has two at once."""
+        others = [
+            edge for (_, child), edge in self._of_other_parents.items()
+            if self._has_two_parents(child)
+        ]  # fmt: skip
+        return [*self._tf.values(), *others]
+
+    def _route(self, target: str, source: str) -> list[tuple[Edge, bool]]:
         """Return the edges from `source` to `target`, each with True where it leads upward."""
         key = (_name(target), _name(source))
         if key not in self._routes:
-            route = _connect(*key, self._tf.values())
+            route = _connect(*key, self._tf_edges())
             if route is None:
                 route = _connect(*key, self._edges())
             if route is None:
@@ -259,8 +405,20 @@ class TransformTree:
         return self._routes[key]
 
 
-class _Edge:
-    """One parent and child: a static pose, or poses over time."""
+class Edge:
+    """
+    One pair of parent and child frame: a static pose, or poses over time.
+
+    Attributes
+    ----------
+    stamps : list of int
+        Stamps of the samples, ascending [ns]; one for a static pair.
+    poses : list of (7,) float64
+        x y z qx qy qz qw of the child in the parent at these stamps [m].
+    arrivals : Arrivals
+        When the first samples were received.
+
+    """
 
     def __init__(self, parent: str, child: str, buffer_ns: int) -> None:
         self.parent = parent
@@ -268,7 +426,8 @@ class _Edge:
         self._buffer_ns = buffer_ns
         self.is_static = False
         self.stamps: list[int] = []
-        self._poses: list[Floats] = []
+        self.poses: list[Floats] = []
+        self.arrivals = Arrivals()
         self._jump_detector = TimeJumpDetector()
         self._was_forgotten = False
         self._last_added: tuple[int, Floats] | None = None
@@ -289,14 +448,17 @@ class _Edge:
             first, end = 0, len(self.stamps)
         else:
             first, end = bisect_left(self.stamps, stamp_ns), bisect_right(self.stamps, stamp_ns)
-        self.stamps[first:end], self._poses[first:end] = [stamp_ns], [values]
+        self.stamps[first:end], self.poses[first:end] = [stamp_ns], [values]
         old = bisect_left(self.stamps, self.stamps[-1] - self._buffer_ns)
         # Two samples stay at any age: extrapolation needs a velocity.
         old = max(min(old, len(self.stamps) - 2), 0)
-        del self.stamps[:old], self._poses[:old]
+        del self.stamps[:old], self.poses[:old]
 
     def rewind(self, stamp_ns: int) -> None:
+        """Forget later samples; at 0 the recording is read again."""
         newest_ns = stamp_ns + round(TIME_JUMP * 1e9)
+        if stamp_ns <= 0 and self.may_be_constant:
+            return  # published once: where the recording is read again, it is known from its begin
         if self.is_static or not self.stamps or self.stamps[-1] <= newest_ns:
             return
         self._forget()
@@ -308,19 +470,28 @@ class _Edge:
 
     def _forget(self) -> None:
         self.stamps.clear()
-        self._poses.clear()
+        self.poses.clear()
         self._last_found = None
 
+    @property
+    def may_be_constant(self) -> bool:
+        """Return whether there was one sample so far, of a pair that is not static."""
+        return not self.is_static and len(self.stamps) == 1 and not self._was_forgotten
+
     def is_older(self, stamp_ns: int) -> bool:
+        """Return whether the newest sample of a moving pair is older than a stamp [ns]."""
         return not self.is_static and bool(self.stamps) and self.stamps[-1] < stamp_ns
 
     def covers(self, stamp_ns: int) -> bool:
+        """Return whether a stamp lies between samples, or the pair is static."""
         if self.is_static:
             return bool(self.stamps)
         return bool(self.stamps) and self.stamps[0] <= stamp_ns <= self.stamps[-1]
 
-    def at(self, stamp_ns: int, max_extrapolation_ns: int) -> Floats:
-        """Return ``T_parent_child`` at a stamp."""
+    def at(self, stamp_ns: int, max_extrapolation_ns: int, is_constant: bool = False) -> Floats:
+        """Return ``T_parent_child`` at a stamp; at any if its only sample is `is_constant`."""
+        if is_constant:
+            return matrix(self.poses[0])
         if self._last_found is None or self._last_found[0] != stamp_ns:
             self._last_found = stamp_ns, self._at(stamp_ns, max_extrapolation_ns)
         return self._last_found[1]
@@ -342,13 +513,13 @@ class _Edge:
                 f'point cloud'
             )
         if self.is_static or len(stamps) == 1:
-            return matrix(self._poses[0])
+            return matrix(self.poses[0])
         after = min(max(bisect_left(stamps, stamp_ns), 1), len(stamps) - 1)
         if stamps[after] == stamp_ns:
-            return matrix(self._poses[after])
+            return matrix(self.poses[after])
         before = after - 1
         share = (stamp_ns - stamps[before]) / (stamps[after] - stamps[before])
-        return interpolated(self._poses[before], self._poses[after], share)
+        return interpolated(self.poses[before], self.poses[after], share)
 
 
 def matrix(pose: Floats) -> Floats:
@@ -410,13 +581,13 @@ def _name(frame_id: str) -> str:
     return frame_id.lstrip('/')
 
 
-def _connect(target: str, source: str, edges: Iterable[_Edge]) -> list[tuple[_Edge, bool]] | None:
+def _connect(target: str, source: str, edges: Iterable[Edge]) -> list[tuple[Edge, bool]] | None:
     """Return the shortest path from `source` to `target` over `edges`, or None."""
-    neighbours: dict[str, list[tuple[_Edge, bool]]] = {}
+    neighbours: dict[str, list[tuple[Edge, bool]]] = {}
     for edge in edges:
         neighbours.setdefault(edge.child, []).append((edge, True))
         neighbours.setdefault(edge.parent, []).append((edge, False))
-    routes: dict[str, list[tuple[_Edge, bool]]] = {source: []}
+    routes: dict[str, list[tuple[Edge, bool]]] = {source: []}
     queue = [source]
     for frame in queue:
         for edge, is_upward in neighbours.get(frame, ()):

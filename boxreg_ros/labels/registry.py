@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -20,6 +21,7 @@ from boxreg_ros.labels.protocol import (
     Provenance,
     SceneFrames,
 )
+from msg_adapters.convention import Convention, STANDARD
 
 BUILT_IN = {
     name: f'boxreg_ros.labels.{name}'
@@ -111,9 +113,16 @@ def writer_for(
     return module.Writer(folder, provenance, options or Options())
 
 
-def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterator[LabelFrame]:
+def frames_of(
+    name: str,
+    path: Path,
+    scene: SceneFrames | None = None,
+    convention: Convention = STANDARD,
+) -> Iterator[LabelFrame]:
     """
     Yield the frames of a label file or folder.
+
+    Files whose boxes follow another `convention` than their format are read by that.
 
     Boxes whose file states no status or covariance have the status ``input`` and the unit matrix.
     A scene of a data set, whose boxes are then read, completes the facts of the files.
@@ -135,7 +144,13 @@ def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterat
         frames = readable.read_scene(path, scene)
     else:
         frames = readable.read(path)
-    return frames
+    return frames if convention.is_standard else (_meant(one, convention) for one in frames)
+
+
+def _meant(frame: LabelFrame, convention: Convention) -> LabelFrame:
+    """Return a frame with its boxes as a convention means them."""
+    boxes = convention.to_centers(frame.refined.boxes)
+    return replace(frame, refined=replace(frame.refined, boxes=boxes))
 
 
 def import_format(name: str) -> FormatModule:

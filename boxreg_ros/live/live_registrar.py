@@ -298,7 +298,7 @@ class LiveRegistrar:
         if is_placeholder(content):
             return self.passed_through(item.message)
         self._start_following(item.received)
-        admitted = self.session.admit(content)
+        admitted = self.session.admit(content, item.received_ns)
         if admitted.reason:
             self._report_missing_transform(content, admitted.reason, admitted.detail)
         moved = admitted.moved
@@ -487,8 +487,8 @@ class LiveRegistrar:
             T_output_item = T_output_fixed @ T_fixed_item
             given = boxes_to_frame(content, T_output_item, self.output_frame)
         self._last_boxes = item.received
-        if self.session.finding:
-            self._trouble(Reason.POSE_REFERENCE, self.session.finding, 1)
+        for found in self.session.findings:
+            self._trouble(found.reason, found.text, 1)
         pending = _Pending(
             item.message, replace(given, track_ids=moved.track_ids), item.received,
             T_output_fixed, T_output_item, moved.track_ids != content.track_ids,

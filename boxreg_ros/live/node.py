@@ -94,6 +94,7 @@ class BoxregNode(Node):
             self._health.report, options.convention, options.lidars, self._budget,
             options.static_points_wait if options.static_points else None, options.input_model,
         )  # fmt: skip
+        self._live.session.tree.clock_offset = options.clock_offset
         gc.collect()
         gc.freeze()  # a collection of imported objects would take 50 ms, several times a minute
 
@@ -200,8 +201,7 @@ class BoxregNode(Node):
     def _subscribe_to_motion(self) -> None:
         """Subscribe to odometry and transforms."""
         qos = QoSProfile(depth=ODOMETRY_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        put = partial(self._inbox.put_event, 'odom')
-        self._topics.subscribe('nav_msgs/msg/Odometry', 'odom', put, qos)
+        self._topics.subscribe('nav_msgs/msg/Odometry', 'odom', self._on_odometry, qos)
         # That of tf2_ros.
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         try:
@@ -245,7 +245,10 @@ class BoxregNode(Node):
         self.get_logger().info(f'boxes are {type_name}; {self._topics.description()}')
 
     def _on_transforms(self, topic: str, msg: Any) -> None:
-        self._inbox.put_event(topic, msg.transforms)
+        self._inbox.put_event(topic, (msg.transforms, time.monotonic_ns()))
+
+    def _on_odometry(self, msg: Any) -> None:
+        self._inbox.put_event('odom', (msg, time.monotonic_ns()))
 
     def _on_points(self, lidar: str, msg: Any) -> None:
         self.worker.cloud_frame = header_of(msg).frame_id

@@ -70,6 +70,20 @@ class NodeOptions:
         'x+', 'axis of the pose that points forward', choices=tuple(FORWARD)
     )
     associate: bool = setting(False, 'assign track ids by data association, ignoring those given')
+    boxes_offset: float = setting(
+        0.0,
+        'added to the stamps of the boxes, where their clock is behind that of the clouds',
+        's',
+        -1e10,
+        1e10,
+    )
+    clock_offset: float = setting(
+        0.0,
+        'added to the stamps of TF and odometry, where their clock is behind that of the clouds',
+        's',
+        -1e10,
+        1e10,
+    )
     fixed_frame: str = setting(
         '', 'frame to refine in; empty: the root of the tree that the frame of the clouds moves in'
     )
@@ -118,7 +132,8 @@ class NodeOptions:
     @property
     def convention(self) -> Convention:
         """Return the convention of the poses and sizes of the input boxes."""
-        return Convention(self.pose_reference, self.size_order, self.forward_axis, self.associate)
+        own = self.pose_reference, self.size_order, self.forward_axis, self.associate
+        return Convention(*own, self.boxes_offset)
 
     @property
     def lidars(self) -> Lidars:

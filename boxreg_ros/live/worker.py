@@ -241,9 +241,11 @@ class Worker:
     def _take_event(self, kind: str, content: Any) -> None:
         match kind:
             case '/tf' | '/tf_static':
-                self._live.session.tree.add_transforms(content, is_static=kind == '/tf_static')
+                transforms, received_ns = content
+                is_static = kind == '/tf_static'
+                self._live.session.tree.add_transforms(transforms, is_static, received_ns)
             case 'odom':
-                self._live.session.tree.add_odometry(content)
+                self._live.session.tree.add_odometry(*content)
             case 'points_info':
                 try:
                     self._live.placement.add_info(content)

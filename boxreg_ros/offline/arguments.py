@@ -19,7 +19,10 @@ RECORDINGS = (
     'nuscenes:/data#scene-0061'
 )
 """Kinds of recordings, for the help of options."""
-TOPICS = ('lidars', 'boxes', 'odometry', 'pose_reference', 'size_order', 'forward_axis')
+TOPICS = (
+    *('lidars', 'boxes', 'odometry', 'tf', 'clock_offset'),
+    *('pose_reference', 'size_order', 'forward_axis', 'stamp_offset'),
+)
 """Options of `Request` for the topics to read, and for the convention of the boxes."""
 
 

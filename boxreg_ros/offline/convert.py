@@ -115,7 +115,7 @@ def _read_frames(request: Request, folder: Path, unused: dict[str, Any]) -> Iter
     if request.recordings:
         yield from _read_with_recording(request, folder, unused)
         return
-    for frame in frames_of(*_labels(request)):
+    for frame in frames_of(*_labels(request), convention=request.convention):
         yield frame.moved('fixed')
 
 
@@ -194,7 +194,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='recording of the labels, if the label files lack the sensor poses; repeatable',
     )  # fmt: skip
     add_options(
-        parser, Request, 'options', 'label_frame', 'lidars', 'odometry', 'fixed_frame'
+        parser, Request, 'options', 'label_frame', 'lidars', 'odometry', 'tf', 'clock_offset',
+        'fixed_frame', 'pose_reference', 'size_order', 'forward_axis', 'stamp_offset',
     )  # fmt: skip
 
 

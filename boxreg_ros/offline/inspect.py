@@ -242,7 +242,7 @@ def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
         if count >= SAMPLE_ITEMS or item.received_ns > begin_ns + SAMPLE_SECONDS * 1e9:
             break
         sample.add(item)
-        admitted = session.admit(item.content)
+        admitted = session.admit(item.content, item.received_ns)
         if admitted.detail:
             sample.without_transform.append(admitted.detail)
     recording.check_readable()

@@ -20,11 +20,12 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.latency import LateBoxes, Latency, set_latency
 from boxreg_ros.errors import ConfigError, RecordingError, TransferError
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
+from boxreg_ros.io.id_assignment import IdCheck
 from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.progress import Stopwatch
-from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.sources import label_frame_of
+from boxreg_ros.offline.request import NO_TOPIC, Request
+from boxreg_ros.offline.sources import label_frame_of, scene_address
 from boxreg_ros.offline.stored_sweeps import StoredPlace, StoredSweeps
 from boxreg_ros.offline.workers import Background, Receive, run_in_worker, Send
 from boxreg_ros.structures import BoxArray, Floats, Sweep
@@ -86,7 +87,8 @@ class RecordingReader:
     Read an open recording and bring its items into the fixed frame.
 
     The stages ``read``, ``decode`` and ``transform`` are measured by the clock. All sweeps are
-    stored in `sweeps`. `source` is known before the first item.
+    stored in `sweeps`. `source` is known before the first item. Where `jumping_ids` says that the
+    ids of the input jump from object to object, boxes are associated instead.
 
     """
 
@@ -97,15 +99,20 @@ class RecordingReader:
         clock: Stopwatch,
         latency: Latency = Latency(),  # noqa: B008
         sweeps: StoredSweeps | None = None,
+        jumping_ids: str = '',
     ) -> None:
         self._recording = recording
+        self._jumping_ids = jumping_ids
         self._clock = clock
         self._sweeps = sweeps
         self._with_points = request.options.with_points
         self._with_times = request.config.sampling.deskew
         self._waits = request.config.estimate == 'track'
+        convention = request.convention
+        if jumping_ids:
+            convention = replace(convention, associate=True)
         self._items = FixedFrameItems(
-            recording, request.config, request.convention, request.fixed_frame, clock
+            recording, request.config, convention, request.fixed_frame, clock
         )
         with clock('read'):
             sensor_frame = label_frame_of(
@@ -159,7 +166,7 @@ class RecordingReader:
             items.session.lidar_counts,
             recording.unreadable.total(),
             recording.outside,
-            '; '.join(filter(None, (recording.finding, items.session.finding))),
+            '; '.join(filter(None, (recording.finding, self._jumping_ids, items.session.finding))),
             facts,
             [] if self._sweeps is None else self._sweeps.complete(),
             self._clock.stages(),
@@ -224,23 +231,61 @@ def latency_of(request: Request) -> Latency:
     known = set_latency(request.config)
     if known is not None:
         return known
-    begin = request.start or 0.0
-    with request.recording() as recording:
-        seconds = (recording.end_ns - recording.start_ns) * 1e-9
     late = LateBoxes()
-    parts = [(request.start, request.end)]
-    if seconds > 2 * SAMPLES * SAMPLED_SECONDS:
-        starts = begin + (np.arange(SAMPLES) + 0.5) / SAMPLES * seconds
-        parts = [(start, start + SAMPLED_SECONDS) for start in starts.tolist()]
-    for start, end in parts:
+    for part in _sampled_parts(request):
         late.restart()
         try:
-            _show(replace(request, start=start, end=end, report=False), late)
+            _show(part, late)
         except TransferError:
             raise
         except RecordingError:  # a pause shows nothing; what else is wrong is said on reading
             continue
     return late.estimate()
+
+
+def _sampled_parts(request: Request) -> list[Request]:
+    """Return requests of the parts of a recording that show its properties: all of a short one."""
+    with request.recording() as recording:
+        seconds = (recording.end_ns - recording.start_ns) * 1e-9
+    parts = [(request.start, request.end)]
+    if seconds > 2 * SAMPLES * SAMPLED_SECONDS:
+        starts = (request.start or 0.0) + (np.arange(SAMPLES) + 0.5) / SAMPLES * seconds
+        parts = [(start, start + SAMPLED_SECONDS) for start in starts.tolist()]
+    return [replace(request, start=start, end=end, report=False) for start, end in parts]
+
+
+def jumping_ids_of(request: Request) -> str:
+    """
+    Return that the ids of a topic of boxes jump from object to object, in words; '' if not.
+
+    Ids of label files are a person's, and are kept.
+
+    """
+    is_topic = request.labels is None and request.boxes != NO_TOPIC
+    is_asked = request.keep_ids or request.keyframes or request.convention.associate
+    if is_asked or not is_topic or scene_address(request.recordings) is not None:
+        return ''
+    check = IdCheck(request.config.max_gap)
+    for part in _sampled_parts(request):
+        check.forget()
+        try:
+            with part.recording() as recording:
+                items = FixedFrameItems(recording, part.config, part.convention, part.fixed_frame)
+                for item in items.read(with_clouds=False):
+                    if item.restarts:
+                        check.forget()
+                    if isinstance(item.moved, BoxArray):
+                        check.add(item.moved)
+        except TransferError:
+            raise
+        except RecordingError:  # what is wrong is said on reading
+            continue
+    if not check.finding:
+        return ''
+    return (
+        f'{check.finding}; boxes are associated over time instead, as with --associate; set '
+        f'--keep-ids to take the ids as they are'
+    )
 
 
 def _show(part: Request, late: LateBoxes) -> None:
@@ -316,9 +361,10 @@ def _messages(
 ) -> Generator[Source | ReadItem | Findings]:
     """Yield the source of a recording, all its items, and the findings."""
     latency = latency_of(request) if latency is None else latency
+    jumping_ids = jumping_ids_of(request)
     with request.recording() as recording:
         _check_copies(request, recording)
-        reading = RecordingReader(recording, request, Stopwatch(), latency, sweeps)
+        reading = RecordingReader(recording, request, Stopwatch(), latency, sweeps, jumping_ids)
         yield reading.source
         if isinstance(recording, Recording) and reading.source.seconds > LONG:
             recording.read_boxes_as_arrays()  # the main process goes on meanwhile

@@ -60,7 +60,26 @@ class Request:
         'found by type)',
         metavar='TOPIC',
     )
+    tf: tuple[str, ...] = option(
+        (),
+        'topic of transforms, with the static ones of its namespace, where several robots state '
+        'the same frames (default: all, or those of the namespace of the clouds); can be repeated',
+        metavar='TOPIC',
+        is_repeated=True,
+    )
+    clock_offset: float = option(
+        0.0,
+        'added to the stamps of TF and odometry, where their clock is behind that of the clouds '
+        '[s]; boxreg inspect estimates it',
+        metavar='S',
+        parse=float,
+    )
     convention: Convention = STANDARD
+    keep_ids: bool = option(
+        False,
+        'take the track ids of a topic as they are, even where they jump from object to object; '
+        'by default boxes are then associated, as with --associate',
+    )
     labels: tuple[str, Path] | None = option(
         None,
         'read the boxes from label files instead of a topic',
@@ -192,11 +211,6 @@ class Request:
             raise ConfigError(
                 'boxes: expected either a topic (--boxes) or label files (--labels), got both; '
                 'leave one out'
-            )
-        if not self.convention.is_standard:
-            raise ConfigError(
-                f'{self.convention}: expected for boxes of a topic only, got label files; leave '
-                f'it out: each label format has its own convention, see boxreg formats'
             )
         module_of(self.labels[0])  # refuses an unknown format
 

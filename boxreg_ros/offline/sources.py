@@ -20,6 +20,7 @@ from boxreg_ros.labels import frames_of
 from boxreg_ros.labels.merging import LabelMerger
 from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.structures import BoxArray
+from msg_adapters.convention import Convention
 import numpy as np
 
 
@@ -28,16 +29,18 @@ class LabelledRecording(Recording):
 
     has_boxes = False
 
-    def __init__(self, labels: tuple[str, Path], paths: Any, **options: Any) -> None:
+    def __init__(
+        self, labels: tuple[str, Path], paths: Any, convention: Convention, **options: Any
+    ) -> None:
         super().__init__(paths, **options)
         self._labels = labels
+        self._label_convention = convention
         self._is_part = any(options.get(name) is not None for name in ('start', 'end'))
 
     def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
         """Yield clouds and boxes; see `Recording.items`. Boxes have `Item.refined`."""
-        merger = LabelMerger(
-            frames_of(*self._labels), tree, self.sensor_frame(), self.start_ns, self._is_part
-        )
+        frames = frames_of(*self._labels, convention=self._label_convention)
+        merger = LabelMerger(frames, tree, self.sensor_frame(), self.start_ns, self._is_part)
         for cloud in super().items(tree, wanted._replace(clouds=True)):
             if wanted.clouds:
                 yield cloud
@@ -80,11 +83,12 @@ def source_of(request: Request) -> Recording | SceneRecording:
     if address is not None:
         _check_scene(address, request)
         topics = request.lidars.topics
-        return SceneRecording(address, topics, request.start, request.end, request.labels)
-    names = ('lidars', 'odometry', 'start', 'end')
+        part = request.start, request.end
+        return SceneRecording(address, topics, *part, request.labels, request.convention)
+    names = ('lidars', 'odometry', 'start', 'end', 'tf', 'clock_offset')
     options = {name: getattr(request, name) for name in names}
     if request.labels is not None:
-        return LabelledRecording(request.labels, request.recordings, **options)
+        return LabelledRecording(request.labels, request.recordings, request.convention, **options)
     if request.boxes == NO_TOPIC:
         return UnlabelledRecording(request.recordings, **options)
     options |= {'boxes': request.boxes, 'convention': request.convention}
@@ -112,16 +116,22 @@ def _check_scene(address: Address, request: Request) -> None:
             f'sensor_frames, points_info: expected for recordings with topics only, got {lidars} '
             f'with {address}; leave them out: a data set has the positions of its LiDARs'
         )
-    for name, topic in (('boxes', request.boxes), ('odometry', request.odometry)):
+    named = (
+        ('boxes', request.boxes),
+        ('odometry', request.odometry),
+        ('tf', ', '.join(request.tf) or None),
+        ('clock_offset', request.clock_offset or None),
+    )
+    for name, topic in named:
         if topic is not None:
             raise ConfigError(
                 f'{name}: expected for recordings with topics only, got {topic!r} with {address}; '
-                f'leave --{name} out'
+                f'leave --{name.replace("_", "-")} out'
             )
-    if not convention.is_standard:
+    if not convention.is_standard and request.labels is None:
         raise ConfigError(
-            f'{convention}: expected for boxes of a topic only, got {address}; leave it out: a '
-            f'data set has its own convention'
+            f'{convention}: expected for boxes of a topic or of label files, got {address}; leave '
+            f'it out: a data set has its own convention'
         )
 
 

@@ -1,0 +1,175 @@
+"""Check of the axes of boxes against the way they move: vehicles drive along their length."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from math import atan2, pi
+
+from boxreg_ros.structures import BoxArray, Floats, LENGTH, WIDTH, YAW
+from msg_adapters.convention import Convention, FORWARD
+import numpy as np
+
+MIN_WAY = 2.0
+"""Way from which a direction is taken [m]; chosen: noise of 0.3 m makes 9 degrees of it."""
+MAX_SECONDS = 2.0
+"""Longest time of this way [s]: slower than 1 m/s, boxes of parked objects drift as fast."""
+MAX_SPEED = 70.0
+"""Faster ones are jumps of ids [m/s]."""
+MAX_ANGLE = pi / 6
+"""Largest angle between a direction and the axis that it counts for [rad]; chosen."""
+MIN_TRACKS = 2
+"""Tracks that a finding needs."""
+MIN_DIRECTIONS = 4
+"""Directions of a single track that are enough: 8 m."""
+MIN_TRACKS_BACKWARD = 3
+"""Tracks that must drive backward; chosen: one or two may."""
+MAX_DIRECTIONS = 500
+"""After so many directions the check ends; chosen."""
+MIN_SHARE = 0.8
+"""Share of the directions that must agree; chosen: about half of unresolved headings do."""
+MIN_RATIO = 1.15
+"""Ratio of length and width of a vehicle from which they can be told apart; chosen."""
+SWAPPED = str.maketrans('lw', 'wl')
+OPTIONS = ('forward_axis', 'size_order')
+"""Of a `Convention`, which the motion can show."""
+AXIS_WORDS = {
+    'x+': 'x axis',
+    'y+': 'y axis, sideways',
+    'x-': 'x axis backward',
+    'y-': 'y axis, sideways to the right',
+}
+AXES = tuple(FORWARD)
+"""Axes of a pose, each a quarter turn after the one before it."""
+
+
+@dataclass(slots=True)
+class _Way:
+    """Where a track was when its last direction was taken, and the axes that it moved along."""
+
+    stamp_ns: int
+    box: Floats
+    axes: Counter[str] = field(default_factory=Counter)
+
+
+class AxisCheck:
+    """
+    Compare the axes of boxes with their motion; `wanted` is the convention that fits.
+
+    Points cannot show which axis points forward; the way of moving vehicles and cyclists does.
+    Once that is known, the larger horizontal extent is the length. `finding` says which options
+    would fit; it is empty where nothing moves. The check ends after `MAX_DIRECTIONS`.
+
+    """
+
+    def __init__(self, convention: Convention, is_checked: Callable[[str], bool]) -> None:
+        self._convention = convention
+        self._is_checked = is_checked
+        self._ratios: list[float] = []
+        self._axes: Counter[str] = Counter()
+        self._tracks: Counter[str] = Counter()  # by the axis along which they moved first
+        self.finding = ''
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget where the tracks are, after a time jump; directions stay."""
+        self._ways: dict[str, _Way] = {}
+
+    def add(self, boxes: BoxArray) -> None:
+        """
+        Add the next boxes, and update `finding`.
+
+        Parameters
+        ----------
+        boxes : BoxArray
+            In a fixed frame, with ids; read by the convention that is checked.
+
+        """
+        known = len(self._ratios)
+        if known >= MAX_DIRECTIONS:
+            return
+        oldest_ns = boxes.stamp_ns - round(MAX_SECONDS * 1e9)
+        self._ways = {k: way for k, way in self._ways.items() if way.stamp_ns >= oldest_ns}
+        for track_id, name, box in zip(
+            boxes.track_ids, boxes.class_names, boxes.boxes, strict=True
+        ):
+            if track_id and np.isfinite(box).all() and self._is_checked(name):
+                self._add(track_id, boxes.stamp_ns, box)
+        if len(self._ratios) > known:
+            self.finding = self._text()
+
+    def _add(self, track_id: str, stamp_ns: int, box: Floats) -> None:
+        way = self._ways.get(track_id)
+        if way is None:
+            self._ways[track_id] = _Way(stamp_ns, box)
+            return
+        step = box[:2] - way.box[:2]
+        moved = float(np.hypot(*step))
+        if moved < MIN_WAY:
+            return
+        if moved <= MAX_SPEED * (stamp_ns - way.stamp_ns) * 1e-9:
+            yaws = np.exp(1j * np.array([way.box[YAW], box[YAW]]))
+            axis = _axis_of(atan2(step[1], step[0]) - float(np.angle(yaws.sum())))
+            self._tracks[axis] += not way.axes[axis]
+            self._axes[axis] += 1
+            self._ratios.append(float(box[LENGTH] / box[WIDTH]))
+            way.axes[axis] += 1
+        way.stamp_ns = stamp_ns
+        way.box = box
+
+    @property
+    def wanted(self) -> Convention:
+        """Return the convention of the motion: the one that is checked, if nothing else fits."""
+        axis = self._axis()
+        if axis is None:
+            return self._convention
+        turned = AXES[(AXES.index(self._convention.forward_axis) + AXES.index(axis)) % 4]
+        wanted = replace(self._convention, forward_axis=turned)
+        ratio = float(np.median(self._ratios))
+        is_long = ratio > (1 / MIN_RATIO if axis[0] == 'x' else MIN_RATIO)
+        # A vehicle is longer than wide: along the axis that points forward.
+        if is_long:
+            return wanted
+        return replace(wanted, size_order=wanted.size_order.translate(SWAPPED))
+
+    def _text(self) -> str:
+        """Return which options fit the motion; empty if the convention that is checked does."""
+        wanted, own = self.wanted, self._convention
+        names = [name for name in OPTIONS if getattr(wanted, name) != getattr(own, name)]
+        if not names:
+            return ''
+        tracks = self._tracks.total()
+        expected = ' and '.join(f'{name} {getattr(wanted, name)!r}' for name in names)
+        got = ' and '.join(repr(getattr(own, name)) for name in names)
+        node = ' '.join(f'{name}:={getattr(wanted, name)}' for name in names)
+        flags = ' '.join(f'--{n.replace("_", "-")} {getattr(wanted, n)}' for n in names)
+        how = 'are wider than long along their way'
+        if wanted.forward_axis != own.forward_axis:
+            how = f'move along their {AXIS_WORDS[self._axis() or "x+"]}'
+        return (
+            f'boxes of vehicles {how} (seen of {tracks} moving tracks): expected {expected}, got '
+            f'{got}; set {node} (boxreg relabel and convert: {flags})'
+        )
+
+    def _axis(self) -> str | None:
+        """Return the axis along which the tracks move; None if too few do, or all ways."""
+        if not self._axes:
+            return None
+        axis, count = self._axes.most_common(1)[0]
+        if axis not in AXES or count < MIN_SHARE * self._axes.total():
+            return None
+        tracks = self._tracks[axis]
+        if axis == 'x-' and tracks < MIN_TRACKS_BACKWARD:
+            return None
+        if tracks < MIN_TRACKS and count < MIN_DIRECTIONS:
+            return None
+        return axis
+
+
+def _axis_of(angle: float) -> str:
+    """Return the axis of a box that a direction at an angle from x is near; '' for none."""
+    for axis, forward in FORWARD.items():
+        if abs(np.angle(np.exp(1j * (angle - forward)))) <= MAX_ANGLE:
+            return axis
+    return ''

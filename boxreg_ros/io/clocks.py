@@ -1,0 +1,93 @@
+"""Clocks of streams of messages, compared by when their messages were received."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+
+import numpy as np
+
+MIN_CLOCK_OFFSET = 0.4
+"""
+Smallest offset between two clocks that is reported [s].
+
+Chosen: a cloud is complete and on its way for 0.1 to 0.3 s, and publishers of TF put their stamps
+0.1 s ahead; NTP that has just started, GPS and TAI are off by more.
+
+"""
+MAX_SCATTER = 0.2
+"""Median deviation of an offset that is constant [s]; chosen: load delays some of the messages."""
+MIN_PAIRS = 5
+"""Pairs of messages that the offset of two clocks needs; chosen."""
+SPACING_NS = 10**8
+"""Messages of a stream that are nearer to each other are left out [ns]."""
+CAPACITY = 200
+"""Messages of a stream that are compared: the first 20 s at 10 Hz."""
+PAIR_NS = 10**9
+"""Largest difference of the receive times of a pair [ns]; a stream of 1 Hz has one."""
+KNOWN_OFFSETS = {37.0: 'TAI and UTC', 18.0: 'GPS time and UTC', 19.0: 'TAI and GPS time'}
+"""Offsets of clocks that are known exactly [s], and between which they are."""
+NEAR_KNOWN = 0.3
+"""Largest difference from an offset that is known [s]: the delay of a message."""
+
+
+class Arrivals:
+    """
+    Receive times and stamps of the first messages of one stream.
+
+    Receive times may be of any clock that does not jump; it is the same for streams that are
+    compared.
+
+    """
+
+    def __init__(self) -> None:
+        self.received_ns: list[int] = []
+        self.delays_ns: list[int] = []
+        """Receive times less stamps."""
+
+    def add(self, received_ns: int, stamp_ns: int) -> None:
+        """Add a message, unless it follows the one before it at once, or there are enough."""
+        if len(self.received_ns) >= CAPACITY or stamp_ns <= 0:
+            return
+        if self.received_ns and received_ns - self.received_ns[-1] < SPACING_NS:
+            return
+        self.received_ns.append(received_ns)
+        self.delays_ns.append(received_ns - stamp_ns)
+
+
+def clock_offset(first: Arrivals, second: Arrivals) -> float | None:
+    """
+    Return the seconds to add to stamps of the `second` stream to get those of the first clock.
+
+    The messages that were received about the same time are compared, so that both streams may be
+    played faster or slower. None if too few were, or the offset is not constant.
+
+    """
+    offsets = []
+    for received_ns, delay_ns in zip(second.received_ns, second.delays_ns, strict=True):
+        row = _nearest(first.received_ns, received_ns)
+        if row is not None:
+            offsets.append((delay_ns - first.delays_ns[row]) * 1e-9)
+    if len(offsets) < MIN_PAIRS:
+        return None
+    offset = float(np.median(offsets))
+    if np.median(np.abs(np.array(offsets) - offset)) > MAX_SCATTER:
+        return None
+    return offset
+
+
+def likely_offset(offset: float) -> tuple[float, str]:
+    """Return the offset of two clocks that a measured one [s] is of, and their names if known."""
+    for seconds, names in KNOWN_OFFSETS.items():
+        if abs(abs(offset) - seconds) < NEAR_KNOWN:
+            return float(np.copysign(seconds, offset)), names
+    return round(offset, 2), ''
+
+
+def _nearest(received_ns: list[int], wanted_ns: int) -> int | None:
+    """Return the row of the receive time next to another; None if it is not near."""
+    after = bisect_left(received_ns, wanted_ns)
+    rows = [row for row in (after - 1, after) if 0 <= row < len(received_ns)]
+    nearest = min(rows, key=lambda row: abs(received_ns[row] - wanted_ns), default=None)
+    if nearest is None or abs(received_ns[nearest] - wanted_ns) > PAIR_NS:
+        return None
+    return nearest

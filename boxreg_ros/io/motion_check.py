@@ -1,0 +1,366 @@
+"""
+Check of the motion of the sensors: frames that jump, clocks, and mistakes of publishers of TF.
+
+The same for the live node and for recordings. `JumpSearch` finds the corrections of a localisation
+in the transforms above the frame that moves smoothly; `MotionCheck` watches the transforms that
+clouds and boxes are moved by.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.io.clocks import Arrivals, clock_offset, likely_offset, MIN_CLOCK_OFFSET
+from boxreg_ros.io.findings import Finding
+from boxreg_ros.io.transforms import Edge, inverse, matrix, TransformTree
+from boxreg_ros.reasons import Reason
+from boxreg_ros.structures import BoxArray, Sweep
+import numpy as np
+
+MIN_STEP = 0.15
+"""
+Smallest step between two samples of a transform that is a correction [m].
+
+Chosen: the error of a detected centre is of this size, that of a localisation between corrections
+a third of it.
+
+"""
+STEP_RADIUS = 20.0
+"""Distance from the sensor at which a rotation counts as a step [m]; chosen: that of objects."""
+MAX_SPEED = 100.0
+"""Speed that no vehicle has [m/s]; derived: 360 km/h."""
+MIN_ALTERNATIONS = 3
+"""Samples at impossible speed that mean two publishers; chosen: one or two are a restart."""
+SPARSE_PERIOD = 0.25
+"""
+Median period of a moving frame that is too long to interpolate [s].
+
+Derived: at 3 m/s^2 linear interpolation is off by a t^2 / 8 = 2.3 cm, at 1 s by 0.4 m.
+
+"""
+MAX_BOXES_DELAY = 1.0
+"""Delay of boxes after their clouds that is reported [s]; a live detector takes 0.1 to 0.5 s."""
+LOOK_PERIOD = 10
+"""Clouds between two looks at what changes slowly; chosen: 1 s at 10 Hz."""
+FIRST_LOOK = 5
+"""Cloud of the first look, for short recordings."""
+LIDAR_NAMES = (
+    *('lidar', 'laser', 'velodyne', 'hesai', 'pandar', 'ouster', 'os_sensor', 'livox', 'mid360'),
+    *('rslidar', 'robosense', 'innovusion', 'aeva', 'luminar', 'scan'),
+)
+"""Parts of the names of frames of LiDARs, by their drivers."""
+
+
+@dataclass(slots=True)
+class Steps:
+    """Corrections of the transform between two frames."""
+
+    parent: str
+    child: str
+    count: int = 0
+    largest: float = 0.0
+    """In metres, a rotation as the way at `STEP_RADIUS`."""
+    first_ns: int = 0
+
+    def add(self, step: float, stamp_ns: int) -> None:
+        """Add a step [m] at a stamp [ns]."""
+        self.first_ns = self.first_ns or stamp_ns
+        self.count += 1
+        self.largest = max(self.largest, step)
+
+    def __str__(self) -> str:
+        """Return number and size of the steps."""
+        steps = f'{self.count} steps of up to' if self.count > 1 else 'a step of'
+        return (
+            f'{self.parent} -> {self.child} has {steps} {self.largest:.2f} m, the first at '
+            f'{self.first_ns} ns, as localisation makes them'
+        )
+
+
+@dataclass
+class JumpSearch:
+    """
+    Search of corrections between a fixed frame and the frame that a sensor moves smoothly in.
+
+    By REP 105 a localisation corrects ``map -> odom`` in steps, while ``odom`` is smooth. The
+    lowest moving transform is the motion itself; those above it should not step.
+
+    """
+
+    steps: dict[tuple[str, str], Steps] = field(default_factory=dict)
+    """By parent and child, of the transforms that stepped."""
+    alternations: dict[tuple[str, str], Steps] = field(default_factory=dict)
+    """Steps of the motion itself at a speed that no vehicle has."""
+    _seen_ns: dict[tuple[str, str], int] = field(default_factory=dict)
+
+    def look(self, tree: TransformTree, fixed_frame: str, sensor_frame: str) -> None:
+        """Add the samples that are new in `tree`, between both frames."""
+        moving = [e for e in tree.route(fixed_frame, sensor_frame) if not tree.is_constant(e)]
+        for number, edge in enumerate(moving):
+            for row in self._new_rows(edge):
+                if number:
+                    self._add_step(tree, edge, row, sensor_frame)
+                else:
+                    self._add_speed(edge, row)
+
+    def smooth_frame(self, tree: TransformTree, fixed_frame: str, sensor_frame: str) -> str:
+        """Return the topmost frame on the way to the sensor that no transform below it steps."""
+        for edge in tree.route(fixed_frame, sensor_frame):
+            if (edge.parent, edge.child) in self.steps:
+                return edge.child
+        return fixed_frame
+
+    def _new_rows(self, edge: Edge) -> range:
+        """Return the rows of samples after one before them, which were not looked at."""
+        key = edge.parent, edge.child
+        seen_ns = self._seen_ns.get(key, -1)
+        rows = range(1 + int(np.searchsorted(edge.stamps[1:], seen_ns, 'right')), len(edge.stamps))
+        if edge.stamps:
+            self._seen_ns[key] = edge.stamps[-1]
+        return rows
+
+    def _add_step(self, tree: TransformTree, edge: Edge, row: int, sensor_frame: str) -> None:
+        """Compare a sample with the one before it, at the place of the sensor."""
+        stamp_ns = edge.stamps[row]
+        try:
+            T_child_sensor = tree.lookup(edge.child, sensor_frame, stamp_ns)
+        except TransformUnavailable:
+            return
+        before, after = (matrix(pose) @ T_child_sensor for pose in edge.poses[row - 1 : row + 1])
+        change = inverse(before) @ after
+        cosine = np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1)
+        step = float(np.linalg.norm(change[:3, 3]) + np.arccos(cosine) * STEP_RADIUS)
+        if step >= MIN_STEP:
+            known = self.steps.setdefault(
+                (edge.parent, edge.child), Steps(edge.parent, edge.child)
+            )
+            known.add(step, stamp_ns)
+
+    def _add_speed(self, edge: Edge, row: int) -> None:
+        """Note two samples of the motion that lie too far apart."""
+        way = float(np.linalg.norm(edge.poses[row][:3] - edge.poses[row - 1][:3]))
+        seconds = (edge.stamps[row] - edge.stamps[row - 1]) * 1e-9
+        if way > 1.0 and way > MAX_SPEED * seconds:
+            key = edge.parent, edge.child
+            self.alternations.setdefault(key, Steps(*key)).add(way, edge.stamps[row])
+
+
+class MotionCheck:
+    """
+    Watch the transforms of a stream of clouds and boxes for what makes their motion wrong.
+
+    `findings` has what was found so far, in words, by its kind.
+
+    """
+
+    def __init__(self, tree: TransformTree, named_sensors: bool) -> None:
+        self._tree = tree
+        self._named_sensors = named_sensors
+        self._jumps = JumpSearch()
+        self.findings: dict[str, Finding] = {}
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget when messages were received: time has jumped. What was found stays."""
+        self._clouds = Arrivals()
+        self._boxes = Arrivals()
+        self._count = 0
+
+    def add(self, item: Sweep | BoxArray, fixed_frame: str, received_ns: int | None) -> None:
+        """
+        Add a cloud or boxes, in the frame of their message.
+
+        Parameters
+        ----------
+        item : Sweep or BoxArray
+            As its adapter reads it.
+        fixed_frame : str
+            The frame that it is moved to.
+        received_ns : int or None
+            When it was received [ns], by the clock of the transforms; None if that is not known.
+
+        """
+        arrivals = self._clouds if isinstance(item, Sweep) else self._boxes
+        if received_ns is not None:
+            arrivals.add(received_ns, item.stamp_ns)
+        if not isinstance(item, Sweep):
+            return
+        self._count += 1
+        if self._count == FIRST_LOOK or self._count % LOOK_PERIOD == 0:
+            self._look(fixed_frame, item.frame_id)
+
+    def _look(self, fixed_frame: str, frame: str) -> None:
+        """Look at the transforms as they are now."""
+        tree = self._tree
+        route = tree.route(fixed_frame, frame)
+        moving = [edge for edge in route if not tree.is_constant(edge)]
+        self._jumps.look(tree, fixed_frame, frame)
+        found = {
+            'jumps': self._jump_text(fixed_frame, frame),
+            'publishers': self._publisher_text(),
+            'clock': self._clock_text(moving),
+            'boxes_clock': self._boxes_clock_text(),
+            'sensor': '' if self._named_sensors else registered_text(tree, fixed_frame, frame),
+            'sparse': _sparse_text(moving),
+            'parents': _parents_text(tree, route),
+            'once': _once_text([edge for edge in route if edge not in moving]),
+        }
+        for kind, text in found.items():
+            if text:
+                self.findings[kind] = Finding(REASONS_OF[kind], text)
+
+    def _jump_text(self, fixed_frame: str, frame: str) -> str:
+        smooth = self._jumps.smooth_frame(self._tree, fixed_frame, frame)
+        if smooth == fixed_frame:
+            return ''
+        return (
+            f'the fixed frame {fixed_frame!r} jumps: {_worst(self._jumps.steps.values())}; '
+            f'{smooth!r} moves smoothly: choose it with --fixed-frame {smooth} (node: '
+            f'fixed_frame:={smooth})'
+        )
+
+    def _publisher_text(self) -> str:
+        for steps in self._jumps.alternations.values():
+            if steps.count >= MIN_ALTERNATIONS:
+                return (
+                    f'transform {steps.parent} -> {steps.child}: expected one motion, got '
+                    f'{steps.count} jumps of up to {steps.largest:.1f} m between samples, the '
+                    f'first at {steps.first_ns} ns, faster than any vehicle: two publishers state '
+                    f'it; choose another source of motion, with --fixed-frame or --odometry'
+                )
+        return ''
+
+    def _clock_text(self, moving: Sequence[Edge]) -> str:
+        """Return how far the clock of the fastest motion is off from that of the clouds."""
+        edge = max(moving, key=_way, default=None)
+        measured = None if edge is None else clock_offset(self._clouds, edge.arrivals)
+        if edge is None or measured is None or abs(measured) < MIN_CLOCK_OFFSET:
+            return ''
+        offset, names = likely_offset(measured)
+        total = round(offset + self._tree.clock_offset, 2)
+        of_whom = f', as {names} are' if names else ''
+        return (
+            f'clocks: expected one for clouds and motion, got stamps of the clouds '
+            f'{abs(offset):g} s {"ahead of" if offset > 0 else "behind"} those of {edge.parent} '
+            f'-> {edge.child} received at the same time{of_whom}: each cloud is placed by the '
+            f'pose of another moment; correct the motion with --clock-offset={total:g} (node: '
+            f'clock_offset:={total:g})'
+        )
+
+    def _boxes_clock_text(self) -> str:
+        """Return how far the clock of the boxes is off from that of the clouds."""
+        measured = clock_offset(self._clouds, self._boxes)
+        if measured is None or -MIN_CLOCK_OFFSET < measured < MAX_BOXES_DELAY:
+            return ''
+        offset, names = likely_offset(measured)
+        of_whom = f', as {names} are' if names else ''
+        doubt = ''
+        if offset > 0:
+            doubt = 'unless the detector takes that long, '
+        return (
+            f'clocks: expected one for clouds and boxes, got stamps of the boxes '
+            f'{abs(offset):g} s {"behind" if offset > 0 else "ahead of"} those of the clouds '
+            f'received at the same time{of_whom}; {doubt}correct them with '
+            f'--boxes-offset={offset:g} (node: boxes_offset:={offset:g})'
+        )
+
+
+def registered_text(tree: TransformTree, fixed_frame: str, frame: str) -> str:
+    """
+    Return what to do about clouds that are registered into a frame that does not move.
+
+    Parameters
+    ----------
+    tree : TransformTree
+        The transforms so far.
+    fixed_frame, frame : str
+        The frame to refine in, and that of the clouds.
+
+    Returns
+    -------
+    str
+        Empty where the frame of the clouds moves, or none moves in it.
+
+    """
+    if not all(map(tree.is_constant, tree.route(fixed_frame, frame))):
+        return ''
+    below = tree.moving_below(frame)
+    if not below:
+        return ''
+    likely = [name for name in below if any(part in name.lower() for part in LIDAR_NAMES)]
+    names = likely or below
+    more = f' (or one of {", ".join(names[1:])})' if names[1:] else ''
+    return (
+        f'clouds are in {frame!r}, which does not move, while {", ".join(names)} moves in it: '
+        f'they are registered already, and the origin of {frame!r} is taken for the position of '
+        f'the LiDAR; name its frame: --sensor-frame {names[0]}{more} (node: '
+        f"sensor_frames:=['{names[0]}'])"
+    )
+
+
+def _sparse_text(moving: Sequence[Edge]) -> str:
+    """Return that the motion itself, the lowest of moving transforms, has few samples."""
+    for edge in moving[:1]:
+        if len(edge.stamps) < 3:
+            continue
+        period = float(np.median(np.diff(edge.stamps))) * 1e-9
+        if period > SPARSE_PERIOD:
+            return (
+                f'transform {edge.parent} -> {edge.child} comes every {period:.2g} s: expected '
+                f'every {SPARSE_PERIOD:g} s or more often; in between the motion is interpolated, '
+                f'which is off where the vehicle turns, brakes or accelerates; use a faster '
+                f'source of motion if the recording has one: --fixed-frame of it, or --odometry'
+            )
+    return ''
+
+
+def _parents_text(tree: TransformTree, route: Sequence[Edge]) -> str:
+    """Return which frame has two parents."""
+    for edge in route:
+        others = tree.other_parents(edge)
+        if others:
+            return (
+                f'frame {edge.child!r}: expected one parent, got {edge.parent!r}, which is used, '
+                f'and {", ".join(map(repr, others))}; to use another, name it: --fixed-frame '
+                f'{others[0]} (node: fixed_frame:={others[0]})'
+            )
+    return ''
+
+
+def _once_text(constant: Sequence[Edge]) -> str:
+    """Return which transform was published once, but not as a static one."""
+    for edge in constant:
+        if not edge.is_static and edge.stamps:
+            return (
+                f'transform {edge.parent} -> {edge.child} was published once on a topic of moving '
+                f'transforms, at {edge.stamps[0]} ns; it is used as a static one, at all times'
+            )
+    return ''
+
+
+def _way(edge: Edge) -> float:
+    """Return the way that the child of a pair has moved in its parent [m]."""
+    if len(edge.poses) < 2:
+        return 0.0
+    positions = np.array([pose[:3] for pose in edge.poses])
+    return float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0)))
+
+
+def _worst(steps: Iterable[Steps]) -> Steps:
+    return max(steps, key=lambda one: one.largest)
+
+
+REASONS_OF = {
+    'jumps': Reason.FIXED_FRAME_JUMPS,
+    'publishers': Reason.TRANSFORM_FAULT,
+    'clock': Reason.CLOCK_OFFSET,
+    'boxes_clock': Reason.CLOCK_OFFSET,
+    'sensor': Reason.SENSOR_POSITION,
+    'sparse': Reason.TRANSFORM_FAULT,
+    'parents': Reason.TRANSFORM_FAULT,
+    'once': Reason.TRANSFORM_FAULT,
+}
+"""Kind of a finding -> reason by which the node counts it."""

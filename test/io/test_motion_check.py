@@ -1,0 +1,294 @@
+"""Motion of the sensors that is wrong without a word: clocks, jumps, publishers of TF."""
+
+from copy import deepcopy
+
+from boxreg_ros.config import Config
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.fixed_frame import FixedFrameItems
+from boxreg_ros.io.lidars import Lidars
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.structures import Sweep
+from msg_adapters.convention import Convention, STANDARD
+import numpy as np
+import pytest
+from ros_messages import Drive, SECOND, START, write_recording
+
+
+def read(drive, tmp_path, fixed_frame=None, convention=STANDARD, **options):
+    """Return positions of the sensor by stamp, the fixed frame and all findings of a drive."""
+    path = write_recording(tmp_path / 'drive', drive.items, messages=drive.messages)
+    with Recording([path], convention=convention, **options) as recording:
+        items = FixedFrameItems(recording, Config(), convention, fixed_frame)
+        moved = [item.moved for item in items.read()]
+        found = '; '.join(filter(None, (recording.finding, items.session.finding)))
+    origins = {one.stamp_ns: one.origin for one in moved if isinstance(one, Sweep)}
+    return origins, items.fixed_frame, found
+
+
+def true_origins(sweeps):
+    return {START + k * SECOND // 10: [0.5 * k, 0.0, 2.0] for k in range(sweeps)}
+
+
+def assert_true(origins, sweeps, atol=1e-9):
+    true = true_origins(sweeps)
+    assert origins.keys() == true.keys()
+    for stamp, origin in origins.items():
+        np.testing.assert_allclose(origin, true[stamp], atol=atol)
+
+
+def in_namespace(drive, space, topics=('/tf', '/tf_static', '/points', '/boxes')):
+    """Move topics of a drive into a namespace."""
+    drive.items = [(space + t if t in topics else t, *rest) for t, *rest in drive.items]
+
+
+def robots(sweeps, numbers, space='/r{}', shift=20.0):
+    """Return a drive of the first robot, and with it the transforms of others, 30 ms later."""
+    drive = Drive(sweeps=sweeps)
+    in_namespace(drive, space.format(1))
+    m = drive.messages
+    for number in numbers:
+        for k in range(sweeps):
+            stamp = START + k * SECOND // 10 + 30_000_000
+            message = m.tf(m.transform(stamp, 'odom', 'base', (shift * number + 0.5 * k, 0, 0)))
+            drive.items.append((f'{space.format(number)}/tf', stamp, message))
+    drive.items.sort(key=lambda item: item[1])
+    return drive
+
+
+@pytest.mark.parametrize('numbers', [[2], [2, 3]])
+@pytest.mark.parametrize('space', ['/r{}', '/fleet/r{}'])
+def test_transforms_are_those_of_the_namespace_of_the_clouds(tmp_path, numbers, space):
+    origins, frame, found = read(robots(8, numbers, space), tmp_path)
+    assert_true(origins, 8)
+    assert frame == 'odom'
+    assert f'those of {space.format(1)}/tf, in the namespace of the clouds' in found
+    assert all(f'{space.format(number)}/tf' in found for number in numbers)
+
+
+def test_robots_that_stand_at_first_are_kept_apart_too(tmp_path):
+    drive = robots(8, [2], shift=0.0)
+    for topic, _, message in drive.items:
+        if topic.endswith('/tf'):
+            message.transforms[0].transform.translation.x = 0.0
+    _, _, found = read(drive, tmp_path)
+    assert 'without /r2/tf' in found
+
+
+def test_clouds_without_a_namespace_need_a_choice_between_two_robots(tmp_path):
+    drive = robots(8, [2])
+    drive.items = [(t.replace('/r1/points', '/points'), *rest) for t, *rest in drive.items]
+    with pytest.raises(RecordingError, match='--tf /r1/tf or --tf /r2/tf'):
+        read(drive, tmp_path)
+    origins, _, found = read(drive, tmp_path / 'asked', tf=['/r1/tf'])
+    assert_true(origins, 8)
+    assert not found
+    with pytest.raises(RecordingError, match="no topic '/r3/tf'; topics with transforms"):
+        read(drive, tmp_path / 'wrong', tf=['/r3/tf'])
+
+
+def test_a_copy_of_tf_and_frames_with_prefixes_are_no_second_robot(tmp_path):
+    drive = Drive(sweeps=8)
+    m = drive.messages
+    for topic, received, message in list(drive.items):
+        if topic == '/tf':
+            drive.items.append(('/relay/tf', received, deepcopy(message)))
+            stamp = received + 1
+            other = m.tf(m.transform(stamp, '/r2/odom', '/r2/base', (20, 0, 0)))
+            drive.items.append(('/r2/tf', stamp, other))
+    drive.items.sort(key=lambda item: item[1])
+    origins, _, found = read(drive, tmp_path)
+    assert_true(origins, 8)
+    assert not found
+
+
+def test_odometry_is_that_of_the_namespace_of_the_clouds(tmp_path):
+    drive = Drive(sweeps=8, motion='odometry')
+    m = drive.messages
+    in_namespace(drive, '/r1', ('/odom', '/points', '/boxes'))
+    for k in range(8):
+        stamp = START + k * SECOND // 10
+        drive.items.append(('/r2/odom', stamp, m.odometry(stamp, 'odom', 'base', (20, 0, 0))))
+    origins, _, found = read(drive, tmp_path)
+    assert_true(origins, 8)
+    assert 'odometry is that of /r1/odom' in found
+    assert '/r2/odom' in found
+
+
+def stamps_moved(drive, topics, seconds):
+    """Add an offset to the stamps in the headers on some topics."""
+    for topic, _, message in drive.items:
+        if topic not in topics:
+            continue
+        stamped = getattr(message, 'transforms', [message])
+        for one in (*stamped, *getattr(message, 'detections', [])):
+            stamp = one.header.stamp
+            total = stamp.sec * SECOND + stamp.nanosec + round(seconds * 1e9)
+            stamp.sec, stamp.nanosec = divmod(total, SECOND)
+
+
+@pytest.mark.parametrize('motion', ['tf', 'odometry'])
+@pytest.mark.parametrize('seconds', [0.5, -0.5, 1.5, -1.5, 18.0, -37.0])
+def test_the_clock_of_clouds_and_boxes_may_be_off_from_that_of_the_motion(
+    tmp_path, seconds, motion
+):
+    sweeps = 30
+    drive = Drive(sweeps=sweeps, motion=motion)
+    stamps_moved(drive, ('/points', '/boxes'), seconds)
+    _, _, found = read(drive, tmp_path)
+    assert f'set of the clouds {abs(seconds):g} s'.replace('set', 'got stamps') in found
+    assert f'--clock-offset={seconds:g}' in found
+    assert ('GPS time' in found, 'TAI' in found) == (seconds == 18, abs(seconds) == 37)
+    origins, _, found = read(drive, tmp_path / 'corrected', clock_offset=seconds)
+    assert not found
+    assert_true({stamp - round(seconds * 1e9): at for stamp, at in origins.items()}, sweeps)
+
+
+def test_the_clock_of_the_motion_alone_may_be_off(tmp_path):
+    drive = Drive(sweeps=30)
+    stamps_moved(drive, ('/tf',), -1.2)
+    assert '--clock-offset=1.2' in read(drive, tmp_path)[2]
+    origins, _, found = read(drive, tmp_path / 'corrected', clock_offset=1.2)
+    assert not found
+    assert_true(origins, 30)
+
+
+@pytest.mark.parametrize('seconds', [0.6, 1.5, 37.0])
+def test_boxes_from_the_future_have_another_clock(tmp_path, seconds):
+    drive = Drive(sweeps=30)
+    stamps_moved(drive, ('/boxes',), seconds)
+    found = read(drive, tmp_path)[2]
+    assert f'stamps of the boxes {seconds:g} s ahead of those of the clouds' in found
+    assert f'--boxes-offset={-seconds:g}' in found
+    convention = Convention(stamp_offset=-seconds)
+    path = write_recording(tmp_path / 'corrected', drive.items, messages=drive.messages)
+    with Recording([path], convention=convention) as recording:
+        items = FixedFrameItems(recording, Config(), convention)
+        stamps = [item.given.stamp_ns for item in items.read()]
+        assert sorted(stamps) == sorted(2 * list(true_origins(30)))
+        assert not items.session.finding
+
+
+def test_delays_of_a_common_clock_are_no_finding(tmp_path):
+    """Clouds are received 0.2 s after their stamp, boxes 0.5 s, transforms at once."""
+    drive = Drive(sweeps=20)
+    delays = {'/points': 200_000_000, '/boxes': 500_000_000}
+    drive.items = [(t, ns + delays.get(t, 0), message) for t, ns, message in drive.items]
+    drive.items.sort(key=lambda item: item[1])
+    origins, _, found = read(drive, tmp_path)
+    assert_true(origins, 20)
+    assert not found
+
+
+def with_map(drive, position_of, every=1):
+    """Add map -> odom at each stamp of the motion, at a position that depends on it."""
+    m = drive.messages
+    for k, stamp in enumerate(drive.stamps):
+        if k % every == 0:
+            message = m.tf(m.transform(stamp, 'map', 'odom', position_of(k)))
+            drive.items.append(('/tf', stamp, message))
+    drive.items.sort(key=lambda item: item[1])
+    return drive
+
+
+@pytest.mark.parametrize(
+    'position_of, count',
+    [
+        (lambda k: (0.4 * (k // 5 % 2), 0, 0), 3),
+        (lambda k: (0, 0.5 * (k >= 13), 0), 1),
+    ],
+    ids=['often', 'once'],
+)
+def test_a_frame_that_localisation_corrects_in_steps_is_not_the_fixed_one(
+    tmp_path, position_of, count
+):
+    drive = with_map(Drive(sweeps=20), position_of)
+    origins, frame, found = read(drive, tmp_path)
+    assert frame == 'odom'
+    assert_true(origins, 20)
+    assert "fixed frame is 'odom', not 'map', which jumps" in found
+    assert ('steps of up to' in found) == (count > 1)
+    _, frame, found = read(drive, tmp_path / 'asked', 'map')
+    assert frame == 'map'
+    assert "the fixed frame 'map' jumps: map -> odom has" in found
+    assert '--fixed-frame odom' in found
+
+
+def test_a_jump_that_rotates_the_map_is_found(tmp_path):
+    """The vehicle stands at the origin of odom: only what it sees moves."""
+    drive = Drive(sweeps=20)
+    m = drive.messages
+    half = np.radians(1.0) / 2
+    for k, stamp in enumerate(drive.stamps):
+        turn = (0, 0, np.sin(half), np.cos(half)) if k >= 10 else (0, 0, 0, 1)
+        drive.items.append(
+            ('/tf', stamp, m.tf(m.transform(stamp, 'map', 'odom', (0, 0, 0), turn)))
+        )
+    drive.items.sort(key=lambda item: item[1])
+    assert read(drive, tmp_path)[1] == 'odom'
+
+
+def test_a_map_that_drifts_smoothly_stays_the_fixed_frame(tmp_path):
+    drive = with_map(Drive(sweeps=20), lambda k: (5 + 0.01 * k, -0.005 * k, 0))
+    _, frame, found = read(drive, tmp_path)
+    assert (frame, found) == ('map', '')
+
+
+def test_clouds_registered_into_the_fixed_frame_need_the_frame_of_their_lidar(tmp_path):
+    drive = Drive(sweeps=12)
+    for topic, _, message in drive.items:
+        if topic in ('/points', '/boxes'):
+            message.header.frame_id = 'odom'
+    origins, frame, found = read(drive, tmp_path)
+    assert frame == 'odom'
+    assert '--sensor-frame lidar' in found
+    assert "sensor_frames:=['lidar']" in found
+    origins, _, found = read(drive, tmp_path / 'asked', lidars=Lidars(frames=('lidar',)))
+    assert not found
+    assert_true(origins, 12)
+
+
+def test_two_publishers_of_one_motion_are_named(tmp_path):
+    drive = robots(12, [2])
+    drive.items = [(t.replace('/r2/', '/r1/'), *rest) for t, *rest in drive.items]
+    found = read(drive, tmp_path)[2]
+    assert 'transform odom -> base: expected one motion, got' in found
+    assert 'two publishers' in found
+
+
+def test_a_static_transform_published_once_on_tf_is_used_at_all_times(tmp_path):
+    drive = Drive(sweeps=20)
+    m = drive.messages
+    drive.items = [item for item in drive.items if item[0] != '/tf_static']
+    late = START + 3 * SECOND // 10
+    drive.items.append(('/tf', late, m.tf(m.transform(late, 'base', 'lidar', (0, 0, 2)))))
+    drive.items.sort(key=lambda item: item[1])
+    origins, _, found = read(drive, tmp_path)
+    assert_true(origins, 20)
+    assert 'base -> lidar was published once on a topic of moving transforms' in found
+
+
+def test_a_frame_with_two_parents_is_named_and_either_may_be_chosen(tmp_path):
+    drive = Drive(sweeps=20)
+    m = drive.messages
+    for k, stamp in enumerate(drive.stamps):
+        message = m.tf(m.transform(stamp + 1, 'map', 'base', (100 + 0.5 * k, 0, 0)))
+        drive.items.append(('/tf', stamp + 1, message))
+    drive.items.sort(key=lambda item: item[1])
+    origins, frame, found = read(drive, tmp_path)
+    assert frame == 'odom'
+    assert_true(origins, 20)
+    assert "frame 'base': expected one parent, got 'odom', which is used, and 'map'" in found
+    origins, frame, _ = read(drive, tmp_path / 'asked', 'map')
+    assert frame == 'map'
+    np.testing.assert_allclose(origins[START + SECOND], [105, 0, 2], atol=1e-6)
+
+
+def test_sparse_transforms_are_named(tmp_path):
+    drive = Drive(sweeps=41)
+    drive.items = [
+        item
+        for k, item in enumerate(drive.items)
+        if item[0] != '/tf' or (item[1] - START) % SECOND == 0
+    ]
+    found = read(drive, tmp_path)[2]
+    assert 'transform odom -> base comes every 1 s' in found
