@@ -215,12 +215,6 @@ class Reason(StrEnum):
         'a publisher of TF makes a mistake that moves clouds and boxes; the log names the frames',
         CHECK_TRANSFORMS,
     )
-    POINT_TIMES = (
-        'point_times',
-        'message',
-        'the times of the points of its clouds are not those of a sweep; the log has the figures',
-        'correct the driver of the LiDAR, or set `time_unit`',
-    )
     LATENCY = (
         'latency',
         'message',

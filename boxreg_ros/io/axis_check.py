@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from math import atan2, pi
+from functools import lru_cache
+from math import atan2, hypot, pi
 
-from boxreg_ros.structures import BoxArray, Floats, LENGTH, WIDTH, YAW
+from boxreg_ros.structures import BoxArray, Floats, is_valid_box, LENGTH, WIDTH, YAW
 from msg_adapters.convention import Convention, FORWARD
 import numpy as np
 
@@ -15,11 +16,11 @@ MIN_WAY = 2.0
 """Way from which a direction is taken [m]; chosen: noise of 0.3 m makes 9 degrees of it."""
 MAX_SECONDS = 2.0
 """Longest time of this way [s]: slower than 1 m/s, boxes of parked objects drift as fast."""
-MAX_SPEED = 70.0
+MAX_OBJECT_SPEED = 70.0
 """Faster ones are jumps of ids [m/s]."""
 MAX_ANGLE = pi / 6
 """Largest angle between a direction and the axis that it counts for [rad]; chosen."""
-MIN_TRACKS = 2
+MIN_MOVING_TRACKS = 2
 """Tracks that a finding needs."""
 MIN_DIRECTIONS = 4
 """Directions of a single track that are enough: 8 m."""
@@ -65,7 +66,7 @@ class AxisCheck:
 
     def __init__(self, convention: Convention, is_checked: Callable[[str], bool]) -> None:
         self._convention = convention
-        self._is_checked = is_checked
+        self._is_checked = lru_cache(maxsize=100)(is_checked)
         self._ratios: list[float] = []
         self._axes: Counter[str] = Counter()
         self._tracks: Counter[str] = Counter()  # by the axis along which they moved first
@@ -91,11 +92,10 @@ class AxisCheck:
             return
         oldest_ns = boxes.stamp_ns - round(MAX_SECONDS * 1e9)
         self._ways = {k: way for k, way in self._ways.items() if way.stamp_ns >= oldest_ns}
-        for track_id, name, box in zip(
-            boxes.track_ids, boxes.class_names, boxes.boxes, strict=True
-        ):
-            if track_id and np.isfinite(box).all() and self._is_checked(name):
-                self._add(track_id, boxes.stamp_ns, box)
+        is_valid = is_valid_box(boxes.boxes).tolist()
+        for row, track_id in enumerate(boxes.track_ids):
+            if track_id and is_valid[row] and self._is_checked(boxes.class_names[row]):
+                self._add(track_id, boxes.stamp_ns, boxes.boxes[row])
         if len(self._ratios) > known:
             self.finding = self._text()
 
@@ -104,11 +104,11 @@ class AxisCheck:
         if way is None:
             self._ways[track_id] = _Way(stamp_ns, box)
             return
-        step = box[:2] - way.box[:2]
-        moved = float(np.hypot(*step))
+        step = (box[:2] - way.box[:2]).tolist()
+        moved = hypot(*step)
         if moved < MIN_WAY:
             return
-        if moved <= MAX_SPEED * (stamp_ns - way.stamp_ns) * 1e-9:
+        if moved <= MAX_OBJECT_SPEED * (stamp_ns - way.stamp_ns) * 1e-9:
             yaws = np.exp(1j * np.array([way.box[YAW], box[YAW]]))
             axis = _axis_of(atan2(step[1], step[0]) - float(np.angle(yaws.sum())))
             self._tracks[axis] += not way.axes[axis]
@@ -162,7 +162,7 @@ class AxisCheck:
         tracks = self._tracks[axis]
         if axis == 'x-' and tracks < MIN_TRACKS_BACKWARD:
             return None
-        if tracks < MIN_TRACKS and count < MIN_DIRECTIONS:
+        if tracks < MIN_MOVING_TRACKS and count < MIN_DIRECTIONS:
             return None
         return axis
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, Floats, Ints, is_valid_box
 import numpy as np
+from numpy.typing import NDArray
 
 CENTER_STD = 0.3
 """Standard deviation of a detected centre [m]."""
@@ -36,39 +37,78 @@ more.
 
 
 @dataclass(eq=False, slots=True)
-class _Track:
-    """A constant-velocity Kalman filter of the centre, with one covariance (2, 2) for all axes."""
+class _Tracks:
+    """
+    Constant-velocity Kalman filters of the centres of K tracks, each with one covariance per axis.
 
-    track_id: str
-    stamp_ns: int
-    center: Floats
-    velocity: Floats
-    covariance: Floats
-    extent: Floats
+    `covariances` are (K, 3): variance of the position, covariance with the velocity, variance of
+    the velocity.
+
+    """
+
+    ids: list[str]
+    stamps_ns: Ints
+    centers: Floats
+    velocities: Floats
+    covariances: Floats
+    extents: Floats
 
     @classmethod
-    def started(cls, track_id: str, stamp_ns: int, box: Floats) -> _Track:
-        covariance = np.diag([CENTER_STD**2, INITIAL_SPEED_STD**2])
-        extent = box[BOX_EXTENT]
-        return cls(track_id, stamp_ns, box[BOX_CENTER], np.zeros(3), covariance, extent)
+    def started(cls, ids: list[str], stamp_ns: int, boxes: Floats) -> _Tracks:
+        """Return tracks (K) that begin with boxes (K, 9)."""
+        count = len(boxes)
+        covariances = np.tile([CENTER_STD**2, 0.0, INITIAL_SPEED_STD**2], (count, 1))
+        stamps_ns = np.full(count, stamp_ns, np.int64)
+        centers, extents = boxes[:, BOX_CENTER], boxes[:, BOX_EXTENT]
+        return cls(ids, stamps_ns, centers, np.zeros((count, 3)), covariances, extents)
 
     def predicted(self, stamp_ns: int) -> tuple[Floats, Floats]:
-        """Return centre (3,) and covariance (2, 2) at a stamp."""
-        seconds = (stamp_ns - self.stamp_ns) * 1e-9
-        F = np.array([[1.0, seconds], [0.0, 1.0]])
-        G = np.array([seconds**2 / 2, abs(seconds)]) * ACCELERATION_STD
-        return self.center + seconds * self.velocity, F @ self.covariance @ F.T + np.outer(G, G)
+        """Return centres (K, 3) and covariances (K, 3) at a stamp."""
+        seconds = (stamp_ns - self.stamps_ns) * 1e-9
+        position, cross, speed = self.covariances.T
+        of_position = seconds**2 / 2 * ACCELERATION_STD
+        of_speed = np.abs(seconds) * ACCELERATION_STD
+        covariances = np.stack(
+            [
+                position + 2 * seconds * cross + seconds**2 * speed + of_position**2,
+                cross + seconds * speed + of_position * of_speed,
+                speed + of_speed**2,
+            ],
+            axis=1,
+        )
+        return self.centers + seconds[:, None] * self.velocities, covariances
 
-    def update(self, stamp_ns: int, box: Floats) -> None:
-        """Update the filter with the newest box of this track."""
-        center, covariance = self.predicted(stamp_ns)
-        gain = covariance[0] / (covariance[0, 0] + CENTER_STD**2)
-        innovation = box[BOX_CENTER] - center
-        self.stamp_ns = stamp_ns
-        self.center = center + gain[0] * innovation
-        self.velocity = self.velocity + gain[1] * innovation
-        self.covariance = covariance - np.outer(gain, covariance[0])
-        self.extent = box[BOX_EXTENT]
+    def update(self, columns: Ints, stamp_ns: int, boxes: Floats) -> None:
+        """Update the filters of some tracks with their newest boxes (n, 9)."""
+        centers, covariances = (values[columns] for values in self.predicted(stamp_ns))
+        position, cross, speed = covariances.T
+        gains = covariances[:, :2] / (position + CENTER_STD**2)[:, None]
+        innovations = boxes[:, BOX_CENTER] - centers
+        self.stamps_ns[columns] = stamp_ns
+        self.centers[columns] = centers + gains[:, :1] * innovations
+        self.velocities[columns] += gains[:, 1:] * innovations
+        self.covariances[columns] = np.stack(
+            [
+                position - gains[:, 0] * position,
+                cross - gains[:, 0] * cross,
+                speed - gains[:, 1] * cross,
+            ],
+            axis=1,
+        )
+        self.extents[columns] = boxes[:, BOX_EXTENT]
+
+    def kept(self, is_kept: NDArray[np.bool_]) -> _Tracks:
+        """Return some of the tracks."""
+        ids = [name for name, keeps in zip(self.ids, is_kept.tolist(), strict=True) if keeps]
+        return _Tracks(ids, *(values[is_kept] for values in self._arrays()))
+
+    def joined(self, others: _Tracks) -> _Tracks:
+        """Return these tracks and others behind them."""
+        pairs = zip(self._arrays(), others._arrays(), strict=True)
+        return _Tracks(self.ids + others.ids, *(np.concatenate(pair) for pair in pairs))
+
+    def _arrays(self) -> tuple[Any, ...]:
+        return self.stamps_ns, self.centers, self.velocities, self.covariances, self.extents
 
 
 class Costs(NamedTuple):
@@ -100,7 +140,7 @@ class Tracker:
 
     def forget(self) -> None:
         """End all tracks; ids that were assigned are not used again."""
-        self._tracks: list[_Track] = []
+        self._tracks = _Tracks.started([], 0, np.zeros((0, 9)))
         self._newest_ns: int | None = None
         self.costs = Costs(np.zeros(0, np.int64), [], np.zeros((0, 0)))
 
@@ -121,38 +161,34 @@ class Tracker:
         is_late = self._newest_ns is not None and stamp_ns <= self._newest_ns
         if not is_late:
             self._newest_ns = stamp_ns
-            oldest = stamp_ns - max_gap_ns
-            self._tracks = [track for track in self._tracks if track.stamp_ns >= oldest]
+            self._tracks = self._tracks.kept(self._tracks.stamps_ns >= stamp_ns - max_gap_ns)
         rows = np.flatnonzero(is_valid_box(boxes.boxes))
+        tracks = self._tracks
         costs = self._costs(stamp_ns, boxes.boxes[rows])
+        self.costs = Costs(rows, list(tracks.ids), costs)
         ids = [''] * len(boxes.boxes)
         # Costs are cut off at the gate: a pair beyond it costs as much as no pair.
-        pairs = zip(*linear_sum_assignment(np.minimum(costs, GATE)), strict=True)
-        found = {int(rows[i]): self._tracks[k] for i, k in pairs if costs[i, k] < GATE}
-        self.costs = Costs(rows, [track.track_id for track in self._tracks], costs)
-        for row in rows.tolist():
-            track = found.get(row)
-            if track is None:
-                self.count += 1
-                track = _Track.started(str(self.count), stamp_ns, boxes.boxes[row])
-                if not is_late:
-                    self._tracks.append(track)
-            elif not is_late:
-                track.update(stamp_ns, boxes.boxes[row])
-            ids[row] = track.track_id
+        chosen, columns = linear_sum_assignment(np.minimum(costs, GATE))
+        is_near = costs[chosen, columns] < GATE
+        chosen, columns = chosen[is_near], columns[is_near]
+        for row, column in zip(rows[chosen].tolist(), columns.tolist(), strict=True):
+            ids[row] = tracks.ids[column]
+        new = np.setdiff1d(rows, rows[chosen])
+        names = [str(self.count + number) for number in range(1, len(new) + 1)]
+        self.count += len(new)
+        for row, name in zip(new.tolist(), names, strict=True):
+            ids[row] = name
+        if not is_late:
+            tracks.update(columns, stamp_ns, boxes.boxes[rows[chosen]])
+            self._tracks = tracks.joined(_Tracks.started(names, stamp_ns, boxes.boxes[new]))
         return replace(boxes, track_ids=tuple(ids))
 
     def _costs(self, stamp_ns: int, boxes: Floats) -> Floats:
         """Return the squared distances (boxes, tracks) in standard deviations."""
-        if not self._tracks:
-            return np.zeros((len(boxes), 0))
-        predicted = [track.predicted(stamp_ns) for track in self._tracks]
-        centers = np.array([center for center, _ in predicted])
-        variances = np.array([covariance[0, 0] for _, covariance in predicted])
-        extents = np.array([track.extent for track in self._tracks])
+        centers, covariances = self._tracks.predicted(stamp_ns)
         away = np.square(boxes[:, None, BOX_CENTER] - centers).sum(axis=2)
-        unlike = np.square(np.log(boxes[:, None, BOX_EXTENT] / extents)).sum(axis=2)
-        costs: Floats = away / (variances + CENTER_STD**2) + unlike / LOG_EXTENT_STD**2
+        unlike = np.square(np.log(boxes[:, None, BOX_EXTENT] / self._tracks.extents)).sum(axis=2)
+        costs: Floats = away / (covariances[:, 0] + CENTER_STD**2) + unlike / LOG_EXTENT_STD**2
         return costs
 
 

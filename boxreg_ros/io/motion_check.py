@@ -30,7 +30,7 @@ a third of it.
 """
 STEP_RADIUS = 20.0
 """Distance from the sensor at which a rotation counts as a step [m]; chosen: that of objects."""
-MAX_SPEED = 100.0
+MAX_EGO_SPEED = 100.0
 """Speed that no vehicle has [m/s]; derived: 360 km/h."""
 MIN_ALTERNATIONS = 3
 """Samples at impossible speed that mean two publishers; chosen: one or two are a restart."""
@@ -55,7 +55,7 @@ LIDAR_NAMES = (
 
 
 @dataclass(slots=True)
-class Steps:
+class Corrections:
     """Corrections of the transform between two frames."""
 
     parent: str
@@ -90,10 +90,10 @@ class JumpSearch:
 
     """
 
-    steps: dict[tuple[str, str], Steps] = field(default_factory=dict)
+    steps: dict[tuple[str, str], Corrections] = field(default_factory=dict)
     """By parent and child, of the transforms that stepped."""
-    alternations: dict[tuple[str, str], Steps] = field(default_factory=dict)
-    """Steps of the motion itself at a speed that no vehicle has."""
+    alternations: dict[tuple[str, str], Corrections] = field(default_factory=dict)
+    """Corrections of the motion itself at a speed that no vehicle has."""
     _seen_ns: dict[tuple[str, str], int] = field(default_factory=dict)
 
     def look(self, tree: TransformTree, fixed_frame: str, sensor_frame: str) -> None:
@@ -135,7 +135,7 @@ class JumpSearch:
         step = float(np.linalg.norm(change[:3, 3]) + np.arccos(cosine) * STEP_RADIUS)
         if step >= MIN_STEP:
             known = self.steps.setdefault(
-                (edge.parent, edge.child), Steps(edge.parent, edge.child)
+                (edge.parent, edge.child), Corrections(edge.parent, edge.child)
             )
             known.add(step, stamp_ns)
 
@@ -143,9 +143,9 @@ class JumpSearch:
         """Note two samples of the motion that lie too far apart."""
         way = float(np.linalg.norm(edge.poses[row][:3] - edge.poses[row - 1][:3]))
         seconds = (edge.stamps[row] - edge.stamps[row - 1]) * 1e-9
-        if way > 1.0 and way > MAX_SPEED * seconds:
+        if way > 1.0 and way > MAX_EGO_SPEED * seconds:
             key = edge.parent, edge.child
-            self.alternations.setdefault(key, Steps(*key)).add(way, edge.stamps[row])
+            self.alternations.setdefault(key, Corrections(*key)).add(way, edge.stamps[row])
 
 
 class MotionCheck:
@@ -349,7 +349,7 @@ def _way(edge: Edge) -> float:
     return float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0)))
 
 
-def _worst(steps: Iterable[Steps]) -> Steps:
+def _worst(steps: Iterable[Corrections]) -> Corrections:
     return max(steps, key=lambda one: one.largest)
 
 

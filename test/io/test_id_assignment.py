@@ -94,7 +94,7 @@ def test_late_boxes_change_no_track():
     late = array_of(START + SECOND // 2, (5.6, 0.5, CAR))
     assert trackers[0].identify(late).track_ids == ('1',)
     after = START + 7 * SECOND // 10 + SECOND  # max_gap later, and no more
-    places = [tracker._tracks[0].predicted(after) for tracker in trackers]
+    places = [tracker._tracks.predicted(after) for tracker in trackers]
     for one, other in zip(*places, strict=True):
         np.testing.assert_array_equal(one, other)
     for tracker in trackers:

@@ -1,0 +1,133 @@
+"""Ids that jump from object to object, and boxes whose axes do not follow their motion."""
+
+from boxreg_ros.config import Config
+from boxreg_ros.io.axis_check import AxisCheck
+from boxreg_ros.io.id_assignment import IdCheck
+from boxreg_ros.structures import BoxArray
+from msg_adapters.convention import Convention, FORWARD, STANDARD
+import numpy as np
+import pytest
+
+S = 10**9
+SIZE = (4.5, 1.9, 1.6)
+
+
+def street(frames=30, moving=2, parked=6, rate=10.0, noise=0.05, seed=3):
+    """Yield stamp [ns], ids, classes and boxes (n, 9) of parked and of moving cars."""
+    rng = np.random.default_rng(seed)
+    headings = np.linspace(-2.0, 2.5, moving)
+    for k in range(frames):
+        t = k / rate
+        rows = [[8.0 * i, 6.0, 0.8, *SIZE, 0, 0, 0.1] for i in range(parked)]
+        for i, heading in enumerate(headings):
+            way = 8.0 * t * np.array([np.cos(heading), np.sin(heading)])
+            rows.append([10.0 * i + way[0], -10.0 + way[1], 0.8, *SIZE, 0, 0, heading])
+        boxes = np.array(rows)
+        boxes[:, :3] += rng.normal(0, noise, (len(boxes), 3))
+        yield round(t * S), [str(i) for i in range(len(boxes))], boxes
+
+
+def array(stamp_ns, ids, boxes, name='car'):
+    n = len(boxes)
+    return BoxArray(stamp_ns, 'odom', tuple(ids), (name,) * n, np.ones(n), boxes)
+
+
+def id_finding(arrays):
+    check = IdCheck(Config().max_gap)
+    for one in arrays:
+        check.add(one)
+    return check
+
+
+def test_ids_that_follow_their_objects_are_no_finding():
+    for rate, noise in ((10, 0.05), (10, 0.3), (2, 0.1)):
+        check = id_finding(array(*one) for one in street(rate=rate, noise=noise))
+        assert (check.finding, check.jumps) == ('', 0)
+
+
+def by_row(frames, every=1):
+    """Yield arrays whose ids are rows, sorted by the distance to a sensor that moves along x."""
+    for k, (stamp, ids, boxes) in enumerate(frames):
+        if k // every % 2 == 0 or every == 1:
+            boxes = boxes[np.argsort(np.hypot(boxes[:, 0] - k, boxes[:, 1]))]
+        yield array(stamp, ids, boxes)
+
+
+@pytest.mark.parametrize('every', [1, 8], ids=['always', 'at_times'])
+def test_ids_that_are_the_row_in_the_message_are_found(every):
+    check = id_finding(by_row(street(), every))
+    assert check.jumps >= 5
+    assert f'at {check.jumps} of {check.boxes} boxes' in check.finding
+
+
+def test_ids_that_move_up_when_an_object_leaves_are_found():
+    def arrays():
+        for k, (stamp, _, boxes) in enumerate(street(parked=8)):
+            there = boxes[min(k // 8, 4) :]
+            yield array(stamp, [str(i) for i in range(len(there))], there)
+
+    assert id_finding(arrays()).finding
+
+
+def test_a_switch_of_a_tracker_is_no_finding():
+    def arrays():
+        for k, (stamp, ids, boxes) in enumerate(street()):
+            names = [*ids]
+            if k >= 15:
+                names[0], names[1] = names[1], names[0]
+            yield array(stamp, names, boxes)
+
+    check = id_finding(arrays())
+    assert check.jumps == 2
+    assert not check.finding
+
+
+def axes_of(frames, convention, checked=STANDARD, name='car'):
+    """Return the check of boxes that a publisher states in a convention."""
+    check = AxisCheck(checked, lambda name: Config().kind(name) != 'pedestrian')
+    for stamp, ids, boxes in frames:
+        given = convention.from_centers(array(stamp, ids, boxes, name))
+        check.add(checked.to_centers(given))
+    return check
+
+
+@pytest.mark.parametrize('size_order', ['lwh', 'wlh'])
+@pytest.mark.parametrize('forward_axis', FORWARD)
+def test_axes_of_moving_vehicles_show_the_convention(forward_axis, size_order):
+    convention = Convention(forward_axis=forward_axis, size_order=size_order)
+    check = axes_of(street(moving=4), convention)
+    assert check.wanted == convention
+    assert bool(check.finding) == (convention != STANDARD)
+    for name, default in (('forward_axis', 'x+'), ('size_order', 'lwh')):
+        value = getattr(convention, name)
+        is_named = f'--{name.replace("_", "-")} {value}' in check.finding
+        assert is_named == (value != default)
+    assert axes_of(street(moving=4), convention, convention).finding == ''
+
+
+def test_a_wrong_option_is_found_too():
+    check = axes_of(street(moving=4), STANDARD, Convention(forward_axis='y+', size_order='wlh'))
+    assert check.wanted == STANDARD
+
+
+def test_one_moving_track_is_enough_sideways_but_not_backward():
+    assert axes_of(street(moving=1), Convention(forward_axis='y-', size_order='wlh')).finding
+    assert not axes_of(street(moving=1), Convention(forward_axis='x-')).finding
+
+
+@pytest.mark.parametrize(
+    'frames, name',
+    [({'moving': 0}, 'car'), ({'moving': 4}, 'pedestrian'), ({'moving': 0, 'noise': 0.5}, 'car')],
+)
+def test_what_does_not_move_along_its_length_is_no_evidence(frames, name):
+    convention = Convention(forward_axis='y+', size_order='wlh')
+    assert axes_of(street(**frames), convention, name=name).finding == ''
+
+
+def test_unresolved_headings_are_no_finding():
+    def frames():
+        for stamp, ids, boxes in street(moving=6):
+            boxes[::2, 8] += np.pi
+            yield stamp, ids, boxes
+
+    assert axes_of(frames(), STANDARD).finding == ''
