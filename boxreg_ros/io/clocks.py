@@ -30,7 +30,7 @@ NEAR_KNOWN = 0.3
 """Largest difference from an offset that is known [s]: the delay of a message."""
 
 
-class Arrivals:
+class ReceiveTimes:
     """
     Receive times and stamps of the first messages of one stream.
 
@@ -54,7 +54,7 @@ class Arrivals:
         self.delays_ns.append(received_ns - stamp_ns)
 
 
-def clock_offset(first: Arrivals, second: Arrivals) -> float | None:
+def clock_offset(first: ReceiveTimes, second: ReceiveTimes) -> float | None:
     """
     Return the seconds to add to stamps of the `second` stream to get those of the first clock.
 

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.clocks import Arrivals, clock_offset, likely_offset, MIN_CLOCK_OFFSET
+from boxreg_ros.io.clocks import clock_offset, likely_offset, MIN_CLOCK_OFFSET, ReceiveTimes
 from boxreg_ros.io.findings import Finding
 from boxreg_ros.io.transforms import Edge, inverse, matrix, TransformTree
 from boxreg_ros.reasons import Reason
@@ -47,7 +47,7 @@ LOOK_PERIOD = 10
 """Clouds between two looks at what changes slowly; chosen: 1 s at 10 Hz."""
 FIRST_LOOK = 5
 """Cloud of the first look, for short recordings."""
-LIDAR_NAMES = (
+LIDAR_WORDS = (
     *('lidar', 'laser', 'velodyne', 'hesai', 'pandar', 'ouster', 'os_sensor', 'livox', 'mid360'),
     *('rslidar', 'robosense', 'innovusion', 'aeva', 'luminar', 'scan'),
 )
@@ -55,8 +55,8 @@ LIDAR_NAMES = (
 
 
 @dataclass(slots=True)
-class Corrections:
-    """Corrections of the transform between two frames."""
+class FrameSteps:
+    """FrameSteps of the transform between two frames."""
 
     parent: str
     child: str
@@ -90,10 +90,10 @@ class JumpSearch:
 
     """
 
-    steps: dict[tuple[str, str], Corrections] = field(default_factory=dict)
+    steps: dict[tuple[str, str], FrameSteps] = field(default_factory=dict)
     """By parent and child, of the transforms that stepped."""
-    alternations: dict[tuple[str, str], Corrections] = field(default_factory=dict)
-    """Corrections of the motion itself at a speed that no vehicle has."""
+    alternations: dict[tuple[str, str], FrameSteps] = field(default_factory=dict)
+    """FrameSteps of the motion itself at a speed that no vehicle has."""
     _seen_ns: dict[tuple[str, str], int] = field(default_factory=dict)
 
     def look(self, tree: TransformTree, fixed_frame: str, sensor_frame: str) -> None:
@@ -135,7 +135,7 @@ class JumpSearch:
         step = float(np.linalg.norm(change[:3, 3]) + np.arccos(cosine) * STEP_RADIUS)
         if step >= MIN_STEP:
             known = self.steps.setdefault(
-                (edge.parent, edge.child), Corrections(edge.parent, edge.child)
+                (edge.parent, edge.child), FrameSteps(edge.parent, edge.child)
             )
             known.add(step, stamp_ns)
 
@@ -145,7 +145,7 @@ class JumpSearch:
         seconds = (edge.stamps[row] - edge.stamps[row - 1]) * 1e-9
         if way > 1.0 and way > MAX_EGO_SPEED * seconds:
             key = edge.parent, edge.child
-            self.alternations.setdefault(key, Corrections(*key)).add(way, edge.stamps[row])
+            self.alternations.setdefault(key, FrameSteps(*key)).add(way, edge.stamps[row])
 
 
 class MotionCheck:
@@ -165,8 +165,8 @@ class MotionCheck:
 
     def restart(self) -> None:
         """Forget when messages were received: time has jumped. What was found stays."""
-        self._clouds = Arrivals()
-        self._boxes = Arrivals()
+        self._clouds = ReceiveTimes()
+        self._boxes = ReceiveTimes()
         self._count = 0
 
     def add(self, item: Sweep | BoxArray, fixed_frame: str, received_ns: int | None) -> None:
@@ -290,7 +290,7 @@ def registered_text(tree: TransformTree, fixed_frame: str, frame: str) -> str:
     below = tree.moving_below(frame)
     if not below:
         return ''
-    likely = [name for name in below if any(part in name.lower() for part in LIDAR_NAMES)]
+    likely = [name for name in below if any(part in name.lower() for part in LIDAR_WORDS)]
     names = likely or below
     more = f' (or one of {", ".join(names[1:])})' if names[1:] else ''
     return (
@@ -349,7 +349,7 @@ def _way(edge: Edge) -> float:
     return float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0)))
 
 
-def _worst(steps: Iterable[Corrections]) -> Corrections:
+def _worst(steps: Iterable[FrameSteps]) -> FrameSteps:
     return max(steps, key=lambda one: one.largest)
 
 

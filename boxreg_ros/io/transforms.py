@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.clocks import Arrivals
+from boxreg_ros.io.clocks import ReceiveTimes
 from boxreg_ros.rotations import (
     interpolate_rotation,
     matrix_from_quaternion,
@@ -415,7 +415,7 @@ class Edge:
         Stamps of the samples, ascending [ns]; one for a static pair.
     poses : list of (7,) float64
         x y z qx qy qz qw of the child in the parent at these stamps [m].
-    arrivals : Arrivals
+    arrivals : ReceiveTimes
         When the first samples were received.
 
     """
@@ -427,7 +427,7 @@ class Edge:
         self.is_static = False
         self.stamps: list[int] = []
         self.poses: list[Floats] = []
-        self.arrivals = Arrivals()
+        self.arrivals = ReceiveTimes()
         self._jump_detector = TimeJumpDetector()
         self._was_forgotten = False
         self._last_added: tuple[int, Floats] | None = None
