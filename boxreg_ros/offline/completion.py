@@ -19,6 +19,7 @@ from boxreg_ros.offline.reader import ReadItem
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BoxArray, Floats, Ints, is_valid_box, RefinedBoxes, ROLL, Sweep
 from boxreg_ros.tracks.complete import complete, CompletionPlan
+from boxreg_ros.tracks.decided import Decided, NOTHING
 from boxreg_ros.tracks.followed import with_evidence
 import numpy as np
 
@@ -188,11 +189,11 @@ class FirstPass(NamedTuple):
     num_points: list[list[Ints]]
     parts: list[Arrivals]
 
-    def plan(self, fixed_frame: str, config: Config) -> CompletionPlan:
+    def plan(self, fixed_frame: str, config: Config, decided: Decided = NOTHING) -> CompletionPlan:
         """Return what completes the tracks in the fixed frame; each part on its own."""
         whole = CompletionPlan([], [])
         for part in zip(*self[:3], strict=True):
-            whole.append(complete(*part, fixed_frame, config))
+            whole.append(complete(*part, fixed_frame, config, decided))
         return whole
 
 

@@ -14,17 +14,22 @@ from boxreg_ros.offline.completion import Arrivals, Moved
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from boxreg_ros.tracks.complete import CompletionPlan
+from boxreg_ros.tracks.decided import with_decisions
 from boxreg_ros.tracks.followed import followed_plan
 import numpy as np
 
 
 def keyframes(
-    items: Iterable[tuple[Moved, bool]], fixed_frame: str, config: Config
+    items: Iterable[tuple[Moved, bool]],
+    fixed_frame: str,
+    config: Config,
+    corrections: Corrections,
 ) -> tuple[CompletionPlan, list[Arrivals], list[FollowedTrack], Floats]:
     """
     Follow the boxes of a recording through its sweeps, both in the fixed frame.
 
-    Items come with whether time went back before them. Return what is added, for the arrays of
+    Items come with whether time went back before them. Pins of a person where the input has no
+    box are keyframes, too. Return what is added, for the arrays of
     `Arrivals.completed`, the parts between time jumps, the tracks of all parts, and the
     deviations (9,) of the keyframes, see `person.DEVIATIONS`.
 
@@ -35,8 +40,12 @@ def keyframes(
     tracks: list[FollowedTrack] = []
     deviations = DEVIATIONS
     for part, store in zip(parts, stores, strict=True):
-        found = followed(part.arrays, store, config)
-        plan.append(followed_plan(part.completed(fixed_frame), found))
+        pins = corrections.keyframes(part.arrays, fixed_frame)
+        seeds = sorted([*part.arrays, *pins], key=lambda array: array.stamp_ns)
+        found = followed(seeds, store, config)
+        found = [with_decisions(track, corrections) for track in found]
+        arrays = part.completed(fixed_frame)
+        plan.append(followed_plan(arrays, found, decided=corrections))
         tracks += found
         own = [replace(track, boxes=_from_store(track.boxes, store, -1)) for track in found]
         of_part = keyframe_deviations(own, store, config, store.sensor_origins)

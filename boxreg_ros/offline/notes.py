@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,15 @@ def closing_line(summary: Summary, out: Path) -> str:
     return line
 
 
+def unused_line(unused: Sequence[str]) -> str:
+    """Return the error of decisions that could not be used, each named."""
+    return (
+        f'decisions: expected those on tracks and boxes of this recording, got {len(unused):,} '
+        f'that could not be used: {", ".join(unused)}; the results are kept, without these: take '
+        f'them back in the review, or decide again on the new result'
+    )
+
+
 def notes(summary: Summary) -> Iterator[str]:
     """Yield warnings about the input and the results, one line each."""
     yield from _input_notes(summary)
@@ -99,19 +108,10 @@ def _lidar_notes(summary: Summary) -> Iterator[str]:
 
 
 def _label_notes(summary: Summary) -> Iterator[str]:
-    """Yield the boxes, decisions and clouds that label files lack, one line each."""
+    """Yield the boxes and clouds that label files lack, one line each."""
     for name, found in summary.left_out_of_labels.items():
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in found.items())
         yield f'format {name} cannot represent some boxes, they are left out: {reasons}'
-    if summary.unused_decisions:
-        unused = summary.unused_decisions
-        named = [*unused[:MAX_NAMED], '...'] if len(unused) > MAX_NAMED else unused
-        names = ', '.join(named)
-        yield (
-            f'decisions: expected those on tracks and boxes of this recording, got '
-            f'{len(unused):,} on others, not used: {names}; give the decisions of this recording '
-            f'to --decisions'
-        )
     if summary.frames_without_cloud:
         yield (
             f'{summary.frames_without_cloud:,} of {summary.box_arrays:,} box arrays have no '

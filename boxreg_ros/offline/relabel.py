@@ -254,7 +254,9 @@ def _survey(
         deviations = None
         if request.keyframes:
             with clock('follow'):
-                plan, parts, tracks, deviations = keyframes(items, fixed_frame, request.config)
+                plan, parts, tracks, deviations = keyframes(
+                    items, fixed_frame, request.config, corrections
+                )
         elif request.completes:
             from boxreg_ros.offline.registration_worker import registration_worker
 
@@ -263,7 +265,8 @@ def _survey(
             )
             submit = _journaled(submit, journal)
             first = first_pass(items, request.config, submit, fixed_frame, drives)
-            plan, parts = first.plan(fixed_frame, request.config), first.parts
+            plan = first.plan(fixed_frame, request.config, corrections)
+            parts = first.parts
         else:
             parts = arrivals(items)
             plan = unchanged_plan([a for part in parts for a in part.completed(fixed_frame)])

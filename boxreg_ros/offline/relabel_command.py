@@ -82,7 +82,8 @@ def run(args: argparse.Namespace) -> int:
     """
     Relabel, print one closing line, and return the exit status.
 
-    Status 1 also if the recording has boxes and none was refined; the result is kept.
+    Status 1 also if the recording has boxes and none was refined, or a decision could not be used;
+    the result is kept.
 
     """
     from boxreg_ros.offline.notes import closing_line, notes
@@ -109,6 +110,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _status(summary: Summary, demands: Demands) -> int:
     """Return the exit status of a run; say on stderr if it misses ``--fail-under``."""
+    if summary.unused_decisions:
+        from boxreg_ros.offline.notes import unused_line
+
+        print(f'boxreg: {unused_line(summary.unused_decisions)}', file=sys.stderr)
+        return FAILED
     if summary.part_refined < demands.fail_under:
         print(
             f'boxreg: --fail-under: expected at least {demands.fail_under:.1%} of the boxes '

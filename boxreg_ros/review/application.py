@@ -310,9 +310,11 @@ class _Review:
             if process.returncode is None:
                 process.terminate()  # it removes what it has begun
         lines = [part.decode(errors='replace').splitlines() for part in (output, errors)]
-        if process.returncode:
+        if not lines[0]:  # nothing was written
             raise RecordingError(lines[1][-1] if lines[1] else 'boxreg relabel failed')
-        return JSONResponse({'out': str(new), 'line': lines[0][-1], 'notes': lines[1]})
+        error = lines[1].pop() if process.returncode and lines[1] else ''
+        found = {'out': str(new), 'line': lines[0][-1], 'notes': lines[1], 'error': error}
+        return JSONResponse(found)
 
 
 async def _refused(_: Request, error: Exception) -> Response:

@@ -36,7 +36,8 @@ class Corrections:
 
     Deleted boxes are not registered; ids, classes and pinned boxes are those of the decisions
     before any step of the run; rejected boxes are as in the input again after it. Boxes can be
-    pinned already.
+    pinned already. The steps that complete tracks ask for the decisions as
+    `tracks.decided.Decided`, after the boxes of the input have passed `to_register`.
 
     """
 
@@ -50,6 +51,9 @@ class Corrections:
             if one.kind not in WITHOUT_EFFECT and not one.is_taken_back
         }
         self._extents = self._extents_of_pins()
+        self._input_ids: dict[tuple[str, int], str] = {}  # by new id and stamp, where renamed
+        self._own_ids: set[str] = set()  # of input boxes that are not renamed
+        self._boxes: set[tuple[str, int]] = set()  # of tracks with a pin: id and stamp, as given
         self._origins: dict[str, list[tuple[int, str]]] = {}  # stamps and first ids of added boxes
 
     def unused(self) -> list[str]:
@@ -114,6 +118,79 @@ class Corrections:
             return ''
         near_ns, origin = min(known, key=lambda one: abs(one[0] - stamp_ns))
         return origin if abs(near_ns - stamp_ns) < SAME_SWEEP_NS else ''
+
+    @property
+    def names(self) -> set[str]:
+        """Return the ids that were given."""
+        return {
+            one.value
+            for decisions in self._of_track.values()
+            for one in decisions
+            if one.kind == 'rename' and not one.is_taken_back
+        }
+
+    @property
+    def apart(self) -> set[str]:
+        """Return the ids that were given, and that the input does not have."""
+        return self.names - self._own_ids
+
+    def input_id(self, track_id: str, stamp_ns: int) -> str:
+        """Return the id in the input of a box that is registered as one of `track_id`."""
+        return self._input_ids.get((track_id, stamp_ns), track_id)
+
+    def track_id(self, input_id: str, stamp_ns: int) -> str:
+        """Return the id that was given to a box; empty for none."""
+        found = self._last('id', input_id, stamp_ns)
+        return found.value if found else ''
+
+    def class_name(self, input_id: str, stamp_ns: int) -> str:
+        """Return the class that was given to a box; empty for none."""
+        found = self._last('class', input_id, stamp_ns)
+        return found.value if found else ''
+
+    def is_deleted(self, input_id: str, stamp_ns: int) -> bool:
+        """Return whether a box is deleted."""
+        return self._last('deletion', input_id, stamp_ns) is not None
+
+    def is_accepted(self, input_id: str, stamp_ns: int) -> bool:
+        """Return whether a box is accepted or pinned."""
+        found = self._judgement(input_id, stamp_ns)
+        return found is not None and found.kind in ('accept', 'pin')
+
+    def pin(self, input_id: str, stamp_ns: int) -> Floats | None:
+        """Return the box (9,) of a pin where the input has none; None for no pin."""
+        if (input_id, stamp_ns) in self._boxes:
+            return None
+        found = self._judgement(input_id, stamp_ns)
+        return found.box if found is not None and found.kind == 'pin' else None
+
+    def keyframes(self, arrays: Sequence[BoxArray], frame_id: str) -> list[BoxArray]:
+        """
+        Return the pins where the input has no box, an array each: further keyframes.
+
+        `arrays` are the boxes of the input as they are to be registered.
+
+        """
+        class_of = {
+            name: class_name
+            for array in arrays
+            for name, class_name in zip(array.track_ids, array.class_names, strict=True)
+        }
+        found = []
+        for one in self._pins():
+            assert one.stamp_ns is not None and one.box is not None
+            track_id = self.track_id(one.track_id, one.stamp_ns) or one.track_id
+            is_extra = self.pin(one.track_id, one.stamp_ns) is not None and track_id in class_of
+            if not is_extra or one.frame_id != frame_id:
+                continue
+            class_name = self.class_name(one.track_id, one.stamp_ns) or class_of[track_id]
+            columns = (track_id,), (class_name,), np.ones(1), one.box[None]
+            found.append(BoxArray(one.stamp_ns, frame_id, *columns))
+            self._input_ids[track_id, one.stamp_ns] = one.track_id
+        return found
+
+    def _pins(self) -> list[Decision]:
+        return [one for rows in self._of_track.values() for one in rows if one.kind == 'pin']
 
     def _additions(self) -> list[Decision]:
         return [one for rows in self._of_track.values() for one in rows if one.kind == 'add']
@@ -189,6 +266,12 @@ class Corrections:
             elif is_pinned[row]:
                 boxes[row] = given.boxes[row]
                 status[row], reasons[row] = HUMAN, ''
+        for row in range(len(given.track_ids), len(status)):
+            name = self._input_ids.get((refined.boxes.track_ids[row], given.stamp_ns), '')
+            pin = self.pin(name, given.stamp_ns)
+            if pin is not None:
+                boxes[row] = pin
+                status[row] = HUMAN
         return replace(
             refined,
             boxes=replace(refined.boxes, boxes=boxes, pinned=None),
@@ -212,6 +295,12 @@ class Corrections:
         for row, track_id in enumerate(given.track_ids):
             renamed = self._last('id', track_id, given.stamp_ns)
             track_ids[row] = renamed.value if renamed else track_id
+            if renamed:
+                self._input_ids[renamed.value, given.stamp_ns] = track_id
+            else:
+                self._own_ids.add(track_id)
+            if track_id in self._of_track:
+                self._boxes.add((track_id, given.stamp_ns))
             reclassed = self._last('class', track_id, given.stamp_ns)
             class_names[row] = reclassed.value if reclassed else class_names[row]
         return replace(given, track_ids=tuple(track_ids), class_names=tuple(class_names))

@@ -10,7 +10,7 @@ from the points.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -30,6 +30,7 @@ from boxreg_ros.structures import (
     REJECTED,
     Y,
 )
+from boxreg_ros.tracks.decided import Decided, DecidedTrack, NOTHING
 from boxreg_ros.tracks.extend import extend, num_free, num_supported, points_at_end
 from boxreg_ros.tracks.fill import fill
 from boxreg_ros.tracks.prune import duplicates, ghosts
@@ -201,9 +202,12 @@ def complete(
     num_points: Sequence[Ints],
     fixed_frame: str,
     config: Config,
+    decided: Decided = NOTHING,
 ) -> CompletionPlan:
     """
     Plan the completed tracks of a recording: the boxes to register in the second pass.
+
+    What a person has `decided` binds each step.
 
     `results` are the registration of the boxes `given`, `num_points` (n,) the points above the
     road in each; arrays outside of the fixed frame stay as they are.
@@ -211,42 +215,50 @@ def complete(
     """
     steps = config.complete
     if steps.stitch:
-        results = _exchanged(given, results, fixed_frame)
-    tracks = tracklets_of(results, num_points, fixed_frame, config)
+        results = _exchanged(given, results, fixed_frame, decided)
+    tracks = tracklets_of(results, num_points, fixed_frame, config, decided.names)
     plan = unchanged_plan(given)
     if steps.prune:  # first: a duplicate could be stitched to its object
-        tracks = _rejected(tracks, duplicates(tracks, config), Reason.DUPLICATE, plan)
+        found = _doubted(tracks, duplicates(tracks, config), given, decided)
+        tracks = _rejected(tracks, found, Reason.DUPLICATE, plan)
     ambiguous: list[tuple[str, str]] = []
     if steps.stitch:
-        tracks, ambiguous = stitch(tracks, config)
+        tracks, ambiguous = stitch(tracks, config, decided)
     if steps.static:
-        tracks = join_static(tracks, config)
+        tracks = join_static(tracks, config, decided)
     if steps.prune:  # last: a fragment of an object may look like a ghost
-        tracks = _rejected(tracks, ghosts(tracks), Reason.GHOST, plan)
+        found = _doubted(tracks, ghosts(tracks), given, decided)
+        tracks = _rejected(tracks, found, Reason.GHOST, plan)
+    of_track = {one.track_id: DecidedTrack.of(one, given, decided) for one in tracks}
     for track in tracks:
-        _place(track, '', plan)
+        _place(track, '', plan, of_track[track.track_id])
     array_of = _array_of_stamp(given, fixed_frame)
     stamps_ns = np.array(sorted(array_of), np.int64)
     if steps.fill:
         for track in tracks:
             for gap in fill(track, stamps_ns, config):
-                _add(gap, track, plan, array_of)
+                own = of_track[track.track_id]
+                _add(own.left(gap, is_extension=False), track, plan, array_of, own)
     if steps.extend:
-        _extend(tracks, stamps_ns, plan, array_of, config)
+        _extend(tracks, stamps_ns, plan, array_of, config, of_track)
     _note_ambiguous(plan, ambiguous)
     return plan
 
 
 def _exchanged(
-    given: Sequence[BoxArray], results: Sequence[RefinedBoxes], fixed_frame: str
+    given: Sequence[BoxArray],
+    results: Sequence[RefinedBoxes],
+    fixed_frame: str,
+    decided: Decided,
 ) -> list[RefinedBoxes]:
-    """Return results in which tracks that changed places have their ids back."""
+    """Return results in which tracks that changed places have their ids back, but named ones."""
     arrays = [array for array in given if array.frame_id == fixed_frame]
     if not arrays:
         return [*results]
     boxes = np.concatenate([array.boxes for array in arrays])
-    valid = np.flatnonzero(is_valid_box(boxes))
     names = [name for array in arrays for name in array.track_ids]
+    is_free = np.array([name not in decided.names for name in names], bool)
+    valid = np.flatnonzero(is_valid_box(boxes) & is_free)
     stamps_ns = np.repeat([a.stamp_ns for a in arrays], [len(a.track_ids) for a in arrays])
     tracks = by_id([names[row] for row in valid], stamps_ns[valid], boxes[valid, : Y + 1])
     found = id_switches(tracks)
@@ -259,6 +271,17 @@ def _exchanged(
     return exchanged
 
 
+def _doubted(
+    tracks: Sequence[Tracklet], names: set[str], given: Sequence[BoxArray], decided: Decided
+) -> set[str]:
+    """Return those of `names` whose track no person has accepted."""
+    return {
+        track.track_id
+        for track in tracks
+        if track.track_id in names and not DecidedTrack.of(track, given, decided).is_accepted()
+    }
+
+
 def _rejected(
     tracks: list[Tracklet], names: set[str], reason: str, plan: CompletionPlan
 ) -> list[Tracklet]:
@@ -269,14 +292,24 @@ def _rejected(
     return [track for track in tracks if track.track_id not in names]
 
 
-def _place(track: Tracklet, reason: str, plan: CompletionPlan) -> None:
-    """Write id and class of a track to its input boxes; reject them where there is a reason."""
+def _place(
+    track: Tracklet, reason: str, plan: CompletionPlan, decided: DecidedTrack | None = None
+) -> None:
+    """
+    Write id and class of a track to its input boxes; reject them where there is a reason.
+
+    Boxes whose class a person has `decided` keep it.
+
+    """
     steps = TrackSteps(track.track_id, track.class_name, track.fragments)
-    for index, row in track.places:
+    for (index, row), stamp_ns in zip(track.places, track.stamps_ns.tolist(), strict=True):
         array = plan.arrays[index]
-        steps.reclassified += array.class_names[row] != track.class_name
+        class_name = track.class_name
+        if decided is not None:
+            class_name = decided.class_name(stamp_ns) or class_name
+        steps.reclassified += array.class_names[row] != class_name
         array.track_ids[row] = track.track_id
-        array.class_names[row] = track.class_name
+        array.class_names[row] = class_name
         if reason:
             array.rejected[row] = reason
             steps.rejected += 1
@@ -299,19 +332,21 @@ def _add(
     track: Tracklet,
     plan: CompletionPlan,
     array_of: dict[int, int],
+    decided: DecidedTrack,
     extension: int = -1,
 ) -> None:
-    """Add boxes of a track to the arrays of their stamps."""
+    """Add boxes of a track to the arrays of their stamps; those that a person has set as such."""
     for i, stamp_ns in enumerate(boxes.stamps_ns.tolist()):
+        pin = decided.pin(stamp_ns)
         plan.arrays[array_of[stamp_ns]].added.append(
             AddedBox(
                 track.track_id,
-                track.class_name,
-                boxes.status,
-                boxes.boxes[i],
+                decided.class_name(stamp_ns) or track.class_name,
+                boxes.status if pin is None else HUMAN,
+                boxes.boxes[i] if pin is None else pin,
                 boxes.covariances[i],
                 float(boxes.scores[i]),
-                extension,
+                extension if pin is None else -1,
             )
         )
 
@@ -322,6 +357,7 @@ def _extend(
     plan: CompletionPlan,
     array_of: dict[int, int],
     config: Config,
+    of_track: Mapping[str, DecidedTrack],
 ) -> None:
     """Add the candidates of all extensions, as far as no other track owns their place."""
     owned: dict[int, list[Floats]] = {}
@@ -332,13 +368,15 @@ def _extend(
         owned.setdefault(stamp_ns, []).extend(added.box for added in plan.arrays[index].added)
     for track in tracks:
         for candidates in extend(track, stamps_ns, config):
-            free = candidates.first(num_free(candidates, owned))
+            own = of_track[track.track_id]
+            free = own.left(candidates.first(num_free(candidates, owned)), is_extension=True)
             if not len(free.boxes):
                 continue
             is_last = int(free.stamps_ns[0]) > track.last_ns
-            extension = _Extension(track.track_id, free.stamps_ns, points_at_end(track, is_last))
-            plan.extensions.append(extension)
-            _add(free, track, plan, array_of, len(plan.extensions) - 1)
+            is_open = [own.pin(stamp_ns) is None for stamp_ns in free.stamps_ns.tolist()]
+            at_end = points_at_end(track, is_last)
+            plan.extensions.append(_Extension(track.track_id, free.stamps_ns[is_open], at_end))
+            _add(free, track, plan, array_of, own, len(plan.extensions) - 1)
 
 
 def _note_ambiguous(plan: CompletionPlan, ambiguous: Sequence[tuple[str, str]]) -> None:

@@ -9,6 +9,7 @@ from boxreg_ros.core.follow import FollowedTrack
 from boxreg_ros.core.following.person import corrections, diagonals, moved
 from boxreg_ros.structures import BoxArray, Floats, HUMAN, REFINED, RefinedBoxes
 from boxreg_ros.tracks.complete import AddedBox, CompletionPlan, TrackSteps, unchanged_plan
+from boxreg_ros.tracks.decided import Decided, DecidedTrack, NOTHING
 import numpy as np
 
 UNSUPPORTED = np.diag(np.square([0.5, 0.5, 0.2, 0.05, 0.05, 0.1]))
@@ -16,7 +17,10 @@ UNSUPPORTED = np.diag(np.square([0.5, 0.5, 0.2, 0.05, 0.05, 0.1]))
 
 
 def followed_plan(
-    given: Sequence[BoxArray], tracks: Sequence[FollowedTrack], has_seeds: bool = True
+    given: Sequence[BoxArray],
+    tracks: Sequence[FollowedTrack],
+    has_seeds: bool = True,
+    decided: Decided = NOTHING,
 ) -> CompletionPlan:
     """
     Return the plan that adds the boxes of followed tracks; none is rejected or renamed.
@@ -31,18 +35,19 @@ def followed_plan(
     for track in tracks:
         steps = TrackSteps(track.track_id, track.class_name)
         plan.tracks.append(steps)
+        own = DecidedTrack.of_followed(track, decided)
         for stamp_ns, box, word in zip(track.stamps_ns, track.boxes, track.status, strict=True):
             after = int(np.searchsorted(stamps[order], stamp_ns))
             near = order[max(0, after - 1) : after + 1]
             array = plan.arrays[int(near[np.abs(stamps[near] - stamp_ns).argmin()])]
-            if word == HUMAN and has_seeds:
-                if track.status.count(HUMAN) == 1 and track.track_id in array.track_ids:
+            if word == HUMAN and has_seeds and track.track_id in array.track_ids:
+                if track.status.count(HUMAN) == 1:
                     # The extents of a single one may have grown.
                     array.moved[array.track_ids.index(track.track_id)] = box
                 continue
-            array.added.append(
-                AddedBox(track.track_id, track.class_name, word, box, UNSUPPORTED, 1.0)
-            )
+            class_name = own.class_name(int(stamp_ns)) if own.stamps_ns else ''
+            class_name = class_name or track.class_name
+            array.added.append(AddedBox(track.track_id, class_name, word, box, UNSUPPORTED, 1.0))
     return plan
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import iou_3d, iou_bev
 from boxreg_ros.structures import Floats
+from boxreg_ros.tracks.decided import Decided, NOTHING
 from boxreg_ros.tracks.stitch import join_links
 from boxreg_ros.tracks.tracklet import is_parked, Tracklet
 import numpy as np
@@ -19,7 +20,9 @@ SAME_PLACE = 0.5
 """Least IoU of the median boxes; chosen: another car in the same space rarely reaches it."""
 
 
-def join_static(tracklets: list[Tracklet], config: Config) -> list[Tracklet]:
+def join_static(
+    tracklets: list[Tracklet], config: Config, decided: Decided = NOTHING
+) -> list[Tracklet]:
     """Join parked tracklets at one place; all are in the order of their start."""
     parked = [i for i, tracklet in enumerate(tracklets) if is_parked(tracklet.boxes)]
     places = {i: np.median(tracklets[i].boxes, axis=0) for i in parked}
@@ -41,7 +44,7 @@ def join_static(tracklets: list[Tracklet], config: Config) -> list[Tracklet]:
         if not _is_occupied(places[j], tracklets[i].last_ns, tracklets[j].first_ns, tracklets):
             pairs.append((i, j))
             used.add(i)
-    return join_links(tracklets, pairs)
+    return join_links(tracklets, pairs, decided)
 
 
 def _is_occupied(place: Floats, after_ns: int, before_ns: int, tracklets: list[Tracklet]) -> bool:

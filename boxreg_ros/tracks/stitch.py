@@ -9,6 +9,7 @@ as good, none is made.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
@@ -16,6 +17,7 @@ from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.motion import EndMotion
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, X, Y, YAW, Z
+from boxreg_ros.tracks.decided import Decided, NOTHING
 from boxreg_ros.tracks.tracklet import end_motion, joined_tracklets, Tracklet
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -53,9 +55,16 @@ def best_links(costs: Floats) -> Links:
     return found
 
 
-def join_links(tracklets: list[Tracklet], pairs: list[tuple[int, int]]) -> list[Tracklet]:
-    """Return tracklets with those of each chain of pairs joined, in the order of their start."""
-    successor = dict(pairs)
+def join_links(
+    tracklets: list[Tracklet], pairs: list[tuple[int, int]], decided: Decided = NOTHING
+) -> list[Tracklet]:
+    """
+    Return tracklets with those of each chain of pairs joined, in the order of their start.
+
+    A chain has at most one of the tracks that a person has named, and its id.
+
+    """
+    successor = dict(allowed(tracklets, pairs, decided))
     followers = set(successor.values())
     whole = []
     for index in range(len(tracklets)):
@@ -65,8 +74,28 @@ def join_links(tracklets: list[Tracklet], pairs: list[tuple[int, int]]) -> list[
         while chain[-1] in successor:
             chain.append(successor[chain[-1]])
         parts = [tracklets[part] for part in chain]
-        whole.append(joined_tracklets(parts) if len(parts) > 1 else parts[0])
+        whole.append(joined_tracklets(parts, decided.names) if len(parts) > 1 else parts[0])
     return whole
+
+
+def allowed(
+    tracklets: Sequence[Tracklet], pairs: Sequence[tuple[int, int]], decided: Decided
+) -> list[tuple[int, int]]:
+    """Return the pairs, earlier ones first, without those that decisions keep apart."""
+    found = []
+    name_of = {
+        index: tracklet.track_id
+        for index, tracklet in enumerate(tracklets)
+        if tracklet.track_id in decided.names
+    }  # of the chain that ends with each tracklet
+    for before, after in sorted(pairs):
+        is_apart = {tracklets[before].track_id, tracklets[after].track_id} & set(decided.apart)
+        if is_apart or (before in name_of and after in name_of):
+            continue
+        if before in name_of:
+            name_of[after] = name_of[before]
+        found.append((before, after))
+    return found
 
 
 STITCH_GATE = 24.3
@@ -82,7 +111,7 @@ HEIGHT_DEVIATION = 0.2
 
 
 def stitch(
-    tracklets: list[Tracklet], config: Config
+    tracklets: list[Tracklet], config: Config, decided: Decided = NOTHING
 ) -> tuple[list[Tracklet], list[tuple[str, str]]]:
     """
     Join tracklets that continue each other, at most over `complete.fill_gap`.
@@ -103,11 +132,12 @@ def stitch(
             is_known = max(counts[i], counts[j]) >= MIN_KNOWN_MOTION
             # A motion is not predicted for longer than it was observed: two ghosts fit anything.
             limit = min(config.complete.fill_gap, spans[i] + spans[j])
-            if is_known and 0 < gap <= limit and kinds[i] is kinds[j]:
+            is_possible = is_known and 0 < gap <= limit and kinds[i] is kinds[j]
+            if is_possible and allowed(tracklets, [(i, j)], decided):
                 costs[i, j] = _cost(lasts[i], firsts[j])
     links = best_links(costs)
     ambiguous = [(tracklets[i].track_id, tracklets[j].track_id) for i, j in links.ambiguous]
-    return join_links(tracklets, links.pairs), ambiguous
+    return join_links(tracklets, links.pairs, decided), ambiguous
 
 
 def _cost(before: EndMotion, after: EndMotion) -> float:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
+from math import inf
 from typing import NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
@@ -70,9 +71,9 @@ class Tracklet:
         return config.class_config(self.class_name)
 
 
-def joined_tracklets(tracklets: Sequence[Tracklet]) -> Tracklet:
-    """Return tracklets of one object as one, under the id of the longest."""
-    longest = max(tracklets, key=lambda tracklet: len(tracklet.stamps_ns))
+def joined_tracklets(tracklets: Sequence[Tracklet], names: Collection[str] = ()) -> Tracklet:
+    """Return tracklets of one object as one, under an id of `names`, else that of the longest."""
+    longest = max(tracklets, key=lambda one: (one.track_id in names, len(one.stamps_ns)))
     stamps_ns = np.concatenate([tracklet.stamps_ns for tracklet in tracklets])
     order = np.argsort(stamps_ns, kind='stable')
     places = [place for tracklet in tracklets for place in tracklet.places]
@@ -93,13 +94,18 @@ def joined_tracklets(tracklets: Sequence[Tracklet]) -> Tracklet:
 
 
 def tracklets_of(
-    results: Sequence[RefinedBoxes], num_points: Sequence[Ints], fixed_frame: str, config: Config
+    results: Sequence[RefinedBoxes],
+    num_points: Sequence[Ints],
+    fixed_frame: str,
+    config: Config,
+    names: Collection[str] = (),
 ) -> list[Tracklet]:
     """
     Return the boxes of a recording, as its results have them, as tracklets in one frame.
 
     An id is split where it names two objects: at one stamp, after `max_gap` without a box, or
-    where the next box is out of reach. The longest part keeps the id. Invalid boxes, those
+    where the next box is out of reach. The longest part keeps the id. Each of `names` is of one
+    object, and split only where it has two boxes at one stamp. Invalid boxes, those
     without an id and those in another frame are in no tracklet. `num_points` has the points (n,)
     above the road in each box of each array.
 
@@ -115,7 +121,7 @@ def tracklets_of(
     tracklets = []
     taken = set(places_of)
     for track_id, places in places_of.items():
-        parts = _split(places, results, config)
+        parts = _split(places, results, inf if track_id in names else config.max_gap)
         parts.sort(key=len, reverse=True)  # stable: of equal ones the first keeps the id
         for part in parts:
             name = track_id if part is parts[0] else unused_id(track_id, taken)
@@ -145,6 +151,8 @@ class _Part:
         seconds = (stamp_ns - self._stamp_ns) * 1e-9
         if not 0 < seconds <= max_gap:
             return np.inf
+        if max_gap == inf:
+            return 0.0
         speed = UNKNOWN_SPEED if self._velocity is None else SWITCH_SPEED
         velocity = np.zeros(3) if self._velocity is None else self._velocity
         predicted = self._box[BOX_CENTER] + seconds * velocity
@@ -160,9 +168,9 @@ class _Part:
 
 
 def _split(
-    places: Iterable[Place], results: Sequence[RefinedBoxes], config: Config
+    places: Iterable[Place], results: Sequence[RefinedBoxes], max_gap: float
 ) -> list[list[Place]]:
-    """Return the boxes of one id as parts that are one object each."""
+    """Return the boxes of one id as parts that are one object each; `inf` joins all in reach."""
 
     def stamp_of(place: Place) -> int:
         return results[place.array].boxes.stamp_ns
@@ -171,7 +179,7 @@ def _split(
     for place in sorted(places, key=stamp_of):
         stamp_ns = stamp_of(place)
         box = results[place.array].boxes.boxes[place.row]
-        excess = [part.excess(stamp_ns, box, config.max_gap) for part in parts]
+        excess = [part.excess(stamp_ns, box, max_gap) for part in parts]
         best = int(np.argmin(excess)) if excess else -1
         if excess and excess[best] <= 1:
             parts[best].add(place, stamp_ns, box)
@@ -270,7 +278,11 @@ class AddedBoxes:
 
     def first(self, count: int) -> AddedBoxes:
         """Return the first `count` of the boxes."""
+        return self.take(range(count))
+
+    def take(self, rows: Sequence[int]) -> AddedBoxes:
+        """Return some of the boxes."""
+        at = np.array(rows, np.int64)
         return AddedBoxes(
-            self.status, self.stamps_ns[:count], self.boxes[:count], self.covariances[:count],
-            self.scores[:count],
-        )  # fmt: skip
+            self.status, self.stamps_ns[at], self.boxes[at], self.covariances[at], self.scores[at]
+        )

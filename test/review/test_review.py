@@ -273,9 +273,9 @@ def test_rejected_tracks_stay_and_pinned_boxes_are_held(result, tmp_path, capsys
     again = tmp_path / 'again'
     decisions = ['--decisions', tmp_path / DECISIONS]
     formats = ['--formats', 'openlabel,nuscenes']
-    assert boxreg('relabel', recording, '-o', again, *formats, *decisions, *QUICK) == 0
+    assert boxreg('relabel', recording, '-o', again, *formats, *decisions, *QUICK) == 1
     (line,) = [line for line in capsys.readouterr().err.splitlines() if 'decisions' in line]
-    for word in ("'nobody'", 'expected', 'got', '--decisions'):
+    for word in ("'nobody'", 'expected', 'got 1 that could not be used', 'are kept'):
         assert word in line
     corrected = BoxTable.read(again / 'boxes.csv')
     is_second = np.array(corrected.track_ids) == '2'

@@ -210,8 +210,9 @@ async function save() {
   view.isSaving = true;
   say('Writing the label files …');
   try {
-    const { line, notes } = await post('save', {});
+    const { line, notes, error } = await post('save', {});
     say([line, ...notes].join(' '));
+    if (error) fail(error);
   } catch (error) {
     say('');
     fail(`The label files were not written, the earlier ones are as they were: ${error.message}`);

@@ -27,7 +27,6 @@ function edit() {
   if (!IS_REVIEW) return;
   if (view.isPlaying) play();
   if (!view.part.usable[view.row]) return fail('This box has numbers that are not finite: correct another box of the track.');
-  if (ADDED.includes(view.part.status[view.row]) && !isAdded(...boxAt(view.row))) return fail('This box was added by the run, and follows the boxes of the input: correct one of these.');
   const human = currentBoxes().find(([name]) => name === 'human');
   view.edit = (human ? human[1] : view.part.usable[view.row]).slice();
   view.steps = [];

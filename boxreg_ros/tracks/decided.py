@@ -1,0 +1,185 @@
+"""What a person has decided, as the steps that complete tracks ask for it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from boxreg_ros.core.follow import FollowedTrack
+from boxreg_ros.structures import BoxArray, Floats, HUMAN
+from boxreg_ros.tracks.tracklet import AddedBoxes, Tracklet
+import numpy as np
+
+
+class Decided(Protocol):
+    """
+    Decisions about boxes, named by the id that their track has in the input, and their stamp.
+
+    They also hold for boxes that the input does not have, and that a step would add.
+
+    """
+
+    @property
+    def names(self) -> Collection[str]:
+        """Return the ids that a person gave: each names one object."""
+
+    @property
+    def apart(self) -> Collection[str]:
+        """Return those of `names` that the input does not have: nothing is joined to them."""
+
+    def input_id(self, track_id: str, stamp_ns: int) -> str:
+        """Return the id in the input of a box that is registered as one of `track_id`."""
+
+    def track_id(self, input_id: str, stamp_ns: int) -> str:
+        """Return the id that was given; empty for none."""
+
+    def class_name(self, input_id: str, stamp_ns: int) -> str:
+        """Return the class that was given; empty for none."""
+
+    def is_deleted(self, input_id: str, stamp_ns: int) -> bool:
+        """Return whether the box is deleted."""
+
+    def is_accepted(self, input_id: str, stamp_ns: int) -> bool:
+        """Return whether the box is accepted or pinned."""
+
+    def pin(self, input_id: str, stamp_ns: int) -> Floats | None:
+        """Return the box (9,) in the fixed frame that a person has set; None for none."""
+
+
+class Nothing:
+    """No decisions."""
+
+    names: Collection[str] = ()
+    apart: Collection[str] = ()
+
+    def input_id(self, track_id: str, stamp_ns: int) -> str:
+        """Return the id itself."""
+        return track_id
+
+    def track_id(self, input_id: str, stamp_ns: int) -> str:
+        """Return none."""
+        return ''
+
+    class_name = track_id
+
+    def is_deleted(self, input_id: str, stamp_ns: int) -> bool:
+        """Return False."""
+        return False
+
+    is_accepted = is_deleted
+
+    def pin(self, input_id: str, stamp_ns: int) -> Floats | None:
+        """Return none."""
+        return None
+
+
+NOTHING = Nothing()
+
+
+@dataclass(frozen=True, slots=True)
+class DecidedTrack:
+    """
+    The decisions about one track of the result.
+
+    A box that the input does not have is named by the id of the box before it, in the page and
+    here; before the first one, by the id of that.
+
+    """
+
+    track_id: str
+    stamps_ns: tuple[int, ...]  # of its boxes of the input, ascending
+    input_ids: tuple[str, ...]  # of these
+    decided: Decided
+
+    @classmethod
+    def of(cls, tracklet: Tracklet, given: Sequence[BoxArray], decided: Decided) -> DecidedTrack:
+        """Return the decisions about a tracklet of some arrays, as they were registered."""
+        stamps_ns = tuple(tracklet.stamps_ns.tolist())
+        names = [given[index].track_ids[row] for index, row in tracklet.places]
+        pairs = zip(names, stamps_ns, strict=True)
+        input_ids = tuple(decided.input_id(*pair) for pair in pairs)
+        return cls(tracklet.track_id, stamps_ns, input_ids, decided)
+
+    @classmethod
+    def of_followed(cls, track: FollowedTrack, decided: Decided) -> DecidedTrack:
+        """Return the decisions about a track that was followed from at least one box."""
+        pairs = zip(track.stamps_ns.tolist(), track.status, strict=True)
+        stamps_ns = tuple(stamp_ns for stamp_ns, word in pairs if word == HUMAN)
+        input_ids = tuple(decided.input_id(track.track_id, stamp) for stamp in stamps_ns)
+        return cls(track.track_id, stamps_ns, input_ids, decided)
+
+    def input_id(self, stamp_ns: int) -> str:
+        """Return the id that names a box at a stamp."""
+        row = int(np.searchsorted(self.stamps_ns, stamp_ns, 'right')) - 1
+        return self.input_ids[max(row, 0)]
+
+    def class_name(self, stamp_ns: int) -> str:
+        """Return the class that was given to the box at a stamp; empty for none."""
+        return self.decided.class_name(self.input_id(stamp_ns), stamp_ns)
+
+    def pin(self, stamp_ns: int) -> Floats | None:
+        """Return the box that a person has set at a stamp; None for none."""
+        return self.decided.pin(self.input_id(stamp_ns), stamp_ns)
+
+    def is_accepted(self) -> bool:
+        """Return whether a person has accepted, pinned or named one of the boxes."""
+        return self.track_id in self.decided.names or any(
+            self.decided.is_accepted(input_id, stamp_ns)
+            for input_id, stamp_ns in zip(self.input_ids, self.stamps_ns, strict=True)
+        )
+
+    def is_deleted(self, stamp_ns: int) -> bool:
+        """Return whether the box at a stamp is deleted."""
+        return self.decided.is_deleted(self.input_id(stamp_ns), stamp_ns)
+
+    def is_of_another(self, stamp_ns: int) -> bool:
+        """Return whether the box at a stamp was given to another track, or left with it."""
+        input_id = self.input_id(stamp_ns)
+        name = self.decided.track_id(input_id, stamp_ns)
+        if not name and self.track_id in self.decided.apart:
+            name = input_id
+        return name not in ('', self.track_id)
+
+    def left(self, boxes: AddedBoxes, is_extension: bool) -> AddedBoxes:
+        """
+        Return the boxes to add that no decision forbids.
+
+        An extension ends where the boxes are of another track, and is none where its first box is
+        deleted: that end of the track was cut off.
+
+        """
+        stamps_ns = boxes.stamps_ns.tolist()
+        others = [self.is_of_another(stamp_ns) for stamp_ns in stamps_ns]
+        deleted = [self.is_deleted(stamp_ns) for stamp_ns in stamps_ns]
+        if is_extension and True in others:
+            del deleted[others.index(True) :]
+        if is_extension and deleted[:1] == [True]:
+            deleted.clear()
+        return boxes.take([i for i, gone in enumerate(deleted) if not (gone or others[i])])
+
+
+def with_decisions(track: FollowedTrack, decided: Decided) -> FollowedTrack:
+    """Return a followed track without the boxes that are deleted, or were given to another."""
+    seeds = [i for i, word in enumerate(track.status) if word == HUMAN]
+    if not seeds:
+        return track
+    stamps_ns = track.stamps_ns.tolist()
+    of_track = DecidedTrack.of_followed(track, decided)
+    is_other = np.array([of_track.is_of_another(stamp) for stamp in stamps_ns])
+    is_other[seeds] = False
+    rows = np.arange(len(stamps_ns))
+    first = rows[is_other & (rows < seeds[0])].max(initial=-1) + 1
+    end = rows[is_other & (rows > seeds[-1])].min(initial=len(rows))
+    left = [
+        i
+        for i in range(first, end)
+        if i in seeds or not (is_other[i] or of_track.is_deleted(stamps_ns[i]))
+    ]
+    return replace(
+        track,
+        rows=track.rows[left],
+        stamps_ns=track.stamps_ns[left],
+        boxes=track.boxes[left],
+        status=tuple(track.status[i] for i in left),
+    )

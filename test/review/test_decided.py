@@ -1,0 +1,226 @@
+"""What a person has decided binds the steps that complete tracks, and those that follow them."""
+
+import shutil
+
+from boxreg_ros.cli import main
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.review_command import drive_of
+from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
+from boxreg_ros.review.server import review_server
+from browser import NEEDS_BROWSER, opened_page, press, serving
+import numpy as np
+import pytest
+from relabel_results import rows_in
+from ros_messages import Drive
+
+SWEEPS = 16
+SETTINGS = ('solver.rounds=2', 'sampling.points=64', 'window=6', 'max_gap=0.5')
+QUICK = ['--formats=csv', *(f'--set={setting}' for setting in SETTINGS)]
+GAP = (4, 5, 6)  # sweeps without a box of the moving car
+
+
+def spoiled():
+    """Return a drive with a gap in track 2, no end of track 1, and a ghost of three boxes."""
+    drive = Drive(sweeps=SWEEPS)
+    for k in GAP:
+        drive.replace('/boxes', k, lambda message: message.detections.pop(1))
+    for k in range(SWEEPS - 3, SWEEPS):
+        drive.replace('/boxes', k, lambda message: message.detections.pop(0))
+
+    def add_ghost(message):
+        ghost = drive.messages.boxes(
+            'vision_msgs/msg/Detection3DArray', 0, 'lidar',
+            [(9, ((30, 30, 0), (0, 0, 0, 1)), (4, 2, 1.5))],
+        ).detections[0]  # fmt: skip
+        ghost.header = message.detections[0].header
+        message.detections.append(ghost)
+
+    for k in (8, 9):
+        drive.replace('/boxes', k, add_ghost)
+    return drive
+
+
+class Run:
+    """A recording, and the result of relabelling it with some decisions."""
+
+    def __init__(self, recording, *options):
+        self._recording = recording
+        self._options = options
+
+    def __call__(self, out, decisions=()):
+        command = ['relabel', str(self._recording), '-o', str(out), *self._options, *QUICK]
+        if decisions:
+            path = out.with_name(f'{out.name}_{DECISIONS}')
+            DecisionLog(path).append(decisions)
+            command += ['--decisions', str(path)]
+        self.status = main(command)
+        rows = rows_in(out / 'boxes.csv')
+        return {(row['track_id'], int(row['stamp_ns'])): row for row in rows}
+
+
+def words_of(rows, track_id, stamps):
+    """Return the status of a track at each sweep, '' where it has no box."""
+    return [rows.get((track_id, stamp), {'status': ''})['status'] for stamp in stamps]
+
+
+@pytest.fixture(scope='module')
+def completed(tmp_path_factory):
+    """Return a run with --complete, its stamps, and its result without decisions."""
+    folder = tmp_path_factory.mktemp('completed')
+    drive = spoiled()
+    recording = drive.write(folder / 'drive')
+    before = Run(recording, '--complete', '--report')(folder / 'out')
+    return Run(recording, '--complete'), drive.stamps, before, folder / 'out'
+
+
+def test_without_decisions_the_steps_do_all_of_this(completed):
+    _, stamps, rows, _ = completed
+    assert [words_of(rows, '2', stamps)[k] for k in GAP] == ['interpolated'] * 3
+    assert words_of(rows, '1', stamps)[-3:] == ['extended'] * 3
+    assert words_of(rows, '9', stamps)[8:10] == ['rejected'] * 2
+
+
+def test_decisions_bind_the_steps_of_complete(completed, tmp_path, capsys):
+    run, stamps, before, out = completed
+    table = BoxTable.read(out / 'boxes.csv')
+    keys = zip(table.track_ids, table.stamps_ns.tolist(), strict=True)
+    pin = table.boxes[list(keys).index(('2', stamps[5]))] + [0.3, 0.2, 0, 0, 0, 0, 0, 0, 0]
+    decisions = [
+        Decision('2', stamps[10], 'rename', end_ns=stamps[-1], value='2_2'),
+        Decision('2', stamps[1], 'reclass', end_ns=stamps[2], value='truck'),
+        Decision('2', stamps[4], 'delete'),  # added in the gap
+        Decision('2', stamps[5], 'pin', '', table.frame_id, pin),  # likewise
+        Decision('1', stamps[3], 'delete', end_ns=stamps[5]),  # inside of the track
+        Decision('1', stamps[14], 'delete', end_ns=stamps[15]),  # added at its end
+        Decision('9', None, 'accept'),
+    ]
+    rows = run(tmp_path / 'out', decisions)
+    assert run.status == 0, capsys.readouterr().err
+    words = words_of(rows, '2', stamps)
+    assert words[4:7] == ['', 'human', 'interpolated']
+    assert words[10:] == [''] * 6
+    assert '' not in words_of(rows, '2_2', stamps)[10:]
+    assert words_of(rows, '2_2', stamps)[:10] == [''] * 10
+    corrected = rows['2', stamps[5]]
+    found = [float(corrected[name]) for name in ('x', 'y', 'z', 'length', 'width', 'height')]
+    np.testing.assert_allclose(found, pin[:6], atol=1e-6)
+    classes = [rows['2', stamp]['class_name'] for stamp in stamps[:4]]
+    assert classes == ['car', 'truck', 'truck', 'car']
+    assert words_of(rows, '1', stamps)[3:6] == ['rejected'] * 3  # the boxes of the input
+    assert words_of(rows, '1', stamps)[13:] == ['extended', '', '']
+    assert set(words_of(rows, '9', stamps)[8:10]) <= {'refined', 'kept'}
+    others = {key for key in rows if rows[key]['status'] != 'rejected'}
+    assert len(others) == len([k for k in before if before[k]['status'] != 'rejected']) - 1 - 3
+
+
+def test_a_deleted_end_is_not_extended_again(completed, tmp_path):
+    run, stamps, _, _ = completed
+    rows = run(tmp_path / 'out', [Decision('2', stamps[13], 'delete', end_ns=stamps[15])])
+    assert words_of(rows, '2', stamps)[13:] == ['rejected'] * 3
+    assert sum(name == '2' for name, _ in rows) == SWEEPS
+
+
+def test_joined_tracks_stay_one_however_long_the_pause(completed, tmp_path, capsys):
+    run, stamps, _, _ = completed
+    decisions = [
+        Decision('2', stamps[3], 'delete', end_ns=stamps[11]),
+        Decision('2', stamps[12], 'rename', end_ns=stamps[15], value='new'),
+        Decision('2', stamps[0], 'rename', end_ns=stamps[2], value='new'),
+        Decision('nobody', None, 'delete'),
+    ]
+    rows = run(tmp_path / 'out', decisions)
+    assert run.status == 1
+    (line,) = [row for row in capsys.readouterr().err.splitlines() if 'decisions' in row]
+    assert "got 1 that could not be used: 'nobody'; the results are kept" in line
+    words = words_of(rows, 'new', stamps)
+    assert '' not in [*words[:3], *words[12:]]
+    assert words[3:12] == [''] * 9
+    assert {name for name, _ in rows} == {'1', '2', 'new', '9'}
+    assert set(words_of(rows, '2', stamps)) == {'', 'rejected'}
+
+
+def test_halves_of_a_split_are_not_followed_into_each_other(tmp_path, capsys):
+    """Boxes between keyframes that are deleted stay away; a corrected one is a new keyframe."""
+    drive = Drive(sweeps=13)
+    for k in range(13):
+        if k % 4:
+            drive.replace('/boxes', k, lambda message: message.detections.clear())
+    stamps = drive.stamps
+    run = Run(drive.write(tmp_path / 'drive'), '--keyframes')
+    before = run(tmp_path / 'before')
+    table = BoxTable.read(tmp_path / 'before' / 'boxes.csv')
+    assert '' not in words_of(before, '2', stamps)
+    keys = zip(table.track_ids, table.stamps_ns.tolist(), strict=True)
+    pin = table.boxes[list(keys).index(('1', stamps[6]))] + [0.2, 0, 0, 0, 0, 0, 0, 0, 0]
+    decisions = [
+        Decision('2', stamps[6], 'rename', end_ns=stamps[-1], value='2_2'),
+        Decision('1', stamps[2], 'delete'),
+        Decision('1', stamps[6], 'pin', '', table.frame_id, pin),
+    ]
+    rows = run(tmp_path / 'after', decisions)
+    assert run.status == 0, capsys.readouterr().err
+    first = words_of(rows, '2', stamps)
+    assert '' not in first[:5]
+    assert first[6:] == [''] * 7
+    second = words_of(rows, '2_2', stamps)
+    assert second[:6] == [''] * 6
+    assert '' not in second[8:]
+    words = words_of(rows, '1', stamps)
+    assert (words[2], words[6]) == ('', 'human')
+    found = [float(rows['1', stamps[6]][name]) for name in ('x', 'y', 'z')]
+    np.testing.assert_allclose(found, pin[:3], atol=1e-6)
+
+
+@NEEDS_BROWSER
+def test_decisions_of_the_page_are_all_in_the_labels_that_it_writes(completed, tmp_path):
+    """Also about boxes that the run has added; what cannot be used is an error in the page."""
+    _, stamps, _, made = completed
+    out = shutil.copytree(made, tmp_path / 'out')
+    with (
+        serving(review_server([(out, drive_of(out))], 0, 'anna')) as server,
+        opened_page(server.address + '#track=2') as page,
+    ):
+
+        def open_box(track_id, row):
+            page.evaluate(f"openTrack(TRACKS.findIndex(t => t.id === '{track_id}'), null, {row})")
+            page.wait_for_function(f"view.part && current().id === '{track_id}'")
+            page.locator('#top').focus()
+
+        open_box('9', 0)
+        press(page, 'a', "judgementOf(current())?.decision === 'accept'")
+        open_box('1', 15)  # added at the end
+        press(page, 'Shift+D', 'current().deleted === 1')
+        open_box('2', 4)  # added in the gap
+        press(page, 'Shift+D', 'current().deleted === 1')
+        open_box('2', 5)
+        page.keyboard.press('e')
+        page.keyboard.press('ArrowUp')
+        corrected = page.evaluate('moved(view.edit, view.part.origin, 1)')
+        press(page, 'Enter', 'pinOf(view.row) !== null')
+        open_box('2', 1)
+        page.keyboard.press('b')
+        page.evaluate('step(2)')
+        page.keyboard.press('k')
+        page.wait_for_selector('#ask[open]')
+        page.fill('#ask-text', 'truck')
+        page.keyboard.press('Enter')
+        page.wait_for_function('log.made.length === 5')
+        open_box('2', 10)
+        press(page, 's', "current().id === '2_2'")
+        DecisionLog(out / DECISIONS).append([Decision('nobody', None, 'delete')])
+        page.keyboard.press('Control+s')
+        page.wait_for_selector('#failure:not([hidden])', timeout=120_000)
+        assert "could not be used: 'nobody'" in page.inner_text('#failure')
+        assert 'boxes in' in page.inner_text('#notice')
+    rows = rows_in(tmp_path / 'out.corrected' / 'boxes.csv')
+    rows = {(row['track_id'], int(row['stamp_ns'])): row for row in rows}
+    words = words_of(rows, '2', stamps)
+    assert words[4:7] == ['', 'human', 'interpolated']
+    found = [float(rows['2', stamps[5]][name]) for name in ('x', 'y', 'z')]
+    np.testing.assert_allclose(found, corrected[:3], atol=1e-6)
+    assert words[10:] == [''] * 6
+    assert '' not in words_of(rows, '2_2', stamps)[10:]
+    assert words_of(rows, '1', stamps)[13:] == ['extended', 'extended', '']
+    assert set(words_of(rows, '9', stamps)[8:10]) <= {'refined', 'kept'}
+    classes = [rows['2', stamp]['class_name'] for stamp in stamps[:4]]
+    assert classes == ['car', 'truck', 'truck', 'car']
