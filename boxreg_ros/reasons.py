@@ -304,6 +304,26 @@ class Reason(StrEnum):
     )
     GHOST = ('ghost', 'box', 'rejected: its track is short, without consistent points or motion')
     DUPLICATE = ('duplicate', 'box', 'rejected: overlaps the boxes of a track with more evidence')
+    NOT_A_KEYFRAME = (
+        'not_a_keyframe',
+        'box of label files',
+        'with `--keyframes`: the labelling tool interpolated it, or a tracker or a model made it; '
+        'no person placed it',
+        'place a box there by hand to have it used as one, or leave `--keyframes` out',
+    )
+    OTHER_SOURCE = (
+        'other_source',
+        'box of label files',
+        'of another source than the one that was read, such as a model run beside the ground '
+        'truth',
+        'name the source to read after the path: `PATH#SOURCE`',
+    )
+    NO_BOX = (
+        'no_box',
+        'entry of label files',
+        'the file states that the object has no box there: a contour or a value that is null, a '
+        'region without labels, a frame where the object is outside',
+    )
     SHORT_TRACK = (
         'short_track',
         'box',

@@ -405,14 +405,44 @@ def datumaro(folder, form='datumaro'):
     return {'cuboids': cuboids, 'infos': data.infos(), 'tracklets': tracklets}
 
 
-def supervisely(folder):
-    """Return every figure of every frame of a project of point cloud episodes."""
+def datumaro_tracklets(folder, out):
+    """Export a data set of Datumaro as tracklets of KITTI raw."""
+    from datumaro import Dataset
+
+    Dataset.import_from(folder, 'datumaro').export(out, 'kitti_raw', reindex=True)
+
+
+def datumaro_kitti(folder):
+    """Return the attributes of every box of KITTI object."""
+    from datumaro import Dataset
+    from datumaro.components.annotation import AnnotationType
+
+    Path(folder, 'image_2').mkdir()
+    data = Dataset.import_from(folder, 'kitti3d')
+    labels = data.categories()[AnnotationType.label]
+    return [
+        {'id': item.id, 'label': labels[box.label].name, **box.attributes}
+        for item in data
+        for box in item.annotations
+    ]
+
+
+@cache
+def import_supervisely():
+    """Import what the projects of Supervisely need of the package."""
     from importlib import import_module
 
     skip_package_init('supervisely')  # imports the whole platform
     package = sys.modules['supervisely']
     package.logger = import_module('supervisely.sly_logger').logger
     package.env = import_module('supervisely.io.env')
+
+
+def supervisely(folder):
+    """Return every figure of every frame of a project of point cloud episodes."""
+    from importlib import import_module
+
+    import_supervisely()
     episodes = import_module('supervisely.project.pointcloud_episode_project')
 
     project = episodes.PointcloudEpisodeProject(folder, episodes.OpenMode.READ)
@@ -433,6 +463,86 @@ def supervisely(folder):
         'type': project.type, 'frames': label.frames_count, 'description': label.description,
         'items': sorted(data), 'figures': figures,
     }  # fmt: skip
+
+
+def supervisely_clouds(folder):
+    """Return every figure of every cloud of a project of point clouds, and its name."""
+    from importlib import import_module
+
+    import_supervisely()
+    projects = import_module('supervisely.project.pointcloud_project')
+    project = projects.PointcloudProject(folder, projects.OpenMode.READ)
+    (data,) = project.datasets
+    figures = []
+    for name in data:
+        label = data.get_ann(name, project.meta)
+        figures += [
+            {
+                'cloud': name, 'geometry': figure.geometry.to_json(),
+                'class': figure.parent_object.obj_class.name,
+                'object': figure.parent_object.key().hex,
+                'tags': {tag.name: tag.value for tag in figure.parent_object.tags},
+            }
+            for figure in label.figures
+        ]  # fmt: skip
+    return {'type': project.type, 'items': sorted(data), 'figures': figures}
+
+
+def vcd_transform(path, source, target, frame):
+    """Return the transform between two coordinate systems of an OpenLABEL file at a frame."""
+    from vcd import core, scl
+
+    label = core.OpenLABEL()
+    label.load_from_file(path)
+    scene = scl.Scene(label)
+    return scene.get_transform(source, target, int(frame))[0].tolist()
+
+
+def vcd_write(path):
+    """Write a file with VCD: a chain of poses, a static object and one that moves."""
+    from vcd import core, types
+
+    label = core.OpenLABEL()
+    quaternion, euler = (
+        types.TransformDataType.quat_and_trans_7x1,
+        types.TransformDataType.euler_and_trans_6x1,
+    )
+    kinds = types.CoordinateSystemType
+    label.add_coordinate_system('odom', cs_type=kinds.scene_cs)
+    label.add_coordinate_system('vehicle-iso8855', cs_type=kinds.local_cs, parent_name='odom')
+    label.add_coordinate_system(
+        'lidar', cs_type=kinds.sensor_cs, parent_name='vehicle-iso8855',
+        pose_wrt_parent=types.PoseData([0.0, 0.0, 0.6, 0.8, 1.2, 0.1, 1.8], quaternion),
+    )  # fmt: skip
+    parked = label.add_object('parked', 'car', coordinate_system='odom')
+    box = [20.0, 3.0, 0.5, 0.0, 0.0, 0.0, 1.0, 4.5, 1.9, 1.6]
+    label.add_object_data(parked, types.cuboid('box', box))
+    moving = label.add_object('moving', 'truck')
+    for number in range(3):
+        seconds = f'2023-11-14T22:13:2{number}.123456789Z'
+        label.add_frame_properties(number, timestamp=seconds)
+        pose = types.TransformData([0.3, -0.1, 0.05, 10.0 + number, 2.0, 0.4], euler)
+        label.add_transform(number, types.Transform('vehicle-iso8855', 'odom', pose))
+        box = [10.0 + number, -3.0, -1.0, 0.1, 0.2, 0.3, 8.0, 2.5, 3.0]
+        label.add_object_data(moving, types.cuboid('box', box, coordinate_system='lidar'), number)
+    label.save(path, validate=True)
+    return [parked, moving]
+
+
+def vcd_labels(path):
+    """Return the cuboids of the objects in each frame, as VCD reads and validates a file."""
+    from vcd import core
+
+    label = core.OpenLABEL()
+    label.load_from_file(path, validation=True)
+    root = label.get_root()
+    return {
+        number: {
+            uid: [cuboid['val'] for cuboid in item['object_data']['cuboid']]
+            for uid, item in frame.get('objects', {}).items()
+        }
+        for number, frame in root['frames'].items()
+    }
 
 
 def cloud(path):

@@ -15,7 +15,7 @@ from boxreg_ros.io.lidars import Lidars, SensorPlacement
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of, LabelFrame
-from boxreg_ros.labels.merging import LabelMerger
+from boxreg_ros.labels.merging import keyframes_of, LabelMerger
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
@@ -31,7 +31,8 @@ class SceneRecording:
     One sweep is in memory at a time. Sweeps that cannot be read are counted and left out. The
     LiDARs are by default the main one of the data set; `start` and `end` are counted from the
     first sweep [s]; with `labels`, a format and a path, the boxes are those of label files and
-    not the annotations. Entering raises RecordingError if the scene or a part of it is missing.
+    not the annotations; with `keyframes` boxes that no person made are left out. Entering raises
+    RecordingError if the scene or a part of it is missing.
 
     """
 
@@ -49,6 +50,7 @@ class SceneRecording:
         end: float | None = None,
         labels: tuple[str, Path] | None = None,
         convention: Convention = STANDARD,
+        keyframes: bool = False,
     ) -> None:
         self._address = address
         self._dataset = module_of(address.dataset).DATASET
@@ -56,11 +58,14 @@ class SceneRecording:
         self._start, self._end = start, end
         self._labels = labels
         self._convention = convention
+        self._keyframes = keyframes
         self.boxes_topic = '' if labels else ANNOTATIONS
         self.unreadable: Counter[str] = Counter()
         self.first_errors: dict[str, UnsupportedMessage] = {}
         self.placement = SensorPlacement()
         self.outside = 0
+        self.left_out: Counter[str] = Counter()
+        self.label_notes: list[str] = []
         self._readable = 0
 
     def __enter__(self) -> Self:
@@ -126,6 +131,8 @@ class SceneRecording:
         self._readable = 0
         tree.rewind(0)  # the pose that was read to choose a frame is read again
         frames = self._frames() if self.has_boxes else iter(())
+        if self._keyframes:
+            frames = keyframes_of(frames)
         is_part = self._start is not None or self._end is not None
         sensor_frame = self.sensor_frame()
         merger = LabelMerger(frames, tree, sensor_frame, self.start_ns, is_part)
@@ -144,6 +151,8 @@ class SceneRecording:
         self._add_poses(tree, num_poses, int(self._scene.pose_stamps_ns[-1]))
         yield from merger.rest()
         self.outside = merger.outside
+        self.left_out = merger.left_out
+        self.label_notes = merger.notes
 
     def check_readable(self) -> None:
         """Raise UnsupportedMessage if sweeps were missing and none was readable."""

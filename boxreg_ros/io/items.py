@@ -96,6 +96,10 @@ class ItemSource(Protocol):
     """Of each topic with messages that could not be decoded; `unreadable` counts them."""
     outside: int
     """Boxes that do not belong to the part that is read."""
+    left_out: Counter[str]
+    """Boxes of label files that are not used, by reason."""
+    label_notes: list[str]
+    """What the reader of label files assumed of them."""
 
     @property
     def odometry_topic(self) -> str | None:

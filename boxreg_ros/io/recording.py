@@ -80,6 +80,8 @@ class Recording:
         self._asked_boxes, self._asked_odometry = boxes, odometry
         self._start, self._end = start, end
         self.outside = 0
+        self.left_out: Counter[str] = Counter()
+        self.label_notes: list[str] = []
         self._decoded_topics: set[str] = set()
         self._array_adapter: SerializedAdapter | None = None
 

@@ -569,11 +569,16 @@ def move_to_frame(item: Sweep | BoxArray, T_frame_item: Floats, frame_id: str) -
 
 def boxes_to_frame(boxes: BoxArray, T_frame_boxes: Floats, frame_id: str) -> BoxArray:
     """Return the boxes in another frame; NaN stays NaN."""
-    moved = boxes.boxes.copy()
+    return replace(boxes, frame_id=frame_id, boxes=moved_boxes(boxes.boxes, T_frame_boxes))
+
+
+def moved_boxes(boxes: Floats, T_frame_boxes: Floats) -> Floats:
+    """Return boxes (n, 9) in another frame by a transform (4, 4); NaN stays NaN."""
+    moved = boxes.copy()
     R = T_frame_boxes[:3, :3]
-    moved[:, BOX_CENTER] = boxes.boxes[:, BOX_CENTER] @ R.T + T_frame_boxes[:3, 3]
+    moved[:, BOX_CENTER] = boxes[:, BOX_CENTER] @ R.T + T_frame_boxes[:3, 3]
     moved[:, ROLL:] = rpy_from_matrix(R @ matrix_from_rpy(moved[:, ROLL:]))
-    return replace(boxes, frame_id=frame_id, boxes=moved)
+    return moved
 
 
 def _name(frame_id: str) -> str:

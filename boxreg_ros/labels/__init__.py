@@ -19,6 +19,7 @@ from boxreg_ros.labels.protocol import (
 from boxreg_ros.labels.registry import (
     can_read,
     check_options,
+    files_of,
     FORMATS,
     frames_of,
     import_format,
@@ -30,6 +31,7 @@ from boxreg_ros.labels.registry import (
 __all__ = [
     'can_read',
     'check_options',
+    'files_of',
     'Format',
     'FORMATS',
     'frames_of',

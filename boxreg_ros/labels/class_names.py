@@ -41,7 +41,8 @@ ARGOVERSE2 = (
 )  # fmt: skip
 KITTI = ('Car', 'Van', 'Truck', 'Pedestrian', 'Person_sitting', 'Cyclist', 'Tram', 'Misc')
 VOCABULARIES = {
-    'nuscenes': NUSCENES, 'lidarseg': NUSCENES, 'argoverse2': ARGOVERSE2, 'kitti': KITTI
+    'nuscenes': NUSCENES, 'lidarseg': NUSCENES, 'argoverse2': ARGOVERSE2, 'kitti': KITTI,
+    'kitti_object': KITTI,
 }  # fmt: skip
 """By format."""
 TRANSLATIONS = (

@@ -29,12 +29,12 @@ element vertex {points}
 {properties}
 end_header
 """
-SUFFIXES = ('.pcd.bin', '.bin', '.pcd', '.ply')
+SUFFIXES = ('.pcd.bin', '.bin', '.npy', '.pcd', '.ply')
 """Longest first: ``.pcd.bin`` also ends in ``.bin``."""
 PCD_LINE_BYTES = 1 << 16
 """Longest line of the header of a PCD file that is read [bytes]; chosen."""
-BIN_COLUMNS = {'.bin': 4, '.pcd.bin': 5}
-"""Numbers per point: KITTI has x y z intensity, nuScenes also the ring."""
+BIN_COLUMNS = {'.bin': 4, '.npy': 4, '.pcd.bin': 5}
+"""Numbers per point: KITTI and OpenPCDet have x y z intensity, nuScenes also the ring."""
 
 
 def write_cloud(
@@ -44,15 +44,17 @@ def write_cloud(
     Write a cloud in the format of its file name, as little-endian float32.
 
     The name ends in ``.pcd`` (binary), ``.ply`` (binary), ``.pcd.bin`` (nuScenes: x y z intensity
-    ring) or ``.bin`` (KITTI: x y z intensity). Points (M, 3) are in the sensor frame [m],
-    intensities (M,) in the unit of the sensor. Without these, PCD and PLY files have no such
-    field, and BIN files have zeros. The ring is always zero. Raises ConfigError if the name has
-    another suffix.
+    ring), ``.bin`` (KITTI: x y z intensity) or ``.npy`` (OpenPCDet: likewise). Points (M, 3) are
+    in the sensor frame [m], intensities (M,) in the unit of the sensor. Without these, PCD and
+    PLY files have no such field, and the others have zeros. The ring is always zero. Raises
+    ConfigError if the name has another suffix.
 
     """
     suffix = next((s for s in SUFFIXES if path.name.endswith(s)), '')
     if not suffix:
-        raise ConfigError(f'cloud {path.name!r}: expected a name in .pcd, .ply, .bin or .pcd.bin')
+        raise ConfigError(
+            f'cloud {path.name!r}: expected a name in .pcd, .ply, .bin, .npy or .pcd.bin'
+        )
     names = ['x', 'y', 'z']
     if intensities is not None:
         names.append('intensity')
@@ -60,6 +62,9 @@ def write_cloud(
     table[:, :3] = points
     if intensities is not None:
         table[:, 3] = intensities
+    if suffix == '.npy':
+        np.save(path, table)
+        return
     with path.open('wb') as file:
         file.write(_header(suffix, names, len(points)).encode())
         file.write(table.data)

@@ -10,7 +10,7 @@ sensor frame; the extents are along x (forward), y (left) and z of the box.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,7 +19,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.files import following, from_json, require_single
 from boxreg_ros.labels.folder import FolderWriter, frame_name
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame
-from boxreg_ros.labels.records import evidence_of, ReadBox, refined_of, UPPER_TRIANGLE
+from boxreg_ros.labels.records import evidence_of, ReadBox, UPPER_TRIANGLE
 from boxreg_ros.labels.sidecar import read_sidecar, STAMPS_FILE
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, ROLL
@@ -30,6 +30,9 @@ EVIDENCE_KEY = 'boxreg'
 """Key of the evidence that is written beside a box; the tools ignore it."""
 UNKNOWN_CLASS = 'unknown'
 """Class name of boxes without one, for tools that require a name."""
+FrameBoxes = tuple[list[ReadBox], Mapping[str, int]]
+"""Boxes of a frame, and the number of those left out by reason."""
+NO_FRAME_BOXES: FrameBoxes = ([], {})
 
 
 def cuboid_format(name: str, title: str, files: str) -> Format:
@@ -53,9 +56,11 @@ def xyz_angles(boxes: Floats) -> Floats:
 
 
 def box_from_cuboid(position: ArrayLike, angles: ArrayLike, extent: ArrayLike) -> Floats:
-    """Return a box (9,) from its centre, angles x y z and extents."""
-    rpy = rpy_from_matrix(matrix_from_rpy(-np.asarray(angles, float)).T)
-    return np.concatenate([np.asarray(position, float), np.asarray(extent, float), rpy])
+    """Return a box (9,) from its centre, angles x y z and extents; ValueError for others."""
+    centre, turn, size = (
+        np.reshape(np.asarray(part, float), 3) for part in (position, angles, extent)
+    )
+    return np.concatenate([centre, size, rpy_from_matrix(matrix_from_rpy(-turn).T)])
 
 
 def xyz(values: Iterable[float]) -> dict[str, float]:
@@ -64,7 +69,12 @@ def xyz(values: Iterable[float]) -> dict[str, float]:
 
 
 def box_from_xyz(*vectors: Mapping[str, float]) -> Floats:
-    """Return a box (9,) from its centre, angles and extents that are written by axis."""
+    """
+    Return a box (9,) from its centre, angles and extents that are written by axis.
+
+    Raises KeyError for an axis that is missing, TypeError or ValueError for one that is no number.
+
+    """
     return box_from_cuboid(*([float(vector[axis]) for axis in 'xyz'] for vector in vectors))
 
 
@@ -140,21 +150,38 @@ def read_files(
     labels: Path,
     names: Iterable[str],
     what: str,
-    cuboids_of: Callable[[Any], list[ReadBox]],
-    has_all: bool = True,
+    cuboids_of: Callable[[Any], FrameBoxes],
+    suffix: str = '.json',
 ) -> Iterator[LabelFrame]:
     """
     Yield the frames of a folder with sidecar files and a file of labels per frame.
 
-    `labels` has the files, whose content `cuboids_of` reads; frames without boxes may lack theirs
-    unless the tool `has_all`. `names` and errors are as of `read_frames`; `what` the file has.
+    Parameters
+    ----------
+    folder : Path
+        Of the sidecar files.
+    labels : Path
+        Folder of the files; frames without boxes may lack theirs.
+    names : iterable of str
+        Of all frames that have labels or points.
+    what : str
+        Content of the files, for errors.
+    cuboids_of : callable
+        Returns the boxes of the content of a file.
+    suffix : str
+        Of the files, after the name of a frame.
+
+    Raises
+    ------
+    RecordingError
+        As `read_frames`, and for a file that `cuboids_of` cannot read.
 
     """
 
-    def cuboids_by_name(name: str) -> list[ReadBox]:
-        file = labels / f'{name}.json'
-        if not has_all and not file.exists():
-            return []
+    def cuboids_by_name(name: str) -> FrameBoxes:
+        file = labels / f'{name}{suffix}'
+        if not file.exists():
+            return NO_FRAME_BOXES
         content = from_json(file)
         with following(file, what):
             return cuboids_of(content)
@@ -163,27 +190,62 @@ def read_files(
 
 
 def read_frames(
-    folder: Path, names: list[str], cuboids_by_name: Callable[[str], list[ReadBox]]
+    folder: Path,
+    names: Sequence[str],
+    cuboids_by_name: Callable[[str], FrameBoxes],
+    numbers: Mapping[str, int] | None = None,
 ) -> Iterator[LabelFrame]:
     """
     Yield the frames of a folder with sidecar files, in the fixed frame where it is known.
 
-    `names`, in order, are those of all frames that have labels or points. Raises RecordingError if
-    the sidecar files are missing or belong to other frames.
+    Parameters
+    ----------
+    folder : Path
+        Of the sidecar files. Without ``timestamps.txt`` the names state the stamps.
+    names : sequence of str
+        Of all frames that have labels or points, in order.
+    cuboids_by_name : callable
+        Returns the boxes of a frame.
+    numbers : mapping of str to int, optional
+        Number of each frame, where the labels state it: the line of its stamp in a file with more.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One for each stamp, in their order.
+
+    Raises
+    ------
+    RecordingError
+        If there are neither sidecar files nor stamps in the names, or those of other frames.
 
     """
-    sidecar = read_sidecar(folder, len(names))
-    used: Counter[int] = Counter()
-    order = [frame_name(stamp_ns, used) for stamp_ns in sidecar.stamps_ns]
-    if not set(names) <= set(order):  # frames named by another program: one stamp for each
-        if len(names) != len(order):
-            raise RecordingError(
-                f'{folder / STAMPS_FILE}: expected one stamp for each of {len(names)} frames, got '
-                f'{len(order)}'
-            )
-        order = names
-    for index, name in enumerate(order):
-        cuboids = cuboids_by_name(name)
+    sidecar = read_sidecar(folder, len(names), names=names)
+    names_in_order = _in_order(folder, names, sidecar.stamps_ns, numbers or {})
+    for index in np.argsort(sidecar.stamps_ns, kind='stable').tolist():
+        name = names_in_order.get(index)
+        boxes, left_out = NO_FRAME_BOXES if name is None else cuboids_by_name(name)
         with following(folder, f'attributes as boxreg writes them in frame {name!r}'):
-            refined = refined_of(sidecar.stamps_ns[index], sidecar.sensor_frame, cuboids)
-        yield sidecar.frame(index, refined).moved('fixed')
+            frame = sidecar.frame(index, boxes, left_out)
+        yield frame.moved('fixed')
+
+
+def _in_order(
+    folder: Path, names: Sequence[str], stamps_ns: Sequence[int], numbers: Mapping[str, int]
+) -> dict[int, str]:
+    """Return the name of the frame of each stamp, by the index of the stamp."""
+    if len(names) == len(stamps_ns):
+        used: Counter[int] = Counter()
+        by_stamp = [frame_name(stamp_ns, used) for stamp_ns in stamps_ns]
+        # Frames named by another program are in the order of the stamps.
+        return dict(enumerate(by_stamp if set(names) == set(by_stamp) else names))
+    used = Counter()
+    index_of = {frame_name(stamp_ns, used): index for index, stamp_ns in enumerate(stamps_ns)}
+    if not set(names) <= index_of.keys() and len({*numbers.values()}) == len(names):
+        index_of = {name: numbers[name] for name in names}
+    if not set(names) <= index_of.keys() or max(index_of.values(), default=0) >= len(stamps_ns):
+        raise RecordingError(
+            f'{folder / STAMPS_FILE}: expected one stamp for each of {len(names)} frames, got '
+            f'{len(stamps_ns)}; leave out the lines of frames without labels'
+        )
+    return {index_of[name]: name for name in names}

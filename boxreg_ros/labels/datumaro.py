@@ -8,15 +8,16 @@ format if the precision matters.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from boxreg_ros.labels import cuboids
-from boxreg_ros.labels.files import following, from_json, JsonList
-from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.files import at, following, from_json, JsonList, require_single
+from boxreg_ros.labels.protocol import absolute, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import ReadBox, TrackNumbers
+from boxreg_ros.structures import INTERPOLATED
 
 FORMAT = replace(
     cuboids.cuboid_format(
@@ -30,6 +31,8 @@ FORMAT = replace(
 ANNOTATIONS_FILE = 'annotations/default.json'
 POINT_CLOUD_MEDIA = 6
 """Number of the media type in Datumaro."""
+OWN_ATTRIBUTE = 'extent_covariance'
+"""Attribute of the boxes that we write, and no other program."""
 SWAPPED_KEY = 'scale_is_height_width_length'
 """Key of the header that states `Options.swap_axes`."""
 
@@ -83,7 +86,13 @@ class Writer(cuboids.CuboidWriter):
     def _annotation(self, index: int, track_number: int, cuboid: cuboids.Cuboid) -> dict[str, Any]:
         """Return the annotation of a cuboid; its class is added to the labels."""
         label_id = self._labels.setdefault(cuboid.class_name, len(self._labels))
-        attributes = {'track_id': track_number, 'track': cuboid.track_id, 'occluded': False}
+        # CVAT imports as tracks only what has keyframes, and interpolates between them.
+        attributes = {
+            'track_id': track_number,
+            'track': cuboid.track_id,
+            'occluded': False,
+            'keyframe': True,
+        }
         return {
             'id': index,
             'type': 'cuboid_3d',
@@ -97,32 +106,84 @@ class Writer(cuboids.CuboidWriter):
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
-    """Yield the items of a data set with one stamp [ns] per item in its ``timestamps.txt``."""
-    file = path / ANNOTATIONS_FILE
+    """
+    Yield the items of a data set.
+
+    Their stamps [ns] are those of ``timestamps.txt``, one per item, or their ids. CVAT marks the
+    boxes that it interpolated as no keyframes.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the data set, or its file of annotations.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per item, in the order of the stamps.
+
+    Raises
+    ------
+    RecordingError
+        If a file is missing or does not follow the format.
+
+    """
+    file = path
+    if path.is_dir():
+        files = sorted((path / ANNOTATIONS_FILE).parent.glob('*.json'))
+        file = require_single(files, path, f'file of annotations, such as {ANNOTATIONS_FILE}')
+    folder = absolute(file).parent.parent
     content = from_json(file)
     with following(file, 'cuboids of Datumaro'):
-        labels = [label['name'] for label in content['categories']['label']['labels']]
+        label_category = content.get('categories', {}).get('label', {})
+        labels = [str(label['name'] or '') for label in label_category.get('labels', ())]
         is_swapped = bool(content.get('infos', {}).get(SWAPPED_KEY))
-        items = {
-            str(item['id']): [
-                _cuboid(annotation, labels, is_swapped)
-                for annotation in item['annotations']
-                if annotation['type'] == 'cuboid_3d'
-            ]
-            for item in sorted(content['items'], key=_order)
-        }
-    yield from cuboids.read_frames(path, list(items), items.__getitem__)
+        items: dict[str, list[ReadBox]] = {}
+        numbers: dict[str, int] = {}
+        for item in sorted(content['items'], key=_order):
+            name = str(item['id'])
+            with at(f'item {name!r}'):
+                items[name] = _cuboids(item.get('annotations') or (), labels, is_swapped)
+                numbers[name] = _order(item)[0]
+    yield from cuboids.read_frames(
+        folder, list(items), lambda name: (items.get(name, []), {}), numbers
+    )
 
 
 def _order(item: dict[str, Any]) -> tuple[int, str]:
     """Return the sort key of an item: its frame number, then its name."""
-    return int(item.get('attr', {}).get('frame', 0)), str(item['id'])
+    return int((item.get('attr') or {}).get('frame') or 0), str(item['id'])
+
+
+def _cuboids(
+    annotations: Sequence[dict[str, Any]], labels: list[str], is_swapped: bool
+) -> list[ReadBox]:
+    """Return the cuboids among the annotations of an item."""
+    found = []
+    for number, annotation in enumerate(annotations):
+        if annotation['type'] == 'cuboid_3d':
+            with at(f'annotation {number}'):
+                found.append(_cuboid(annotation, labels, is_swapped))
+    return found
 
 
 def _cuboid(annotation: dict[str, Any], labels: list[str], is_swapped: bool) -> ReadBox:
-    attributes = annotation.get('attributes', {})
+    attributes = annotation.get('attributes') or {}
     scale = annotation['scale']
     extent = scale[::-1] if is_swapped else scale
     box = cuboids.box_from_cuboid(annotation['position'], annotation['rotation'], extent)
-    track = attributes.get('track', attributes.get('track_id', ''))
-    return ReadBox(str(track), labels[annotation['label_id']], box, attributes)
+    track = attributes.get('track', attributes.get('track_id'))
+    label_id = annotation.get('label_id')
+    class_name = '' if label_id is None else labels[label_id]
+    evidence: dict[str, Any] = {'score': _score(attributes)}
+    if attributes.get('keyframe') is False:
+        evidence['status'] = INTERPOLATED
+    if OWN_ATTRIBUTE in attributes:  # others may have a `status` of another meaning
+        evidence = attributes
+    return ReadBox('' if track is None else str(track), class_name, box, evidence)
+
+
+def _score(attributes: dict[str, Any]) -> float | None:
+    """Return the score of a detection, which Datumaro has among its attributes."""
+    score = attributes.get('score')
+    return score if isinstance(score, int | float) else None

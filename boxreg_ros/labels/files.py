@@ -12,6 +12,8 @@ from boxreg_ros.errors import RecordingError, unreadable
 import orjson
 
 PROVENANCE_FILE = 'boxreg.json'
+CONTENT_ERRORS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""Errors of reading content that does not follow a format."""
 JSON_OPTIONS = orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY
 
 
@@ -37,10 +39,15 @@ def write_json(path: Path, value: Any) -> None:
     path.write_text(to_json(value) + '\n', encoding='utf-8')
 
 
-def from_json(path: Path) -> Any:
-    """Return the content of a JSON file; RecordingError if it cannot be read or is not JSON."""
+def from_json(path: Path, parse_float: Callable[[str], Any] = float) -> Any:
+    """
+    Return the content of a JSON file; RecordingError if it cannot be read or is not JSON.
+
+    `parse_float` makes numbers of their text: a float has too few digits for a stamp.
+
+    """
     try:
-        return json.loads(path.read_text(encoding='utf-8'))
+        return json.loads(path.read_text(encoding='utf-8-sig'), parse_float=parse_float)
     except OSError as error:
         raise RecordingError(unreadable(path, error)) from None
     except (ValueError, RecursionError) as error:
@@ -115,9 +122,30 @@ def following(path: Path, what: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise RecordingError(unreadable(path, error)) from None
-    except (AttributeError, LookupError, TypeError, ValueError) as error:
-        text = f'{type(error).__name__} {error}'
-        raise RecordingError(f'{path}: expected {what}: {text}; write it again') from None
+    except CONTENT_ERRORS as error:
+        raise RecordingError(f'{path}: expected {what}: {_words(error)}; correct it') from None
+
+
+@contextmanager
+def at(place: str) -> Iterator[None]:
+    """Name a place in errors of its content, for `following`; places may be nested."""
+    try:
+        yield
+    except CONTENT_ERRORS as error:
+        raise ValueError(f'{place}: {_words(error)}') from None
+
+
+def _words(error: Exception) -> str:
+    """Return what is wrong with content in words."""
+    if isinstance(error, KeyError):
+        return f'lacks {error.args[0]!r}'
+    if isinstance(error, AttributeError | TypeError):
+        return f'got a value of another type ({error})'
+    return (
+        f'got a number out of range ({error})'
+        if isinstance(error, ArithmeticError)
+        else str(error)
+    )
 
 
 def write_provenance(folder: Path, content: Mapping[str, Any]) -> None:

@@ -9,13 +9,14 @@ of -1. Occlusion is 3, unknown. Stamps and poses are in the files of `sidecar`.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.camera import Camera
-from boxreg_ros.labels.files import following, read_provenance, require_single
+from boxreg_ros.labels.files import at, following, read_provenance, require_single
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import (
     absolute,
@@ -27,8 +28,9 @@ from boxreg_ros.labels.protocol import (
 )
 from boxreg_ros.labels.records import ReadBox, TrackNumbers
 from boxreg_ros.labels.sidecar import numbered_frames, numbered_scene
+from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import HEIGHT, LENGTH, WIDTH
+from boxreg_ros.structures import Floats, HEIGHT, Ints, LENGTH, WIDTH
 import numpy as np
 
 FORMAT = Format(
@@ -45,6 +47,8 @@ SEQUENCE = '0000'
 INSIDE_IMAGE, TRUNCATED, OUTSIDE_IMAGE = 0, 1, 2
 """Values of truncation."""
 UNKNOWN_OCCLUSION = 3
+OTHER_COLUMNS = dict.fromkeys((15, 16), ': those of KITTI object, which is read as kitti_object')
+"""Hint by the number of columns of another format."""
 IGNORED_CLASS = 'DontCare'
 """Regions without labels, which have no 3D box."""
 
@@ -66,7 +70,7 @@ class Writer(FolderWriter):
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         self._camera = Camera.read(options.camera, 'format kitti')
         super().__init__(folder, provenance, options)
-        _write_calibration(self._camera, folder / 'calib' / f'{SEQUENCE}.txt')
+        write_calibration(self._camera, folder / 'calib' / f'{SEQUENCE}.txt')
         self._file = self.text_file(f'label_02/{SEQUENCE}.txt')
         self._tracks = TrackNumbers()
         self._given_classes: dict[str, str] = {}  # by number of the track and class as written
@@ -75,27 +79,15 @@ class Writer(FolderWriter):
         """Add the lines of a frame."""
         rows, boxes = frame.boxes_in('sensor', self.dropped)
         array = frame.refined.boxes
-        centres, rotations_y = self._camera.to_upright(boxes)
-        rectangles, is_inside = self._camera.project(boxes)
-        is_outside = np.isnan(rectangles).any(axis=1)
-        rectangles[is_outside] = -1.0
-        truncation = np.where(is_inside, INSIDE_IMAGE, TRUNCATED)
-        truncation[is_outside] = OUTSIDE_IMAGE
-        for i, (row, box) in enumerate(zip(rows, boxes, strict=True)):
-            x, y, z = centres[i]
-            alpha = float(wrap_angle(rotations_y[i] - np.arctan2(x, z)))
-            size = box[[HEIGHT, WIDTH, LENGTH]]
-            location = (x, y + box[HEIGHT] / 2, z)
-            numbers = [alpha, *rectangles[i], *size, *location, rotations_y[i]]
-            if np.isfinite(array.scores[row]):
-                numbers.append(array.scores[row])
+        truncation, columns = columns_of(self._camera, boxes)
+        for i, row in enumerate(rows):
             track = self._tracks.of(array.track_ids[row])
             given = array.class_names[row]
             name = '_'.join(self.class_names.of(given).split()) or 'Misc'
             if name != given:
                 self._given_classes[f'{track} {name}'] = given
             self._file.write(f'{self.number} {track} {name} {truncation[i]} {UNKNOWN_OCCLUSION} ')
-            self._file.write(' '.join(f'{value:.6f}' for value in numbers) + '\n')
+            self._file.write(decimals(columns[i], array.scores[row]) + '\n')
 
     def finish(self) -> None:
         """Name the tracks."""
@@ -103,6 +95,67 @@ class Writer(FolderWriter):
             self.about['tracks'] = names
         if self._given_classes:
             self.about['given_classes'] = self._given_classes
+
+
+def columns_of(camera: Camera, boxes: Floats) -> tuple[Ints, Floats]:
+    """
+    Return the columns of boxes that both formats of KITTI have.
+
+    Parameters
+    ----------
+    camera : Camera
+        That the boxes refer to.
+    boxes : array, shape (n, 9)
+        In the frame of the LiDAR [m, rad].
+
+    Returns
+    -------
+    truncation : array, shape (n,)
+        `INSIDE_IMAGE`, `TRUNCATED` or `OUTSIDE_IMAGE`.
+    columns : array, shape (n, 12)
+        alpha [rad]; left, top, right, bottom [px], -1 outside of the image; height, width, length
+        and the centre of the bottom face in the rectified camera frame [m]; rotation_y [rad].
+
+    """
+    centres, rotations_y = camera.to_upright(boxes)
+    rectangles, is_inside = camera.project(boxes)
+    is_outside = np.isnan(rectangles).any(axis=1)
+    rectangles[is_outside] = -1.0
+    truncation = np.where(is_inside, INSIDE_IMAGE, TRUNCATED)
+    truncation[is_outside] = OUTSIDE_IMAGE
+    alpha = wrap_angle(rotations_y - np.arctan2(centres[:, 0], centres[:, 2]))
+    sizes = boxes[:, [HEIGHT, WIDTH, LENGTH]]
+    locations = centres.copy()
+    locations[:, 1] += boxes[:, HEIGHT] / 2
+    return truncation, np.column_stack([alpha, rectangles, sizes, locations, rotations_y])
+
+
+def boxes_of(camera: Camera, numbers: Floats) -> Floats:
+    """
+    Return the boxes of the last columns of KITTI.
+
+    Parameters
+    ----------
+    camera : Camera
+        That the boxes refer to.
+    numbers : array, shape (n, 7)
+        Height, width, length, centre of the bottom face [m] and rotation_y [rad].
+
+    Returns
+    -------
+    boxes : array, shape (n, 9)
+        In the frame of the LiDAR [m, rad].
+
+    """
+    centres = numbers[:, 3:6].copy()
+    centres[:, 1] -= numbers[:, 0] / 2
+    return camera.from_upright(centres, numbers[:, 6], numbers[:, [2, 1, 0]])
+
+
+def decimals(numbers: Floats, score: float) -> str:
+    """Return numbers as text, and the score after them if there is one."""
+    values = [*numbers, score] if np.isfinite(score) else numbers
+    return ' '.join(f'{value:.6f}' for value in values)
 
 
 class _Line(NamedTuple):
@@ -120,16 +173,16 @@ def read(path: Path) -> Iterator[LabelFrame]:
     Yield the frames of a label file, or of the only sequence of a folder.
 
     ``calib/NAME.txt`` is beside ``label_02/NAME.txt``; the files of `sidecar` are in the folder
-    that contains both. Regions of the class DontCare are skipped.
+    that contains both. Regions of the class DontCare are counted.
 
     """
     if path.is_dir():
         found = sorted((path / 'label_02').glob('*.txt'))
         path = require_single(found, path, 'sequence, label_02/NAME.txt')
     folder = absolute(path).parent.parent
-    lines = _read_lines(path)
+    lines, left_out = _read_lines(path)
     camera = Camera.read(folder / 'calib' / path.name)
-    yield from numbered_frames(folder, _boxes_by_frame(path, lines, camera))
+    yield from numbered_frames(folder, _boxes_by_frame(path, lines, camera), left_out)
 
 
 def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
@@ -142,13 +195,14 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """
     if path.is_dir():
         path = _file_of_sequence(path, scene.name)
-    lines = _read_lines(path)
+    lines, left_out = _read_lines(path)
     if scene.camera is None:
         raise RecordingError(
             f'{path}: expected the calibration of a camera, which the scene {scene.name!r} '
             f'lacks; read it with a scene of kitti-tracking'
         )
-    yield from numbered_scene(path, _boxes_by_frame(path, lines, scene.camera), scene)
+    boxes = _boxes_by_frame(path, lines, scene.camera)
+    yield from numbered_scene(path, boxes, left_out, scene)
 
 
 def _file_of_sequence(folder: Path, name: str) -> Path:
@@ -162,20 +216,28 @@ def _file_of_sequence(folder: Path, name: str) -> Path:
     )
 
 
-def _read_lines(path: Path) -> list[_Line]:
-    """Return the lines of a label file, in their order."""
+def _read_lines(path: Path) -> tuple[list[_Line], dict[int, Counter[str]]]:
+    """Return the lines of a label file, in their order, and the regions in each frame."""
     lines = []
+    left_out: dict[int, Counter[str]] = {}
     with following(path, '17 or 18 columns of KITTI tracking'):
-        for text in path.read_text(encoding='utf-8').splitlines():
+        for number, text in enumerate(path.read_text(encoding='utf-8').splitlines(), 1):
             words = text.split()
-            if not words or words[2] == IGNORED_CLASS:
+            if not words:
                 continue
-            numbers = [float(word) for word in words[10:17]]
-            score = float(words[17]) if len(words) > 17 else np.nan
-            if len(numbers) != 7:
-                raise ValueError(f'got {len(words)} columns')
-            lines.append(_Line(int(words[0]), words[1], words[2], numbers, score))
-    return lines
+            with at(f'line {number}'):
+                if len(words) not in (17, 18):
+                    raise ValueError(
+                        f'got {len(words)} columns{OTHER_COLUMNS.get(len(words), "")}'
+                    )
+                frame = int(words[0])
+                if words[2] == IGNORED_CLASS:
+                    left_out.setdefault(frame, Counter())[Reason.NO_BOX] += 1
+                    continue
+                numbers = [float(word) for word in words[10:17]]
+                score = float(words[17]) if len(words) > 17 else np.nan
+                lines.append(_Line(frame, words[1], words[2], numbers, score))
+    return lines, left_out
 
 
 def _boxes_by_frame(
@@ -184,10 +246,7 @@ def _boxes_by_frame(
     """Return the boxes of a label file in the LiDAR frame; tracks have the names beside it."""
     about = read_provenance(absolute(path).parent.parent)
     tracks, given = about.get('tracks', {}), about.get('given_classes', {})
-    numbers = np.array([line.numbers for line in lines]).reshape(-1, 7)
-    centres = numbers[:, 3:6].copy()
-    centres[:, 1] -= numbers[:, 0] / 2
-    boxes = camera.from_upright(centres, numbers[:, 6], numbers[:, [2, 1, 0]])
+    boxes = boxes_of(camera, np.array([line.numbers for line in lines]).reshape(-1, 7))
     found: dict[int, list[ReadBox]] = {}
     for line, box in zip(lines, boxes, strict=True):
         track_id = tracks.get(line.track, line.track)
@@ -197,12 +256,20 @@ def _boxes_by_frame(
     return found
 
 
-def _write_calibration(camera: Camera, path: Path) -> None:
-    """Write the calibration under the names of the benchmark, the same for all four cameras."""
+def write_calibration(
+    camera: Camera,
+    path: Path,
+    names: tuple[str, str, str] = ('R_rect', 'Tr_velo_cam', 'Tr_imu_velo'),
+) -> None:
+    """
+    Write the calibration as the benchmark has it, the same for all four cameras.
+
+    `names` are those of the rectification and of the poses of LiDAR and IMU.
+
+    """
     parts = {f'P{i}': camera.projection for i in range(4)}
-    parts['R_rect'] = camera.rectification
-    parts['Tr_velo_cam'] = camera.T_camera_sensor[:3]
-    parts['Tr_imu_velo'] = np.eye(4)[:3]
+    matrices = camera.rectification, camera.T_camera_sensor[:3], np.eye(4)[:3]
+    parts |= zip(names, matrices, strict=True)
     parts['S_rect_02'] = np.array(camera.size, float)
     with path.open('w', encoding='utf-8') as file:
         for name, values in parts.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -25,7 +26,8 @@ class LabelMerger:
     Boxes whose labels have poses in the sensor frame are taken in the frame of the clouds and move
     with the recording; the others are taken in the frame that the labels name. Boxes of the status
     ``human`` are pinned. The stamps of `frames` ascend. Where only a part of the recording, from
-    `start_ns` on, is read, boxes before and after it are left out, and `outside` counts them.
+    `start_ns` on, is read, boxes before and after it are left out, and `outside` counts them;
+    `left_out` counts those that the frames lack, by reason; `notes` has what their reader assumed.
 
     Raises RecordingError if all labels are earlier than the clouds, or all later.
 
@@ -40,6 +42,8 @@ class LabelMerger:
         is_part: bool,
     ) -> None:
         self.outside = 0
+        self.left_out: Counter[str] = Counter()
+        self.notes: list[str] = []
         self._frames = frames
         self._next = next(frames, None)
         self._tree = tree
@@ -75,6 +79,9 @@ class LabelMerger:
         frame = self._next
         assert frame is not None
         stamp_ns = _stamp(frame)
+        self.left_out.update(frame.left_out)
+        if frame.note:
+            self.notes.append(frame.note)
         first_ns = stamp_ns if self._labelled_ns is None else self._labelled_ns[0]
         self._labelled_ns = first_ns, stamp_ns
         if is_outside:
@@ -92,6 +99,28 @@ class LabelMerger:
             f'{time_range(*self._labelled_ns)}, clouds of '
             f'{time_range(self._first_ns, self._newest_ns)}: another drive? give the labels of '
             f'this recording'
+        )
+
+
+def keyframes_of(frames: Iterator[LabelFrame]) -> Iterator[LabelFrame]:
+    """
+    Yield frames with the boxes of a person alone; see `LabelFrame.keyframes`.
+
+    Raises RecordingError, at the end, if there were boxes and none was of a person.
+
+    """
+    status: Counter[str] = Counter()
+    num_kept = 0
+    for frame in frames:
+        status.update(frame.refined.status)
+        keyframes = frame.keyframes()
+        num_kept += len(keyframes.refined.status)
+        yield keyframes
+    if status and not num_kept:
+        words = ', '.join(f'{count:,} {word}' for word, count in status.items())
+        raise RecordingError(
+            f'keyframes: expected boxes that a person placed, got {words}; leave --keyframes '
+            f'out: the boxes are then refined as those of a tracker'
         )
 
 

@@ -10,19 +10,30 @@ numbered, as the format requires, and have the track id as their name.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import asdict
+from decimal import Decimal
 from itertools import count
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.labels.files import following, from_json, to_json
-from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.records import refined_boxes
+from boxreg_ros.io.transforms import inverse, moved_boxes
+from boxreg_ros.labels.files import at, following, from_json, to_json
+from boxreg_ros.labels.protocol import Format, INPUT_STATUS, LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import ReadBox, refined_of
+from boxreg_ros.labels.sidecar import STAMPS_FILE, whole_stamps
+from boxreg_ros.labels.stamps import stamps_ns
 from boxreg_ros.reasons import Reason
-from boxreg_ros.rotations import rpy_from_quaternion
-from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, is_valid_box, RefinedBoxes
+from boxreg_ros.rotations import matrix_from_quaternion, matrix_from_rpy, rpy_from_quaternion
+from boxreg_ros.structures import (
+    BOX_CENTER,
+    BOX_EXTENT,
+    Floats,
+    INTERPOLATED,
+    is_valid_box,
+    RefinedBoxes,
+)
 from msg_adapters.poses import quaternions_of
 import numpy as np
 
@@ -38,6 +49,8 @@ FORMAT = Format(
 SCHEMA_VERSION = '1.0.0'
 COVARIANCE_DIGITS = 9
 """Decimals of covariances: a standard deviation of 0.03 mm. Full precision doubles the file."""
+FIXED_TYPES = ('scene_cs', 'geo_cs', 'geo_utm', 'geo_wgs84')
+"""Types of coordinate systems that do not move with a sensor or a vehicle."""
 OBJECT_DATA_POINTER = {
     'type': 'cuboid',
     'attribute_pointers': {
@@ -196,78 +209,289 @@ def _transforms(frame: LabelFrame, T_fixed_sensor: Floats) -> dict[str, Any]:
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
-    Yield the cuboids of each frame and coordinate system.
+    Yield the cuboids of each frame, in one coordinate system where transforms connect theirs.
 
-    The track id is the uid of the object, in files written by `Writer` its name. Rotations of
-    three values are read as roll, pitch and yaw, as defined in `structures`.
+    The track id is the uid of the object, in files written by `Writer` its name; more cuboids of
+    an object in a frame are tracks of their own, ``uid/name``. Cuboids of an object itself are in
+    all frames of its intervals, or in every frame. Rotations of three values are roll, pitch and
+    yaw, as defined in `structures`. Poses are those of the frame, else ``pose_wrt_parent``.
+
+    Parameters
+    ----------
+    path : Path
+        File, or the folder with ``labels.json``. Stamps are numbers or decimals in one unit, see
+        `stamps.stamps_ns`, or moments as in ISO 8601.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per frame, more where the transforms between coordinate systems are not known. Fixed is
+        the system that the one of the cuboids moves in, or the topmost.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read or does not follow the format.
 
     """
     if path.is_dir():
         path = path / 'labels.json'
-    content = from_json(path)
+    content = from_json(path, parse_float=Decimal)
     with following(path, 'frames with stamps and cuboids as in ASAM OpenLABEL 1.0'):
         label = content['openlabel']
-        has_names = label.get('metadata', {}).get('annotator') == Provenance().tool
-        objects = label.get('objects', {})
-        names = {uid: item['name'] if has_names else uid for uid, item in objects.items()}
-        classes = {uid: str(item.get('type', '')) for uid, item in objects.items()}
-        for _, frame in sorted(label.get('frames', {}).items(), key=lambda item: int(item[0])):
-            yield from _read_frame(frame, names, classes)
+        objects = _Objects(label)
+        systems = label.get('coordinate_systems') or {}
+        frames = sorted(
+            ((int(number), frame or {}) for number, frame in _items(label, 'frames')),
+            key=lambda item: item[0],
+        )
+        stamps = _stamps(path, frames)
+        objects.require_frames(len(frames))
+        for (number, frame), stamp_ns in zip(frames, stamps, strict=True):
+            with at(f'frame {number}'):
+                found = list(_read_frame(number, frame, stamp_ns, objects, systems))
+            yield from found
+
+
+def _items(parent: dict[str, Any], name: str) -> list[tuple[str, Any]]:
+    """Return the members of an object of JSON that may be missing or null."""
+    return list((parent.get(name) or {}).items())
+
+
+def _stamps(path: Path, frames: list[tuple[int, Any]]) -> list[int]:
+    """Return the stamp of each frame [ns]; those of ``timestamps.txt`` where one has none."""
+    properties = [frame.get('frame_properties') or {} for _, frame in frames]
+    if properties and all('stamp_ns' in one for one in properties):  # files of `Writer`
+        return [int(one['stamp_ns']) for one in properties]
+    values = [one.get('timestamp') for one in properties]
+    if None not in values:
+        return stamps_ns(values)
+    file = path.with_name(STAMPS_FILE)
+    number, _ = frames[values.index(None)]
+    if not file.exists():
+        raise ValueError(
+            f"frame {number}: lacks 'timestamp' in its frame_properties; or create {file} with "
+            f'one stamp per frame, as whole nanoseconds'
+        )
+    stamps = whole_stamps(file, len(frames))
+    if len(stamps) != len(frames):
+        raise ValueError(f'{file}: expected {len(frames)} stamps, got {len(stamps)}')
+    return stamps
+
+
+class _Objects:
+    """The objects of a file: their names, classes, and cuboids that are in several frames."""
+
+    def __init__(self, label: dict[str, Any]) -> None:
+        self._are_own = (label.get('metadata') or {}).get('annotator') == Provenance().tool
+        self._names: dict[str, str] = {}
+        self._classes: dict[str, str] = {}
+        self._systems: dict[str, str] = {}
+        self._static: list[tuple[str, list[dict[str, Any]], list[tuple[int, int]]]] = []
+        for uid, item in _items(label, 'objects'):
+            with at(f'object {uid}'):
+                self._names[uid] = item['name'] if self._are_own else uid
+                self._classes[uid] = str(item.get('type') or '')
+                self._systems[uid] = str(item.get('coordinate_system') or '')
+                cuboids = (item.get('object_data') or {}).get('cuboid') or []
+                intervals = [
+                    (int(one['frame_start']), int(one['frame_end']))
+                    for one in item.get('frame_intervals') or ()
+                ]
+                if cuboids:
+                    self._static.append((uid, cuboids, intervals))
+
+    def cuboids_in(self, number: int, frame: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+        """Yield the cuboids of a frame with the uids of their objects."""
+        own = set()
+        for uid, item in _items(frame, 'objects'):
+            for cuboid in ((item or {}).get('object_data') or {}).get('cuboid') or ():
+                own.add((uid, cuboid.get('name')))
+                yield uid, cuboid
+        for uid, cuboids, intervals in self._static:
+            if not intervals or any(first <= number <= last for first, last in intervals):
+                for cuboid in cuboids:
+                    if (uid, cuboid.get('name')) not in own:
+                        yield uid, cuboid
+
+    def system_of(self, uid: str, cuboid: dict[str, Any]) -> str:
+        """Return the coordinate system of a cuboid, by default that of its object."""
+        return str(cuboid.get('coordinate_system') or self._systems.get(uid, ''))
+
+    def read_box(self, uid: str, cuboid: dict[str, Any], others: Collection[str]) -> ReadBox:
+        """Return the box of a cuboid; `others` are track ids of its frame."""
+        track_id = self._names.get(uid, uid)
+        if track_id and track_id in others:
+            track_id = f'{track_id}/{cuboid.get("name", len(others))}'
+        class_name = self._classes.get(uid, '')
+        evidence = _attributes(cuboid)
+        if not self._are_own:
+            evidence = _of_others(evidence)
+        return ReadBox(track_id, class_name, _box(cuboid['val']), evidence)
+
+    def require_frames(self, count: int) -> None:
+        """Raise ValueError for cuboids of objects in a file with a `count` of frames of zero."""
+        if self._static and not count:
+            raise ValueError(f'got cuboids of {len(self._static)} objects, and no frames')
 
 
 def _read_frame(
-    frame: dict[str, Any], names: dict[str, str], classes: dict[str, str]
+    number: int,
+    frame: dict[str, Any],
+    stamp_ns: int,
+    objects: _Objects,
+    systems: dict[str, Any],
 ) -> Iterator[LabelFrame]:
-    """Yield the content of one frame, one `LabelFrame` per coordinate system."""
-    properties = frame['frame_properties']
-    stamp_ns = properties.get('stamp_ns')
-    if stamp_ns is None:
-        stamp_ns = round(float(properties['timestamp']) * 1e9)
-    transforms = list(properties.get('transforms', {}).values())
-    without: dict[str, list[Any]] = {item['dst']: [] for item in transforms[:1]}  # no object
-    for system, items in (_cuboids_by_system(frame) or without).items():
-        refined = refined_boxes(
-            int(stamp_ns),
-            system,
-            [names[uid] for uid, _ in items],
-            [classes[uid] for uid, _ in items],
-            [_box(cuboid['val']) for _, cuboid in items],
-            [_attributes(cuboid) for _, cuboid in items],
-        )
-        fixed_frame, sensor_frame, T_fixed_sensor = _pose(system, transforms)
-        yield LabelFrame(refined, fixed_frame, sensor_frame, T_fixed_sensor)
+    """Yield the content of one frame, one `LabelFrame` per unconnected coordinate system."""
+    boxes: dict[str, list[ReadBox]] = {}
+    left_out: Counter[str] = Counter()
+    for uid, cuboid in objects.cuboids_in(number, frame):
+        with at(f'object {uid}'):
+            if cuboid['val'] is None:
+                left_out[Reason.NO_BOX] += 1
+                continue
+            found = boxes.setdefault(objects.system_of(uid, cuboid), [])
+            found.append(objects.read_box(uid, cuboid, {box.track_id for box in found}))
+    poses = _Poses(frame.get('frame_properties') or {}, systems)
+    if not boxes:
+        boxes[poses.first()] = []
+    for system, items in poses.joined(boxes).items():
+        fixed_frame, sensor_frame, T_fixed_sensor = poses.of(system)
+        refined = refined_of(stamp_ns, system, items)
+        yield LabelFrame(refined, fixed_frame, sensor_frame, T_fixed_sensor, left_out=left_out)
+        left_out = Counter()
 
 
-def _cuboids_by_system(frame: dict[str, Any]) -> dict[str, list[tuple[str, dict[str, Any]]]]:
-    """Return pairs of object uid and cuboid by coordinate system; null values are skipped."""
-    found: dict[str, list[tuple[str, dict[str, Any]]]] = {}
-    for uid, item in frame.get('objects', {}).items():
-        for cuboid in item.get('object_data', {}).get('cuboid', ()):
-            if cuboid['val'] is not None:
-                system = cuboid.get('coordinate_system', '')
-                found.setdefault(system, []).append((uid, cuboid))
-    return found
+class _Poses:
+    """
+    The transforms of a frame: ``X_dst = T X_src``.
+
+    Those of the frame itself have precedence over the poses of the coordinate systems.
+
+    """
+
+    def __init__(self, properties: dict[str, Any], systems: dict[str, Any]) -> None:
+        self._types = {name: str((one or {}).get('type') or '') for name, one in systems.items()}
+        self._moving: list[tuple[str, str]] = []
+        self._edges: dict[tuple[str, str], Floats] = {}
+        for name, one in systems.items():
+            if (one or {}).get('parent') and one.get('pose_wrt_parent'):
+                with at(f'coordinate system {name!r}'):
+                    self._add(name, one['parent'], one['pose_wrt_parent'])
+        for name, one in _items(properties, 'transforms'):
+            with at(f'transform {name!r}'):
+                transform = one.get('transform_src_to_dst', one)
+                self._add(one['src'], one['dst'], transform)
+                self._moving.append((one['src'], one['dst']))
+
+    def _add(self, source: str, target: str, transform: dict[str, Any]) -> None:
+        T = _matrix(transform)
+        if T is not None:
+            self._edges[target, source] = T
+            self._edges[source, target] = inverse(T)
+
+    def first(self) -> str:
+        """Return the coordinate system of a frame without cuboids."""
+        return self._moving[0][1] if self._moving else ''
+
+    def joined(self, boxes: dict[str, list[ReadBox]]) -> dict[str, list[ReadBox]]:
+        """Return boxes with those of connected systems in the first of these."""
+        joined: dict[str, list[ReadBox]] = {}
+        for system, items in boxes.items():
+            targets = ((target, self._between(target, system)) for target in joined)
+            target, T = next(((name, T) for name, T in targets if T is not None), (system, None))
+            if T is None:
+                joined[system] = items
+                continue
+            known = {box.track_id for box in joined[target]}
+            moved = moved_boxes(np.reshape([box.box for box in items], (-1, 9)), T)
+            joined[target] += [
+                box._replace(box=row)
+                for box, row in zip(items, moved, strict=True)
+                if not box.track_id or box.track_id not in known  # the same one, stated twice
+            ]
+        return joined
+
+    def of(self, system: str) -> tuple[str, str, Floats | None]:
+        """Return fixed frame, sensor frame and T_fixed_sensor for boxes of a system."""
+        connected = {name: T for name, T in self._reached(system).items() if name != system}
+        is_fixed = self._types.get(system, '') in FIXED_TYPES
+        fixed = [name for name in connected if self._types.get(name, '') in FIXED_TYPES]
+        if not is_fixed and not fixed:  # without types, a system is fixed if another moves in it
+            targets = {target for _, target in self._moving}
+            is_fixed = system in targets
+            fixed = [name for name in connected if name in targets]
+        if is_fixed:
+            sources = [source for source, _ in self._moving if source in connected]
+            sensors = [name for name in sources if self._types.get(name) == 'sensor_cs'] or sources
+            if not sensors:
+                return system, '', None
+            return system, sensors[0], inverse(connected[sensors[0]])
+        if not fixed:
+            return system, '', None
+        return fixed[-1], system, connected[fixed[-1]]
+
+    def _between(self, target: str, source: str) -> Floats | None:
+        """Return T_target_source (4, 4); None if it is not known."""
+        return self._reached(source).get(target)
+
+    def _reached(self, source: str) -> dict[str, Floats]:
+        """Return T_name_source (4, 4) of all connected systems, the nearest first."""
+        reached = {source: np.eye(4)}
+        queue = [source]
+        for here in queue:  # grows
+            for (target, start), T in self._edges.items():
+                if start == here and target not in reached:
+                    reached[target] = T @ reached[here]
+                    queue.append(target)
+        return reached
 
 
-def _pose(system: str, transforms: list[dict[str, Any]]) -> tuple[str, str, Floats | None]:
-    """Return fixed frame, sensor frame and T_fixed_sensor of the transform of a system."""
-    found: tuple[str, str, Floats | None] = (system, '', None)
-    for item in transforms:
-        matrix = item['transform_src_to_dst'].get('matrix4x4')
-        if system in (item['src'], item['dst']) and matrix is not None:
-            T_fixed_sensor = np.array(matrix, np.float64).reshape(4, 4)
-            found = (item['dst'], item['src'], T_fixed_sensor)
-    return found
+def _matrix(transform: dict[str, Any]) -> Floats | None:
+    """Return the matrix (4, 4) of a transform; None for one of another kind."""
+    for name in ('matrix4x4', 'transform_src_to_dst_4x4'):
+        if name in transform:
+            return np.array(transform[name], np.float64).reshape(4, 4)
+    T = np.eye(4)
+    if 'quaternion' in transform:
+        T[:3, :3] = matrix_from_quaternion(np.array(transform['quaternion'], np.float64))
+    elif 'euler_angles' in transform:
+        T[:3, :3] = _euler_matrix(transform['euler_angles'], transform.get('sequence') or 'ZYX')
+    else:
+        return None
+    T[:3, 3] = np.array(transform['translation'], np.float64).reshape(3)
+    return T
+
+
+def _euler_matrix(angles: list[float], sequence: str) -> Floats:
+    """Return R (3, 3), the product of the rotations about the axes of a sequence, in its order."""
+    R = np.eye(3)
+    for angle, axis in zip(np.array(angles, np.float64), sequence.upper(), strict=True):
+        rpy = np.zeros(3)
+        rpy['XYZ'.index(axis)] = angle
+        R = R @ matrix_from_rpy(rpy)
+    return R
 
 
 def _attributes(cuboid: dict[str, Any]) -> dict[str, Any]:
     """Return the attributes of a cuboid by name."""
-    groups = cuboid.get('attributes', {}).values()
-    return {item['name']: item['val'] for group in groups for item in group}
+    groups = (cuboid.get('attributes') or {}).values()
+    return {item['name']: item.get('val') for group in groups for item in group if 'name' in item}
+
+
+def _of_others(attributes: dict[str, Any]) -> dict[str, Any]:
+    """Return the evidence among the attributes of another program, whose words are its own."""
+    score = attributes.get('score')
+    return {
+        'score': score if isinstance(score, int | Decimal) else None,
+        'status': INTERPOLATED if attributes.get('interpolated') is True else INPUT_STATUS,
+    }
 
 
 def _box(values: list[float]) -> Floats:
     """Return a box (9,) from nine or ten values of a cuboid."""
-    if len(values) == 9:
-        return np.array([*values[:3], *values[6:], *values[3:6]])
-    return np.array([*values[:3], *values[7:], *rpy_from_quaternion(values[3:7])])
+    numbers = np.array(values, np.float64)
+    if numbers.shape not in ((9,), (10,)):
+        raise ValueError(f'expected 9 or 10 values of a cuboid, got {values!r}')
+    rpy = numbers[3:6] if len(numbers) == 9 else rpy_from_quaternion(numbers[3:7])
+    return np.concatenate([numbers[:3], numbers[-3:], rpy])

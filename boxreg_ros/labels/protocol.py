@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import os
 from pathlib import Path
 from typing import Protocol, TYPE_CHECKING
@@ -14,7 +14,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.options import option
 from boxreg_ros.reasons import Reason
-from boxreg_ros.structures import Floats, Ints, is_valid_box, RefinedBoxes, Sweep
+from boxreg_ros.structures import ADDED, Floats, Ints, is_valid_box, RefinedBoxes, Sweep
 import numpy as np
 
 if TYPE_CHECKING:
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 
 INPUT_STATUS = 'input'
 """Status of boxes whose label file states none."""
+AUTOMATIC_STATUS = 'automatic'
+"""Status of boxes that a model, a tracker or another tool made, and no person has touched."""
+NOT_OF_A_PERSON = (*ADDED, AUTOMATIC_STATUS)
+"""Status of boxes that are no keyframes; labelling tools interpolate, as we do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +81,10 @@ class LabelFrame:
     """Pose (4, 4) of the frame of the input boxes; None if unknown."""
     points: PointLabels | None = None
     """Labels of the points of `sweep`, for formats of points."""
+    left_out: Mapping[str, int] = field(default_factory=dict)
+    """Boxes of the file at this stamp that `refined` lacks, by `Reason`."""
+    note: str = ''
+    """What the reader assumed of the files, where they do not state it; on the first frame."""
 
     def boxes_in(self, frame: str, dropped: Counter[str]) -> tuple[Ints, Floats]:
         """
@@ -107,6 +115,16 @@ class LabelFrame:
         T = self.T_fixed_sensor if frame == 'fixed' else inverse(self.T_fixed_sensor)
         boxes = boxes_to_frame(boxes, T, target)
         return replace(self, refined=replace(self.refined, boxes=boxes))
+
+    def keyframes(self) -> LabelFrame:
+        """Return it with the boxes of a person alone; the others are in `left_out`."""
+        status = self.refined.status
+        rows = [row for row, word in enumerate(status) if word not in NOT_OF_A_PERSON]
+        if len(rows) == len(status):
+            return self
+        left_out = Counter(self.left_out)
+        left_out[Reason.NOT_A_KEYFRAME] += len(status) - len(rows)
+        return replace(self, refined=self.refined.take(rows), left_out=left_out)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +217,8 @@ class FormatModule(Protocol):
     A module of `registry.FORMATS`.
 
     A module whose files can be read back also has ``read(path)``, which yields a `LabelFrame`
-    per stamp and raises `RecordingError` for files that do not follow the format. A module of a
+    per stamp and raises `RecordingError` for files that do not follow the format; one whose
+    paths may name a part of the files, ``PATH#PART``, has ``files_of(path)``. A module of a
     data set may have ``read_scene(path, scene)``: it reads files, results of detectors and
     trackers among them, whose stamps or calibration are those of a `SceneFrames`.
 

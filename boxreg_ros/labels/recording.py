@@ -61,7 +61,7 @@ def config_hash(path: Path) -> str:
     return next((found for found, _ in _messages(path)), '')
 
 
-def drive_of(path: Path) -> Path:
+def files_of(path: Path) -> Path:
     """Return the path of the recording, without the topic."""
     return Path(_parts(path)[0])
 

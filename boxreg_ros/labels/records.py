@@ -69,7 +69,10 @@ def refined_boxes(
         np.array([item.get('num_points') or 0 for item in items], np.int64),
         np.reshape([_covariance(item.get('covariance')) for item in items], (n, 6, 6)),
         extent_covariances=np.reshape(
-            [np.eye(3) if extent is None else np.reshape(extent, (3, 3)) for extent in extents],
+            [
+                np.eye(3) if extent is None else np.reshape(np.asarray(extent, np.float64), (3, 3))
+                for extent in extents
+            ],
             (n, 3, 3),
         ),
     )

@@ -26,9 +26,9 @@ from msg_adapters.convention import Convention, STANDARD
 BUILT_IN = {
     name: f'boxreg_ros.labels.{name}'
     for name in (
-        *('csv', 'parquet', 'openlabel', 'kitti', 'tracklets', 'nuscenes', 't4', 'argoverse2'),
-        *('waymo', 'sustechpoints', 'datumaro', 'supervisely', 'xtreme1', 'mcap'),
-        *('semantickitti', 'lidarseg', 'recording'),
+        *('csv', 'parquet', 'openlabel', 'kitti', 'kitti_object', 'tracklets', 'nuscenes', 't4'),
+        *('argoverse2', 'waymo', 'openpcdet', 'sustechpoints', 'datumaro', 'supervisely'),
+        *('sly_pointcloud', 'xtreme1', 'mcap', 'semantickitti', 'lidarseg', 'recording'),
     )
 }
 GROUP = 'boxreg_ros.labels'
@@ -136,7 +136,7 @@ def frames_of(
         able = ', '.join(other for other in FORMATS if can_read(other))
         raise ConfigError(f'format {name!r} can only be written; readable: {able}')
     readable: Any = module
-    files = readable.drive_of(path) if hasattr(module, 'drive_of') else path
+    files = files_of(name, path)
     if not files.exists():
         raise RecordingError(f'labels {str(files)!r}: no such file or folder; correct the path')
     frames: Iterator[LabelFrame]
@@ -151,6 +151,13 @@ def _meant(frame: LabelFrame, convention: Convention) -> LabelFrame:
     """Return a frame with its boxes as a convention means them."""
     boxes = convention.to_centers(frame.refined.boxes)
     return replace(frame, refined=replace(frame.refined, boxes=boxes))
+
+
+def files_of(name: str, path: Path) -> Path:
+    """Return the files of a path of a format, without the part of them that it names."""
+    module: Any = import_format(name)
+    found: Path = module.files_of(path) if hasattr(module, 'files_of') else path
+    return found
 
 
 def import_format(name: str) -> FormatModule:

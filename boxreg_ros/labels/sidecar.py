@@ -18,7 +18,8 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.files import frame_names
 from boxreg_ros.labels.protocol import LabelFrame, SceneFrames
 from boxreg_ros.labels.records import ReadBox, refined_of
-from boxreg_ros.structures import Floats, RefinedBoxes
+from boxreg_ros.labels.stamps import stamps_of_names
+from boxreg_ros.structures import Floats
 import numpy as np
 
 STAMPS_FILE = 'timestamps.txt'
@@ -34,15 +35,43 @@ class Sidecar:
     fixed_frame: str
     sensor_frame: str
 
-    def frame(self, index: int, refined: RefinedBoxes) -> LabelFrame:
-        """Return a frame with boxes in the sensor frame."""
-        return LabelFrame(refined, self.fixed_frame, self.sensor_frame, self.poses[index])
+    def frame(
+        self, index: int, boxes: Sequence[ReadBox], left_out: Mapping[str, int]
+    ) -> LabelFrame:
+        """Return a frame of boxes in the sensor frame, and of the count of those left out."""
+        refined = refined_of(self.stamps_ns[index], self.sensor_frame, boxes)
+        pose = self.poses[index]
+        return LabelFrame(
+            refined, self.fixed_frame, self.sensor_frame, pose, left_out=dict(left_out)
+        )
 
 
-def read_sidecar(folder: Path, count: int, stamps: Path | None = None) -> Sidecar:
-    """Return stamps (of `stamps`, if given) and poses of `count` frames, or RecordingError."""
+def read_sidecar(
+    folder: Path, count: int, stamps: Path | None = None, names: Sequence[str] = ()
+) -> Sidecar:
+    """
+    Return stamps and poses of frames.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the sidecar files.
+    count : int
+        Least number of frames.
+    stamps : Path, optional
+        File of the stamps, instead of that of the folder.
+    names : sequence of str
+        Of the frames in order. Without a file of stamps these are used, if they state one each.
+
+    Raises
+    ------
+    RecordingError
+        If a file is missing, does not follow its format, or has too few frames.
+
+    """
     path = stamps or folder / STAMPS_FILE
-    stamps_ns = whole_stamps(path, count)
+    stamps_of_frames = None if path.exists() else stamps_of_names(names)
+    stamps_ns = whole_stamps(path, count, names) if stamps_of_frames is None else stamps_of_frames
     if len(stamps_ns) < count:
         raise RecordingError(f'{path}: expected a stamp for {count} frames, got {len(stamps_ns)}')
     fixed_frame, sensor_frame = frame_names(folder)
@@ -55,19 +84,31 @@ def read_sidecar(folder: Path, count: int, stamps: Path | None = None) -> Sideca
 
 
 def numbered_frames(
-    folder: Path, boxes_by_frame: Mapping[int, Sequence[ReadBox]], stamps: Path | None = None
+    folder: Path,
+    boxes_by_frame: Mapping[int, Sequence[ReadBox]],
+    left_out: Mapping[int, Mapping[str, int]],
+    stamps: Path | None = None,
+    names: Sequence[str] = (),
 ) -> Iterator[LabelFrame]:
-    """Yield the frames of a folder whose boxes have their number; see `read_sidecar`."""
-    sidecar = read_sidecar(folder, 1 + max(boxes_by_frame, default=-1), stamps)
-    for index, stamp_ns in enumerate(sidecar.stamps_ns):
-        refined = refined_of(stamp_ns, sidecar.sensor_frame, boxes_by_frame.get(index, ()))
-        yield sidecar.frame(index, refined)
+    """
+    Yield the frames of a folder whose boxes, and the counts left out, have their number.
+
+    Other parameters and errors are those of `read_sidecar`.
+
+    """
+    count = 1 + max((*boxes_by_frame, *left_out), default=-1)
+    sidecar = read_sidecar(folder, count, stamps, names)
+    for index in range(len(sidecar.stamps_ns)):
+        yield sidecar.frame(index, boxes_by_frame.get(index, ()), left_out.get(index, {}))
 
 
 def numbered_scene(
-    path: Path, boxes_by_frame: Mapping[int, Sequence[ReadBox]], scene: SceneFrames
+    path: Path,
+    boxes_by_frame: Mapping[int, Sequence[ReadBox]],
+    left_out: Mapping[int, Mapping[str, int]],
+    scene: SceneFrames,
 ) -> Iterator[LabelFrame]:
-    """Yield the frames of a scene, whose boxes in `path` have their number."""
+    """Yield the frames of a scene; the boxes of `path`, and counts left out, have their number."""
     unknown = [number for number in boxes_by_frame if str(number) not in scene.stamps_ns]
     if unknown:
         raise RecordingError(
@@ -77,10 +118,11 @@ def numbered_scene(
     for number, stamp_ns in scene.stamps_ns.items():
         boxes = boxes_by_frame.get(int(number), ())
         refined = refined_of(stamp_ns, scene.sensor_frame, boxes)
-        yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame)
+        counts = dict(left_out.get(int(number), {}))
+        yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame, left_out=counts)
 
 
-def whole_stamps(path: Path, count: int = 0) -> list[int]:
+def whole_stamps(path: Path, count: int = 0, names: Sequence[str] = ()) -> list[int]:
     """
     Return a stamp for each frame of a file [ns]; its format and errors are those of `read_stamps`.
 
@@ -88,7 +130,7 @@ def whole_stamps(path: Path, count: int = 0) -> list[int]:
     neighbours, and extrapolated at an end. Blank lines at the end are frames up to `count`.
 
     """
-    return filled_stamps(read_stamps(path), count)
+    return filled_stamps(read_stamps(path, names), count)
 
 
 def filled_stamps(stamps_ns: Sequence[int | None], count: int = 0) -> list[int]:
@@ -108,19 +150,21 @@ def filled_stamps(stamps_ns: Sequence[int | None], count: int = 0) -> list[int]:
     return [given_ns[0] + round(offset) for offset in (filled_ns + period_ns * beyond).tolist()]
 
 
-def read_stamps(path: Path) -> list[int | None]:
+def read_stamps(path: Path, names: Sequence[str] = ()) -> list[int | None]:
     """
     Return the stamps of a file, one per line [ns]: integers, or UTC as in KITTI raw.
 
-    None for a blank line. Raises RecordingError if the file cannot be read, or a line is neither.
+    None for a blank line; `names` are those of frames, which state no stamps. Raises
+    RecordingError if the file cannot be read, or a line is neither.
 
     """
     try:
         lines = path.read_text(encoding='utf-8').splitlines()
     except OSError:
+        got = f' (names such as {names[0]!r} are none)' if names else ''
         raise RecordingError(
-            f'{path}: not found, and these labels have no stamps of their own; create it with '
-            f'one stamp per frame, as whole nanoseconds'
+            f'{path}: not found, and these labels have no stamps of their own{got}; create it '
+            f'with one stamp per frame, as whole nanoseconds'
         ) from None
     stamps: list[int | None] = []
     for number, line in enumerate(lines, 1):

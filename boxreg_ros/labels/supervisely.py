@@ -12,16 +12,25 @@ from pathlib import Path
 from typing import Any
 from uuid import NAMESPACE_URL, uuid5
 
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import cuboids
-from boxreg_ros.labels.files import following, from_json, JsonList, to_json, write_json
-from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.files import at, following, from_json, JsonList, to_json, write_json
+from boxreg_ros.labels.protocol import (
+    AUTOMATIC_STATUS,
+    INPUT_STATUS,
+    LabelFrame,
+    Options,
+    Provenance,
+)
 from boxreg_ros.labels.records import ReadBox
+from boxreg_ros.structures import INTERPOLATED
 
 FORMAT = cuboids.cuboid_format(
     name='supervisely',
     title='Supervisely episodes',
     files='meta.json, episode/annotation.json, episode/pointcloud/STAMP.pcd',
 )
+ANNOTATION_FILE = 'annotation.json'
 CUBOID = 'cuboid_3d'
 TAGS = ('track_id', 'status')
 
@@ -42,8 +51,8 @@ class Writer(cuboids.CuboidWriter):
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
         self._episode = folder / 'episode'
-        head = {'description': to_json(self.about), 'key': _key('episode'), 'tags': []}
-        self._records = JsonList(self._episode / 'annotation.json', head, 'frames')
+        head = {'description': to_json(self.about), 'key': key_of('episode'), 'tags': []}
+        self._records = JsonList(self._episode / ANNOTATION_FILE, head, 'frames')
         self._clouds: list[str] = []
         self._objects: dict[str, dict[str, Any]] = {}
 
@@ -52,7 +61,7 @@ class Writer(cuboids.CuboidWriter):
         figures = []
         for cuboid in self.cuboids(frame):
             object_key = self._add_to_object(cuboid, self.number)
-            figures.append(_figure(cuboid, self.number, object_key))
+            figures.append(figure_of(cuboid, self.number, object_key))
         self._records.append({'index': self.number, 'figures': figures})
         self._clouds.append(f'{self.name}.pcd')
 
@@ -61,7 +70,7 @@ class Writer(cuboids.CuboidWriter):
         objects = list(self._objects.values())
         self._records.close({'objects': objects, 'framesCount': len(self._clouds)})
         classes = dict.fromkeys(item['classTitle'] for item in objects)
-        write_json(self.folder / 'meta.json', _meta(classes))
+        write_json(self.folder / 'meta.json', meta_of(classes, 'point_cloud_episodes'))
         ids: dict[str, Any] = {kind: {} for kind in ('tags', 'objects', 'figures', 'videos')}
         write_json(self.folder / 'key_id_map.json', ids)
         write_json(self._episode / 'frame_pointcloud_map.json', dict(enumerate(self._clouds)))
@@ -69,9 +78,9 @@ class Writer(cuboids.CuboidWriter):
     def _add_to_object(self, cuboid: cuboids.Cuboid, number: int) -> str:
         """Return the key of the object of a cuboid; add its status in frame `number`."""
         suffix = '' if cuboid.track_id else f'{number}/{cuboid.row}'
-        key = _key(f'object/{cuboid.class_name}/{cuboid.track_id}/{suffix}')
+        key = key_of(f'object/{cuboid.class_name}/{cuboid.track_id}/{suffix}')
         if key not in self._objects:
-            tag = {'key': _key(f'{key}/track'), 'name': 'track_id', 'value': cuboid.track_id}
+            tag = {'key': key_of(f'{key}/track'), 'name': 'track_id', 'value': cuboid.track_id}
             self._objects[key] = {'key': key, 'classTitle': cuboid.class_name, 'tags': [tag]}
         tags = self._objects[key]['tags']
         status = cuboid.evidence['status']
@@ -83,7 +92,7 @@ class Writer(cuboids.CuboidWriter):
                 return key
         tags.append(
             {
-                'key': _key(f'{key}/{number}/{status}'),
+                'key': key_of(f'{key}/{number}/{status}'),
                 'name': 'status',
                 'value': status,
                 'frameRange': [number, number],
@@ -96,39 +105,94 @@ def read(path: Path) -> Iterator[LabelFrame]:
     """
     Yield the frames of an episode, or of the only episode of a project.
 
-    ``timestamps.txt`` in the episode or in the project has one stamp [ns] per frame.
+    Their stamps [ns] are those of ``timestamps.txt`` in the episode or in the project, one per
+    frame, or the names of the clouds.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the project or of the episode.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per cloud, in the order of the stamps.
+
+    Raises
+    ------
+    RecordingError
+        If a file is missing or does not follow the format.
 
     """
-    episode, folder = cuboids.single_part(path, 'episode', ['annotation.json'])
-    file = episode / 'annotation.json'
+    episodes = [*path.glob(ANNOTATION_FILE), *path.glob(f'*/{ANNOTATION_FILE}')]
+    if not episodes and [*path.glob('ann/*.json'), *path.glob('*/ann/*.json')]:
+        raise RecordingError(
+            f'{path}: expected an episode with {ANNOTATION_FILE}, got a project of single clouds; '
+            f'read it as sly_pointcloud'
+        )
+    episode, folder = cuboids.single_part(path, 'episode', [ANNOTATION_FILE])
+    file = episode / ANNOTATION_FILE
     content = from_json(file)
     clouds = from_json(file.with_name('frame_pointcloud_map.json'))
     with following(file, 'cuboids of Supervisely'):
-        objects = {item['key']: item for item in content['objects']}
         figures = {str(frame['index']): frame['figures'] for frame in content['frames']}
-        boxes = {
-            Path(cloud).stem: [
-                _cuboid(figure, objects[figure['objectKey']])
-                for figure in figures.get(index, ())
-                if figure['geometryType'] == CUBOID
-            ]
-            for index, cloud in sorted(clouds.items(), key=lambda item: int(item[0]))
-        }
-    yield from cuboids.read_frames(folder, list(boxes), boxes.__getitem__)
+        objects = objects_by_key(content)
+        boxes = {}
+        for index, cloud in sorted(clouds.items(), key=lambda item: int(item[0])):
+            with at(f'frame {index}'):
+                boxes[Path(cloud).stem] = boxes_of(figures.get(index) or (), objects)
+    yield from cuboids.read_frames(folder, list(boxes), lambda name: (boxes.get(name, []), {}))
 
 
-def _cuboid(figure: dict[str, Any], parent: dict[str, Any]) -> ReadBox:
+def objects_by_key(content: dict[str, Any]) -> dict[Any, dict[str, Any]]:
+    """Return the objects of an annotation by their keys, and by the numbers of the server."""
+    return {
+        item[name]: item for item in content['objects'] for name in ('id', 'key') if name in item
+    }
+
+
+def boxes_of(
+    figures: Iterable[dict[str, Any]], objects: dict[Any, dict[str, Any]]
+) -> list[ReadBox]:
+    """Return the cuboids of figures; ValueError or KeyError for those of another layout."""
+    boxes = []
+    for number, figure in enumerate(figures):
+        with at(f'figure {number}'):
+            if figure['geometryType'] == CUBOID:
+                key = figure['objectKey'] if 'objectKey' in figure else figure['objectId']
+                boxes.append(_cuboid(figure, objects[key], key))
+    return boxes
+
+
+def _cuboid(figure: dict[str, Any], parent: dict[str, Any], key: Any) -> ReadBox:
     """Return the cuboid of a figure; `parent` is its object."""
-    tags = {tag['name']: tag.get('value') for tag in parent.get('tags', ())}
+    tags = {tag['name']: tag.get('value') for tag in parent.get('tags') or ()}
     geometry = figure['geometry']
     box = cuboids.box_from_xyz(geometry['position'], geometry['rotation'], geometry['dimensions'])
-    track_id = str(tags.get('track_id', parent['key']))
-    return ReadBox(track_id, parent['classTitle'], box, figure.get(cuboids.EVIDENCE_KEY, {}))
+    evidence = {'status': _status(figure, tags)} | figure.get(cuboids.EVIDENCE_KEY, {})
+    track_id = evidence.get('track_id', tags.get('track_id', key))
+    return ReadBox(str(track_id), str(parent['classTitle'] or ''), box, evidence)
 
 
-def _figure(cuboid: cuboids.Cuboid, number: int, object_key: str) -> dict[str, Any]:
+def _status(figure: dict[str, Any], tags: dict[str, Any]) -> str:
+    """
+    Return the status of a figure.
+
+    Supervisely marks those that a model made and nobody changed by two flags, and those of a
+    tracker by its number; exports of CVAT have its keyframes as a tag.
+
+    """
+    if str(tags.get('keyframe')).lower() == 'false':
+        return INTERPOLATED
+    is_of_model = figure.get('nnCreated') and figure.get('nnUpdated')
+    is_of_tracker = figure.get('trackId') is not None
+    return AUTOMATIC_STATUS if is_of_model or is_of_tracker else INPUT_STATUS
+
+
+def figure_of(cuboid: cuboids.Cuboid, number: int, object_key: str) -> dict[str, Any]:
+    """Return the figure of a cuboid in the frame `number`."""
     return {
-        'key': _key(f'figure/{number}/{cuboid.row}'),
+        'key': key_of(f'figure/{number}/{cuboid.row}'),
         'objectKey': object_key,
         'geometryType': CUBOID,
         'geometry': {
@@ -140,8 +204,8 @@ def _figure(cuboid: cuboids.Cuboid, number: int, object_key: str) -> dict[str, A
     }
 
 
-def _meta(classes: Iterable[str]) -> dict[str, Any]:
-    """Return the content of ``meta.json``: classes and tags of the project."""
+def meta_of(classes: Iterable[str], kind: str) -> dict[str, Any]:
+    """Return the content of ``meta.json``: classes and tags of a project of a kind."""
     return {
         'classes': [
             {'title': title, 'shape': CUBOID, 'color': _colour(title), 'geometry_config': {}}
@@ -150,15 +214,15 @@ def _meta(classes: Iterable[str]) -> dict[str, Any]:
         'tags': [
             {'name': name, 'value_type': 'any_string', 'color': _colour(name)} for name in TAGS
         ],
-        'projectType': 'point_cloud_episodes',
+        'projectType': kind,
     }
 
 
-def _key(text: str) -> str:
+def key_of(text: str) -> str:
     """Return a key that is the same in every run."""
     return uuid5(NAMESPACE_URL, text).hex
 
 
 def _colour(text: str) -> str:
     """Return a colour that is the same in every run, as hexadecimal RGB."""
-    return '#' + _key(text)[:6].upper()
+    return '#' + key_of(text)[:6].upper()

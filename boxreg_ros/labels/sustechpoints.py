@@ -13,15 +13,26 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.labels import cuboids
-from boxreg_ros.labels.files import write_json
-from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.files import at, write_json
+from boxreg_ros.labels.protocol import (
+    AUTOMATIC_STATUS,
+    INPUT_STATUS,
+    LabelFrame,
+    Options,
+    Provenance,
+)
 from boxreg_ros.labels.records import ReadBox
+from boxreg_ros.structures import INTERPOLATED
 
 FORMAT = cuboids.cuboid_format(
     name='sustechpoints',
     title='SUSTechPOINTS',
     files='label/STAMP.json, lidar/STAMP.pcd, desc.json',
 )
+
+
+STATUS_OF = {'i': INTERPOLATED, 'I': INTERPOLATED}
+"""Status by `annotator`; the others are trackers, models and static objects."""
 
 
 class Writer(cuboids.CuboidWriter):
@@ -41,7 +52,29 @@ class Writer(cuboids.CuboidWriter):
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
-    """Yield the frames of a scene with one stamp [ns] per label file in its ``timestamps.txt``."""
+    """
+    Yield the frames of a scene.
+
+    Their stamps [ns] are those of ``timestamps.txt``, one per label file, or their names. The tool
+    names the algorithm that made a box, or interpolated it, as its ``annotator``; boxes that a
+    person drew or edited have none.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the scene, with ``label/``.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per label file, in the order of the stamps.
+
+    Raises
+    ------
+    RecordingError
+        If a file is missing or does not follow the format.
+
+    """
     names = {file.stem for file in path.glob('label/*.json')}
     yield from cuboids.read_files(path, path / 'label', names, 'boxes of SUSTechPOINTS', _cuboids)
 
@@ -61,12 +94,19 @@ def _item(cuboid: cuboids.Cuboid) -> dict[str, Any]:
     }
 
 
-def _cuboids(content: Any) -> list[ReadBox]:
-    return [_cuboid(item) for item in (content['objs'] if isinstance(content, dict) else content)]
+def _cuboids(content: Any) -> cuboids.FrameBoxes:
+    boxes = []
+    for number, item in enumerate(content['objs'] if isinstance(content, dict) else content):
+        with at(f'box {number}'):
+            boxes.append(_cuboid(item))
+    return boxes, {}
 
 
 def _cuboid(item: dict[str, Any]) -> ReadBox:
     psr = item['psr']
     box = cuboids.box_from_xyz(psr['position'], psr['rotation'], psr['scale'])
-    evidence = item.get(cuboids.EVIDENCE_KEY, {})
-    return ReadBox(str(item['obj_id']), str(item['obj_type']), box, evidence)
+    annotator = item.get('annotator')
+    status = STATUS_OF.get(annotator, AUTOMATIC_STATUS) if annotator else INPUT_STATUS
+    evidence = {'status': status} | item.get(cuboids.EVIDENCE_KEY, {})
+    track_id, class_name = (str(item.get(key) or '') for key in ('obj_id', 'obj_type'))
+    return ReadBox(track_id, class_name, box, evidence)

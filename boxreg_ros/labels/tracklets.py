@@ -2,31 +2,41 @@
 KITTI raw: ``tracklet_labels.xml``, one tracklet per gapless sequence of a track in one class.
 
 A tracklet has one extent, the median over its boxes, and one pose per frame: the centre of the
-bottom face in the LiDAR frame. ``l`` is the extent along x of the box. Datumaro and CVAT differ:
-they read the extents along x, y and z from ``h``, ``w`` and ``l`` and the position as the centre;
-``--swap-axes`` writes files for them.
+bottom face in the LiDAR frame. ``l`` is the extent along x of the box. Datumaro and CVAT differ,
+see `_convention_of`; ``--swap-axes`` writes files for them.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 import re
 import shutil
 from tempfile import TemporaryFile
-from typing import cast
+from typing import cast, NamedTuple
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape, unescape
 
-from boxreg_ros.labels.files import following, to_json
+from boxreg_ros.config import Config
+from boxreg_ros.labels.files import at, following, to_json
 from boxreg_ros.labels.folder import FolderWriter
-from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance, SceneFrames
+from boxreg_ros.labels.protocol import (
+    Format,
+    INPUT_STATUS,
+    LabelFrame,
+    NOT_OF_A_PERSON,
+    Options,
+    Provenance,
+    SceneFrames,
+)
 from boxreg_ros.labels.records import ReadBox
 from boxreg_ros.labels.sidecar import numbered_frames, numbered_scene
+from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import ADDED, BOX_CENTER, BOX_EXTENT, Floats, ROLL, YAW
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, INTERPOLATED, ROLL, YAW
 import numpy as np
 
 FORMAT = Format(
@@ -40,10 +50,14 @@ FORMAT = Format(
     options=('with_points', 'swap_axes'),
 )
 FILE = 'tracklet_labels.xml'
+NAMES_FILE = 'frame_list.txt'
+"""Of Datumaro: lines with the number of a frame and its name."""
 POSE_TAGS = ('tx', 'ty', 'tz', 'rx', 'ry', 'rz')
 EXTENT_TAGS = {False: ('l', 'w', 'h'), True: ('h', 'w', 'l')}
 """Tags of length, width and height by `Options.swap_axes`."""
 SWAPPED_COMMENT = 'axes swapped'
+OWN_COMMENT = '"tool":"boxreg_ros"'
+"""In the comment with the origin of files written by `Writer`."""
 TRACK_COMMENT = 'track '
 ESCAPED_HYPHEN = '&#45;'
 """Replaces a hyphen in a comment where XML forbids it: beside another, or at the end."""
@@ -66,6 +80,8 @@ CLASS_IDS = tuple(
 TAIL = '</tracklets>\n</boost_serialization>\n'
 INTERPOLATED_STATE = 1
 LABELLED_STATE = 2
+OUTSIDE_TRUNCATION, UNSET_OCCLUSION = '2', '-1'
+"""Of poses with which Datumaro fills a gap."""
 UNKNOWN_TRUNCATION = {False: '99', True: '-1'}
 """Unknown truncation by `Options.swap_axes`: of KITTI and of Datumaro."""
 FLAGS = """\
@@ -116,7 +132,7 @@ class Writer(FolderWriter):
             else:
                 tracklet = self._open.pop(key, tracklet)
             continued[key] = tracklet
-            is_interpolated = frame.refined.status[row] in ADDED
+            is_interpolated = frame.refined.status[row] in NOT_OF_A_PERSON
             tracklet.boxes.append(box)
             tracklet.states.append(INTERPOLATED_STATE if is_interpolated else LABELLED_STATE)
         for tracklet in self._open.values():
@@ -165,29 +181,76 @@ class Writer(FolderWriter):
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
-    Yield the frames of a tracklet file; its stamps are those of `sidecar` or of KITTI raw.
+    Yield the frames of a tracklet file.
 
     The track id is in a comment of files written by `Writer`, else it is the number of the
-    tracklet.
+    tracklet. Files of Datumaro and CVAT are recognised by their extents, see `_convention_of`.
+
+    Parameters
+    ----------
+    path : Path
+        File, or the folder with it. Stamps are those of `sidecar`, of ``velodyne_points`` as in
+        KITTI raw, or the names in ``frame_list.txt``, which Datumaro writes.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per stamp, in the frame of the LiDAR.
+
+    Raises
+    ------
+    RecordingError
+        If a file is missing or does not follow the format.
 
     """
     if path.is_dir():
         path = path / FILE
-    boxes_by_frame = _read_boxes(path)
+    content = _read_file(path)
     raw_stamps = path.parent / 'velodyne_points' / 'timestamps.txt'
     stamps = raw_stamps if raw_stamps.exists() else None
-    yield from numbered_frames(path.parent, boxes_by_frame, stamps)
+    names = _frame_names(path.parent / NAMES_FILE)
+    frames = numbered_frames(path.parent, content.boxes, content.left_out, stamps, names)
+    yield from content.noted(frames)
 
 
 def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """Yield the frames of a drive, by the stamps of the data set."""
     if path.is_dir():
         path = path / FILE
-    yield from numbered_scene(path, _read_boxes(path), scene)
+    content = _read_file(path)
+    yield from content.noted(numbered_scene(path, content.boxes, content.left_out, scene))
 
 
-def _read_boxes(path: Path) -> dict[int, list[ReadBox]]:
-    """Return the boxes of a tracklet file by the index of their frame."""
+class _Convention(NamedTuple):
+    """How a program uses the tags of extents, and where the position is."""
+
+    tags: tuple[str, str, str]
+    """Of length, width and height, that is along x, y and z."""
+    is_centre: bool
+    """Whether the position is the centre of the box, and not of its bottom face."""
+    program: str
+
+
+KITTI = _Convention(('l', 'w', 'h'), False, 'KITTI')
+DATUMARO = _Convention(('h', 'w', 'l'), True, 'Datumaro')
+CVAT = _Convention(('w', 'h', 'l'), True, 'CVAT')
+
+
+class _Content(NamedTuple):
+    """The boxes of a file, and the number of those left out by reason, by index of the frame."""
+
+    boxes: dict[int, list[ReadBox]]
+    left_out: dict[int, Counter[str]]
+    note: str
+
+    def noted(self, frames: Iterator[LabelFrame]) -> Iterator[LabelFrame]:
+        """Yield frames, the first with the note."""
+        for index, frame in enumerate(frames):
+            yield frame if index else replace(frame, note=self.note)
+
+
+def _read_file(path: Path) -> _Content:
+    """Return the content of a tracklet file."""
     with following(path, 'tracklets of KITTI'):
         text = path.read_text(encoding='utf-8')
         builder = ElementTree.TreeBuilder(insert_comments=True)
@@ -195,25 +258,132 @@ def _read_boxes(path: Path) -> dict[int, list[ReadBox]]:
             tree = ElementTree.parse(path, ElementTree.XMLParser(target=builder))
         except ElementTree.ParseError as error:
             raise ValueError(str(error)) from None
-        is_swapped = SWAPPED_COMMENT in text[: text.find('<boost_serialization')]
-        return _boxes_by_frame(tree.getroot(), is_swapped)
+        origin = text[: text.find('<boost_serialization')]
+        root = tree.getroot()
+        if SWAPPED_COMMENT in origin:
+            return _content(root, DATUMARO, is_own=True)
+        if OWN_COMMENT in origin:
+            return _content(root, KITTI, is_own=True)
+        return _content(root, _convention_of(root))
 
 
-def _boxes_by_frame(root: ElementTree.Element, is_swapped: bool) -> dict[int, list[ReadBox]]:
+def _frame_names(path: Path) -> list[str]:
+    """Return the names of the frames of a file with lines of number and name; empty without it."""
+    if not path.exists():
+        return []
+    with following(path, 'lines with the number of a frame and its name'):
+        lines = [line.split(maxsplit=1) for line in path.read_text(encoding='utf-8').splitlines()]
+        by_number = {int(words[0]): Path(words[1].strip()).name for words in lines if words}
+        return [by_number[number] for number in range(len(by_number))]
+
+
+def _convention_of(root: ElementTree.Element) -> _Convention:
+    """
+    Return the convention of a file: that in which most vehicles are longest along x.
+
+    The last versions of Datumaro write the extents along x, y and z as ``h``, ``w`` and ``l``, the
+    earlier ones, and CVAT, as ``w``, ``h`` and ``l``; KITTI defines ``l``, ``w`` and ``h``.
+    Without vehicles, pedestrians are highest along z.
+
+    """
+    config = Config()
+    longest: dict[str, Counter[str]] = {'vehicle': Counter(), 'pedestrian': Counter()}
+    for item in root.findall('tracklets/item'):
+        class_name = item.findtext('objectType') or ''
+        kind = config.kind(class_name)
+        if kind in longest and config.knows_class(class_name):
+            sizes = {tag: _number(item, tag) for tag in 'hwl'}
+            longest[kind][max(sizes, key=sizes.__getitem__)] += 1
+    by_tag = {'l': KITTI, 'h': DATUMARO, 'w': CVAT}
+    votes = longest['vehicle']
+    if not votes:
+        by_tag = {'h': KITTI, 'l': DATUMARO}
+        votes = longest['pedestrian']
+    for tag, count in votes.most_common(1):
+        if 2 * count > votes.total():
+            return by_tag.get(tag, KITTI)
+    return KITTI
+
+
+def _content(root: ElementTree.Element, convention: _Convention, is_own: bool = False) -> _Content:
     """Return the boxes of all tracklets by the index of their frame."""
-    boxes_by_frame: dict[int, list[ReadBox]] = {}
-    for number, item in enumerate(root.findall('tracklets/item')):
-        track_id = _track_id(item, str(number))
-        class_name = (item.findtext('objectType') or '').strip()
-        extent = [_number(item, tag) for tag in EXTENT_TAGS[is_swapped]]
-        first_frame = int(_number(item, 'first_frame'))
-        for index, pose in enumerate(item.findall('poses/item'), first_frame):
-            values = [_number(pose, tag) for tag in POSE_TAGS]
-            box = np.array([*values[:3], *extent, *values[3:]])
-            if not is_swapped:
-                box[BOX_CENTER] = _shifted_centres(box[None], extent[2] / 2)[0]
-            boxes_by_frame.setdefault(index, []).append(ReadBox(track_id, class_name, box))
-    return boxes_by_frame
+    items = root.findall('tracklets/item')
+    note = ''
+    if not is_own and convention.is_centre:
+        x, y, z = convention.tags
+        note = (
+            f'tracklets: read as those of {convention.program}: {x}, {y} and {z} are the extents '
+            f'along x, y and z, and the position is the centre; as KITTI defines them, most '
+            f'objects would be longest upwards or sideways'
+        )
+    content = _Content({}, {}, note)
+    status_of = _KittiStatus() if is_own or not convention.is_centre else _DatumaroStatus(items)
+    for number, item in enumerate(items):
+        with at(f'tracklet {number}'):
+            _add(content, item, str(number), convention, status_of)
+    return content
+
+
+def _add(
+    content: _Content,
+    item: ElementTree.Element,
+    name: str,
+    convention: _Convention,
+    status_of: Callable[[ElementTree.Element], str | None],
+) -> None:
+    """Add the boxes of a tracklet; `name` is its track id where it states none."""
+    track_id = _track_id(item, name)
+    class_name = (item.findtext('objectType') or '').strip()
+    extent = [_number(item, tag) for tag in convention.tags]
+    first_frame = int(_number(item, 'first_frame'))
+    for index, pose in enumerate(item.findall('poses/item'), first_frame):
+        status = status_of(pose)
+        if status is None:
+            content.left_out.setdefault(index, Counter())[Reason.NO_BOX] += 1
+            continue
+        values = [_number(pose, tag) for tag in POSE_TAGS]
+        box = np.array([*values[:3], *extent, *values[3:]])
+        if not convention.is_centre:
+            box[BOX_CENTER] = _shifted_centres(box[None], extent[2] / 2)[0]
+        read_box = ReadBox(track_id, class_name, box, {'status': status})
+        content.boxes.setdefault(index, []).append(read_box)
+
+
+class _KittiStatus:
+    """Status of a pose by its ``state``: 0 is not set, 1 interpolated, 2 drawn by a person."""
+
+    def __call__(self, pose: ElementTree.Element) -> str | None:
+        is_interpolated = (pose.findtext('state') or '').strip() == str(INTERPOLATED_STATE)
+        return INTERPOLATED if is_interpolated else INPUT_STATUS
+
+
+class _DatumaroStatus:
+    """
+    Status of a pose by ``occlusion_kf``, or an attribute; None for one that fills a gap.
+
+    Datumaro writes the state 2 for all poses. Where a track is interrupted it repeats the last
+    pose, marked as outside of the image and without an occlusion.
+
+    """
+
+    def __init__(self, items: Sequence[ElementTree.Element]) -> None:
+        poses = [pose for item in items for pose in item.findall('poses/item')]
+        self._has_keyframes = any(_keyframe(pose) for pose in poses)
+
+    def __call__(self, pose: ElementTree.Element) -> str | None:
+        flags = [(pose.findtext(tag) or '').strip() for tag in ('truncation', 'occlusion')]
+        if flags == [OUTSIDE_TRUNCATION, UNSET_OCCLUSION]:
+            return None
+        is_interpolated = self._has_keyframes and not _keyframe(pose)
+        return INTERPOLATED if is_interpolated else INPUT_STATUS
+
+
+def _keyframe(pose: ElementTree.Element) -> bool:
+    """Return whether a pose of Datumaro is marked as a keyframe."""
+    for attribute in pose.findall('attributes/attribute'):
+        if attribute.findtext('name') == 'keyframe':
+            return (attribute.findtext('value') or '').strip().lower() == 'true'
+    return (pose.findtext('occlusion_kf') or '').strip() == '1'
 
 
 def _track_id(item: ElementTree.Element, default: str) -> str:

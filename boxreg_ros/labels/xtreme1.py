@@ -8,14 +8,17 @@ classes in its own data base, so the class names here are shown as those of a mo
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import cuboids
-from boxreg_ros.labels.files import write_json
+from boxreg_ros.labels.files import at, following, from_json, write_json
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import ReadBox
+from boxreg_ros.reasons import Reason
 
 FORMAT = cuboids.cuboid_format(
     name='xtreme1',
@@ -25,6 +28,10 @@ FORMAT = cuboids.cuboid_format(
 LIDAR_FOLDER = 'lidar_point_cloud_0'
 RESULT_FOLDER = 'result'
 BOX_TYPE = '3D_BOX'
+BOX_TYPES = (BOX_TYPE, '3D')
+"""Types of objects that are boxes; versions up to 0.5 call them 3d."""
+GROUND_TRUTH = 'Ground Truth'
+"""Name of the source of boxes that people have drawn."""
 
 
 class Writer(cuboids.CuboidWriter):
@@ -54,17 +61,50 @@ def read(path: Path) -> Iterator[LabelFrame]:
     """
     Yield the frames of a scene, or of a folder with one scene.
 
-    ``timestamps.txt`` in either has one stamp [ns] per frame. Exports of Xtreme1 are read too if
-    the ``result`` folder of the scene has one file per frame.
+    Their stamps [ns] are those of ``timestamps.txt`` in either, one per frame, or the names of the
+    files. The track id is ``trackId``: names of tracks start again in each frame that is no part
+    of a scene.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the scene, or of one scene; exports have its ``result`` folder. After ``#`` may
+        be the name of the source to read, by default the only one, or the ground truth.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per file, in the order of the stamps; boxes of other sources are counted.
+
+    Raises
+    ------
+    RecordingError
+        If a file is missing or does not follow the format, or no source is to be preferred.
 
     """
+    path, part = _parts(path)
     scene, folder = cuboids.single_part(path, 'scene', [RESULT_FOLDER, LIDAR_FOLDER])
-    files = [*scene.glob(f'{RESULT_FOLDER}/*.json'), *scene.glob(f'{LIDAR_FOLDER}/*.pcd')]
-    names = {file.stem for file in files}
-    labels = scene / RESULT_FOLDER
-    yield from cuboids.read_files(
-        folder, labels, names, 'objects of Xtreme1', _cuboids, has_all=False
-    )
+    names = {file.stem for file in scene.glob(f'{LIDAR_FOLDER}/*.pcd')}
+    results: dict[str, list[_Result]] = {}
+    for file in sorted(scene.glob(f'{RESULT_FOLDER}/*.json')):
+        content = from_json(file)
+        with following(file, 'objects of Xtreme1'):
+            results[file.stem] = _results(content)
+    sources = [one.source for found in results.values() for one in found if one.boxes]
+    source = _source(path, Counter(sources), part)
+
+    def boxes_of(name: str) -> cuboids.FrameBoxes:
+        boxes: list[ReadBox] = []
+        left_out: Counter[str] = Counter()
+        for result in results.get(name, ()):
+            left_out[Reason.NO_BOX] += result.without_box
+            if result.source == source:
+                boxes += result.boxes
+            else:
+                left_out[Reason.OTHER_SOURCE] += len(result.boxes)
+        return boxes, +left_out
+
+    yield from cuboids.read_frames(folder, sorted(names | results.keys()), boxes_of)
 
 
 def _object(cuboid: cuboids.Cuboid, frame_name: str) -> dict[str, Any]:
@@ -86,22 +126,69 @@ def _object(cuboid: cuboids.Cuboid, frame_name: str) -> dict[str, Any]:
     }
 
 
-def _cuboids(content: Any) -> list[ReadBox]:
+def files_of(path: Path) -> Path:
+    """Return the path of the files, without the source."""
+    return _parts(path)[0]
+
+
+def _parts(path: Path) -> tuple[Path, str]:
+    """Return the path of the files, and the source that was asked for; empty for none."""
+    before, mark, part = str(path).rpartition('#')
+    return (path, '') if path.exists() or not mark else (Path(before), part)
+
+
+class _Result(NamedTuple):
+    """The boxes of one source in a frame, and the number of its objects without a box."""
+
+    source: str
+    boxes: list[ReadBox]
+    without_box: int
+
+
+def _results(content: Any) -> list[_Result]:
+    """Return the results in a file: one, or a list with one for each source."""
     parts = content if isinstance(content, list) else [content]
-    objects = [item for part in parts for item in part['objects']]
-    return [_cuboid(item) for item in objects if item.get('type', BOX_TYPE) == BOX_TYPE]
+    found = []
+    for part in parts:
+        result = part.get('result') or part  # versions up to 0.5 have another level
+        boxes = []
+        without_box = 0
+        for number, item in enumerate(result['objects'] or ()):
+            with at(f'object {number}'):
+                if item.get('type', item.get('objType', BOX_TYPE)).upper() not in BOX_TYPES:
+                    continue
+                if 'contour' in item and item['contour'] is None:
+                    without_box += 1
+                    continue
+                boxes.append(_cuboid(item))
+        found.append(_Result(str(part.get('sourceName') or ''), boxes, without_box))
+    return found
+
+
+def _source(path: Path, sources: Counter[str], part: str) -> str:
+    """Return the source to read, of several with their numbers of frames."""
+    names = ', '.join(f'{name!r} ({count} frames)' for name, count in sources.items())
+    if part:
+        if part in sources:
+            return part
+        raise RecordingError(f'{path}: expected a source {part!r}, got {names}; name one of these')
+    if len(sources) > 1 and GROUND_TRUTH not in sources:
+        raise RecordingError(
+            f'{path}: expected boxes of one source, or of the ground truth, got {names}; '
+            f'name the one to read after the path: {path}#SOURCE'
+        )
+    return GROUND_TRUTH if GROUND_TRUTH in sources else next(iter(sources), '')
 
 
 def _cuboid(item: dict[str, Any]) -> ReadBox:
-    contour = item['contour']
-    name = item.get('trackName')
-    if cuboids.EVIDENCE_KEY not in item:  # an export of Xtreme1: every object has a trackId
-        name = name or item['trackId']
+    contour = item.get('contour', item)
+    own = item.get(cuboids.EVIDENCE_KEY)  # of our files, where boxes may lack a track id
+    track_id = item.get('trackId') if own is None else item.get('trackName')
     box = cuboids.box_from_xyz(contour['center3D'], contour['rotation3D'], contour['size3D'])
     evidence = {
-        'score': item.get('modelConfidence'),
+        'score': item.get('modelConfidence', item.get('confidence')),
         'num_points': contour.get('pointN'),
-        **item.get(cuboids.EVIDENCE_KEY, {}),
+        **(own or {}),
     }
-    class_name = item.get('className') or item.get('modelClass') or ''
-    return ReadBox(str(name or ''), str(class_name), box, evidence)
+    class_name = item.get('className') or item.get('classType') or item.get('modelClass') or ''
+    return ReadBox('' if track_id is None else str(track_id), str(class_name), box, evidence)

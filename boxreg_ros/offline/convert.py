@@ -16,12 +16,14 @@ from boxreg_ros.io.fixed_frame import FixedFrameItems, StoredCloud
 from boxreg_ros.io.lidars import SINGLE_LIDAR
 from boxreg_ros.labels import check_options, frames_of, LabelFrame, Provenance, writer_for
 from boxreg_ros.labels.cloud_spool import Spool
-from boxreg_ros.labels.recording import config_hash, drive_of
+from boxreg_ros.labels.recording import config_hash, files_of
 from boxreg_ros.offline.arguments import add_options, values_of
+from boxreg_ros.offline.notes import left_out_line
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
 from boxreg_ros.offline.sources import label_frame_of
-from boxreg_ros.structures import BoxArray, Sweep
+from boxreg_ros.reasons import Reason
+from boxreg_ros.structures import BoxArray, is_valid_box, Sweep
 
 FORMAT_OF_NODE = 'recording'
 """Format of labels that are messages of a recording, which also has the clouds and poses."""
@@ -44,6 +46,8 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
         config_hash=config_hash(source) if source_format == FORMAT_OF_NODE else '',
     )
     counts: Counter[str] = Counter()
+    not_read: Counter[str] = Counter()
+    assumed: list[str] = []
     unused: dict[str, Any] = {'unreadable': 0, 'unused': '', 'damage': []}  # of the recording
     with claimed(out), whole_folder(out, request.inputs()) as folder:
         writers = {
@@ -52,11 +56,16 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
         for frame in _read_frames(request, folder, unused):
             counts['frames'] += 1
             counts['boxes'] += len(frame.refined.status)
+            counts['valid'] += int(is_valid_box(frame.refined.boxes.boxes).sum())
+            not_read.update(frame.left_out)
+            if frame.note:
+                assumed.append(frame.note)
             for writer in writers.values():
                 writer.write(frame)
         for writer in writers.values():
             writer.close()
         left_out = {name: dict(+writer.dropped) for name, writer in writers.items()}
+        _require_valid_boxes(source, counts)
         _require_boxes(request, left_out, counts['boxes'])
         summary = {
             'source': str(source),
@@ -65,6 +74,9 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             'to': list(request.formats),
             'frames': counts['frames'],
             'boxes': counts['boxes'],
+            'invalid_boxes': counts['boxes'] - counts['valid'],
+            'left_out_of_source': dict(+not_read),
+            'assumed': assumed,
             **unused,
             'left_out_of_labels': {name: found for name, found in left_out.items() if found},
             'versions': {'boxreg_ros': __version__},
@@ -97,6 +109,16 @@ def _check(request: Request) -> None:
             'it with --recording'
         )
     check_options(request.formats, request.options)
+
+
+def _require_valid_boxes(source: Path, counts: Counter[str]) -> None:
+    """Raise `RecordingError` if no box of the labels can be of an object."""
+    if counts['boxes'] and not counts['valid']:
+        raise RecordingError(
+            f'{source}: expected boxes of objects, got none among {counts["boxes"]:,}: '
+            f'{Reason.INVALID_BOX.meaning}; labels of images alone have extents of -1: give those '
+            f'with 3D boxes'
+        )
 
 
 def _require_boxes(request: Request, left_out: dict[str, dict[str, int]], num_boxes: int) -> None:
@@ -203,7 +225,7 @@ def run(args: argparse.Namespace) -> int:
     """Convert, and print one line with the counts."""
     recordings = tuple(args.recording)
     if args.source_format == FORMAT_OF_NODE and not recordings:
-        recordings = (drive_of(args.source),)
+        recordings = (files_of(args.source),)
     request = Request(
         recordings,
         labels=(args.source_format, args.source),
@@ -218,6 +240,12 @@ def run(args: argparse.Namespace) -> int:
     for name, counts in summary['left_out_of_labels'].items():
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in counts.items())
         parts.append(f'{name} leaves out {reasons}')
+    if summary['invalid_boxes']:
+        parts.append(
+            f'{summary["invalid_boxes"]:,} boxes are invalid: {Reason.INVALID_BOX.meaning}'
+        )
+    parts += [left_out_line(*item) for item in summary['left_out_of_source'].items()]
+    parts += summary['assumed']
     if summary['unused']:
         parts.append(summary['unused'])
     if summary['damage']:

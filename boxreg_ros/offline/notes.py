@@ -109,6 +109,8 @@ def _lidar_notes(summary: Summary) -> Iterator[str]:
 
 def _label_notes(summary: Summary) -> Iterator[str]:
     """Yield the boxes and clouds that label files lack, one line each."""
+    for name, count in (summary.labels or {}).get('left_out', {}).items():
+        yield left_out_line(name, count)
     for name, found in summary.left_out_of_labels.items():
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in found.items())
         yield f'format {name} cannot represent some boxes, they are left out: {reasons}'
@@ -117,6 +119,13 @@ def _label_notes(summary: Summary) -> Iterator[str]:
             f'{summary.frames_without_cloud:,} of {summary.box_arrays:,} box arrays have no '
             f'cloud to write beside them'
         )
+
+
+def left_out_line(name: str, count: int) -> str:
+    """Return the number of boxes of label files that are not used for a reason, and its words."""
+    reason = REASONS[name]
+    remedy = f'; remedy: {reason.remedy}' if reason.remedy else ''
+    return f'labels: {count:,} boxes are left out ({name}): {reason.meaning}{remedy}'
 
 
 def _keyframe_notes(summary: Summary) -> Iterator[str]:

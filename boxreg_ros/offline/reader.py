@@ -76,6 +76,7 @@ class Findings(NamedTuple):
     lidars: dict[str, Counter[str]]  # clouds of each that were merged, late and missing
     unreadable: int  # messages
     outside: int  # boxes of label files outside of the part that is read
+    left_out: Counter[str]  # boxes of label files that are not used, by reason
     warning: str  # finding of the pose check
     facts: dict[str, Any]  # fields of the summary that follow from the recording alone
     places: list[StoredPlace]  # of the stored sweeps; empty where none are stored
@@ -166,7 +167,18 @@ class RecordingReader:
             items.session.lidar_counts,
             recording.unreadable.total(),
             recording.outside,
-            '; '.join(filter(None, (recording.finding, self._jumping_ids, items.session.finding))),
+            +recording.left_out,
+            '; '.join(
+                filter(
+                    None,
+                    (
+                        *recording.label_notes,
+                        recording.finding,
+                        self._jumping_ids,
+                        items.session.finding,
+                    ),
+                )
+            ),
             facts,
             [] if self._sweeps is None else self._sweeps.complete(),
             self._clock.stages(),

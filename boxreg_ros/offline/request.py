@@ -15,7 +15,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.storage.urls import entries_of, url_of
-from boxreg_ros.labels import check_options, labels_points, module_of, Options
+from boxreg_ros.labels import check_options, files_of, labels_points, module_of, Options
 from boxreg_ros.options import option
 from msg_adapters.convention import Convention, STANDARD
 
@@ -279,7 +279,7 @@ class Request:
         if self.options.camera is not None:
             paths.append(self.options.camera)
         if self.labels is not None:
-            paths.append(self.labels[1])
+            paths.append(files_of(*self.labels))
         if self.truth is not None:
             paths += _parts_of(self.truth)
         if self.decisions is not None:

@@ -17,7 +17,7 @@ from boxreg_ros.io.items import EVERYTHING, Item, ItemSource, Wanted
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of
-from boxreg_ros.labels.merging import LabelMerger
+from boxreg_ros.labels.merging import keyframes_of, LabelMerger
 from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.structures import BoxArray
 from msg_adapters.convention import Convention
@@ -30,16 +30,24 @@ class LabelledRecording(Recording):
     has_boxes = False
 
     def __init__(
-        self, labels: tuple[str, Path], paths: Any, convention: Convention, **options: Any
+        self,
+        labels: tuple[str, Path],
+        paths: Any,
+        convention: Convention,
+        keyframes: bool = False,
+        **options: Any,
     ) -> None:
         super().__init__(paths, **options)
         self._labels = labels
         self._label_convention = convention
+        self._keyframes = keyframes
         self._is_part = any(options.get(name) is not None for name in ('start', 'end'))
 
     def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
         """Yield clouds and boxes; see `Recording.items`. Boxes have `Item.refined`."""
         frames = frames_of(*self._labels, convention=self._label_convention)
+        if self._keyframes:
+            frames = keyframes_of(frames)
         merger = LabelMerger(frames, tree, self.sensor_frame(), self.start_ns, self._is_part)
         for cloud in super().items(tree, wanted._replace(clouds=True)):
             if wanted.clouds:
@@ -47,6 +55,8 @@ class LabelledRecording(Recording):
             yield from merger.after(cloud.received_ns, cloud.content.stamp_ns)
         yield from merger.rest()
         self.outside = merger.outside
+        self.left_out = merger.left_out
+        self.label_notes = merger.notes
 
 
 class UnlabelledRecording(Recording):
@@ -82,13 +92,22 @@ def source_of(request: Request) -> Recording | SceneRecording:
     address = scene_address(request.recordings)
     if address is not None:
         _check_scene(address, request)
-        topics = request.lidars.topics
-        part = request.start, request.end
-        return SceneRecording(address, topics, *part, request.labels, request.convention)
+        return SceneRecording(
+            address,
+            request.lidars.topics,
+            request.start,
+            request.end,
+            request.labels,
+            request.convention,
+            request.keyframes,
+        )
     names = ('lidars', 'odometry', 'start', 'end', 'tf', 'clock_offset')
     options = {name: getattr(request, name) for name in names}
     if request.labels is not None:
-        return LabelledRecording(request.labels, request.recordings, request.convention, **options)
+        convention = request.convention
+        return LabelledRecording(
+            request.labels, request.recordings, convention, request.keyframes, **options
+        )
     if request.boxes == NO_TOPIC:
         return UnlabelledRecording(request.recordings, **options)
     options |= {'boxes': request.boxes, 'convention': request.convention}

@@ -100,7 +100,7 @@ class Summary:
             command=list(request.command),
             folder=str(Path.cwd()),
             topics=source.topics,
-            labels=_labels(request, findings.outside),
+            labels=_labels(request, findings),
             fixed_frame=source.fixed_frame,
             estimate=request.config.estimate,
             sweeps=findings.counts['sweeps'],
@@ -161,12 +161,18 @@ class Summary:
         return self.num_refined / self.boxes_in if self.boxes_in else 1.0
 
 
-def _labels(request: Request, outside: int) -> dict[str, Any] | None:
+def _labels(request: Request, findings: Findings) -> dict[str, Any] | None:
     """Return the label files that the boxes come from; None for boxes of the recording."""
+    left_out = dict(findings.left_out)
     if request.labels is None:
-        return None
+        return {'left_out': left_out} if left_out else None  # annotations of a data set
     name, path = request.labels
-    return {'format': name, 'path': str(path), 'boxes_outside_part': outside}
+    return {
+        'format': name,
+        'path': str(path),
+        'boxes_outside_part': findings.outside,
+        'left_out': left_out,
+    }
 
 
 def _dropped(registered: Counter[str], findings: Findings) -> dict[str, int]:

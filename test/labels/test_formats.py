@@ -69,10 +69,12 @@ R_rect 1 0 0 0 1 0 0 0 1
 Tr_velo_cam 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.5
 """
 READABLE_FORMATS = (
-    'csv', 'parquet', 'openlabel', 'kitti', 'tracklets', 'nuscenes', 't4', 'argoverse2', 'waymo',
-    'sustechpoints', 'datumaro', 'supervisely', 'xtreme1',
+    'csv', 'parquet', 'openlabel', 'kitti', 'kitti_object', 'tracklets', 'nuscenes', 't4',
+    'argoverse2', 'waymo', 'openpcdet', 'sustechpoints', 'datumaro', 'supervisely',
+    'sly_pointcloud', 'xtreme1',
 )  # fmt: skip
-UPRIGHT_FORMATS = {'kitti', 'waymo'}
+UPRIGHT_FORMATS = {'kitti', 'kitti_object', 'openpcdet', 'waymo'}
+DECIMAL_FORMATS = {'kitti', 'kitti_object', 'openpcdet'}
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.0, 5.5, 0.25]], np.float32)
 
 
@@ -551,7 +553,7 @@ def test_round_trip(tmp_path, name):
         assert (b.stamp_ns, b.frame_id, b.track_ids) == (a.stamp_ns, 'odom', a.track_ids)
         assert b.class_names == a.class_names
         kept = [0, 1, 2, 3, 4, 5] if name in UPRIGHT_FORMATS else list(range(9))
-        atol = 3e-6 if name == 'kitti' else 1e-9
+        atol = 3e-6 if name in DECIMAL_FORMATS else 1e-9
         np.testing.assert_allclose(b.boxes[:, kept], a.boxes[:, kept], atol=atol)
         if name in UPRIGHT_FORMATS:  # the heading remains, up to its projection to the plane
             cosines = np.cos(b.boxes[:, 8] - a.boxes[:, 8])

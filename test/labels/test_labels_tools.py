@@ -11,7 +11,7 @@ from consumers import consumer
 import numpy as np
 import pytest
 
-TOOLS = ('sustechpoints', 'datumaro', 'supervisely', 'xtreme1')
+TOOLS = ('sustechpoints', 'datumaro', 'supervisely', 'sly_pointcloud', 'xtreme1')
 STAMP = 1_700_000_000_100_000_000
 NAME = '1700000000100000000'
 

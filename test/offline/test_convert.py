@@ -72,7 +72,8 @@ def test_labels_are_refined_like_boxes_of_a_topic(tmp_path, drive):
     relabel(Request((recording,), config=QUICK), tmp_path / 'topic')
     request = Request((recording,), config=QUICK, labels=('csv', table))
     summary = relabel(request, tmp_path / 'labels')
-    assert summary.labels == {'format': 'csv', 'path': str(table), 'boxes_outside_part': 0}
+    expected = {'format': 'csv', 'path': str(table), 'boxes_outside_part': 0, 'left_out': {}}
+    assert summary.labels == expected
     assert summary.topics['boxes'] is None
     assert (summary.boxes_in, summary.status['refined']) == (14, 14)
     assert_same_boxes(rows_of(tmp_path / 'labels'), rows_of(tmp_path / 'topic'), 1e-5)
@@ -98,7 +99,7 @@ def test_labels_with_other_frame_names_are_refined_alike(tmp_path, drive, camera
     assert_same_boxes(found, expected, atol)
 
 
-def test_boxes_of_a_person_stay_as_they_are(tmp_path, drive):
+def test_boxes_of_a_person_stay_as_they_are(tmp_path, drive, camera):
     recording, table = drive
     corrected = BoxTable.read(table)
     rows = [6, 7]
@@ -106,7 +107,7 @@ def test_boxes_of_a_person_stay_as_they_are(tmp_path, drive):
     status = list(corrected.status)
     status[6] = status[7] = 'human'
     replace(corrected, status=tuple(status)).write(table)
-    options = Options(with_points=True)
+    options = Options(with_points=True, camera=camera)
     convert(conversion(table, WITH_STATUS, options, (recording,)), tmp_path / 'made')
     for name in WITH_STATUS:
         labels = (name, tmp_path / 'made' / ('boxes.csv' if name == 'csv' else name))
@@ -299,7 +300,7 @@ def test_convert_on_the_command_line(tmp_path, drive, capsys):
         (['convert', '{csv}', '-o', '{out}', '--from', 'kiti', '--to', 'csv'], 2, 'one of csv'),
         (['convert', '{csv}', '-o', '{out}', '--from', 'csv', '--to', 'kitti'], 2, '--camera'),
         (['convert', '{csv}', '-o', '{out}', '--from=csv', '--to=csv', '--camera', '{csv}'], 2,
-         '--camera: expected a format that uses it (kitti), got csv; add one, or leave it out'),
+         '--camera: expected a format that uses it (kitti, kitti_object), got csv; add one'),
         (['relabel', '{bag}', '-o', '{out}', '--formats', 'kitti', '--camera', '{csv}',
           '--swap-axes'], 2, 'uses it (tracklets, datumaro), got kitti'),
         (['relabel', '{bag}', '-o', '{out}', '--with-points'], 2, 'got csv, openlabel'),

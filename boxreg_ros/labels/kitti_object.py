@@ -1,0 +1,143 @@
+"""
+KITTI object detection: ``label_2/NAME.txt`` with ``calib/NAME.txt`` and ``velodyne/NAME.bin``.
+
+The 15 columns of a label, and the score of a result, are those of KITTI tracking without frame and
+track. Truncation is 0 inside of the image, 1 outside of it and -1, unknown, at its edge; occlusion
+is 3, unknown. Names of files are stamps, see `per_frame`.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.labels.camera import Camera
+from boxreg_ros.labels.kitti import (
+    boxes_of,
+    columns_of,
+    decimals,
+    IGNORED_CLASS,
+    INSIDE_IMAGE,
+    OUTSIDE_IMAGE,
+    TRUNCATED,
+    UNKNOWN_OCCLUSION,
+    write_calibration,
+)
+from boxreg_ros.labels.per_frame import EVIDENCE_FOLDER, numbers_of, PerFrameWriter, read_lines
+from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import ReadBox
+from boxreg_ros.structures import BoxArray, Floats, Ints
+import numpy as np
+
+FORMAT = Format(
+    name='kitti_object',
+    title='KITTI object',
+    frame='rectified camera (`--camera`)',
+    reference='centre of the bottom face',
+    sizes='height width length',
+    rotation="rotation_y about the camera's y; roll and pitch are lost",
+    files='label_2/STAMP.txt, calib/STAMP.txt, velodyne/STAMP.bin',
+    options=('camera', 'with_points', 'class_map'),
+)
+LABEL_FOLDER = 'label_2'
+OBJECT_COLUMNS = (15, 16)
+TRUNCATION = {INSIDE_IMAGE: '0.00', TRUNCATED: '-1.00', OUTSIDE_IMAGE: '1.00'}
+"""Text of the values of KITTI tracking; the part outside of the image is not known."""
+CALIBRATION_NAMES = ('R0_rect', 'Tr_velo_to_cam', 'Tr_imu_to_velo')
+
+
+class Writer(PerFrameWriter):
+    """Write one file of labels and of the calibration per frame, and one of points on request."""
+
+    form = 'kitti_object'
+    folders = (LABEL_FOLDER, 'calib', EVIDENCE_FOLDER)
+    label_folder = LABEL_FOLDER
+    cloud_file = 'velodyne/{name}.bin'
+
+    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
+        self._camera = Camera.read(options.camera, 'format kitti_object')
+        super().__init__(folder, provenance, options)
+
+    def add(self, frame: LabelFrame) -> None:
+        """Write the files of a frame."""
+        super().add(frame)
+        path = self.folder / 'calib' / f'{self.name}.txt'
+        write_calibration(self._camera, path, CALIBRATION_NAMES)
+
+    def lines(self, array: BoxArray, rows: Ints, boxes: Floats) -> Iterator[str]:
+        """Yield the line of each box; see `PerFrameWriter.lines`."""
+        truncation, columns = columns_of(self._camera, boxes)
+        for i, row in enumerate(rows):
+            name = '_'.join(self.class_names.of(array.class_names[row]).split()) or 'Misc'
+            begin = f'{name} {TRUNCATION[int(truncation[i])]}'
+            numbers = decimals(columns[i], array.scores[row])
+            yield f'{begin} {UNKNOWN_OCCLUSION} {numbers}'
+
+
+def read(path: Path) -> Iterator[LabelFrame]:
+    """
+    Yield the frames of a split, or of a folder of results.
+
+    Their stamps [ns] are those of ``timestamps.txt``, one per frame, or the names of the files.
+    Regions of the class DontCare are counted.
+
+    Parameters
+    ----------
+    path : Path
+        Folder with ``label_2/`` or ``data/`` (of results), or the folder of label files itself.
+        ``calib/`` is in the same folder, or in one above it.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per frame, in the order of the stamps.
+
+    Raises
+    ------
+    RecordingError
+        If a file is missing or does not follow the format.
+
+    """
+    parts = [path / name for name in (LABEL_FOLDER, 'data')]
+    labels = next((part for part in parts if part.is_dir()), path)
+    calibrations = _calibrations(labels)
+    folder = calibrations.parent
+    names = {file.stem for file in labels.glob('*.txt')}
+    names |= {file.stem for file in folder.glob('velodyne/*.bin')}
+    cameras: dict[bytes, Camera] = {}
+
+    def boxes_by_name(name: str, words: list[list[str]]) -> list[ReadBox | None]:
+        numbers = np.reshape(numbers_of(words, slice(8, 15), OBJECT_COLUMNS), (-1, 7))
+        boxes = boxes_of(_camera(calibrations / f'{name}.txt', cameras), numbers)
+        found: list[ReadBox | None] = []
+        for line, box in zip(words, boxes, strict=True):
+            score = float(line[15]) if len(line) > 15 else None
+            is_region = line[0] == IGNORED_CLASS
+            found.append(None if is_region else ReadBox('', line[0], box, {'score': score}))
+        return found
+
+    what = '15 or 16 columns of KITTI object'
+    yield from read_lines(folder, labels, names, what, boxes_by_name)
+
+
+def _calibrations(labels: Path) -> Path:
+    """Return the folder of calibrations, beside the labels or in a folder above them."""
+    folders = [folder / 'calib' for folder in (absolute(labels), *absolute(labels).parents[:2])]
+    for folder in folders:
+        if folder.is_dir():
+            return folder
+    raise RecordingError(
+        f'{labels}: expected calib/NAME.txt for each frame, got none in {folders[0].parent} or '
+        f'above it; copy the calibration of the data set there'
+    )
+
+
+def _camera(path: Path, known: dict[bytes, Camera]) -> Camera:
+    """Return the calibration of a frame; most frames have that of the one before."""
+    content = path.read_bytes()
+    if content not in known:
+        known.clear()
+        known[content] = Camera.read(path)
+    return known[content]

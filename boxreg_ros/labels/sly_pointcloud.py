@@ -1,0 +1,143 @@
+"""
+Supervisely projects of single clouds: ``ds0/ann/NAME.pcd.json`` with ``ds0/pointcloud/NAME.pcd``.
+
+CVAT and Datumaro call the format Sly Point Cloud. An object has the same key in all clouds, from
+which they take the track.
+
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterator
+from pathlib import Path
+import shutil
+from tempfile import TemporaryFile
+from typing import Any
+
+from boxreg_ros.labels import cuboids
+from boxreg_ros.labels.files import at, following, from_json, to_json, write_json
+from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import ReadBox, TrackNumbers
+from boxreg_ros.labels.supervisely import boxes_of, figure_of, key_of, meta_of, objects_by_key
+
+FORMAT = cuboids.cuboid_format(
+    name='sly_pointcloud',
+    title='Supervisely clouds, CVAT Sly Point Cloud',
+    files='meta.json, key_id_map.json, ds0/ann/STAMP.pcd.json, ds0/pointcloud/STAMP.pcd',
+)
+ANNOTATION_FOLDER = 'ann'
+ANNOTATION_SUFFIX = '.pcd.json'
+
+
+class Writer(cuboids.CuboidWriter):
+    """
+    Write one file of labels per cloud, and the files of the project when closed.
+
+    ``key_id_map.json`` has a number for each cloud, object and figure, without which Datumaro
+    reads none.
+
+    """
+
+    folders = (f'ds0/{ANNOTATION_FOLDER}', 'ds0/pointcloud')
+    cloud_file = 'ds0/pointcloud/{name}.pcd'
+
+    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
+        super().__init__(folder, provenance, options)
+        self._classes: dict[str, None] = {}
+        self._tracks = TrackNumbers()
+        self._objects: dict[str, int] = {}
+        self._figures = 0
+        # Figures are as many as boxes: their numbers wait in a file.
+        self._figure_ids = TemporaryFile('w+', encoding='utf-8', dir=folder)  # noqa: SIM115
+        self._cloud_ids = TemporaryFile('w+', encoding='utf-8', dir=folder)  # noqa: SIM115
+
+    def add(self, frame: LabelFrame) -> None:
+        """Write the file of a frame."""
+        objects: dict[str, dict[str, Any]] = {}
+        figures = []
+        for cuboid in self.cuboids(frame):
+            self._classes.setdefault(cuboid.class_name)
+            item = self._object(cuboid, objects)
+            objects[item['key']] = item
+            figure = figure_of(cuboid, self.number, item['key'])
+            # No tag: Datumaro would take its text for the number that it has of the object.
+            figure[cuboids.EVIDENCE_KEY] = {'track_id': cuboid.track_id} | cuboid.evidence
+            figures.append(figure)
+            self._figure_ids.write(
+                f'{"," if self._figures else ""}\n"{figure["key"]}": {self._figures}'
+            )
+            self._figures += 1
+        key = key_of(f'cloud/{self.number}')
+        self._cloud_ids.write(f'{"," if self.number else ""}\n"{key}": {self.number}')
+        path = self.folder / 'ds0' / ANNOTATION_FOLDER / f'{self.name}{ANNOTATION_SUFFIX}'
+        about = {'description': '', 'key': key, 'tags': []}
+        write_json(path, about | {'objects': list(objects.values()), 'figures': figures})
+
+    def finish(self) -> None:
+        """Write the files of the project."""
+        write_json(self.folder / 'meta.json', meta_of(self._classes, 'point_clouds'))
+        with (self.folder / 'key_id_map.json').open('w', encoding='utf-8') as file:
+            file.write(f'{{"tags": {{}},\n"objects": {to_json(self._objects)}')
+            for name, numbers in (('figures', self._figure_ids), ('videos', self._cloud_ids)):
+                numbers.seek(0)
+                file.write(f',\n"{name}": {{')
+                shutil.copyfileobj(numbers, file)
+                numbers.close()
+                file.write('}')
+            file.write('}\n')
+
+    def _object(self, cuboid: cuboids.Cuboid, others: dict[str, Any]) -> dict[str, Any]:
+        """Return the object of a cuboid, with its status as a tag."""
+        key = key_of(f'object/{cuboid.class_name}/{cuboid.track_id}')
+        if not cuboid.track_id or key in others:
+            key = key_of(f'object/{self.number}/{cuboid.row}')
+        else:
+            self._objects.setdefault(key, self._tracks.of(cuboid.track_id))
+        self._objects.setdefault(key, self._tracks.of(''))
+        status = cuboid.evidence['status']
+        tag = {'key': key_of(f'{key}/{self.number}'), 'name': 'status', 'value': status}
+        return {'key': key, 'classTitle': cuboid.class_name, 'tags': [tag]}
+
+
+def read(path: Path) -> Iterator[LabelFrame]:
+    """
+    Yield the frames of a data set, or of the only one of a project.
+
+    Their stamps [ns] are those of ``timestamps.txt`` in the data set or in the project, one per
+    cloud, or the names of the clouds. Boxes have no track ids if no object is in two clouds.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the project or of the data set.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per cloud, in the order of the stamps.
+
+    Raises
+    ------
+    RecordingError
+        If a file is missing or does not follow the format.
+
+    """
+    dataset, folder = cuboids.single_part(path, 'data set', [ANNOTATION_FOLDER])
+    boxes: dict[str, list[ReadBox]] = {}
+    clouds_of: Counter[str] = Counter()  # of each object that states no track
+    for file in sorted((dataset / ANNOTATION_FOLDER).glob('*.json')):
+        content = from_json(file)
+        with following(file, 'cuboids of Supervisely'), at('annotation'):
+            objects = objects_by_key(content)
+            found = boxes_of(content.get('figures') or (), objects)
+        boxes[Path(file.stem).stem] = found
+        clouds_of.update({box.track_id for box in found} & set(map(str, objects)))
+    if len(boxes) > 1 and max(clouds_of.values(), default=2) == 1:
+        boxes = {name: _without_objects(found, clouds_of) for name, found in boxes.items()}
+    yield from cuboids.read_frames(folder, list(boxes), lambda name: (boxes.get(name, []), {}))
+
+
+def _without_objects(boxes: list[ReadBox], objects: Collection[str]) -> list[ReadBox]:
+    """Return boxes whose track id is none of some objects."""
+    return [box._replace(track_id='') if box.track_id in objects else box for box in boxes]
