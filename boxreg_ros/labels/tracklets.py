@@ -231,7 +231,7 @@ class _Convention(NamedTuple):
     program: str
 
 
-KITTI = _Convention(('l', 'w', 'h'), False, 'KITTI')
+KITTI_CONVENTION = _Convention(('l', 'w', 'h'), False, 'KITTI')
 DATUMARO = _Convention(('h', 'w', 'l'), True, 'Datumaro')
 CVAT = _Convention(('w', 'h', 'l'), True, 'CVAT')
 
@@ -263,7 +263,7 @@ def _read_file(path: Path) -> _Content:
         if SWAPPED_COMMENT in origin:
             return _content(root, DATUMARO, is_own=True)
         if OWN_COMMENT in origin:
-            return _content(root, KITTI, is_own=True)
+            return _content(root, KITTI_CONVENTION, is_own=True)
         return _content(root, _convention_of(root))
 
 
@@ -294,15 +294,15 @@ def _convention_of(root: ElementTree.Element) -> _Convention:
         if kind in longest and config.knows_class(class_name):
             sizes = {tag: _number(item, tag) for tag in 'hwl'}
             longest[kind][max(sizes, key=sizes.__getitem__)] += 1
-    by_tag = {'l': KITTI, 'h': DATUMARO, 'w': CVAT}
+    by_tag = {'l': KITTI_CONVENTION, 'h': DATUMARO, 'w': CVAT}
     votes = longest['vehicle']
     if not votes:
-        by_tag = {'h': KITTI, 'l': DATUMARO}
+        by_tag = {'h': KITTI_CONVENTION, 'l': DATUMARO}
         votes = longest['pedestrian']
     for tag, count in votes.most_common(1):
         if 2 * count > votes.total():
-            return by_tag.get(tag, KITTI)
-    return KITTI
+            return by_tag.get(tag, KITTI_CONVENTION)
+    return KITTI_CONVENTION
 
 
 def _content(root: ElementTree.Element, convention: _Convention, is_own: bool = False) -> _Content:
