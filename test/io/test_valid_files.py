@@ -88,10 +88,11 @@ class Layout:
             self.add(message, content)
         data = content.end()
         times = [message.log_time for _, _, message in messages]
+        packed = zstandard.compress(data)
         begin = self.out.count
         crc = zlib.crc32(data) if self.has_checksums else 0
         self.add(records.Chunk(
-            compression='zstd', data=zstandard.compress(data), message_start_time=min(times),
+            compression='zstd', data=packed, message_start_time=min(times),
             message_end_time=max(times), uncompressed_crc=crc, uncompressed_size=len(data),
         ))  # fmt: skip
         end = self.out.count
@@ -101,7 +102,7 @@ class Layout:
             self.add(index)
         return records.ChunkIndex(
             chunk_length=end - begin - len(PRIVATE) * self.private, chunk_start_offset=begin,
-            compression='zstd', compressed_size=len(data), message_start_time=min(times),
+            compression='zstd', compressed_size=len(packed), message_start_time=min(times),
             message_end_time=max(times), message_index_offsets=offsets,
             message_index_length=self.out.count - end, uncompressed_size=len(data),
         )  # fmt: skip
