@@ -199,9 +199,8 @@ def observe(
 
     A point near several boxes belongs to the box it is deepest inside of, or least outside. It
     also belongs to boxes it is nearly as deep inside of: two boxes of one object do not take
-    points from each other. Boxes beside each other are parted by the air between them (M10a).
-    Points less than `GROUND_CLEARANCE` above the road beside the box are left out; the height of
-    the road is kept.
+    points from each other (M10a). Points less than `GROUND_CLEARANCE` above the road beside the
+    box are left out; the height of the road is kept.
 
     The sweep is in the fixed frame; its points may be in their own, see `Sweep.T_frame_points`.
     The boxes are at its stamp, the observations at `stamp_ns`. Without the `view` of the LiDAR,

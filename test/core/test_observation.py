@@ -154,29 +154,9 @@ def test_points_with_huge_coordinates_are_ignored():
 
 # --- ownership ----------------------------------------------------------------------------------
 
-# Two cars that overlap: the first reaches to x = 12, the second begins at x = 11.5.
-OTHER = CAR + np.eye(9)[0] * 3.5
-
-
-@pytest.mark.parametrize('first_of_other', [11.3, 11.9, 12.3])
-@pytest.mark.parametrize('is_reversed', [False, True])
-def test_points_of_cars_bumper_to_bumper_are_parted_by_the_air_between(
-    first_of_other, is_reversed
-):
-    """Whichever of both boxes is too long, the widest gap is between the bumpers."""
-    sides = np.array([-0.9, -0.3, 0.3, 0.9])
-    own = np.arange(8.1, first_of_other - 0.35, 0.1)
-    others = np.arange(first_of_other, 15.4, 0.1)
-    points = [[x, 20 + y, 1.0] for x in (*own, *others) for y in sides]
-    boxes = [OTHER, CAR] if is_reversed else [CAR, OTHER]
-    seen = observed(points, *boxes, changes={'sampling.points': 1000})
-    if is_reversed:
-        seen = seen[::-1]
-    assert [len(observation.points) for observation in seen] == [4 * len(own), 4 * len(others)]
-
 
 def test_a_point_belongs_to_the_box_it_is_deeper_inside_of():
-    # A trailer with its front over the tractor overlaps it by more than boxes err: no air between.
+    # A trailer with its front over the tractor overlaps it by more than boxes err.
     trailer = CAR + np.eye(9)[0] * 3
     points = [[x, 20.0, 1.0] for x in (11.0, 11.3, 11.45, 11.55, 11.7, 12.0)]
     seen = observed(points, CAR, trailer)
@@ -189,27 +169,6 @@ def test_two_boxes_of_one_object_share_its_points():
     points = near([2.0, 0, 0], [-2.0, 0, 0], [0, 0.9, 0], [1.0, -0.9, 0.3])
     seen = observed(points, CAR, CAR + np.eye(9)[0] * 0.1)
     assert [len(observation.points) for observation in seen] == [4, 4]
-
-
-def border_between(boxes, axes, i, j, points):
-    """Return normal and place of the air between boxes beside each other; None for others."""
-    first, second = sorted((i, j))
-    offset = boxes[second, :3] - boxes[first, :3]
-    found = []
-    for normal in (*axes[first].T[:2], *axes[second].T[:2]):
-        normal = normal * np.sign(normal @ offset)
-        reach = [np.abs(normal @ axes[k]) @ boxes[k, 3:6] / 2 for k in (first, second)]
-        found.append((normal @ offset - sum(reach), normal @ offset > max(reach), normal, reach))
-    gap, is_apart, normal, reach = max(found, key=lambda item: item[0])
-    if not is_apart or abs(gap) >= 0.6:
-        return None
-    faces = reach[0], normal @ offset - reach[1]
-    low, high = min(faces) - 0.6, max(faces) + 0.6
-    places = np.sort((points - boxes[first, :3]) @ normal)
-    places = np.array([low, *places[(low < places) & (places < high)], high])
-    k = np.diff(places).argmax()
-    place = (places[k] + places[k + 1]) / 2
-    return (normal, place) if i == first else (-normal, normal @ offset - place)
 
 
 def test_many_boxes_equal_brute_force():
@@ -238,13 +197,7 @@ def test_many_boxes_equal_brute_force():
     for i, (box, observation) in enumerate(zip(boxes, seen, strict=True)):
         own = possible[i].copy()
         for j in np.flatnonzero(np.arange(n) != i):
-            border = border_between(boxes, axes, i, j, points[possible[i] | possible[j]])
-            if border is None:
-                near_other = outside[j] < 1.0
-                own &= ~near_other | (outside[i] <= outside[j] + 0.2)
-            else:
-                normal, place = border
-                own &= (outside[j] >= 1.0) | ((points - box[:3]) @ normal < place)
+            own &= (outside[j] >= 1.0) | (outside[i] <= outside[j] + 0.2)
         assert rows(observation.points) == rows((points[own] - box[:3]).astype(np.float32))
         assert observation.num_points == (outside[i] <= 0).sum()
 

@@ -273,166 +273,24 @@ def road_heights(owner, height, n, numbers):
     return road
 
 
-class Neighbours(NamedTuple):
-    """
-    Pairs of boxes beside each other, such as cars parked bumper to bumper.
-
-    Attributes
-    ----------
-    number : array, shape (n, n)
-        Number of the pair of two boxes; -1 if they are none.
-    first, second : array, shape (m,)
-        Boxes of each pair.
-    normal : array, shape (m, 3)
-        From the first to the second, in the frame of the boxes.
-    faces : array, shape (m, 2)
-        Their faces toward each other, along the normal from the centre of the first [m].
-
-    """
-
-    number: Any
-    first: Any
-    second: Any
-    normal: Any
-    faces: Any
-
-
 @kernel
-def support(shapes, box, x, y, z):
-    """Return how far a box reaches from its centre along a direction [m]."""
-    R, half = shapes.rotations[box], shapes.half[box]
-    total = 0.0
-    for k in range(3):
-        total += abs(x * R[0, k] + y * R[1, k] + z * R[2, k]) * half[k]
-    return total
-
-
-@kernel
-def separated(a, b, shapes, margin, normal, faces):
-    """
-    Return whether two boxes are beside each other: write the axis that separates them, and faces.
-
-    They are if they overlap, or are apart, by less than `margin` along one of their upright faces,
-    and neither has its centre in the other there: those are two boxes of one object.
-
-    """
-    dx, dy, dz = turned(
-        shapes.turn, shapes.centers[b, 0] - shapes.centers[a, 0],
-        shapes.centers[b, 1] - shapes.centers[a, 1], shapes.centers[b, 2] - shapes.centers[a, 2],
-    )  # fmt: skip
-    widest = -np.inf
-    is_apart = False
-    for k in range(4):
-        R = shapes.rotations[a if k < 2 else b]
-        x, y, z = R[0, k % 2], R[1, k % 2], R[2, k % 2]
-        distance = x * dx + y * dy + z * dz
-        sign = 1.0 if distance > 0.0 else -1.0
-        of_a, of_b = support(shapes, a, x, y, z), support(shapes, b, x, y, z)
-        gap = sign * distance - of_a - of_b
-        if gap > widest:
-            widest = gap
-            is_apart = sign * distance > max(of_a, of_b)
-            normal[0], normal[1], normal[2] = sign * x, sign * y, sign * z
-            faces[0], faces[1] = of_a, sign * distance - of_b
-    return is_apart and abs(widest) < margin
-
-
-@kernel
-def neighbours(shapes, margin):
-    """Return the boxes beside each other, see `separated`."""
-    n = len(shapes.half)
-    number = np.full((n, n), np.int32(-1))
-    normal, faces = np.empty(3), np.empty(2)
-    count = 0
-    for a in range(n):
-        for b in range(a + 1, n):
-            is_near = True
-            for k in range(2):
-                away = abs(shapes.centers[a, k] - shapes.centers[b, k])
-                is_near &= away < shapes.reach[a, k] + shapes.reach[b, k]
-            if is_near and separated(a, b, shapes, margin, normal, faces):
-                number[a, b] = number[b, a] = count
-                count += 1
-    found = Neighbours(
-        number, np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, 3)),
-        np.empty((count, 2)),
-    )  # fmt: skip
-    for a in range(n):
-        for b in range(a + 1, n):
-            pair = number[a, b]
-            if pair >= 0:
-                found.first[pair], found.second[pair] = a, b
-                separated(a, b, shapes, margin, found.normal[pair], found.faces[pair])
-    return found
-
-
-@kernel
-def along(points, i, shapes, pairs, pair):
-    """Return where point `i` is along the normal of a pair, from the centre of the first [m]."""
-    x, y, z = offset_of(points, i, shapes, pairs.first[pair])
-    normal = pairs.normal[pair]
-    return normal[0] * x + normal[1] * y + normal[2] * z
-
-
-@kernel
-def borders(points, shapes, pairs, margin, row, owner):
-    """
-    Return where the air between the boxes of each pair is, along its normal (m,) [m].
-
-    That is the middle of the widest gap between the points of both, `row` and `owner` (P,), from
-    `margin` before the first of their faces to as far behind the second.
-
-    """
-    rows, first = grouped(row, owner, len(pairs.number))
-    border = np.empty(len(pairs.first))
-    places = np.empty(len(row) + 2)
-    for pair in range(len(border)):
-        low = pairs.faces[pair].min() - margin
-        high = pairs.faces[pair].max() + margin
-        places[0], places[1] = low, high
-        count = 2
-        for box in (pairs.first[pair], pairs.second[pair]):
-            for i in rows[first[box] : first[box + 1]]:
-                place = along(points, i, shapes, pairs, pair)
-                if low < place < high:
-                    places[count] = place
-                    count += 1
-        ordered = np.sort(places[:count])
-        widest = 0.0
-        for k in range(1, count):
-            if ordered[k] - ordered[k - 1] > widest:
-                widest = ordered[k] - ordered[k - 1]
-                border[pair] = (ordered[k] + ordered[k - 1]) / 2
-    return border
-
-
-@kernel
-def fill_owned(points, shapes, numbers, row, owner, depth, is_owned):
+def clear_foreign(tolerance, row, depth, is_owned):
     """
     Clear `is_owned` (P,) of the pairs whose point belongs to another box (M10a).
 
-    A point belongs to the boxes it is deepest inside of, or nearly so. Of two boxes beside each
-    other it belongs to one: that on its side of the air between both.
+    A point belongs to the boxes that it is deepest inside of, up to a tolerance [m]. The pairs of
+    one point, its `row` (P,), follow each other.
 
     """
-    pairs = neighbours(shapes, numbers.own_margin)
-    border = np.empty(0)
-    if len(pairs.first):
-        kept = np.flatnonzero(is_owned)
-        border = borders(points, shapes, pairs, numbers.own_margin, row[kept], owner[kept])
     start = 0
     while start < len(row):
         end = start
+        deepest = depth[start]
         while end < len(row) and row[end] == row[start]:
+            deepest = min(deepest, depth[end])
             end += 1
         for k in range(start, end):
-            for other in range(start, end):
-                pair = pairs.number[owner[k], owner[other]]
-                if pair >= 0:
-                    is_before = along(points, row[k], shapes, pairs, pair) < border[pair]
-                    is_owned[k] &= is_before == (owner[k] == pairs.first[pair])
-                else:
-                    is_owned[k] &= depth[k] <= depth[other] + numbers.ownership_tolerance
+            is_owned[k] &= depth[k] <= deepest + tolerance
         start = end
 
 
@@ -540,7 +398,7 @@ def own_points(points, shapes, numbers):
         ground = road[owner[k]] if road[owner[k]] == road[owner[k]] else 0.0
         is_owned[k] = depth[k] < numbers.own_margin and height[k] > ground + numbers.clearance
     if numbers.ownership_tolerance < np.inf:
-        fill_owned(points, shapes, numbers, row[:P], owner[:P], depth[:P], is_owned)
+        clear_foreign(numbers.ownership_tolerance, row[:P], depth[:P], is_owned)
     own = 0
     for k in range(P):
         row[own], owner[own], x[own] = row[k], owner[k], x[k]
