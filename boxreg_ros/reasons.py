@@ -4,9 +4,9 @@ from enum import StrEnum
 from typing import Self
 
 REDUCE_LOAD = (
-    'compare the latencies in `/diagnostics`; lower `window`, `solver.rounds` or '
-    '`sampling.points`, publish fewer boxes, use more CPU cores (`solver.threads`), or give the '
-    'node cores of its own, see "Priority and cores"'
+    'compare the latencies in `/diagnostics`; lower `window` or `sampling.points`, publish fewer '
+    'boxes, use more CPU cores (`solver.threads`), or give the node cores of its own, see '
+    '"Priority and cores"'
 )
 ENLARGE_TRANSPORT = 'see "Large clouds"'
 CHECK_TRANSFORMS = 'see "Requirements of your TF tree and stamps"'

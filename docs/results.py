@@ -335,7 +335,8 @@ def _ablation(documents: Documents) -> Iterable[str]:
         estimates = document['results'][data].values()
         titles.append(result_tables.title_of(data))
         for name, found in losses.items():
-            found.append([rows[WHOLE]['iou_3d'] - rows[name]['iou_3d'] for rows in estimates])
+            pairs = [(rows[WHOLE], rows[name]) for rows in estimates if name in rows]
+            found.append([whole['iou_3d'] - without['iou_3d'] for whole, without in pairs])
     rows = [
         [f'{name}: {INGREDIENTS[name].meaning}', *(' / '.join(map(_loss, pair)) for pair in found)]
         for name, found in sorted(losses.items(), key=lambda item: -max(map(max, item[1])))

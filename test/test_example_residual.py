@@ -1,4 +1,4 @@
-"""The page docs/tasks/add-a-residual.md, followed to the letter in a copy of the package."""
+"""The page docs/tasks/add-a-residual.md, followed to the letter in a copy of package and tests."""
 
 import os
 import re
@@ -11,6 +11,8 @@ import pytest
 
 PAGE = ROOT / 'docs' / 'tasks' / 'add-a-residual.md'
 EXAMPLE = ROOT / 'docs' / 'examples' / 'residual_example.py'
+COPIED = ('boxreg_ros', 'msg_adapters', 'test/core/test_method.py', 'test/reference',
+          'test/scenes.py', 'test/paths.py', 'test/measure')  # fmt: skip
 
 
 def test_page_shows_the_example():
@@ -18,29 +20,39 @@ def test_page_shows_the_example():
     assert f'```python\n{source}```\n' in PAGE.read_text(encoding='utf-8')
 
 
+def block(language, begin):
+    """Return the code of the page that begins with a text."""
+    page = PAGE.read_text(encoding='utf-8')
+    return re.search(rf'```{language}\n({re.escape(begin)}.*?)```', page, re.DOTALL)[1]
+
+
 @pytest.fixture
 def copy(tmp_path):
-    """Return a copy of the package in which the page has been followed."""
-    shutil.copytree(ROOT / 'boxreg_ros', tmp_path / 'boxreg_ros', ignore=ignored)
-    shutil.copytree(ROOT / 'msg_adapters', tmp_path / 'msg_adapters', ignore=ignored)
+    """Return a copy of package and tests in which the page has been followed."""
+    for name in COPIED:
+        target = tmp_path / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, target, ignore=shutil.ignore_patterns('__pycache__'))
+        else:
+            shutil.copy(ROOT / name, target)
     source = EXAMPLE.read_text(encoding='utf-8')
     functions = source[source.index('@kernel') : source.index('ROW = ')]
     residual, weight = functions.split('\n\n\n')[:2]
-    method = tmp_path / 'boxreg_ros' / 'core' / 'method'
-    insert(method / 'residuals.py', 'RESIDUALS = (', f'{residual}\n\n\n')
-    insert(method / 'weights.py', '@loop\ndef robustify', f'{weight}\n\n\n')
-    insert(method / 'residuals.py', '    slip_weight,\n', '    rise_weight,\n')
+    core = tmp_path / 'boxreg_ros' / 'core'
+    insert(core / 'method' / 'residuals.py', 'RESIDUALS = (', f'{residual}\n\n\n')
+    insert(core / 'method' / 'weights.py', '@loop\ndef robustify', f'{weight}\n\n\n')
+    insert(core / 'method' / 'residuals.py', '    slip_weight,\n', '    rise_weight,\n')
     row = re.search(r'`(Residual\(rise, .*\))`', PAGE.read_text(encoding='utf-8'))[1]
-    insert(method / 'residuals.py', '    Residual(slip, ', f'    {row},\n')
-    setting = re.search(r'```python\n(    rise: float = .*?)```', PAGE.read_text(), re.DOTALL)[1]
+    insert(core / 'method' / 'residuals.py', '    Residual(slip, ', f'    {row},\n')
+    setting = block('python', '    rise: float = ')
     insert(tmp_path / 'boxreg_ros' / 'config.py', '    shape: float = setting(', setting)
-    field = "    'rise': ('rise',),\n"
-    insert(tmp_path / 'boxreg_ros' / 'core' / 'problem.py', "    'extent': ('extent',),\n", field)
+    insert(core / 'problem.py', "    'extent': ('extent',),\n", "    'rise': ('rise',),\n")
+    oracle = tmp_path / 'test' / 'reference' / 'objective.py'
+    insert(oracle, 'OF_OBSERVATIONS = {', block('text', 'def rise(p, s, t):') + '\n\n')
+    insert(oracle, "    'slip': slip,\n", "    'rise': rise,\n")
+    (tmp_path / 'test' / 'core' / 'test_rise.py').write_text(CHECK, encoding='utf-8')
     return tmp_path
-
-
-def ignored(folder, names):
-    return [name for name in names if name == '__pycache__']
 
 
 def insert(path, before, text):
@@ -51,32 +63,73 @@ def insert(path, before, text):
 
 
 CHECK = """
-import numpy as np
-from boxreg_ros.core.method.assemble import accumulate, empty_axes, no_matrix
-from boxreg_ros.core.method.constants import RESIDUAL_NAMES
-from boxreg_ros.core.method.residuals import empty_linearised, RESIDUALS, TERMS
-from boxreg_ros.core.method.arrays import COMMON
-
-# 0.1 m up in 0.2 s, with the weight 7: r = .5, value 7 * .25 / 2, gradient 7 * .5 / .2.
-i = RESIDUAL_NAMES.index('rise')
-terms, common = np.zeros(2, TERMS), np.zeros((), COMMON)[()]
-terms['time'], terms['W'][0, i, 0] = [0.0, 0.2], 7.0
-x, gradient = np.zeros(35), np.empty(35)
-x[6:9] = 1.0, 2.0, 0.1
-value = accumulate(
-    x, 2, terms, common, empty_axes(2), empty_linearised(), gradient, no_matrix()
-)
-np.testing.assert_allclose(value, 7 * 0.25 / 2)
-known = np.zeros(35)
-known[2], known[8] = -17.5, 17.5
-np.testing.assert_allclose(gradient, known)
 from boxreg_ros import Config
-assert Config().vehicle.rise == 1.0
+from boxreg_ros.core.method.assemble import (
+    accumulate, empty_axes, no_matrix, weigh_each
+)
+from boxreg_ros.core.method.arrays import COMMON
+from boxreg_ros.core.method.constants import CONSTANTS, RESIDUAL_NAMES
+from boxreg_ros.core.method.residuals import empty_linearised, RESIDUALS, TERMS
+from boxreg_ros.core.method.weights import Weighing
+from boxreg_ros.core.problem import settings_of_kinds
+from measure.ablation import INGREDIENTS, merged
+import numpy as np
+
+I = RESIDUAL_NAMES.index('rise')
+POSES = np.zeros((2, 6))
+POSES[1, :3] = 1.0, 2.0, 0.1  # 0.1 m up in 0.2 s: r = 0.5 m/s
+
+
+def terms_of(config):
+    # Weights of a window of two boxes of a car, as at the start of a round.
+    terms = np.zeros(2, TERMS)
+    terms['time'], terms['axes'] = [0.0, 0.2], np.eye(3)
+    ones = np.ones(6)
+    window = Weighing(2, ones, ones, np.zeros(2, bool), ones, np.zeros(2, bool),
+                      settings_of_kinds(config)[0])
+    constants = CONSTANTS.with_settings(config).in_round(False, False).record()
+    weigh_each(POSES, np.zeros(23), terms, window, constants, empty_axes(2), empty_linearised())
+    return terms
+
+
+def test_the_setting_is_the_weight():
+    assert Config().vehicle.rise == 1.0
+    config = Config().updated({'vehicle.rise': 0.5})
+    assert terms_of(config)['W'][0, I, 0] == 4.0
+    assert not terms_of(config)['W'][1, I].any()  # no box follows the last one
+
+
+def test_the_ablation_leaves_it_out():
+    config = Config().updated(merged([INGREDIENTS['rise'].settings]))
+    assert not terms_of(config)['W'][:, I].any()
+
+
+def test_value_and_gradient_by_hand():
+    # With the weight 7: value 7 * .25 / 2, gradient 7 * .5 / .2.
+    terms, common = np.zeros(2, TERMS), np.zeros((), COMMON)[()]
+    terms['time'], terms['W'][0, I, 0] = [0.0, 0.2], 7.0
+    x, gradient = np.zeros(35), np.empty(35)
+    x[:12] = POSES.ravel()
+    value = accumulate(
+        x, 2, terms, common, empty_axes(2), empty_linearised(), gradient, no_matrix()
+    )
+    np.testing.assert_allclose(value, 7 * 0.25 / 2)
+    known = np.zeros(35)
+    known[2], known[8] = -17.5, 17.5
+    np.testing.assert_allclose(gradient, known)
 """
 
 
 def test_the_page_makes_a_residual(copy):
-    command = [sys.executable, '-c', CHECK]
-    done = subprocess.run(command, cwd=copy, env={**os.environ, 'PYTHONPATH': ''},
-                          capture_output=True, text=True, timeout=600)  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    # The oracle, automatic differentiation, sums the residual of the page too.
+    tests = ['test/core/test_rise.py', 'test/core/test_method.py']
+    only = 'rise or automatic or by_hand and value'
+    command = [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', *tests, '-k', only]
+    folders = os.pathsep.join(map(str, (copy, copy / 'test')))
+    # Kernels that are used once need no optimisation.
+    environment = {**os.environ, 'PYTHONPATH': folders, 'NUMBA_OPT': '0'}
+    done = subprocess.run(
+        command, cwd=copy, env=environment, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert '7 passed' in done.stdout, done.stdout

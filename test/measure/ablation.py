@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.method.constants import RESIDUAL_NAMES
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import Scores, summarise
 from measure import RECORDINGS
@@ -46,12 +47,13 @@ def _off(*names: str) -> dict[str, bool]:
 
 INGREDIENTS = {
     WHOLE: Ingredient('every ingredient is on', {}),
+    **{
+        name: Ingredient(f'the residual {name} has no weight', _without(name))
+        for name in RESIDUAL_NAMES
+    },
     'points': Ingredient(
         'faces and rigid shape have no weight: motion and input alone',
         {'faces.ends': 10.0, 'faces.sides': 10.0} | _off('road') | _without('rigid shape'),
-    ),
-    'rigid shape': Ingredient(
-        'points of a track are not tied to one rigid shape', _without('rigid shape')
     ),
     'learnt margins': Ingredient(
         'labelling margins are those of the settings', {'faces.learn': False}
@@ -81,12 +83,7 @@ INGREDIENTS = {
         'boxes also use the points of their neighbours', _off('point_ownership')
     ),
     'road': Ingredient('the bottom face is never observed', _off('road')),
-    'smoothness': Ingredient('accelerations have no weight', _without('acceleration')),
     'robust motion': Ingredient('motion residuals are not robust', _off('robust_motion')),
-    'slip and pivot': Ingredient(
-        'sideways and vertical velocities have no weight', _without('slip')
-    ),
-    'zero motion': Ingredient('parked objects have no zero-motion prior', _without('zero motion')),
     'heading sign': Ingredient('180° flips stay', _off('heading_sign')),
     'robust weights': Ingredient('outliers have full weight', _off('robust_weights')),
 }

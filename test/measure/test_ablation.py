@@ -75,7 +75,7 @@ def test_losses_are_printed(tmp_path, scene, capsys):
 
 
 def test_ingredients_are_left_out_one_after_the_other():
-    settings = [INGREDIENTS[name].settings for name in ('rigid shape', 'road', 'slip and pivot')]
+    settings = [INGREDIENTS[name].settings for name in ('rigid shape', 'road', 'slip')]
     known = {'ingredients.without': ('rigid shape', 'slip'), 'ingredients.road': False}
     assert merged(settings) == known
 

@@ -8,6 +8,7 @@ derivatives. Every function returns whitened residuals, whose squares are summed
 
 from boxreg_ros.core.geometry import rotation_from_rpy
 from boxreg_ros.core.method.arrays import ANCHOR, BIAS, EXTENT, GAP, PIVOT, SHARED, SIDESLIP
+from boxreg_ros.core.method.constants import RESIDUAL_NAMES
 import numpy as np
 import torch
 
@@ -41,32 +42,33 @@ def along(t, step):
     return torch.cat([(t['axes'].mT @ step[:, :3, None])[..., 0], step[:, 3:]], 1)
 
 
-def weighted(i, r, t):
-    """Return residual `i` times the root of its weights."""
-    return (t['W'][: len(r), i, : r.shape[1]].sqrt() * r).flatten()
+def weighted(name, r, t):
+    """Return a residual of the table, by its name, times the root of its weights."""
+    W = t['W'][: len(r), RESIDUAL_NAMES.index(name), : r.shape[1]]
+    return (W.sqrt() * r).flatten()
 
 
 def input_pose(p, s, t):
     """(M3)."""
-    return weighted(0, along(t, p - t['given']) - s[BIAS:GAP], t)
+    return weighted('input', along(t, p - t['given']) - s[BIAS:GAP], t)
 
 
 def rigid_shape(p, s, t):
     """(M4)."""
     off = along(t, p - t['start']) - s[ANCHOR:SIDESLIP] - t['wanted']
-    return weighted(1, (t['root'].mT @ off[..., None])[..., 0], t)
+    return weighted('rigid shape', (t['root'].mT @ off[..., None])[..., 0], t)
 
 
 def acceleration(p, s, t):
     """(M5)."""
     dt = t['time'].diff()[:, None]
     change = (p.diff(dim=0) / dt).diff(dim=0) / ((dt[1:] + dt[:-1]) / 2)
-    return weighted(2, along({'axes': t['axes'][1:-1]}, change), t)
+    return weighted('acceleration', along({'axes': t['axes'][1:-1]}, change), t)
 
 
 def zero_motion(p, s, t):
     """(M6)."""
-    return weighted(3, p.diff(dim=0), t)
+    return weighted('zero motion', p.diff(dim=0), t)
 
 
 def slip(p, s, t):
@@ -76,7 +78,17 @@ def slip(p, s, t):
     velocity = (p[:, :3] - s[PIVOT] * x).diff(dim=0) / t['time'].diff()[:, None]
     across = mean[:, :, 1] - s[SIDESLIP] * mean[:, :, 0]
     r = torch.stack([(across * velocity).sum(1), (mean[:, :, 2] * velocity).sum(1)], 1)
-    return weighted(4, r, t)
+    return weighted('slip', r, t)
+
+
+OF_OBSERVATIONS = {
+    'input': input_pose,
+    'rigid shape': rigid_shape,
+    'acceleration': acceleration,
+    'zero motion': zero_motion,
+    'slip': slip,
+}
+"""The residuals of the table `RESIDUALS`, by their names."""
 
 
 def shared_prior(p, s, c):
@@ -92,8 +104,8 @@ def marginalisation_prior(p, s, c):
 def whitened(x, terms, common):
     """Return all whitened residuals (R,) at variables x (6 N + 23,)."""
     p, s = x[:-SHARED].view(-1, 6), x[-SHARED:]
-    of_observations = faces, input_pose, rigid_shape, acceleration, zero_motion, slip
-    parts = [function(p, s, terms) for function in of_observations]
+    parts = [OF_OBSERVATIONS[name](p, s, terms) for name in RESIDUAL_NAMES]
+    parts += [faces(p, s, terms)]
     return torch.cat([*parts, shared_prior(p, s, common), marginalisation_prior(p, s, common)])
 
 

@@ -33,10 +33,19 @@ POSE4 = [0, 1, 2, YAW]
 
 class KindOfMotion(NamedTuple):
     """
-    Motion of a kind of object: densities of `turn_rate.predict`, largest speed [m/s].
+    Motion of a kind of object.
 
-    Points nearer to the road than `clearance` may be of it [m]. Of others than rigid objects
-    points do not show the extents: limbs move.
+    Attributes
+    ----------
+    noise : array, shape (5,)
+        Spectral densities of acceleration [m^2/s^3], angular acceleration [rad^2/s^3], slip
+        sideways and upward [m^2/s] and turning [rad^2/s], see `turn_rate.predict`. Chosen.
+    max_speed : float
+        Largest speed [m/s]. Chosen.
+    is_rigid : bool
+        Whether points show the extents; of other objects limbs move.
+    clearance : float
+        Points nearer to the road may be of it [m].
 
     """
 
@@ -261,7 +270,7 @@ class Follower:
         rows, boxes = self._seeds.rows[seed : seed + 2], self._seeds.boxes[seed : seed + 2]
         seconds = self._sweeps.times[rows[1]] - self._sweeps.times[rows[0]]
         distance = np.linalg.norm(boxes[1, :2] - boxes[0, :2])
-        return bool(distance > self._kind.max_speed * seconds + 1.0)
+        return bool(distance > self._kind.max_speed * seconds + FOLLOW.seed_error)
 
     def fit_of(self, rows: Ints, poses: Floats) -> float:
         """Return the mean score of poses (n, 4) in sweeps `rows` (n,)."""
@@ -272,8 +281,8 @@ class Follower:
         """Return the points around a prediction, and the pose by them."""
         reach = 0.0
         if way.reason:
-            far = 2.5 * float(np.sqrt(state.covariance[0, 0] + state.covariance[1, 1]))
-            reach = min(far, FOLLOW.max_search)
+            deviation = float(np.sqrt(state.covariance[0, 0] + state.covariance[1, 1]))
+            reach = min(FOLLOW.search_deviations * deviation, FOLLOW.max_search)
         points = self._near(row, state.pose, FOLLOW.around + max(reach, 2 * FOLLOW.cell))
         expected = Expected(state, reach, way.usual, self._road)
         found: Registered = sweep_fit.find(points, expected, self._target)
@@ -313,16 +322,16 @@ class Follower:
         if not around:
             return 0.0
         period = max(abs(times[other] - times[row]) for other in around)
-        step = min(3.0, 0.35 / max(period, 1e-3))
+        step = min(FOLLOW.max_speed_step, FOLLOW.start_shift / period)
         count = int(self._kind.max_speed / step)
-        speeds = step * np.arange(-count // 3, count + 1)
+        speeds = step * np.arange(-count // FOLLOW.forward_over_reverse, count + 1)
         forward = np.array([np.cos(pose[3]), np.sin(pose[3]), 0.0, 0.0])
         scores = np.zeros(len(speeds))
         for i, speed in enumerate(speeds):
             for other in around:
                 start = pose + speed * (times[other] - times[row]) * forward
                 state = State(np.array([*start, speed, 0.0]), START)
-                scores[i] += self._registered(other, state, 6).fit.score
+                scores[i] += self._registered(other, state, FOLLOW.start_iterations).fit.score
             scores[i] = scores[i] / len(around) - _cost(speed, mean)
         likely = speeds[np.argsort(-scores, kind='stable')[: FOLLOW.speeds_tested]]
         tested = [self._tested_speed(row, pose, speed, mean) for speed in likely]
@@ -342,7 +351,7 @@ class Follower:
                 if not self._sweeps.has(other):
                     break
                 state = self._predicted(state, times[other] - times[other - sign])
-                found = self._registered(other, state, 8)
+                found = self._registered(other, state, FOLLOW.test_iterations)
                 total += sweep_fit.rank(found) / count
                 weights += 1 / count
                 state = turn_rate.update(state, found.pose, found.covariance)
@@ -372,5 +381,9 @@ class Follower:
 
 def _cost(speed: float, mean: float) -> float:
     """Return how much better the score of a speed has to be than that of the mean speed."""
-    is_other = abs(speed - mean) > 0.7
-    return 0.03 * is_other + 0.1 * (is_other and speed < -0.7) + 0.002 * abs(speed - mean)
+    cost = FOLLOW.difference_cost * abs(speed - mean)
+    if abs(speed - mean) > FOLLOW.same_speed:
+        cost += FOLLOW.speed_cost
+        if speed < -FOLLOW.same_speed:
+            cost += FOLLOW.reverse_cost
+    return cost

@@ -190,6 +190,15 @@ def empty_axes(N):
     return Axes(np.empty((N, 3, 3)), np.empty((N, 3, 3, 3)))
 
 
+@loop
+def has_weight(W):
+    """Return whether any row of a residual has a weight, W (6,)."""
+    total = 0.0
+    for k in range(POSE):
+        total += abs(W[k])
+    return total != 0.0
+
+
 @kernel
 def add_all(poses, shared, last, terms, at, out, gradient, A):
     """Add all `RESIDUALS` that begin at the first `last` observations."""
@@ -198,7 +207,7 @@ def add_all(poses, shared, last, terms, at, out, gradient, A):
     for row in literal_unroll(RESIDUALS):
         for n in range(min(last, number_of(len(poses), row.poses, True))):
             W = terms[n].W[i]
-            if W[0] != 0.0:
+            if has_weight(W):
                 out.J[:] = 0.0
                 out.S[:] = 0.0
                 rows, columns = row.function(n, poses, shared, terms, at, out)

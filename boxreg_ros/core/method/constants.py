@@ -74,7 +74,8 @@ class Constants(NamedTuple):
     """Turn of a parked object, in errors of the input yaw, and bound of the gaps of tracks, in
     their deviations. Literature: as `outlier`."""
     gap_outlier: float = 2.0
-    """The same for the prior of a labelling margin, weight 1/2. Chosen."""
+    """Deviation at which the prior of a labelling margin has weight 1/2, in standard deviations.
+    Chosen."""
     is_robust: bool = True
     """Whether motion residuals are robust: not from a start that is as noisy as the input."""
     pin_deviations: tuple[float, ...] = (0.02, 0.02, 0.02, 0.005, 0.005, 0.005, 0.01)

@@ -93,6 +93,29 @@ class FollowNumbers(NamedTuple):
     """Sweeps in each direction that a start speed is tested with."""
     speeds_tested: int = 4
     """Most likely speeds by the first sweeps that are tested with `search_sweeps`."""
+    search_deviations: float = 2.5
+    """Deviations of the predicted place that a lost object is searched in: 99 % of them."""
+    seed_error: float = 1.0
+    """Seeds farther apart than an object moves, by less than this, are of one object [m]."""
+    max_speed_step: float = 3.0
+    """Largest step between the start speeds that are compared [m/s]."""
+    start_shift: float = 0.35
+    """Start speeds are so close that their places in the next sweep differ by no more [m]: less
+    than `margin`, from which the registration of a sweep finds the object."""
+    forward_over_reverse: int = 3
+    """Largest start speed forward over that in reverse."""
+    start_iterations: int = 6
+    """Iterations of the registration at each start speed."""
+    test_iterations: int = 8
+    """The same at the speeds that are tested: they are compared by their ends."""
+    same_speed: float = 0.7
+    """Start speeds that differ by less from the mean one are the same [m/s]."""
+    speed_cost: float = 0.03
+    """Score that another speed than the mean one has to gain."""
+    reverse_cost: float = 0.1
+    """The same of reversing, beside `speed_cost`."""
+    difference_cost: float = 0.002
+    """The same of each m/s of difference from the mean speed."""
 
     # Boxes between seeds, and extents
     max_gap_yaw: float = 0.15
