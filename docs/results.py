@@ -329,14 +329,16 @@ def _paper(documents: Documents) -> Iterable[str]:
 
 def _ablation(documents: Documents) -> Iterable[str]:
     """Yield the losses of 3D IoU without each ingredient on all recordings, the largest first."""
-    losses: dict[str, list[list[float]]] = {name: [] for name in INGREDIENTS if name != WHOLE}
+    losses: dict[str, list[list[float]]] = {}
     titles = []
     for data, document in documents:
         estimates = document['results'][data].values()
         titles.append(result_tables.title_of(data))
-        for name, found in losses.items():
+        for name in INGREDIENTS:
             pairs = [(rows[WHOLE], rows[name]) for rows in estimates if name in rows]
-            found.append([whole['iou_3d'] - without['iou_3d'] for whole, without in pairs])
+            if pairs and name != WHOLE:
+                found = [whole['iou_3d'] - without['iou_3d'] for whole, without in pairs]
+                losses.setdefault(name, []).append(found)
     rows = [
         [f'{name}: {INGREDIENTS[name].meaning}', *(' / '.join(map(_loss, pair)) for pair in found)]
         for name, found in sorted(losses.items(), key=lambda item: -max(map(max, item[1])))
