@@ -113,7 +113,7 @@ $(runtime): constraints.txt setup.py package.xml
 	$(INSTALL) -e '.[ros,report,tracking]'
 	@touch $@
 
-$(tests): $(runtime) $(shell find test/interfaces test/build_interfaces.py -type f)
+$(tests): $(runtime) $(shell find test/interfaces msg_adapters/interfaces test/build_interfaces.py -type f)
 	$(INSTALL) -e '.[ros,report,tracking,test,interfaces]'
 	$(BIN)/python test/build_interfaces.py
 	@touch $@

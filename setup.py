@@ -54,8 +54,12 @@ setup(
         ('share/ament_index/resource_index/packages', [f'{NAME}/resource/{NAME}']),
         (f'share/{NAME}', ['package.xml', *sorted(glob(f'{NAME}/share/*'))]),
     ],
-    # Read by the node and `relabel --report`, without an installation too.
-    package_data={NAME: ['py.typed', 'share/*', 'review/page/*'], 'msg_adapters': ['py.typed']},
+    # Read by the node, `relabel --report` and of recordings without definitions, without an
+    # installation too.
+    package_data={
+        NAME: ['py.typed', 'share/*', 'review/page/*'],
+        'msg_adapters': ['py.typed', 'interfaces/*/*/msg/*.msg'],
+    },
     entry_points={
         'console_scripts': [
             f'boxreg = {NAME}.cli:command',
@@ -98,6 +102,8 @@ setup(
         'compressed': ['DracoPy>=2,<3'],
         # Data sets as recordings: tables of nuScenes, pickles of PandaSet, tables of Arrow, PCD.
         'datasets': ['ijson>=3.2', 'pandas>=2', 'pyarrow', 'python-neo-lzf>=0.3'],
+        # Point clouds that are compressed by Cloudini. Its licence is the GPL 3.
+        'cloudini': ['pureini>=0.10'],
         # Label formats that are tables of Arrow: parquet, argoverse2, waymo.
         'formats': ['pyarrow'],
         # MCAP files whose boxes are protobuf.
@@ -131,6 +137,7 @@ setup(
             'flask',
             'flask-cors',
             'foxglove-schemas-protobuf',
+            'foxglove-sdk',
             'gcp-storage-emulator',
             'gcsfs',
             'hypothesis',
@@ -148,6 +155,7 @@ setup(
             'pandas>=2',
             'playwright',
             'plotly',
+            'pureini>=0.10',
             'pyarrow',
             'pytest',
             'pytest-cov',

@@ -1,8 +1,9 @@
 """
-``autoware_perception_msgs``: TrackedObjects, and DetectedObjects, which have no ids.
+``autoware_perception_msgs``: TrackedObjects, PredictedObjects; DetectedObjects, which have no ids.
 
-The track id is the UUID in hexadecimal, the class the most probable label, the score
-`existence_probability`. The pose is the centre, `dimensions` are length, width and height.
+Those of ``autoware_auto_perception_msgs``, their package before, are read as well. The track id is
+the UUID in hexadecimal, the class the most probable label, the score `existence_probability`. The
+pose is the centre, `dimensions` are length, width and height.
 
 """
 
@@ -25,31 +26,37 @@ CYLINDER = 1
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 """Rotation by 180 degrees about z."""
 REQUIRED_FIELDS = (
-    'kinematics.pose_with_covariance.pose',
-    'kinematics.orientation_availability',
+    'kinematics',
     'shape.type',
     'shape.dimensions',
     'classification',
     'existence_probability',
 )
+KINEMATICS_FIELDS = ('pose_with_covariance.pose', 'orientation_availability')
+PREDICTED_FIELDS = ('initial_pose_with_covariance.pose', 'predicted_paths')
+"""Fields of the kinematics that are read, and those of a PredictedObject."""
+INITIAL = 'initial_'
+"""Begin of the names of pose, twist and acceleration in the kinematics of a PredictedObject."""
 
 
 def from_msg(msg: Any) -> BoxArray:
     """
-    Return the boxes of TrackedObjects or DetectedObjects; UnsupportedMessage without a field.
+    Return the boxes of objects of any of the types; UnsupportedMessage without a field.
 
     An object without orientation gets NaN angles, so that its box is returned unchanged, unless it
     is a cylinder. The sign of the heading is resolved per track later.
 
     """
     poses.require_fields('TrackedObjects', msg.objects[:1], REQUIRED_FIELDS)
+    for o in msg.objects[:1]:
+        names = PREDICTED_FIELDS if _prefix_of(o.kinematics) else KINEMATICS_FIELDS
+        poses.require_fields('TrackedObjects', [o.kinematics], names)
     boxes = poses.boxes_of(
-        [o.kinematics.pose_with_covariance.pose for o in msg.objects],
+        [_posed(o.kinematics).pose for o in msg.objects],
         [o.shape.dimensions for o in msg.objects],
     )
     for box, o in zip(boxes, msg.objects, strict=True):
-        has_orientation = o.kinematics.orientation_availability != ORIENTATION_UNAVAILABLE
-        if not has_orientation and o.shape.type != CYLINDER:
+        if not _has_orientation(o.kinematics) and o.shape.type != CYLINDER:
             box[ROLL : YAW + 1] = np.nan
     return BoxArray(
         poses.stamp_ns(msg.header),
@@ -68,14 +75,15 @@ def to_msg(
     Return a copy with the boxes replaced; see `Adapter.to_msg`.
 
     Fields in the frame of the object follow its box: the footprint is scaled, twist and
-    acceleration are rotated where the heading flips by 180 degrees.
+    acceleration are rotated where the heading flips by 180 degrees. Predicted paths change their
+    frame only.
 
     """
     quaternions_xyzw = poses.quaternions_of(boxes.boxes)
     objects = []
     for i, (o, box) in enumerate(zip(msg.objects, boxes.boxes, strict=True)):
         covariance = None if covariances is None else covariances[i]
-        given_pose = poses.moved(o.kinematics.pose_with_covariance.pose, T_out_in)
+        given_pose = poses.moved(_posed(o.kinematics).pose, T_out_in)
         pose, size = poses.with_box(given_pose, o.shape.dimensions, box, quaternions_xyzw[i])
         if o.shape.type == CYLINDER and np.isfinite(box).all():
             diameter = float(box[LENGTH : WIDTH + 1].mean())
@@ -109,18 +117,41 @@ def _with_pose(
     is_flipped: bool,
 ) -> Any:
     """Return a copy of the kinematics with another pose and covariance."""
-    own = kinematics.pose_with_covariance
-    fields = {'pose_with_covariance': poses.with_covariance(own, pose, covariance, T_out_in)}
+    prefix = _prefix_of(kinematics)
+    posed = poses.with_covariance(_posed(kinematics), pose, covariance, T_out_in)
+    fields: dict[str, Any] = {f'{prefix}pose_with_covariance': posed}
     if hasattr(kinematics, 'has_position_covariance'):
         is_estimated = covariance is not None and bool(np.isfinite(covariance).all())
         fields['has_position_covariance'] = is_estimated or kinematics.has_position_covariance
     if is_flipped:
         for name, inner in (('twist', 'twist'), ('acceleration', 'accel')):
-            motion = getattr(kinematics, f'{name}_with_covariance', None)
+            motion = getattr(kinematics, f'{prefix}{name}_with_covariance', None)
             if motion is not None:
                 rotated = poses.rotated_motion(motion, inner, HALF_TURN)
-                fields[f'{name}_with_covariance'] = rotated
+                fields[f'{prefix}{name}_with_covariance'] = rotated
+    if prefix and T_out_in is not None:
+        fields['predicted_paths'] = [
+            poses.replaced(path, path=[poses.moved(step, T_out_in) for step in path.path])
+            for path in kinematics.predicted_paths
+        ]
     return poses.replaced(kinematics, **fields)
+
+
+def _prefix_of(kinematics: Any) -> str:
+    """Return the begin of the names of pose, twist and acceleration."""
+    return INITIAL if hasattr(kinematics, f'{INITIAL}pose_with_covariance') else ''
+
+
+def _posed(kinematics: Any) -> Any:
+    """Return the pose with its covariance."""
+    return getattr(kinematics, f'{_prefix_of(kinematics)}pose_with_covariance')
+
+
+def _has_orientation(kinematics: Any) -> bool:
+    """Return whether the orientation is known; predictions do not say, and have one."""
+    if _prefix_of(kinematics):
+        return True
+    return bool(kinematics.orientation_availability != ORIENTATION_UNAVAILABLE)
 
 
 def _track_id(o: Any) -> str:

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 
 HEADER = 4
 """Bytes before the first field; alignment counts from there."""
-PADDING = 4
-"""Fewer bytes than this may follow the last field: a message ends on a multiple."""
 LITTLE_ENDIAN = 1
 """Second byte of the header, of the only encoding that is walked."""
 STEP_NUMBERS, STEP_TEXT, STEP_SEQUENCE, STEP_ITEMS, STEP_END = range(5)
@@ -44,20 +42,15 @@ class Layout:
     """
     Steps through the fields of a message type, and where to note the places of some of them.
 
-    `kind` is the class of the messages, of rclpy, or another object with its field types;
-    `kind_of` returns the same of a type that a field has, as ``std_msgs/Header``. Fields to find
-    are paths, as ``items.pose.position.x``; all strings are found, too. Raises UnsupportedMessage
-    if the type lacks one of the fields, or has one of a type that is not walked.
+    `kind` is the class of the messages, of rclpy. Fields to find are paths, as
+    ``items.pose.position.x``. Raises UnsupportedMessage if the type lacks one of the fields, or
+    has one of a type that is not walked.
 
     """
 
-    def __init__(
-        self, kind: Any, paths: Sequence[str], kind_of: Callable[[str], Any] | None = None
-    ) -> None:
-        self._kind_of = kind_of or _class_of
+    def __init__(self, kind: Any, paths: Sequence[str]) -> None:
         steps = list(self._steps_of(kind, ''))
-        self._texts = tuple(path for step, *_, path in steps if step == STEP_TEXT)
-        self._paths = tuple(dict.fromkeys((*paths, *self._texts)))
+        self._paths = tuple(dict.fromkeys(paths))
         missing = set(paths) - {path for *_, path in steps}
         if missing:
             raise UnsupportedMessage(
@@ -85,7 +78,7 @@ class Layout:
         counts[:] = 0
         walk_compiled(body, size, self._steps, counts, places)
         found = {path: places[i, : counts[i]] for i, path in enumerate(self._paths)}
-        return Fields(data, body, found, self._texts, int(end))
+        return Fields(data, body, found)
 
     def _steps_of(self, kind: Any, prefix: str) -> Iterator[tuple[int, int, int, str]]:
         """Yield step, size [bytes], count and path for all fields of a class."""
@@ -104,7 +97,7 @@ class Layout:
         if element == 'string':
             inner = [(STEP_TEXT, 1, 1, path)]
         elif '/' in element:
-            inner = list(self._steps_of(self._kind_of(element), f'{path}.'))
+            inner = list(self._steps_of(_class_of(element), f'{path}.'))
         else:
             raise UnsupportedMessage(f'{path}: expected numbers, strings or messages, got {text}')
         if count == 1:
@@ -126,8 +119,7 @@ class Fields:
     The fields that a `Layout` has found in a message.
 
     `body` are the bytes after its header, filled up to a multiple of 8 with zeros. `places` has
-    offset in `body` and count (numbers, letters, items) of each field by path, (k, 2); `texts` are
-    the paths of all strings; `end` is where in `body` the last field ends.
+    offset in `body` and count (numbers, letters, items) of each field by path, (k, 2).
 
     """
 
@@ -136,31 +128,11 @@ class Fields:
         data: bytes,
         body: NDArray[np.uint8],
         places: dict[str, NDArray[np.int64]],
-        texts: tuple[str, ...],
-        end: int,
     ) -> None:
         self._data = data
         self._body = body
         self._places = places
-        self._texts = texts
-        self._end = end
         self._strings: dict[str, list[bytes]] = {}  # by path, once they are asked for
-
-    def is_flawless(self) -> bool:
-        """Return whether all strings are of UTF-8 and end with a zero, and no bytes are left."""
-        if len(self._data) - HEADER - self._end >= PADDING:
-            return False
-        ends = np.concatenate([self._places[path].sum(1) - 1 for path in self._texts])
-        lengths = np.concatenate([self.counts(path) for path in self._texts])
-        if not lengths.all() or self._body[ends].any():
-            return False
-        try:
-            for path in self._texts:
-                for text in set(self._encoded(path)):
-                    text.decode()
-        except UnicodeDecodeError:
-            return False
-        return True
 
     def counts(self, path: str) -> NDArray[np.int64]:
         """Return how many elements (k,) a sequence or array has, for each item that it is in."""

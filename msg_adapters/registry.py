@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, cast
 
@@ -27,31 +27,40 @@ class MessageType:
     """Fields that are written besides pose and size."""
 
 
+TRACKED_TYPE = MessageType(
+    'msg_adapters.autoware',
+    track_id='UUID in hexadecimal',
+    class_and_score='most probable label, `existence_probability`',
+    also_written=(
+        'covariance; footprint, scaled with the box; twist and acceleration, rotated where '
+        'the heading flips'
+    ),
+)
+PREDICTED_TYPE = replace(
+    TRACKED_TYPE, also_written=f'{TRACKED_TYPE.also_written}; predicted paths are copied'
+)
+DETECTED_TYPE = MessageType(
+    'msg_adapters.autoware',
+    class_and_score='most probable label, `existence_probability`',
+    also_written=(
+        'covariance and `has_position_covariance`; footprint, scaled with the box; twist, '
+        'rotated where the heading flips'
+    ),
+)
 MESSAGE_TYPES = {
     'vision_msgs/msg/Detection3DArray': MessageType(
         'msg_adapters.vision',
-        track_id='`id`; an empty one is filled in',
+        track_id='`id`, `tracking_id` of vision_msgs 2; an empty one is filled in',
         class_and_score='hypothesis with the highest score',
         also_written='poses of the hypotheses and their covariance',
     ),
     'vision_msgs/msg/BoundingBox3DArray': MessageType('msg_adapters.vision'),
-    'autoware_perception_msgs/msg/TrackedObjects': MessageType(
-        'msg_adapters.autoware',
-        track_id='UUID in hexadecimal',
-        class_and_score='most probable label, `existence_probability`',
-        also_written=(
-            'covariance; footprint, scaled with the box; twist and acceleration, rotated where '
-            'the heading flips'
-        ),
-    ),
-    'autoware_perception_msgs/msg/DetectedObjects': MessageType(
-        'msg_adapters.autoware',
-        class_and_score='most probable label, `existence_probability`',
-        also_written=(
-            'covariance and `has_position_covariance`; footprint, scaled with the box; twist, '
-            'rotated where the heading flips'
-        ),
-    ),
+    'autoware_perception_msgs/msg/TrackedObjects': TRACKED_TYPE,
+    'autoware_perception_msgs/msg/PredictedObjects': PREDICTED_TYPE,
+    'autoware_perception_msgs/msg/DetectedObjects': DETECTED_TYPE,
+    'autoware_auto_perception_msgs/msg/TrackedObjects': TRACKED_TYPE,
+    'autoware_auto_perception_msgs/msg/PredictedObjects': PREDICTED_TYPE,
+    'autoware_auto_perception_msgs/msg/DetectedObjects': DETECTED_TYPE,
     'derived_object_msgs/msg/ObjectArray': MessageType(
         'msg_adapters.derived',
         track_id='`id`',

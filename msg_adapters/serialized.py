@@ -77,9 +77,8 @@ class SerializedAdapter:
     """
     An `Adapter` whose messages are bytes, as they arrive and as they are published.
 
-    `kind` is the class of the type, of rclpy, and `kind_of` as for `Layout`; `inner` is the
-    adapter of the messages that `deserialize` makes. Raises UnsupportedMessage if the type is an
-    older one that lacks a field.
+    `kind` is the class of the type, of rclpy; `inner` is the adapter of the messages that
+    `deserialize` makes. Raises UnsupportedMessage if the type is an older one that lacks a field.
 
     """
 
@@ -89,7 +88,6 @@ class SerializedAdapter:
         kind: Any,
         inner: Adapter,
         deserialize: Callable[[bytes, Any], Any],
-        kind_of: Callable[[str], Any] | None = None,
     ) -> None:
         self._at = BOX_FIELDS[type_name]
         self._kind = kind
@@ -97,7 +95,7 @@ class SerializedAdapter:
         self._deserialize = deserialize
         at = self._at
         paths = (at.stamp, *at.frames, at.pose, at.size, at.covariance, *at.others)
-        self._layout = Layout(kind, [path for path in dict.fromkeys(paths) if path], kind_of)
+        self._layout = Layout(kind, [path for path in dict.fromkeys(paths) if path])
 
     def from_msg(self, msg: bytes) -> BoxArray:
         """Return the boxes of a message, see `Adapter`."""
@@ -105,11 +103,6 @@ class SerializedAdapter:
         if fields is None:
             return self._inner.from_msg(self._deserialize(msg, self._kind))
         return self._boxes_of(fields)
-
-    def read_flawless(self, msg: bytes) -> BoxArray | None:
-        """Return the boxes of a message; None if a reader by objects may refuse it."""
-        fields = self._ordinary(msg)
-        return None if fields is None or not fields.is_flawless() else self._boxes_of(fields)
 
     def _boxes_of(self, fields: Fields) -> BoxArray:
         """Return the boxes of a message that arrays can represent."""

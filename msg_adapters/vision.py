@@ -3,6 +3,8 @@
 
 The track id is the `id` of a detection; class and score are those of the hypothesis with the
 highest score. ``center`` is the pose of the box, ``size`` its extents along x, y and z of the box.
+The definition of vision_msgs 2 (ROS 2 Foxy) is read as well: its track id is `tracking_id`, where
+`is_tracking` is set. That of vision_msgs 1 (ROS 1) has no track ids.
 
 """
 
@@ -21,8 +23,7 @@ def from_msg(msg: Any) -> BoxArray:
     """
     Return the boxes; a detection without hypotheses has the class ``''`` and the score 1.
 
-    Raises UnsupportedMessage if a detection is in another frame than the array, or the definition
-    is older than vision_msgs 4.
+    Raises UnsupportedMessage if a detection is in another frame than the array, or lacks a field.
 
     """
     if hasattr(msg, 'detections'):
@@ -59,7 +60,9 @@ def to_msg(
         covariance = None if covariances is None else covariances[i]
         results = []
         for result in detection.results:
-            pose = poses.with_covariance(result.pose, bbox.center, covariance, T_out_in)
+            pose = bbox.center
+            if hasattr(result.pose, 'covariance'):
+                pose = poses.with_covariance(result.pose, pose, covariance, T_out_in)
             results.append(poses.replaced(result, pose=pose))
         detections.append(
             poses.replaced(
@@ -67,7 +70,7 @@ def to_msg(
                 header=poses.with_frame(detection.header, boxes.frame_id),
                 results=results,
                 bbox=bbox,
-                id=detection.id or boxes.track_ids[i],
+                **_id_fields(detection, boxes.track_ids[i]),
             )
         )
     return poses.replaced(msg, header=header, detections=detections)
@@ -84,11 +87,14 @@ def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
 
 def _unseen(detection: Any, header: Any) -> Any:
     """Return a detection with its best hypothesis only, at the score 0, under another header."""
-    results = sorted(detection.results, key=lambda result: -result.hypothesis.score)[:1]
-    unseen = [
-        poses.replaced(result, hypothesis=poses.replaced(result.hypothesis, score=0.0))
-        for result in results
-    ]
+    best = sorted(detection.results, key=lambda result: -_hypothesis_of(result).score)[:1]
+    unseen = []
+    for result in best:
+        if hasattr(result, 'hypothesis'):
+            scored = poses.replaced(result.hypothesis, score=0.0)
+            unseen.append(poses.replaced(result, hypothesis=scored))
+        else:
+            unseen.append(poses.replaced(result, score=0.0))
     return poses.replaced(detection, header=header, results=unseen)
 
 
@@ -96,11 +102,11 @@ def _from_detections(msg: Any) -> BoxArray:
     header = poses.common_header('Detection3DArray', msg.header, msg.detections)
     try:
         best = [_best_hypothesis(detection) for detection in msg.detections]
-        track_ids = tuple(str(detection.id) for detection in msg.detections)
+        track_ids = tuple(_track_id(detection) for detection in msg.detections)
     except AttributeError as error:
         raise UnsupportedMessage(
-            f'Detection3DArray: expected the fields of vision_msgs 4 (ROS 2 Galactic and '
-            f'later), got a message where {error}; convert the recording'
+            f'Detection3DArray: expected the fields of a release of vision_msgs, got a message '
+            f'where {error}; convert the recording'
         ) from None
     boxes = [detection.bbox for detection in msg.detections]
     return BoxArray(
@@ -118,7 +124,33 @@ def _with_box(bbox: Any, box: Floats, quaternion_xyzw: Floats) -> Any:
     return poses.replaced(bbox, center=center, size=size)
 
 
+def _track_id(detection: Any) -> str:
+    """Return the track id of a detection; '' if it has none."""
+    if hasattr(detection, 'is_tracking'):  # vision_msgs 2
+        return str(detection.tracking_id) if detection.is_tracking else ''
+    if hasattr(detection, 'source_cloud'):  # vision_msgs 1
+        return ''
+    return str(detection.id)
+
+
+def _id_fields(detection: Any, track_id: str) -> dict[str, Any]:
+    """Return the fields of the track id of a detection: its own, or else `track_id`."""
+    if hasattr(detection, 'is_tracking'):
+        own = str(detection.tracking_id) if detection.is_tracking else ''
+        return {'is_tracking': bool(own or track_id), 'tracking_id': own or track_id}
+    return {'id': detection.id or track_id} if hasattr(detection, 'id') else {}
+
+
+def _hypothesis_of(result: Any) -> Any:
+    """Return the part of a result with class and score: itself before vision_msgs 3."""
+    return result.hypothesis if hasattr(result, 'hypothesis') else result
+
+
 def _best_hypothesis(detection: Any) -> tuple[str, float]:
     """Return class and score of the hypothesis with the highest score."""
-    found = [(str(r.hypothesis.class_id), float(r.hypothesis.score)) for r in detection.results]
+    found = []
+    for result in detection.results:
+        hypothesis = _hypothesis_of(result)
+        name = hypothesis.class_id if hasattr(hypothesis, 'class_id') else hypothesis.id
+        found.append((str(name), float(hypothesis.score)))
     return max(found, key=lambda item: item[1], default=('', 1.0))

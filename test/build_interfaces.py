@@ -1,9 +1,10 @@
 """
-Build Python type support for the packages in ``test/interfaces`` into the running environment.
+Build Python type support for message packages into the running environment.
 
-The registries have no wheels of these message packages. The real rosidl generators build them
-from their field lists. The type hashes equal those of the originals, so tests communicate with
-nodes that use the originals. A package whose files have not changed since its build is skipped.
+They are those of ROS 2 Jazzy in ``msg_adapters/interfaces``, and those in ``test/interfaces``. The
+registries have no wheels of these message packages. The real rosidl generators build them from
+their field lists. The type hashes equal those of the originals, so tests communicate with nodes
+that use the originals. A package whose files have not changed since its build is skipped.
 
 """
 
@@ -18,6 +19,7 @@ import sys
 from tempfile import TemporaryDirectory
 
 HERE = Path(__file__).resolve().parent / 'interfaces'
+FOLDERS = (HERE, HERE.parents[1] / 'msg_adapters' / 'interfaces' / 'jazzy')
 PREFIX = Path(sys.prefix)
 MANIFEST = """<package format="3">
   <name>{name}</name>
@@ -44,7 +46,8 @@ ament_package()
 
 def main() -> None:
     """Build the packages that are new or changed."""
-    packages = [p for p in sorted(HERE.iterdir()) if p.is_dir() and not is_built(p)]
+    found = sorted(path for folder in FOLDERS for path in folder.iterdir() if path.is_dir())
+    packages = [path for path in found if not is_built(path)]
     compiler = os.environ.get('CXX', 'c++')
     if packages and shutil.which(compiler) is None:
         sys.exit(f'no C++ compiler {compiler!r} to build message types with: apt install g++')

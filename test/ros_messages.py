@@ -3,13 +3,14 @@
 from functools import cache
 from pathlib import Path
 
+from boxreg_ros.io.definitions import INTERFACES
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
-INTERFACES = Path(__file__).resolve().parent / 'interfaces'
+RELEASES = ('jazzy', 'humble')
 
 POINTS = 'sensor_msgs/msg/PointCloud2'
 DETECTIONS = 'vision_msgs/msg/Detection3DArray'
@@ -18,6 +19,10 @@ TF = 'tf2_msgs/msg/TFMessage'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 TRACKED = 'autoware_perception_msgs/msg/TrackedObjects'
 DETECTED = 'autoware_perception_msgs/msg/DetectedObjects'
+PREDICTED = 'autoware_perception_msgs/msg/PredictedObjects'
+AUTO_TRACKED, AUTO_DETECTED, AUTO_PREDICTED = (
+    name.replace('autoware_', 'autoware_auto_') for name in (TRACKED, DETECTED, PREDICTED)
+)
 OBJECTS = 'derived_object_msgs/msg/ObjectArray'
 OBJECTS_WITH_COVARIANCE = 'derived_object_msgs/msg/ObjectWithCovarianceArray'
 SCENE = 'foxglove_msgs/msg/SceneUpdate'
@@ -29,13 +34,18 @@ NUMBERS = {'i1': 1, 'u1': 2, 'i2': 3, 'u2': 4, 'i4': 5, 'u4': 6, 'f4': 7, 'f8': 
 
 @cache
 def typestore(stock=Stores.ROS2_JAZZY):
-    """Return a typestore with the stock types and the packages in ``interfaces``."""
-    store = get_typestore(stock)
+    """Return a typestore with the stock types and the packages in ``msg_adapters/interfaces``."""
+    return with_interfaces(get_typestore(stock), RELEASES)
+
+
+def with_interfaces(store, releases):
+    """Register the packages of releases, the first before the others, in a typestore."""
     extra = {}
-    for file in INTERFACES.glob('*/msg/*.msg'):
-        name = f'{file.parts[-3]}/msg/{file.stem}'
-        if name not in store.types:
-            extra.update(get_types_from_msg(file.read_text(), name))
+    for release in releases:
+        for file in (INTERFACES / release).glob('*/msg/*.msg'):
+            name = f'{file.parts[-3]}/msg/{file.stem}'
+            if name not in store.types and name not in extra:
+                extra.update(get_types_from_msg(file.read_text(), name))
     store.register(extra)
     return store
 
@@ -214,6 +224,14 @@ def _tracked(header, number, pose, size):
     return item | {'object_id': {'uuid': [0] * 15 + [number]}}
 
 
+def _predicted(header, number, pose, size):
+    item = _tracked(header, number, pose, size)
+    names = ('pose_with_covariance', 'twist_with_covariance', 'acceleration_with_covariance')
+    initial = {f'initial_{name}': item['kinematics'][name] for name in names}
+    path = {'path': [pose], 'confidence': 0.5}
+    return item | {'kinematics': initial | {'predicted_paths': [path]}}
+
+
 def _object(header, number, pose, size):
     return {
         'header': header, 'id': number, 'detection_level': 1, 'object_classified': True,
@@ -253,6 +271,10 @@ def _bare(header, number, pose, size):
 ITEMS = {
     TRACKED: (_tracked, 'objects'),
     DETECTED: (_autoware, 'objects'),
+    PREDICTED: (_predicted, 'objects'),
+    AUTO_TRACKED: (_tracked, 'objects'),
+    AUTO_DETECTED: (_autoware, 'objects'),
+    AUTO_PREDICTED: (_predicted, 'objects'),
     OBJECTS: (_object, 'objects'),
     OBJECTS_WITH_COVARIANCE: (_object_with_covariance, 'objects'),
     SCENE: (_entity, 'entities'),

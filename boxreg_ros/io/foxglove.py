@@ -1,8 +1,8 @@
 """
 Messages of Foxglove's schemas, as protobuf and as JSON.
 
-Clouds, transforms and images are converted to the corresponding ROS messages. A SceneUpdate stays
-as it is, because adapters read by attribute.
+Clouds, transforms, odometry and images are converted to the corresponding ROS messages. A
+SceneUpdate stays as it is, because adapters read by attribute.
 
 """
 
@@ -16,6 +16,7 @@ from typing import Any
 
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from mcap.records import Schema
+from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
 
 FOXGLOVE_ENCODINGS = ('protobuf', 'json')
 """Encodings of messages with a schema of Foxglove."""
@@ -25,6 +26,7 @@ ROS_TYPES = {
     'foxglove.CompressedPointCloud': 'foxglove_msgs/msg/CompressedPointCloud',
     'foxglove.FrameTransform': 'tf2_msgs/msg/TFMessage',
     'foxglove.FrameTransforms': 'tf2_msgs/msg/TFMessage',
+    'foxglove.Odometry': 'nav_msgs/msg/Odometry',
     'foxglove.CompressedImage': 'sensor_msgs/msg/CompressedImage',
     'foxglove.RawImage': 'sensor_msgs/msg/Image',
     'foxglove.CameraCalibration': 'sensor_msgs/msg/CameraInfo',
@@ -55,6 +57,9 @@ JSON_FIELDS: dict[str, Any] = {
     'foxglove.SceneUpdate': {'entities': [_ENTITY]},
     'foxglove.FrameTransform': _TRANSFORM,
     'foxglove.FrameTransforms': {'transforms': [_TRANSFORM]},
+    'foxglove.Odometry': {
+        'timestamp': _TIME, 'frame_id': str, 'body_frame_id': str, 'pose': _POSE,
+    },
     'foxglove.PointCloud': {
         'timestamp': _TIME, 'frame_id': str, 'pose?': _POSE, 'point_stride': int,
         'fields': [_FIELD], 'data': str,
@@ -82,24 +87,38 @@ def ros_type(schema_name: str) -> str:
     return ROS_TYPES.get(schema_name, schema_name)
 
 
-class ChannelDecoder:
-    """Decodes the messages of one channel, each JSON or protobuf; errors name origin and topic."""
+def schema_as_definition(schema: Schema) -> MessageDefinition:
+    """Return a schema as the definition of a connection, which `ChannelDecoder` reads."""
+    text = f'{schema.name}\n{schema.data.decode("latin1")}'
+    return MessageDefinition(MessageDefinitionFormat.NONE, text)
 
-    def __init__(self, origin: str, topic: str, schema: Schema) -> None:
-        self._origin = f'{origin}: messages on {topic!r}'
-        self._schema = schema
+
+class ChannelDecoder:
+    """
+    Decodes the messages of a connection of JSON or protobuf, as `schema_as_definition` left it.
+
+    Errors name `origin` and topic.
+
+    """
+
+    def __init__(self, origin: str, connection: Connection) -> None:
+        self._origin = f'{origin}: messages on {connection.topic!r}'
+        self._name, _, data = connection.msgdef.data.partition('\n')
+        self._schema = Schema(1, data.encode('latin1'), 'protobuf', self._name)
+        ext: Any = connection.ext
+        self._is_json = ext.serialization_format == 'json'
         self._decode: Callable[[bytes], Any] | None = None
 
     def __call__(self, data: bytes) -> Any:
         """Return a message as ROS has it where it is converted."""
-        if data[:1] == b'{':
-            message = _from_json(data, self._schema.name)
+        if self._is_json:
+            message = _from_json(data, self._name)
         else:
             if self._decode is None:
                 self._decode = self._protobuf()
             message = self._decode(data)
-        if self._schema.name in CONVERTERS:
-            return CONVERTERS[self._schema.name](message)
+        if self._name in CONVERTERS:
+            return CONVERTERS[self._name](message)
         return message
 
     def _protobuf(self) -> Callable[[bytes], Any]:
@@ -275,11 +294,20 @@ def _transforms(message: Any) -> Any:
     )
 
 
+def _odometry(message: Any) -> Any:
+    """Return a foxglove Odometry as that of ROS, without the velocities, which are not read."""
+    return SimpleNamespace(
+        header=_header(message), child_frame_id=message.body_frame_id,
+        pose=SimpleNamespace(pose=message.pose),
+    )  # fmt: skip
+
+
 CONVERTERS = {
     'foxglove.PointCloud': _cloud,
     'foxglove.CompressedPointCloud': _compressed_cloud,
     'foxglove.FrameTransform': _transforms,
     'foxglove.FrameTransforms': _transforms,
+    'foxglove.Odometry': _odometry,
     'foxglove.CompressedImage': _compressed_image,
     'foxglove.RawImage': _raw_image,
     'foxglove.CameraCalibration': _calibration,

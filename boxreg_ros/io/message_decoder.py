@@ -3,65 +3,89 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from itertools import islice
 from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
-from boxreg_ros.io.storage.reader import is_message, Reader
+from boxreg_ros.io.definitions import definitions_of, RELEASES, TypeDefinition
+from boxreg_ros.io.foxglove import ChannelDecoder, FOXGLOVE_ENCODINGS
+from boxreg_ros.io.storage.files import encoding_of
+from boxreg_ros.io.storage.reader import decompressed, is_message
 from boxreg_ros.io.storage.record import one_line, Record
-from rosbags.interfaces import Nodetype
-from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
+from rosbags.serde import SerdeError
+from rosbags.typesys import TypesysError
 from rosbags.typesys.store import Typestore
 
-# Definitions that recordings before ROS 2 Iron lack, and rosbags does not include.
-VISION_DEFINITIONS = {
-    'vision_msgs/msg/ObjectHypothesis': 'string class_id\nfloat64 score',
-    'vision_msgs/msg/ObjectHypothesisWithPose': (
-        'vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose'
-    ),
-    'vision_msgs/msg/BoundingBox3D': 'geometry_msgs/Pose center\ngeometry_msgs/Vector3 size',
-    'vision_msgs/msg/Detection3D': (
-        'std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n'
-        'vision_msgs/BoundingBox3D bbox\nstring id'
-    ),
-    'vision_msgs/msg/Detection3DArray': (
-        'std_msgs/Header header\nvision_msgs/Detection3D[] detections'
-    ),
-}
-
-NAMES = {'bool': 'boolean', 'byte': 'octet', 'float32': 'float', 'float64': 'double'}
-"""Names of rclpy where those of definitions differ."""
+ENCAPSULATIONS = {
+    2: 'PL_CDR', 3: 'PL_CDR', 6: 'XCDR2', 7: 'XCDR2', 8: 'D_CDR2', 9: 'D_CDR2', 10: 'PL_CDR2',
+    11: 'PL_CDR2',
+}  # fmt: skip
+"""Encodings of DDS-XTypes that no middleware of ROS 2 records, by the second byte of a message."""
+SAMPLE = 1000
+"""Messages among which one is looked for that fits one definition alone; chosen."""
 
 
 class MessageDecoder:
     """
-    Decode the messages of a recording, called `origin`, by the definitions in it.
+    Decode the messages of a recording, called `origin`, each by the definition of its connection.
 
     `unreadable` counts the messages of each topic that could not be decoded; `first_errors` says
     why.
 
     """
 
-    def __init__(self, reader: Reader, origin: str) -> None:
-        self._reader = reader
+    def __init__(self, origin: str) -> None:
         self.origin = origin
         self.unreadable: Counter[str] = Counter()
         self.first_errors: dict[str, UnsupportedMessage] = {}
-
-    def complete_definitions(self, kinds: Collection[str]) -> None:
-        """Add the definitions that ROS 2 has of types that the recording does not define."""
-        known = self._reader.typestore.fielddefs
-        if not known.keys() >= {kind for kind in kinds if '/msg/' in kind}:
-            self._reader.complete_definitions(stock_types())
+        self._decoders: dict[tuple[str, ...], _RosDecoder | ChannelDecoder] = {}
 
     def message(self, record: Record) -> Any:
         """Return a message decoded; UnsupportedMessage if its bytes are not of its type."""
-        connection = record.connection
-        kind = connection.msgtype
-        origin = f'{self.origin}: a message on {connection.topic!r} is not a {kind}'
+        return self.decoded(record.connection, record.data)
+
+    def decoded(self, connection: Connection, data: bytes) -> Any:
+        """Return a message on a connection; raises as `message`."""
+        origin = f'{self.origin}: a message on {connection.topic!r} is not a {connection.msgtype}'
         with malformed(f'{origin} as defined there'):
-            return self._reader.deserialize(record.data, kind)
+            return self._decoder_of(connection)(data)
+
+    def choose_definition(self, connection: Connection, records: Iterable[Record]) -> str:
+        """
+        Choose the definition of a type that has several and that the recording does not define.
+
+        It is the one by which the first of `records`, those on the connection, parse whole.
+
+        Returns
+        -------
+        str
+            What was chosen, and of which release of ROS 2; empty if nothing had to be.
+
+        """
+        decoder = self._decoder_of(connection)
+        if not isinstance(decoder, _RosDecoder) or len(decoder.definitions) < 2:
+            return ''
+        for record in islice(records, SAMPLE):
+            with suppress(UnsupportedMessage):
+                if decoder.fits_one(record.data):
+                    release = decoder.definitions[0].release
+                    return (
+                        f'{connection.topic}: the recording has no definition of '
+                        f'{connection.msgtype}; its messages are read as those of ROS 2 '
+                        f'{_releases_from(release, decoder.definitions)}, the only known '
+                        f'definition that they fit'
+                    )
+        return ''
+
+    def store_of(self, connection: Connection) -> Typestore | None:
+        """Return the definition of a connection's messages; None if it is not known, or of ROS."""
+        decoder = self._decoder_of(connection)
+        if isinstance(decoder, _RosDecoder) and decoder.definitions:
+            return decoder.definitions[0].store
+        return None
 
     def count_unreadable(self, topic: str, error: UnsupportedMessage) -> None:
         """Count a message of a topic that cannot be decoded."""
@@ -73,40 +97,97 @@ class MessageDecoder:
         self.unreadable.clear()
         self.first_errors.clear()
 
-
-class RecordedType:
-    """Stand-in for the class of a message type; KeyError if the recording does not define it."""
-
-    def __init__(self, store: Typestore, name: str) -> None:
-        package, _, kind = name.replace('/msg/', '/').partition('/')
-        self.__name__ = name
-        self._fields = store.fielddefs[f'{package}/msg/{kind}'][1]
-
-    def get_fields_and_field_types(self) -> dict[str, str]:
-        """Return the type of each field, as ``double[36]``."""
-        return {name: _field_type(kind) for name, kind in self._fields}
-
-
-def _field_type(kind: Any) -> str:
-    """Return the type of a field."""
-    node, value = kind
-    if node == Nodetype.BASE:
-        return NAMES.get(value[0], str(value[0]))
-    if node == Nodetype.NAME:
-        return str(value).replace('/msg/', '/')
-    element, count = value
-    inner = _field_type(element)
-    return f'{inner}[{count}]' if node == Nodetype.ARRAY else f'sequence<{inner}>'
+    def _decoder_of(self, connection: Connection) -> _RosDecoder | ChannelDecoder:
+        encoding = encoding_of(connection)
+        definition = connection.msgdef
+        key = (connection.msgtype, encoding, definition.data, definition.format.name)
+        decoder = self._decoders.get(key)
+        if decoder is None:
+            if encoding in FOXGLOVE_ENCODINGS:
+                decoder = ChannelDecoder(self.origin, connection)
+            else:
+                decoder = _RosDecoder(connection.msgtype, definition, encoding == 'ros1')
+            self._decoders[key] = decoder
+        return decoder
 
 
-def stock_types() -> Typestore:
-    """Return the definitions used where a recording has none (before ROS 2 Iron)."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types = {}
-    for name, text in VISION_DEFINITIONS.items():
-        types.update(get_types_from_msg(text, name))
-    store.register(types)
-    return store
+class _RosDecoder:
+    """Decodes messages of one definition, or of the first of several known ones that they fit."""
+
+    def __init__(self, kind: str, recorded: MessageDefinition, is_ros1: bool) -> None:
+        self._kind = kind
+        self._is_ros1 = is_ros1
+        self._is_recorded = recorded.format != MessageDefinitionFormat.NONE
+        self.definitions = list(definitions_of(kind, recorded, is_ros1))
+
+    def __call__(self, data: bytes) -> Any:
+        """Return a message; UnsupportedMessage if it fits none of the definitions."""
+        data = decompressed(data)
+        first_error: UnsupportedMessage | None = None
+        for number, definition in enumerate(self.definitions):
+            try:
+                message = self._decoded(definition, data)
+            except UnsupportedMessage as error:
+                first_error = first_error or error
+            else:
+                if number:  # the others are of this one too
+                    self.definitions.insert(0, self.definitions.pop(number))
+                return message
+        raise first_error or UnsupportedMessage(self._absence())
+
+    def fits_one(self, data: bytes) -> bool:
+        """Return whether a message fits one definition alone, which is the first from now on."""
+        data = decompressed(data)
+        fitting = []
+        for definition in self.definitions:
+            with suppress(UnsupportedMessage):
+                self._decoded(definition, data)
+                fitting.append(definition)
+        if len(fitting) != 1:
+            return False
+        self.definitions.remove(fitting[0])
+        self.definitions.insert(0, fitting[0])
+        return True
+
+    def _decoded(self, definition: TypeDefinition, data: bytes) -> Any:
+        store = definition.store
+        decode = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
+        view: Any = memoryview(data)  # parts of it are no copies
+        try:
+            return decode(view, self._kind)
+        # rosbags turns all errors of malformed bytes into SerdeError; the others mean that a
+        # definition refers to a type that rosbags does not decode, as ``wstring``.
+        except (SerdeError, TypesysError, KeyError) as error:
+            encoding = ENCAPSULATIONS.get(data[1]) if data[:1] == b'\0' else None
+            if encoding and not self._is_ros1:
+                raise UnsupportedMessage(
+                    f'expected plain CDR, as the middlewares of ROS 2 write it, got {encoding}; '
+                    f'convert the topic to plain CDR with the middleware that wrote it'
+                ) from None
+            raise UnsupportedMessage(one_line(error)) from None
+
+    def _absence(self) -> str:
+        """Return why there is no definition, and what helps."""
+        if self._is_recorded:
+            return (
+                'the definition in the recording cannot be read; convert the recording by a tool '
+                'that writes it as ros2msg'
+            )
+        package = self._kind.partition('/')[0]
+        return (
+            f'expected its definition in the recording, got none; convert it where {package} is '
+            f'installed, by ros2 bag convert to MCAP, which adds the definitions'
+        )
+
+
+def _releases_from(release: str, definitions: Iterable[TypeDefinition]) -> str:
+    """Return the releases that share a definition, from the oldest to the newest."""
+    names = list(RELEASES)
+    starts = sorted(names.index(definition.release) for definition in definitions)
+    newest = names.index(release)
+    oldest = next((start for start in starts if start > newest), len(names)) - 1
+    named = [names[oldest].capitalize(), names[newest].capitalize()]
+    return ' to '.join(dict.fromkeys(named))
 
 
 @contextmanager

@@ -9,16 +9,17 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Sequence
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast, Self, TYPE_CHECKING
+from typing import Any, cast, Self
 
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.io.definitions import known_store
 from boxreg_ros.io.foxglove import encoded
 from boxreg_ros.io.images import RecordedImages
 from boxreg_ros.io.items import EVERYTHING, Item, LOOKAHEAD_NS, requested_part, Wanted
 from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
-from boxreg_ros.io.message_decoder import malformed, MessageDecoder, RecordedType
+from boxreg_ros.io.message_decoder import malformed, MessageDecoder
 from boxreg_ros.io.recorded_motion import RecordedMotion
 from boxreg_ros.io.resync import MessageOrder
 from boxreg_ros.io.storage.files import part_of
@@ -29,14 +30,13 @@ from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from msg_adapters import adapter_for, clouds, pointcloud, poses
 from msg_adapters.convention import Convention, STANDARD
+import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.typesys.store import Typestore
 
-if TYPE_CHECKING:
-    from msg_adapters.serialized import SerializedAdapter
-
-CDR_BEGIN = b'\0\1'
-"""Begin of a message in little-endian CDR, of no other encoding."""
+JOIN_NS = 20 * 10**6
+"""Box arrays of one stamp that are received within this time are one array [ns]; chosen: they are
+published in a burst, and detectors are slower."""
 
 
 class Recording:
@@ -83,7 +83,9 @@ class Recording:
         self.left_out: Counter[str] = Counter()
         self.label_notes: list[str] = []
         self._decoded_topics: set[str] = set()
-        self._array_adapter: SerializedAdapter | None = None
+        self._waiting: deque[Record] = deque()
+        self._joined: set[int] = set()
+        self._joins = 0
 
     def __enter__(self) -> Self:
         """Open all files and find the topics."""
@@ -115,8 +117,10 @@ class Recording:
         self.data_topics = {*self.points_topics, self.boxes_topic}
         if self._asked_odometry:
             self._topics.find('odometry', 'odometry', (ODOMETRY_TYPE,), self._asked_odometry)
-        self._decoder = MessageDecoder(self._reader, str(self))
-        self._decoder.complete_definitions(self.topics.values())
+        self._decoder = MessageDecoder(str(self))
+        motion = self._topics.transforms | self._topics.of((ODOMETRY_TYPE,))
+        chosen = map(self.choose_definition, self._topics.connections(self.data_topics | motion))
+        self._chosen = list(filter(None, chosen))
         self.unreadable: Counter[str] = self._decoder.unreadable
         self.first_errors: dict[str, UnsupportedMessage] = self._decoder.first_errors
 
@@ -163,32 +167,20 @@ class Recording:
                 record = next(records, None)
             if record is None:
                 return
+            if id(record) in self._joined:
+                self._joined.remove(id(record))
+                continue
             with wanted.stage('decode'):
                 item = self._item(record, wanted.intensities)
+                if item is not None and isinstance(item.content, BoxArray):
+                    item = item._replace(content=self._whole(item.content, record))
             if item is not None:
                 yield item
 
-    def read_boxes_as_arrays(self) -> None:
-        """
-        Read boxes by a compiled loop from now on, where their type and numba allow it.
-
-        They are the same. Messages that rosbags may refuse are left to it.
-
-        """
-        from msg_adapters.cdr import walker  # these take 10 ms, which most commands do not need
-        from msg_adapters.serialized import BOX_FIELDS, SerializedAdapter
-
-        kind = self.topics.get(self.boxes_topic, '')
-        if kind not in BOX_FIELDS or not self.is2 or walker() is None:
-            return
-        kind_of = partial(RecordedType, self.typestore)
-        deserialize = self._reader.deserialize
-        try:
-            self._array_adapter = SerializedAdapter(
-                kind, kind_of(kind), adapter_for(kind), deserialize, kind_of
-            )
-        except (KeyError, UnsupportedMessage):  # a definition is missing, or an older one
-            return
+    def choose_definition(self, connection: Connection) -> str:
+        """Choose the definition of a connection, see `MessageDecoder.choose_definition`."""
+        records = self._reader.messages([connection], None, None)
+        return self._decoder.choose_definition(connection, records)
 
     def check_readable(self) -> None:
         """Raise UnsupportedMessage, after the last item, if no cloud or no boxes were readable."""
@@ -197,40 +189,48 @@ class Recording:
             if topic in self.data_topics and self._decoded_topics.isdisjoint(alike):
                 raise UnsupportedMessage(f'no message on {topic!r} can be read; first: {first}')
 
-    def box_message(self, data: bytes) -> tuple[Any, BoxArray]:
+    def box_message(self, connection: Connection, data: bytes) -> tuple[Any, BoxArray]:
         """Return a message of the boxes' topic, and its boxes; UnsupportedMessage if malformed."""
-        (connection, *_) = self._topics.connections({self.boxes_topic})
-        message = self._decoder.message(Record(connection, 0, data))
+        message = self._decoder.decoded(connection, data)
         return message, cast(BoxArray, self._content(self.boxes_topic, message))
 
-    def with_boxes(self, message: Any, boxes: BoxArray, covariances: Floats) -> bytes:
+    def with_boxes(
+        self, connection: Connection, message: Any, boxes: BoxArray, covariances: Floats
+    ) -> bytes:
         """Return the bytes of a message of the boxes' topic with its boxes replaced."""
         replaced = self._adapter.to_msg(message, boxes, covariances)
-        if not hasattr(message, '__msgtype__'):
+        store = self.store_of(connection)
+        if store is None:
             return encoded(replaced)
-        return self._encoded(replaced, self.topics[self.boxes_topic])
+        return self._encoded(replaced, connection.msgtype, store)
 
-    def cloud_message(self, topic: str, data: bytes) -> Any:
+    def cloud_message(self, connection: Connection, data: bytes) -> Any:
         """Return a message of a topic of clouds; UnsupportedMessage if it is malformed."""
-        (connection, *_) = self._topics.connections({topic})
-        return self._decoder.message(Record(connection, 0, data))
+        return self._decoder.decoded(connection, data)
 
     def encoded_cloud(self, message: Any) -> bytes:
         """Return the bytes of a PointCloud2 as the recording encodes its messages."""
-        return self._encoded(message, clouds.POINTS_TYPE)
+        store = known_store((clouds.POINTS_TYPE,), not self.is2)
+        return self._encoded(message, clouds.POINTS_TYPE, store)
 
-    def _encoded(self, message: Any, kind: str) -> bytes:
-        store = self._reader.typestore
+    def _encoded(self, message: Any, kind: str, store: Typestore) -> bytes:
         return bytes((store.serialize_cdr if self.is2 else store.serialize_ros1)(message, kind))
 
-    def received_ns(self, topic: str, received_ns: int, data: bytes) -> int:
+    def received_ns(self, connection: Connection, received_ns: int, data: bytes) -> int:
         """Return the receive time that a message on a topic of `apart` gets: its cloud's [ns]."""
-        (connection, *_) = self._topics.connections({topic})
         return self._timeline.received_ns(connection, received_ns, data)
+
+    def store_of(self, connection: Connection) -> Typestore | None:
+        """Return the definition of a connection's messages; None if unknown, or not of ROS."""
+        return self._decoder.store_of(connection)
+
+    def store_of_type(self, kind: str) -> Typestore | None:
+        """Return the definition of a type in the recording; None if no topic has it."""
+        same = (c for c in self._reader.connections if c.msgtype == kind)
+        return next(filter(None, map(self.store_of, same)), None)
 
     def images(self) -> RecordedImages:
         """Return the camera images."""
-        self._decoder.complete_definitions(self.topics.values())
         return RecordedImages(self._topics, self._reader, self._decoder)
 
     @property
@@ -247,15 +247,25 @@ class Recording:
     @property
     def finding(self) -> str:
         """Return what is unusual about the recordings as a whole; empty if nothing is."""
-        return '; '.join(filter(None, (self._pauses(), *self._motion.notes.values())))
+        return '; '.join(
+            (*self._chosen, *self._joining(), *self._pauses(), *self._motion.notes.values())
+        )
 
-    def _pauses(self) -> str:
-        """Return that there are pauses between the recordings; empty if there are none."""
+    def _joining(self) -> Iterator[str]:
+        """Yield that messages with boxes were joined, if some were."""
+        if self._joins:
+            yield (
+                f'{self.boxes_topic}: {self._joins} messages have the stamp of the one before '
+                f'them and other boxes: they are read as one message per stamp'
+            )
+
+    def _pauses(self) -> Iterator[str]:
+        """Yield that the recordings are not of one drive, if they are not."""
         parts = self._timeline.parts_ns
         if len(parts) == 1:
-            return ''
+            return
         spans = ' and '.join(f'{begin * 1e-9:.3f} to {end * 1e-9:.3f} s' for begin, end in parts)
-        return (
+        yield (
             f'recordings: expected those of one drive, without pauses between them, got clouds '
             f'received at {spans}; tracks of the same id are one track: relabel drives one by one'
         )
@@ -264,11 +274,6 @@ class Recording:
     def damages(self) -> list[Damage]:
         """Return the parts of the files that could not be read so far."""
         return self._reader.damages
-
-    @property
-    def typestore(self) -> Typestore:
-        """Return the message definitions of the recording."""
-        return self._reader.typestore
 
     def choose_fixed_frame(self, tree: TransformTree, fixed_frame: str | None = None) -> str:
         """
@@ -326,7 +331,7 @@ class Recording:
         begin, end = self.part_ns
         read_from = begin and begin - LOOKAHEAD_NS
         read_to = end and end + LOOKAHEAD_NS
-        waiting: deque[Record] = deque()
+        self._waiting = waiting = deque[Record]()
         for record in self._read(topics | ahead_topics, read_from, read_to):
             # Those complete first: after a pause, this record resets the tree.
             while waiting and waiting[0].received_ns <= record.received_ns - LOOKAHEAD_NS:
@@ -335,7 +340,8 @@ class Recording:
                 self._follow(tree, record)
             elif (begin or 0) <= record.received_ns and (not end or record.received_ns < end):
                 waiting.append(record)
-        yield from waiting
+        while waiting:
+            yield waiting.popleft()
 
     def _ahead_topics(self) -> set[str]:
         """Return the topics that are read ahead of clouds and boxes."""
@@ -345,10 +351,6 @@ class Recording:
     def _item(self, record: Record, with_intensities: bool) -> Item | None:
         """Return a message decoded; None, and counted, if it cannot be."""
         topic = record.connection.topic
-        boxes = self._boxes_as_arrays(record)
-        if boxes is not None:
-            self._decoded_topics.add(topic)
-            return Item(record.received_ns, boxes)
         try:
             message = self._decoder.message(record)
             content = self._content(topic, message)
@@ -364,15 +366,25 @@ class Recording:
                 self._decoder.count_unreadable(topic, error)
         return Item(record.received_ns, content, intensities)
 
-    def _boxes_as_arrays(self, record: Record) -> BoxArray | None:
-        """Return the boxes of a flawless message; None for others, and for all by default."""
-        is_boxes = record.connection.topic == self.boxes_topic
-        if self._array_adapter is None or not is_boxes or record.data[:2] != CDR_BEGIN:
-            return None
-        boxes = self._array_adapter.read_flawless(record.data)
-        if boxes is None or self._convention.is_standard:
-            return boxes
-        return self._convention.to_centers(boxes)
+    def _whole(self, boxes: BoxArray, record: Record) -> BoxArray:
+        """Return the boxes of a message, and of those behind it that have others of its stamp."""
+        for other in self._waiting:
+            if other.received_ns - record.received_ns > JOIN_NS:
+                break
+            if other.connection.topic != self.boxes_topic:
+                continue
+            try:
+                message = self._decoder.message(other)
+                more = self._content(self.boxes_topic, message)
+            except UnsupportedMessage:
+                continue  # counted in its turn
+            assert isinstance(more, BoxArray)
+            if not are_parts(boxes, more):
+                break
+            boxes = joined(boxes, more)
+            self._joined.add(id(other))
+            self._joins += 1
+        return boxes
 
     def _content(self, topic: str, message: Any) -> Sweep | BoxArray:
         """Return the sweep or the boxes of a message; UnsupportedMessage if it has none."""
@@ -411,3 +423,21 @@ class Recording:
                 self.placement.add_info(message)
         except UnsupportedMessage as error:
             self._decoder.count_unreadable(topic, error)
+
+
+def are_parts(boxes: BoxArray, more: BoxArray) -> bool:
+    """Return whether two arrays have different objects of one stamp, in one frame."""
+    is_same = (boxes.stamp_ns, boxes.frame_id) == (more.stamp_ns, more.frame_id)
+    has_ids = '' not in boxes.track_ids and '' not in more.track_ids
+    return is_same and has_ids and set(boxes.track_ids).isdisjoint(more.track_ids)
+
+
+def joined(boxes: BoxArray, more: BoxArray) -> BoxArray:
+    """Return the boxes of two arrays of one stamp and frame."""
+    return replace(
+        boxes,
+        track_ids=boxes.track_ids + more.track_ids,
+        class_names=boxes.class_names + more.class_names,
+        scores=np.concatenate([boxes.scores, more.scores]),
+        boxes=np.concatenate([boxes.boxes, more.boxes]),
+    )

@@ -8,6 +8,7 @@ from dataclasses import replace
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.lidars import Lidars
 from msg_adapters import ADAPTERS, CLOUD_TYPES, WITHOUT_IDS
+from msg_adapters.clouds import PACKETS
 from msg_adapters.concatenation import INFO_TYPE
 from rosbags.interfaces import Connection
 
@@ -95,6 +96,15 @@ class Topics:
             raise RecordingError(
                 f'{self._origin}: no {content}: no messages on {", ".join(empty)}; record the '
                 f'topic while its publisher runs'
+            )
+        packets = self.filled(PACKETS) if role == 'points' else []
+        if packets:
+            raise RecordingError(
+                f'{self._origin}: no point clouds, but packets of a LiDAR: '
+                f'{", ".join(f"{topic} ({self.kinds[topic]})" for topic in packets)}; convert '
+                f'them to points first: play the recording to '
+                f'{" and ".join({PACKETS[self.kinds[topic]]: None for topic in packets})}, and '
+                f'record the points it publishes'
             )
         there = ', '.join(f'{topic} ({kind})' for topic, kind in self.kinds.items())
         raise RecordingError(

@@ -20,6 +20,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
+from boxreg_ros.io.definitions import known_store
 from boxreg_ros.io.markers import MarkerBoard
 from boxreg_ros.io.session import covariances_to_write
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
@@ -29,7 +30,6 @@ from boxreg_ros.structures import ADDED, BoxArray, RefinedBoxes
 from msg_adapters.poses import turned_covariances
 import numpy as np
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
 FORMAT = Format(
@@ -78,7 +78,9 @@ class Writer:
         self._refined_topic = self._topic + BOXES_SUFFIX
         while self._refined_topic in self._recording.topics:
             self._refined_topic += BOXES_SUFFIX
-        self._markers = _MarkerEncoder(self._recording.typestore, not self._recording.is2)
+        is_ros1 = not self._recording.is2
+        known = self._recording.store_of_type(MARKERS) or known_store(MARKER_MESSAGES, is_ros1)
+        self._markers = _MarkerEncoder(known, is_ros1)
 
     def write(self, frame: LabelFrame) -> None:
         """Add the boxes of a message, and copy messages up to the next missing boxes."""
@@ -110,7 +112,7 @@ class Writer:
     def _refined(self, raw: RawMessage) -> list[RawMessage] | None:
         """Return the message with refined boxes, and its markers; None if they are missing."""
         try:
-            message, given = self._recording.box_message(raw.data)
+            message, given = self._recording.box_message(raw.connection, raw.data)
         except UnsupportedMessage:
             return []  # skipped and counted by `relabel` too
         copied = raw._replace(topic=self._refined_topic)
@@ -120,9 +122,14 @@ class Writer:
         if not waiting:
             return None
         frame = waiting.popleft()
+        refined = _without_added(frame.refined)
+        count = len(given.track_ids)
+        if len(refined.status) > count:  # of several messages, which have a part of the boxes each
+            rows = range(len(refined.status))
+            waiting.appendleft(replace(frame, refined=refined.take(list(rows[count:]))))
+            refined = refined.take(list(rows[:count]))
         if not waiting:
             del self._waiting[given.stamp_ns]
-        refined = _without_added(frame.refined)
         T = frame.T_fixed_given
         if refined.boxes.frame_id != given.frame_id and T is not None:
             refined = replace(
@@ -131,7 +138,7 @@ class Writer:
                 covariances=turned_covariances(refined.covariances, inverse(T)),
             )
         covariances = covariances_to_write(refined)
-        data = self._recording.with_boxes(message, refined.boxes, covariances)
+        data = self._recording.with_boxes(raw.connection, message, refined.boxes, covariances)
         markers = self._markers.encode(copied, given, refined)
         return [copied._replace(data=data), markers]
 
@@ -140,8 +147,7 @@ class _MarkerEncoder:
     """Encodes the markers of the node as the recording encodes its messages."""
 
     def __init__(self, known: Typestore, is_ros1: bool) -> None:
-        stock = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
-        self._store = known if MARKERS in known.types else stock
+        self._store = known
         self._is_ros1 = is_ros1
         text = self._store.generate_msgdef(MARKERS, ros_version=1 if is_ros1 else 2)[0]
         name = MARKERS.replace('/msg/', '/') if is_ros1 else MARKERS

@@ -78,8 +78,7 @@ def _messages(path: Path) -> Iterator[tuple[str, LabelFrame]]:
     with closing(Reader([part_of(Path(drive))])) as reader:
         topics = Topics(reader.connections, drive)
         source = _source_of(topics, drive, asked)
-        decoder = MessageDecoder(reader, drive)
-        decoder.complete_definitions([source.kind])
+        decoder = MessageDecoder(drive)
         for record in reader.messages(topics.connections({source.topic}), None, None):
             try:
                 message = decoder.message(record)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.storage.files import opened
+from boxreg_ros.io.storage.files import as_ros, opened
 from boxreg_ros.io.storage.mcap import McapFile
 from boxreg_ros.io.storage.record import Definition
 from boxreg_ros.labels.protocol import Provenance
@@ -35,6 +35,8 @@ _T = TypeVar('_T')
 class RawMessage(NamedTuple):
     """An encoded message of the recording, with the fields of its MCAP channel."""
 
+    connection: Connection
+    """It was recorded on; `topic` is that of the copy."""
     topic: str
     schema: tuple[str, str, bytes] | None
     encoding: str
@@ -105,7 +107,7 @@ class RecordingCopy:
             if raw.topic not in apart:
                 yield raw
                 continue
-            time_ns = self.recording.received_ns(raw.topic, raw.log_time, raw.data)
+            time_ns = self.recording.received_ns(raw.connection, raw.log_time, raw.data)
             if (start_ns or 0) <= time_ns and (end_ns is None or time_ns < end_ns):
                 is_same = time_ns == raw.log_time
                 yield raw if is_same else raw._replace(log_time=time_ns, publish_time=time_ns)
@@ -115,6 +117,7 @@ class RecordingCopy:
     ) -> Iterator[RawMessage]:
         """Yield the messages of a part of a file; all static transforms and topics in `whole`."""
         with closing(opened(path)) as file:
+            connections = {c.id: as_ros(c) for c in file.connections}
             channels = {c.id: self._channel(c) for c in file.connections}
             uncut = [
                 c for c in file.connections if c.topic.endswith(STATIC_SUFFIX) or c.topic in whole
@@ -122,6 +125,7 @@ class RecordingCopy:
             for wanted, begin, end in _intervals(file.connections, uncut, start_ns, end_ns):
                 for record in file.messages(wanted, begin, end):
                     yield RawMessage(
+                        connections[record.connection.id],
                         record.connection.topic,
                         *channels[record.connection.id],
                         record.received_ns,
@@ -135,7 +139,11 @@ class RecordingCopy:
         owner: Any = connection.owner
         if isinstance(owner, McapFile):
             return owner.definition_of(connection)
-        return _definition(connection, self.recording.typestore)
+        store = None
+        if connection.msgdef.format is MessageDefinitionFormat.NONE:
+            self.recording.choose_definition(connection)
+            store = self.recording.store_of(connection)
+        return _definition(connection, store)
 
 
 def _intervals(
@@ -150,7 +158,7 @@ def _intervals(
     return intervals
 
 
-def _definition(connection: Connection, store: Typestore) -> Definition:
+def _definition(connection: Connection, store: Typestore | None) -> Definition:
     """Return schema, encoding and metadata of a channel for a connection of another format."""
     kind = connection.msgtype
     text = connection.msgdef.data
@@ -158,10 +166,8 @@ def _definition(connection: Connection, store: Typestore) -> Definition:
         encoding = connection.ext.serialization_format
         is_idl = connection.msgdef.format is MessageDefinitionFormat.IDL
         language = 'ros2idl' if is_idl else 'ros2msg'
-        if connection.msgdef.format is MessageDefinitionFormat.NONE:
-            text = ''
-            if kind in store.fielddefs:
-                text = store.generate_msgdef(kind, ros_version=2)[0]
+        if store is not None:
+            text = store.generate_msgdef(kind, ros_version=2)[0]
         qos = yaml.safe_dump(dump_qos_v9(connection.ext.offered_qos_profiles), sort_keys=False)
         metadata = {'offered_qos_profiles': qos, 'topic_type_hash': connection.digest or ''}
     else:

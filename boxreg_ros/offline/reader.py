@@ -35,10 +35,6 @@ import numpy as np
 MESSAGES_AHEAD = 4
 """Messages that are read before the receiver has taken those before them: two clouds, their boxes.
 Swept: with 1, 2, 8 and 32 a run took 8.2, 7.5, 7.8 and 8.4 s, and each message 1.5 MB."""
-LONG = 60.0
-"""Recordings of this duration are worth loading numba to read their boxes [s]. Derived: it takes
-0.7 s of CPU, in parallel with the other processes, and saves 1.2 ms per message of 64 boxes, ten a
-second."""
 
 
 SAMPLES = 4
@@ -378,8 +374,6 @@ def _messages(
         _check_copies(request, recording)
         reading = RecordingReader(recording, request, Stopwatch(), latency, sweeps, jumping_ids)
         yield reading.source
-        if isinstance(recording, Recording) and reading.source.seconds > LONG:
-            recording.read_boxes_as_arrays()  # the main process goes on meanwhile
         yield from reading
         yield reading.findings()
 

@@ -8,28 +8,22 @@ import tempfile
 from typing import Any
 
 from boxreg_ros.errors import RecordingError, remedy_of
-from boxreg_ros.io.message_decoder import VISION_DEFINITIONS
+from boxreg_ros.io.definitions import known_store
 from boxreg_ros.rotations import matrix_from_rpy, quaternion_from_matrix
 from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, Sweep
 from msg_adapters.concatenation import INFO_TYPE
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
-TF_DEFINITION = {'tf2_msgs/msg/TFMessage': 'geometry_msgs/TransformStamped[] transforms'}
-INFO_DEFINITIONS = {
-    'autoware_sensing_msgs/msg/SourcePointCloudInfo': (
-        'std_msgs/Header header\nstring topic\nuint8 status\nuint32 idx_begin\nuint32 length'
-    ),
-    INFO_TYPE: (
-        'std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n'
-        'bool is_bigendian\nuint32 point_step\nuint32 row_step\nbool is_dense\n'
-        'bool concatenation_success\nuint8 matching_strategy\n'
-        'uint8[] matching_strategy_config\n'
-        'autoware_sensing_msgs/SourcePointCloudInfo[] source_info'
-    ),
-}
+RECORDED_TYPES = (
+    'nav_msgs/msg/Odometry',
+    'sensor_msgs/msg/PointCloud2',
+    'tf2_msgs/msg/TFMessage',
+    'vision_msgs/msg/Detection3DArray',
+    INFO_TYPE,
+)
+"""Types of the messages of a recording."""
 
 
 def write_recording(
@@ -101,12 +95,7 @@ class LidarMessages:
     """Makes the messages of a recording."""
 
     def __init__(self) -> None:
-        self.store = get_typestore(Stores.ROS2_JAZZY)
-        types: dict[str, Any] = {}
-        for name, text in (VISION_DEFINITIONS | TF_DEFINITION | INFO_DEFINITIONS).items():
-            if name not in self.store.types:
-                types.update(get_types_from_msg(text, name))
-        self.store.register(types)
+        self.store = known_store(RECORDED_TYPES)
 
     def make(self, kind: str, /, **fields: Any) -> Any:
         """Return a message of a type ``package/Name``."""
@@ -170,12 +159,9 @@ class LidarMessages:
             )
             sources.append(source)
             begin += len(part.points)
-        cloud = self.cloud(whole, np.zeros(begin))
-        copied = ('header', 'height', 'width', 'fields', 'is_bigendian', 'point_step', 'row_step')
         return self.make(
             'autoware_sensing_msgs/ConcatenatedPointCloudInfo',
-            **{name: getattr(cloud, name) for name in copied},
-            is_dense=True,
+            header=self.header(whole.stamp_ns, whole.frame_id),
             concatenation_success=True,
             matching_strategy=0,
             matching_strategy_config=np.zeros(0, np.uint8),

@@ -11,13 +11,112 @@ from boxreg_ros.io.foxglove import encoded
 from boxreg_ros.io.items import Wanted
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
-from foxglove_recordings import PointCloud, SceneUpdate, write_foxglove_mcap
+from boxreg_ros.structures import BoxArray, Sweep
+from foxglove_recordings import KINDS, PointCloud, scene, SceneUpdate, write_foxglove_mcap
 from mcap.reader import make_reader
 from msg_adapters import adapter_for
 import numpy as np
 import pytest
 from relabel_results import rows_in
 from ros_messages import Drive, SCENE
+
+FRAME = '{"timestamp": {"sec": %d, "nsec": %d}, "parent_frame_id": "odom", '
+FRAME += '"child_frame_id": "base", "translation": {"x": %g, "y": 0, "z": 0}, '
+FRAME += '"rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}'
+
+
+def of_foxglove(path, drive, motion):
+    """
+    Write a drive by the SDK of Foxglove: clouds as protobuf, and an update per object in JSON.
+
+    The motion of the base is that of `motion`: FrameTransform in JSON, or Odometry; the place of
+    the LiDAR on it are FrameTransforms in protobuf.
+
+    """
+    foxglove = pytest.importorskip('foxglove')
+    from foxglove import messages as m
+
+    with foxglove.open_mcap(str(path)):
+        points, mount = (
+            foxglove.Channel(
+                '/points', schema=m.PointCloud.get_schema(), message_encoding='protobuf'
+            ),
+            foxglove.Channel(
+                '/tf_static', schema=m.FrameTransforms.get_schema(), message_encoding='protobuf'
+            ),
+        )
+        schemas = {
+            name: foxglove.Schema(name=name, encoding='jsonschema', data=b'{"type": "object"}')
+            for name in ('foxglove.FrameTransform', 'foxglove.SceneUpdate')
+        }
+        odometry = m.Odometry.get_schema()
+        kinds = {'/boxes': (schemas['foxglove.SceneUpdate'], 'json')}
+        kinds['/motion'] = (
+            (odometry, 'protobuf') if motion == 'odometry'
+            else (schemas['foxglove.FrameTransform'], 'json')
+        )  # fmt: skip
+        channels = {
+            topic: foxglove.Channel(topic, schema=schema, message_encoding=encoding)
+            for topic, (schema, encoding) in kinds.items()
+        }
+        for topic, received_ns, message in drive.items:
+            write = {'/points': points, '/tf_static': mount}.get(topic)
+            if topic == '/tf':
+                (t,) = message.transforms
+                x, stamp = t.transform.translation.x, t.header.stamp
+                data = (' \n' + FRAME % (stamp.sec, stamp.nanosec, x)).encode()
+                if motion == 'odometry':
+                    data = m.Odometry(
+                        timestamp=m.Timestamp(stamp.sec, stamp.nanosec), frame_id='odom',
+                        body_frame_id='base',
+                        pose=m.Pose(
+                            position=m.Vector3(x=x, y=0, z=0),
+                            orientation=m.Quaternion(x=0, y=0, z=0, w=1),
+                        ),
+                    ).encode()  # fmt: skip
+                channels['/motion'].log(data, log_time=received_ns)
+            elif topic == '/boxes':
+                for n, entity in enumerate(scene(message, 'json')['entities']):
+                    update = {'deletions': [], 'entities': [entity]}
+                    data = (n * ' ' + json.dumps(update)).encode()
+                    channels[topic].log(data, log_time=received_ns + n * 10**6)
+            else:
+                kind, convert = KINDS[message.__msgtype__]
+                data = kind(**convert(message, 'protobuf')).SerializeToString()
+                write.log(data, log_time=received_ns)
+    return path
+
+
+@pytest.mark.parametrize('motion', ['transforms', 'odometry'])
+def test_one_file_may_mix_schemas_and_encodings_of_one_content(tmp_path, motion):
+    drive = Drive(sweeps=3, boxes=SCENE)
+    path = of_foxglove(tmp_path / 'drive.mcap', drive, motion)
+    tree = TransformTree()
+    with Recording([path]) as recording:
+        assert recording.choose_fixed_frame(tree) == 'odom'
+        found = [item.content for item in recording.items(tree)]
+        assert not recording.unreadable
+        T = tree.lookup('odom', 'lidar', drive.stamps[2])
+        assert '3 messages have the stamp of the one before them' in recording.finding
+    np.testing.assert_allclose(T[:3, 3], [1.0, 0.0, 2.0])  # 0.5 m per sweep, 2 m above the base
+    boxes = [content for content in found if isinstance(content, BoxArray)]
+    assert [array.track_ids for array in boxes] == [('1', '2')] * 3
+    assert sum(isinstance(content, Sweep) for content in found) == 3
+
+
+def test_an_update_per_object_gets_the_refined_boxes_of_its_object(tmp_path):
+    drive = Drive(sweeps=4, boxes=SCENE)
+    path = of_foxglove(tmp_path / 'drive.mcap', drive, 'transforms')
+    expected = rows_of(drive.write(tmp_path / 'ros'), tmp_path / 'expected')
+    out = tmp_path / 'out'
+    assert main(['relabel', str(path), '-o', str(out), '--formats=mcap']) == 0
+    assert rows_in(out / 'boxes.csv') == expected
+    with (out / 'overlay.mcap').open('rb') as file:
+        updates = [
+            json.loads(m.data) for _, _, m in make_reader(file).iter_messages('/boxes_refined')
+        ]
+    ids = [[entity['id'] for entity in update['entities']] for update in updates]
+    assert ids == [['1'], ['2']] * 4
 
 
 def rows_of(path, out):
@@ -59,7 +158,7 @@ def test_other_fields_are_copied_in_the_encoding_of_the_input(tmp_path, encoding
         np.testing.assert_allclose(adapter.from_msg(written).boxes, longer.boxes, atol=1e-12)
         np.testing.assert_array_equal(adapter.from_msg(message).boxes, boxes.boxes)
         restored = encoded(adapter.to_msg(written, boxes))
-        decoded = recording._reader.deserialize(restored, SCENE)
+        decoded = recording._decoder.decoded(record.connection, restored)
     np.testing.assert_allclose(adapter.from_msg(decoded).boxes, boxes.boxes, atol=1e-12)
     if encoding == 'json':
         old, new = json.loads(raw.data), json.loads(restored)
@@ -94,11 +193,10 @@ def test_clouds_with_a_pose_other_than_identity_are_refused(tmp_path):
         tmp_path / 'a.mcap', drive, {'/boxes': 'cdr', '/points': 'protobuf', '/tf': 'cdr'}
     )
     with Recording([path]) as recording:
+        (connection,) = recording._topics.connections({'/points'})
         message = PointCloud(pose={'position': {'x': 1.0}, 'orientation': {'w': 1.0}})
         with pytest.raises(UnsupportedMessage, match='pose'):
-            recording._reader.deserialize(
-                message.SerializeToString() or b'', 'sensor_msgs/msg/PointCloud2'
-            )
+            recording.cloud_message(connection, message.SerializeToString())
 
 
 def test_the_error_of_invalid_json_names_the_topic(tmp_path):
@@ -107,8 +205,10 @@ def test_the_error_of_invalid_json_names_the_topic(tmp_path):
         tmp_path / 'a.mcap', drive, {'/boxes': 'json', '/points': 'cdr', '/tf': 'cdr'}
     )
     match = r"'/boxes'.*not JSON"
-    with Recording([path]) as recording, pytest.raises(UnsupportedMessage, match=match):
-        recording.box_message(b'{"entities": [')
+    with Recording([path]) as recording:
+        (connection,) = recording._topics.connections({'/boxes'})
+        with pytest.raises(UnsupportedMessage, match=match):
+            recording.box_message(connection, b'{"entities": [')
 
 
 @pytest.mark.parametrize('encoding', ['protobuf', 'json'])

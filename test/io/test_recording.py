@@ -14,7 +14,8 @@ from boxreg_ros.structures import BoxArray, Sweep
 from mcap_files import rewritten
 import numpy as np
 import pytest
-from ros_messages import Drive, Messages, SECOND, START, write_recording
+from ros_messages import Drive, Messages, SECOND, START, typestore, write_recording
+from rosbags.typesys import get_types_from_msg
 
 M = Messages()
 
@@ -276,7 +277,7 @@ def test_a_part_of_a_topic_recorded_apart_is_that_of_its_stamps(tmp_path, late):
     with closing(Reader([part_of(path) for path in paths])) as reader:
 
         def stamp_of(connection, data):
-            stamp = reader.typestore.deserialize_cdr(data, connection.msgtype).header.stamp
+            stamp = drive.messages.store.deserialize_cdr(data, connection.msgtype).header.stamp
             return stamp.sec * SECOND + stamp.nanosec
 
         order = MessageOrder(reader, '/points', stamp_of)
@@ -288,6 +289,26 @@ def test_a_part_of_a_topic_recorded_apart_is_that_of_its_stamps(tmp_path, late):
 
 
 # Errors ----------------------------------------------------------------------------------------
+
+
+def test_packets_of_a_lidar_name_what_converts_them(tmp_path):
+    drive = Drive(sweeps=2)
+    messages = drive.messages
+    messages.store = typestore.__wrapped__()
+    kind = 'velodyne_msgs/msg/VelodyneScan'
+    text = 'std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets'
+    packet = 'builtin_interfaces/Time stamp\nuint8[1206] data'
+    messages.store.register(
+        get_types_from_msg(text, kind)
+        | get_types_from_msg(packet, 'velodyne_msgs/msg/VelodynePacket')
+    )
+    items = [item for item in drive.items if item[0] != '/points']
+    items.append(('/velodyne_packets', START, messages.build(kind)))
+    path = write_recording(tmp_path / 'packets', items, messages=messages)
+    text = error_of(path)
+    assert '/velodyne_packets (velodyne_msgs/msg/VelodyneScan)' in text
+    assert 'convert them to points first' in text
+    assert 'velodyne_transform_node of velodyne_pointcloud' in text
 
 
 def test_unknown_topics_are_refused(tmp_path):

@@ -1,6 +1,7 @@
 """Clouds that are not a PointCloud2: compressed ones, and Livox's own message."""
 
 import base64
+import struct
 import sys
 import tracemalloc
 from types import SimpleNamespace
@@ -202,6 +203,135 @@ def test_draco_streams_of_the_transport_plugin_have_its_fields(method):
     assert clouds.is_reordered(message) == (method == 'k-d tree')
 
 
+DRACO_NUMBERS = {'i1': 1, 'u1': 2, 'i4': 5, 'u4': 6, 'i8': 7, 'u8': 8, 'f4': 9, 'f8': 10}
+
+
+def draco_stream(columns):
+    """
+    Return a stream of Draco 2.2, an attribute per column.
+
+    Doubles and integers of 64 bits are stored as they are: Draco does so, but DracoPy does not
+    encode them. Integers of 32 bits are symbols, with the sign as the last bit.
+
+    """
+    kinds = [column.dtype.str[1:] for column in columns]
+    count = len(columns[0])
+    head = b'DRACO' + bytes([2, 2, 0, 0]) + struct.pack('<HiB', 0, count, 1)
+    attributes = [
+        bytes([4 if number else 0, DRACO_NUMBERS[kind], 1, 0, number])
+        for number, kind in enumerate(kinds)
+    ]
+    decoders = bytes(kind == 'i4' for kind in kinds)
+    values = [
+        b'\xfe\0\4' + (column << 1 ^ column >> 31).tobytes() if kind == 'i4' else column.tobytes()
+        for kind, column in zip(kinds, columns, strict=True)
+    ]
+    return b''.join([head, bytes([len(columns)]), *attributes, decoders, *values])
+
+
+@pytest.mark.parametrize('origin', [0.0, 250_000.0], ids=['near', 'of UTM'])
+def test_doubles_of_draco_keep_all_digits(origin):
+    """Times of today as float32 are multiples of 128 s, coordinates of UTM of 0.016 to 0.5 m."""
+    pytest.importorskip('DracoPy')
+    rng = np.random.default_rng(6)
+    xyz = origin + rng.uniform(-20, 20, (ROWS, 3))
+    xyz[0, 2] = np.nan
+    times = START * 1e-9 + np.linspace(0, 0.1, ROWS)
+    columns = [(name, 'f8', xyz[:, k]) for k, name in enumerate('xyz')]
+    columns += [('ring', 'u1', np.arange(ROWS)), ('timestamp', 'f8', times)]
+    message = MESSAGES.cloud(START, 'lidar', columns)
+    stream = draco_stream([np.asarray(values, kind) for _, kind, values in columns])
+    sweep = pointcloud.from_msg(clouds.plain(compressed(message, 'draco', stream)))
+    known = pointcloud.from_msg(message)
+    assert known.points.dtype == np.float64 and len(known.points) == ROWS - 1
+    np.testing.assert_array_equal(sweep.points, known.points)
+    np.testing.assert_array_equal(sweep.times, known.times)
+    np.testing.assert_allclose(sweep.times, np.linspace(0, 0.1, ROWS)[1:], atol=1e-6)
+
+
+def test_long_integers_of_draco_keep_all_digits():
+    pytest.importorskip('DracoPy')
+    xyz = np.random.default_rng(7).uniform(-20, 20, (3, ROWS)).astype('f4')
+    offsets = np.linspace(0, 1e8, ROWS).astype('u8')
+    stream = draco_stream([*xyz, START + offsets])
+    data = [(name, values) for name, values in zip('xyzt', [*xyz, START + offsets], strict=True)]
+    found = dict(clouds._draco_columns(stream))
+    assert len(found) == len(data)
+    np.testing.assert_allclose(list(found.values())[3] - START, offsets, atol=256)
+
+
+def test_integers_that_draco_rounds_are_refused():
+    """50 times 2^21 is 10^8: the times of a sweep in ns. DracoPy gives them as float32."""
+    pytest.importorskip('DracoPy')
+    for step in (1, 2**21):
+        columns = [(name, 'f4', np.arange(ROWS)) for name in 'xyz']
+        columns += [
+            ('flags', 'i4', np.arange(ROWS) * 2**21 + 1),
+            ('t', 'i4', np.arange(ROWS) * step),
+        ]
+        message = MESSAGES.cloud(START, 'lidar', columns)
+        stream = draco_stream([np.asarray(values, kind) for _, kind, values in columns])
+        packed = compressed(message, 'draco', stream)
+        if step == 1:
+            rows = np.asarray(clouds.plain(packed).data).reshape(ROWS, 20)
+            np.testing.assert_array_equal(rows[:, 16:].copy().view('<i4')[:, 0], np.arange(ROWS))
+            continue
+        with pytest.raises(UnsupportedMessage, match=r'expected t as .* below 2\^24'):
+            clouds.plain(packed)
+
+
+def cloudini_stream(message, **settings):
+    """Return a cloud as Cloudini compresses it, coordinates to 1 mm."""
+    pureini = pytest.importorskip('pureini')
+    fields = [
+        pureini.PointField(
+            field.name, field.offset, pureini.FieldType(field.datatype),
+            0.001 if field.datatype == 7 else None,
+        )
+        for field in message.fields
+    ]  # fmt: skip
+    info = pureini.EncodingInfo(
+        fields, message.width, message.height, message.point_step, **settings
+    )
+    return pureini.PointcloudEncoder(info).encode(message.data.tobytes())
+
+
+@pytest.mark.parametrize('version', [2, 3, 4, 5])
+@pytest.mark.parametrize('form', ['', 'cloudini'])
+def test_clouds_of_cloudini_are_read_whatever_their_format_says(version, form):
+    message = cloud()
+    stream = cloudini_stream(message, version=version)
+    packed = compressed(message, form, stream)
+    sweep, known = pointcloud.from_msg(clouds.plain(packed)), pointcloud.from_msg(message)
+    np.testing.assert_allclose(sweep.points, known.points, atol=0.000501)
+    np.testing.assert_array_equal(sweep.times, known.times)
+    assert not clouds.is_reordered(packed)
+
+
+def test_cloudini_in_a_message_of_foxglove():
+    message = cloud()
+    time = MESSAGES.header(START, '').stamp
+    packed = MESSAGES.build(
+        clouds.FOXGLOVE_TYPE, timestamp=time, frame_id='lidar', format='cloudini',
+        data=list(cloudini_stream(message)),
+    )  # fmt: skip
+    sweep = pointcloud.from_msg(clouds.plain(packed))
+    assert (sweep.stamp_ns, sweep.frame_id, len(sweep.points)) == (START, 'lidar', ROWS)
+
+
+def test_cloudini_without_its_package_damaged_or_too_large(monkeypatch):
+    message = cloud()
+    stream = cloudini_stream(message)
+    with pytest.raises(UnsupportedMessage, match='by cloudini: expected a whole stream'):
+        clouds.plain(compressed(message, '', stream[:-9]))
+    bomb = stream.replace(b'width: 50\n', b'width: 2000000000\n')
+    with pytest.raises(UnsupportedMessage, match='a cloud of 40000000000 bytes'):
+        clouds.plain(compressed(message, '', bomb))
+    monkeypatch.setitem(sys.modules, 'pureini', None)
+    with pytest.raises(UnsupportedMessage, match=r'pip install pureini, or .*rosbag_conv'):
+        clouds.plain(compressed(message, '', stream))
+
+
 def test_fields_of_draco_beyond_the_point_are_refused():
     pytest.importorskip('DracoPy')
     message = plugin_cloud('sequential')
@@ -218,7 +348,9 @@ def test_attributes_that_do_not_fit_the_fields_are_refused():
 
 
 def test_unknown_formats_are_named():
-    with pytest.raises(UnsupportedMessage, match="'lz4': expected draco or zlib or zstd"):
+    with pytest.raises(
+        UnsupportedMessage, match="'lz4': expected draco or zlib or zstd or cloudini"
+    ):
         clouds.plain(compressed(cloud(), 'lz4', b''))
     message = SimpleNamespace(timestamp=None, frame_id='', format='ply', data=b'')
     with pytest.raises(UnsupportedMessage, match="'ply': expected draco"):

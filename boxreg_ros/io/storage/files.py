@@ -7,17 +7,17 @@ from contextlib import closing, ExitStack
 from heapq import heapify, heappop, heapreplace
 from pathlib import Path, PurePath
 import re
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from boxreg_ros.config import YAML_ERRORS
 from boxreg_ros.errors import RecordingError, TransferError, unreadable
+from boxreg_ros.io.foxglove import FOXGLOVE_ENCODINGS, ros_type, schema_as_definition
 from boxreg_ros.io.storage.mcap import McapFile
 from boxreg_ros.io.storage.record import Damage, one_line, Record, span_ns, StorageFile
 from boxreg_ros.io.storage.rosbag1 import Rosbag1File
 from boxreg_ros.io.storage.sqlite import SqliteFile
 from boxreg_ros.io.storage.urls import entries_of, entry_of, url_of
 from boxreg_ros.io.whole_files import temporary_folder
-from mcap.records import Schema
 from rosbags.interfaces import Connection
 import yaml
 import zstandard
@@ -156,29 +156,30 @@ class Files:
                 raise first_error
             self._opened = stack.pop_all()
         self.start_time, self.end_time = span_ns([(f.start_time, f.end_time) for f in self._files])
-        self._own: dict[tuple[str, str, str], list[Connection]] = {}
+        self._own: list[list[Connection]] = []
         for file in self._files:
             for connection in file.connections:
-                key = connection.topic, connection.msgtype, connection.ext.__class__.__name__
-                self._own.setdefault(key, []).append(connection)
+                self._add(as_ros(connection))
         self.connections = [
-            next((c for c in own if c.msgdef.data), own[0])._replace(
-                id=number, owner=self, msgcount=sum(c.msgcount for c in own)
-            )
-            for number, own in enumerate(self._own.values())
+            own[0]._replace(id=number, owner=self, msgcount=sum(c.msgcount for c in own))
+            for number, own in enumerate(self._own)
         ]
+
+    def _add(self, connection: Connection) -> None:
+        """Add a connection to those of its topic, type and definition; one without fits each."""
+        for own in self._own:
+            if _channel(own[0]) == _channel(connection):
+                definitions = {own[0].msgdef.data, connection.msgdef.data} - {''}
+                if len(definitions) < 2:
+                    is_first = bool(connection.msgdef.data) and not own[0].msgdef.data
+                    own.insert(0 if is_first else len(own), connection)
+                    return
+        self._own.append([connection])
 
     @property
     def damages(self) -> list[Damage]:
         """Return the damages of all files."""
         return [*self._damages, *(damage for file in self._files for damage in file.damages)]
-
-    def schema_of(self, connection: Connection) -> Schema | None:
-        """Return the schema of a channel of MCAP files; None without."""
-        for own in list(self._own.values())[connection.id]:
-            if isinstance(own.owner, McapFile):
-                return own.owner.schema_of(own)
-        return None
 
     def close(self) -> None:
         """Close all files."""
@@ -210,10 +211,31 @@ class Files:
         """Return those of `connections` by file and id of the files' own connections."""
         return {
             (id(own.owner), own.id): connection
-            for connection, group in zip(self.connections, self._own.values(), strict=True)
+            for connection, group in zip(self.connections, self._own, strict=True)
             if connection in connections
             for own in group
         }
+
+
+def encoding_of(connection: Connection) -> str:
+    """Return the encoding of messages: ``cdr``, ``ros1``, ``json``, ``protobuf``."""
+    return getattr(connection.ext, 'serialization_format', 'ros1')
+
+
+def as_ros(connection: Connection) -> Connection:
+    """Return a connection; one with a schema of Foxglove gets the ROS type it is read as."""
+    owner: Any = connection.owner
+    if encoding_of(connection) not in FOXGLOVE_ENCODINGS:
+        return connection
+    schema = owner.schema_of(connection)
+    if schema is None:
+        return connection
+    return connection._replace(msgtype=ros_type(schema.name), msgdef=schema_as_definition(schema))
+
+
+def _channel(connection: Connection) -> tuple[str, ...]:
+    """Return topic, type and encoding of a connection."""
+    return connection.topic, connection.msgtype, encoding_of(connection)
 
 
 def merged_streams(streams: Sequence[tuple[int, Iterator[Record]]]) -> Iterator[Record]:
