@@ -29,10 +29,12 @@ ASSOCIATE = Convention(associate=True)
 
 
 def without_definitions(folder):
-    """Take the definitions from the database of a recording, as before ROS 2 Iron."""
+    """Make the database of a recording one of ROS 2 Humble, which has no definitions."""
     (database,) = folder.glob('*.db3')
     with closing(sqlite3.connect(database)) as opened, opened:
         opened.execute('DROP TABLE message_definitions')
+        opened.execute('ALTER TABLE topics DROP COLUMN type_description_hash')
+        opened.execute("UPDATE schema SET schema_version = 3, ros_distro = 'humble'")
     return folder
 
 
