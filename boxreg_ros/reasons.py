@@ -218,7 +218,7 @@ class Reason(StrEnum):
     LATENCY = (
         'latency',
         'message',
-        'its boxes are late, or early, and were moved along their tracks; the log has the figure',
+        'its boxes are late, or early, and were moved to where their objects are at their stamp',
         'correct their stamps where they are made, or set `sampling.box_time`',
     )
     LATE = (

@@ -240,6 +240,30 @@ def _texts(name: str, values: Sequence[str]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class FrameMotion:
+    """
+    Motion of the frame that boxes were measured in, up to their stamp.
+
+    Attributes
+    ----------
+    stamps_ns : array, shape (K,)
+        Ascending; the last is the stamp of the boxes [ns].
+    T_fixed_frame : array, shape (K, 4, 4)
+        Poses of the frame in that of the boxes.
+
+    """
+
+    stamps_ns: Ints
+    T_fixed_frame: Floats
+
+    def __post_init__(self) -> None:
+        """Check the shapes."""
+        K = len(self.stamps_ns)
+        T = checked('T_fixed_frame', self.T_fixed_frame, (K, 4, 4))
+        object.__setattr__(self, 'T_fixed_frame', T)  # the class is frozen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BoxArray:
     """
     All boxes of one stamp; boxes without an identity have the track id ``''``.
@@ -261,6 +285,9 @@ class BoxArray:
     pinned : array, shape (n,), or None
         True for boxes that a person has corrected: they are held, and the rest of their track
         follows them. None for none.
+    motion : FrameMotion or None
+        Of the frame that the boxes were measured in, before they were brought to `frame_id`: late
+        boxes were measured at an earlier pose. None if that frame does not move in `frame_id`.
 
     """
 
@@ -272,6 +299,7 @@ class BoxArray:
     boxes: Floats
     ticket: object = field(default=None, repr=False)
     pinned: NDArray[np.bool_] | None = None
+    motion: FrameMotion | None = None
 
     def __post_init__(self) -> None:
         """Check that all columns have one length; convert lists to arrays and tuples."""
@@ -368,3 +396,10 @@ class RefinedBoxes:
             self.face_distances[rows],
             self.near_points[rows],
         )
+
+
+def kept(boxes: BoxArray, reason: str) -> RefinedBoxes:
+    """Return boxes as a result in which each is kept for the same reason."""
+    n = len(boxes.track_ids)
+    unknown = np.broadcast_to(np.eye(6), (n, 6, 6))
+    return RefinedBoxes(boxes, (KEPT,) * n, (str(reason),) * n, np.zeros(n, np.int64), unknown)

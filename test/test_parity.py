@@ -1,4 +1,4 @@
-"""The final boxes of the node equal those of `boxreg relabel`."""
+"""The boxes of the node equal those of `boxreg relabel`."""
 
 import csv
 import json
@@ -10,17 +10,17 @@ from msg_adapters.clouds import COMPRESSED_TYPE
 from msg_adapters.poses import quaternions_of
 import numpy as np
 import pytest
-from ros_graph import ended_cleanly, graph_in, records_of, RELIABLE, ROOT, stamp_of
-from ros_messages import DETECTIONS, Drive, JSK, MARKERS
+from ros_graph import ended_cleanly, graph_in, play, records_of, RELIABLE, ROOT, stamp_of
+from ros_messages import DETECTIONS, Drive, JSK, MARKERS, SECOND
 
 SETTINGS = {'window': 5, 'lag': 3}
 UNHURRIED = ['transform_timeout:=20.0', 'backlog:=60.0', 'deadline:=60.0']
 """So that on a busy machine no transform is extrapolated, and no box left out for its deadline."""
 
 
-def relabelled(path, out, *more):
+def relabelled(path, out, *more, settings=SETTINGS):
     """Return (stamp, track) -> x y z qx qy qz qw length width height of `boxreg relabel`."""
-    options = [f'--set={key}={value}' for key, value in SETTINGS.items()]
+    options = [f'--set={key}={value}' for key, value in settings.items()]
     command = ['relabel', str(path), '-o', str(out), '--set=estimate=final', '--formats=csv']
     assert main([*command, *options, *more]) == 0
     columns = ['x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height']
@@ -74,9 +74,19 @@ def test_final_boxes_equal_those_of_relabel(tmp_path, recording):
 
 def final_of_node(tmp_path, records, *parameters, boxes=(DETECTIONS, '/boxes')):
     """Return the final boxes of the node for records, with boxes of a type on a topic."""
+    options = [f'{key}:={value}' for key, value in SETTINGS.items()]
+    return boxes_of_node(tmp_path, records, *parameters, *options, boxes=boxes)[1]
+
+
+def boxes_of_node(tmp_path, records, *parameters, boxes=(DETECTIONS, '/boxes'), ahead=0):
+    """
+    Return early and final boxes of the node for records, with boxes of a type on a topic.
+
+    At most `ahead` messages of boxes are published whose early boxes have not been received.
+
+    """
     type_name, boxes_topic = boxes
     options = [*UNHURRIED, 'output_frame:=odom', *parameters]
-    options += [f'{key}:={value}' for key, value in SETTINGS.items()]
     topics = {record.topic for record in records if record.topic not in ('/tf', '/tf_static')}
     options += [
         f'qos_overrides.{topic}.subscription.reliability:=reliable' for topic in sorted(topics)
@@ -84,9 +94,13 @@ def final_of_node(tmp_path, records, *parameters, boxes=(DETECTIONS, '/boxes')):
     every = [part for option in options for part in ('-p', option)]
     with graph_in(tmp_path) as graph:
         node = graph.run(records, *every, '-r', f'boxes:={boxes_topic}', kind=type_name)
-        node.play(records)
+        played = 0
+        for record in records:
+            play(graph, [record])
+            played += record.boxes_stamp_ns is not None
+            graph.wait(lambda n=played: len(node.early) >= n - ahead, 'early boxes')
         assert ended_cleanly(node)
-        return node.final
+        return node.early, node.final
 
 
 def assert_equal_boxes(found, expected):
@@ -94,6 +108,70 @@ def assert_equal_boxes(found, expected):
     keys = sorted(expected)
     difference = np.abs(np.array([found[k] for k in keys]) - [expected[k] for k in keys])
     assert difference.max() < 1e-6
+
+
+def late(drive, seconds, jitter=0.0, frame='lidar', lost=()):
+    """
+    Return a drive whose boxes are stamped and received later, up to the last transform.
+
+    `jitter` [s] is the largest deviation from `seconds`; boxes in the frame odom are where their
+    objects were. The clouds of the sweeps in `lost` are left out.
+
+    """
+    rng = np.random.default_rng(0)
+    lost_ns = {drive.stamps[k] for k in lost}
+    last_ns = max(received for topic, received, _ in drive.items if topic == '/tf')
+    items = []
+    for topic, received, message in drive.items:
+        if topic != '/boxes':
+            is_lost = topic in ('/points', '/front', '/rear') and stamp_of(message) in lost_ns
+            items += [] if is_lost else [(topic, received, message)]
+            continue
+        measured_ns = stamp_of(message)
+        delay_ns = round((seconds + rng.uniform(-jitter, jitter)) * SECOND)
+        header = drive.messages.header(measured_ns + delay_ns, frame)
+        for detection in message.detections:
+            detection.header = header
+            if frame == 'odom':
+                position = detection.bbox.center.position
+                position.x += 5.0 * (measured_ns - drive.stamps[0]) / SECOND
+                position.z += 2.0
+        message.header = header
+        if measured_ns + delay_ns <= last_ns:
+            items.append((topic, max(received, measured_ns + delay_ns), message))
+    drive.items = sorted(items, key=lambda item: item[1])
+    return drive
+
+
+LATE = {
+    'in time, clouds lost': (0.0, {'lost': (0, 1, 9)}),
+    'late': (0.2, {}),
+    'late, fixed frame, cloud lost': (0.2, {'frame': 'odom', 'lost': (14,)}),
+    'jitter, two LiDARs': (0.2, {'jitter': 0.03}),
+}
+
+
+@pytest.mark.parametrize('case', LATE)
+def test_early_and_final_boxes_are_those_of_relabel_by_default(tmp_path, case):
+    """With the settings of both: each estimates the latency of the boxes from what it knows."""
+    seconds, more = LATE[case]
+    has_two = 'two' in case
+    drive = LidarDrive(34) if has_two else Drive(sweeps=34)
+    path = late(drive, seconds, **more).write(tmp_path / 'drive')
+    options = ['--points', '/front', '--points', '/rear'] if has_two else []
+    parameters = ['points:=[/front, /rear]'] if has_two else []
+    early, final = boxes_of_node(tmp_path, records_of(path), *parameters, ahead=4)
+    for estimate, messages in (('early', early), ('final', final)):
+        out = tmp_path / estimate
+        expected = relabelled(path, out, *options, f'--set=estimate={estimate}', settings={})
+        found = as_published(messages, DETECTIONS)
+        assert found.keys() == expected.keys()
+        rows = np.array([found[key] for key in expected])
+        # To rounding: the message has quaternions of angles of quaternions.
+        np.testing.assert_allclose(rows, np.array([*expected.values()]), rtol=0, atol=1e-9)
+    summary = json.loads((out / 'summary.json').read_text())
+    latency = summary['box_time']['latency']['seconds']
+    assert latency == pytest.approx(seconds, abs=0.03)
 
 
 def test_missed_detections_are_added_live_and_offline(tmp_path):

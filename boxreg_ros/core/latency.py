@@ -1,34 +1,24 @@
 """
-The latency of input boxes: how long before their stamp they were right (M12a).
+The latency of input boxes: how long before their stamp they were measured (M12a).
 
 A tracker that stamps its boxes when it is done, or holds them back, is late by one time for a
-whole recording. A box of a moving object is then behind its points, and the later boxes of its own
-track are where it should be.
+whole recording. A box in the frame of a sensor that moves was then brought to the fixed frame by
+the wrong pose, and a moving object has gone on. Both are mended where the box was measured.
 
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from itertools import islice
+from math import inf
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import (
-    BOX_EXTENT,
-    BoxArray,
-    Floats,
-    Ints,
-    is_valid_box,
-    LENGTH,
-    Sweep,
-    X,
-    Y,
-    YAW,
-    Z,
-)
+from boxreg_ros.core.matching import Pair
+from boxreg_ros.core.measured_tracks import MeasuredTracks
+from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, LENGTH, Sweep, X, Y, YAW, Z
 import numpy as np
 
 # All of these are chosen, except where an origin stands beside them.
@@ -39,13 +29,15 @@ CANDIDATES = np.arange(-0.2, 0.801, 0.05)
 SAMPLE_PERIOD = 0.3
 """Least time between sweeps whose points are compared with boxes [s]."""
 MIN_SPEED = 2.0
-"""Slower objects provide no evidence [m/s]."""
+"""Objects that move slower in the frame they are measured in provide no evidence [m/s]."""
 FEWEST_POINTS, POINTS_COMPARED = 10, 128
 """Points of an object that provide evidence, and those that are used of more."""
 CONSTANT_ERROR = 0.2
 """Deviation of the mean error of a track along its path [m]; measured: 0.07 to 0.16 m."""
 USABLE_DEVIATION = 0.03
 """An estimate with a larger deviation is not used [s]."""
+GAIN = 2.0
+"""Deviations by which tracks must fit better at a latency than in time, for it to be corrected."""
 SIGNIFICANCE = 3.0
 """Deviations by which a latency, or a drift of it, is more than an error of the estimate."""
 PREFERENCE = 1.2
@@ -54,8 +46,6 @@ Deviations by which boxes fit better at the stamp, or where points were seen, to
 otherwise the smaller latency is taken. Measured: 1.5 and more on a simulated highway of known
 time, 0.8 and less where human labels are of neither.
 """
-SMOOTHING = 0.35
-"""Reach of the local lines through the centres of a track [s]: noise must not be motion."""
 PATH_REACH = 0.3
 """Points up to this far outside of the predicted boxes are compared with them [m]."""
 ROAD_CLEARANCE = 0.3
@@ -70,6 +60,17 @@ MAX_SAMPLES = 600
 """Comparisons that are kept: the newest, so that the estimate follows a latency that changes."""
 TRACK_SECONDS = 3.0
 """Boxes of a track are held this long [s]."""
+SWEEPS_HELD = 16
+"""Sweeps that wait for the boxes they are compared with: 5 s, if boxes are missing for long."""
+STEP = 0.02
+"""The latency that is corrected changes by this or more [s]: each step is a jump of the boxes."""
+FIRST_SECONDS = 10.0
+"""With `estimate` 'track' boxes wait for the latency that the first seconds show [s]."""
+FIRST_POINTS = 2**24
+"""Points of the sweeps that wait with them, at most: 200 MB."""
+
+
+NOTHING_MOVES = 'nothing moves that boxes and points could be compared by'
 
 
 class Latency(NamedTuple):
@@ -87,17 +88,19 @@ class Latency(NamedTuple):
     tracks: int = 0
     """Moving objects that provide evidence."""
     drifts: bool = False
-    """Whether it is not one time for the whole recording."""
+    """Whether it is not one time: older evidence was forgotten."""
 
     @property
     def warning(self) -> str:
         """Return what a user should know; empty for boxes that are in time, or may be."""
-        if abs(self.seconds) < NOTABLE or self.estimated is None:
-            return self.finding if self.drifts else ''
+        if self.estimated is None or not (self.drifts or abs(self.seconds) >= NOTABLE):
+            return ''
         word = 'late' if self.seconds > 0 else 'early'
+        changes = ', at the end of a latency that drifts' if self.drifts else ''
         return (
-            f'boxes are {abs(self.seconds):.2f} s {word}, and moved along their tracks before '
-            f'registration: correct their stamps where they are made, or set sampling.box_time'
+            f'boxes are {abs(self.seconds):.2f} s {word}{changes}, and moved to where their '
+            f'objects are at their stamps: correct the stamps where they are made, or set '
+            f'sampling.box_time'
         )
 
     @property
@@ -130,26 +133,19 @@ class _Sample(NamedTuple):
     costs: Floats
 
 
-class LateBoxes:
-    """
-    Estimate the latency of the boxes of a stream, and correct them.
-
-    Sweeps and boxes are added in the order of their arrival, in the fixed frame. Not thread-safe.
-
-    """
+class LatencyEvidence:
+    """Comparisons of boxes with points, and the latency that they show. Not thread-safe."""
 
     def __init__(self) -> None:
         self._samples = deque[_Sample](maxlen=MAX_SAMPLES)
-        self._has_new_samples = True
-        self._latency = Latency()
+        self._has_new_samples = False
+        self._latency = Latency(finding=NOTHING_MOVES)
         self.restart()
 
     def restart(self) -> None:
-        """Forget the tracks and sweeps, but not the latency: time has gone back."""
-        self._tracks: dict[str, _Path] = {}
-        self._sweeps = deque[Sweep]()
-        self._sampled_ns = -(2**62)
-        self.newest_ns = -(2**62)
+        """Forget the sweeps that wait, but not the latency: time has gone back."""
+        self._sweeps = deque[Sweep](maxlen=SWEEPS_HELD)
+        self._sampled_ns = -inf
 
     def add_sweep(self, sweep: Sweep) -> None:
         """Keep a sweep until the boxes are known that its points are compared with."""
@@ -157,83 +153,53 @@ class LateBoxes:
             self._sampled_ns = sweep.stamp_ns
             self._sweeps.append(sweep)
 
-    def add_boxes(self, boxes: BoxArray) -> None:
-        """Note the boxes, as they were given, and compare those of earlier sweeps with points."""
-        self.newest_ns = max(self.newest_ns, boxes.stamp_ns)
-        for row in np.flatnonzero(is_valid_box(boxes.boxes)).tolist():
-            path = self._tracks.setdefault(boxes.track_ids[row], _Path())
-            path.add(boxes.stamp_ns, boxes.boxes[row])
-        oldest_ns = self.newest_ns - TRACK_SECONDS * 1e9
-        self._tracks = {k: path for k, path in self._tracks.items() if path.newest_ns > oldest_ns}
-        while self._sweeps and self._sweeps[0].stamp_ns < self.newest_ns - CANDIDATES[-1] * 1e9:
-            self._compare(self._sweeps.popleft())
+    def compare(self, tracks: MeasuredTracks) -> None:
+        """Compare the sweeps whose later boxes are among the tracks."""
+        while self._sweeps and self._sweeps[0].stamp_ns < tracks.newest_ns - CANDIDATES[-1] * 1e9:
+            self._compare(self._sweeps.popleft(), tracks)
 
-    def corrected(self, boxes: BoxArray, latency: float) -> BoxArray:
-        """
-        Return boxes moved along their tracks to where their objects are at their stamp.
-
-        Between later boxes of the track that have been added, else on a circle beyond the last.
-
-        """
-        if not latency:
-            return boxes
-        moved = boxes.boxes.copy()
-        for row in np.flatnonzero(is_valid_box(boxes.boxes)).tolist():
-            path = self._tracks.get(boxes.track_ids[row])
-            if path is not None and boxes.track_ids[row]:
-                moved[row] = path.at(boxes.stamp_ns + round(latency * 1e9), moved[row])
-        return replace(boxes, boxes=moved)
-
-    def kept_up(self) -> Latency:
-        """
-        Return the latency by the newest evidence, for a stream that goes on.
-
-        It changes in steps of `USABLE_DEVIATION` or more: each step is a jump of the boxes.
-
-        """
+    @property
+    def latency(self) -> Latency:
+        """Return the latency by the newest evidence; it changes in steps of `STEP` or more."""
         if self._has_new_samples:
             self._has_new_samples = False
-            found = _estimated(self._samples)
-            if abs(found.seconds - self._latency.seconds) < USABLE_DEVIATION:
+            drifts = self._latency.drifts or self._forget_other_latency()
+            found = _estimated(self._samples)._replace(drifts=drifts)
+            if abs(found.seconds - self._latency.seconds) < STEP:
                 found = found._replace(seconds=self._latency.seconds)
             self._latency = found
         return self._latency
 
-    def estimate(self) -> Latency:
-        """Return the latency of a recording, by the evidence from all of it."""
-        whole = _estimated(self._samples)
-        if whole.finding or len(self._samples) < 2:
-            return whole
-        half = len(self._samples) // 2
-        first = _estimated(islice(self._samples, half))
-        last = _estimated(islice(self._samples, half, None))
-        if first.finding or last.finding:
-            return whole
-        assert first.estimated is not None and last.estimated is not None
-        assert first.deviation is not None and last.deviation is not None
-        drift = abs(last.estimated - first.estimated)
-        if drift > NOTABLE + SIGNIFICANCE * np.hypot(first.deviation, last.deviation):
-            return whole._replace(
-                seconds=0.0,
-                drifts=True,
-                finding=f'the latency of the boxes drifts from {first.estimated:.2f} to '
-                f'{last.estimated:.2f} s: they are not corrected; let one clock stamp boxes and '
-                f'clouds',
-            )
-        return whole
+    def _forget_other_latency(self) -> bool:
+        """Forget the older half of the evidence if it shows another latency; return if so."""
+        samples = [*self._samples]
+        half = len(samples) // 2
+        older, newer = _estimated(samples[:half]), _estimated(samples[half:])
+        if older.finding or newer.finding:
+            return False
+        assert older.estimated is not None and newer.estimated is not None
+        assert older.deviation is not None and newer.deviation is not None
+        drift = abs(newer.estimated - older.estimated)
+        if drift < NOTABLE + SIGNIFICANCE * np.hypot(older.deviation, newer.deviation):
+            return False
+        self._samples.clear()
+        self._samples.extend(samples[half:])
+        return True
 
-    def _compare(self, sweep: Sweep) -> None:
-        """Compare the points of a sweep with the boxes of moving objects."""
+    def _compare(self, sweep: Sweep, tracks: MeasuredTracks) -> None:
+        """Compare the points of a sweep with the boxes of objects that move in their frame."""
         times_ns = sweep.stamp_ns + np.round(CANDIDATES * 1e9).astype(np.int64)
-        paths = {k: path for k, path in self._tracks.items() if k and path.covers(times_ns)}
+        covering = {k: track for k, track in tracks.by_id.items() if track.covers(times_ns)}
         compared = Counter(sample.track_id for sample in self._samples)
         found = 0
-        for track_id in sorted(paths, key=compared.__getitem__):
-            boxes = paths[track_id].smoothed(times_ns)
+        for track_id in sorted(covering, key=compared.__getitem__):
+            boxes, velocities = covering[track_id].smoothed(times_ns)
             duration = CANDIDATES[-1] - CANDIDATES[0]
-            velocity = (boxes[-1, : Z + 1] - boxes[0, : Z + 1]) / duration
-            speed = float(np.linalg.norm(velocity))
-            costs = _costs(sweep, boxes, velocity) if speed > MIN_SPEED else None
+            shift = (boxes[-1, : Z + 1] - boxes[0, : Z + 1]) / duration  # per second of latency
+            speed = float(np.linalg.norm(shift))
+            costs = None
+            if speed > MIN_SPEED:
+                costs = _costs(sweep, boxes, shift, velocities.mean(0))
             if costs is not None:
                 self._has_new_samples = True
                 self._samples.append(_Sample(sweep.stamp_ns, track_id, speed, costs))
@@ -242,79 +208,127 @@ class LateBoxes:
                 break
 
 
-class _Path:
-    """The boxes of a track in the last seconds, as they were given."""
+class LatencyCorrection:
+    """
+    Bring the boxes of a stream to where their objects are at their stamp.
 
-    def __init__(self) -> None:
-        self._stamps_ns: list[int] = []
-        self._boxes: list[Floats] = []
+    It stands between matching and observation. The latency is the one that the settings state, or
+    that sweeps and boxes so far have shown: what is returned depends on the order of box arrays
+    and on the order of sweeps alone, not on how both are interleaved. Not thread-safe.
+
+    Parameters
+    ----------
+    waits : bool
+        Whether boxes wait: all for `FIRST_SECONDS`, to know the latency from the first on, and
+        each for the later boxes of its track that show its object. Otherwise they are predicted.
+    known : Latency, optional
+        The latency, if it is known otherwise.
+
+    """
+
+    def __init__(self, waits: bool, known: Latency | None = None) -> None:
+        self._waits = waits
+        self._known = known
+        self._evidence = LatencyEvidence()
+        self._set: Latency | None = None
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget tracks, sweeps and boxes, but not the latency: time has gone back."""
+        self._tracks = MeasuredTracks(CANDIDATES)
+        self._evidence.restart()
+        self._waiting = deque[Pair]()
+        self._first_ns: int | None = None
+        self._is_begun = False
 
     @property
-    def newest_ns(self) -> int:
-        """Stamp of the newest box [ns]."""
-        return self._stamps_ns[-1]
+    def latency(self) -> Latency:
+        """Return the latency that boxes are corrected by now."""
+        return self._set or self._evidence.latency
 
-    def add(self, stamp_ns: int, box: Floats) -> None:
-        """Add a box; one that is not newer than the others is left out."""
-        if self._stamps_ns and stamp_ns <= self.newest_ns:
+    def add_sweep(self, sweep: Sweep) -> None:
+        """Add a sweep, before the pairs that it completes."""
+        if self._is_estimated:
+            self._evidence.add_sweep(sweep)
+
+    @property
+    def waiting(self) -> list[BoxArray]:
+        """Return the box arrays that wait, in their order."""
+        return [pair.boxes for pair in self._waiting]
+
+    def add(self, pairs: Iterable[Pair], config: Config) -> Iterator[Pair]:
+        """Add pairs with ascending stamps; yield those that are in time, in their order."""
+        self._set = self._known or set_latency(config)
+        for pair in pairs:
+            self._waiting.append(pair)
+            if not pair.reason:
+                self._note(pair.boxes)
+            yield from self._ready()
+
+    def flush(self) -> Iterator[Pair]:
+        """Yield the pairs that wait, without waiting on."""
+        while self._waiting:
+            yield self._pop_corrected()
+
+    def _note(self, boxes: BoxArray) -> None:
+        """Add boxes to their tracks, and compare earlier sweeps with these."""
+        if self._first_ns is None:
+            self._first_ns = boxes.stamp_ns
+        if self._is_estimated or self.latency.seconds:
+            oldest_ns = min(boxes.stamp_ns, self._waiting[0].boxes.stamp_ns)
+            self._tracks.add(boxes, oldest_ns - TRACK_SECONDS * 1e9)
+        if self._is_estimated:
+            self._evidence.compare(self._tracks)
+
+    @property
+    def _is_estimated(self) -> bool:
+        return self._set is None
+
+    def _ready(self) -> Iterator[Pair]:
+        """Yield the pairs that wait for nothing."""
+        if self._waits and self._is_estimated and not self._knows_first_seconds():
             return
-        self._stamps_ns.append(stamp_ns)
-        self._boxes.append(box)
-        while self._stamps_ns[0] < stamp_ns - TRACK_SECONDS * 1e9:
-            del self._stamps_ns[0], self._boxes[0]
+        until_ns = inf
+        if self._waits and self.latency.seconds > 0:
+            until_ns = self._tracks.newest_ns - self.latency.seconds * 1e9
+        while self._waiting:
+            first = self._waiting[0]
+            if first.boxes.stamp_ns > until_ns and not first.reason:
+                return
+            yield self._pop_corrected()
 
-    def covers(self, times_ns: Ints) -> bool:
-        """Return whether all times are within those of the boxes."""
-        return bool(self._stamps_ns[0] <= times_ns[0] and times_ns[-1] <= self.newest_ns)
+    def _knows_first_seconds(self) -> bool:
+        """Return whether boxes have waited long enough for the latency to be known."""
+        if not self._is_begun and self._first_ns is not None:
+            seconds = (self._tracks.newest_ns - self._first_ns) * 1e-9
+            sweeps = {id(pair.sweep): pair.sweep for pair in self._waiting}.values()
+            points = sum(len(sweep.points) for sweep in sweeps if sweep is not None)
+            self._is_begun = seconds >= FIRST_SECONDS or points >= FIRST_POINTS
+        return self._is_begun
 
-    def at(self, time_ns: int, box: Floats) -> Floats:
-        """Return the box (9,) at a time, between those known or beyond; it heads as `box` does."""
-        if time_ns > self.newest_ns:
-            from boxreg_ros.core.motion import motion_at  # it imports numba
-
-            stamps_ns, boxes = np.array(self._stamps_ns), np.array(self._boxes)
-            found = motion_at(stamps_ns, boxes, -1, Config().vehicle).predict(time_ns)
-        elif time_ns <= self._stamps_ns[0]:
-            found = self._boxes[0].copy()
-        else:
-            after = int(np.searchsorted(self._stamps_ns, time_ns))
-            begin_ns, end_ns = self._stamps_ns[after - 1 : after + 1]
-            first, last = self._boxes[after - 1 : after + 1]
-            last = last.copy()
-            last[YAW] = first[YAW] + (last[YAW] - first[YAW] + np.pi / 2) % np.pi - np.pi / 2
-            found = first + (time_ns - begin_ns) / (end_ns - begin_ns) * (last - first)
-        if np.cos(found[YAW] - box[YAW]) < 0:
-            found[YAW] += np.pi
-        found[YAW] = wrap_angle(found[YAW])
-        return found
-
-    def smoothed(self, times_ns: Ints) -> Floats:
-        """Return boxes (C, 9) at some times, on local lines through the boxes."""
-        seconds = (np.array(self._stamps_ns)[:, None] - times_ns) * 1e-9  # (n, C)
-        weights = np.clip(SMOOTHING - np.abs(seconds), 1e-6, None)
-        weights /= weights.sum(0)
-        mean = (weights * seconds).sum(0)
-        offsets = seconds - mean
-        spread = (weights * offsets**2).sum(0)
-        boxes = np.array(self._boxes)
-        boxes[:, YAW] = np.unwrap(boxes[:, YAW], period=np.pi)
-        middle = weights.T @ boxes
-        slope = (weights * offsets).T @ boxes / spread[:, None]
-        found: Floats = middle - mean[:, None] * slope
-        found[:, BOX_EXTENT] = np.median(boxes[:, BOX_EXTENT], axis=0)
-        return found
+    def _pop_corrected(self) -> Pair:
+        """Return the first pair that waits, in time."""
+        pair = self._waiting[0]
+        latency = self.latency.seconds
+        if latency and not pair.reason:
+            moved = self._tracks.at_stamp(pair.boxes, latency)
+            pair = pair._replace(boxes=replace(pair.boxes, boxes=moved))
+        self._waiting.popleft()  # only now: an error loses no boxes
+        return pair
 
 
-def _costs(sweep: Sweep, boxes: Floats, velocity: Floats) -> Floats | None:
+def _costs(sweep: Sweep, boxes: Floats, shift: Floats, velocity: Floats) -> Floats | None:
     """
     Return how badly boxes (C, 9) along a path fit the points, (2, C); None with too few points.
+
+    The path leads along `shift` (3,), while the object moves with `velocity` (3,) [m/s].
 
     The part of the points outside of a box, and their mean distance from its faces: the first is
     robust, the second precise. First for the points where they were seen, then for those at the
     stamp.
 
     """
-    points = _points_near(sweep, boxes, velocity)
+    points = _points_near(sweep, boxes, shift)
     costs = np.zeros((2, len(boxes)))
     if points is None:
         return None
@@ -335,7 +349,7 @@ def _costs(sweep: Sweep, boxes: Floats, velocity: Floats) -> Floats | None:
     return costs
 
 
-def _points_near(sweep: Sweep, boxes: Floats, velocity: Floats) -> tuple[Floats, Floats] | None:
+def _points_near(sweep: Sweep, boxes: Floats, shift: Floats) -> tuple[Floats, Floats] | None:
     """Return points (M, 3) around boxes along a path and their times (M,); None with too few."""
     centers = boxes[:, : Z + 1]
     middle = centers.mean(0)
@@ -343,7 +357,7 @@ def _points_near(sweep: Sweep, boxes: Floats, velocity: Floats) -> tuple[Floats,
     R, t = np.eye(3), np.zeros(3)
     if sweep.T_frame_points is not None:
         R, t = sweep.T_frame_points[:3, :3], sweep.T_frame_points[:3, 3]
-    ahead = velocity / np.linalg.norm(velocity)
+    ahead = shift / np.linalg.norm(shift)
     beside = np.array([-ahead[Y], ahead[X], 0.0])
     reach = np.abs((centers - middle) @ np.stack([ahead, beside], 1)).max(0)
     reach += np.array([length, width]) / 2 + PATH_REACH
@@ -368,7 +382,7 @@ def _estimated(samples: Any) -> Latency:
     for sample in samples:
         of_track.setdefault(sample.track_id, []).append(sample)
     if not of_track:
-        return Latency(finding='nothing moves that boxes and points could be compared by')
+        return Latency(finding=NOTHING_MOVES)
     costs = np.array([_weighted([one.costs for one in group]) for group in of_track.values()])
     speed = np.mean([one.speed for group in of_track.values() for one in group])
     n = len(costs)
@@ -376,19 +390,33 @@ def _estimated(samples: Any) -> Latency:
     seen, at_stamp = costs.sum(0).argmin(1)
     better = costs[:, 0, seen] - costs[:, 1, at_stamp]  # at the stamp, for each track
     if abs(better.sum()) > PREFERENCE * np.sqrt(np.square(better).sum()):
-        estimated, jackknife = ways[int(better.sum() > 0)]
+        way = int(better.sum() > 0)
     else:
-        estimated, jackknife = min(ways, key=lambda way: abs(way[0]))
+        way = int(abs(ways[1][0]) < abs(ways[0][0]))
+    estimated, jackknife = ways[way]
     deviation = float(np.hypot(jackknife, CONSTANT_ERROR / speed / np.sqrt(n)))
     found = Latency(0.0, '', estimated, deviation, n)
-    if abs(estimated) >= max(NOTABLE, SIGNIFICANCE * deviation):
+    is_significant = abs(estimated) >= max(NOTABLE, SIGNIFICANCE * deviation)
+    is_inside = CANDIDATES[0] < estimated < CANDIDATES[-1]  # at the ends it is no minimum
+    if is_significant and is_inside and _fits_better(costs[:, way]):
         found = found._replace(seconds=estimated)
-    elif deviation > USABLE_DEVIATION:
+    elif deviation > USABLE_DEVIATION or is_significant:
         found = found._replace(
             finding=f'the latency of the boxes is not known: {estimated:.2f} s with a deviation '
             f'of {deviation:.2f} s, by {n} moving objects'
         )
     return found
+
+
+def _fits_better(costs: Floats) -> bool:
+    """Return whether the tracks of costs (n, C) fit better at the minimum than in time."""
+    in_time = int(np.abs(CANDIDATES).argmin())
+    gain = costs[:, in_time] - costs[:, costs.sum(0).argmin()]  # of each track
+    # The mean is `GAIN` times its deviation s / sqrt(n) where the sum is so many root sums of
+    # squares. A single track has no spread, and a ratio of 1.
+    n = len(costs)
+    ratio = GAIN * np.sqrt(n / (n - 1 + GAIN**2)) - 1e-9
+    return bool(gain.sum() > ratio * np.sqrt(np.square(gain).sum()))
 
 
 def _minimum_and_jackknife(costs: Floats) -> tuple[float, float]:

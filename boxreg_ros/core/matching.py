@@ -21,6 +21,16 @@ class Pair(NamedTuple):
 
     boxes: BoxArray
     sweep: Sweep | None
+    reason: str = ''
+    """Why the boxes are kept, whether or not there is a sweep; empty for others."""
+
+
+class _Unpaired(NamedTuple):
+    """A box array that waits for its sweep, or for the arrays before it."""
+
+    order_ns: int
+    boxes: BoxArray
+    reason: str
 
 
 class StampMatcher:
@@ -41,13 +51,19 @@ class StampMatcher:
         self._capacity = config.queue
         self._counts = counts
         self._sweeps: list[Sweep] = []  # ascending by stamp
-        self._boxes: list[BoxArray] = []  # ascending by stamp
+        self._unpaired: list[_Unpaired] = []  # ascending by stamp
+        self._newest_boxes_ns = 0
         self._used_ns: set[int] = set()  # stamps of held sweeps that were paired
         self._newest_ns = -inf  # of all sweeps added
         self._oldest_ns = -inf  # sweeps before this one are late
 
-    def add_sweep(self, sweep: Sweep) -> list[Pair]:
-        """Add a sweep; return the pairs completed by it."""
+    @property
+    def unpaired(self) -> list[BoxArray]:
+        """Return the box arrays that wait, in their order."""
+        return [one.boxes for one in self._unpaired]
+
+    def add_sweep(self, sweep: Sweep) -> Iterator[Pair]:
+        """Add a sweep; yield the pairs completed by it."""
         if sweep.stamp_ns < self._oldest_ns:
             self._counts[Reason.SWEEP_LATE] += 1
         elif any(sweep.stamp_ns == other.stamp_ns for other in self._sweeps):
@@ -55,32 +71,44 @@ class StampMatcher:
         else:
             insort(self._sweeps, sweep, key=lambda item: item.stamp_ns)
         self._newest_ns = max(self._newest_ns, sweep.stamp_ns)
-        pairs = list(self._pop_pairs())
+        yield from self._pop_pairs()
         if len(self._sweeps) > self._capacity:
             self._discard_before(self._sweeps[1].stamp_ns)
-        return pairs
 
-    def add_boxes(self, boxes: BoxArray) -> list[Pair]:
-        """Add a box array; return the pairs completed by it."""
-        insort(self._boxes, boxes, key=lambda item: item.stamp_ns)
-        return list(self._pop_pairs())
+    def add_boxes(self, boxes: BoxArray, reason: str = '') -> Iterator[Pair]:
+        """
+        Add a box array; yield the pairs completed by it.
 
-    def flush(self) -> list[Pair]:
-        """Return all box arrays held, paired or not, and discard all sweeps."""
-        pairs = list(self._pop_pairs(is_flush=True))
+        With a `reason` it is kept: it waits for no sweep, but for the arrays before it. One
+        without a stamp stands behind the newest.
+
+        """
+        order_ns = boxes.stamp_ns
+        if reason and order_ns <= 0:
+            order_ns = self._newest_boxes_ns
+        elif not reason:
+            self._newest_boxes_ns = max(self._newest_boxes_ns, order_ns)
+        insort(self._unpaired, _Unpaired(order_ns, boxes, reason), key=lambda one: one.order_ns)
+        yield from self._pop_pairs()
+
+    def flush(self) -> Iterator[Pair]:
+        """Yield all box arrays held, paired or not, and discard all sweeps."""
+        yield from self._pop_pairs(is_flush=True)
         self._discard_before(self._newest_ns + 1)
-        return pairs
 
     def _pop_pairs(self, is_flush: bool = False) -> Iterator[Pair]:
         """Yield the oldest box arrays as long as no later sweep can be nearer to them."""
-        while self._boxes:
-            stamp_ns = self._boxes[0].stamp_ns
+        while self._unpaired:
+            stamp_ns, boxes, reason = self._unpaired[0]
+            if reason:
+                yield Pair(self._unpaired.pop(0).boxes, None, reason)
+                continue
             sweep = min(self._sweeps, key=lambda s: abs(s.stamp_ns - stamp_ns), default=None)
             offset_ns = self._reach_ns + 1
             if sweep is not None:
                 offset_ns = abs(sweep.stamp_ns - stamp_ns)
             is_decided = offset_ns <= self._at_once_ns or self._newest_ns >= stamp_ns
-            is_over_capacity = len(self._boxes) > self._capacity
+            is_over_capacity = len(self._unpaired) > self._capacity
             if not (is_decided or is_over_capacity or is_flush):
                 return
             if offset_ns > self._reach_ns:
@@ -90,8 +118,8 @@ class StampMatcher:
                 if sweep.is_dropped:
                     sweep = None
                 else:
-                    _check_frames(sweep, self._boxes[0])
-            yield Pair(self._boxes.pop(0), sweep)
+                    _check_frames(sweep, boxes)
+            yield Pair(self._unpaired.pop(0).boxes, sweep)
             self._discard_before(stamp_ns - self._reach_ns)
 
     def _discard_before(self, oldest_ns: float) -> None:

@@ -64,9 +64,9 @@ class PendingArray:
     Attributes
     ----------
     input : BoxArray
-        As added, followed by the predicted boxes of tracks that have none here.
+        As they are registered, followed by the predicted boxes of tracks that have none here.
     num_given : int
-        Boxes that were added.
+        Boxes to register.
     reasons : list of str
         Why each box is kept as long as it has no estimate.
     num_points : array, shape (n,)
@@ -83,15 +83,24 @@ class PendingArray:
     """
 
     def __init__(self, boxes: BoxArray) -> None:
+        self.num_unsettled = 0
+        self.is_observed = False
+        self.followed: list[int] = []
+        self.set_input(boxes)
+
+    def set_input(self, boxes: BoxArray) -> None:
+        """Set the boxes to register."""
         n = len(boxes.track_ids)
         self.input = boxes
         self.reasons = [''] * n
         self.num_points = np.zeros(n, int)
         self.estimates: list[tuple[Estimates, int] | None] = [None] * n
         self.num_given = n
-        self.num_unsettled = 0
-        self.is_observed = False
-        self.followed: list[int] = []
+
+    def keep_all(self, reason: str) -> None:
+        """Return the boxes as they are, all for one reason."""
+        self.set_input(self.input.take(range(self.num_given)))
+        self.reasons = [str(reason)] * self.num_given
 
     def set_reasons(self, reason: str) -> None:
         """Set the reason of each box that cannot be refined; `reason`, if any, holds for all."""

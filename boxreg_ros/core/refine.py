@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.latency import Latency
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import ConfigError, ShapeError
@@ -231,7 +232,10 @@ def registered(
             places.setdefault(stamp_ns, []).append(_Place(index, row))
 
     registrar = BoxRegistrar(
-        replace(config, reach=0.0), has_whole_sweeps=False, constants=constants
+        replace(config, reach=0.0),
+        has_whole_sweeps=False,
+        constants=constants,
+        latency=Latency(),  # points are given per box, of its own time
     )
     results: list[RefinedBoxes] = []
     for stamp_ns in sorted(places):

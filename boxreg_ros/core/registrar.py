@@ -15,6 +15,7 @@ from boxreg_ros.core.field_of_view import FieldOfView
 from boxreg_ros.core.following.stream import FollowedObjects
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_statistics import Drives
+from boxreg_ros.core.latency import Latency, LatencyCorrection
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.observation import Observation, Observations, observe
@@ -31,6 +32,8 @@ GetEstimates = Callable[[], list[Estimate | None]]
 """Waits for the estimates of submitted windows, None for windows that are too short."""
 Submit = Callable[[list[Window], Config, InputModel], GetEstimates]
 """Starts `register` with the same arguments, perhaps in another process."""
+Prepare = Callable[[Pair], BoxArray]
+"""Returns the boxes to register in place of those of a pair, which are in time."""
 Budget = Callable[[int], int]
 """
 Returns how many windows may be solved for the box array at hand.
@@ -54,9 +57,10 @@ class BoxRegistrar:
     thread-safe.
 
     Each box array added is returned exactly once with ``is_final=True``, with all its boxes in
-    the order of the input; `coasted` boxes follow. Stamps of returned arrays ascend, except for
-    late arrays. With `estimate` 'early' or 'final' an array is returned once more before that,
-    with ``is_final=False``, as soon as its sweep is known.
+    the order of the input; `coasted` boxes follow. Stamps of returned arrays ascend; a late array
+    stands before the younger ones that have not been returned. With `estimate` 'early' or 'final'
+    an array is returned once more before that, with ``is_final=False``, as soon as its sweep is
+    known.
 
     Parameters
     ----------
@@ -76,6 +80,11 @@ class BoxRegistrar:
         its field of view.
     constants : Constants, optional
         Numbers of the method, if others than the usual ones, as for the boxes of a person.
+    latency : Latency, optional
+        Of the boxes, where it is known; default: as set, or estimated, see `LatencyCorrection`.
+    prepare : callable, optional
+        Called with each pair whose boxes are in time; returns those to register in their place,
+        with the same stamp and ticket. Default: the same.
 
     Attributes
     ----------
@@ -94,14 +103,16 @@ class BoxRegistrar:
     -----
     A **box array** passes through these states, in this order:
 
-    1. *Unpaired*: held by `StampMatcher` until its sweep is known, or known not to come.
+    1. *Unpaired*: held by `StampMatcher` until its sweep is known, or known not to come. Then its
+       late boxes are brought to their stamp by `LatencyCorrection`, where arrays wait with
+       'track'.
     2. *Pending*: each valid box is an observation of the track with its id. A box that cannot be
-       refined has a reason and is not waited for. Estimates overwrite each other until they are
-       settled.
+       refined has a reason and is not waited for, nor are the boxes of `add_kept`. Estimates
+       overwrite each other until they are settled.
     3. *Settled*: no estimate changes any more. With 'early' and 'final' an array is settled when
        `lag` younger arrays are paired. With 'track' it is settled when all its observations have
        been estimated in a window where they are not among the newest eighth.
-    4. *Returned*: arrays are returned in the order they were paired, so a settled array waits for
+    4. *Returned*: arrays are returned in the order of their stamps, so a settled array waits for
        the arrays before it.
 
     A **track** starts with the first observation of its id. With 'early' and 'final' its window
@@ -134,6 +145,8 @@ class BoxRegistrar:
         drives: Drives | None = None,
         has_whole_sweeps: bool = True,
         constants: Constants | None = None,
+        latency: Latency | None = None,
+        prepare: Prepare | None = None,
     ) -> None:
         self.config = config
         self.counts: Counter[str] = Counter()
@@ -142,17 +155,21 @@ class BoxRegistrar:
         self._drives = drives
         self._has_whole_sweeps = has_whole_sweeps
         self._constants = constants
+        self._prepare = prepare
+        self._correction = LatencyCorrection(config.estimate == 'track', latency)
         self.reset()
 
     def reset(self) -> None:
-        """Discard tracks and box arrays that are held; keep the counts."""
+        """Discard tracks and box arrays that are held; keep the counts, and the latency."""
         config = self.config
+        self._correction.restart()
         self._matcher = StampMatcher(config, self.counts)
         self._input_model = InputModel(config.faces, self._drives, self._constants)
         self.box_time = BoxTimeEvidence()
         self._view = FieldOfView() if self._has_whole_sweeps else None
         self.followed = FollowedObjects(config)
         self._pending = deque[PendingArray]()
+        self._ready: list[RefinedBoxes] = []  # survives an error while further ones are made
         self._newest_ns = -inf
         self._tracks: dict[str, ObservedTrack] = {}
         self._ended_tracks: list[ObservedTrack] = []
@@ -173,12 +190,28 @@ class BoxRegistrar:
         """Add a sweep; return the box arrays that are completed by it."""
         self.counts['sweeps'] += not sweep.is_dropped
         self.followed.add_sweep(sweep)
-        return list(self._process(self._matcher.add_sweep(sweep)))
+        self._correction.add_sweep(sweep)
+        return self._process(self._matcher.add_sweep(sweep))
 
     def add_boxes(self, boxes: BoxArray) -> list[RefinedBoxes]:
         """Add a box array; return the box arrays that are completed by it."""
         self.counts['boxes'] += len(boxes.track_ids)
-        return list(self._process(self._matcher.add_boxes(boxes)))
+        return self._process(self._matcher.add_boxes(boxes))
+
+    def add_kept(self, boxes: BoxArray, reason: str) -> list[RefinedBoxes]:
+        """
+        Add a box array that cannot be refined; return the box arrays that are completed by it.
+
+        Parameters
+        ----------
+        boxes : BoxArray
+            In any frame. One without a stamp stands behind the newest array.
+        reason : str
+            Why its boxes are returned as they are.
+
+        """
+        self.counts['boxes'] += len(boxes.track_ids)
+        return self._process(self._matcher.add_boxes(boxes, reason))
 
     def follow(self, boxes: BoxArray) -> None:
         """Follow the object of each box, with `estimate` 'early' or 'final', see the notes."""
@@ -186,13 +219,24 @@ class BoxRegistrar:
 
     def flush(self) -> list[RefinedBoxes]:
         """Return all box arrays held. Tracks end with `estimate` 'track', else they go on."""
-        ready = list(self._process(self._matcher.flush()))
+        self._register(chain(self._in_time(self._matcher.flush()), self._correction.flush()))
         if self.config.estimate == 'track':
             self._end(list(self._tracks))
             self._solve([])
         for array in self._pending:
             array.num_unsettled = 0
-        return [*ready, *self._pop_settled()]
+        return self._returned()
+
+    def abandon(self, reason: str) -> list[RefinedBoxes]:
+        """Return all box arrays held, kept for a reason, after an error; reset everything else."""
+        unpaired = [*self._correction.waiting, *self._matcher.unpaired]
+        self._pending.extend(PendingArray(boxes) for boxes in unpaired)
+        for array in self._pending:
+            array.keep_all(reason)
+            array.num_unsettled = 0
+        ready = self._returned()
+        self.reset()
+        return ready
 
     def catch_up(self, limit: int) -> list[RefinedBoxes]:
         """
@@ -207,7 +251,7 @@ class BoxRegistrar:
         waiting = [track for track in self._tracks.values() if track.num_carried]
         if waiting:
             self._solve(_by_urgency(waiting)[:limit])
-        return list(self._pop_settled())
+        return self._returned()
 
     @property
     def num_waiting(self) -> int:
@@ -227,22 +271,55 @@ class BoxRegistrar:
         """Return what the boxes so far have shown of their detector, by a `name`."""
         return self._input_model.statistics(name)
 
-    def _process(self, pairs: list[Pair]) -> Iterator[RefinedBoxes]:
+    @property
+    def latency(self) -> Latency:
+        """Return the latency of the boxes, by which they are corrected."""
+        return self._correction.latency
+
+    @property
+    def unpaired(self) -> list[BoxArray]:
+        """Return the box arrays whose sweep is not known, in their order."""
+        return self._matcher.unpaired
+
+    @property
+    def num_held(self) -> int:
+        """Return the number of box arrays that have not been returned as final."""
+        paired = len(self._correction.waiting) + len(self._pending)
+        return len(self._matcher.unpaired) + paired
+
+    def _process(self, pairs: Iterator[Pair]) -> list[RefinedBoxes]:
+        self._register(self._in_time(pairs))
+        return self._returned()
+
+    def _in_time(self, pairs: Iterator[Pair]) -> Iterator[Pair]:
+        """Yield pairs with their late boxes corrected, as soon as the latency is known."""
+        return self._correction.add(pairs, self.config)
+
+    def _register(self, pairs: Iterator[Pair]) -> None:
+        """Observe pairs, and solve the windows that they complete."""
         for pair in pairs:
             array = self._open(pair)
-            if self.config.estimate == 'track':
-                self._solve_full_windows()
-            else:
-                self._solve(self._within_budget(array))
-                yield array.result(is_final=False)
+            is_track = self.config.estimate == 'track'
+            if not pair.reason:
+                if is_track:
+                    self._solve_full_windows()
+                else:
+                    self._solve(self._within_budget(array))
+            if not is_track:
+                self._ready.append(array.result(is_final=False))
                 self._settle_after_lag()
-            yield from self._pop_settled()
+            self._pop_settled()
 
     def _open(self, pair: Pair) -> PendingArray:
         """Make a box array pending: its valid boxes become observations of their tracks."""
-        boxes, sweep = pair
-        array = PendingArray(boxes)
-        self._pending.append(array)
+        array = PendingArray(pair.boxes)
+        self._queue(array)
+        if pair.reason:
+            array.keep_all(pair.reason)
+            return array
+        if self._prepare is not None:
+            array.set_input(self._prepare(pair))
+        boxes, sweep = array.input, pair.sweep
         reason = ''
         if boxes.stamp_ns < self._newest_ns:
             reason = Reason.LATE
@@ -258,6 +335,15 @@ class BoxRegistrar:
         if sweep is not None:
             self._observe(array, sweep)
         return array
+
+    def _queue(self, array: PendingArray) -> None:
+        """Append an array to those that are returned in their order; a late one to its place."""
+        stamp_ns = array.input.stamp_ns
+        place = len(self._pending)
+        if 0 < stamp_ns < self._newest_ns:
+            while place and self._pending[place - 1].input.stamp_ns > stamp_ns:
+                place -= 1
+        self._pending.insert(place, array)
 
     def _observe(self, array: PendingArray, sweep: Sweep) -> None:
         """Add an observation to the track of each box that has no reason not to be refined."""
@@ -448,13 +534,21 @@ class BoxRegistrar:
         self._submitted = []
         self._get_estimates = list
 
-    def _pop_settled(self) -> Iterator[RefinedBoxes]:
-        """Yield settled box arrays, up to the first one that is not."""
+    def _pop_settled(self) -> None:
+        """Make the results of settled box arrays, up to the first one that is not."""
         while self._pending and self._pending[0].num_unsettled <= 0:
-            refined = self._pending.popleft().result(is_final=True)
+            refined = self._pending[0].result(is_final=True)
+            self._pending.popleft()
             self.counts.update(refined.status)
             self.counts.update(reason for reason in refined.reasons if reason)
-            yield refined
+            self._ready.append(refined)
+
+    def _returned(self) -> list[RefinedBoxes]:
+        """Return the results that are ready, once."""
+        self._pop_settled()
+        ready = self._ready
+        self._ready = []
+        return ready
 
 
 def _windows(tracks: Sequence[ObservedTrack]) -> list[Window]:

@@ -11,6 +11,7 @@ transforms and publishing; `boxreg relabel` adds reading and writing.
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import Generic, NamedTuple, TYPE_CHECKING, TypeVar
 
 from boxreg_ros.config import Config
@@ -129,17 +130,17 @@ class Session:
         report: Report = ignore,
     ) -> None:
         self.tree = TransformTree()
-        self._placement = placement or SensorPlacement()
+        self.placement = placement or SensorPlacement()
         self.fixed_frame = fixed_frame.lstrip('/')
         self.sensor_frame = ''
         self._convention = convention
         self._config = config
         self._tracker = Tracker(config.max_gap) if convention.associate else None
         self._merger: SweepMerger | None = None
-        topics = self._placement.lidars.topics
+        topics = self.placement.lidars.topics
         if len(topics) > 1:
             self._merger = SweepMerger(topics, config.merge_span, report)
-        lidars = self._placement.lidars
+        lidars = self.placement.lidars
         self._motion_check = MotionCheck(self.tree, bool(lidars.frames or lidars.info))
         self._id_check = None if convention.associate else IdCheck(config.max_gap)
         self._axis_check = AxisCheck(convention, self._is_vehicle)
@@ -193,7 +194,10 @@ class Session:
         reason, detail = None, ''
         moved = move_to_frame(item, T_fixed_item, self.fixed_frame)
         if isinstance(moved, Sweep):
-            moved, reason, detail = self._placement.placed(moved, self.tree)
+            moved, reason, detail = self.placement.placed(moved, self.tree)
+        else:
+            motion = self.tree.motion(self.fixed_frame, item.frame_id, item.stamp_ns)
+            moved = replace(moved, motion=motion)
         self._pose_check.add(moved)
         if isinstance(moved, BoxArray):
             if self._tracker is not None:
@@ -281,12 +285,13 @@ class Session:
 
 
 def hand_to_registrar(
-    registrar: BoxRegistrar, moved: Sweep | BoxArray | None, restarts: bool
+    registrar: BoxRegistrar, moved: Sweep | BoxArray | None, restarts: bool, reason: str = ''
 ) -> list[RefinedBoxes]:
     """
     Hand an item, moved as of `Admitted`, to the registrar; return results that are ready now.
 
-    If time went back before it, tracks are flushed and the registrar is reset first.
+    If time went back before it, tracks are flushed and the registrar is reset first. With a
+    `reason` boxes are kept.
 
     """
     ready: list[RefinedBoxes] = []
@@ -295,6 +300,8 @@ def hand_to_registrar(
         registrar.reset()
     if isinstance(moved, Sweep):
         ready += registrar.add_sweep(moved)
+    elif moved is not None and reason:
+        ready += registrar.add_kept(moved, reason)
     elif moved is not None:
         ready += registrar.add_boxes(moved)
     return ready

@@ -18,7 +18,8 @@ from boxreg_ros.io.session import is_placeholder
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.inbox import Inbox, Message
-from boxreg_ros.live.live_registrar import LiveRegistrar, Outgoing
+from boxreg_ros.live.live_registrar import LiveRegistrar
+from boxreg_ros.live.outgoing import Outgoing
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.structures import BoxArray, Sweep
 from msg_adapters import Adapter
@@ -121,7 +122,7 @@ class Worker:
             self._live.session.sensor_frame = self.cloud_frame  # may arrive while boxes wait
             if item is None:
                 self._pause()
-            elif self._live.is_ready(item, time.monotonic()):
+            elif self._live.wait.is_over(item, time.monotonic()):
                 self._process(item)
                 item = None
             else:
@@ -259,8 +260,8 @@ class Worker:
                 self._publish(self._guarded(self._live.reset))
             case 'settings':
                 self._live.config, options = content
-                self._live.output_frame = options.output_frame.lstrip('/')
-                self._live.transform_timeout = options.transform_timeout
+                self._live.wait.output_frame = options.output_frame.lstrip('/')
+                self._live.wait.timeout = options.transform_timeout
                 self._budget.deadline = options.deadline
             case _:
                 raise ValueError(f'kind: expected that of an event, got {kind!r}')
@@ -286,7 +287,7 @@ class Worker:
         except Exception as error:
             self._health.report_failure(error)
         else:
-            self._live.follow(Item(time.monotonic_ns(), boxes, message=message))
+            self._live.following.add(Item(time.monotonic_ns(), boxes, message=message))
 
     def _process(self, item: Item) -> None:
         if isinstance(item.content, BoxArray):

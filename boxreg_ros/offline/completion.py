@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_statistics import Drives
-from boxreg_ros.core.matching import Pair, StampMatcher
+from boxreg_ros.core.latency import Latency
+from boxreg_ros.core.matching import Pair
 from boxreg_ros.core.observation import crop
 from boxreg_ros.core.registrar import BoxRegistrar, Submit
 from boxreg_ros.io.session import hand_to_registrar
-from boxreg_ros.io.stamp_order import kept
 from boxreg_ros.offline.reader import ReadItem
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import BoxArray, Floats, Ints, is_valid_box, RefinedBoxes, ROLL, Sweep
+from boxreg_ros.structures import (
+    BoxArray,
+    Floats,
+    Ints,
+    is_valid_box,
+    kept,
+    RefinedBoxes,
+    ROLL,
+    Sweep,
+)
 from boxreg_ros.tracks.complete import complete, CompletionPlan
 from boxreg_ros.tracks.decided import Decided, NOTHING
 from boxreg_ros.tracks.followed import with_evidence
@@ -104,6 +112,16 @@ def _oldest_to_come(arrays: Sequence[BoxArray]) -> list[float]:
     return oldest[::-1]
 
 
+def with_boxes_in_time(
+    items: Iterable[ReadItem], in_time: Sequence[BoxArray]
+) -> Iterator[ReadItem]:
+    """Yield the items of a recording with the boxes that a `FirstPass` has brought in time."""
+    arrays = iter(in_time)
+    for item in items:
+        is_boxes = isinstance(item.moved, BoxArray)
+        yield item._replace(moved=replace(next(arrays), ticket=None)) if is_boxes else item
+
+
 def with_empty_arrays(
     items: Iterable[ReadItem], parts: Sequence[Arrivals], frame_id: str
 ) -> Iterator[ReadItem]:
@@ -131,46 +149,15 @@ SIDE_MARGIN = 0.2
 
 Moved = Sweep | BoxArray | None
 """An item in the fixed frame; None where no transform is known."""
+NO_COUNTS = np.zeros(0, np.int64)
+"""Counts of an array without boxes."""
 
 
-class PointCounter:
-    """Count the points above the road in boxes, (n,) by the ticket of each array with a sweep."""
-
-    def __init__(self, config: Config) -> None:
-        self._config = config
-        self.counts: dict[object, Ints] = {}
-        self.restart()
-
-    def restart(self) -> None:
-        """Discard sweeps and boxes that wait for each other."""
-        self._matcher = StampMatcher(self._config, Counter())
-
-    def add(self, item: Moved) -> None:
-        """Add a sweep or boxes."""
-        if isinstance(item, BoxArray):
-            self._count(self._matcher.add_boxes(item))
-        elif item is not None:
-            self._count(self._matcher.add_sweep(item))
-
-    def finish(self) -> None:
-        """Count the boxes that still wait."""
-        self._count(self._matcher.flush())
-
-    def of(self, array: BoxArray) -> Ints:
-        """Return the counts of an array; zeros where it has no sweep."""
-        return self.counts.get(array.ticket, np.zeros(len(array.track_ids), np.int64))
-
-    def _count(self, pairs: Iterable[Pair]) -> None:
-        for boxes, sweep in pairs:
-            if sweep is not None:
-                self.counts[boxes.ticket] = points_above_road(sweep, boxes.boxes)
-
-
-def points_above_road(sweep: Sweep, boxes: Floats) -> Ints:
+def points_above_road(sweep: Sweep | None, boxes: Floats) -> Ints:
     """Return the number of points (n,) in boxes (n, 9), without the lowest part; 0 if invalid."""
     counts = np.zeros(len(boxes), np.int64)
     valid = np.flatnonzero(is_valid_box(boxes))
-    if not len(valid):
+    if sweep is None or not len(valid):
         return counts
     near = crop(sweep, boxes[valid], SIDE_MARGIN)
     up = matrix_from_rpy(boxes[valid, ROLL:])[:, :, 2]
@@ -185,16 +172,24 @@ class FirstPass(NamedTuple):
     """A registered recording, before its tracks are completed: by part between time jumps."""
 
     given: list[list[BoxArray]]
+    """As they were registered."""
     results: list[list[RefinedBoxes]]
     num_points: list[list[Ints]]
     parts: list[Arrivals]
+    in_time: list[BoxArray]
+    """Of all parts, as they arrived, but where their objects are at their stamp."""
+    latency: Latency
 
     def plan(self, fixed_frame: str, config: Config, decided: Decided = NOTHING) -> CompletionPlan:
         """Return what completes the tracks in the fixed frame; each part on its own."""
         whole = CompletionPlan([], [])
-        for part in zip(*self[:3], strict=True):
+        for part in zip(self.given, self.results, self.num_points, strict=True):
             whole.append(complete(*part, fixed_frame, config, decided))
         return whole
+
+
+def _unchanged(boxes: BoxArray) -> BoxArray:
+    return boxes
 
 
 def first_pass(
@@ -203,52 +198,69 @@ def first_pass(
     submit: Submit | None = None,
     fixed_frame: str | None = None,
     drives: Drives | None = None,
+    corrected: Callable[[BoxArray], BoxArray] = _unchanged,
 ) -> FirstPass:
     """
     Register a recording, and count the points in its boxes.
 
-    `items` are in the fixed frame, each with whether time went back before it. With `fixed_frame`
-    sweeps without boxes get an empty array, see `Arrivals`. The rest is as of `BoxRegistrar`.
+    Parameters
+    ----------
+    items : iterable of pairs
+        In the fixed frame, each with whether time went back before it.
+    config, submit, drives
+        As of `BoxRegistrar`.
+    fixed_frame : str, optional
+        With it, sweeps without boxes get an empty array, see `Arrivals`.
+    corrected : callable
+        Returns boxes in time as a person has decided.
 
     """
-    registrar = BoxRegistrar(config, submit, drives=drives)
-    counter = PointCounter(config)
     parts = [Arrivals()]
-    count = 0
+    arrived: list[int] = []
     results: dict[object, RefinedBoxes] = {}
+    in_time: dict[object, BoxArray] = {}
+    given: dict[object, BoxArray] = {}
+    num_points: dict[object, Ints] = {}
     is_early = config.estimate == 'early'
+
+    def prepared(pair: Pair) -> BoxArray:
+        ticket = pair.boxes.ticket
+        in_time[ticket] = pair.boxes
+        given[ticket] = boxes = corrected(pair.boxes)
+        num_points[ticket] = points_above_road(pair.sweep, boxes.boxes)
+        return boxes
 
     def keep(ready: Iterable[RefinedBoxes]) -> None:
         for result in ready:
             if result.is_final or is_early:
                 results.setdefault(result.boxes.ticket, result)
 
-    for item, restarts in items:
+    registrar = BoxRegistrar(config, submit, drives=drives, prepare=prepared)
+    for moved, restarts in items:
         if restarts:
-            counter.finish()
-            counter.restart()
             parts.append(Arrivals())
-        moved = item
         if isinstance(moved, BoxArray):
-            moved = replace(moved, ticket=count)
-            count += 1
+            moved = replace(moved, ticket=len(arrived))
+            arrived.append(len(arrived))
         if moved is not None:
             parts[-1].add(moved)
-        counter.add(moved)
         keep(hand_to_registrar(registrar, moved, restarts))
     keep(registrar.flush())
-    counter.finish()
+    for part in parts:
+        part.items = [one if isinstance(one, int) else given[one.ticket] for one in part.items]
     arrays = [
         part.arrays if fixed_frame is None else part.completed(fixed_frame) for part in parts
     ]
     return FirstPass(
         arrays,
         [
-            [results[a.ticket] if a.ticket is not None else kept(a, '') for a in given]
-            for given in arrays
+            [results[a.ticket] if a.ticket is not None else kept(a, '') for a in part]
+            for part in arrays
         ],
-        [[counter.of(array) for array in given] for given in arrays],
+        [[num_points.get(a.ticket, NO_COUNTS) for a in part] for part in arrays],
         parts,
+        [in_time[ticket] for ticket in arrived],
+        registrar.latency,
     )
 
 
@@ -266,47 +278,57 @@ class Completion:
         self._plan = plan
         self._deviations = deviations
         self._is_early = config.estimate == 'early'
-        self._counter = PointCounter(config)
-        self._given: list[BoxArray] = []
-        self._to_register: list[BoxArray] = []
         self._index_of: dict[object, int] = {}
+        self._given: dict[int, BoxArray] = {}
+        self._registered: dict[int, BoxArray] = {}
+        self._num_points: dict[int, Ints] = {}
         self._results: dict[int, RefinedBoxes] = {}
+        self._kept: list[RefinedBoxes] = []
 
-    def to_register(self, item: Moved, restarts: bool) -> Moved:
-        """Return an item as it is to be registered: boxes with those that the plan adds."""
-        if restarts:
-            self._counter.finish()
-            self._counter.restart()
-        if isinstance(item, BoxArray):
-            index = len(self._given)
-            self._given.append(item)
-            self._index_of[item.ticket] = index
-            item = self._plan.arrays[index].to_register(item)
-            self._to_register.append(item)
-        self._counter.add(item)
-        return item
+    def expect(self, ticket: object) -> None:
+        """Note the ticket of the next box array, in the order of the plan."""
+        self._index_of[ticket] = len(self._index_of)
+
+    def to_register(self, boxes: BoxArray, sweep: Sweep | None) -> BoxArray:
+        """Return boxes as they are to be registered: with those that the plan adds."""
+        index = self._index_of[boxes.ticket]
+        self._given[index] = boxes
+        registered = self._plan.arrays[index].to_register(boxes)
+        self._registered[index] = registered
+        self._num_points[index] = points_above_road(sweep, registered.boxes)
+        return registered
 
     def added_boxes(self, given: BoxArray) -> BoxArray:
-        """Return the boxes that the plan adds to an array, after `to_register` of it."""
+        """Return the boxes that the plan adds to an array."""
         return self._plan.arrays[self._index_of[given.ticket]].added_boxes(given)
 
     def add(self, ready: Iterable[RefinedBoxes]) -> None:
         """Hold results of the registrar."""
         for result in ready:
-            if result.is_final or self._is_early:
-                self._results.setdefault(self._index_of[result.boxes.ticket], result)
+            index = self._index_of.get(result.boxes.ticket)
+            if not (result.is_final or self._is_early):
+                continue
+            if index is None:  # one of `add_kept`: the plan has no place for it
+                self._kept.append(result)
+            else:
+                self._results.setdefault(index, result)
 
     def finished(self) -> list[RefinedBoxes]:
-        """Return the results of all arrays, in their order."""
-        self._counter.finish()
-        points = [self._counter.of(array) for array in self._to_register]
-        registered = [self._results[index] for index in range(len(self._given))]
-        results = self._plan.finished(self._given, registered, points)
+        """Return the results of all arrays, in the order of their stamps."""
+        results = self._kept + self._completed()
+        return sorted(results, key=lambda result: result.boxes.stamp_ns)
+
+    def _completed(self) -> list[RefinedBoxes]:
+        """Return the results of the arrays of the plan, in their order."""
+        indices = range(len(self._index_of))
+        given = [self._given[index] for index in indices]
+        registered = [self._results[index] for index in indices]
+        points = [self._num_points[index] for index in indices]
+        results = self._plan.finished(given, registered, points)
         if self._deviations is None:
             return results
-        pairs = zip(self._given, self._to_register, strict=True)
+        pairs = zip(given, (self._registered[index] for index in indices), strict=True)
         keyframes = [
-            replace(given, boxes=registered.boxes[: len(given.track_ids)])
-            for given, registered in pairs
+            replace(array, boxes=boxes.boxes[: len(array.track_ids)]) for array, boxes in pairs
         ]  # none of them is rejected
         return with_evidence(keyframes, results, self._deviations)

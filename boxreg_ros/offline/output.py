@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.stamp_order import kept, Slot, StampOrder
 from boxreg_ros.labels import LabelFrame, LabelOutput, Provenance
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline.progress import Stopwatch
@@ -17,7 +16,7 @@ from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.workers import Background
 from boxreg_ros.reasons import Reason
 from boxreg_ros.review.corrections import Corrections
-from boxreg_ros.structures import BoxArray, REFINED, RefinedBoxes, Sweep, YAW
+from boxreg_ros.structures import BoxArray, Floats, REFINED, RefinedBoxes, Sweep, YAW
 import numpy as np
 
 ARRAYS_AHEAD = 256
@@ -25,14 +24,27 @@ ARRAYS_AHEAD = 256
 returns the results of as many stamps at once."""
 
 
+@dataclass(eq=False, slots=True)
+class ArrayPlace:
+    """What label files need of a box array beside its result: its ticket at the registrar."""
+
+    boxes: BoxArray
+    """Of the input, in time, in the fixed frame where a transform to it is known."""
+    T_fixed_sensor: Floats | None
+    T_fixed_boxes: Floats | None
+    """Pose of the frame of the input message; None where unknown, as that of the sensor."""
+    early: RefinedBoxes | None = None
+    is_written: bool = False
+
+
 class Sink:
     """
-    Collect results, bring them into the order of stamps and write each box array once.
+    Write the result of each box array once, in the order of the registrar.
 
-    Every box array gets a ticket on its way to the registrar; its result is found by that
-    ticket, because several arrays may have the same stamp. Files are written in a thread, while
-    the registrar goes on; attributes are those of all results after the end of the block only.
-    The time spent on files is added to the stage ``write`` of the clock.
+    Every box array gets an `ArrayPlace` as its ticket on its way to the registrar. Files are
+    written in a thread, while the registrar goes on; attributes are those of all results after
+    the end of the block only. The time spent on files is added to the stage ``write`` of the
+    clock.
 
     """
 
@@ -70,9 +82,6 @@ class Sink:
         # Clouds would fill the memory while they wait.
         waits = uses_one_core(request.config) or self._spool is not None
         self._background = Background(0 if waits else ARRAYS_AHEAD)
-        self._order = StampOrder()
-        self._early: dict[object, RefinedBoxes] = {}  # by ticket, until the final estimate is
-        self._last_ticket = 0
         self.array_stamps_ns: list[int] = []
         self.boxes_in = 0
         self.boxes_out = 0
@@ -84,34 +93,50 @@ class Sink:
         self.heading_flips = 0
         self.without_cloud = 0
 
-    def expect(self, item: ReadItem) -> ReadItem:
-        """Store a cloud that files need, or reserve the place of boxes, which get a ticket."""
+    def expect(self, item: ReadItem) -> tuple[Sweep | BoxArray | None, str]:
+        """
+        Return what the registrar is given for an item, and why boxes are kept; empty if not.
+
+        A cloud is stored if files need it; boxes get a `ArrayPlace` as their ticket.
+
+        """
         if self.points is not None and item.moved is not None:
             with self._clock('report'):
-                self.points.add(item.moved)
+                self.points.note(item.moved)
         self._note_time(item.given or item.moved)
         if isinstance(item.given, BoxArray):
-            return self._reserve(item, item.given)
+            return self._with_place(item, item.given)
         if self._spool and item.given is not None and item.T_fixed_given is not None:
             with self._clock('write'):
                 self._spool.add(item.given, item.T_fixed_given, item.intensities)
-        return item
+        return item.moved, ''
+
+    def to_register(self, boxes: BoxArray, sweep: Sweep | None) -> BoxArray:
+        """Take note of boxes in time; return them as a person has decided."""
+        place = boxes.ticket
+        assert isinstance(place, ArrayPlace)
+        place.boxes = boxes
+        if self.points is not None:
+            with self._clock('report'):
+                self.points.gather(boxes, sweep)
+        boxes = self.corrections.to_register(boxes)
+        if self._has_keyframes:
+            boxes = replace(boxes, pinned=np.ones(len(boxes.track_ids), bool))
+        return boxes
 
     def take(self, ready: Sequence[RefinedBoxes]) -> None:
-        """Take results of the registrar; write arrays up to the first one without a result."""
+        """Write results in their order: of each box array the final one, or the early one."""
         for refined in ready:
-            ticket = refined.boxes.ticket
-            slot = self._order.waiting_for(ticket)
-            if slot is None:  # its early result has been taken
+            place = refined.boxes.ticket
+            assert isinstance(place, ArrayPlace)
+            if place.is_written:
                 continue
-            result = self.corrections.apply(slot.boxes, refined)
+            result = self.corrections.apply(place.boxes, refined)
             if refined.is_final or self._writes_early:
-                self._order.take(ticket, result)
+                place.is_written = True
+                self._background(self._put, result, place)
             else:
-                self._early[ticket] = result
-        for slot, result in self._order.ready():
-            early = self._early.pop(result.boxes.ticket, None)
-            self._background(self._put, result, slot, early)
+                place.early = result
 
     def __enter__(self) -> Sink:
         """Return the sink."""
@@ -123,8 +148,6 @@ class Sink:
             self._background.abandon()
             return
         self._background.complete()
-        if self.points is not None:
-            self.points.flush()
         with self._clock('write'):
             self.output.close()
             if self._spool is not None:
@@ -143,8 +166,8 @@ class Sink:
         first, last = self.time_ranges.get(name, (stamp_ns, stamp_ns))
         self.time_ranges[name] = min(first, stamp_ns), max(last, stamp_ns)
 
-    def _reserve(self, item: ReadItem, given: BoxArray) -> ReadItem:
-        """Reserve a place; boxes that could not be transformed have their result at once."""
+    def _with_place(self, item: ReadItem, given: BoxArray) -> tuple[BoxArray | None, str]:
+        """Return boxes with their place, and why they are kept, if they are."""
         count = len(given.track_ids)
         self.boxes_in += count
         self.arrays_in += count > 0
@@ -156,39 +179,35 @@ class Sink:
         if isinstance(moved, BoxArray):
             if self._has_keyframes:  # soft: evidence may move those that files call pinned
                 moved = replace(moved, pinned=None)
-            self._last_ticket += 1
-            slot = Slot(moved, item.T_fixed_sensor, item.T_fixed_given)
-            self._order.expect(slot, self._last_ticket)
-            moved = replace(self.corrections.to_register(moved), ticket=self._last_ticket)
-            if self._has_keyframes:
-                moved = replace(moved, pinned=np.ones(len(moved.track_ids), bool))
-            item = item._replace(moved=moved)
-        elif count:
-            left = kept(self.corrections.to_register(given, with_pins=False), Reason.NO_TRANSFORM)
-            result = self.corrections.apply(given, left)
-            self._order.expect(Slot(given, item.T_fixed_sensor, item.T_fixed_given, result))
-        return item
+            return replace(
+                moved, ticket=ArrayPlace(moved, item.T_fixed_sensor, item.T_fixed_given)
+            ), ''
+        if not count:
+            return None, ''
+        place = ArrayPlace(given, item.T_fixed_sensor, item.T_fixed_given)
+        as_kept = self.corrections.to_register(given, with_pins=False)
+        return replace(as_kept, ticket=place), Reason.NO_TRANSFORM
 
-    def _put(self, refined: RefinedBoxes, slot: Slot, early: RefinedBoxes | None) -> None:
+    def _put(self, refined: RefinedBoxes, place: ArrayPlace) -> None:
         """Count the boxes of one array and write them in all formats; in the thread."""
-        count = len(slot.boxes.track_ids)
+        count = len(place.boxes.track_ids)
         self.boxes_out += len(refined.status)
         self._boxes_added += len(refined.status) - count
         self.arrays_out += len(refined.status) > 0
         self.status.update(refined.status)
         self.reasons.update(filter(None, refined.reasons))
-        self.heading_flips += _heading_flips(slot.boxes, refined)
+        self.heading_flips += _heading_flips(place.boxes, refined)
         stamp_ns, added = refined.boxes.stamp_ns, refined.boxes.track_ids[count:]
         added_ids = [self.corrections.origin_of(stamp_ns, track_id) for track_id in added]
-        self.changes.add(slot.boxes, refined, early, added_ids)
+        self.changes.add(place.boxes, refined, place.early, added_ids)
         with self._clock('write'):
-            self.output.write(self._frame(refined, slot))
+            self.output.write(self._frame(refined, place))
 
-    def _frame(self, refined: RefinedBoxes, slot: Slot) -> LabelFrame:
+    def _frame(self, refined: RefinedBoxes, place: ArrayPlace) -> LabelFrame:
         """Return all that label writers need about one array, its cloud included."""
         frame = LabelFrame(
-            refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor,
-            T_fixed_given=slot.T_fixed_boxes,
+            refined, self._fixed_frame, self._sensor_frame, place.T_fixed_sensor,
+            T_fixed_given=place.T_fixed_boxes,
         )  # fmt: skip
         if self._spool is not None:
             frame = self._spool.with_cloud(frame)

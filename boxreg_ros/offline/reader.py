@@ -8,16 +8,14 @@ core; see `reader`.
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
-from math import inf
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.latency import LateBoxes, Latency, set_latency
 from boxreg_ros.errors import ConfigError, RecordingError, TransferError
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
 from boxreg_ros.io.id_assignment import IdCheck
@@ -35,12 +33,10 @@ import numpy as np
 MESSAGES_AHEAD = 4
 """Messages that are read before the receiver has taken those before them: two clouds, their boxes.
 Swept: with 1, 2, 8 and 32 a run took 8.2, 7.5, 7.8 and 8.4 s, and each message 1.5 MB."""
-
-
 SAMPLES = 4
-"""Parts of a long recording that its latency is estimated from; chosen: one that drifts shows."""
+"""Parts of a long recording in which the ids of its boxes are looked at; chosen."""
 SAMPLED_SECONDS = 5.0
-"""Their duration [s]; chosen: some ten sweeps with 0.8 s of boxes after them."""
+"""Their duration [s]; chosen."""
 
 
 class ReadItem(NamedTuple):
@@ -62,7 +58,6 @@ class Source(NamedTuple):
     fixed_frame: str  # to refine in
     sensor_frame: str  # of label files
     seconds: float  # duration of the part that is read
-    latency: Latency  # of the boxes, which have been corrected for it
 
 
 class Findings(NamedTuple):
@@ -94,7 +89,6 @@ class RecordingReader:
         recording: ItemSource,
         request: Request,
         clock: Stopwatch,
-        latency: Latency = Latency(),  # noqa: B008
         sweeps: StoredSweeps | None = None,
         jumping_ids: str = '',
     ) -> None:
@@ -104,7 +98,6 @@ class RecordingReader:
         self._sweeps = sweeps
         self._with_points = request.options.with_points
         self._with_times = request.config.sampling.deskew
-        self._waits = request.config.estimate == 'track'
         convention = request.convention
         if jumping_ids:
             convention = replace(convention, associate=True)
@@ -121,7 +114,7 @@ class RecordingReader:
             'odometry': recording.odometry_topic,
         }
         seconds = (recording.end_ns - recording.start_ns) * 1e-9
-        self.source = Source(topics, self._items.fixed_frame, sensor_frame, seconds, latency)
+        self.source = Source(topics, self._items.fixed_frame, sensor_frame, seconds)
 
     def __iter__(self) -> Iterator[ReadItem]:
         """
@@ -130,7 +123,7 @@ class RecordingReader:
         Raises UnsupportedMessage at the end, if no cloud, or no message of boxes, was readable.
 
         """
-        yield from in_time(self._read(), self.source.latency.seconds, self._waits)
+        yield from self._read()
         self._recording.check_readable()
 
     def _read(self) -> Iterator[ReadItem]:
@@ -201,56 +194,6 @@ class RecordingReader:
         )
 
 
-def in_time(items: Iterable[ReadItem], latency: float, waits: bool) -> Iterator[ReadItem]:
-    """
-    Yield items in their order, late boxes moved to where their objects are at their stamp.
-
-    With `waits` boxes wait for the later ones that show their objects; as in the node, which
-    cannot wait, they are otherwise predicted. `latency` is that of the boxes [s].
-
-    """
-    late = LateBoxes()
-    waiting = deque[ReadItem]()
-
-    def ready(until_ns: float) -> Iterator[ReadItem]:
-        while waiting:
-            moved = waiting[0].moved
-            if isinstance(moved, BoxArray):
-                if moved.stamp_ns + latency * 1e9 > until_ns:
-                    return
-                moved = late.corrected(moved, latency)
-            yield waiting.popleft()._replace(moved=moved)
-
-    for item in items:
-        if item.restarts:
-            yield from ready(inf)
-            late.restart()
-        if latency and isinstance(item.moved, BoxArray):
-            late.add_boxes(item.moved)
-        waiting.append(item)
-        yield from ready(late.newest_ns if waits and latency > 0 else inf)
-    yield from ready(inf)
-
-
-def latency_of(request: Request) -> Latency:
-    """Return the latency of the boxes: as set, or estimated from parts of the recording."""
-    if request.keyframes:
-        return Latency()
-    known = set_latency(request.config)
-    if known is not None:
-        return known
-    late = LateBoxes()
-    for part in _sampled_parts(request):
-        late.restart()
-        try:
-            _show(part, late)
-        except TransferError:
-            raise
-        except RecordingError:  # a pause shows nothing; what else is wrong is said on reading
-            continue
-    return late.estimate()
-
-
 def _sampled_parts(request: Request) -> list[Request]:
     """Return requests of the parts of a recording that show its properties: all of a short one."""
     with request.recording() as recording:
@@ -296,31 +239,16 @@ def jumping_ids_of(request: Request) -> str:
     )
 
 
-def _show(part: Request, late: LateBoxes) -> None:
-    """Add the boxes and sweeps of a part of a recording to the evidence of the latency."""
-    with part.recording() as recording:
-        items = FixedFrameItems(recording, part.config, part.convention, part.fixed_frame)
-        for item in items.read():
-            if item.restarts:
-                late.restart()
-            if isinstance(item.moved, BoxArray):
-                late.add_boxes(item.moved)
-            elif item.moved is not None:
-                late.add_sweep(item.moved)
-
-
 @contextmanager
-def reader(
-    request: Request, latency: Latency | None = None, sweeps: StoredSweeps | None = None
-) -> Iterator[Receive]:
+def reader(request: Request, sweeps: StoredSweeps | None = None) -> Iterator[Receive]:
     """
     Yield, for a block, a function that returns the next message for `ReadAhead`.
 
     The recording is read in a process of its own, or in this one where it may use one core only.
-    Without a `latency` that is known, it is estimated first. All sweeps are added to `sweeps`.
+    All sweeps are added to `sweeps`.
 
     """
-    messages = partial(_messages, request, latency, sweeps)
+    messages = partial(_messages, request, sweeps)
     if uses_one_core(request.config):
         with closing(messages()) as received:
             yield received.__next__
@@ -365,14 +293,13 @@ def _read(
 
 
 def _messages(
-    request: Request, latency: Latency | None, sweeps: StoredSweeps | None
+    request: Request, sweeps: StoredSweeps | None
 ) -> Generator[Source | ReadItem | Findings]:
     """Yield the source of a recording, all its items, and the findings."""
-    latency = latency_of(request) if latency is None else latency
     jumping_ids = jumping_ids_of(request)
     with request.recording() as recording:
         _check_copies(request, recording)
-        reading = RecordingReader(recording, request, Stopwatch(), latency, sweeps, jumping_ids)
+        reading = RecordingReader(recording, request, Stopwatch(), sweeps, jumping_ids)
         yield reading.source
         yield from reading
         yield reading.findings()

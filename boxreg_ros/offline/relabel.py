@@ -8,12 +8,12 @@ step of `Config.complete`, the recording is read twice and its tracks are comple
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from shutil import copyfile
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.io.storage.urls import url_of
@@ -26,7 +26,7 @@ from boxreg_ros.offline.products import (
     write_track_tables,
 )
 from boxreg_ros.offline.progress import Progress, Stopwatch
-from boxreg_ros.offline.reader import ReadAhead, reader, ReadItem
+from boxreg_ros.offline.reader import ReadAhead, reader
 from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.offline.result_folder import (
     claimed,
@@ -37,22 +37,19 @@ from boxreg_ros.offline.result_folder import (
 )
 from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.summary import Summary
+from boxreg_ros.offline.survey import journaled, Passes, Survey, survey
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.structures import BoxArray
 import yaml
 
 if TYPE_CHECKING:
-    from boxreg_ros.core.follow import FollowedTrack
     from boxreg_ros.core.input_statistics import Drives
     from boxreg_ros.core.latency import Latency
-    from boxreg_ros.core.method.constants import Constants
-    from boxreg_ros.core.registrar import BoxRegistrar, Submit
-    from boxreg_ros.io.sweep_store import SweepStore
-    from boxreg_ros.offline.completion import Arrivals, Completion, Moved
+    from boxreg_ros.core.matching import Pair
+    from boxreg_ros.core.registrar import BoxRegistrar
     from boxreg_ros.offline.resume import EstimateJournal
     from boxreg_ros.offline.stored_sweeps import StoredSweeps
-    from boxreg_ros.tracks.complete import CompletionPlan
 
 
 def relabel(
@@ -79,17 +76,15 @@ def relabel(
     # What cannot be read is refused before the work.
     truth = true_boxes(request.truth) if request.report and request.truth is not None else None
     drives = _other_drives(request)
-    shown = _Passes(progress, 1 + (request.completes or corrections.adds))
+    shown = Passes(progress, 1 + (request.completes or corrections.adds))
     with claimed(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         if request.cloud_copies:
             with request.recording():  # both processes need the types of its messages
                 pass
-        survey = _survey(request, clock, shown, journal, corrections, drives)
+        first = survey(request, clock, shown, journal, corrections, drives)
         sweeps = _stored_sweeps(request, out)
-        receive = workers.enter_context(
-            reader(request, None if survey is None else survey.latency, sweeps)
-        )
+        receive = workers.enter_context(reader(request, sweeps))
         # The recording is opened while this process imports numba, which takes half a second.
         from boxreg_ros.core.input_statistics import to_text
         from boxreg_ros.core.registrar import BoxRegistrar
@@ -97,24 +92,29 @@ def relabel(
         from boxreg_ros.offline.registration_worker import registration_worker
 
         recording = ReadAhead(receive)
-        if survey is None:
+        if first is None:
             clock.begun('start')
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.announce)
         )
-        registrar = BoxRegistrar(
-            request.config,
-            _journaled(submit, journal),
-            drives=drives,
-            constants=None if survey is None else survey.constants,
-        )
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock, corrections) as sink:
-                _register(recording, registrar, survey, sink, clock, shown)
-            plan = None if survey is None else survey.plan
-            summary = Summary.of(request, recording, registrar, sink)
+                registrar = BoxRegistrar(
+                    request.config,
+                    journaled(submit, journal),
+                    drives=drives,
+                    constants=None if first is None else first.constants,
+                    latency=_known_latency(request, first),
+                    prepare=partial(_to_register, sink=sink, survey=first),
+                )
+                _register(recording, registrar, first, sink, clock, shown)
+            plan = None if first is None else first.plan
+            latency = registrar.latency
+            if first is not None and first.latency is not None:
+                latency = first.latency
+            summary = Summary.of(request, recording, registrar, latency, sink)
             summary.complete = completed_counts(plan)
-            summary.seeds = [] if survey is None else survey.ends
+            summary.seeds = [] if first is None else first.ends
             for stage, seconds in recording.findings.seconds.items():
                 clock.add(stage, seconds)
             summary.fingerprint = fingerprint
@@ -188,99 +188,6 @@ def _journal(out: Path, fingerprint: str) -> EstimateJournal:
     return EstimateJournal(journal_path(out), fingerprint)
 
 
-def _journaled(submit: Submit | None, journal: EstimateJournal | None) -> Submit | None:
-    """Return `submit` with the estimates that a journal has."""
-    from boxreg_ros.core.registrar import submit_locally
-
-    return submit if journal is None else journal.journaled(submit or submit_locally)
-
-
-class _Passes:
-    """Progress over several passes through a recording."""
-
-    def __init__(self, progress: Progress, passes: int) -> None:
-        self.progress = progress
-        self._passes = passes
-        self._done = 0
-
-    def each(self, recording: ReadAhead) -> Iterator[ReadItem]:
-        """Yield the items of one pass, and show the time that has been read [s]."""
-        seconds = recording.source.seconds
-        for item in recording:
-            self.progress.show(self._done * seconds + item.seconds, self._passes * seconds)
-            yield item
-        self._done += 1
-
-
-class _Survey(NamedTuple):
-    """The first pass over a recording: what completes its tracks, and where keyframes end."""
-
-    plan: CompletionPlan
-    completion: Completion
-    parts: list[Arrivals]
-    ends: list[dict[str, Any]]
-    latency: Latency
-    constants: Constants | None
-
-
-def _survey(
-    request: Request,
-    clock: Stopwatch,
-    progress: _Passes,
-    journal: EstimateJournal | None,
-    corrections: Corrections,
-    drives: Drives,
-) -> _Survey | None:
-    """Read the recording a first time and plan its whole tracks; None where none is completed."""
-    if not (request.completes or corrections.adds):
-        return None
-    with ExitStack() as workers:
-        receive = workers.enter_context(reader(request))
-        from boxreg_ros.core.following.person import numbers
-        from boxreg_ros.offline.completion import Completion, first_pass
-        from boxreg_ros.offline.keyframes import add_objects, arrivals, ends_of, keyframes, stored
-        from boxreg_ros.tracks.complete import unchanged_plan
-
-        recording = ReadAhead(receive)
-        clock.begun('start')
-        fixed_frame = recording.source.fixed_frame
-        moved = (
-            (_corrected(item.moved, corrections), item.restarts)
-            for item in progress.each(recording)
-        )
-        stores: list[SweepStore] = []
-        items = stored(moved, stores) if corrections.adds else moved
-        tracks: list[FollowedTrack] = []
-        deviations = None
-        if request.keyframes:
-            with clock('follow'):
-                plan, parts, tracks, deviations = keyframes(
-                    items, fixed_frame, request.config, corrections
-                )
-        elif request.completes:
-            from boxreg_ros.offline.registration_worker import registration_worker
-
-            submit = workers.enter_context(
-                registration_worker(request.config, clock, progress.progress.announce)
-            )
-            submit = _journaled(submit, journal)
-            first = first_pass(items, request.config, submit, fixed_frame, drives)
-            plan = first.plan(fixed_frame, request.config, corrections)
-            parts = first.parts
-        else:
-            parts = arrivals(items)
-            plan = unchanged_plan([a for part in parts for a in part.completed(fixed_frame)])
-        if corrections.adds:
-            with clock('follow'):
-                tracks += add_objects(
-                    plan, parts, stores, corrections, fixed_frame, request.config
-                )
-        completion = Completion(plan, request.config, deviations)
-        constants = None if deviations is None else numbers(deviations)
-        latency = recording.source.latency
-        return _Survey(plan, completion, parts, ends_of(tracks), latency, constants)
-
-
 def _other_drives(request: Request) -> Drives:
     """Return what other drives have shown; this one, made before, would count twice."""
     if not request.input_model:
@@ -292,40 +199,48 @@ def _other_drives(request: Request) -> Drives:
     return drives
 
 
-def _corrected(item: Moved, corrections: Corrections) -> Moved:
-    """Return boxes as they are to be registered; sweeps as they are."""
-    return corrections.to_register(item) if isinstance(item, BoxArray) else item
+def _known_latency(request: Request, survey: Survey | None) -> Latency | None:
+    """Return the latency of the boxes that are read: none once the survey has corrected them."""
+    from boxreg_ros.core.latency import Latency
+
+    is_in_time = survey is not None and survey.in_time is not None
+    return Latency() if request.keyframes or is_in_time else None
+
+
+def _to_register(pair: Pair, sink: Sink, survey: Survey | None) -> BoxArray:
+    """Return boxes as they are to be registered: as decided, with those that the plan adds."""
+    given = sink.to_register(pair.boxes, pair.sweep)
+    if survey is None:
+        return given
+    boxes = survey.completion.to_register(given, pair.sweep)
+    if sink.points is not None:
+        sink.points.gather(survey.completion.added_boxes(given), pair.sweep)
+    return boxes
 
 
 def _register(
     recording: ReadAhead,
     registrar: BoxRegistrar,
-    survey: _Survey | None,
+    survey: Survey | None,
     sink: Sink,
     clock: Stopwatch,
-    progress: _Passes,
+    progress: Passes,
 ) -> None:
     """Read the recording, register its boxes, with those of the survey, and write them."""
     items = progress.each(recording)
-    completion, take = None, sink.take
+    take = sink.take
     if survey is not None:
-        from boxreg_ros.offline.completion import with_empty_arrays
-
-        completion = survey.completion
-        take = completion.add  # completed tracks wait for the end of the recording
-        items = with_empty_arrays(items, survey.parts, recording.source.fixed_frame)
+        items = survey.completed(items, recording.source.fixed_frame)
+        take = survey.completion.add  # completed tracks wait for the end of the recording
     for item in items:
-        with_ticket = sink.expect(item)
-        moved = with_ticket.moved
+        moved, reason = sink.expect(item)
+        if survey is not None and isinstance(moved, BoxArray) and not reason:
+            survey.completion.expect(moved.ticket)
         with clock('registrar'):
-            if completion is not None:
-                given, moved = moved, completion.to_register(moved, item.restarts)
-                if sink.points is not None and isinstance(given, BoxArray):
-                    sink.points.add(completion.added_boxes(given))
-            ready = hand_to_registrar(registrar, moved, item.restarts)
+            ready = hand_to_registrar(registrar, moved, item.restarts, reason)
         take(ready)
     with clock('registrar'):
         ready = registrar.flush()
     take(ready)
-    if completion is not None:
-        sink.take(completion.finished())
+    if survey is not None:
+        sink.take(survey.completion.finished())

@@ -17,6 +17,7 @@ from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import HUMAN, REFINED
 
 if TYPE_CHECKING:
+    from boxreg_ros.core.latency import Latency
     from boxreg_ros.core.registrar import BoxRegistrar
     from boxreg_ros.offline.output import Sink
     from boxreg_ros.offline.reader import Findings, ReadAhead
@@ -85,7 +86,12 @@ class Summary:
 
     @classmethod
     def of(
-        cls, request: Request, recording: ReadAhead, registrar: BoxRegistrar, sink: Sink
+        cls,
+        request: Request,
+        recording: ReadAhead,
+        registrar: BoxRegistrar,
+        latency: Latency,
+        sink: Sink,
     ) -> Self:
         """Return the summary of a written run; RuntimeError if the registrar has lost boxes."""
         if sink.missing():
@@ -112,14 +118,13 @@ class Summary:
             reasons=dict(sink.reasons.most_common()),
             time_jumps=findings.counts[Reason.TIME_JUMP],
             heading_flips=sink.heading_flips,
-            box_time=registrar.box_time.summary(request.config)
-            | {'latency': source.latency.summary()},
+            box_time=registrar.box_time.summary(request.config) | {'latency': latency.summary()},
             time_ranges={name: list(ends) for name, ends in sink.time_ranges.items()},
             unknown_classes=dict(sink.unknown_classes.most_common()),
             dropped=_dropped(registrar.counts, findings),
             without_stamp=_without_stamp(findings),
             lidars={topic: dict(counts) for topic, counts in findings.lidars.items()},
-            warning='; '.join(filter(None, (findings.warning, source.latency.warning)))
+            warning='; '.join(filter(None, (findings.warning, latency.warning)))
             or ('' if sink.boxes_in or request.boxes == NO_TOPIC else NO_BOXES),
             **findings.facts,
             left_out_of_labels=sink.output.left_out(),

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.stamp_order import kept
 from boxreg_ros.reasons import Reason
 from boxreg_ros.review.decisions import Decision, held, Scope
 from boxreg_ros.structures import (
@@ -16,6 +15,7 @@ from boxreg_ros.structures import (
     Floats,
     HUMAN,
     KEPT,
+    kept,
     RefinedBoxes,
     REJECTED,
 )

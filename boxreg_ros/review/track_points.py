@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.observation import crop
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.rotations import matrix_from_rpy
@@ -47,7 +45,6 @@ class PointCollector:
 
     def __init__(self, config: Config) -> None:
         self.stamps_ns: set[int] = set()
-        self._matcher = StampMatcher(config, Counter())
         self.settle(config)
         self._gathered: dict[tuple[int, str], _Gathered] = {}
         self._origins: dict[int, Floats] = {}
@@ -57,19 +54,12 @@ class PointCollector:
         sampling = config.sampling
         self._is_at_stamp = sampling.deskew and sampling.box_time == 'stamp'
 
-    def add(self, item: Sweep | BoxArray) -> None:
-        """Add a sweep or a box array in the fixed frame."""
+    def note(self, item: Sweep | BoxArray) -> None:
+        """Note the stamp of a box array, or where the sensor was at that of a sweep."""
         if isinstance(item, Sweep):
             self._origins[item.stamp_ns] = item.origin
-            pairs = self._matcher.add_sweep(item)
         else:
             self.stamps_ns.add(item.stamp_ns)
-            pairs = self._matcher.add_boxes(item)
-        self._gather(pairs)
-
-    def flush(self) -> None:
-        """Gather the points of the last boxes; call this after the last item."""
-        self._gather(self._matcher.flush())
 
     @property
     def origins(self) -> Floats:
@@ -109,28 +99,28 @@ class PointCollector:
         is_before = stamps_ns - known[before] < known[after] - stamps_ns
         return self.origins[np.where(is_before, before, after)]
 
-    def _gather(self, pairs: list[Pair]) -> None:
-        for boxes, sweep in pairs:
-            rows = np.flatnonzero(is_valid_box(boxes.boxes))
-            if sweep is None or not len(rows):
-                continue
-            near = crop(sweep, boxes.boxes[rows], GATHERED_MARGIN)
-            is_near = near.outside.max(0) < GATHERED_MARGIN
-            owners = near.owner[is_near]
-            offsets = to_millimetres(near.offset[:, is_near].T)
-            delay = (sweep.stamp_ns - boxes.stamp_ns) * 1e-9
-            times = None
-            if sweep.times is not None:
-                times = sweep.times[near.row[is_near]].astype(np.float32)
-            ends = np.searchsorted(owners, np.arange(len(rows) + 1))
-            for row, begin, end in zip(rows.tolist(), ends[:-1], ends[1:], strict=True):
-                step = max(1, -(-(end - begin) // GATHERED_POINTS))
-                part = slice(begin, end, step)
-                key = boxes.stamp_ns, boxes.track_ids[row]
-                center = boxes.boxes[row, : Z + 1].copy()
-                own_times = None if times is None else times[part].copy()
-                found = _Gathered(center, offsets[part].copy(), delay, own_times)
-                self._gathered.setdefault(key, found)  # of two boxes of one id the first counts
+    def gather(self, boxes: BoxArray, sweep: Sweep | None) -> None:
+        """Gather the points of a sweep around its boxes, both in the fixed frame."""
+        rows = np.flatnonzero(is_valid_box(boxes.boxes))
+        if sweep is None or not len(rows):
+            return
+        near = crop(sweep, boxes.boxes[rows], GATHERED_MARGIN)
+        is_near = near.outside.max(0) < GATHERED_MARGIN
+        owners = near.owner[is_near]
+        offsets = to_millimetres(near.offset[:, is_near].T)
+        delay = (sweep.stamp_ns - boxes.stamp_ns) * 1e-9
+        times = None
+        if sweep.times is not None:
+            times = sweep.times[near.row[is_near]].astype(np.float32)
+        ends = np.searchsorted(owners, np.arange(len(rows) + 1))
+        for row, begin, end in zip(rows.tolist(), ends[:-1], ends[1:], strict=True):
+            step = max(1, -(-(end - begin) // GATHERED_POINTS))
+            part = slice(begin, end, step)
+            key = boxes.stamp_ns, boxes.track_ids[row]
+            center = boxes.boxes[row, : Z + 1].copy()
+            own_times = None if times is None else times[part].copy()
+            found = _Gathered(center, offsets[part].copy(), delay, own_times)
+            self._gathered.setdefault(key, found)  # of two boxes of one id the first counts
 
 
 def to_millimetres(offsets: Floats) -> NDArray[np.int16]:

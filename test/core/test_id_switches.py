@@ -2,8 +2,7 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.id_switches import by_id, id_switches, Switch
-from boxreg_ros.io.stamp_order import kept
-from boxreg_ros.structures import BoxArray
+from boxreg_ros.structures import BoxArray, kept
 from boxreg_ros.tracks.complete import complete
 import numpy as np
 from scenes import drive, jittered, START_NS

@@ -3,12 +3,16 @@
 from collections import Counter
 from dataclasses import replace
 
+from boxreg_ros.config import Config
 from boxreg_ros.core import latency
-from boxreg_ros.core.latency import LateBoxes, NOTABLE, OBJECTS_COMPARED
+from boxreg_ros.core.latency import Latency, LatencyCorrection, NOTABLE, OBJECTS_COMPARED, STEP
+from boxreg_ros.core.matching import Pair
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.transforms import boxes_to_frame, inverse
+from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.scenarios import highway
-from boxreg_ros.structures import BoxArray
+from boxreg_ros.structures import BoxArray, FrameMotion
 from measure.drives import Drive
 import numpy as np
 from paths import BAGS
@@ -17,23 +21,28 @@ from scenes import drive, START_NS
 
 
 def late(boxes, seconds):
-    """Return box arrays whose stamps are later, each by a number or by its own."""
+    """Return boxes of the fixed frame with later stamps, each by a number or by its own."""
     times = np.broadcast_to(seconds, len(boxes))
     return [
-        replace(array, stamp_ns=array.stamp_ns + round(time * 1e9))
+        replace(array, stamp_ns=array.stamp_ns + round(time * 1e9), motion=None)
         for array, time in zip(boxes, times, strict=True)
     ]
 
 
-def estimated(sweeps, boxes):
-    """Return the latency that a stream shows."""
-    found = LateBoxes()
+def shown(sweeps, boxes):
+    """Yield the latency that a stream shows with each box array."""
+    correction = LatencyCorrection(waits=False)
     for item in sorted([*sweeps, *boxes], key=lambda item: item.stamp_ns):
         if isinstance(item, BoxArray):
-            found.add_boxes(item)
+            list(correction.add([Pair(item, None)], Config()))
+            yield correction.latency
         else:
-            found.add_sweep(item)
-    return found.estimate()
+            correction.add_sweep(item)
+
+
+def estimated(sweeps, boxes):
+    """Return the latency that a whole stream shows."""
+    return [*shown(sweeps, boxes)][-1]
 
 
 @pytest.fixture(scope='module')
@@ -48,7 +57,8 @@ def test_one_latency_is_found_and_none_where_there_is_none(sample_drive):
         assert found.tracks >= 5
         assert found.estimated == pytest.approx(seconds, abs=0.02)
         assert found.deviation < 0.03
-        assert found.seconds == (0.0 if seconds < NOTABLE else found.estimated)
+        corrected = 0.0 if seconds < NOTABLE else found.estimated
+        assert found.seconds == pytest.approx(corrected, abs=STEP)
         assert bool(found.warning) == (seconds > NOTABLE)
 
 
@@ -79,60 +89,93 @@ def test_of_many_objects_every_one_is_evidence(sample_drive, monkeypatch):
 
 
 def test_a_stream_is_corrected_from_its_first_seconds_on(sample_drive):
-    items = [*sample_drive.sweeps, *late(sample_drive.boxes, 0.3)]
-    known = LateBoxes()
-    shown = []
-    for item in sorted(items, key=lambda item: item.stamp_ns):
-        if isinstance(item, BoxArray):
-            known.add_boxes(item)
-            shown.append(known.kept_up().seconds)
-        else:
-            known.add_sweep(item)
-    assert shown[0] == 0
-    np.testing.assert_allclose(shown[len(shown) // 2 :], 0.3, atol=0.05)
+    found = [one.seconds for one in shown(sample_drive.sweeps, late(sample_drive.boxes, 0.3))]
+    assert found[0] == 0
+    np.testing.assert_allclose(found[len(found) // 2 :], 0.3, atol=0.05)
 
 
 @pytest.mark.parametrize('at_sight', [False, True], ids=['stamp', 'sight'])
 def test_boxes_of_either_time_of_a_sweep_are_not_late(at_sight):
     scene = Drive.from_scene(highway(np.random.default_rng(0), 16, at_sight, 30.0))
     assert estimated(scene.sweeps, scene.boxes).seconds == 0
-    shown = estimated(scene.sweeps, late(scene.boxes, 0.2))
-    assert shown.seconds == pytest.approx(0.2, abs=0.02)
+    found = estimated(scene.sweeps, late(scene.boxes, 0.2))
+    assert found.seconds == pytest.approx(0.2, abs=0.02)
 
 
 def test_weak_evidence_corrects_nothing(sample_drive):
-    parked = [replace(sample_drive.boxes[0], stamp_ns=a.stamp_ns) for a in sample_drive.boxes]
+    first = replace(sample_drive.boxes[0], motion=None)
+    parked = [replace(first, stamp_ns=array.stamp_ns) for array in sample_drive.boxes]
     found = estimated(sample_drive.sweeps, parked)
     assert (found.seconds, found.estimated) == (0.0, None)
     assert 'nothing moves' in found.finding
+    assert not found.warning
+
+
+def test_a_latency_that_drifts_is_followed_and_said(sample_drive):
     n = len(sample_drive.boxes)
     drifting = late(sample_drive.boxes, np.where(np.arange(n) < n / 2, 0.0, 0.4))
     found = estimated(sample_drive.sweeps, drifting)
-    assert found.seconds == 0
+    assert found.seconds == pytest.approx(0.4, abs=0.05)
     assert 'drifts' in found.warning
+
+
+def boxes_of(truth, stamps_ns, **more):
+    """Return an array per box of an object."""
+    return [
+        BoxArray(int(stamp), 'odom', ('1',), ('car',), np.ones(1), box[None].copy(), **more)
+        for stamp, box in zip(stamps_ns, truth, strict=True)
+    ]
+
+
+def corrected(arrays, waits, latency):
+    """Return the arrays in time."""
+    correction = LatencyCorrection(waits, Latency(latency))
+    found = [p.boxes for a in arrays for p in correction.add([Pair(a, None)], Config())]
+    return found + [pair.boxes for pair in correction.flush()]
 
 
 def test_boxes_are_moved_to_where_their_objects_are():
     truth = drive(20, speed=8.0)
     stamps = START_NS + 10**8 * np.arange(20)
-    arrays = [
-        BoxArray(int(s) + 250_000_000, 'odom', ('1',), ('car',), np.ones(1), box[None].copy())
-        for s, box in zip(stamps, truth, strict=True)
-    ]
+    arrays = boxes_of(truth, stamps + 250_000_000)
     arrays[4].boxes[0, 8] += np.pi  # the heading of the given box is that of the result
-    known = LateBoxes()
-    for array in arrays:
-        known.add_boxes(array)
-    whole = [known.corrected(array, 0.25) for array in arrays]
-    online = LateBoxes()
-    for k, array in enumerate(arrays[:17]):
-        online.add_boxes(array)
-        predicted = online.corrected(array, 0.25).boxes[0]
+    whole, predicted = (corrected(arrays, waits, 0.25) for waits in (True, False))
+    assert [a.stamp_ns for a in whole] == [a.stamp_ns for a in arrays]
+    for k in range(17):
         row = k + 2.5  # of the truth at the stamp of the array
         expected = (truth[int(row)] + truth[int(row) + 1]) / 2
         np.testing.assert_allclose(whole[k].boxes[0, :3], expected[:3], atol=0.02)
         turn = np.pi if k == 4 else 0.0
         assert np.cos(whole[k].boxes[0, 8] - expected[8] - turn) > 0.9999
         if k > 4:
-            np.testing.assert_allclose(predicted[:3], expected[:3], atol=0.15)
-    assert known.corrected(arrays[0], 0.0) is arrays[0]
+            np.testing.assert_allclose(predicted[k].boxes[0, :3], expected[:3], atol=0.15)
+    assert corrected(arrays, False, 0.0)[0] is arrays[0]
+
+
+def test_late_boxes_in_a_frame_that_turns_and_drives_are_put_where_they_were_measured():
+    """A parked car, seen from a vehicle at 8 m/s that turns by 0.6 rad/s, 0.27 s late."""
+    latency = 0.27
+    parked = np.array([30.0, 12.0, 0.5, 4.4, 1.8, 1.5, 0, 0, 0.4])
+
+    def pose(seconds):
+        yaw = 0.6 * seconds
+        T = np.eye(4)
+        T[:3, :3] = matrix_from_rpy([0.0, 0.0, yaw])
+        T[:2, 3] = 8.0 / 0.6 * np.array([np.sin(yaw), 1 - np.cos(yaw)])
+        return T
+
+    arrays = []
+    for k in range(12):
+        at = 0.1 * k + latency
+        stamp_ns = START_NS + round(at * 1e9)
+        (given,) = boxes_of([parked], [stamp_ns])
+        given = boxes_to_frame(given, pose(at) @ inverse(pose(at - latency)), 'odom')
+        times = at - 0.1 * np.arange(10, -1, -1)
+        motion = FrameMotion(
+            START_NS + np.round(times * 1e9).astype(np.int64), np.array([*map(pose, times)])
+        )
+        arrays.append(replace(given, motion=motion))
+    assert np.linalg.norm(arrays[-1].boxes[0, :2] - parked[:2]) > 3
+    for waits in (False, True):
+        for array in corrected(arrays, waits, latency):
+            np.testing.assert_allclose(array.boxes[0], parked, atol=0.02)

@@ -7,6 +7,7 @@ from boxreg_ros import Config, refine
 from boxreg_ros.config import Ingredients
 from boxreg_ros.core import registration
 from boxreg_ros.core.geometry import face_distances
+from boxreg_ros.core.latency import Latency
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.problem import stack_windows
 from boxreg_ros.core.registrar import BoxRegistrar
@@ -124,7 +125,7 @@ def test_final_boxes_are_more_accurate_than_early_boxes():
 def test_boxes_of_long_tracks_are_returned_in_parts():
     # With windows of 12, a track is solved when it has 12; the newest is solved again later.
     stream = stream_of([track_of(drive(40), np.random.default_rng(0))])
-    registrar = BoxRegistrar(config_with('track', track_window=12))
+    registrar = BoxRegistrar(config_with('track', track_window=12), latency=Latency())
     held = []
     results = []
     for i, pair in enumerate(stream):
@@ -603,7 +604,7 @@ def test_a_track_that_ends_does_not_hold_back_others():
     # With estimate 'track' a short track that has ended must not delay the boxes of others.
     rng = np.random.default_rng(0)
     short, long = track_of(drive(5), rng, 'short'), track_of(drive(60, speed=0, turn=0), rng, 'l')
-    registrar = BoxRegistrar(config_with('track', track_window=12))
+    registrar = BoxRegistrar(config_with('track', track_window=12), latency=Latency())
     assert len(fed(registrar, stream_of([short, long]))) >= 60 - 12
 
 
@@ -613,7 +614,7 @@ def test_memory_is_bounded(estimate):
     rng = np.random.default_rng(0)
     parked = track_of(drive(20, speed=0, turn=0), rng)
     config = config_with(estimate, track_window=10, max_gap=0.3, **{'sampling.points': 16})
-    registrar = BoxRegistrar(config)
+    registrar = BoxRegistrar(config, latency=Latency())
     returned, held = 0, []
     for i in range(60):
         now_ns = int(stamps(1)[0]) + i * PERIOD_NS

@@ -4,7 +4,8 @@ from boxreg_ros.config import Config
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.transforms import matrix
-from boxreg_ros.live.live_registrar import LiveRegistrar, refined_to_frame
+from boxreg_ros.live.live_registrar import LiveRegistrar
+from boxreg_ros.live.outgoing import refined_to_frame
 from boxreg_ros.structures import BoxArray, COASTED, KEPT, REFINED, RefinedBoxes
 from lidar_drives import LidarDrive
 from msg_adapters import adapter_for, pointcloud, vision
@@ -43,7 +44,7 @@ class Live(LiveRegistrar):
                 confirmed, ready = self.confirm(item)
                 out += ready
                 for each in confirmed:
-                    assert self.is_ready(each, now + 0.5) or not self.session.fixed_frame
+                    assert self.wait.is_over(each, now + 0.5) or not self.session.fixed_frame
                     out += self.process(each)
         return out
 
@@ -194,14 +195,14 @@ def test_messages_wait_for_their_transforms_until_the_timeout():
     static, *moving = [m for t, _, m in drive.items if t.startswith('/tf')]
     clouds = [received('/points', m, 10.0) for m in items_of(drive, '/points')]
     live.session.tree.add_transforms(static.transforms, is_static=True)
-    assert not live.is_ready(clouds[0], 10.0)
+    assert not live.wait.is_over(clouds[0], 10.0)
     live.session.tree.add_transforms(moving[0].transforms)
     live.session.tree.add_transforms(moving[1].transforms)
-    assert not live.is_ready(clouds[1], 10.1)  # the fixed frame is chosen after 0.5 s
-    assert live.is_ready(clouds[1], 10.5)
+    assert not live.wait.is_over(clouds[1], 10.1)  # the fixed frame is chosen after 0.5 s
+    assert live.wait.is_over(clouds[1], 10.5)
     assert live.session.fixed_frame == 'odom'
-    assert not live.is_ready(clouds[2], 10.5)
-    assert live.is_ready(clouds[2], 11.0)  # timeout: extrapolated by 0.1 s
+    assert not live.wait.is_over(clouds[2], 10.5)
+    assert live.wait.is_over(clouds[2], 11.0)  # timeout: extrapolated by 0.1 s
     assert live.process(clouds[2]) == []
     assert not live.reports
 
@@ -227,8 +228,8 @@ def test_boxes_without_transform_are_published_unchanged_with_a_remedy():
     drive = Drive(sweeps=2, motion='none')
     live = Live()
     cloud, boxes = items_of(drive, '/points')[0], items_of(drive, '/boxes')[0]
-    assert not live.is_ready(received('/points', cloud), 0.9)
-    assert live.is_ready(received('/points', cloud), 1.0)
+    assert not live.wait.is_over(received('/points', cloud), 0.9)
+    assert live.wait.is_over(received('/points', cloud), 1.0)
     assert live.process(received('/points', cloud)) == []
     out = live.process(received('/boxes', boxes))
     assert [item.is_final for item in out] == [False, True]
@@ -256,8 +257,8 @@ def test_empty_arrays_without_stamp_cause_no_wait_and_no_report():
     empty.detections, stamped.detections = [], []
     empty.header.stamp.sec = empty.header.stamp.nanosec = 0
     live = Live()
-    assert live.is_ready(received('/boxes', empty), 0.0)
-    assert not live.is_ready(received('/boxes', stamped), 0.0)
+    assert live.wait.is_over(received('/boxes', empty), 0.0)
+    assert not live.wait.is_over(received('/boxes', stamped), 0.0)
     for message in (empty, stamped):
         out = live.process(received('/boxes', message))
         assert [item.message for item in out] == [message, message]
@@ -500,7 +501,7 @@ def test_a_lidar_that_tf_does_not_know_holds_back_the_others_only_once():
             else live.placement.sweep_of(message, topic)
         )
         item = Item(round(now * 1e9), content, message=message)
-        not_ready += bool(live.session.fixed_frame) and not live.is_ready(item, now + 0.5)
+        not_ready += bool(live.session.fixed_frame) and not live.wait.is_over(item, now + 0.5)
         out += live.process(item)
     out += live.flush()
     finals = [item for item in out if item.is_final]
@@ -525,7 +526,7 @@ def test_a_concatenated_cloud_waits_for_its_info_while_there_are_infos():
     ]
 
     def are_ready(now=0.5):
-        return [live.is_ready(cloud, now) for cloud in clouds]
+        return [live.wait.is_over(cloud, now) for cloud in clouds]
 
     assert are_ready() == [False, False, False]
     live.placement.add_info(infos[1])

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.config import COMPLETE_STEPS, Config, KINDS
+from boxreg_ros.core.latency import Latency
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import hand_to_registrar
@@ -177,9 +178,17 @@ def completed(items, fixed_frame, config, first=None):
         first = first_pass(((item, False) for item in items), config)
     plan = first.plan(fixed_frame, config)
     completion = Completion(plan, config)
-    registrar = BoxRegistrar(config)
+    registrar = BoxRegistrar(
+        config,
+        latency=Latency(),
+        prepare=lambda pair: completion.to_register(pair.boxes, pair.sweep),
+    )
+    arrays = iter(first.in_time)
     for ticket, item in enumerate(items):
-        moved = replace(item, ticket=ticket) if isinstance(item, BoxArray) else item
-        completion.add(hand_to_registrar(registrar, completion.to_register(moved, False), False))
+        moved = item
+        if isinstance(item, BoxArray):
+            moved = replace(next(arrays), ticket=ticket)
+            completion.expect(ticket)
+        completion.add(hand_to_registrar(registrar, moved, False))
     completion.add(registrar.flush())
     return completion.finished(), plan.tracks

@@ -11,6 +11,7 @@ import zlib
 
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
+from boxreg_ros.core.matching import StampMatcher
 from boxreg_ros.errors import BoxregError, ConfigError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.notes import closing_line
@@ -403,9 +404,14 @@ SUMMARY = {
 def cells_of(tracks, items, config=None):
     """Return the number of cells that the points of the track fill before and after."""
     collector = PointCollector(config or Config())
+    matcher = StampMatcher(Config(), Counter())
     for item in items:
-        collector.add(item)
-    collector.flush()
+        collector.note(item)
+        add = matcher.add_sweep if isinstance(item, Sweep) else matcher.add_boxes
+        for pair in add(item):
+            collector.gather(pair.boxes, pair.sweep)
+    for pair in matcher.flush():
+        collector.gather(pair.boxes, pair.sweep)
     (track,) = tracks
     unknown = np.full(len(track.boxes), np.nan)
     points = collector.points_of(track)

@@ -18,13 +18,12 @@ from time import sleep
 from boxreg_ros.cli import main
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.stamp_order import kept
 from boxreg_ros.labels import LabelFrame, Options, Provenance
 from boxreg_ros.labels.csv import Writer as csv_writer
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
-from boxreg_ros.structures import BoxArray, RefinedBoxes
+from boxreg_ros.structures import BoxArray, kept, RefinedBoxes
 from browser import NEEDS_BROWSER, opened_page, press, serving
 import numpy as np
 import pytest

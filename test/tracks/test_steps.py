@@ -2,7 +2,7 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.motion import motion_at
-from boxreg_ros.io.stamp_order import kept
+from boxreg_ros.structures import kept
 from boxreg_ros.tracks.extend import extend, MOVING_REACH, num_free, num_supported
 from boxreg_ros.tracks.fill import fill
 from boxreg_ros.tracks.prune import duplicates, ghosts

@@ -1,0 +1,247 @@
+"""Input boxes of tracks where they were measured: in a moving frame, before their stamp."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from boxreg_ros.config import Config
+from boxreg_ros.rotations import (
+    matrix_from_quaternion,
+    matrix_from_rpy,
+    quaternion_from_matrix,
+    rpy_from_matrix,
+    wrap_angle,
+)
+from boxreg_ros.structures import (
+    BOX_EXTENT,
+    BoxArray,
+    Floats,
+    FrameMotion,
+    Ints,
+    is_valid_box,
+    ROLL,
+    YAW,
+    Z,
+)
+import numpy as np
+
+SMOOTHING = 0.35
+"""Reach of the local lines through a track [s]: noise must not be motion; chosen."""
+
+
+def displacements(motion: FrameMotion, seconds: Floats) -> Floats:
+    """
+    Return how boxes move in the fixed frame if they were measured before their stamp.
+
+    A box with stamp t that was brought to the fixed frame by the pose T(t) of its own frame, but
+    was measured at t - s, was at T(t - s) inv(T(t)) times itself.
+
+    Parameters
+    ----------
+    motion : FrameMotion
+        Poses of the frame that the boxes were measured in; the last is that at the stamp.
+    seconds : array, shape (C,)
+        Times before the stamp [s]; outside of the known poses the motion is extrapolated.
+
+    Returns
+    -------
+    T : array, shape (C, 4, 4)
+        Maps the fixed frame to itself; the identity if one pose is known only.
+
+    """
+    found = np.tile(np.eye(4), (len(seconds), 1, 1))
+    if len(motion.stamps_ns) < 2:
+        return found
+    poses = motion.T_fixed_frame
+    quaternions = quaternion_from_matrix(poses[:, :3, :3])
+    for before, after in pairwise(quaternions):
+        after *= np.sign(before @ after) or 1.0  # one of both signs is the shortest rotation
+    times = (motion.stamps_ns - motion.stamps_ns[-1]) * 1e-9
+    after = np.searchsorted(times, -seconds).clip(1, len(times) - 1)
+    share = ((-seconds - times[after - 1]) / (times[after] - times[after - 1]))[:, None]
+    turned = (1 - share) * quaternions[after - 1] + share * quaternions[after]
+    placed = (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3]
+    R_last, t_last = poses[-1, :3, :3], poses[-1, :3, 3]
+    found[:, :3, :3] = matrix_from_quaternion(turned) @ R_last.T
+    found[:, :3, 3] = placed - found[:, :3, :3] @ t_last
+    return found
+
+
+class MeasuredArray:
+    """The stamp of a box array, and where its boxes were for each latency."""
+
+    def __init__(self, boxes: BoxArray, candidates: Floats) -> None:
+        self.stamp_ns = boxes.stamp_ns
+        self._motion = boxes.motion
+        self.of_candidates: Floats | None = None  # (C, 4, 4); None: the frame does not move
+        if boxes.motion is not None:
+            self.of_candidates = displacements(boxes.motion, candidates)
+        self._known = (0.0, np.eye(4))
+
+    def displacement(self, latency: float) -> Floats:
+        """Return T (4, 4) from the boxes as given to where they were measured."""
+        if self._motion is not None and latency != self._known[0]:
+            self._known = latency, displacements(self._motion, np.array([latency]))[0]
+        return self._known[1] if self._motion is not None else np.eye(4)
+
+
+class MeasuredTrack:
+    """The boxes of a track in the last seconds, as they were given, oldest first."""
+
+    def __init__(self) -> None:
+        self._arrays: list[MeasuredArray] = []
+        self._boxes: list[Floats] = []
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest box [ns]."""
+        return self._arrays[-1].stamp_ns
+
+    def add(self, array: MeasuredArray, box: Floats) -> None:
+        """Add a box; one that is not newer than the others is left out."""
+        if not self._arrays or array.stamp_ns > self.newest_ns:
+            self._arrays.append(array)
+            self._boxes.append(box)
+
+    def forget_before(self, oldest_ns: float) -> None:
+        """Remove the boxes with older stamps, but for the newest."""
+        old = sum(array.stamp_ns < oldest_ns for array in self._arrays[:-1])
+        del self._arrays[:old], self._boxes[:old]
+
+    def covers(self, times_ns: Ints) -> bool:
+        """Return whether all times are within those of the boxes."""
+        first_ns = self._arrays[0].stamp_ns
+        return bool(first_ns <= times_ns[0] and times_ns[-1] <= self.newest_ns)
+
+    def at(self, stamp_ns: int, latency: float, box: Floats) -> Floats:
+        """
+        Return the box (9,) of the object at a stamp, if its boxes have a latency [s].
+
+        Between two boxes, or beyond the last on a circle at constant speed; it heads as `box`
+        does.
+
+        """
+        time_ns = stamp_ns + round(latency * 1e9)
+        stamps_ns = self._stamps_ns()
+        after = int(np.searchsorted(stamps_ns, time_ns))
+        if time_ns > self.newest_ns:
+            from boxreg_ros.core.motion import motion_at  # it imports numba
+
+            boxes = self._measured(0, len(stamps_ns), latency)
+            found = motion_at(stamps_ns, boxes, -1, Config().vehicle).predict(time_ns)
+        elif after == 0:
+            found = self._measured(0, 1, latency)[0]
+        else:
+            begin_ns, end_ns = stamps_ns[after - 1 : after + 1].tolist()
+            first, last = self._measured(after - 1, after + 1, latency)
+            last[YAW] = first[YAW] + (last[YAW] - first[YAW] + np.pi / 2) % np.pi - np.pi / 2
+            found = first + (time_ns - begin_ns) / (end_ns - begin_ns) * (last - first)
+        if np.cos(found[YAW] - box[YAW]) < 0:
+            found[YAW] += np.pi
+        found[YAW] = wrap_angle(found[YAW])
+        return found
+
+    def smoothed(self, times_ns: Ints) -> tuple[Floats, Floats]:
+        """
+        Return boxes at some times, each for its own candidate of the latency.
+
+        They are on local lines through the boxes as the frame measured them so long before.
+
+        Parameters
+        ----------
+        times_ns : array, shape (C,)
+            Times in the stamps of the boxes, one for each candidate [ns].
+
+        Returns
+        -------
+        boxes : array, shape (C, 9)
+            In the fixed frame.
+        velocities : array, shape (C, 3)
+            Slopes of the lines through the centres [m/s].
+
+        """
+        seconds = (self._stamps_ns()[:, None] - times_ns) * 1e-9  # (n, C)
+        weights = np.clip(SMOOTHING - np.abs(seconds), 1e-6, None)
+        weights /= weights.sum(0)
+        mean = (weights * seconds).sum(0)
+        offsets = seconds - mean
+        spread = (weights * offsets**2).sum(0)
+        boxes = self._of_candidates(len(times_ns))
+        middle = np.einsum('nc,cnk->ck', weights, boxes)
+        slope = np.einsum('nc,cnk->ck', weights * offsets, boxes) / spread[:, None]
+        found: Floats = middle - mean[:, None] * slope
+        found[:, BOX_EXTENT] = np.median(boxes[0][:, BOX_EXTENT], axis=0)
+        return found, slope[:, : Z + 1]
+
+    def _stamps_ns(self) -> Ints:
+        return np.array([array.stamp_ns for array in self._arrays])
+
+    def _measured(self, begin: int, end: int, latency: float) -> Floats:
+        """Return some boxes (n, 9) where they were measured."""
+        boxes = np.array(self._boxes[begin:end])
+        T = np.array([array.displacement(latency) for array in self._arrays[begin:end]])
+        return displaced(boxes, T)
+
+    def _of_candidates(self, count: int) -> Floats:
+        """Return all boxes where they were measured by each candidate, (C, n, 9)."""
+        given = np.array(self._boxes)
+        boxes = np.tile(given, (count, 1, 1))
+        known = [array.of_candidates for array in self._arrays]
+        moving = [row for row, T in enumerate(known) if T is not None]
+        if moving:
+            T = np.array([known[row] for row in moving])  # (n, C, 4, 4)
+            centers = np.einsum('ncij,nj->cni', T[..., :3, :3], given[moving, : Z + 1])
+            boxes[:, moving, : Z + 1] = centers + np.moveaxis(T[..., :3, 3], 0, 1)
+            boxes[:, moving, YAW] += np.arctan2(T[..., 1, 0], T[..., 0, 0]).T
+        boxes[..., YAW] = np.unwrap(boxes[..., YAW], period=np.pi, axis=1)
+        return boxes
+
+
+class MeasuredTracks:
+    """Input boxes by track, and the box arrays that they are of."""
+
+    def __init__(self, candidates: Floats) -> None:
+        self._candidates = candidates
+        self.by_id: dict[str, MeasuredTrack] = {}
+        self.newest_ns = -(2**62)
+
+    def add(self, boxes: BoxArray, oldest_ns: float) -> None:
+        """Add the boxes of an array, and forget tracks and boxes that ended before a time."""
+        self.newest_ns = max(self.newest_ns, boxes.stamp_ns)
+        array = MeasuredArray(boxes, self._candidates)
+        for row in rows_with_latency(boxes):
+            track = self.by_id.setdefault(boxes.track_ids[row], MeasuredTrack())
+            track.add(array, boxes.boxes[row])
+        ended = [name for name, track in self.by_id.items() if track.newest_ns <= oldest_ns]
+        for name in ended:
+            del self.by_id[name]
+        for track in self.by_id.values():
+            track.forget_before(oldest_ns)
+
+    def at_stamp(self, boxes: BoxArray, latency: float) -> Floats:
+        """Return the boxes (n, 9) of an array where their objects are at its stamp."""
+        moved = boxes.boxes.copy()
+        for row in rows_with_latency(boxes):
+            track = self.by_id.get(boxes.track_ids[row])
+            if track is not None:
+                moved[row] = track.at(boxes.stamp_ns, latency, moved[row])
+        return moved
+
+
+def rows_with_latency(boxes: BoxArray) -> list[int]:
+    """Return the rows of valid boxes of a track; a pinned box holds at its stamp."""
+    is_valid = is_valid_box(boxes.boxes)
+    if boxes.pinned is not None:
+        is_valid &= ~boxes.pinned
+    return [row for row in np.flatnonzero(is_valid).tolist() if boxes.track_ids[row]]
+
+
+def displaced(boxes: Floats, T: Floats) -> Floats:
+    """Return boxes (n, 9), each moved by its T (n, 4, 4)."""
+    found = boxes.copy()
+    R = T[:, :3, :3]
+    found[:, : Z + 1] = np.einsum('nij,nj->ni', R, boxes[:, : Z + 1]) + T[:, :3, 3]
+    is_turned = np.any(np.eye(3) != R, axis=(1, 2))
+    turned = R[is_turned] @ matrix_from_rpy(boxes[is_turned, ROLL:])
+    found[is_turned, ROLL:] = rpy_from_matrix(turned)
+    return found
