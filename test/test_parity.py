@@ -99,6 +99,7 @@ def boxes_of_node(tmp_path, records, *parameters, boxes=(DETECTIONS, '/boxes'), 
             play(graph, [record])
             played += record.boxes_stamp_ns is not None
             graph.wait(lambda n=played: len(node.early) >= n - ahead, 'early boxes')
+        graph.wait(lambda: len(node.early) >= played, 'all early boxes')
         assert ended_cleanly(node)
         return node.early, node.final
 
