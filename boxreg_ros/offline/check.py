@@ -13,7 +13,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.review.label_tracks import LabelTrack
 from boxreg_ros.review.rules import ERROR, RULES, Violation, violations, WARNING
-from boxreg_ros.structures import BoxArray, Floats, Ints
+from boxreg_ros.structures import BoxArray, Floats, Ints, REJECTED
 import numpy as np
 
 RECORDING_SUFFIXES = ('.mcap', '.db3', '.bag')
@@ -86,7 +86,7 @@ def _print(tracks: list[LabelTrack], found: dict[str, list[Violation]]) -> None:
 
 
 def _tracks(source: str, config: Config) -> list[LabelTrack]:
-    """Read the tracks of label files or of a recording."""
+    """Read the tracks of label files, whose rejected boxes are no labels, or of a recording."""
     path = Path(source)
     if _is_recording(path):
         from boxreg_ros.io.fixed_frame import input_boxes  # slow to import: it reads bags
@@ -98,7 +98,11 @@ def _tracks(source: str, config: Config) -> list[LabelTrack]:
 
     name, path = _format_of(source)
     frames = (frame.moved('fixed').refined for frame in frames_of(name, path))
-    return _grouped(((refined.boxes, refined.num_points) for refined in frames), config)
+    labels = (
+        refined.take([i for i, word in enumerate(refined.status) if word != REJECTED])
+        for refined in frames
+    )
+    return _grouped(((refined.boxes, refined.num_points) for refined in labels), config)
 
 
 def _is_recording(path: Path) -> bool:

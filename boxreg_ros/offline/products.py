@@ -76,7 +76,7 @@ def checked(
     for track in tracks:
         names = track.track_id, track.class_name, config, track.stamps_ns
         before.append(LabelTrack.of(*names, track.given, track.num_points))
-        after.append(LabelTrack.of(*names, track.boxes, track.num_points))
+        after.append(LabelTrack.of(*names, track.labels, track.num_points))
     found = violations(after)
     return {'before': counts(violations(before)), 'after': counts(found)}, found
 

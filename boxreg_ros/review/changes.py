@@ -16,6 +16,7 @@ from boxreg_ros.structures import (
     is_valid_box,
     REFINED,
     RefinedBoxes,
+    REJECTED,
     YAW,
 )
 import numpy as np
@@ -56,6 +57,16 @@ class TrackChanges:
     """(n,), why a box was kept; empty for the others."""
     num_points: Ints
     """(n,), inside the input boxes."""
+
+    @property
+    def is_label(self) -> NDArray[np.bool_]:
+        """Return which boxes are labels, shape (n,): rejected ones are none."""
+        return np.asarray(self.status != REJECTED)
+
+    @property
+    def labels(self) -> Floats:
+        """Return the result (n, 9) without rejected boxes: NaN in their place."""
+        return np.where(self.is_label[:, None], self.boxes, np.nan)
 
     @property
     def is_refined(self) -> NDArray[np.bool_]:

@@ -126,8 +126,10 @@ class TrackPart:
         self._usual = usual
         self._sensor = collector.sensor_at(track.stamps_ns)
         self._points = collector.points_of(track)
-        self.before = quality(track, track.given, self._points, truth.iou_before)
-        self.after = quality(track, track.boxes, self._points, truth.iou_after)
+        of_labels = np.where(track.is_label, 0.0, np.nan)  # NaN for rejected boxes
+        given = track.given + of_labels[:, None]
+        self.before = quality(track, given, self._points, truth.iou_before + of_labels)
+        self.after = quality(track, track.labels, self._points, truth.iou_after + of_labels)
 
     def row(self, stamps_ns: Ints) -> dict[str, Any]:
         """Return the row of the list; `stamps_ns` are those of the drive, sorted."""

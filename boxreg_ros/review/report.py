@@ -173,7 +173,7 @@ def _of_tracks(found: Sequence[TrackRow]) -> dict[str, Any]:
     changes = np.concatenate([np.zeros((0, 4)), *(t.change[t.is_refined] for t in tracks)])
     return {
         'count': len(tracks),
-        'risk': median([row.risk.track for row in found]),
+        'risk': median([row.risk.track for row in found if row.track.is_label.any()]),
         'shift': mean(np.linalg.norm(changes[:, :3], axis=1)),
         'turn': float(np.degrees(mean(np.abs(changes[:, 3])))),
     }

@@ -1,12 +1,17 @@
 """What a person has decided binds the steps that complete tracks, and those that follow them."""
 
+from dataclasses import replace
+import json
 import shutil
 
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.stamp_order import kept
 from boxreg_ros.offline.review_command import drive_of
+from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
 from boxreg_ros.review.server import review_server
+from boxreg_ros.structures import BoxArray
 from browser import NEEDS_BROWSER, opened_page, press, serving
 import numpy as np
 import pytest
@@ -78,6 +83,35 @@ def test_without_decisions_the_steps_do_all_of_this(completed):
     assert [words_of(rows, '2', stamps)[k] for k in GAP] == ['interpolated'] * 3
     assert words_of(rows, '1', stamps)[-3:] == ['extended'] * 3
     assert words_of(rows, '9', stamps)[8:10] == ['rejected'] * 2
+
+
+def test_rejected_boxes_are_no_labels(completed, capsys):
+    """Neither rules nor the figures of all tracks see them."""
+    _, stamps, rows, out = completed
+    capsys.readouterr()
+    main(['check', str(out), '--json'])
+    found = json.loads(capsys.readouterr().out)
+    assert (found['tracks'], found['boxes']) == (2, len(rows) - 2)
+    summary = json.loads((out / 'summary.json').read_text())
+    flash = {name: of_run['after'] for name, of_run in rules_of(summary).items()}
+    violations = {name: len(rule['violations']) for name, rule in found['rules'].items()}
+    assert flash == {name: violations[name] for name in flash}
+    changes = Changes('odom')
+    given = BoxArray(stamps[0], 'odom', ('1', '9'), ('car',) * 2, np.ones(2), np.ones((2, 9)))
+    result = kept(given, '')
+    changes.add(given, replace(result, status=('kept', 'rejected')))
+    labels = {track.track_id: track.labels for track in changes.tracks()}
+    assert np.isfinite(labels['1']).all()
+    assert np.isnan(labels['9']).all()
+
+
+def rules_of(summary):
+    """Return the number of violations of each rule, before and after."""
+    names = summary['rules']['before'].keys() | summary['rules']['after'].keys()
+    return {
+        name: {when: summary['rules'][when].get(name, 0) for when in ('before', 'after')}
+        for name in names
+    }
 
 
 def test_decisions_bind_the_steps_of_complete(completed, tmp_path, capsys):

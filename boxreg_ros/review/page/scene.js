@@ -16,8 +16,8 @@ const sceneStamp = () => DATA.stamps[scene.at];
 async function slimPart(s) {
   if (DATA.tracks[s].part) return DATA.tracks[s].part;
   if (!scene.slim.has(s)) {
-    const { origin, usable, stamps } = await loadPart(s);
-    scene.slim.set(s, { origin, usable, stamps });
+    const { origin, usable, stamps, status } = await loadPart(s);
+    scene.slim.set(s, { origin, usable, stamps, status });
   }
   return scene.slim.get(s);
 }
@@ -28,7 +28,7 @@ async function boxesAt(at) {
   for (const track of TRACKS) {
     for (const [s, k] of track.members().filter(([t, l]) => DATA.tracks[t].at[l] === at)) {
       const part = await slimPart(s), box = part.usable[k];
-      if (box) found.push({ track, box: moved(box, part.origin, 1), isGone: isDeleted(s, k) });
+      if (box) found.push({ track, box: moved(box, part.origin, 1), isGone: isDeleted(s, k) || part.status[k] === 'rejected' });
     }
   }
   return found;
