@@ -7,16 +7,16 @@ set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 python3 -m venv "$folder/venv"
-"$folder/venv/bin/pip" install --quiet pypcd4==1.5.1 numpy
+"$folder/venv/bin/pip" install --quiet pypcd4==1.5.1 python-neo-lzf==0.3.5
 "$folder/venv/bin/python" - "$folder/cloud.pcd" <<'PYTHON'
 from importlib.metadata import version
 import sys
 
 import numpy as np
-from pypcd4 import PointCloud
+from pypcd4 import Encoding, PointCloud
 
 path = sys.argv[1]
-PointCloud.from_xyz_points(np.arange(9, dtype=np.float32).reshape(3, 3)).save(path, 'binary')
+PointCloud.from_xyz_points(np.arange(9, dtype=np.float32).reshape(3, 3)).save(path, Encoding.BINARY)
 with open(path, 'rb') as file:
     whole = file.read()
 with open(path, 'wb') as file:

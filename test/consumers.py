@@ -233,6 +233,25 @@ def av2_precision(folder):
     return {name: float(value) for name, value in scores['AP'].items() if value > 0}
 
 
+def nuscenes_images(folder, version, channel):
+    """Return the boxes of each sample in the frames of the LiDAR and of a camera."""
+    from nuscenes.nuscenes import NuScenes
+    from PIL import Image
+
+    data = NuScenes(version, folder, verbose=False)
+    images = []
+    for sample in data.sample:
+        path, boxes, intrinsic = data.get_sample_data(sample['data'][channel], box_vis_level=0)
+        _, in_lidar, _ = data.get_sample_data(sample['data']['LIDAR_TOP'], box_vis_level=0)
+        tokens = [box.token for box in boxes]
+        images.append({
+            'size': list(Image.open(path).size), 'intrinsic': intrinsic.tolist(),
+            'in_camera': [box.center.tolist() for box in boxes],
+            'in_lidar': [box.center.tolist() for box in in_lidar if box.token in tokens],
+        })  # fmt: skip
+    return images
+
+
 def nuscenes_precision(folder, version):
     """Return the average precision of annotations as detections of themselves, by class."""
     from nuscenes.eval.common.data_classes import EvalBoxes

@@ -45,7 +45,7 @@ def cuboid_format(name: str, title: str, files: str) -> Format:
         sizes='length width height (x y z)',
         rotation='angles x y z, R = Rx Ry Rz',
         files=files,
-        options=('with_points',),
+        options=('with_points', 'with_images'),
     )
 
 

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing, ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, TextIO
 
+from boxreg_ros.io.images import Image
 from boxreg_ros.labels.arrow import Table
+from boxreg_ros.labels.cameras import (
+    cameras_of,
+    LabelCamera,
+    LabelCameras,
+    SUFFIXES_OF_IMAGES,
+)
 from boxreg_ros.labels.class_names import ClassNames
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import write_provenance
@@ -36,6 +43,11 @@ class FolderWriter:
     """To create."""
     cloud_file: ClassVar[str] = ''
     """Of the cloud of a frame, with the fields ``name`` and ``number``; empty for none."""
+    image_file: ClassVar[str] = ''
+    """
+    Of the image of a frame, with the fields ``camera``, ``channel`` (in capitals), ``index`` (from
+    0), ``name``, ``number`` and ``suffix``; empty for none.
+    """
     needs_clouds: ClassVar[bool] = False
     """Whether a frame without a cloud gets an empty file, because the tool needs one."""
     needs_pose: ClassVar[bool] = False
@@ -54,6 +66,10 @@ class FolderWriter:
         self._used_stamps: Counter[int] = Counter()
         self.files = ExitStack()
         self.class_names = ClassNames(self.form, options.class_map if self.form else None)
+        self.cameras: LabelCameras | None = None
+        if options.with_images and self.image_file:
+            self.cameras = cameras_of(options.recording, '--with-images')
+            self.files.callback(self.cameras.close)
         self._with_points = options.with_points and self.cloud_file != ''
         for name in self.folders:
             (folder / name).mkdir(parents=True)
@@ -78,11 +94,42 @@ class FolderWriter:
         if self._with_points and (self.needs_clouds or frame.sweep is not None):
             path = self.cloud_file.format(name=self.name, number=self.number)
             self.add_cloud(self.folder / path, frame)
+        if self.cameras is not None:
+            self._add_images(self.cameras, frame)
         if self.has_sidecar:
             values = np.full((3, 4), np.nan) if T is None else T[:3]
             self._stamps_file.write(f'{stamp_ns}\n')
             self._poses_file.write(' '.join(map(repr, values.ravel().tolist())) + '\n')
         self.number += 1
+
+    def _add_images(self, cameras: LabelCameras, frame: LabelFrame) -> None:
+        """Write the image of each camera that is nearest to a frame."""
+        stamp_ns = frame.refined.boxes.stamp_ns
+        known = cameras.known(frame.sensor_frame, stamp_ns)
+        if self.number == 0:
+            for camera in known:
+                self.add_camera(camera)
+        images = []
+        for camera, image in cameras.images(frame.sensor_frame, stamp_ns):
+            path = self.image_file.format(
+                camera=camera.name,
+                channel=f'CAM_{camera.name.upper()}',
+                index=known.index(camera),
+                name=self.name,
+                number=self.number,
+                suffix=SUFFIXES_OF_IMAGES[image.media_type],
+            )
+            (self.folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (self.folder / path).write_bytes(image.content)
+            images.append((camera, image, path))
+        self.add_images(images)
+        self.about['images'] = dict(cameras.counts)
+
+    def add_camera(self, camera: LabelCamera) -> None:
+        """Write the calibration of a camera, where it is the same for all frames."""
+
+    def add_images(self, images: Sequence[tuple[LabelCamera, Image, str]]) -> None:
+        """Write what belongs to the images of a frame, which are at paths in the folder."""
 
     def text_file(self, name: str) -> TextIO:
         """Open a text file of the folder, which is closed at the end."""

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.camera import Camera
+from boxreg_ros.labels.cameras import LabelCameras
 from boxreg_ros.labels.files import at, following, read_provenance, require_single
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import (
@@ -68,7 +70,7 @@ class Writer(FolderWriter):
     has_sidecar = True
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        self._camera = Camera.read(options.camera, 'format kitti')
+        self._camera = _camera_of(options)
         super().__init__(folder, provenance, options)
         write_calibration(self._camera, folder / 'calib' / f'{SEQUENCE}.txt')
         self._file = self.text_file(f'label_02/{SEQUENCE}.txt')
@@ -254,6 +256,16 @@ def _boxes_by_frame(
         read_box = ReadBox(track_id, class_name, box, {'score': line.score})
         found.setdefault(line.frame, []).append(read_box)
     return found
+
+
+def _camera_of(options: Options) -> Camera:
+    """Return the camera of a file, else that of the recording."""
+    path = options.camera
+    if options.recording is None or (path is not None and path.is_file()):
+        return Camera.read(path, 'format kitti')
+    with closing(LabelCameras(options.recording)) as cameras:
+        sensor_frame = options.recording.sensor_frame()
+        return cameras.only(sensor_frame, path, 'format kitti').calibration()
 
 
 def write_calibration(

@@ -11,7 +11,7 @@ several instances. T4 has these values in a file beside its tables.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import hashlib
 from pathlib import Path
 import struct
@@ -19,8 +19,10 @@ from typing import Any, TypeVar
 import zlib
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.transforms import matrix
+from boxreg_ros.io.images import Image
+from boxreg_ros.io.transforms import inverse, matrix
 from boxreg_ros.labels import files
+from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import (
     absolute,
@@ -46,7 +48,7 @@ FORMAT = Format(
     sizes='width length height',
     rotation='quaternion w x y z',
     files='v1.0-boxreg/, samples/, maps/',
-    options=('with_points', 'class_map'),
+    options=('with_points', 'with_images', 'class_map'),
     reads='annotations of all scenes; results of the detection and the tracking task',
     leaves_out='attributes, visibility, velocities, radar',
     read_back='nuscenes-devkit 1.2.0',
@@ -55,6 +57,8 @@ STREAMED_TABLES = ('sample', 'sample_data', 'sample_annotation', 'ego_pose')
 """Tables that grow with the recording; their rows are written one by one."""
 OWN_VALUES = 'boxreg_values.json'
 """Values without a column in the tables of T4, by the token of their row."""
+DISTORTIONS = (4, 5, 8, 12, 14)
+"""Numbers of coefficients that T4 takes, those of OpenCV."""
 EMPTY_MAP = 'maps/empty.png'
 
 
@@ -71,6 +75,7 @@ class Writer(FolderWriter):
     version = 'v1.0-boxreg'
     channel = 'LIDAR_TOP'
     cloud_file = 'samples/LIDAR_TOP/{number:05d}.pcd.bin'
+    image_file = 'samples/{channel}/{number:05d}.{suffix}'
     date_key = 'date_captured'
     needs_pose = True
 
@@ -84,6 +89,8 @@ class Writer(FolderWriter):
         self._held_rows: dict[str, dict[str, Any]] = {}  # by table
         self._held_annotations: dict[str, dict[str, Any]] = {}  # by instance key
         self._instances: dict[str, dict[str, Any]] = {}
+        self._sensors: list[dict[str, Any]] = []  # the cameras
+        self._calibrations: list[dict[str, Any]] = []
         self._categories: dict[str, str] = {}
         self._drive = f'{self.about["recordings"]} {self.about["config_hash"]}'
         self._num_single = 0  # annotations that are an instance of their own
@@ -97,8 +104,8 @@ class Writer(FolderWriter):
 
     def finish(self) -> None:
         """Write the rows still held and the remaining tables."""
-        for table, row in self._held_rows.items():
-            self._streams[table].append(row)
+        for chain, row in self._held_rows.items():
+            self._streams[chain.partition(' ')[0]].append(row)
         for row in self._held_annotations.values():
             self._streams['sample_annotation'].append(row)
         for stream in self._streams.values():
@@ -156,6 +163,49 @@ class Writer(FolderWriter):
                 'translation': T_fixed_sensor[:3, 3].tolist(),
             }
         )
+
+    def add_camera(self, camera: LabelCamera) -> None:
+        """Hold the rows of a camera, whose pose is that in the LiDAR."""
+        sensor = self._token('sensor', camera.name)
+        T_sensor_camera = inverse(camera.T_camera_sensor)
+        qx, qy, qz, qw = quaternion_from_matrix(T_sensor_camera[:3, :3]).tolist()
+        distortion = camera.image.distortion.tolist()
+        self._sensors.append(
+            {'token': sensor, 'channel': f'CAM_{camera.name.upper()}', 'modality': 'camera'}
+        )
+        self._calibrations.append(
+            {
+                'token': self._token('calibrated_sensor', camera.name),
+                'sensor_token': sensor,
+                'translation': T_sensor_camera[:3, 3].tolist(),
+                'rotation': [qw, qx, qy, qz],
+                'camera_intrinsic': camera.intrinsics.tolist(),
+                'camera_distortion': distortion if len(distortion) in DISTORTIONS else [],
+            }
+        )
+
+    def add_images(self, images: Sequence[tuple[LabelCamera, Image, str]]) -> None:
+        """Add a row for each image of a sample, which has the pose of the sample."""
+        for camera, image, path in images:
+            width, height = camera.image.size
+            token = self._token('sample_data', f'{self.number} {camera.name}')
+            row = {
+                'token': token,
+                'sample_token': self._token('sample', self.number),
+                'ego_pose_token': self._token('ego_pose', self.number),
+                'calibrated_sensor_token': self._token('calibrated_sensor', camera.name),
+                'timestamp': round(image.stamp_ns / 1000),
+                'fileformat': path.rpartition('.')[2],
+                'is_key_frame': True,
+                'height': height,
+                'width': width,
+                'filename': path,
+                'prev': '',
+                'next': '',
+                'is_valid': True,
+                **self._own_columns(token, {'stamp_ns': image.stamp_ns}),
+            }
+            self._link('sample_data', row, camera=camera.name)
 
     def _add_annotations(
         self, frame: LabelFrame, sample: str, rows: list[int], boxes: Floats
@@ -229,10 +279,10 @@ class Writer(FolderWriter):
         instance['last_annotation_token'] = annotation
         return str(instance['token'])
 
-    def _link(self, table: str, row: dict[str, Any], instance: str = '') -> None:
-        """Hold a row, and write the one before it of the same table and instance."""
+    def _link(self, table: str, row: dict[str, Any], instance: str = '', camera: str = '') -> None:
+        """Hold a row, and write the one before it of the same table and instance or camera."""
         held = self._held_annotations if instance else self._held_rows
-        key = instance or table
+        key = instance or f'{table} {camera}'
         before = held.get(key)
         if before is not None:
             before['next'] = row['token']
@@ -274,8 +324,11 @@ class Writer(FolderWriter):
             'attribute': [],
             'visibility': [{'token': 'unavailable', 'level': 'unavailable', 'description': ''}],
             'instance': list(self._instances.values()),
-            'sensor': [{'token': sensor, 'channel': self.channel, 'modality': 'lidar'}],
-            'calibrated_sensor': [calibrated_sensor],
+            'sensor': [
+                {'token': sensor, 'channel': self.channel, 'modality': 'lidar'},
+                *self._sensors,
+            ],
+            'calibrated_sensor': [calibrated_sensor, *self._calibrations],
             'log': [{'token': log, **drive}],
             'scene': [scene],
             'map': [{'token': self._token('map'), **area}],

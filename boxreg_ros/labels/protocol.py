@@ -172,12 +172,16 @@ class Options:
     )
     camera: Path | None = option(
         None,
-        'camera calibration, for formats with image coordinates',
-        metavar='FILE',
+        'camera calibration, for formats with image coordinates (default: the CameraInfo of the '
+        'only camera); a topic of images chooses one of several',
+        metavar='FILE|TOPIC',
         parse=Path,
     )
     swap_axes: bool = option(
         False, 'write the extents in the order that Datumaro and CVAT display them'
+    )
+    with_images: bool = option(
+        False, 'also write the camera images that a label format stores beside its labels'
     )
     class_map: Path | None = option(
         None,

@@ -39,7 +39,7 @@ FORMATS = BUILT_IN | {
 """Name on the command line -> module that implements `protocol.FormatModule`."""
 IN_RESULT_FOLDER = ('csv', 'mcap')
 """Formats of a single file that is written into the folder of results itself."""
-COMMAND_LINE_OPTIONS = ('camera', 'with_points', 'swap_axes', 'class_map')
+COMMAND_LINE_OPTIONS = ('camera', 'with_points', 'swap_axes', 'class_map', 'with_images')
 """Fields of `protocol.Options` that a user sets by name."""
 
 
@@ -99,8 +99,11 @@ def check_options(names: Sequence[str], options: Options) -> None:
     for name in names:
         if 'class_map' in module_of(name).FORMAT.options:
             ClassNames(name, options.class_map)  # raises for other names
-        if 'camera' in module_of(name).FORMAT.options:
-            Camera.read(options.camera, f'format {name}')
+        camera = options.camera
+        # Without a file it is that of the recording, which is not open yet.
+        is_file = camera is not None and (camera.is_file() or not str(camera).startswith('/'))
+        if is_file and 'camera' in module_of(name).FORMAT.options:
+            Camera.read(camera, f'format {name}')
 
 
 def writer_for(

@@ -7,13 +7,15 @@ Supervisely: a project of point cloud episodes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from uuid import NAMESPACE_URL, uuid5
 
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.images import Image
 from boxreg_ros.labels import cuboids
+from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, following, from_json, JsonList, to_json, write_json
 from boxreg_ros.labels.protocol import (
     AUTOMATIC_STATUS,
@@ -47,6 +49,7 @@ class Writer(cuboids.CuboidWriter):
 
     folders = ('episode/pointcloud',)
     cloud_file = 'episode/pointcloud/{name}.pcd'
+    image_file = 'episode/related_images/{name}_pcd/{camera}.{suffix}'
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
@@ -99,6 +102,16 @@ class Writer(cuboids.CuboidWriter):
             }
         )
         return key
+
+    def add_images(self, images: Sequence[tuple[LabelCamera, Image, str]]) -> None:
+        """Write the calibration beside each image of a frame."""
+        for camera, _, path in images:
+            sensors = {
+                'extrinsicMatrix': camera.T_camera_sensor[:3].ravel().tolist(),
+                'intrinsicMatrix': camera.intrinsics.ravel().tolist(),
+            }
+            meta = {'deviceId': camera.name, 'sensorsData': sensors}
+            write_json(self.folder / f'{path}.json', {'name': Path(path).name, 'meta': meta})
 
 
 def read(path: Path) -> Iterator[LabelFrame]:

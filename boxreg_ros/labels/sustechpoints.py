@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.labels import cuboids
+from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, write_json
 from boxreg_ros.labels.protocol import (
     AUTOMATIC_STATUS,
@@ -40,6 +41,7 @@ class Writer(cuboids.CuboidWriter):
 
     folders = ('label', 'lidar')
     cloud_file = 'lidar/{name}.pcd'
+    image_file = 'camera/{camera}/{name}.{suffix}'
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
@@ -49,6 +51,16 @@ class Writer(cuboids.CuboidWriter):
         """Write the file of a frame."""
         items = [_item(cuboid) for cuboid in self.cuboids(frame)]
         write_json(self.folder / 'label' / f'{self.name}.json', items)
+
+    def add_camera(self, camera: LabelCamera) -> None:
+        """Write the calibration, from the LiDAR to the camera, row by row."""
+        path = self.folder / 'calib' / 'camera' / f'{camera.name}.json'
+        path.parent.mkdir(parents=True, exist_ok=True)
+        content = {
+            'extrinsic': camera.T_camera_sensor.ravel().tolist(),
+            'intrinsic': camera.intrinsics.ravel().tolist(),
+        }
+        write_json(path, content)
 
 
 def read(path: Path) -> Iterator[LabelFrame]:

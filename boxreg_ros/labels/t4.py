@@ -41,6 +41,7 @@ class Writer(nuscenes.Writer):
     version = 'annotation'
     channel = 'LIDAR_CONCAT'
     cloud_file = 'data/LIDAR_CONCAT/{number:05d}.pcd.bin'
+    image_file = 'data/{channel}/{number:05d}.{suffix}'
     date_key = 'data_captured'
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
@@ -61,7 +62,7 @@ class Writer(nuscenes.Writer):
         super().finish()
         self._own_values.close()
 
-    def _link(self, table: str, row: dict[str, Any], instance: str = '') -> None:
+    def _link(self, table: str, row: dict[str, Any], instance: str = '', camera: str = '') -> None:
         """Hold a row as that class does; annotations get their velocity."""
         if instance:
             places = self._places.setdefault(instance, [])
@@ -71,7 +72,7 @@ class Writer(nuscenes.Writer):
             if held is not None:
                 held['velocity'] = _velocity(places[-3:]) or held['velocity']
             del places[:-2]
-        super()._link(table, row, instance)
+        super()._link(table, row, instance, camera)
 
     def _own_columns(self, token: str, values: dict[str, Any]) -> dict[str, Any]:
         """Write values beside the tables; return those that T4 has columns for."""

@@ -9,12 +9,14 @@ classes in its own data base, so the class names here are shown as those of a mo
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.images import Image
 from boxreg_ros.labels import cuboids
+from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, following, from_json, write_json
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import ReadBox
@@ -44,6 +46,7 @@ class Writer(cuboids.CuboidWriter):
 
     folders = (f'scene_1/{RESULT_FOLDER}', f'scene_1/{LIDAR_FOLDER}')
     cloud_file = f'scene_1/{LIDAR_FOLDER}/{{name}}.pcd'
+    image_file = 'scene_1/camera_image_{index}/{name}.{suffix}'
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
@@ -55,6 +58,24 @@ class Writer(cuboids.CuboidWriter):
         if objects:
             path = self.folder / 'scene_1' / RESULT_FOLDER / f'{self.name}.json'
             write_json(path, {'objects': objects, cuboids.EVIDENCE_KEY: self._origin})
+
+    def add_images(self, images: Sequence[tuple[LabelCamera, Image, str]]) -> None:
+        """Write the calibration of the cameras of a frame, in the order of their folders."""
+        path = self.folder / 'scene_1' / 'camera_config' / f'{self.name}.json'
+        path.parent.mkdir(exist_ok=True)
+        write_json(path, [_camera_config(camera) for camera, _, _ in images])
+
+
+def _camera_config(camera: LabelCamera) -> dict[str, Any]:
+    K = camera.intrinsics
+    width, height = camera.image.size
+    return {
+        'camera_internal': {'fx': K[0, 0], 'fy': K[1, 1], 'cx': K[0, 2], 'cy': K[1, 2]},
+        'width': width,
+        'height': height,
+        'camera_external': camera.T_camera_sensor.ravel().tolist(),
+        'rowMajor': True,
+    }
 
 
 def read(path: Path) -> Iterator[LabelFrame]:

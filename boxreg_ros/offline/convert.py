@@ -14,6 +14,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.fixed_frame import FixedFrameItems, StoredCloud
 from boxreg_ros.io.lidars import SINGLE_LIDAR
+from boxreg_ros.io.recording import Recording
 from boxreg_ros.labels import check_options, frames_of, LabelFrame, Provenance, writer_for
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.labels.recording import config_hash, files_of
@@ -48,11 +49,12 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
     counts: Counter[str] = Counter()
     not_read: Counter[str] = Counter()
     assumed: list[str] = []
+    recording = request.recording() if request.recordings else None
+    images = recording if isinstance(recording, Recording) else None
+    options = replace(request.options, recording=images)
     unused: dict[str, Any] = {'unreadable': 0, 'unused': '', 'damage': []}  # of the recording
     with claimed(out), whole_folder(out, request.inputs()) as folder:
-        writers = {
-            name: writer_for(name, folder, provenance, request.options) for name in request.formats
-        }
+        writers = {name: writer_for(name, folder, provenance, options) for name in request.formats}
         for frame in _read_frames(request, folder, unused):
             counts['frames'] += 1
             counts['boxes'] += len(frame.refined.status)

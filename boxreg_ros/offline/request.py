@@ -276,7 +276,7 @@ class Request:
     def inputs(self) -> tuple[Path, ...]:
         """Return the input files and folders."""
         paths = [part for path in self.recordings for part in _parts_of(path)]
-        if self.options.camera is not None:
+        if self.options.camera is not None and self.options.camera.is_file():
             paths.append(self.options.camera)
         if self.labels is not None:
             paths.append(files_of(*self.labels))

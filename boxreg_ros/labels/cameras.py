@@ -1,0 +1,127 @@
+"""The cameras of a recording for label files: their calibration, and the image of each frame."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import ExitStack
+from pathlib import Path
+from typing import NamedTuple
+
+from boxreg_ros.errors import ConfigError, RecordingError, TransformUnavailable
+from boxreg_ros.io.images import Image, ImageCamera
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.labels.camera import Camera
+from boxreg_ros.structures import Floats
+import numpy as np
+
+SUFFIXES_OF_IMAGES = {'image/jpeg': 'jpg', 'image/png': 'png', 'image/webp': 'webp'}
+
+
+class LabelCamera(NamedTuple):
+    """A camera with a model, fixed to the LiDAR."""
+
+    name: str
+    """For names of files: its topic, with ``_`` for slashes."""
+    image: ImageCamera
+    T_camera_sensor: Floats
+    """Pose (4, 4) of the label frame in that of the camera."""
+
+    @property
+    def intrinsics(self) -> Floats:
+        """Return the matrix (3, 3) from camera coordinates to homogeneous pixels."""
+        assert self.image.matrix is not None
+        return self.image.matrix[:, :3]
+
+    def calibration(self) -> Camera:
+        """Return the camera as the formats with image coordinates use it."""
+        assert self.image.matrix is not None
+        return Camera(self.image.matrix, np.eye(3), self.T_camera_sensor, self.image.size)
+
+
+class LabelCameras:
+    """
+    The cameras of a recording, which stays open until `close`.
+
+    Parameters
+    ----------
+    recording : Recording
+        Of the labels, not open.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read.
+
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self._opened = ExitStack()
+        self._recording = self._opened.enter_context(recording)
+        self._images = recording.images()
+        self._tree = TransformTree()
+        recording.choose_fixed_frame(self._tree)
+        self._of_frame: dict[str, list[LabelCamera]] = {}
+        self.counts: Counter[str] = Counter()
+        """Images written, and those that no message was near enough for, by topic."""
+
+    def close(self) -> None:
+        """Close the recording."""
+        self._opened.close()
+
+    def only(self, sensor_frame: str, topic: Path | None, needed_by: str) -> LabelCamera:
+        """
+        Return the only camera, or that of a topic of images or of its CameraInfo.
+
+        Raises ConfigError if there is none, or several and no topic.
+
+        """
+        found = self.known(sensor_frame, self._recording.start_ns)
+        if topic is not None:
+            found = [one for one in found if one.image.topic == str(topic)]
+        if len(found) == 1:
+            return found[0]
+        topics = ', '.join(one.image.topic for one in self.known(sensor_frame, 0)) or 'none'
+        raise ConfigError(
+            f'{needed_by}: expected the calibration of one camera, got '
+            f'{"none of " + str(topic) if topic else len(found)} in {self._recording}; cameras '
+            f'with images, a CameraInfo and a transform: {topics}; give --camera TOPIC, or '
+            f'--camera FILE'
+        )
+
+    def known(self, sensor_frame: str, stamp_ns: int) -> list[LabelCamera]:
+        """Return the cameras with a model whose pose in the frame of the labels is known."""
+        if sensor_frame not in self._of_frame:
+            found = []
+            for image in self._images.cameras:
+                if image.matrix is None:
+                    continue
+                try:
+                    T = self._tree.lookup(image.frame_id, sensor_frame, stamp_ns)
+                except TransformUnavailable:
+                    continue  # it moves on the vehicle, or nobody says where it is
+                found.append(LabelCamera(image.topic.strip('/').replace('/', '_'), image, T))
+            self._of_frame[sensor_frame] = found
+        return self._of_frame[sensor_frame]
+
+    def images(self, sensor_frame: str, stamp_ns: int) -> list[tuple[LabelCamera, Image]]:
+        """Return the image of each camera nearest to a stamp; those without one are counted."""
+        found = []
+        for camera in self.known(sensor_frame, stamp_ns):
+            topic = camera.image.topic
+            try:
+                found.append((camera, self._images.nearest(camera.image, stamp_ns)))
+            except RecordingError:
+                self.counts[f'{topic} missing'] += 1
+            else:
+                self.counts[topic] += 1
+        return found
+
+
+def cameras_of(recording: Recording | None, needed_by: str) -> LabelCameras:
+    """Return the cameras of a recording; ConfigError where the labels have none."""
+    if recording is None:
+        raise ConfigError(
+            f'{needed_by}: expected a recording with camera images and a CameraInfo, got none'
+        )
+    return LabelCameras(recording)
