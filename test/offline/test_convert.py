@@ -3,6 +3,7 @@
 from dataclasses import replace
 from importlib import import_module
 import json
+from pathlib import Path
 
 from boxreg_ros import cli
 from boxreg_ros.errors import ConfigError, RecordingError
@@ -325,8 +326,9 @@ def test_errors_are_printed_in_one_line(tmp_path, drive, capsys, arguments, stat
 
 
 def test_a_missing_camera_is_refused_before_a_recording_is_read(tmp_path):
-    with pytest.raises(ConfigError, match='format kitti needs the calibration of a camera'):
-        Request((tmp_path / 'missing.mcap',), formats=('kitti',))
+    options = Options(camera=Path('missing.yaml'))
+    with pytest.raises(ConfigError, match=r'missing\.yaml: cannot be read'):
+        Request((tmp_path / 'missing.mcap',), formats=('kitti',), options=options)
 
 
 def test_formats_command_lists_all_formats(capsys):
