@@ -35,7 +35,9 @@ FrameBoxes = tuple[list[ReadBox], Mapping[str, int]]
 NO_FRAME_BOXES: FrameBoxes = ([], {})
 
 
-def cuboid_format(name: str, title: str, files: str) -> Format:
+def cuboid_format(
+    name: str, title: str, files: str, leaves_out: str = '', read_by: str = ''
+) -> Format:
     """Return the format of a tool with these conventions."""
     return Format(
         name=name,
@@ -45,6 +47,8 @@ def cuboid_format(name: str, title: str, files: str) -> Format:
         sizes='length width height (x y z)',
         rotation='angles x y z, R = Rx Ry Rz',
         files=files,
+        leaves_out=leaves_out,
+        read_back=read_back,
         options=('with_points', 'with_images'),
     )
 

@@ -44,6 +44,8 @@ FORMAT = Format(
     rotation="rotation_y about the camera's y; roll and pitch are lost",
     files='label_02/, calib/, velodyne/',
     options=('camera', 'with_points', 'class_map'),
+    leaves_out='regions without a 3D box (counted)',
+    read_by='pykitti 0.3.1',
 )
 SEQUENCE = '0000'
 INSIDE_IMAGE, TRUNCATED, OUTSIDE_IMAGE = 0, 1, 2

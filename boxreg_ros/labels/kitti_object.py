@@ -40,6 +40,8 @@ FORMAT = Format(
     rotation="rotation_y about the camera's y; roll and pitch are lost",
     files='label_2/STAMP.txt, calib/STAMP.txt, velodyne/STAMP.bin',
     options=('camera', 'with_points', 'class_map'),
+    leaves_out='regions without a 3D box (counted), the rectangles in the image',
+    read_by='datumaro 1.13.12',
 )
 LABEL_FOLDER = 'label_2'
 OBJECT_COLUMNS = (15, 16)

@@ -48,6 +48,8 @@ FORMAT = Format(
     rotation='rx ry rz, R = Rz Ry Rx',
     files='tracklet_labels.xml, velodyne_points/',
     options=('with_points', 'swap_axes'),
+    leaves_out='poses with which Datumaro fills gaps (counted)',
+    read_by='datumaro 1.13.12',
 )
 FILE = 'tracklet_labels.xml'
 NAMES_FILE = 'frame_list.txt'
@@ -80,8 +82,9 @@ CLASS_IDS = tuple(
 TAIL = '</tracklets>\n</boost_serialization>\n'
 INTERPOLATED_STATE = 1
 LABELLED_STATE = 2
-OUTSIDE_TRUNCATION, UNSET_OCCLUSION = '2', '-1'
-"""Of poses with which Datumaro fills a gap."""
+OUTSIDE_TRUNCATIONS = ('2', 'TruncationStates.OUT_IMAGE')
+UNSET_OCCLUSIONS = ('-1', 'OcclusionStates.OCCLUSION_UNSET')
+"""Of poses with which Datumaro fills a gap; version 1.13 writes the names of its constants."""
 UNKNOWN_TRUNCATION = {False: '99', True: '-1'}
 """Unknown truncation by `Options.swap_axes`: of KITTI and of Datumaro."""
 FLAGS = """\
@@ -371,8 +374,10 @@ class _DatumaroStatus:
         self._has_keyframes = any(_keyframe(pose) for pose in poses)
 
     def __call__(self, pose: ElementTree.Element) -> str | None:
-        flags = [(pose.findtext(tag) or '').strip() for tag in ('truncation', 'occlusion')]
-        if flags == [OUTSIDE_TRUNCATION, UNSET_OCCLUSION]:
+        truncation, occlusion = (
+            (pose.findtext(tag) or '').strip() for tag in ('truncation', 'occlusion')
+        )
+        if truncation in OUTSIDE_TRUNCATIONS and occlusion in UNSET_OCCLUSIONS:
             return None
         is_interpolated = self._has_keyframes and not _keyframe(pose)
         return INTERPOLATED if is_interpolated else INPUT_STATUS

@@ -26,6 +26,7 @@ FORMAT = cuboids.cuboid_format(
     name='xtreme1',
     title='Xtreme1',
     files='scene_1/result/STAMP.json, scene_1/lidar_point_cloud_0/STAMP.pcd',
+    leaves_out='other sources and objects without contour (counted), objects in images',
 )
 LIDAR_FOLDER = 'lidar_point_cloud_0'
 RESULT_FOLDER = 'result'

@@ -19,6 +19,8 @@ FORMAT_COLUMNS = (
     'sizes',
     'rotation',
     'files',
+    'not read',
+    'read back by',
     'needs',
 )
 
@@ -61,7 +63,15 @@ def rows() -> list[tuple[str, ...]]:
         except ConfigError as error:
             table.append((name, str(error), *[''] * (len(FORMAT_COLUMNS) - 2)))
             continue
-        conventions = form.frame, form.reference, form.sizes, form.rotation, form.files
+        conventions = (
+            form.frame,
+            form.reference,
+            form.sizes,
+            form.rotation,
+            form.files,
+            form.leaves_out,
+            form.read_by,
+        )
         readable, needs = 'yes' if can_read(name) else '', ', '.join(form.packages)
         table.append((name, form.title, readable, *conventions, needs))
     return table
@@ -79,7 +89,8 @@ def run(args: argparse.Namespace) -> int:
         for column, text in zip(
             FORMAT_COLUMNS[3:], [] if is_broken else conventions, strict=False
         ):
-            print(f'    {column:9} {text}')
+            if text:
+                print(f'    {column:9} {text}')
         if needs:
             print(f'    needs     pip install {needs}')
     print('\ndata sets, as recordings:')

@@ -12,7 +12,7 @@ from boxreg_ros.labels.stamps import stamps_ns, stamps_of_names
 from consumers import consumer
 import numpy as np
 import pytest
-from test_labels_tools import CENTER, EXTENT, frame, NAME, STAMP, vector, write
+from test_labels_tools import CENTER, CLOUD, EXTENT, frame, NAME, STAMP, vector, write
 
 S = 10**9
 AT = 1_700_000_000 * S
@@ -267,12 +267,18 @@ def test_extents_of_tracklets_are_read_as_their_program_writes_them(
 
 
 def test_datumaro_itself_writes_tracklets_that_are_read_right(tmp_path):
-    boxes = [frame(STAMP + i, ['3'], boxes=[[8, 1, 0, *CAR, 0, 0, 0.2]]) for i in range(3)]
-    write('datumaro', tmp_path, boxes)
+    box = [8, 1, 0, *CAR, 0, 0, 0.2]
+    # In the second frame the car is not seen; Datumaro repeats the first pose there.
+    frames = [
+        frame(STAMP + i, ['3'] * (i != 1), boxes=[box] * (i != 1), sweep=CLOUD) for i in range(3)
+    ]
+    write('datumaro', tmp_path, frames)
     consumer('datumaro_tracklets', tmp_path / 'datumaro', tmp_path / 'kitti')
     found = read('tracklets', tmp_path / 'kitti')
     given = read('datumaro', tmp_path / 'datumaro')
     assert stamps(found) == [STAMP, STAMP + 1, STAMP + 2]
+    assert ids(found) == [('0',), (), ('0',)]
+    assert found[1].left_out == {'no_box': 1}
     for one, two in zip(given, found, strict=True):
         sensor = one.moved('sensor').refined.boxes.boxes
         np.testing.assert_allclose(two.refined.boxes.boxes, sensor, atol=0.0051)  # two digits
