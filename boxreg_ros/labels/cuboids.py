@@ -36,7 +36,7 @@ NO_FRAME_BOXES: FrameBoxes = ([], {})
 
 
 def cuboid_format(
-    name: str, title: str, files: str, leaves_out: str = '', read_by: str = ''
+    name: str, title: str, files: str, leaves_out: str = '', read_back: str = ''
 ) -> Format:
     """Return the format of a tool with these conventions."""
     return Format(
@@ -47,6 +47,8 @@ def cuboid_format(
         sizes='length width height (x y z)',
         rotation='angles x y z, R = Rx Ry Rz',
         files=files,
+        leaves_out=leaves_out,
+        read_back=read_back,
         leaves_out=leaves_out,
         read_back=read_back,
         options=('with_points', 'with_images'),

@@ -28,7 +28,7 @@ FORMAT = replace(
     sizes='length width height (x y z); height width length with --swap-axes',
     options=('with_points', 'swap_axes'),
     leaves_out='annotations that are no cuboids',
-    read_by='datumaro 1.13.12',
+    read_back='datumaro 1.13.12',
 )
 ANNOTATIONS_FILE = 'annotations/default.json'
 POINT_CLOUD_MEDIA = 6

@@ -45,7 +45,7 @@ FORMAT = Format(
     files='label_02/, calib/, velodyne/',
     options=('camera', 'with_points', 'class_map'),
     leaves_out='regions without a 3D box (counted)',
-    read_by='pykitti 0.3.1',
+    read_back='pykitti 0.3.1',
 )
 SEQUENCE = '0000'
 INSIDE_IMAGE, TRUNCATED, OUTSIDE_IMAGE = 0, 1, 2

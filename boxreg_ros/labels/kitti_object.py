@@ -41,7 +41,7 @@ FORMAT = Format(
     files='label_2/STAMP.txt, calib/STAMP.txt, velodyne/STAMP.bin',
     options=('camera', 'with_points', 'class_map'),
     leaves_out='regions without a 3D box (counted), the rectangles in the image',
-    read_by='datumaro 1.13.12',
+    read_back='datumaro 1.13.12',
 )
 LABEL_FOLDER = 'label_2'
 OBJECT_COLUMNS = (15, 16)
@@ -138,7 +138,7 @@ def _calibrations(labels: Path) -> Path:
 
 def _camera(path: Path, known: dict[bytes, Camera]) -> Camera:
     """Return the calibration of a frame; most frames have that of the one before."""
-    content = path.read_bytes()
+    content = path.read_backtes()
     if content not in known:
         known.clear()
         known[content] = Camera.read(path)

@@ -46,7 +46,7 @@ FORMAT = Format(
     rotation='quaternion x y z w',
     files='labels.json',
     leaves_out='boxes of images, and all objects without a cuboid',
-    read_by='vcd 6.0.3',
+    read_back='vcd 6.0.3',
 )
 SCHEMA_VERSION = '1.0.0'
 COVARIANCE_DIGITS = 9

@@ -48,10 +48,6 @@ class Format:
     """Parameters of the orientation, and the angles that are lost."""
     files: str
     """That the writer creates, and folders, with commas; ``STAMP`` stands for one per frame."""
-    leaves_out: str = ''
-    """What files of other programs may hold that the reader does not take."""
-    read_by: str = ''
-    """Libraries and their versions by which tests read the files of the writer."""
     packages: tuple[str, ...] = ()
     """Of pip, needed beyond those of boxreg_ros itself."""
     options: tuple[str, ...] = ()

@@ -26,7 +26,7 @@ FORMAT = cuboids.cuboid_format(
     title='Supervisely clouds, CVAT Sly Point Cloud',
     files='meta.json, key_id_map.json, ds0/ann/STAMP.pcd.json, ds0/pointcloud/STAMP.pcd',
     leaves_out='figures that are no cuboids',
-    read_by='supervisely 6.74.51, datumaro 1.13.12',
+    read_back='supervisely 6.74.51, datumaro 1.13.12',
 )
 ANNOTATION_FOLDER = 'ann'
 ANNOTATION_SUFFIX = '.pcd.json'

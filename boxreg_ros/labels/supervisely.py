@@ -32,7 +32,7 @@ FORMAT = cuboids.cuboid_format(
     title='Supervisely episodes',
     files='meta.json, episode/annotation.json, episode/pointcloud/STAMP.pcd',
     leaves_out='figures that are no cuboids',
-    read_by='supervisely 6.74.51',
+    read_back='supervisely 6.74.51',
 )
 ANNOTATION_FILE = 'annotation.json'
 CUBOID = 'cuboid_3d'

@@ -49,7 +49,7 @@ FORMAT = Format(
     files='tracklet_labels.xml, velodyne_points/',
     options=('with_points', 'swap_axes'),
     leaves_out='poses with which Datumaro fills gaps (counted)',
-    read_by='datumaro 1.13.12',
+    read_back='datumaro 1.13.12',
 )
 FILE = 'tracklet_labels.xml'
 NAMES_FILE = 'frame_list.txt'

@@ -19,8 +19,6 @@ FORMAT_COLUMNS = (
     'sizes',
     'rotation',
     'files',
-    'not read',
-    'read back by',
     'needs',
 )
 
@@ -63,15 +61,7 @@ def rows() -> list[tuple[str, ...]]:
         except ConfigError as error:
             table.append((name, str(error), *[''] * (len(FORMAT_COLUMNS) - 2)))
             continue
-        conventions = (
-            form.frame,
-            form.reference,
-            form.sizes,
-            form.rotation,
-            form.files,
-            form.leaves_out,
-            form.read_by,
-        )
+        conventions = form.frame, form.reference, form.sizes, form.rotation, form.files
         readable, needs = 'yes' if can_read(name) else '', ', '.join(form.packages)
         table.append((name, form.title, readable, *conventions, needs))
     return table
@@ -89,8 +79,7 @@ def run(args: argparse.Namespace) -> int:
         for column, text in zip(
             FORMAT_COLUMNS[3:], [] if is_broken else conventions, strict=False
         ):
-            if text:
-                print(f'    {column:9} {text}')
+            print(f'    {column:9} {text}')
         if needs:
             print(f'    needs     pip install {needs}')
     print('\ndata sets, as recordings:')
