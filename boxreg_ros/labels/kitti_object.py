@@ -138,7 +138,7 @@ def _calibrations(labels: Path) -> Path:
 
 def _camera(path: Path, known: dict[bytes, Camera]) -> Camera:
     """Return the calibration of a frame; most frames have that of the one before."""
-    content = path.read_backtes()
+    content = path.read_bytes()
     if content not in known:
         known.clear()
         known[content] = Camera.read(path)
