@@ -49,8 +49,6 @@ def cuboid_format(
         files=files,
         leaves_out=leaves_out,
         read_back=read_back,
-        leaves_out=leaves_out,
-        read_back=read_back,
         options=('with_points', 'with_images'),
     )
 
