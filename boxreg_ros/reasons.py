@@ -215,6 +215,13 @@ class Reason(StrEnum):
         'a publisher of TF makes a mistake that moves clouds and boxes; the log names the frames',
         CHECK_TRANSFORMS,
     )
+    POINT_TIMES = (
+        'point_times',
+        'message',
+        'the times of the points of its clouds are parts of a revolution, not seconds; they are '
+        'read as such',
+        'correct the driver of the LiDAR, which would give exact times',
+    )
     LATENCY = (
         'latency',
         'message',

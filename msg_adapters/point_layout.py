@@ -26,6 +26,12 @@ MAX_TIME_OFFSET = 1.0
 """Largest difference between the time of a point and the stamp [s]; one revolution is shorter."""
 MIN_DURATION = 1e-3
 """A whole cloud takes longer [s]; chosen: a hundredth of a revolution at 10 Hz."""
+WILD_SHARE = 0.02
+"""Part of the points at each end of their times that may have wild ones; chosen."""
+MIN_TIMES = 100
+"""Clouds with fewer points have no wild times: derived, `WILD_SHARE` would be two of them."""
+MAX_TIMES = 2000
+"""Points whose times are sorted; chosen: it takes 0.1 ms."""
 WHOLE_CLOUD = 5000
 """A cloud of as many points is not a small part of a revolution; chosen: 3 ms of 128 channels."""
 
@@ -98,7 +104,7 @@ def reading_of(
     UnsupportedMessage if the times of a known layout are in another unit than that of its driver.
 
     """
-    ends = float(raw.min()), float(raw.max())
+    ends = _usual_ends(raw)
     may_be_absolute = raw.dtype.kind == 'f' and raw.dtype.itemsize == 8
     fitting = partial(_fitting, ends, stamp_ns, may_be_absolute)
     if unit != AUTO:
@@ -120,11 +126,45 @@ def reading_of(
 
 
 def seconds_of(raw: NDArray[Any], stamp_ns: int, reading: TimeReading) -> Floats:
-    """Return times (M,) relative to the stamp [s]."""
+    """Return times (M,) relative to the stamp [s]; wild ones are 0, see `wild_times`."""
+    times = _relative(raw, stamp_ns, reading)
+    times[wild_times(times)] = 0.0
+    return times
+
+
+def wild_count(raw: NDArray[Any], stamp_ns: int, reading: TimeReading) -> int:
+    """Return how many times (M,) of a message are wild, see `wild_times`."""
+    return int(wild_times(_relative(raw, stamp_ns, reading)).sum())
+
+
+def _relative(raw: NDArray[Any], stamp_ns: int, reading: TimeReading) -> Floats:
+    """Return times (M,) relative to the stamp [s], wild ones too."""
     scale = TIME_UNITS[reading.unit]
     if reading.is_absolute:
         return np.asarray((raw.astype(np.float64) - stamp_ns * 1e-9 / scale) * scale)
     return np.asarray(np.multiply(raw, scale, dtype=np.float64))
+
+
+def wild_times(times: Floats) -> NDArray[np.bool_]:
+    """
+    Return which times (M,) [s] of points are none of their sweep, (M,).
+
+    They lie further from the usual ones than these from each other: drivers leave some points
+    without a time, or with one of another sweep.
+
+    """
+    low, high = _usual_ends(times)
+    margin = max(high - low, MIN_DURATION)
+    return np.asarray((times < low - margin) | (times > high + margin))
+
+
+def _usual_ends(values: NDArray[Any]) -> tuple[float, float]:
+    """Return the ends of values (M,), M > 0, without up to `WILD_SHARE` of them at each end."""
+    if len(values) < MIN_TIMES:
+        return float(values.min()), float(values.max())
+    some = np.sort(values[:: -(-len(values) // MAX_TIMES)])
+    rank = int(WILD_SHARE * len(some))
+    return float(some[rank]), float(some[-1 - rank])
 
 
 def _fitting(

@@ -16,6 +16,14 @@ from numpy.typing import NDArray
 DTYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 """``PointField.datatype`` -> dtype of numpy."""
 NUMBERS = {kind: number for number, kind in DTYPES.items()}
+MIN_POINTS_OF_ORDER, MAX_POINTS_OF_ORDER = 20, 60
+"""Points of a cloud that its byte order is checked by; chosen."""
+LIKELY_POINTS = 0.9
+"""Part of them with possible coordinates that shows the byte order; chosen."""
+MAX_COORDINATE = 1e7
+"""Larger coordinates are of no LiDAR [m]; derived: those of UTM end there."""
+NEXT_TO_NOTHING = 1e-9
+"""Smaller coordinates but 0 are of none [m]; chosen."""
 INTENSITY_FIELDS = ('intensity', 'i', 'reflectivity')
 
 
@@ -33,7 +41,9 @@ def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
     ``time_stamp``; unit and origin are derived from type and magnitude. A float64 field within 1 s
     of the stamp in s, ms, us or ns is absolute. Other fields are relative to the stamp, in the
     coarsest of these units in which all points are within 1 s of it; seconds only for floats. If
-    none fits, ``times`` is None. A point whose time is not finite gets the time of the stamp.
+    none fits, ``times`` is None. A point whose time is not finite, or far from those of the
+    others, gets the time of the stamp. Where `is_bigendian` contradicts the coordinates, these
+    decide.
 
     """
     stamp = stamp_ns(msg.header)
@@ -70,6 +80,8 @@ def described(msg: Any, time_unit: str = AUTO) -> str:
     kinds = _kinds(fields)
     layout = point_layout.layout_of(kinds)
     name = f'unknown layout ({", ".join(fields)})' if layout is None else layout.name
+    if _table(msg, [fields[key] for key in 'xyz']).dtype['x'].str[0] != '<>'[msg.is_bigendian]:
+        name += f' in the other byte order than is_bigendian = {bool(msg.is_bigendian)} states'
     time_field = point_layout.time_field_of(kinds)
     if not time_field:
         return f'{name}: no times of the points'
@@ -83,9 +95,13 @@ def described(msg: Any, time_unit: str = AUTO) -> str:
             f'{name}: times in {time_field} are not used: in no unit are they within '
             f'{point_layout.MAX_TIME_OFFSET:g} s of the stamp'
         )
-    duration = np.ptp(point_layout.seconds_of(raw, stamp_ns(msg.header), reading))
+    times = point_layout.seconds_of(raw, stamp_ns(msg.header), reading)
     origin = 'absolute' if reading.is_absolute else 'relative to the stamp'
-    return f'{name}: times in {time_field}, {reading.unit}, {origin}, over {duration:.3f} s'
+    text = f'{name}: times in {time_field}, {reading.unit}, {origin}, over {np.ptp(times):.3f} s'
+    wild = point_layout.wild_count(raw, stamp_ns(msg.header), reading)
+    if wild:
+        text += f'; {wild} points have times of no sweep, and get that of the stamp'
+    return text
 
 
 def finite_rows(msg: Any) -> Ints | None:
@@ -159,20 +175,41 @@ def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
     """Return a structured view (height, width) of the raw bytes, with these fields only."""
     data = np.frombuffer(bytes_of(msg.data), np.uint8)
     row_step = _checked_row_step(msg, len(data))
-    order = '>' if msg.is_bigendian else '<'
     for field in fields:
         _check_field(field, msg.point_step)
     layout = np.dtype(
         {
             'names': [field.name for field in fields],
-            'formats': [order + DTYPES[field.datatype] for field in fields],
+            'formats': ['<' + DTYPES[field.datatype] for field in fields],
             'offsets': [field.offset for field in fields],
             'itemsize': msg.point_step,
         }
     )
-    return np.ndarray(
+    table: NDArray[Any] = np.ndarray(
         (msg.height, msg.width), layout, data.data, strides=(row_step, msg.point_step)
     )
+    stated, other = table, table.view(layout.newbyteorder('>'))
+    if msg.is_bigendian:
+        stated, other = other, stated
+    is_wrong = _likely_share(stated) < 0.5 and _likely_share(other) >= LIKELY_POINTS
+    return other if is_wrong else stated
+
+
+def _likely_share(table: NDArray[Any]) -> float:
+    """
+    Return the part of the points whose coordinates may be those of a LiDAR; 1 if unknown.
+
+    Floats of the other byte order are mostly huge or next to nothing.
+
+    """
+    names = [name for name in 'xyz' if name in (table.dtype.names or ())]
+    if not names or table.dtype[names[0]].kind != 'f' or table.size < MIN_POINTS_OF_ORDER:
+        return 1.0
+    some = table.reshape(-1)[:: -(-table.size // MAX_POINTS_OF_ORDER)]
+    values = np.abs(np.array([some[name] for name in names], dtype=np.float64))
+    is_likely = (values == 0) | ((values > NEXT_TO_NOTHING) & (values < MAX_COORDINATE))
+    is_known = np.isfinite(values).all(axis=0)
+    return float(is_likely.all(axis=0)[is_known].mean()) if is_known.any() else 0.0
 
 
 def _checked_row_step(msg: Any, num_bytes: int) -> int:

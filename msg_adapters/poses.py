@@ -48,7 +48,26 @@ def require_fields(kind: str, items: Iterable[Any], names: Sequence[str]) -> Non
 
 
 def common_header(kind: str, header: Any, items: Sequence[Any]) -> Any:
-    """Return the header of an array, or its items'; UnsupportedMessage for several frames."""
+    """
+    Return the header of an array of boxes.
+
+    Parameters
+    ----------
+    kind : str
+        Type of the message, for errors.
+    header : std_msgs/Header
+        Of the array. Where it has no frame that of the first item counts; where its stamp is 0,
+        that of the items, if they have the same.
+    items : sequence
+        Boxes with a header of their own.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If an item is in another frame.
+
+    """
+    own = header
     header = header if header.frame_id or not items else items[0].header
     for item in items:
         frame = item.header.frame_id
@@ -57,6 +76,8 @@ def common_header(kind: str, header: Any, items: Sequence[Any]) -> Any:
                 f'{kind}: expected all boxes in the frame of the array {header.frame_id!r}, got '
                 f'one in {frame!r}; publish one array per frame'
             )
+    if stamp_ns(own) == 0 and len({stamp_ns(item.header) for item in items}) == 1:
+        return replaced(header, stamp=items[0].header.stamp)
     return header
 
 

@@ -166,7 +166,9 @@ class SerializedAdapter:
         at = self._at
         frames = {text for path in at.frames for text in fields.distinct(path)}
         stamps = fields.numbers(at.stamp, '<i4', 2)
-        is_one = len(frames) == 1 and '' not in frames and bool((stamps == stamps[:1]).all())
+        # Where the stamp is 0, those of the boxes may be known.
+        is_stamped = bool((stamps == stamps[:1]).all() and stamps.any())
+        is_one = len(frames) == 1 and '' not in frames and is_stamped
         has_boxes = len(fields.counts(at.pose)) > 0
         return fields if is_one and has_boxes and at.is_ordinary(fields) else None
 

@@ -95,6 +95,7 @@ class FixedFrameItems:
         with stage('read'):
             self.fixed_frame = source.choose_fixed_frame(self.tree, fixed_frame)
         self.session.fixed_frame = self.fixed_frame
+        self.session.sensor_frame = source.sensor_frame()
         self.counts: Counter[str] = Counter()
         self.missing_transforms = 0
         self.first_missing_transform = ''

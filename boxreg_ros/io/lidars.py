@@ -9,7 +9,7 @@ into the fixed frame, each by the pose of its own stamp, and merged by `SweepMer
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -36,6 +36,12 @@ Sweeps that wait for clouds at once; chosen.
 A cloud may arrive after the first cloud of the next period, but not after two periods.
 
 """
+PERIOD_STAMPS = 6
+"""Stamps that the period of the clouds is taken from; chosen."""
+WHOLE_REVOLUTION = 0.9
+"""Part of a second from which times from 0 on are those of a whole revolution of 1; chosen."""
+MAX_PERIOD = 0.5
+"""Period from which times over a second may be those of the clouds [s]: they overlap at most."""
 CLOUD_MERGED, CLOUD_LATE, CLOUD_MISSING = 'merged', Reason.CLOUD_LATE, Reason.CLOUD_MISSING
 """Counters of a LiDAR; the last two are reasons of `boxreg_ros.reasons`."""
 
@@ -119,7 +125,8 @@ class SensorPlacement:
     Find the LiDARs that measured the points of a cloud.
 
     State: the newest info messages of concatenated clouds, and in `layouts` the layout of the
-    first cloud of each topic and how the times of its points are read. Not thread-safe.
+    first cloud of each topic and how the times of its points are read; `normalised` says of which
+    topics they are parts of a revolution. Not thread-safe.
 
     """
 
@@ -132,6 +139,37 @@ class SensorPlacement:
             self._frames = {topic: (frame,) for topic, frame in pairs}
         self._infos: dict[int, ConcatenationInfo] = {}
         self._is_awaited = True
+        self._stamps_ns: dict[str, deque[int]] = {}
+        self.normalised: dict[str, str] = {}
+
+    def _with_times_of_sweep(self, sweep: Sweep, topic: str) -> Sweep:
+        """
+        Return a sweep whose times of the points are those within it.
+
+        Some drivers number the points from 0 to 1 over a revolution. Times over a whole second are
+        such parts if clouds come more often: they are multiplied by the period of the clouds. As
+        long as that is not known, the points have none.
+
+        """
+        stamps_ns = self._stamps_ns.setdefault(topic, deque(maxlen=PERIOD_STAMPS))
+        stamps_ns.append(sweep.stamp_ns)
+        times = sweep.times
+        if times is None or not len(times):
+            return sweep
+        low, high = float(times.min()), float(times.max())
+        if not (0 <= low < 1 - WHOLE_REVOLUTION and WHOLE_REVOLUTION < high <= 1):
+            return sweep
+        if len(stamps_ns) < 2:
+            return replace(sweep, times=None)
+        period = float(np.median(np.diff(sorted(stamps_ns)))) * 1e-9
+        if not 0 < period < MAX_PERIOD:
+            return sweep
+        self.normalised[topic] = (
+            f'times of the points{f" of {topic}" if topic else ""} run over {high - low:.2f} s, '
+            f'while clouds come every {period:.3f} s: they are parts of a revolution, from 0 to '
+            f'1, and are read as such'
+        )
+        return replace(sweep, times=times * period)
 
     def sweep_of(self, msg: Any, topic: str) -> Sweep:
         """
@@ -151,7 +189,7 @@ class SensorPlacement:
         unit = self.lidars.time_unit
         if topic not in self.layouts:
             self.layouts[topic] = pointcloud.described(cloud, unit)
-        sweep = pointcloud.from_msg(cloud, unit)
+        sweep = self._with_times_of_sweep(pointcloud.from_msg(cloud, unit), topic)
         if self.lidars.info:
             return replace(sweep, rows=pointcloud.finite_rows(cloud))
         return replace(sweep, topic=topic) if len(self.lidars.topics) > 1 else sweep

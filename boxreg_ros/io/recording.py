@@ -247,9 +247,8 @@ class Recording:
     @property
     def finding(self) -> str:
         """Return what is unusual about the recordings as a whole; empty if nothing is."""
-        return '; '.join(
-            (*self._chosen, *self._joining(), *self._pauses(), *self._motion.notes.values())
-        )
+        own = (*self._chosen, *self._joining(), *self._pauses(), self._timeline.finding)
+        return '; '.join(filter(None, (*own, *self._motion.notes.values())))
 
     def _joining(self) -> Iterator[str]:
         """Yield that messages with boxes were joined, if some were."""

@@ -37,7 +37,8 @@ class MessageOrder:
 
     A message that was recorded apart gets the receive time of a cloud of its stamp. That is
     possible where clouds were received with a constant delay after their stamps; it is not where a
-    recording was played in a loop or paused, and receive times are kept there. `stamp_of` returns
+    recording was played in a loop or paused, and receive times are kept there. Where all receive
+    times are equal, as 0, all messages are ordered by stamp. `stamp_of` returns
     the stamp of a message [ns], None if it has none; `apart` has the topics that were recorded
     apart, and how much later than the clouds [s].
 
@@ -48,13 +49,32 @@ class MessageOrder:
         self._stamp_of = stamp_of
         self._clouds = [c for c in reader.connections if c.topic == points_topic]
         self._begin_ns, self._end_ns = self._span(self._clouds)
+        count = sum(connection.msgcount for connection in self._clouds)
+        self._lacks_times = count > 1 and self._end_ns - self._begin_ns <= 1
+        if self._lacks_times:
+            ends = [stamp for connection in self._clouds for _, stamp in self._ends(connection)]
+            self._lacks_times = bool(ends)
+            self._begin_ns = min(ends, default=self._begin_ns)
+            self._end_ns = max(ends, default=self._end_ns) + 1
         self._known: dict[tuple[int, int], bool] = {}
         self.apart: dict[str, float] = {}
 
     def span_ns(self, topics: Collection[str]) -> tuple[int, int]:
         """Return begin and end of the files with clouds, or with `topics` not apart [ns]."""
+        if self._lacks_times:
+            return self._begin_ns, self._end_ns
         used = [c for c in self._reader.connections if c.topic in topics and c.msgcount]
         return self._span([*self._clouds, *(c for c in used if not self._is_apart(c))])
+
+    @property
+    def finding(self) -> str:
+        """Return that the messages have no receive times; empty if they have."""
+        if not self._lacks_times:
+            return ''
+        return (
+            'receive times: expected those of the messages, got the same for all of them, as 0 in '
+            'log_time; messages are ordered by the stamps of their headers'
+        )
 
     @property
     def parts_ns(self) -> list[tuple[int, int]]:
@@ -73,7 +93,7 @@ class MessageOrder:
         self, connections: Collection[Connection], start_ns: int | None, end_ns: int | None
     ) -> Iterator[Record]:
         """Yield the messages in the order of their receive times."""
-        apart = [c for c in connections if self._is_apart(c)]
+        apart = [c for c in connections if self._lacks_times or self._is_apart(c)]
         together = [c for c in connections if c not in apart]
         streams = [self._reader.messages(together, start_ns, end_ns)]
         streams += [self._by_stamp(c, start_ns, end_ns) for c in apart]
@@ -161,6 +181,8 @@ class MessageOrder:
         """Return the delay of the clouds after their stamps [ns]; None if it is not constant."""
         ends = [end for connection in self._clouds for end in self._ends(connection)]
         delays = [received_ns - stamp_ns for received_ns, stamp_ns in ends]
+        if self._lacks_times:
+            return 0
         # It changes when playback loops or pauses: stamps do not order the messages then.
         if not delays or max(delays) - min(delays) >= APART_NS:
             return None

@@ -144,6 +144,7 @@ class Session:
         self._motion_check = MotionCheck(self.tree, bool(lidars.frames or lidars.info))
         self._id_check = None if convention.associate else IdCheck(config.max_gap)
         self._axis_check = AxisCheck(convention, self._is_vehicle)
+        self._has_boxes_without_frame = False
         self._pose_check = PoseCheck(self._convention, AT_ONCE)
 
     @property
@@ -183,6 +184,9 @@ class Session:
         """
         if is_placeholder(item):
             return Admitted(None, None)
+        if isinstance(item, BoxArray) and not item.frame_id and self.sensor_frame:
+            item = replace(item, frame_id=self.sensor_frame)
+            self._has_boxes_without_frame = True
         try:
             fixed_frame = self.require_fixed_frame(item)
             self._motion_check.add(item, fixed_frame, received_ns)
@@ -257,6 +261,15 @@ class Session:
     def findings(self) -> list[Finding]:
         """Return the faults of the input, and guesses about it, that were found so far."""
         found = [*self._motion_check.findings.values()]
+        found += [
+            Finding(Reason.POINT_TIMES, text) for text in self._placement.normalised.values()
+        ]
+        if self._has_boxes_without_frame:
+            text = (
+                f'boxes have an empty frame_id: expected the name of their frame; they are taken '
+                f'to be in that of the clouds, {self.sensor_frame!r}'
+            )
+            found.append(Finding(Reason.TRANSFORM_FAULT, text))
         axes = self._axis_check.finding
         # Points show which horizontal extent is which, motion also which axis points forward.
         poses = axes or self._pose_check.finding

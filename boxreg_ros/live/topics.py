@@ -42,6 +42,8 @@ QOS_OVERRIDES = QoSOverridingOptions(
     [QoSPolicyKind[policy.upper()] for policy in (*QOS_POLICIES, 'depth')]
 )
 """Policies that parameters ``qos_overrides.TOPIC.ENTITY.POLICY`` may set."""
+TF_TOPIC = '/tf'
+"""Of moving transforms, as of tf2; a robot in a namespace has it there."""
 FOLLOW_TOPIC = '~/follow'
 """Boxes of a person, whose objects are followed."""
 INFINITE_NS = 9223372036854775807
@@ -192,6 +194,8 @@ class NodeTopics:
                 found.append(_type_problem(endpoint, other_type))
             if endpoint.is_input:
                 found += self._silence(endpoint, peers)
+            if endpoint.topic == TF_TOPIC and not peers:
+                found += self._other_transforms(endpoint)
             if endpoint.topic == FOLLOW_TOPIC and not peers:
                 found += self._unheard(endpoint)
         return found
@@ -284,6 +288,18 @@ class NodeTopics:
                 DiagnosticStatus.WARN,
                 f'{endpoint.name}: nothing received yet from {_nodes(peers)}; check that messages '
                 f'are sent, and shared memory and network in between',
+            )
+
+    def _other_transforms(self, endpoint: Endpoint) -> Iterator[TopicProblem]:
+        """Yield a problem if nobody publishes transforms here, but somebody in a namespace."""
+        published = self._published_topics({endpoint.type_name})
+        others = [topic for topic in published if topic.endswith(TF_TOPIC)]
+        if others and not endpoint.received:
+            yield TopicProblem(
+                DiagnosticStatus.WARN,
+                f'{endpoint.name}: nobody publishes it, but transforms are published on '
+                f'{", ".join(others)}; if the clouds are of that robot, start the node with -r '
+                f'{TF_TOPIC}:={others[0]} -r {TF_TOPIC}_static:={others[0]}_static',
             )
 
     def _unheard(self, endpoint: Endpoint) -> Iterator[TopicProblem]:

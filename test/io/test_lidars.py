@@ -9,7 +9,7 @@ from boxreg_ros.structures import Sweep
 from lidar_drives import DELAY_NS, LidarDrive, LIDARS, SPEED
 import numpy as np
 import pytest
-from ros_messages import SECOND
+from ros_messages import Messages, SECOND, START
 
 MS = 10**6
 PERIOD = 100 * MS
@@ -254,3 +254,25 @@ def test_what_is_missing_of_a_lidar_is_named(kind, lidars, reason, text):
     assert found == reason
     assert text in detail
     assert sweep.origins is None
+
+
+def test_times_that_are_parts_of_a_revolution_become_seconds():
+    m = Messages()
+    placement = SensorPlacement()
+    parts = np.linspace(0, 1, 500)
+    columns = [(name, 'f4', np.ones(500)) for name in ('x', 'y', 'z')]
+    for k in range(4):
+        stamp = START + k * SECOND // 10
+        message = m.cloud(stamp, 'lidar', [*columns, ('time', 'f4', parts)])
+        sweep = placement.sweep_of(message, '')
+        if k == 0:
+            assert sweep.times is None  # their period is not known yet
+        else:
+            np.testing.assert_allclose(sweep.times, parts / 10, atol=1e-6)
+    assert 'clouds come every 0.100 s: they are parts of a revolution' in placement.normalised['']
+    slow = SensorPlacement()
+    for k in range(3):  # one revolution in a second
+        message = m.cloud(START + k * SECOND, 'lidar', [*columns, ('time', 'f4', parts)])
+        sweep = slow.sweep_of(message, '')
+    np.testing.assert_allclose(sweep.times, parts, atol=1e-6)
+    assert not slow.normalised

@@ -292,3 +292,47 @@ def test_sparse_transforms_are_named(tmp_path):
     ]
     found = read(drive, tmp_path)[2]
     assert 'transform odom -> base comes every 1 s' in found
+
+
+def test_boxes_without_a_frame_are_taken_to_be_in_that_of_the_clouds(tmp_path):
+    drive = Drive(sweeps=8)
+    for topic, _, message in drive.items:
+        for one in (message, *message.detections) if topic == '/boxes' else ():
+            one.header.frame_id = ''
+    path = write_recording(tmp_path / 'drive', drive.items, messages=drive.messages)
+    with Recording([path]) as recording:
+        items = FixedFrameItems(recording, Config())
+        moved = [item.moved for item in items.read()]
+    assert "in that of the clouds, 'lidar'" in items.session.finding
+    for boxes in moved:
+        if not isinstance(boxes, Sweep):
+            np.testing.assert_allclose(
+                boxes.boxes[:, :3], drive.truth[boxes.stamp_ns][:, :3], atol=0.3
+            )
+
+
+def test_an_array_stamped_0_has_the_stamp_of_its_boxes(tmp_path):
+    drive = Drive(sweeps=8)
+    for topic, _, message in drive.items:
+        if topic == '/boxes':
+            message.header.stamp.sec = message.header.stamp.nanosec = 0
+    path = write_recording(tmp_path / 'drive', drive.items, messages=drive.messages)
+    for reads_arrays in (False, True):
+        with Recording([path]) as recording:
+            if reads_arrays:
+                recording.read_boxes_as_arrays()
+            items = FixedFrameItems(recording, Config())
+            given = [item.given for item in items.read(with_clouds=False)]
+        assert [boxes.stamp_ns for boxes in given] == drive.stamps
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'rosbag1'])
+def test_messages_without_receive_times_are_ordered_by_stamp(tmp_path, storage):
+    drive = Drive(sweeps=12, ros1=storage == 'rosbag1')
+    items = sorted(((topic, 0, message) for topic, _, message in drive.items), key=lambda i: i[0])
+    path = write_recording(tmp_path / 'drive', items, storage, drive.messages)
+    with Recording([path], start=0.3, end=0.9) as recording:
+        moved = FixedFrameItems(recording, Config())
+        received = [item.received_ns for item in moved.read()]
+        assert recording.finding.startswith('receive times: expected')
+    assert received == [stamp for stamp in drive.stamps[3:9] for _ in range(2)]

@@ -101,3 +101,33 @@ def test_times_without_a_unit_are_not_used_and_said_so():
     assert 'times in time are not used' in pointcloud.described(message)
     message = MESSAGES.cloud(START, 'lidar', columns)
     assert pointcloud.described(message) == 'unknown layout (x, y, z): no times of the points'
+
+
+@pytest.mark.parametrize('driver', TIMES)
+def test_points_with_wild_times_alone_lose_them(driver):
+    message, times = cloud(driver)
+    kinds = dict([*XYZ, *DRIVERS[driver]])
+    field, scale, start = TIMES[driver]
+    columns = [(name, kind, np.ones(6000, kind)) for name, kind in kinds.items()]
+    values = (start + times * scale).astype(kinds[field])
+    wild = [7, 3000, 5990]
+    values[wild] = np.array([0, 3e9, 5e8]).astype(values.dtype)
+    values[wild[0]] = values[0] + 0.9 * scale
+    columns = [(n, k, values if n == field else v) for n, k, v in columns]
+    message = MESSAGES.cloud(START, 'lidar', columns)
+    expected = times.copy()
+    expected[wild] = 0
+    np.testing.assert_allclose(pointcloud.from_msg(message).times, expected, atol=1e-5)
+    assert '3 points have times of no sweep' in pointcloud.described(message)
+
+
+@pytest.mark.parametrize('order', '<>')
+def test_a_wrong_byte_order_is_corrected_and_said(order):
+    xyz = np.random.default_rng(2).uniform(-60, 60, (300, 3))
+    columns = [(name, 'f4', xyz[:, i]) for i, name in enumerate('xyz')]
+    message = MESSAGES.cloud(START, 'lidar', columns, order=order)
+    for stated in (message.is_bigendian, not message.is_bigendian):
+        message.is_bigendian = stated
+        np.testing.assert_allclose(pointcloud.from_msg(message).points, xyz, rtol=1e-6)
+        is_wrong = stated != (order == '>')
+        assert ('in the other byte order' in pointcloud.described(message)) == is_wrong
