@@ -427,6 +427,10 @@ class Config:
                 return kind
         return 'vehicle'
 
+    def drives(self, class_name: str) -> bool:
+        """Return whether objects of a class move along their length: all but pedestrians."""
+        return self.kind(class_name) != 'pedestrian'
+
     def class_config(self, class_name: str) -> ClassConfig:
         """Return the group of settings for `class_name`; `vehicle` for unknown classes."""
         group: ClassConfig = getattr(self, self.kind(class_name))

@@ -143,7 +143,7 @@ class Session:
         lidars = self.placement.lidars
         self._motion_check = MotionCheck(self.tree, bool(lidars.frames or lidars.info))
         self._id_check = None if convention.associate else IdCheck(config.max_gap)
-        self._axis_check = AxisCheck(convention, self._is_vehicle)
+        self._axis_check = AxisCheck(convention, config.drives)
         self._has_boxes_without_frame = False
         self._pose_check = PoseCheck(self._convention, AT_ONCE)
 
@@ -285,9 +285,6 @@ class Session:
     def finding(self) -> str:
         """Return all findings in one line; empty if there are none."""
         return '; '.join(found.text for found in self.findings)
-
-    def _is_vehicle(self, class_name: str) -> bool:
-        return self._config.kind(class_name) in ('vehicle', 'cyclist')
 
     @property
     def facts(self) -> dict[str, object]:

@@ -12,6 +12,7 @@ from typing import Any
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.axis_check import AxisCheck
 from boxreg_ros.io.fixed_frame import FixedFrameItems, StoredCloud
 from boxreg_ros.io.lidars import SINGLE_LIDAR
 from boxreg_ros.io.recording import Recording
@@ -52,6 +53,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
     recording = request.recording() if request.recordings else None
     images = recording if isinstance(recording, Recording) else None
     options = replace(request.options, recording=images)
+    axes = AxisCheck(request.convention, Config().drives)
     unused: dict[str, Any] = {'unreadable': 0, 'unused': '', 'damage': []}  # of the recording
     with claimed(out), whole_folder(out, request.inputs()) as folder:
         writers = {name: writer_for(name, folder, provenance, options) for name in request.formats}
@@ -62,6 +64,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             not_read.update(frame.left_out)
             if frame.note:
                 assumed.append(frame.note)
+            axes.add(frame.moved('fixed').refined.boxes)
             for writer in writers.values():
                 writer.write(frame)
         for writer in writers.values():
@@ -80,6 +83,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             'left_out_of_source': dict(+not_read),
             'assumed': assumed,
             **unused,
+            'warning': axes.finding,
             'left_out_of_labels': {name: found for name, found in left_out.items() if found},
             'versions': {'boxreg_ros': __version__},
             'fingerprint': request.fingerprint(),
@@ -248,8 +252,7 @@ def run(args: argparse.Namespace) -> int:
         )
     parts += [left_out_line(*item) for item in summary['left_out_of_source'].items()]
     parts += summary['assumed']
-    if summary['unused']:
-        parts.append(summary['unused'])
+    parts += filter(None, (summary['unused'], summary['warning']))
     if summary['damage']:
         parts.append(f'damaged, and read as far as possible: {"; ".join(summary["damage"])}')
     print('; '.join(parts))

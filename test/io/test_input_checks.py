@@ -1,7 +1,9 @@
 """Ids that jump from object to object, and boxes whose axes do not follow their motion."""
 
+from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.io.axis_check import AxisCheck
+from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.id_assignment import IdCheck
 from boxreg_ros.structures import BoxArray
 from msg_adapters.convention import Convention, FORWARD, STANDARD
@@ -84,7 +86,7 @@ def test_a_switch_of_a_tracker_is_no_finding():
 
 def axes_of(frames, convention, checked=STANDARD, name='car'):
     """Return the check of boxes that a publisher states in a convention."""
-    check = AxisCheck(checked, lambda name: Config().kind(name) != 'pedestrian')
+    check = AxisCheck(checked, Config().drives)
     for stamp, ids, boxes in frames:
         given = convention.from_centers(array(stamp, ids, boxes, name))
         check.add(checked.to_centers(given))
@@ -131,3 +133,24 @@ def test_unresolved_headings_are_no_finding():
             yield stamp, ids, boxes
 
     assert axes_of(frames(), STANDARD).finding == ''
+
+
+def test_label_files_with_other_axes_are_named_and_read_by_the_options(tmp_path, capsys):
+    """The table of a drive along its x axis, written with y forward and width, length, height."""
+    convention = Convention(forward_axis='y+', size_order='wlh')
+    arrays = [array(*frame) for frame in street(moving=3)]
+    for name, boxes in (('own', arrays), ('other', map(convention.from_centers, arrays))):
+        BoxTable.from_arrays(list(boxes)).write(tmp_path / f'{name}.csv')
+    meant = ['--forward-axis', 'y+', '--size-order', 'wlh']
+    tables = []
+    for name, options in (('own', []), ('other', []), ('other', meant)):
+        out = tmp_path / f'{name}{len(options)}'
+        source = str(tmp_path / f'{name}.csv')
+        command = ['convert', source, '--from', 'csv', '--to', 'csv', '-o', str(out), *options]
+        assert main(command) == 0
+        assert ('--forward-axis y+ --size-order wlh' in capsys.readouterr().out) == (
+            name == 'other' and not options
+        )
+        tables.append(BoxTable.read(out / 'boxes.csv').boxes)
+    np.testing.assert_allclose(tables[2], tables[0], atol=1e-6)
+    assert np.abs(tables[1] - tables[0]).max() > 1

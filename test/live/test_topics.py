@@ -22,7 +22,7 @@ from ros_graph import (
     UNKNOWN_NODE,
     values_of,
 )
-from ros_messages import DETECTIONS, Drive, MARKERS, POINTS
+from ros_messages import DETECTIONS, Drive, MARKERS, POINTS, TF
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -308,3 +308,11 @@ def test_a_policy_mismatches_in_one_direction_only(policy, offered, requested):
     assert [item.policy for item in mismatches(weak, strong)] == [policy]
     assert not mismatches(strong, weak)
     assert not mismatches(weak, weak)
+
+
+def test_transforms_of_a_robot_in_a_namespace_are_named(graph):
+    graph.publisher(TF, '/r1/tf')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start(*RELIABLE, '-p', f'boxes_type:={DETECTIONS}')
+    parts = '/tf: nobody publishes it', '/r1/tf', '-r /tf:=/r1/tf -r /tf_static:=/r1/tf_static'
+    reported(graph, node, diagnostics, *parts)
