@@ -262,7 +262,7 @@ class Session:
         """Return the faults of the input, and guesses about it, that were found so far."""
         found = [*self._motion_check.findings.values()]
         found += [
-            Finding(Reason.POINT_TIMES, text) for text in self._placement.normalised.values()
+            Finding(Reason.POINT_TIMES, text) for text in self.placement.normalised.values()
         ]
         if self._has_boxes_without_frame:
             text = (
