@@ -261,9 +261,7 @@ class Session:
     def findings(self) -> list[Finding]:
         """Return the faults of the input, and guesses about it, that were found so far."""
         found = [*self._motion_check.findings.values()]
-        found += [
-            Finding(Reason.POINT_TIMES, text) for text in self.placement.normalised.values()
-        ]
+        found += [Finding(Reason.POINT_TIMES, text) for text in self.placement.normalised.values()]
         if self._has_boxes_without_frame:
             text = (
                 f'boxes have an empty frame_id: expected the name of their frame; they are taken '
