@@ -47,7 +47,7 @@ interface Report {
 
 interface Sweep { stamp: string; origin: number[]; sensor: number[]; points: Float32Array }
 interface Camera { topic: string; size: number[]; matrix: number[][] | null; distortion: number[]; model: string; pose: number[][] | null }
-type SlimPart = Pick<Part, 'origin' | 'usable' | 'stamps'>;
+type SlimPart = Pick<Part, 'origin' | 'usable' | 'stamps' | 'status'>;
 interface SceneBox { track: Track; box: number[]; isGone: boolean }
 interface Fit { box: number[]; class: string; points: number; stamp: string; place: number[] }
 interface Line { name: string; dash: number[]; corners: Point[] }
