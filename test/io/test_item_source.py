@@ -6,6 +6,7 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import move_to_frame, TransformTree
 from boxreg_ros.offline.sources import LabelledRecording
 from boxreg_ros.structures import Sweep
+from msg_adapters.convention import STANDARD
 import numpy as np
 import pytest
 from ros_messages import Drive, SCENE
@@ -28,7 +29,7 @@ def source_of(name, folder):
         # is 1 because no box was refined.
         config = ['--set=min_observations=50', '--set=window=50']
         assert main(['relabel', str(drive), '-o', str(out), '--formats=csv', *config]) == 1
-        return LabelledRecording(('csv', out / 'boxes.csv'), [drive])
+        return LabelledRecording(('csv', out / 'boxes.csv'), [drive], STANDARD)
     is_ros1 = name == 'rosbag1'
     boxes = 'vision' if is_ros1 else SCENE
     return Recording([Drive(sweeps=6, boxes=boxes, ros1=is_ros1).write(folder / 'drive', name)])

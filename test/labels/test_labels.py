@@ -188,7 +188,8 @@ def test_formats_state_all_conventions():
     for name in FORMATS:
         conventions = import_module(FORMATS[name]).FORMAT
         assert conventions.name == name
-        required = set(conventions.__slots__) - {'packages', 'options', 'has_points'}
+        optional = {'packages', 'options', 'has_points', 'reads', 'leaves_out', 'read_back'}
+        required = set(conventions.__slots__) - optional
         assert all(getattr(conventions, field) for field in required)
 
 

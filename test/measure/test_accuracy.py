@@ -102,7 +102,12 @@ def test_real_prints_all_methods_and_groups(folder, capsys):
     words = ['--classes', 'van', '--min-points', 10, '--methods', 'smoothing', 'ours']
     assert run('real', folder, *words) == 0
     text = capsys.readouterr().out
-    for shown in ('smoothing only', '| BEV | 3D | R@0.5 |', '0-20 m', 'ours, track - input | all'):
+    for shown in (
+        'smoothing only',
+        '| BEV | 3D | R@0.5 |',
+        '| 3D IoU |',
+        'ours, track - input | all',
+    ):
         assert shown in text
     assert 'CTRA' not in text
 

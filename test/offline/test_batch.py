@@ -15,9 +15,9 @@ from boxreg_ros.offline.batch_results import INDEX_COLUMNS
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.offline.job_process import JobRunner, memory_bytes, Watch, watched
 from boxreg_ros.offline.result_folder import whole_folder
-from measure.node import children_of
 from paths import ROOT
 from preloaded import BOXREG, PreloadedProcess
+from processes import children_of
 import pytest
 from relabel_results import rows_in
 from ros_messages import Drive

@@ -18,9 +18,9 @@ from boxreg_ros.offline.registration_worker import registration_worker
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.relabel_command import ProgressBar
 from boxreg_ros.offline.workers import run_in_worker
-from measure.node import children_of
 import numpy as np
 from paths import ROOT
+from processes import children_of
 import pytest
 from ros_messages import Drive
 from scenes import cut, drive, fed, stream_of, track_of

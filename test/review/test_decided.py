@@ -6,12 +6,11 @@ import shutil
 
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.stamp_order import kept
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
 from boxreg_ros.review.server import review_server
-from boxreg_ros.structures import BoxArray
+from boxreg_ros.structures import BoxArray, kept
 from browser import NEEDS_BROWSER, opened_page, press, serving
 import numpy as np
 import pytest
