@@ -20,10 +20,10 @@ from rosbags.typesys import TypesysError
 from rosbags.typesys.store import Typestore
 
 ENCAPSULATIONS = {
-    2: 'PL_CDR', 3: 'PL_CDR', 6: 'XCDR2', 7: 'XCDR2', 8: 'D_CDR2', 9: 'D_CDR2', 10: 'PL_CDR2',
-    11: 'PL_CDR2',
+    b'\0\x02': 'PL_CDR', b'\0\x03': 'PL_CDR', b'\0\x06': 'XCDR2', b'\0\x07': 'XCDR2',
+    b'\0\x08': 'D_CDR2', b'\0\x09': 'D_CDR2', b'\0\x0a': 'PL_CDR2', b'\0\x0b': 'PL_CDR2',
 }  # fmt: skip
-"""Encodings of DDS-XTypes that no middleware of ROS 2 records, by the second byte of a message."""
+"""Encodings of DDS-XTypes that no middleware of ROS 2 records, by the first bytes of a message."""
 SAMPLE = 1000
 """Messages among which one is looked for that fits one definition alone; chosen."""
 
@@ -158,7 +158,7 @@ class _RosDecoder:
         # rosbags turns all errors of malformed bytes into SerdeError; the others mean that a
         # definition refers to a type that rosbags does not decode, as ``wstring``.
         except (SerdeError, TypesysError, KeyError) as error:
-            encoding = ENCAPSULATIONS.get(data[1]) if data[:1] == b'\0' else None
+            encoding = ENCAPSULATIONS.get(data[:2])
             if encoding and not self._is_ros1:
                 raise UnsupportedMessage(
                     f'expected plain CDR, as the middlewares of ROS 2 write it, got {encoding}; '

@@ -56,6 +56,8 @@ def test_corrupted_bytes_are_unreadable_or_decoded(tmp_path, topic):
         record = next(recording._read({topic}))
         changed = [corrupted(bytes(record.data), rng) for _ in range(300)]
         assert 0 < outcomes(recording, record, changed) < 300
+        cut_off = [bytes(record.data[:size]) for size in range(12)]
+        assert outcomes(recording, record, cut_off) == 0
 
 
 def tampered_json(value, rng):
