@@ -105,8 +105,8 @@ def _from_detections(msg: Any) -> BoxArray:
         track_ids = tuple(_track_id(detection) for detection in msg.detections)
     except AttributeError as error:
         raise UnsupportedMessage(
-            f'Detection3DArray: expected the fields of a release of vision_msgs, got a message '
-            f'where {error}; convert the recording'
+            f'Detection3DArray: expected the fields of vision_msgs 1 to 4, got a message where '
+            f'{error}; convert the messages to vision_msgs 4'
         ) from None
     boxes = [detection.bbox for detection in msg.detections]
     return BoxArray(

@@ -327,8 +327,8 @@ def test_contradicting_headers_are_refused():
         vision.from_msg(message)
 
 
-def test_old_definition_of_vision_msgs_is_refused():
-    old = SimpleNamespace(
+def test_fields_of_no_release_of_vision_msgs_are_refused():
+    unknown = SimpleNamespace(
         header=M.header(STAMP, 'lidar'),
         detections=[
             SimpleNamespace(
@@ -338,8 +338,8 @@ def test_old_definition_of_vision_msgs_is_refused():
             )
         ],
     )
-    with pytest.raises(UnsupportedMessage, match='vision_msgs 4'):
-        vision.from_msg(old)
+    with pytest.raises(UnsupportedMessage, match=r"msgs 1 to 4, got.*'id'.*to vision_msgs 4"):
+        vision.from_msg(unknown)
 
 
 def test_adapters_are_found_by_both_spellings_of_the_type():
