@@ -8,6 +8,7 @@ and needs Chromium; where there is none, that picture alone stays as it is.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 import csv
 from dataclasses import replace
@@ -20,6 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.matching import StampMatcher
 from boxreg_ros.core.observation import GROUND_CLEARANCE
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
@@ -129,9 +131,14 @@ def car_picture(recording: Path, result: Path) -> bytes:
     items: list[Sweep | BoxArray] = [*drive.sweeps, *drive.boxes]
     items.sort(key=lambda item: item.stamp_ns)
     collector = PointCollector(Config())
+    matcher = StampMatcher(Config(), Counter())
     for item in items:
-        collector.add(item)
-    collector.flush()
+        collector.note(item)
+        is_sweep = isinstance(item, Sweep)
+        for pair in matcher.add_sweep(item) if is_sweep else matcher.add_boxes(item):
+            collector.gather(pair.boxes, pair.sweep)
+    for pair in matcher.flush():
+        collector.gather(pair.boxes, pair.sweep)
     with matplotlib.rc_context(STYLE):
         return points_picture(track, collector.points_of(track))
 

@@ -63,7 +63,7 @@ class StampMatcher:
         return [one.boxes for one in self._unpaired]
 
     def add_sweep(self, sweep: Sweep) -> Iterator[Pair]:
-        """Add a sweep; yield the pairs completed by it."""
+        """Add a sweep; return the pairs completed by it, which are taken from here one by one."""
         if sweep.stamp_ns < self._oldest_ns:
             self._counts[Reason.SWEEP_LATE] += 1
         elif any(sweep.stamp_ns == other.stamp_ns for other in self._sweeps):
@@ -71,13 +71,11 @@ class StampMatcher:
         else:
             insort(self._sweeps, sweep, key=lambda item: item.stamp_ns)
         self._newest_ns = max(self._newest_ns, sweep.stamp_ns)
-        yield from self._pop_pairs()
-        if len(self._sweeps) > self._capacity:
-            self._discard_before(self._sweeps[1].stamp_ns)
+        return self._pop_pairs_of_sweeps()
 
     def add_boxes(self, boxes: BoxArray, reason: str = '') -> Iterator[Pair]:
         """
-        Add a box array; yield the pairs completed by it.
+        Add a box array; return the pairs completed by it, which are taken from here one by one.
 
         With a `reason` it is kept: it waits for no sweep, but for the arrays before it. One
         without a stamp stands behind the newest.
@@ -89,12 +87,18 @@ class StampMatcher:
         elif not reason:
             self._newest_boxes_ns = max(self._newest_boxes_ns, order_ns)
         insort(self._unpaired, _Unpaired(order_ns, boxes, reason), key=lambda one: one.order_ns)
-        yield from self._pop_pairs()
+        return self._pop_pairs()
 
     def flush(self) -> Iterator[Pair]:
         """Yield all box arrays held, paired or not, and discard all sweeps."""
         yield from self._pop_pairs(is_flush=True)
         self._discard_before(self._newest_ns + 1)
+
+    def _pop_pairs_of_sweeps(self) -> Iterator[Pair]:
+        """Yield pairs; then discard the oldest sweep if there are too many."""
+        yield from self._pop_pairs()
+        if len(self._sweeps) > self._capacity:
+            self._discard_before(self._sweeps[1].stamp_ns)
 
     def _pop_pairs(self, is_flush: bool = False) -> Iterator[Pair]:
         """Yield the oldest box arrays as long as no later sweep can be nearer to them."""

@@ -192,22 +192,22 @@ class TransformTree:
         """
         Return the motion of `source` in `target` up to a stamp that `lookup` can answer.
 
-        Poses of the last `POSES_SECONDS`, `POSES_PERIOD` apart, as far back as they are known.
-        None if all transforms between both frames are static.
+        Poses of the last `POSES_SECONDS`, `POSES_PERIOD` apart, as far back as they are known: a
+        pose before the first one would depend on how many later ones have arrived. None if all
+        transforms between both frames are static.
 
         """
         if all(edge.is_static for edge, _ in self._route(target, source)):
             return None
-        stamps_ns: list[int] = []
-        poses: list[Floats] = []
+        stamps_ns = [stamp_ns]
+        poses = [self.lookup(target, source, stamp_ns)]
         period_ns = round(POSES_PERIOD * 1e9)
-        for step in range(round(POSES_SECONDS / POSES_PERIOD) + 1):
+        for step in range(1, round(POSES_SECONDS / POSES_PERIOD) + 1):
             at_ns = stamp_ns - step * period_ns
-            try:
-                poses.insert(0, self.lookup(target, source, at_ns))
-            except TransformUnavailable:
+            if not self.covers(target, source, at_ns):
                 break
             stamps_ns.insert(0, at_ns)
+            poses.insert(0, self.lookup(target, source, at_ns))
         return FrameMotion(np.array(stamps_ns), np.array(poses))
 
     def connects(self, target: str, source: str) -> bool:

@@ -187,7 +187,8 @@ def test_boxes_of_another_frame_than_their_sweep_are_refused():
     matcher = StampMatcher(Config(), Counter())
     assert not list(matcher.add_sweep(Sweep(100, 'lidar', np.zeros((0, 3)))))
     with pytest.raises(ShapeError, match=r"frame of its boxes, 'odom', got 'lidar'; bring both"):
-        matcher.add_boxes(boxes(100))
+        next(matcher.add_boxes(boxes(100)))
+    assert matcher.unpaired  # an error loses no boxes
     # A sweep without the name of its frame is taken to be in that of the boxes.
     matcher = StampMatcher(Config(), Counter())
     matcher.add_sweep(Sweep(100, '', np.zeros((0, 3))))

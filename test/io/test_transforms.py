@@ -110,6 +110,16 @@ def test_covers_excludes_extrapolation():
     assert tree.covers('base', 'lidar', 99 * S), 'static transforms are valid at all times'
 
 
+def test_the_motion_up_to_a_stamp_does_not_depend_on_later_transforms():
+    first = (S, 'odom', 'base', (0, 0, 0))
+    later = (S + S // 10, 'odom', 'base', (1, 0, 0))
+    for known in ([first], [first, later]):
+        motion = tree_of(*known).motion('odom', 'base', S)
+        assert motion.stamps_ns.tolist() == [S]
+    motion = tree_of(first, later).motion('odom', 'base', S + S // 10)
+    assert motion.stamps_ns.tolist() == [S, S + S // 10]
+
+
 def test_a_static_transform_on_both_topics_stays_static():
     tree = tree_of((5 * S, 'base', 'lidar', (1, 0, 0)), static=[(0, 'base', 'lidar', (1, 0, 0))])
     assert tree.lookup('base', 'lidar', 0)[0, 3] == 1.0
