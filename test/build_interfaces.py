@@ -48,6 +48,8 @@ def main() -> None:
     """Build the packages that are new or changed."""
     found = sorted(path for folder in FOLDERS for path in folder.iterdir() if path.is_dir())
     packages = [path for path in found if not is_built(path)]
+    for package in packages:
+        stamp(package).unlink(missing_ok=True)  # a hard link to it may be in another environment
     compiler = os.environ.get('CXX', 'c++')
     if packages and shutil.which(compiler) is None:
         sys.exit(f'no C++ compiler {compiler!r} to build message types with: apt install g++')
