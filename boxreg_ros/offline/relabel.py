@@ -47,25 +47,21 @@ if TYPE_CHECKING:
     from boxreg_ros.core.input_statistics import Drives
     from boxreg_ros.core.latency import Latency
     from boxreg_ros.core.method.constants import Constants
-    from boxreg_ros.core.registrar import BoxRegistrar, Submit
+    from boxreg_ros.core.registrar import BoxRegistrar
     from boxreg_ros.io.sweep_store import SweepStore
     from boxreg_ros.offline.completion import Arrivals, Completion, Moved
-    from boxreg_ros.offline.resume import EstimateJournal
     from boxreg_ros.offline.stored_sweeps import StoredSweeps
     from boxreg_ros.tracks.complete import CompletionPlan
 
 
-def relabel(
-    request: Request, out: Path, progress: Progress | None = None, resume: bool = False
-) -> Summary:
+def relabel(request: Request, out: Path, progress: Progress | None = None) -> Summary:
     """
     Refine all boxes of a recording and write ``boxes.csv``, ``summary.json`` and other files.
 
     The folder `out` appears complete or not at all; an earlier result is replaced. `progress`
     shows the duration of the recording that has been read and its whole duration [s]; both count
-    once for each time that it is read: with completed tracks once more. With `resume` the run
-    keeps a journal, and goes on with that of an interrupted one, see `EstimateJournal`. Returned
-    is the content of ``summary.json``.
+    once for each time that it is read: with completed tracks once more. Returned is
+    the content of ``summary.json``.
 
     Raises RecordingError if the recording lacks something, or `out` is not an earlier result or
     cannot be written, and UnsupportedMessage if none of its clouds, or none of its messages of
@@ -81,11 +77,10 @@ def relabel(
     drives = _other_drives(request)
     shown = _Passes(progress, 1 + (request.completes or corrections.adds))
     with claimed(out), ExitStack() as workers:
-        journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         if request.cloud_copies:
             with request.recording():  # both processes need the types of its messages
                 pass
-        survey = _survey(request, clock, shown, journal, corrections, drives)
+        survey = _survey(request, clock, shown, corrections, drives)
         sweeps = _stored_sweeps(request, out)
         receive = workers.enter_context(
             reader(request, None if survey is None else survey.latency, sweeps)
@@ -104,7 +99,7 @@ def relabel(
         )
         registrar = BoxRegistrar(
             request.config,
-            _journaled(submit, journal),
+            submit,
             drives=drives,
             constants=None if survey is None else survey.constants,
         )
@@ -181,20 +176,6 @@ def _write_points(
             summary.points = PointProducts(folder, request, sweeps, labeller, frame).write()
 
 
-def _journal(out: Path, fingerprint: str) -> EstimateJournal:
-    """Return the journal of a run, not yet open."""
-    from boxreg_ros.offline.resume import EstimateJournal, journal_path
-
-    return EstimateJournal(journal_path(out), fingerprint)
-
-
-def _journaled(submit: Submit | None, journal: EstimateJournal | None) -> Submit | None:
-    """Return `submit` with the estimates that a journal has."""
-    from boxreg_ros.core.registrar import submit_locally
-
-    return submit if journal is None else journal.journaled(submit or submit_locally)
-
-
 class _Passes:
     """Progress over several passes through a recording."""
 
@@ -227,7 +208,6 @@ def _survey(
     request: Request,
     clock: Stopwatch,
     progress: _Passes,
-    journal: EstimateJournal | None,
     corrections: Corrections,
     drives: Drives,
 ) -> _Survey | None:
@@ -263,7 +243,6 @@ def _survey(
             submit = workers.enter_context(
                 registration_worker(request.config, clock, progress.progress.announce)
             )
-            submit = _journaled(submit, journal)
             first = first_pass(items, request.config, submit, fixed_frame, drives)
             plan = first.plan(fixed_frame, request.config, corrections)
             parts = first.parts
