@@ -36,7 +36,7 @@ jazzy := $(VENV_JAZZY)/.done
 JAZZY_TESTS := $(addprefix --ignore test/core/,test_refine.py test_kernel_cache.py) \
     $(addprefix --ignore test/io/,test_damaged.py test_malformed.py test_remote.py) \
     test/test_config.py test/core test/io test/msg_adapters test/labels/test_labels.py \
-    test/offline/test_evaluate.py test/live/test_live_registrar.py test/measure/test_baselines.py \
+    test/offline/test_evaluate.py test/live/test_pipeline.py test/measure/test_baselines.py \
     test/offline/test_relabel.py::test_every_box_is_written_once_in_order \
     test/offline/test_relabel.py::test_refined_boxes_match_the_truth_in_the_fixed_frame
 

@@ -86,7 +86,10 @@ from msg_adapters import vision
 from boxreg_ros.config import Config
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.warm_up import warm_up, warm_up_followed
-from boxreg_ros.live.live_registrar import LiveRegistrar
+from boxreg_ros.io.session import Session
+from boxreg_ros.live.pipeline import MessagePipeline
+from boxreg_ros.live.transform_wait import TransformWait
+from msg_adapters.convention import STANDARD
 from numba.core.dispatcher import Dispatcher
 from pathlib import Path
 from rosbags.highlevel import AnyReader
@@ -100,15 +103,16 @@ config = Config(estimate='final')
 warm_up(config)
 warm_up_followed(config)
 before = kernels()
-live = LiveRegistrar(config, 'odom', '', 0.0, print)
+session = Session(STANDARD, config, 'odom', report=print)
+live = MessagePipeline(config, session, TransformWait(session, 0.0, ''), print)
 live.adapter = vision
 with AnyReader([Path(sys.argv[1])]) as reader:
     for connection, at, data in reader.messages():
         message = reader.deserialize(data, connection.msgtype)
         if connection.topic == '/tf':
-            live.session.tree.add_transforms(message.transforms)
+            session.tree.add_transforms(message.transforms)
         elif connection.topic == '/points':
-            live.process(Item(at, live.placement.sweep_of(message, ''), message=message))
+            live.process(Item(at, session.placement.sweep_of(message, ''), message=message))
         elif connection.topic == '/detections':
             live.process(Item(at, vision.from_msg(message), message=message))
         if at > 1_700_000_000_800_000_000:

@@ -103,7 +103,7 @@ def test_the_picture_of_the_house_has_the_same_arrows():
         ('boxreg_ros.core.geometry', 'boxreg_ros.io.recording'),
         ('boxreg_ros.core.geometry', 'msg_adapters.vision'),
         ('boxreg_ros.live.node', 'boxreg_ros.offline.relabel'),
-        ('boxreg_ros.offline.relabel', 'boxreg_ros.live.live_registrar'),
+        ('boxreg_ros.offline.relabel', 'boxreg_ros.live.pipeline'),
         ('boxreg_ros.config', 'boxreg_ros.core.geometry'),
         ('msg_adapters.vision', 'boxreg_ros.core.geometry'),
     ],

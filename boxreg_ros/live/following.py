@@ -9,7 +9,7 @@ from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.session import Session
 from boxreg_ros.io.transforms import boxes_to_frame
-from boxreg_ros.live.outgoing import Detection
+from boxreg_ros.live.tickets import Detection
 from boxreg_ros.live.transform_wait import TransformWait
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray

@@ -12,16 +12,19 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.compilation import announced_compilation
 from boxreg_ros.io.label_messages import LABELS_TOPIC, LABELS_TYPE
-from boxreg_ros.io.lidars import Lidars
+from boxreg_ros.io.lidars import Lidars, SensorPlacement
+from boxreg_ros.io.session import Session
 from boxreg_ros.io.warm_up import warm_up, warm_up_followed, warm_up_labels
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.inbox import Inbox
-from boxreg_ros.live.live_registrar import LiveRegistrar
+from boxreg_ros.live.model_file import ModelFile
 from boxreg_ros.live.params import changed, declare, numbers_as_declared, parameters_yaml
+from boxreg_ros.live.pipeline import MessagePipeline
 from boxreg_ros.live.topics import FOLLOW_TOPIC, import_message, NodeTopics
+from boxreg_ros.live.transform_wait import TransformWait
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
 from msg_adapters import adapter_for, canonical, cdr
@@ -89,12 +92,16 @@ class BoxregNode(Node):
             cdr.walker()
         self._budget = TickBudget(options.deadline)
         warm_up(config, self._budget.submit)  # once more, timed without imports and compilation
-        self._live = LiveRegistrar(
-            config, options.fixed_frame, options.output_frame, options.transform_timeout,
-            self._health.report, options.convention, options.lidars, self._budget,
-            options.static_points_wait if options.static_points else None, options.input_model,
-        )  # fmt: skip
-        self._live.session.tree.clock_offset = options.clock_offset
+        report = self._health.report
+        placement = SensorPlacement(options.lidars)
+        session = Session(options.convention, config, options.fixed_frame, placement, report)
+        session.tree.clock_offset = options.clock_offset
+        wait = TransformWait(session, options.transform_timeout, options.output_frame)
+        patience = options.static_points_wait if options.static_points else None
+        self._model = ModelFile(options.input_model)
+        self._live = MessagePipeline(
+            config, session, wait, report, self._budget, patience, self._model.drives
+        )
         gc.collect()
         gc.freeze()  # a collection of imported objects would take 50 ms, several times a minute
 
@@ -118,7 +125,7 @@ class BoxregNode(Node):
         )
         self.worker = Worker(
             self._live, self._inbox, self._health, self.get_logger(), self._budget,
-            options.backlog, self._markers,
+            options.backlog, self._markers, self._model,
         )  # fmt: skip
         if options.static_points:
             self._open_static_points(options.points_type)

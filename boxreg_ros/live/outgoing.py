@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
-from boxreg_ros.config import Config
-from boxreg_ros.io.session import covariances_to_write
+from boxreg_ros.errors import TransformUnavailable, UnsupportedMessage
+from boxreg_ros.io.session import covariances_to_write, Session
 from boxreg_ros.io.transforms import boxes_to_frame
-from boxreg_ros.structures import BoxArray, COASTED, Floats, REFINED, RefinedBoxes
+from boxreg_ros.live.following import Following
+from boxreg_ros.live.static_points import StaticPoints
+from boxreg_ros.live.tickets import Detection, Ticket, ticket_of
+from boxreg_ros.reasons import Reason
+from boxreg_ros.structures import BoxArray, COASTED, Floats, kept, REFINED, RefinedBoxes
 from msg_adapters import Adapter
 from msg_adapters.poses import turned_covariances
 
@@ -25,103 +30,66 @@ class Outgoing(NamedTuple):
     in_fixed: RefinedBoxes | None = None  # the same as `refined`, as the registrar returns it
 
 
-class Detection(NamedTuple):
-    """The last message with a box of a track, the row of the box, and its stamp [ns]."""
-
-    message: Any
-    row: int
-    stamp_ns: int
-
-
-class OutputFrame(NamedTuple):
-    """How boxes get from the fixed frame, and from their message, to that of the output."""
-
-    T_output_fixed: Floats
-    T_output_item: Floats | None
-    """None: it is that of the message."""
-
-
-@dataclass(eq=False, slots=True)
-class Given:
-    """An input message; the ticket of its boxes at the registrar."""
-
-    message: Any
-    boxes: BoxArray | None = None
-    """In the output frame; None: the message passes through."""
-    received: float = 0.0
-    frame: OutputFrame | None = None
-    has_new_ids: bool = False
-    earlier: Mapping[str, Detection] = field(default_factory=dict)
-    """By id, of the tracks that have no box in the message."""
-    is_late: bool = False
-    """Whether its boxes were corrected."""
-    is_early_out: bool = False
-
-
-class Detections:
-    """The last detection of each track, for boxes of tracks that miss one. Not thread-safe."""
-
-    def __init__(self) -> None:
-        self._last: dict[str, Detection] = {}
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._last = {}
-
-    def earlier(self, message: Any, boxes: BoxArray, config: Config) -> dict[str, Detection]:
-        """Return those of tracks that miss one in `boxes` of a message; note those of `boxes`."""
-        # `coast` may become larger while tracks without a detection wait for their end.
-        oldest_ns = boxes.stamp_ns - round((config.coast + config.max_gap) * 1e9)
-        own = set(boxes.track_ids)
-        earlier = {
-            track_id: detection
-            for track_id, detection in self._last.items()
-            if detection.stamp_ns >= oldest_ns and track_id not in own
-        }
-        self._last = earlier | {
-            track_id: Detection(message, row, boxes.stamp_ns)
-            for row, track_id in enumerate(boxes.track_ids)
-        }
-        return earlier
-
-
-def passed_on(given: Given, is_final: bool) -> Outgoing:
-    """Return an input message as it is."""
-    return Outgoing(given.message, is_final, received=given.received or None)
-
-
-def outgoing(
-    refined: RefinedBoxes, given: Given, adapter: Adapter, followed: Mapping[str, Detection]
-) -> Outgoing:
+class OutgoingQueue:
     """
-    Return the message of refined boxes, in the output frame.
+    Results of the registrar on their way to messages.
 
-    Parameters
-    ----------
-    refined : RefinedBoxes
-        In the fixed frame.
-    given : Given
-        The ticket of the boxes, which do not pass through.
-    adapter : Adapter
-        Of the type of the message.
-    followed : mapping
-        The box that each followed object began with: it may have no other in a message.
+    Both survive an error while messages are made: `abandoned` has them. Early boxes are shown to
+    `static_points`, if any. Not thread-safe.
 
     """
-    assert given.boxes is not None and given.frame is not None
-    moved = refined_to_frame(refined, given.frame.T_output_fixed, given.boxes.frame_id)
-    message = given.message
-    coasted = refined.boxes.track_ids[len(given.boxes.track_ids) :]
-    if coasted:
-        sources = [(given.earlier.get(name) or followed[name])[:2] for name in coasted]
-        message = adapter.with_added(message, sources)
-    T_output_item = given.frame.T_output_item
-    is_changed = REFINED in refined.status or COASTED in refined.status
-    # Copying a message takes time; under load most boxes are kept.
-    if is_changed or T_output_item is not None or given.has_new_ids or given.is_late:
-        covariances = covariances_to_write(moved)
-        message = adapter.to_msg(message, moved.boxes, covariances, T_output_item)
-    return Outgoing(message, refined.is_final, given.boxes, moved, given.received, refined)
+
+    def __init__(self, following: Following, static_points: StaticPoints | None) -> None:
+        self._following = following
+        self._static_points = static_points
+        self._results = deque[RefinedBoxes]()
+        self._made: list[Outgoing] = []
+
+    def messages(self, results: list[RefinedBoxes], adapter: Adapter | None) -> list[Outgoing]:
+        """Return the messages to publish for results; `adapter` has read those of the input."""
+        self._results += results
+        self._following.report()
+        while self._results:
+            refined = self._results[0]
+            ticket = ticket_of(refined.boxes)
+            if refined.is_final or not ticket.is_early_out:
+                self._made.append(self._message_of(refined, ticket, adapter))
+            if self._static_points is not None and not ticket.is_early_out:
+                self._static_points.add_boxes(refined)
+            ticket.is_early_out = True
+            self._results.popleft()
+        made = self._made
+        self._made = []
+        return made
+
+    def abandoned(self, results: list[RefinedBoxes]) -> tuple[list[Outgoing], list[Any]]:
+        """
+        Return the messages made before an error, and all others passed through.
+
+        Also return the input messages of `results` and of those before them, which are these.
+
+        """
+        lost = [*self._results, *results]
+        self._results.clear()
+        ready = self._made
+        self._made = []
+        for refined in lost:
+            ticket = ticket_of(refined.boxes)
+            if not ticket.is_early_out:
+                ready.append(_passed_on(ticket, False))
+                ticket.is_early_out = True
+            if refined.is_final:
+                ready.append(_passed_on(ticket, True))
+        return ready, [ticket_of(refined.boxes).message for refined in lost]
+
+    def _message_of(
+        self, refined: RefinedBoxes, ticket: Ticket, adapter: Adapter | None
+    ) -> Outgoing:
+        """Return the message to publish for a result."""
+        if ticket.boxes is None:
+            return Outgoing(ticket.message, refined.is_final)
+        assert adapter is not None
+        return _outgoing(refined, ticket, adapter, self._following.sources)
 
 
 def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:
@@ -131,3 +99,56 @@ def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str
         boxes=boxes_to_frame(refined.boxes, T_frame_boxes, frame_id),
         covariances=turned_covariances(refined.covariances, T_frame_boxes),
     )
+
+
+def labels_passed_through(message: Any, adapter: Adapter, session: Session) -> RefinedBoxes | None:
+    """Return the boxes of a message that passed through as kept; None for unreadable ones."""
+    try:
+        boxes = adapter.from_msg(message)
+    except UnsupportedMessage:
+        return None
+    try:
+        T_fixed_boxes = session.tree.lookup(session.fixed_frame, boxes.frame_id, boxes.stamp_ns)
+    except TransformUnavailable:
+        return kept(boxes, Reason.NO_TRANSFORM)
+    moved = boxes_to_frame(boxes, T_fixed_boxes, session.fixed_frame)
+    return kept(moved, Reason.BOXES_QUEUE_FULL)
+
+
+def _passed_on(ticket: Ticket, is_final: bool) -> Outgoing:
+    """Return an input message as it is."""
+    return Outgoing(ticket.message, is_final, received=ticket.received or None)
+
+
+def _outgoing(
+    refined: RefinedBoxes, ticket: Ticket, adapter: Adapter, followed: Mapping[str, Detection]
+) -> Outgoing:
+    """
+    Return the message of refined boxes, in the output frame.
+
+    Parameters
+    ----------
+    refined : RefinedBoxes
+        In the fixed frame.
+    ticket : Ticket
+        That of the boxes, which do not pass through.
+    adapter : Adapter
+        Of the type of the message.
+    followed : mapping
+        The box that each followed object began with: it may have no other in a message.
+
+    """
+    assert ticket.boxes is not None and ticket.frame is not None
+    moved = refined_to_frame(refined, ticket.frame.T_output_fixed, ticket.boxes.frame_id)
+    message = ticket.message
+    coasted = refined.boxes.track_ids[len(ticket.boxes.track_ids) :]
+    if coasted:
+        sources = [(ticket.earlier.get(name) or followed[name])[:2] for name in coasted]
+        message = adapter.with_added(message, sources)
+    T_output_item = ticket.frame.T_output_item
+    is_changed = REFINED in refined.status or COASTED in refined.status
+    # Copying a message takes time; under load most boxes are kept.
+    if is_changed or T_output_item is not None or ticket.has_new_ids or ticket.is_late:
+        covariances = covariances_to_write(moved)
+        message = adapter.to_msg(message, moved.boxes, covariances, T_output_item)
+    return Outgoing(message, refined.is_final, ticket.boxes, moved, ticket.received, refined)

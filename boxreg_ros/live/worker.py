@@ -18,8 +18,9 @@ from boxreg_ros.io.session import is_placeholder
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.inbox import Inbox, Message
-from boxreg_ros.live.live_registrar import LiveRegistrar
-from boxreg_ros.live.outgoing import Outgoing
+from boxreg_ros.live.model_file import ModelFile
+from boxreg_ros.live.outgoing import labels_passed_through, Outgoing
+from boxreg_ros.live.pipeline import MessagePipeline
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.structures import BoxArray, Sweep
 from msg_adapters import Adapter
@@ -60,13 +61,14 @@ class Worker:
 
     def __init__(
         self,
-        live: LiveRegistrar,
+        live: MessagePipeline,
         inbox: Inbox,
         health: Health,
         logger: RcutilsLogger,
         budget: TickBudget,
         backlog: float,
         markers: Publisher,
+        model: ModelFile,
     ) -> None:
         self.cloud_frame = ''
         self.cloud_received = 0.0
@@ -84,6 +86,7 @@ class Worker:
         self._fully_collected_at = time.monotonic()
         self._board = MarkerBoard()
         self._markers = markers
+        self._model = model
         self.static: Publisher | None = None  # of clouds without moving objects
         self._early: Publisher | None = None
         self._final: Publisher | None = None
@@ -155,7 +158,7 @@ class Worker:
         if message is None:
             return
         if message.topic == 'passing':
-            self._publish(self._live.last(message.content))
+            self._publish(self._live.pass_through_as_final(message.content))
         elif self._is_overdue(message):
             self.drop(message)
         else:
@@ -183,7 +186,7 @@ class Worker:
         content: Sweep | BoxArray
         try:
             if message.topic == 'points':
-                content = self._live.placement.sweep_of(message.content, message.lidar)
+                content = self._live.session.placement.sweep_of(message.content, message.lidar)
                 self._log_layouts()
             else:
                 assert self._live.adapter is not None  # set before boxes are subscribed to
@@ -195,12 +198,12 @@ class Worker:
         else:
             return Item(message.received_ns, content, message=message.content)
         if message.topic == 'boxes':
-            self._publish(self._live.passed_through(message.content))
+            self._publish(self._live.pass_through(message.content))
         return None
 
     def _log_layouts(self) -> None:
         """Log the layout of the first cloud of each LiDAR."""
-        for lidar, layout in self._live.placement.layouts.items():
+        for lidar, layout in self._live.session.placement.layouts.items():
             if lidar not in self._logged_layouts:
                 self._logged_layouts.add(lidar)
                 self._logger.info(f'clouds {lidar or "points"}: {layout}')
@@ -210,10 +213,10 @@ class Worker:
         if self._confirmed or any(self._inbox.sizes().values()):
             return
         now = time.monotonic()
-        if self._live.is_silent(now):
+        if self._live.registrar.num_held and self._live.silence.has_no_boxes(now):
             self._catch_up(self._live.registrar.num_waiting)
             self._publish(self._guarded(self._live.flush))
-        if self._board.is_showing and self._live.has_ceased(now):
+        if self._board.is_showing and self._live.silence.has_no_boxes(now):
             self._markers.publish(self._board.clear())
         self._waited = 0.0
         spare = self._budget.spare_windows()
@@ -249,7 +252,7 @@ class Worker:
                 self._live.session.tree.add_odometry(*content)
             case 'points_info':
                 try:
-                    self._live.placement.add_info(content)
+                    self._live.session.placement.add_info(content)
                 except UnsupportedMessage as error:
                     self._health.report(Reason.UNREADABLE, f'points_info: {error}')
             case 'follow':
@@ -272,7 +275,8 @@ class Worker:
             return
         refined = out.in_fixed
         if refined is None:
-            refined = self._live.labels_passed_through(out.message)
+            assert self._live.adapter is not None  # it has read the message
+            refined = labels_passed_through(out.message, self._live.adapter, self._live.session)
         if refined is not None:
             fixed_frame = self._live.session.fixed_frame
             content = LabelMessage(refined, fixed_frame, self._live.config.digest)
@@ -355,7 +359,7 @@ class Worker:
     def _save_model(self) -> None:
         """Write what the drive has shown of its detector, and log where drives differ."""
         try:
-            differing = self._live.save_model()
+            differing = self._model.save(self._live.registrar.statistics())
         except OSError as error:
             self._logger.error(f'input_model: cannot be written: {error}')
             return
@@ -382,13 +386,13 @@ class Worker:
         self._publish(self._guarded(self._live.flush))
         for waiting in (item, *self._confirmed, *self._live.release()):
             if waiting is not None and not isinstance(waiting.content, Sweep):
-                self._publish(self._live.passed_through(waiting.message))
+                self._publish(self._live.pass_through(waiting.message))
         message = self._inbox.take()
         while message is not None:
             if message.topic == 'boxes':
-                self._publish(self._live.passed_through(message.content))
+                self._publish(self._live.pass_through(message.content))
             elif message.topic == 'passing':
-                self._publish(self._live.last(message.content))
+                self._publish(self._live.pass_through_as_final(message.content))
             message = self._inbox.take()
         self._save_model()
         self._publish_static()

@@ -2,10 +2,12 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.io.items import Item
-from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
+from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
+from boxreg_ros.io.session import Session
 from boxreg_ros.io.transforms import matrix
-from boxreg_ros.live.live_registrar import LiveRegistrar
 from boxreg_ros.live.outgoing import refined_to_frame
+from boxreg_ros.live.pipeline import MessagePipeline
+from boxreg_ros.live.transform_wait import TransformWait
 from boxreg_ros.structures import BoxArray, COASTED, KEPT, REFINED, RefinedBoxes
 from lidar_drives import LidarDrive
 from msg_adapters import adapter_for, pointcloud, vision
@@ -15,7 +17,7 @@ import pytest
 from ros_messages import DETECTIONS, Drive, MARKERS, SECOND, START, TRACKED
 
 
-class Live(LiveRegistrar):
+class Live(MessagePipeline):
     """A driver whose input is a `Drive`; `reports` are (reason, text, number)."""
 
     def __init__(
@@ -24,12 +26,14 @@ class Live(LiveRegistrar):
     ):  # fmt: skip
         self.reports = []
         config = Config(estimate='final').updated({'window': 5, 'lag': 2} | settings)
-        super().__init__(
-            config, fixed_frame, output_frame, timeout,
-            lambda *report: self.reports.append(report), convention, lidars,
-        )  # fmt: skip
+        session = Session(convention, config, fixed_frame, SensorPlacement(lidars), self.report)
+        wait = TransformWait(session, timeout, output_frame)
+        super().__init__(config, session, wait, self.report)
         self.adapter = adapter_for(DETECTIONS, convention)
         self.session.sensor_frame = 'lidar'
+
+    def report(self, *report):
+        self.reports.append(report)
 
     def feed(self, drive, now=0.0):
         """Process all messages of a drive, each when it is ready; return the output."""
@@ -215,13 +219,13 @@ def test_final_boxes_keep_the_input_order_with_unchanged_ones_between():
             item.header.frame_id = 'nowhere'
     live = Live(timeout=0.4)
     out = live.feed(drive)
-    (unread,) = live.passed_through('unread')
+    (unread,) = live.pass_through('unread')
     out += [unread, *live.flush()]
     for is_final in (False, True):
         messages = [item.message for item in out if item.is_final == is_final]
         assert messages.pop() == 'unread'
         assert [vision.from_msg(message).stamp_ns for message in messages] == drive.stamps
-    assert [item.message for item in live.passed_through('free')] == ['free', 'free']
+    assert [item.message for item in live.pass_through('free')] == ['free', 'free']
 
 
 def test_boxes_without_transform_are_published_unchanged_with_a_remedy():
@@ -382,10 +386,10 @@ def test_a_pause_of_playback_does_not_change_later_boxes():
 def test_held_boxes_are_published_after_silence():
     live = Live()
     out = live.feed(Drive(sweeps=6), now=10.0)
-    assert not live.is_silent(12.9)
-    assert live.is_silent(13.1)
+    assert not live.silence.has_no_boxes(12.9)
+    assert live.silence.has_no_boxes(13.1)
     out += live.flush()
-    assert not live.is_silent(99.0) and live.has_ceased(99.0)
+    assert not live.is_holding
     assert sum(item.is_final for item in out) == 6
     assert sum(item.is_final for item in live.feed(moved(Drive(sweeps=6), 1)) + live.flush()) == 6
 
@@ -498,7 +502,7 @@ def test_a_lidar_that_tf_does_not_know_holds_back_the_others_only_once():
         content = (
             vision.from_msg(message)
             if topic == '/boxes'
-            else live.placement.sweep_of(message, topic)
+            else live.session.placement.sweep_of(message, topic)
         )
         item = Item(round(now * 1e9), content, message=message)
         not_ready += bool(live.session.fixed_frame) and not live.wait.is_over(item, now + 0.5)
@@ -521,7 +525,7 @@ def test_a_concatenated_cloud_waits_for_its_info_while_there_are_infos():
             live.session.tree.add_transforms(message.transforms, topic == '/tf_static')
     infos = items_of(drive, '/points_info')
     clouds = [
-        Item(0, live.placement.sweep_of(message, '/points'), message=message)
+        Item(0, live.session.placement.sweep_of(message, '/points'), message=message)
         for message in items_of(drive, '/points')
     ]
 
@@ -529,11 +533,11 @@ def test_a_concatenated_cloud_waits_for_its_info_while_there_are_infos():
         return [live.wait.is_over(cloud, now) for cloud in clouds]
 
     assert are_ready() == [False, False, False]
-    live.placement.add_info(infos[1])
+    live.session.placement.add_info(infos[1])
     assert are_ready() == [False, True, False]
     assert are_ready(now=1.0) == [True, True, True]  # the timeout
     live.process(clouds[0])  # without its info: later ones do not wait
     assert live.reports[-1][0] == 'cloud_without_info'
     assert are_ready() == [True, True, True]
-    live.placement.add_info(infos[2])  # there are infos again
+    live.session.placement.add_info(infos[2])  # there are infos again
     assert are_ready() == [False, True, True]

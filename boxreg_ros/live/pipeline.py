@@ -1,0 +1,299 @@
+"""The way of a message through the node, without its topics and threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf
+from typing import Any
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.input_statistics import Drives
+from boxreg_ros.core.matching import Pair
+from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.io.items import Item
+from boxreg_ros.io.lidars import MergedSweep
+from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
+from boxreg_ros.io.transforms import boxes_to_frame, inverse
+from boxreg_ros.live.budget import TickBudget
+from boxreg_ros.live.following import Following
+from boxreg_ros.live.outgoing import Outgoing, OutgoingQueue
+from boxreg_ros.live.silence import Silence
+from boxreg_ros.live.static_points import StaticPoints
+from boxreg_ros.live.tickets import OutputFrame, passing, ticket_of, Tickets
+from boxreg_ros.live.transform_wait import TransformWait
+from boxreg_ros.reasons import Reason
+from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
+from msg_adapters import Adapter
+import numpy as np
+
+CONFIRMATION_TIME = 0.5
+"""A message waits this long for the one that confirms a time jump [s]: five sweeps at 10 Hz."""
+PASSED = 'passed'
+"""Reason of messages that pass through; they have no boxes that it could be counted for."""
+
+
+class MessagePipeline:
+    """
+    Take messages as they arrive, and return the messages to publish.
+
+        message --> confirm --> session --+-- cloud --> merged --+--> registrar --> messages
+                                          +-- boxes --> ticket --+
+
+    The registrar has the order of the boxes; what is published for them is in their ticket. Not
+    thread-safe.
+
+    Parameters
+    ----------
+    config : Config
+        Settings of the core.
+    session : Session
+        Brings messages into the fixed frame.
+    wait : TransformWait
+        Says how long a message waits for its transforms, and in which frame boxes are published.
+    report : callable
+        Called with reason, text and count for everything that is not refined here.
+    budget : TickBudget, optional
+        Limits the windows that are solved; default: all are.
+    static_patience : float, optional
+        How long clouds wait for their boxes [s]; default: no clouds without moving objects.
+    drives : Drives, optional
+        What other drives have shown of the detector.
+
+    Attributes
+    ----------
+    adapter : Adapter or None
+        Of the boxes; to be set before the first ones.
+    registrar, following, static_points, silence
+        The parts that the worker asks.
+
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        session: Session,
+        wait: TransformWait,
+        report: Callable[[Reason, str, int], None],
+        budget: TickBudget | None = None,
+        static_patience: float | None = None,
+        drives: Drives | None = None,
+    ) -> None:
+        self.adapter: Adapter | None = None
+        self.session = session
+        self.wait = wait
+        self._report = report
+        submit, windows = (None, None) if budget is None else (budget.submit, budget.windows)
+        self.registrar = BoxRegistrar(config, submit, windows, drives, prepare=self._note_latency)
+        self.following = Following(self.registrar, session, wait, report)
+        self.static_points: StaticPoints | None = None
+        if static_patience is not None:
+            self.static_points = StaticPoints(static_patience, self.registrar)
+        self.silence = Silence(self.registrar)
+        self._jumps = JumpConfirmation[Item]()
+        self._tickets = Tickets()
+        self._queue = OutgoingQueue(self.following, self.static_points)
+
+    @property
+    def config(self) -> Config:
+        """Return the settings of the core; see `BoxRegistrar` for those that may change."""
+        return self.registrar.config
+
+    @config.setter
+    def config(self, config: Config) -> None:
+        self.registrar.config = config
+        self.session.config = config
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """Return origin of the ids, latency of the boxes and followed objects, for reports."""
+        facts = {**self.session.facts, 'box latency': self.registrar.latency.text}
+        return facts | self.following.facts
+
+    @property
+    def is_holding(self) -> bool:
+        """Return whether messages wait for a cloud, further observations or confirmation."""
+        return self.registrar.num_held > 0 or self._jumps.held is not None
+
+    # ------------------------------------------------------------ one message
+
+    def confirm(self, item: Item) -> tuple[list[Item], list[Outgoing]]:
+        """
+        Return the messages to process next, in the order of stamps: none while this one is held.
+
+        Also return all that was held where time went back: tracks and transforms start anew.
+
+        """
+        if is_placeholder(item.content):
+            return [item], []
+        confirmed, has_jumped = self._jumps.add(item, item.content)
+        if not has_jumped:
+            return confirmed, []
+        stamp_ns = confirmed[0].content.stamp_ns
+        self._report(
+            Reason.TIME_JUMP,
+            f'expected stamps of one clock, got some that went back to {stamp_ns} ns; tracks '
+            f'start anew: unless a recording is played in a loop, let one clock set all stamps',
+            1,
+        )
+        ready = self.reset()
+        self.session.tree.rewind(stamp_ns)
+        return confirmed, ready
+
+    def release(self, now: float = inf) -> list[Item]:
+        """Return the message that no other has confirmed in time, if any: it is late."""
+        held = self._jumps.held
+        if held is None or now < held.received + CONFIRMATION_TIME:
+            return []
+        return self._jumps.release()
+
+    def process(self, item: Item) -> list[Outgoing]:
+        """Take a message to the registrar; return the messages that are ready to be published."""
+        if is_placeholder(item.content):
+            return self.pass_through(item.message)
+        self.following.start(item.received)
+        admitted = self.session.admit(item.content, item.received_ns)
+        if admitted.reason:
+            self._report_missing_transform(item, admitted.reason, admitted.detail)
+        if isinstance(item.content, Sweep):
+            return self._process_cloud(item, item.content, admitted)
+        return self._process_boxes(item, item.content, admitted)
+
+    def pass_through(self, message: Any) -> list[Outgoing]:
+        """Return an input message as early boxes and, once those before it are, as final."""
+        return [Outgoing(message, False), *self.pass_through_as_final(message)]
+
+    def pass_through_as_final(self, message: Any) -> list[Outgoing]:
+        """Return an input message as final boxes once those before it are."""
+        return self._messages(self.registrar.add_kept(passing(message), PASSED))
+
+    # ------------------------------------------------------------ messages that do not arrive
+
+    def lose(self, stamp_ns: int, lidar: str = '') -> list[Outgoing]:
+        """Release the boxes that wait for a cloud that was dropped, of one of several LiDARs."""
+        nothing = np.zeros((0, 3))
+        sweep = Sweep(stamp_ns, self.session.fixed_frame, nothing, is_dropped=True, topic=lidar)
+        if lidar:
+            return self._add_sweeps(self.session.merged(sweep))
+        return self._messages(self.registrar.add_sweep(sweep))
+
+    def lose_overdue(self, now: float, cloud_received: float) -> list[Outgoing]:
+        """Release boxes that wait for clouds if no clouds have arrived for long."""
+        overdue_ns = self.silence.overdue_ns(now, cloud_received)
+        if overdue_ns is None:
+            return []
+        return self._add_sweeps(self.session.unmerged()) + self.lose(overdue_ns)
+
+    # ------------------------------------------------------------ all that is held
+
+    def flush(self) -> list[Outgoing]:
+        """Return everything that is held; tracks continue if further boxes arrive."""
+        ready = self._add_sweeps(self.session.unmerged())
+        return ready + self._messages(self.registrar.flush())
+
+    def catch_up(self, limit: int) -> list[Outgoing]:
+        """Solve up to `limit` tracks that wait, for their final boxes."""
+        return self._messages(self.registrar.catch_up(limit))
+
+    def reset(self) -> list[Outgoing]:
+        """Forget everything but the transforms; return everything that is held."""
+        ready = self.flush()
+        self.registrar.reset()
+        self._restart()
+        return ready
+
+    def abandon(self, item: Item | None) -> list[Outgoing]:
+        """
+        Start again after an internal error while a message was being processed.
+
+        Return the messages made before the error, and all that are held, passed through.
+
+        """
+        ready, returned = self._queue.abandoned(self.registrar.abandon(Reason.FAILED))
+        self._restart()
+        if item is None or not isinstance(item.content, BoxArray):
+            return ready
+        if not any(message is item.message for message in returned):
+            ready += self.pass_through(item.message)
+        return ready
+
+    # ------------------------------------------------------------ steps
+
+    def _process_cloud(self, item: Item, cloud: Sweep, admitted: Admitted) -> list[Outgoing]:
+        """Add a cloud to the registrar, with those of the other LiDARs."""
+        if admitted.moved is None:
+            self.wait.give_up(cloud)
+            return []
+        assert isinstance(admitted.moved, Sweep)
+        return self._add_sweeps(self.session.merged(admitted.moved, item))
+
+    def _process_boxes(self, item: Item, given: BoxArray, admitted: Admitted) -> list[Outgoing]:
+        """Add boxes to the registrar, with their ticket; pass them through without transforms."""
+        placed = self._in_output_frame(item, given, admitted)
+        if placed is None:
+            return self.pass_through(item.message)
+        shown, frame = placed
+        assert isinstance(admitted.moved, BoxArray)
+        self.silence.boxes_received = item.received
+        for found in self.session.findings:
+            self._report(found.reason, found.text, 1)
+        boxes = self._tickets.issue(item, shown, admitted.moved, frame, self.config)
+        return self._messages(self.registrar.add_boxes(boxes))
+
+    def _in_output_frame(
+        self, item: Item, given: BoxArray, admitted: Admitted
+    ) -> tuple[BoxArray, OutputFrame] | None:
+        """Return boxes in the output frame, and that frame; None if it is not reached."""
+        T_fixed_item = admitted.T_fixed_item
+        if T_fixed_item is None:
+            return None
+        if not self.wait.changes_frame(given):
+            return given, OutputFrame(inverse(T_fixed_item), None)
+        output_frame = self.wait.output_frame
+        try:
+            T_output_fixed = self.session.tree.lookup(
+                output_frame, self.session.fixed_frame, given.stamp_ns
+            )
+        except TransformUnavailable as error:
+            self._report_missing_transform(item, Reason.NO_TRANSFORM, str(error))
+            return None
+        T_output_item = T_output_fixed @ T_fixed_item
+        shown = boxes_to_frame(given, T_output_item, output_frame)
+        return shown, OutputFrame(T_output_fixed, T_output_item)
+
+    def _add_sweeps(self, complete: list[MergedSweep]) -> list[Outgoing]:
+        """Add sweeps to the registrar; return the messages that are ready to be published."""
+        ready: list[Outgoing] = []
+        for sweep, parts in complete:
+            if self.static_points is not None:
+                clouds = [part for part in parts if part is not None]
+                self.static_points.add_cloud(sweep, clouds)
+            ready += self._messages(self.registrar.add_sweep(sweep))
+        return ready
+
+    def _messages(self, results: list[RefinedBoxes]) -> list[Outgoing]:
+        """Return the messages to publish for results of the registrar."""
+        return self._queue.messages(results, self.adapter)
+
+    def _restart(self) -> None:
+        """Forget all but the transforms."""
+        if self.static_points is not None:
+            self.static_points.reset()
+        self.session.restart()
+        self._tickets.restart()
+        self.following.restart()
+
+    def _report_missing_transform(self, item: Item, reason: Reason, detail: str) -> None:
+        """Report a sweep, or the boxes of an array, that no transform is known for."""
+        content = item.content
+        count = 1 if isinstance(content, Sweep) else len(content.track_ids)
+        if count:
+            self._report(reason, detail, count)
+
+    def _note_latency(self, pair: Pair) -> BoxArray:
+        """Report boxes that were late, and return them."""
+        latency = self.registrar.latency
+        ticket_of(pair.boxes).is_late = latency.seconds != 0
+        if latency.warning:
+            self._report(Reason.LATENCY, latency.warning, 1)
+        return pair.boxes
