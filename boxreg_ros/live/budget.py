@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Collection
 from functools import partial
 from math import inf
+from statistics import median
 import time
 
 from boxreg_ros.config import Config
@@ -14,6 +15,8 @@ from boxreg_ros.core.registrar import GetEstimates
 from boxreg_ros.core.registration import register
 from boxreg_ros.core.window import Estimate, Window
 
+Solve = Callable[[list[Window], Config, InputModel], list[Estimate | None]]
+"""Solves windows, see `register`."""
 PART_OF_PERIOD = 0.8
 """Part of the period of the boxes that is the default deadline; chosen: the rest is for decoding
 clouds, and for final boxes and markers, which are published after the early boxes."""
@@ -26,13 +29,12 @@ BATCH_OVERHEAD = 25
 `measure speed`: 10 ms beside 0.4 ms a window."""
 RECENT = 10
 """Last batches and box arrays that times are estimated from; chosen: a second at 10 Hz."""
-OVERRUNS = 300
-"""Ticks whose second largest overrun is left as a reserve; derived: the next one exceeds it with a
-probability of 2 / 301, so that the deadline holds for 99 of 100 box arrays, and one interruption
-of the process in half a minute costs no windows."""
+MEMORY = 1.0
+"""Overruns of this time are a reserve [s]; chosen: a machine that has become free is used within
+a second."""
 LARGEST_RESERVE = 0.5
-"""Part of the deadline that the reserve may take; chosen: a longer interruption of the process
-would leave no time for solving in the `OVERRUNS` ticks after it."""
+"""Part of the deadline that the reserve may take; chosen: the rest is for solving. A longer
+overrun is an interruption of the process, and would be late with any reserve."""
 
 
 class TickBudget:
@@ -41,27 +43,35 @@ class TickBudget:
 
     The registrar reads no clock; this object does for it. The time for windows is the deadline
     less the time used by then, for decoding and cropping, less that for publishing, less a
-    reserve for overruns. The times of a window and of publishing are the second longest of
-    `RECENT` ones, the reserve is the second largest overrun of `OVERRUNS` ticks: a single
-    interruption of the process is ignored.
+    reserve for overruns. The times of a window and of publishing are the medians of `RECENT`
+    ones. The reserve is the second largest overrun of the last `MEMORY` seconds, without those
+    that no reserve would hold. So interruptions of the process cost the boxes of their own ticks,
+    and none after them.
 
     Final boxes are given up last. In a tick that is late with any plan, and after the early
     boxes of any other, the windows that they need are solved, as long as these take no longer
     than what a batch costs in any case (`BATCH_OVERHEAD`): else clouds would be dropped.
 
     `deadline`, which may change, is the maximum time from complete data to published early boxes
-    [s]; negative: `PART_OF_PERIOD` of the measured period of the boxes.
+    [s]; negative: `PART_OF_PERIOD` of the measured period of the boxes. `solve` does the same as
+    `register`, and `clock` is monotonic [s].
 
     """
 
-    def __init__(self, deadline: float, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        deadline: float,
+        clock: Callable[[], float] = time.monotonic,
+        solve: Solve = register,
+    ) -> None:
         self.deadline = deadline
         self._clock = clock
+        self._solve = solve
         self._since = clock()
         self._solved_at = self._since
         self._planned_end = inf
         self._publishing_times = deque[float](maxlen=RECENT)  # [s]
-        self._overruns = deque[float](maxlen=OVERRUNS)  # of the planned end [s]
+        self._overruns = deque[tuple[float, float]]()  # when, and by how much [s]
         self._times = deque[float](maxlen=RECENT)  # per window [s]
         self.owed = 0  # windows to solve once the early boxes are published
         self._arrivals = deque[float](maxlen=RECENT)
@@ -84,7 +94,7 @@ class TickBudget:
         if self._solved_at:
             now = self._clock()
             self._publishing_times.append(now - self._solved_at)
-            self._overruns.append(now - self._planned_end)
+            self._overruns.append((now, now - self._planned_end))
             self._solved_at = 0.0
 
     def windows(self, needed: int) -> int:
@@ -97,12 +107,9 @@ class TickBudget:
         self.owed = min(needed, BATCH_OVERHEAD)
         number = 0
         if self._times:
-            reserve = max(
-                0.0, min(LARGEST_RESERVE * self.seconds, _second_longest(self._overruns))
-            )
-            planned_end = self._since + self.seconds - reserve
-            time_left = planned_end - _second_longest(self._publishing_times) - self._clock()
-            number = int(time_left / _second_longest(self._times)) - BATCH_OVERHEAD
+            planned_end = self._since + self.seconds - self._reserve
+            time_left = planned_end - _median(self._publishing_times) - self._clock()
+            number = int(time_left / _median(self._times)) - BATCH_OVERHEAD
         if number > 0:
             self._planned_end = planned_end
             limit = number
@@ -116,16 +123,26 @@ class TickBudget:
         if not self._times:
             return 0
         spare = (1.0 - PART_OF_PERIOD) * self._period
-        return int(spare / _second_longest(self._times)) - BATCH_OVERHEAD
+        return int(spare / _median(self._times)) - BATCH_OVERHEAD
 
     def submit(self, windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
-        """Return a function that calls `register` with these arguments, and times it."""
+        """Return a function that calls `solve` with these arguments, and times it."""
         return partial(self._timed, windows, config, model)
 
     @property
     def seconds(self) -> float:
         """Return the present deadline [s]."""
         return self.deadline if self.deadline >= 0 else PART_OF_PERIOD * self._period
+
+    @property
+    def _reserve(self) -> float:
+        """Return the second largest of the recent overruns that a reserve can hold [s]."""
+        oldest = self._clock() - MEMORY
+        while self._overruns and self._overruns[0][0] < oldest:
+            self._overruns.popleft()
+        most = LARGEST_RESERVE * self.seconds
+        held = sorted(overrun for _, overrun in self._overruns if 0 < overrun <= most)
+        return held[-2] if len(held) > 1 else 0.0
 
     @property
     def _period(self) -> float:
@@ -138,7 +155,7 @@ class TickBudget:
         self, windows: list[Window], config: Config, model: InputModel
     ) -> list[Estimate | None]:
         begin = self._clock()
-        estimates = register(windows, config, model)
+        estimates = self._solve(windows, config, model)
         self._solved_at = self._clock()
         num_solved = sum(estimate is not None for estimate in estimates)
         if num_solved:
@@ -146,6 +163,6 @@ class TickBudget:
         return estimates
 
 
-def _second_longest(times: Collection[float]) -> float:
-    """Return the second longest of some times, the longest of one, 0 of none."""
-    return sorted(times)[-2:][0] if times else 0.0
+def _median(times: Collection[float]) -> float:
+    """Return the median of some times, 0 of none."""
+    return median(times) if times else 0.0
