@@ -65,7 +65,8 @@ class Reason(StrEnum):
     POINTS_QUEUE_FULL = (
         'points_queue_full',
         'cloud',
-        'dropped because the solver is slower than the data',
+        'dropped because the solver is slower than the data: it waited longer than `backlog`, or '
+        'longer than `deadline` while the waits grew',
         REDUCE_LOAD,
     )
     BOXES_QUEUE_FULL = (
@@ -269,8 +270,8 @@ class Reason(StrEnum):
         'budget',
         'box',
         'not solved before `deadline`: other tracks came first; its track is solved at a later '
-        'stamp, which refines the final box too if that is within `lag`. More than 1 % of the '
-        'final boxes are a WARN',
+        'stamp, which refines the final box too if that is within `lag`. 1 % of the final boxes '
+        'are a WARN; early boxes have the counter `early_budget`, and 5 % of them are one',
     )
     COAST_UNCONFIRMED = (
         'coast_unconfirmed',

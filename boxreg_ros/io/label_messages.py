@@ -1,5 +1,5 @@
 """
-Messages with all that label files hold of the final boxes of the node: JSON in `LABELS_TYPE`.
+Messages with all that label files hold of the boxes of the node: JSON in `LABELS_TYPE`.
 
 No message type of boxes has status, reason and number of points, and some have neither ids nor
 covariances, or extents of 32 bits. A number is written such that it is read back to the last bit,
@@ -17,6 +17,8 @@ import numpy as np
 import orjson
 
 LABELS_TOPIC = 'refined_labels'
+EARLY_TOPIC = 'refined_boxes_status'
+"""The same of the early boxes: the status of each."""
 LABELS_TYPE = 'std_msgs/msg/String'
 NAMES_OF_BOX = ('track_ids', 'class_names', 'status', 'reasons')
 SHAPES = {

@@ -89,13 +89,20 @@ class TickBudget:
         self._planned_end = inf
         self.owed = 0
 
-    def end(self) -> None:
-        """End a tick, unless it has ended: its early boxes are published."""
+    def end(self) -> float | None:
+        """
+        End a tick, whose early boxes are published: return its time from complete data [s].
+
+        None if it has ended, or if nothing was solved in it.
+
+        """
         if self._solved_at:
             now = self._clock()
             self._publishing_times.append(now - self._solved_at)
             self._overruns.append((now, now - self._planned_end))
             self._solved_at = 0.0
+            return now - self._since
+        return None
 
     def windows(self, needed: int) -> int:
         """

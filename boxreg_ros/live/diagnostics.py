@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from math import inf
+from statistics import median
 from threading import Lock
 import time
 import traceback
 
 from boxreg_ros.reasons import FAULTS, Reason, REDUCE_LOAD
-from boxreg_ros.structures import COASTED, REFINED
+from boxreg_ros.structures import COASTED, REFINED, RefinedBoxes
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
@@ -23,6 +25,12 @@ RATES = ('points_received', 'boxes_received', 'early_published', 'final_publishe
 """Counters that are also reported as a rate."""
 LEAST_SHARE = 0.01
 """Part of the final boxes without time that is worth a warning; chosen: fewer are a hiccup."""
+LEAST_EARLY_SHARE = 0.05
+"""The same of the early boxes; chosen: one of 20 is an interruption of the process."""
+EARLY_REFINED = 'early_refined'
+EARLY_BUDGET = 'early_budget'
+EARLY_KEPT = 'early_kept'
+"""Counters of early boxes, those of the core are of final ones."""
 LATENCY_QUANTILES = (('median', 0.5), ('p99', 0.99), ('most', 1.0))
 
 
@@ -43,6 +51,7 @@ class Health:
         self._logged: Counter[str] = Counter()
         self._logged_at = {WAITING: time.monotonic()}
         self._latencies: list[float] = []
+        self._ticks: list[float] = []
         self._static: list[tuple[float, float]] = []
         self._since = time.monotonic()
 
@@ -56,10 +65,31 @@ class Health:
         with self._lock:
             self._core_counts = Counter(counts)
 
-    def add_latency(self, seconds: float) -> None:
-        """Record the time from the arrival of boxes to the publication of the early estimate."""
+    def add_latency(self, seconds: float, took: float | None = None) -> None:
+        """
+        Record times until the early estimate of boxes is published [s].
+
+        Parameters
+        ----------
+        seconds : float
+            From the arrival of the boxes.
+        took : float or None
+            From the arrival of all that they need; None where nothing was solved.
+
+        """
         with self._lock:
             self._latencies.append(seconds)
+            if took is not None:
+                self._ticks.append(took)
+
+    def add_early(self, refined: RefinedBoxes) -> None:
+        """Count early boxes: refined, without time to solve them, and kept for other reasons."""
+        number = sum(status in (REFINED, COASTED) for status in refined.status)
+        late = sum(reason == Reason.BUDGET for reason in refined.reasons)
+        with self._lock:
+            self._counts[EARLY_REFINED] += number
+            self._counts[EARLY_BUDGET] += late
+            self._counts[EARLY_KEPT] += len(refined.status) - number - late
 
     def add_static(self, seconds: float, cpu: float) -> None:
         """Record latency and CPU time of a cloud without moving objects [s]."""
@@ -104,8 +134,15 @@ class Health:
         if not (counts[REFINED] or counts[COASTED]) and self.is_due(WAITING):
             self._logger.info(f'waiting for {_awaited(counts, fixed_frame)}; no box refined yet')
 
-    def status(self, name: str, facts: Mapping[str, object]) -> DiagnosticStatus:
-        """Return the state since the last call; `facts` come between latencies and counters."""
+    def status(
+        self, name: str, facts: Mapping[str, object], deadline: float = inf
+    ) -> DiagnosticStatus:
+        """
+        Return the state since the last call; `facts` come between latencies and counters.
+
+        Early boxes that take longer than `deadline` [s] are a warning.
+
+        """
         now = time.monotonic()
         with self._lock:
             counts = self._counts + self._core_counts
@@ -113,6 +150,8 @@ class Health:
             self._reported = counts
             latencies = sorted(self._latencies)
             self._latencies = []
+            ticks = sorted(self._ticks)
+            self._ticks = []
             static = self._static
             self._static = []
             period = max(now - self._since, 1e-3)
@@ -125,10 +164,10 @@ class Health:
         values |= _latency_values('static_points CPU', sorted(cpu for _, cpu in static))
         values |= facts
         values |= dict(sorted(counts.items()))
-        late = _budget_text(recent)
+        late = _late_text(recent, ticks, deadline)
         if late and self.is_due(Reason.BUDGET):
             self._logger.warning(late)
-        return diagnosis(name, *_level_and_message(recent), values)
+        return diagnosis(name, *_level_and_message(recent, late), values)
 
     def _log(self, reason: str, text: str) -> None:
         if reason in FAULTS:
@@ -169,15 +208,14 @@ def _latency_values(what: str, latencies: list[float]) -> dict[str, str]:
     return values
 
 
-def _level_and_message(recent: Counter[str]) -> tuple[bytes, str]:
-    """Return level and message of the counters of one status period."""
+def _level_and_message(recent: Counter[str], late: str) -> tuple[bytes, str]:
+    """Return level and message of the counters of one status period, which `late` is part of."""
     worst = next((one for one in Reason if recent[one] and one.remedy), None)
     if worst is not None:
         return _level_and_message_of(worst, recent)
     missing = [name for name in ('points', 'boxes') if not recent[f'{name}_received']]
     if missing:
         return DiagnosticStatus.WARN, f'nothing received on {" and ".join(missing)}'
-    late = _budget_text(recent)
     if late:
         return DiagnosticStatus.WARN, late
     if recent['kept'] and not (recent[REFINED] or recent[COASTED]):
@@ -188,12 +226,27 @@ def _level_and_message(recent: Counter[str]) -> tuple[bytes, str]:
     return DiagnosticStatus.OK, 'refining'
 
 
-def _budget_text(recent: Counter[str]) -> str:
-    """Return the warning of final boxes without time, with their share; '' for few or none."""
-    share = recent[Reason.BUDGET] / max(1, recent['refined'] + recent['kept'])
-    if share < LEAST_SHARE:
-        return ''
-    return f'{Reason.BUDGET}: no time to refine {share:.0%} of the final boxes; {REDUCE_LOAD}'
+def _late_text(recent: Counter[str], ticks: list[float], deadline: float) -> str:
+    """Return the warning of boxes without time, and of late ones; '' for few or none."""
+    shares = {
+        'final': recent[Reason.BUDGET] / max(1, recent['refined'] + recent['kept']),
+        'early': recent[EARLY_BUDGET]
+        / max(1, recent[EARLY_REFINED] + recent[EARLY_BUDGET] + recent[EARLY_KEPT]),
+    }
+    least = {'final': LEAST_SHARE, 'early': LEAST_EARLY_SHARE}
+    found = [
+        f'{shares[kind]:.0%} of the {kind} boxes' for kind in least if shares[kind] >= least[kind]
+    ]
+    texts = []
+    if found:
+        texts.append(f'no time to refine {" and ".join(found)}')
+    took = median(ticks) if ticks else 0.0
+    if took > deadline:
+        texts.append(
+            f'early boxes are published {1e3 * took:.0f} ms after the last of their data, later '
+            f'than the deadline of {1e3 * deadline:.0f} ms'
+        )
+    return f'{Reason.BUDGET}: {"; ".join(texts)}; {REDUCE_LOAD}' if texts else ''
 
 
 def _level_and_message_of(worst: Reason, recent: Counter[str]) -> tuple[bytes, str]:

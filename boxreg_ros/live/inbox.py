@@ -12,6 +12,9 @@ BOXES_PER_CLOUD = 20
 solver time and are published in order with the others, so many more of them than of clouds may
 wait."""
 
+RECOVERY = 10
+"""Clouds in time after which an overload has ended; chosen: a second at 10 Hz."""
+
 
 class Message(NamedTuple):
     """A received message."""
@@ -79,6 +82,43 @@ class Inbox:
                 return None
             return min(filled, key=lambda queue: queue[0].number).popleft()
 
+    def has_newer(self, cloud: Message) -> bool:
+        """Return whether a later cloud of the same LiDAR waits."""
+        with self._lock:
+            return any(other.lidar == cloud.lidar for other in self._waiting['points'])
+
     def sizes(self) -> dict[str, int]:
         """Return the number of waiting messages per topic."""
         return {f'{topic}_waiting': len(queue) for topic, queue in self._waiting.items()}
+
+
+class CloudPatience:
+    """
+    Decide which clouds are dropped, because the solver is slower than the data.
+
+    A cloud may wait `backlog` [s]. Where the waits beyond the deadline became longer twice in a
+    row, the node does not catch up, and would publish all boxes late by the backlog: from then on
+    each cloud that has waited longer than the deadline gives way to a newer one, until none had
+    to for `RECOVERY` clouds. After a single delay the waits become shorter.
+
+    """
+
+    def __init__(self, backlog: float) -> None:
+        self.backlog = backlog
+        self._last_wait = 0.0
+        self._num_longer = 0  # in a row
+        self._until_recovery = 0
+
+    def is_overdue(self, waited: float, deadline: float, has_newer: bool) -> bool:
+        """Return whether to drop a cloud that has waited for a time; both times in [s]."""
+        if waited > self.backlog:
+            return True
+        is_late = waited > deadline and has_newer
+        is_longer = is_late and waited >= self._last_wait
+        self._num_longer = self._num_longer + 1 if is_longer else 0
+        self._last_wait = waited
+        if is_late and (self._until_recovery or self._num_longer > 1):
+            self._until_recovery = RECOVERY
+            return True
+        self._until_recovery = max(0, self._until_recovery - 1)
+        return False

@@ -11,7 +11,7 @@ from typing import Any
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.compilation import announced_compilation
-from boxreg_ros.io.label_messages import LABELS_TOPIC, LABELS_TYPE
+from boxreg_ros.io.label_messages import EARLY_TOPIC, LABELS_TOPIC, LABELS_TYPE
 from boxreg_ros.io.lidars import Lidars, SensorPlacement
 from boxreg_ros.io.session import Session
 from boxreg_ros.io.warm_up import warm_up, warm_up_followed, warm_up_labels
@@ -238,6 +238,7 @@ class BoxregNode(Node):
         early = self._topics.publish(type_name, 'refined_boxes', at_end)
         final = self._topics.publish(type_name, 'refined_boxes_final', at_end)
         self.worker.labels = self._topics.publish(LABELS_TYPE, LABELS_TOPIC, at_end)
+        self.worker.early_status = self._topics.publish(LABELS_TYPE, EARLY_TOPIC, at_end)
         self.worker.open_boxes(serialized or adapter, early, final)
         qos = QoSProfile(depth=2 * capacity, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._topics.subscribe(
@@ -329,7 +330,7 @@ class BoxregNode(Node):
             **self.worker.facts(),
             **self._inbox.sizes(),
         }
-        registration = self._health.status(f'{name}: registration', facts)
+        registration = self._health.status(f'{name}: registration', facts, self._budget.seconds)
         message = DiagnosticArray(status=[registration, topics])
         message.header.stamp = now.to_msg()
         self._diagnostics.publish(message)

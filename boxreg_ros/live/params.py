@@ -20,7 +20,7 @@ from rclpy.parameter import Parameter
 DYNAMIC = (
     *('sampling.', 'solver.', 'paper.', 'vehicle.', 'cyclist.', 'pedestrian.'),
     *('max_gap', 'coast', 'min_observations', 'output_frame', 'transform_timeout', 'deadline'),
-    'config_file',
+    *('backlog', 'config_file'),
 )
 """Prefixes of the parameters that may change while the node runs."""
 READ_ONLY = 'read-only: windows, threads or subscriptions are built from it at start-up'
@@ -103,7 +103,8 @@ class NodeOptions:
     backlog: float = setting(
         0.5,
         'maximum wait of a cloud for those before it, after which it is dropped; of a box array '
-        'ten times that, before it passes through unrefined',
+        'ten times that, before it passes through unrefined. While waits grow beyond deadline, '
+        'older clouds give way to the newest',
         's',
         0.0,
         3600.0,

@@ -17,7 +17,7 @@ from boxreg_ros.io.markers import MarkerBoard
 from boxreg_ros.io.session import is_placeholder
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
-from boxreg_ros.live.inbox import Inbox, Message
+from boxreg_ros.live.inbox import CloudPatience, Inbox, Message
 from boxreg_ros.live.model_file import ModelFile
 from boxreg_ros.live.outgoing import labels_passed_through, Outgoing
 from boxreg_ros.live.pipeline import MessagePipeline
@@ -80,7 +80,7 @@ class Worker:
         self._health = health
         self._logger = logger
         self._budget = budget
-        self._backlog = backlog
+        self._patience = CloudPatience(backlog)
         self._complete_at = 0.0  # when a message got its transforms, and how long it had waited
         self._waited = 0.0
         self._fully_collected_at = time.monotonic()
@@ -91,6 +91,7 @@ class Worker:
         self._early: Publisher | None = None
         self._final: Publisher | None = None
         self.labels: Publisher | None = None  # of all that label files hold of final boxes
+        self.early_status: Publisher | None = None  # of the same of early boxes
         self._stopping = Event()
         self._confirmed: deque[Item] = deque()
         self._logged_layouts: set[str] = set()
@@ -174,12 +175,13 @@ class Worker:
 
     def _is_overdue(self, message: Message) -> bool:
         """Return whether a message has waited too long for the solver."""
-        patience = self._backlog
-        if message.topic == 'boxes':
-            patience *= BOXES_PATIENCE
         # What arrived while a transform was waited for may take as long again to be solved.
         since = max(message.received_ns / 1e9, self._complete_at + self._waited)
-        return time.monotonic() > since + patience
+        waited = time.monotonic() - since
+        if message.topic == 'boxes':
+            return waited > BOXES_PATIENCE * self._patience.backlog
+        deadline = self._budget.seconds
+        return self._patience.is_overdue(waited, deadline, self._inbox.has_newer(message))
 
     def _decoded(self, message: Message) -> Item | None:
         """Return a message decoded; boxes that cannot be decoded pass through."""
@@ -266,12 +268,14 @@ class Worker:
                 self._live.wait.output_frame = options.output_frame.lstrip('/')
                 self._live.wait.timeout = options.transform_timeout
                 self._budget.deadline = options.deadline
+                self._patience.backlog = options.backlog
             case _:
                 raise ValueError(f'kind: expected that of an event, got {kind!r}')
 
     def _publish_labels(self, out: Outgoing) -> None:
-        """Publish all that label files hold of final boxes, while somebody subscribes."""
-        if self.labels is None or not self.labels.get_subscription_count():
+        """Publish status and all else that label files hold, while somebody subscribes."""
+        publisher = self.labels if out.is_final else self.early_status
+        if publisher is None or not publisher.get_subscription_count():
             return
         refined = out.in_fixed
         if refined is None:
@@ -280,7 +284,7 @@ class Worker:
         if refined is not None:
             fixed_frame = self._live.session.fixed_frame
             content = LabelMessage(refined, fixed_frame, self._live.config.digest)
-            self.labels.publish(String(data=to_text(content)))
+            publisher.publish(String(data=to_text(content)))
 
     def _follow(self, message: Any) -> None:
         assert self._live.adapter is not None  # set before boxes are subscribed to
@@ -340,12 +344,16 @@ class Worker:
             publisher.publish(out.message)
             self._health.count('final_published' if out.is_final else 'early_published')
             if out.is_final:
-                self._publish_labels(out)
-            if not out.is_final and out.received is not None:
-                self._budget.end()
-                self._health.add_latency(time.monotonic() - out.received)
-            if not out.is_final and out.given is not None:
+                continue
+            if out.received is not None:
+                took = self._budget.end()
+                self._health.add_latency(time.monotonic() - out.received, took)
+            if out.given is not None:
                 self.tracks = len(set(out.given.track_ids) - {''})
+            if out.refined is not None:
+                self._health.add_early(out.refined)
+        for out in ready:
+            self._publish_labels(out)
         if not self._markers.get_subscription_count():
             return
         for out in ready:  # after all boxes: making markers takes longer than publishing boxes

@@ -1,7 +1,10 @@
 """Counters, levels and log entries of the node."""
 
 from boxreg_ros.live.diagnostics import Health
+from boxreg_ros.structures import BoxArray, RefinedBoxes
 from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
+import pytest
 
 
 class Log:
@@ -79,6 +82,46 @@ def test_the_share_of_final_boxes_without_time_is_a_warning():
         health.count(name)
     health.set_core_counts({'budget': 4, 'kept': 5, 'refined': 200})  # one of 200: a hiccup
     assert health.status('node', {}).level == DiagnosticStatus.OK
+
+
+def early(refined, late, kept):
+    """Return early boxes: numbers refined, without time, and kept for another reason."""
+    number = refined + late + kept
+    boxes = BoxArray(0, '', ('1',) * number, ('',) * number, np.ones(number), np.ones((number, 9)))
+    return RefinedBoxes(
+        boxes, ('refined',) * refined + ('kept',) * (late + kept),
+        ('',) * refined + ('budget',) * late + ('no_points',) * kept,
+        np.zeros(number, int), np.zeros((number, 6, 6)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('late', 'took', 'expected'),
+    [
+        (4, 0.07, ''),
+        (5, 0.07, 'budget: no time to refine 5% of the early boxes'),
+        (0, 0.3, 'budget: early boxes are published 300 ms after the last of their data, later'),
+    ],
+)
+def test_early_boxes_without_time_and_late_ones_are_a_warning(late, took, expected):
+    log = Log()
+    health = Health(log)
+    for name in ('points_received', 'boxes_received'):
+        health.count(name)
+    health.set_core_counts({'refined': 100})
+    health.add_early(early(90 - late, late, 10))
+    for one in (took, took, 5.0):  # a single interruption
+        health.add_latency(0.2, one)
+    status = health.status('node', {}, deadline=0.08)
+    assert status.level == (DiagnosticStatus.WARN if expected else DiagnosticStatus.OK)
+    assert status.message.startswith(expected or 'refining')
+    assert [text for _, text in log.entries] == ([status.message] if expected else [])
+    values = {item.key: item.value for item in status.values}
+    names = 'early_refined', 'early_budget', 'early_kept'
+    assert [values.get(name, '0') for name in names] == [str(90 - late), str(late), '10']
+    for name in ('points_received', 'boxes_received'):
+        health.count(name)
+    assert health.status('node', {}, deadline=0.08).level == DiagnosticStatus.OK
 
 
 def test_quaternions_of_zeros_are_named():

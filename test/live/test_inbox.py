@@ -1,6 +1,7 @@
-"""The queues between the threads of the node: their capacity and the order of arrival."""
+"""The queues between the threads of the node: capacity, order, and clouds that give way."""
 
-from boxreg_ros.live.inbox import BOXES_PER_CLOUD, Inbox
+from boxreg_ros.live.inbox import BOXES_PER_CLOUD, CloudPatience, Inbox
+import pytest
 
 
 def test_the_oldest_message_is_dropped_beyond_the_capacity_of_its_kind():
@@ -17,3 +18,50 @@ def test_the_oldest_message_is_dropped_beyond_the_capacity_of_its_kind():
     clouds = [('points', k) for k in range(1, 7)]
     arrays = [('passing', 0)] + [('boxes', k) for k in range(1, 2 * BOXES_PER_CLOUD + 1)]
     assert taken == clouds + arrays
+
+
+def test_a_newer_cloud_is_one_of_the_same_lidar():
+    inbox = Inbox(2, lidars=2)
+    inbox.put('points', 0, 'front')
+    inbox.put('points', 1, 'rear')
+    inbox.put('boxes', 2)
+    front = inbox.take()
+    assert not inbox.has_newer(front)
+    inbox.put('points', 3, 'front')
+    assert inbox.has_newer(front)
+
+
+def run_queue(backlog, took):
+    """Return for each cloud of 10 Hz its wait, or None if dropped; each takes a time [s]."""
+    patience = CloudPatience(backlog)
+    now = 0.0
+    waits = []
+    for number, duration in enumerate(took):
+        arrived = 0.1 * number
+        now = max(now, arrived)
+        has_newer = now >= arrived + 0.1
+        if patience.is_overdue(now - arrived, 0.08, has_newer):
+            waits.append(None)
+        else:
+            waits.append(round(now - arrived, 3))
+            now += duration
+    return waits
+
+
+@pytest.mark.parametrize(('took', 'share'), [(0.15, 0.65), (0.25, 0.38), (0.4, 0.24)])
+def test_under_lasting_overload_the_newest_cloud_goes_first(took, share):
+    waits = run_queue(0.5, [took] * 100)
+    kept = [wait for wait in waits[10:] if wait is not None]
+    assert max(kept) <= 0.1
+    assert len(kept) / 90 == pytest.approx(share, abs=0.05)
+
+
+def test_after_one_delay_the_node_catches_up_without_drops():
+    waits = run_queue(0.5, [0.03, 0.03, 0.35, *[0.03] * 10])
+    assert waits[2:8] == pytest.approx([0.0, 0.25, 0.18, 0.11, 0.04, 0.0])
+
+
+def test_clouds_beyond_the_backlog_are_dropped():
+    assert run_queue(0.2, [0.03, 0.5, 0.03, 0.03, 0.03, 0.03]) == [
+        *(0.0, 0.0, None, None), *(pytest.approx(0.2), pytest.approx(0.13)),
+    ]  # fmt: skip
