@@ -141,6 +141,13 @@ class Reason(StrEnum):
         'nothing, if a recording is played in a loop; otherwise let one clock set all stamps of '
         'a topic',
     )
+    STAMP_AHEAD = (
+        'stamp_ahead',
+        'message',
+        'its stamp is in the future of those before and after it; a cloud, transform or odometry '
+        'is not used, boxes are returned unchanged',
+        'correct the clock, or the driver, that sets the stamps of the topic that the log names',
+    )
     REJECTED = (
         'rejected',
         'box',

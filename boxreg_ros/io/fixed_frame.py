@@ -19,7 +19,8 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.items import Item, ItemSource, not_measured, Stage, Wanted
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MISSING, MergedSweep
-from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
+from boxreg_ros.io.session import Admitted, is_placeholder, Session
+from boxreg_ros.io.time_jumps import Confirmed, JumpConfirmation
 from boxreg_ros.io.transforms import inverse, sweep_to_frame
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, Sweep
@@ -36,6 +37,8 @@ class MovedItem(NamedTuple):
     """Boxes with their ids; None where no transform is known."""
     restarts: bool
     """Whether time went back before it."""
+    reason: str = ''
+    """Why `moved` is None, if not for want of a transform."""
 
     @property
     def T_fixed_item(self) -> Floats | None:
@@ -68,7 +71,7 @@ class FixedFrameItems:
     It is the one that `source` chooses unless `fixed_frame` names another. Of `config`, `max_gap`
     and `merge_span` are used; `convention` also says whether ids are assigned; `stage` measures
     ``read``, ``decode`` and ``transform``. `counts` has sweeps, box arrays, time jumps, clouds
-    without a transform or whose LiDARs are not all known, and what has no stamp;
+    without a transform or whose LiDARs are not all known, and what has no stamp or one ahead;
     `missing_transforms` both clouds and box arrays. `first_missing_transform` and `first_unplaced`
     are the errors of the first ones.
 
@@ -100,6 +103,7 @@ class FixedFrameItems:
         self.missing_transforms = 0
         self.first_missing_transform = ''
         self.first_unplaced = ''
+        self.first_ahead = ''
 
     def read(
         self, *, with_clouds: bool = True, with_intensities: bool = False
@@ -107,16 +111,19 @@ class FixedFrameItems:
         """Yield clouds and boxes in the order they were received; see `Recording.items`."""
         wanted = Wanted(with_clouds, with_intensities, self._stage)
         for item in self._source.items(self.tree, wanted):
-            confirmed, restarts = [item], False
+            confirmed = Confirmed([item])
             if not is_placeholder(item.content):
-                confirmed, restarts = self._jumps.add(item, item.content)
-            if restarts:
+                confirmed = self._jumps.add(item, item.content, item.received_ns)
+            for ahead in confirmed.ahead:
+                self._count_ahead(ahead)
+                yield self._item((ahead,), None)._replace(reason=Reason.STAMP_AHEAD)
+            if confirmed.has_jumped:
                 yield from map(self._merged, self.session.unmerged())
                 # The tree, which is ahead of the items, has detected the jump itself.
                 self.session.restart()
                 self.counts[Reason.TIME_JUMP] += 1
                 self._restarts = True
-            for ready in confirmed:
+            for ready in confirmed.items:
                 yield from self._moved(ready)
         for late in self._jumps.release():
             yield from self._moved(late)
@@ -165,9 +172,28 @@ class FixedFrameItems:
                     f'LiDAR {topic}: {counts[CLOUD_LATE]} clouds late, '
                     f'{counts[CLOUD_MISSING]} missing'
                 )
+        if self.ahead:
+            parts.append(self.ahead)
         if self.first_unplaced:
             parts.append(f'the LiDARs of some clouds are not known, first: {self.first_unplaced}')
         return '; '.join(parts)
+
+    @property
+    def ahead(self) -> str:
+        """Return which stamps are in the future of the others, in one line; '' for none."""
+        transforms = +self.tree.stamps_ahead
+        number = self.counts[Reason.STAMP_AHEAD] + transforms.total()
+        first = self.first_ahead or next(iter(transforms), '')
+        reason = Reason.STAMP_AHEAD
+        return (
+            f'{reason} ({number:,} messages, first: {first}): {reason.meaning}' if number else ''
+        )
+
+    def _count_ahead(self, item: Item) -> None:
+        """Count a cloud or boxes whose stamp is in the future of those before and after."""
+        self.counts[Reason.STAMP_AHEAD] += 1
+        name = 'clouds' if isinstance(item.content, Sweep) else 'boxes'
+        self.first_ahead = self.first_ahead or f'{name} at {item.content.stamp_ns} ns'
 
     def _moved(self, item: Item) -> Iterator[MovedItem]:
         """Yield an item in the fixed frame, or the sweeps that are complete with its cloud."""

@@ -1,7 +1,7 @@
 """
 Preparation of sweeps and boxes for the registrar, the same for the live node and for recordings.
 
-`JumpConfirmation` detects time jumps. A `Session` brings each item into the fixed frame, merges
+A `Session` brings each item into the fixed frame, merges
 the clouds of several LiDARs, assigns ids where they are asked for, and checks the poses of the
 boxes. `hand_to_registrar` adds the result to the registrar. The live node adds waiting for
 transforms and publishing; `boxreg relabel` adds reading and writing.
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from typing import Generic, NamedTuple, TYPE_CHECKING, TypeVar
+from typing import NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.matching import AT_ONCE
@@ -23,7 +23,7 @@ from boxreg_ros.io.id_assignment import IdCheck, Tracker
 from boxreg_ros.io.lidars import ignore, MergedSweep, Report, SensorPlacement, SweepMerger
 from boxreg_ros.io.motion_check import MotionCheck
 from boxreg_ros.io.pose_check import PoseCheck
-from boxreg_ros.io.transforms import move_to_frame, TIME_JUMP, TransformTree
+from boxreg_ros.io.transforms import move_to_frame, TransformTree
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention
@@ -31,8 +31,6 @@ import numpy as np
 
 if TYPE_CHECKING:  # it imports torch, which a process that only reads does not need
     from boxreg_ros.core.registrar import BoxRegistrar
-
-_T = TypeVar('_T')
 
 
 class Admitted(NamedTuple):
@@ -46,65 +44,6 @@ class Admitted(NamedTuple):
     """Why `moved` is None, or why not all LiDARs of a cloud are known."""
     detail: str = ''
     """The transform or message that is missing."""
-
-
-class JumpConfirmation(Generic[_T]):
-    """
-    Detect that time goes back: a recording in a loop, a simulation that is reset.
-
-    Two old stamps in a row, of sweeps or boxes, are a time jump; a single one is a late item. So
-    an item with an old stamp is held until the next one, and the first items after a jump are
-    not late.
-
-    """
-
-    def __init__(self) -> None:
-        self._newest_ns: dict[str, int] = {}  # by stream
-        self._held: tuple[_T, Sweep | BoxArray] | None = None
-
-    def add(self, item: _T, content: Sweep | BoxArray) -> tuple[list[_T], bool]:
-        """
-        Return the items to process now, in order, and whether time went back before them.
-
-        `item` is what the caller wants back for the `content`, which has a stamp.
-
-        """
-        held = self._held
-        self._held = None
-        is_old = self._is_old(content)
-        if is_old and held is None:
-            self._held = item, content
-            return [], False
-        if is_old and held is not None:
-            self._newest_ns.clear()
-            self._note(held[1])
-        self._note(content)
-        return ([item] if held is None else [held[0], item]), is_old
-
-    def release(self) -> list[_T]:
-        """Return the item that is held, if any: no other confirms a jump, so it is late."""
-        held = self._held
-        self._held = None
-        return [] if held is None else [held[0]]
-
-    @property
-    def held(self) -> _T | None:
-        """Return the item that is held; None if there is none."""
-        return None if self._held is None else self._held[0]
-
-    def _is_old(self, content: Sweep | BoxArray) -> bool:
-        newest_ns = self._newest_ns.get(_stream_of(content), content.stamp_ns)
-        return content.stamp_ns < newest_ns - round(TIME_JUMP * 1e9)
-
-    def _note(self, content: Sweep | BoxArray) -> None:
-        stream = _stream_of(content)
-        newest_ns = self._newest_ns.get(stream, content.stamp_ns)
-        self._newest_ns[stream] = max(newest_ns, content.stamp_ns)
-
-
-def _stream_of(content: Sweep | BoxArray) -> str:
-    """Return the name of a stream of ascending stamps: the boxes, or the clouds of one LiDAR."""
-    return f'clouds {content.topic}' if isinstance(content, Sweep) else 'boxes'
 
 
 class Session:

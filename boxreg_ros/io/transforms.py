@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.clocks import ReceiveTimes
+from boxreg_ros.io.time_jumps import is_near, StreamClock, TIME_JUMP
 from boxreg_ros.rotations import (
     interpolate_rotation,
     matrix_from_quaternion,
@@ -43,13 +44,6 @@ vehicle 4 mm off the line between two poses.
 """
 BUFFER_DURATION = 30.0
 """Transforms this much older than the newest of their pair are forgotten [s]; tf2 keeps 10 s."""
-TIME_JUMP = 1.0
-"""
-A stamp this far before the newest is a time jump [s].
-
-Longer than any message is late on its way, shorter than a recording that is played in a loop.
-
-"""
 ONCE = 1.0
 """
 A single sample of a frame counts as static once others are so much newer [s].
@@ -115,7 +109,9 @@ class TransformTree:
     extrapolated. A moving frame with one sample only counts as static once others are newer. Of a
     frame that has two parents at once, the transforms to both are kept. Not thread-safe.
 
-    `clock_offset` [s] is added to the stamps of moving frames as they arrive.
+    A sample whose stamp is far ahead of its pair, which its time of receipt does not explain,
+    waits for the next one to confirm it. `clock_offset` [s] is added to the stamps of moving
+    frames as they arrive.
 
     """
 
@@ -179,6 +175,11 @@ class TransformTree:
         return max(
             (e.stamps[-1] for e in self._edges() if e.stamps and not e.is_static), default=None
         )
+
+    @property
+    def stamps_ahead(self) -> Counter[str]:
+        """Return for each pair of frames how many samples had a stamp ahead of all others."""
+        return Counter({f'{e.parent} -> {e.child}': e.num_ahead for e in self._edges()})
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Floats:
         """Return ``T_target_source`` (4, 4) at a stamp, or raise TransformUnavailable."""
@@ -333,8 +334,8 @@ class TransformTree:
         if not is_static:
             stamp_ns += round(self.clock_offset * 1e9)
         pose = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
-        edge = self._add_to(edges, parent, child, stamp_ns, pose, is_static)
-        if received_ns is not None and not edge.is_static:
+        edge = self._add_to(edges, parent, child, stamp_ns, pose, is_static, received_ns)
+        if received_ns is not None and not edge.is_static and not edge.is_holding:
             edge.arrivals.add(received_ns, stamp_ns)
 
     def _add_to(
@@ -345,6 +346,7 @@ class TransformTree:
         stamp_ns: int,
         pose: tuple[float, ...],
         is_static: bool,
+        received_ns: int | None = None,
     ) -> Edge:
         edge = edges.get(child)
         if edge is None:
@@ -353,7 +355,7 @@ class TransformTree:
         elif edge.parent != parent:
             edge = self._of_another_parent(edges, edge, parent, is_static)
         edge.is_static |= is_static
-        edge.add(stamp_ns, pose)
+        edge.add(stamp_ns, pose, received_ns)
         if len(edges) > self._frames_limit:
             oldest_ns = stamp_ns - self._buffer_ns
             for name in [name for name, edge in edges.items() if edge.is_older(oldest_ns)]:
@@ -447,6 +449,8 @@ class Edge:
         x y z qx qy qz qw of the child in the parent at these stamps [m].
     arrivals : ReceiveTimes
         When the first samples were received.
+    num_ahead : int
+        Samples that were not used, since their stamps were ahead of those before and after them.
 
     """
 
@@ -458,14 +462,46 @@ class Edge:
         self.stamps: list[int] = []
         self.poses: list[Floats] = []
         self.arrivals = ReceiveTimes()
+        self.num_ahead = 0
         self._jump_detector = TimeJumpDetector()
+        self._clock = StreamClock()
+        self._ahead: tuple[int, tuple[float, ...], int | None] | None = None
         self._was_forgotten = False
         self._last_added: tuple[int, Floats] | None = None
         # A cloud, its boxes and its label files ask for the same stamp.
         self._last_found: tuple[int, Floats] | None = None
 
-    def add(self, stamp_ns: int, pose: tuple[float, ...]) -> None:
-        """Add x y z qx qy qz qw; a second one of the same stamp replaces the first."""
+    @property
+    def is_holding(self) -> bool:
+        """Return whether the last sample waits for the next one to confirm its stamp."""
+        return self._ahead is not None
+
+    def add(self, stamp_ns: int, pose: tuple[float, ...], received_ns: int | None = None) -> None:
+        """
+        Add x y z qx qy qz qw; a second one of the same stamp replaces the first.
+
+        One with a time of receipt whose stamp is ahead of all others is held.
+
+        """
+        if received_ns is None or self.is_static:
+            self._use(stamp_ns, pose)
+            return
+        held = self._ahead
+        self._ahead = None
+        is_ahead = self._clock.is_ahead(stamp_ns, received_ns)
+        if held is not None and not (is_ahead and is_near(stamp_ns, held[0])):
+            self.num_ahead += 1
+            held = None
+        if is_ahead and held is None:
+            self._ahead = stamp_ns, pose, received_ns
+            return
+        if held is not None:
+            self._clock.note(held[0], held[2])
+            self._use(*held[:2])
+        self._clock.note(stamp_ns, received_ns)
+        self._use(stamp_ns, pose)
+
+    def _use(self, stamp_ns: int, pose: tuple[float, ...]) -> None:
         values = np.array(pose, dtype=np.float64)
         if not np.isfinite(values).all() or not np.any(values[3:]):
             return  # no pose; the error of a lookup has the stamps that are known
@@ -501,6 +537,7 @@ class Edge:
     def _forget(self) -> None:
         self.stamps.clear()
         self.poses.clear()
+        self._clock = StreamClock()
         self._last_found = None
 
     @property

@@ -13,7 +13,8 @@ from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import MergedSweep
-from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
+from boxreg_ros.io.session import Admitted, is_placeholder, Session
+from boxreg_ros.io.time_jumps import Held, JumpConfirmation
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.following import Following
@@ -29,6 +30,9 @@ import numpy as np
 
 CONFIRMATION_TIME = 0.5
 """A message waits this long for the one that confirms a time jump [s]: five sweeps at 10 Hz."""
+AHEAD_TIME = 3.0
+"""The same of one that is ahead of all others [s]; chosen: boxes of the slowest detectors, 1 Hz,
+have come three times."""
 PASSED = 'passed'
 """Reason of messages that pass through; they have no boxes that it could be counted for."""
 
@@ -113,7 +117,7 @@ class MessagePipeline:
     @property
     def is_holding(self) -> bool:
         """Return whether messages wait for a cloud, further observations or confirmation."""
-        return self.registrar.num_held > 0 or self._jumps.held is not None
+        return self.registrar.num_held > 0 or bool(self._jumps.held)
 
     # ------------------------------------------------------------ one message
 
@@ -126,26 +130,29 @@ class MessagePipeline:
         """
         if is_placeholder(item.content):
             return [item], []
-        confirmed, has_jumped = self._jumps.add(item, item.content)
-        if not has_jumped:
-            return confirmed, []
-        stamp_ns = confirmed[0].content.stamp_ns
+        confirmed = self._jumps.add(item, item.content, item.received_ns)
+        ready = self._not_used(confirmed.ahead)
+        if not confirmed.has_jumped:
+            return confirmed.items, ready
+        stamp_ns = confirmed.items[0].content.stamp_ns
         self._report(
             Reason.TIME_JUMP,
             f'expected stamps of one clock, got some that went back to {stamp_ns} ns; tracks '
             f'start anew: unless a recording is played in a loop, let one clock set all stamps',
             1,
         )
-        ready = self.reset()
+        ready += self._start_anew()
         self.session.tree.rewind(stamp_ns)
-        return confirmed, ready
+        return confirmed.items, ready
 
-    def release(self, now: float = inf) -> list[Item]:
-        """Return the message that no other has confirmed in time, if any: it is late."""
-        held = self._jumps.held
-        if held is None or now < held.received + CONFIRMATION_TIME:
-            return []
-        return self._jumps.release()
+    def release(self, now: float = inf) -> tuple[list[Item], list[Outgoing]]:
+        """Return what no other message has confirmed in time: late ones, and those not used."""
+        late: list[Item] = []
+        ahead: list[Item] = []
+        for held in self._jumps.held:
+            if now >= held.item.received + _patience(held):
+                (ahead if held.is_ahead else late).extend(self._jumps.release(held))
+        return late, self._not_used(ahead)
 
     def process(self, item: Item) -> list[Outgoing]:
         """Take a message to the registrar; return the messages that are ready to be published."""
@@ -197,9 +204,11 @@ class MessagePipeline:
 
     def reset(self) -> list[Outgoing]:
         """Forget everything but the transforms; return everything that is held."""
-        ready = self.flush()
-        self.registrar.reset()
-        self._restart()
+        ready = self._start_anew()
+        for item in self._jumps.release():
+            if not isinstance(item.content, Sweep):
+                ready += self.pass_through(item.message)
+        self._jumps.restart()
         return ready
 
     def abandon(self, item: Item | None) -> list[Outgoing]:
@@ -218,6 +227,28 @@ class MessagePipeline:
         return ready
 
     # ------------------------------------------------------------ steps
+
+    def _start_anew(self) -> list[Outgoing]:
+        """Forget tracks and estimated errors; return everything that the registrar holds."""
+        ready = self.flush()
+        self.registrar.reset()
+        self._restart()
+        return ready
+
+    def _not_used(self, ahead: list[Item]) -> list[Outgoing]:
+        """Report messages that are ahead of all others; return boxes, which pass through."""
+        ready: list[Outgoing] = []
+        for item in ahead:
+            is_cloud = isinstance(item.content, Sweep)
+            self._report(
+                Reason.STAMP_AHEAD,
+                f'{"points" if is_cloud else "boxes"}: the stamp {item.content.stamp_ns} ns is in '
+                f'the future of those before and after it; {Reason.STAMP_AHEAD.remedy}',
+                1,
+            )
+            if not is_cloud:
+                ready += self.pass_through(item.message)
+        return ready
 
     def _process_cloud(self, item: Item, cloud: Sweep, admitted: Admitted) -> list[Outgoing]:
         """Add a cloud to the registrar, with those of the other LiDARs."""
@@ -297,3 +328,8 @@ class MessagePipeline:
         if latency.warning:
             self._report(Reason.LATENCY, latency.warning, 1)
         return pair.boxes
+
+
+def _patience(held: Held[Item]) -> float:
+    """Return how long a message waits for the next of its stream [s]."""
+    return AHEAD_TIME if held.is_ahead else CONFIRMATION_TIME

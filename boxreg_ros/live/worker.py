@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
 import gc
@@ -95,6 +95,7 @@ class Worker:
         self._stopping = Event()
         self._confirmed: deque[Item] = deque()
         self._logged_layouts: set[str] = set()
+        self._stamps_ahead: Counter[str] = Counter()
 
     def open_boxes(self, adapter: Adapter, early: Publisher, final: Publisher) -> None:
         """Set adapter and publishers of the boxes; to be called before they are subscribed to."""
@@ -148,7 +149,9 @@ class Worker:
 
     def _next(self) -> Item | None:
         """Return the next message decoded, or None if there is none to process now."""
-        self._confirmed.extend(self._live.release(time.monotonic()))
+        late, ready = self._live.release(time.monotonic())
+        self._confirmed.extend(late)
+        self._publish(ready)
         if not self._confirmed:
             self._take_message()
         return self._confirmed.popleft() if self._confirmed else None
@@ -242,7 +245,12 @@ class Worker:
         """Handle all events of the inbox, in the order of their arrival."""
         for kind, content in self._inbox.take_events():
             self._take_event(kind, content)
-        self.newest_transform_ns = self._live.session.tree.newest_ns()
+        tree = self._live.session.tree
+        self.newest_transform_ns = tree.newest_ns()
+        for pair, number in (tree.stamps_ahead - self._stamps_ahead).items():
+            text = f'transform {pair}: {Reason.STAMP_AHEAD.meaning}; {Reason.STAMP_AHEAD.remedy}'
+            self._health.report(Reason.STAMP_AHEAD, text, number)
+        self._stamps_ahead = tree.stamps_ahead
 
     def _take_event(self, kind: str, content: Any) -> None:
         match kind:
@@ -392,7 +400,9 @@ class Worker:
         """Publish held boxes, and pass waiting messages through unsolved."""
         self._take_events()
         self._publish(self._guarded(self._live.flush))
-        for waiting in (item, *self._confirmed, *self._live.release()):
+        late, ready = self._live.release()
+        self._publish(ready)
+        for waiting in (item, *self._confirmed, *late):
             if waiting is not None and not isinstance(waiting.content, Sweep):
                 self._publish(self._live.pass_through(waiting.message))
         message = self._inbox.take()

@@ -186,7 +186,7 @@ class Sink:
             return None, ''
         place = ArrayPlace(given, item.T_fixed_sensor, item.T_fixed_given)
         as_kept = self.corrections.to_register(given, with_pins=False)
-        return replace(as_kept, ticket=place), Reason.NO_TRANSFORM
+        return replace(as_kept, ticket=place), item.reason or Reason.NO_TRANSFORM
 
     def _put(self, refined: RefinedBoxes, place: ArrayPlace) -> None:
         """Count the boxes of one array and write them in all formats; in the thread."""

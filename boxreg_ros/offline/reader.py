@@ -49,6 +49,7 @@ class ReadItem(NamedTuple):
     T_fixed_given: Floats | None  # None where unknown, and for a cloud that is not written
     T_fixed_sensor: Floats | None  # pose of the sensor frame of label files
     intensities: Floats | None  # (M,) of a cloud that is written
+    reason: str = ''  # why `moved` is None, if not for want of a transform
 
 
 class Source(NamedTuple):
@@ -165,6 +166,7 @@ class RecordingReader:
                         recording.finding,
                         self._jumping_ids,
                         items.session.finding,
+                        items.ahead,
                     ),
                 )
             ),
@@ -190,8 +192,9 @@ class RecordingReader:
             given, T_fixed_given, intensities = cloud
         T_fixed_sensor = self._items.pose_of(self.source.sensor_frame, given.stamp_ns)
         return ReadItem(
-            seconds, item.restarts, given, moved, T_fixed_given, T_fixed_sensor, intensities
-        )
+            seconds, item.restarts, given, moved, T_fixed_given, T_fixed_sensor, intensities,
+            item.reason,
+        )  # fmt: skip
 
 
 def _sampled_parts(request: Request) -> list[Request]:

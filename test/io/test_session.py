@@ -5,7 +5,8 @@ from dataclasses import replace
 from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.session import hand_to_registrar, is_placeholder, JumpConfirmation, Session
+from boxreg_ros.io.session import hand_to_registrar, is_placeholder, Session
+from boxreg_ros.io.time_jumps import Confirmed, JumpConfirmation
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.reader import RecordingReader
 from boxreg_ros.offline.request import Request
@@ -114,10 +115,11 @@ def boxes_at(seconds):
 
 @pytest.fixture
 def jumps():
-    """Return a confirmation that has seen a sweep and boxes at 100 s."""
+    """Return a confirmation that has seen sweeps and boxes of 10 Hz up to 100 s."""
     jumps = JumpConfirmation()
-    for content in (sweep_at(100), boxes_at(100)):
-        assert jumps.add('item', content) == (['item'], False)
+    for seconds in (99.9, 100):
+        for content in (sweep_at(seconds), boxes_at(seconds)):
+            assert jumps.add('item', content) == Confirmed(['item'])
     return jumps
 
 
@@ -126,17 +128,25 @@ def jumps():
 )
 def test_two_old_stamps_in_a_row_are_a_time_jump(jumps, kinds):
     first, second = (make(5 + 0.1 * k) for k, make in enumerate(kinds))
-    assert jumps.add('first', first) == ([], False)
-    assert jumps.add('second', second) == (['first', 'second'], True)
+    assert jumps.add('first', first) == Confirmed()
+    assert jumps.add('second', second) == Confirmed(['first', 'second'], has_jumped=True)
     for content in (sweep_at(5.2), boxes_at(5.2)):
-        assert jumps.add('next', content) == (['next'], False)
+        assert jumps.add('next', content) == Confirmed(['next'])
 
 
 def test_a_single_old_stamp_is_late_and_keeps_its_order(jumps):
-    assert jumps.add('late', boxes_at(5)) == ([], False)
-    assert jumps.held == 'late'
-    assert jumps.add('following', sweep_at(100.1)) == (['late', 'following'], False)
-    assert jumps.held is None
+    assert jumps.add('late', boxes_at(5)) == Confirmed()
+    assert [held.item for held in jumps.held] == ['late']
+    assert jumps.add('cloud', sweep_at(100.1)) == Confirmed(['cloud'])
+    assert jumps.add('following', boxes_at(100.1)) == Confirmed(['late', 'following'])
+    assert jumps.held == []
+
+
+def test_clouds_in_time_do_not_keep_old_boxes_from_being_a_time_jump(jumps):
+    """One stream alone went back: two of its stamps in a row."""
+    assert jumps.add('first', boxes_at(5)) == Confirmed()
+    assert jumps.add('cloud', sweep_at(100.1)) == Confirmed(['cloud'])
+    assert jumps.add('second', boxes_at(5.1)) == Confirmed(['first', 'second'], has_jumped=True)
 
 
 def test_a_late_item_can_be_released_without_another(jumps):
@@ -146,8 +156,46 @@ def test_a_late_item_can_be_released_without_another(jumps):
 
 
 def test_stamps_more_than_a_second_old_are_held(jumps):
-    assert jumps.add('item', boxes_at(99.1)) == (['item'], False)
-    assert jumps.add('item', boxes_at(98.9)) == ([], False)
+    assert jumps.add('item', boxes_at(99.1)) == Confirmed(['item'])
+    assert jumps.add('item', boxes_at(98.9)) == Confirmed()
+
+
+@pytest.mark.parametrize('ahead', [2.2, 60, 3600])
+@pytest.mark.parametrize('make', [sweep_at, boxes_at])
+def test_a_single_stamp_ahead_is_not_used_and_holds_no_other(jumps, make, ahead):
+    assert jumps.add('wrong', make(100 + ahead)) == Confirmed()
+    others = [one for one in (sweep_at, boxes_at) if one is not make]
+    assert jumps.add('other', others[0](100.1)) == Confirmed(['other'])
+    assert jumps.add('next', make(100.1)) == Confirmed(['next'], ahead=['wrong'])
+    for seconds in (100.2, 100.3):
+        for content in (sweep_at(seconds), boxes_at(seconds)):
+            assert jumps.add('later', content) == Confirmed(['later'])
+
+
+@pytest.mark.parametrize('kinds', [(sweep_at, boxes_at), (boxes_at, boxes_at)])
+def test_two_stamps_ahead_are_a_gap(jumps, kinds):
+    first, second = (make(3700 + 0.1 * k) for k, make in enumerate(kinds))
+    assert jumps.add('first', first) == Confirmed()
+    assert jumps.add('second', second) == Confirmed(['first', 'second'])
+    for content in (sweep_at(3700.2), boxes_at(3700.2)):
+        assert jumps.add('next', content) == Confirmed(['next'])
+
+
+def test_a_pause_and_a_long_period_are_not_ahead():
+    jumps = JumpConfirmation()
+    for seconds in (0, 0.1, 60):  # received as late as it is stamped
+        item = Confirmed(['item'])
+        assert jumps.add('item', boxes_at(seconds), round(seconds * SECOND)) == item
+    jumps = JumpConfirmation()
+    for seconds in (0, 2, 4, 10):  # of keyframes, received at once
+        assert jumps.add('item', boxes_at(seconds), 0) == Confirmed(['item'])
+
+
+def test_a_restart_forgets_stamps_and_what_is_held(jumps):
+    jumps.add('wrong', boxes_at(3700))
+    jumps.restart()
+    assert jumps.held == []
+    assert jumps.add('item', boxes_at(5)) == Confirmed(['item'])
 
 
 def test_an_array_without_boxes_stamp_and_frame_is_a_placeholder():
@@ -174,6 +222,23 @@ def test_the_pose_check_is_renewed_after_a_time_jump(tmp_path):
     assert len(jumps) == 1
     assert 'pose_reference' in findings[jumps[0] - 1][1]
     assert not any(finding for _, finding in findings[jumps[0] :])
+
+
+def test_boxes_of_a_recording_stamped_in_the_future_are_kept_and_said(tmp_path):
+    drive = Drive(sweeps=12)
+    arrays = [message for topic, _, message in drive.items if topic == '/boxes']
+    arrays[5].header.stamp.sec += 3600
+    path = write_recording(tmp_path / 'drive', drive.items)
+    request = Request((path,))
+    with request.recording() as recording:
+        reading = RecordingReader(recording, request, Stopwatch())
+        items = list(reading)
+        warning = reading.findings().warning
+    unused = [item for item in items if item.reason]
+    assert [(item.moved, item.reason) for item in unused] == [(None, 'stamp_ahead')]
+    assert unused[0].given.stamp_ns == drive.stamps[5] + 3600 * SECOND
+    assert sum(isinstance(item.moved, BoxArray) for item in items) == 11
+    assert 'stamp_ahead (1 messages, first: boxes at' in warning
 
 
 def findings_of(path):

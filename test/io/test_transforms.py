@@ -300,6 +300,34 @@ def test_samples_after_a_time_jump_replace_the_old_ones():
         assert tree.covers('odom', 'lidar', stamp) == is_new
 
 
+@pytest.mark.parametrize('is_odometry', [False, True])
+def test_a_single_stamp_ahead_is_not_used(is_odometry):
+    tree = TransformTree()
+
+    def add(seconds, x, received=None):
+        sample = round(seconds * S), 'odom', 'base', (x, 0, 0)
+        received_ns = round((seconds if received is None else received) * S)
+        if is_odometry:
+            tree.add_odometry(M.odometry(*sample), received_ns)
+        else:
+            tree.add_transforms(M.tf(M.transform(*sample)).transforms, False, received_ns)
+
+    for k in range(20):
+        add(100 + 0.05 * k, k)
+    add(3701, 0, received=101)
+    assert tree.newest_ns() == round(100.95 * S)
+    add(101, 20)
+    add(101.05, 21)
+    assert dict(tree.stamps_ahead) == {'odom -> base': 1}
+    assert tree.lookup('odom', 'base', 101 * S + S // 40)[0, 3] == pytest.approx(20.5)
+    for seconds in (8000, 8000.05):  # two are a clock that was set
+        add(seconds, 30, received=101.1)
+    assert tree.covers('odom', 'base', 8000 * S)
+    add(9000, 31)  # a pause
+    assert tree.covers('odom', 'base', 9000 * S)
+    assert tree.stamps_ahead.total() == 1
+
+
 def test_two_consecutive_old_stamps_are_a_time_jump():
     detector = TimeJumpDetector()
     jumps = [

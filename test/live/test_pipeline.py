@@ -356,6 +356,46 @@ def test_tracks_restart_at_a_time_jump(back):
         assert np.abs(array.boxes[:, :3] + sensor - drive.truth[stamp_ns][:, :3]).max() < 0.3
 
 
+@pytest.mark.parametrize('topic', ['/boxes', '/points'])
+def test_one_stamp_in_the_future_changes_nothing_of_the_others(topic):
+    live = Live(timeout=0.4)
+    drive = Drive(sweeps=12)
+    wrong = items_of(drive, topic)[5]
+    wrong.header.stamp.sec += 3600
+    out = live.feed(drive)
+    assert [reason for reason, _, _ in live.reports] == ['stamp_ahead']
+    out += live.flush()
+    early = [item for item in out if not item.is_final]
+    assert len(early) == sum(item.is_final for item in out) == 12
+    if topic == '/boxes':
+        assert sum(item.message is wrong for item in out) == 2  # unchanged, on both topics
+    lost = [item for item in early if item.refined is None or 'no_sweep' in item.refined.reasons]
+    assert len(lost) == 1
+    assert all(REFINED in item.refined.status for item in early[7:])
+
+
+def test_a_stamp_in_the_future_that_nothing_follows_is_not_used():
+    live = Live()
+    drive = Drive(sweeps=6)
+    items_of(drive, '/boxes')[-1].header.stamp.sec += 3600
+    live.feed(drive, now=10.0)
+    assert live.is_holding
+    assert live.release(12.9) == ([], [])
+    late, out = live.release(13.1)
+    assert not late and [item.is_final for item in out] == [False]
+    assert live.reports[-1][0] == 'stamp_ahead'
+
+
+def test_reset_publishes_what_waits_for_confirmation():
+    live = Live()
+    drive = Drive(sweeps=6)
+    wrong = items_of(drive, '/boxes')[-1]
+    wrong.header.stamp.sec += 3600
+    live.feed(drive)
+    assert sum(item.message is wrong for item in live.reset()) == 2
+    assert live.release() == ([], [])
+
+
 def test_tracks_restart_after_a_gap():
     live = Live()
     live.feed(Drive(sweeps=6))
