@@ -29,7 +29,7 @@ BATCH_OVERHEAD = 25
 `measure speed`: 10 ms beside 0.4 ms a window."""
 RECENT = 10
 """Last batches and box arrays that times are estimated from; chosen: a second at 10 Hz."""
-MEMORY = 1.0
+RESERVE_MEMORY = 1.0
 """Overruns of this time are a reserve [s]; chosen: a machine that has become free is used within
 a second."""
 LARGEST_RESERVE = 0.5
@@ -44,7 +44,7 @@ class TickBudget:
     The registrar reads no clock; this object does for it. The time for windows is the deadline
     less the time used by then, for decoding and cropping, less that for publishing, less a
     reserve for overruns. The times of a window and of publishing are the medians of `RECENT`
-    ones. The reserve is the second largest overrun of the last `MEMORY` seconds, without those
+    ones. The reserve is the second largest overrun of the last `RESERVE_MEMORY` seconds, without those
     that no reserve would hold. So interruptions of the process cost the boxes of their own ticks,
     and none after them.
 
@@ -144,7 +144,7 @@ class TickBudget:
     @property
     def _reserve(self) -> float:
         """Return the second largest of the recent overruns that a reserve can hold [s]."""
-        oldest = self._clock() - MEMORY
+        oldest = self._clock() - RESERVE_MEMORY
         while self._overruns and self._overruns[0][0] < oldest:
             self._overruns.popleft()
         most = LARGEST_RESERVE * self.seconds

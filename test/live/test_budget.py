@@ -2,7 +2,7 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
-from boxreg_ros.live.budget import BATCH_OVERHEAD, MEMORY, TickBudget
+from boxreg_ros.live.budget import BATCH_OVERHEAD, RESERVE_MEMORY, TickBudget
 import pytest
 
 
@@ -94,7 +94,7 @@ def test_the_second_largest_overrun_of_the_last_second_is_a_reserve():
     for solving in (0.12, 0.13, 0.05):
         tick(budget, clock, solving)
     assert windows(budget, clock.now) == pytest.approx(80, abs=1)
-    clock.now += 0.9 * MEMORY
+    clock.now += 0.9 * RESERVE_MEMORY
     assert windows(budget, clock.now) == pytest.approx(100, abs=1)
 
 
