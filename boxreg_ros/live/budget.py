@@ -44,9 +44,9 @@ class TickBudget:
     The registrar reads no clock; this object does for it. The time for windows is the deadline
     less the time used by then, for decoding and cropping, less that for publishing, less a
     reserve for overruns. The times of a window and of publishing are the medians of `RECENT`
-    ones. The reserve is the second largest overrun of the last `RESERVE_MEMORY` seconds, without those
-    that no reserve would hold. So interruptions of the process cost the boxes of their own ticks,
-    and none after them.
+    ones. The reserve is the second largest overrun of the last `RESERVE_MEMORY` seconds, without
+    those that no reserve would hold. So interruptions of the process cost the boxes of their own
+    ticks, and none after them.
 
     Final boxes are given up last. In a tick that is late with any plan, and after the early
     boxes of any other, the windows that they need are solved, as long as these take no longer
