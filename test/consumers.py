@@ -507,6 +507,46 @@ def supervisely_clouds(folder):
     return {'type': project.type, 'items': sorted(data), 'figures': figures}
 
 
+def supervisely_images(folder, form):
+    """Return the images of each cloud of a project, with their calibration and size."""
+    from importlib import import_module
+
+    from PIL import Image
+
+    import_supervisely()
+    if form == 'supervisely':
+        module = import_module('supervisely.project.pointcloud_episode_project')
+        project = module.PointcloudEpisodeProject(folder, module.OpenMode.READ)
+    else:
+        module = import_module('supervisely.project.pointcloud_project')
+        project = module.PointcloudProject(folder, module.OpenMode.READ)
+    (data,) = project.datasets
+    return [
+        {
+            'cloud': name,
+            'images': [
+                {'name': Path(path).name, 'size': list(Image.open(path).size), **info}
+                for path, info in data.get_related_images(name)
+            ],
+        }
+        for name in data
+    ]
+
+
+def datumaro_images(folder):
+    """Return the sizes of the images beside each cloud, height and width, by their paths."""
+    from datumaro import Dataset
+
+    root = Path(folder, 'images/default')
+    return {
+        item.id: {
+            str(Path(image.path).relative_to(root)): list(image.data.shape[:2])
+            for image in item.media.extra_images
+        }
+        for item in Dataset.import_from(folder, 'datumaro')
+    }
+
+
 def vcd_transform(path, source, target, frame):
     """Return the transform between two coordinate systems of an OpenLABEL file at a frame."""
     from vcd import core, scl

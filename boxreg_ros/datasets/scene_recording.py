@@ -15,6 +15,7 @@ from boxreg_ros.io.lidars import Lidars, SensorPlacement
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of, LabelFrame
+from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.merging import keyframes_of, LabelMerger
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import Convention, STANDARD
@@ -102,6 +103,11 @@ class SceneRecording:
     def files(self) -> list[Path]:
         """Return the files that the scene is read from."""
         return scene_files(self._address)
+
+    @property
+    def camera(self) -> Camera | None:
+        """Return the camera that the boxes of the scene refer to; None if it states none."""
+        return self._scene.frames.camera
 
     def sensor_frame(self) -> str:
         """Return the frame of the clouds."""

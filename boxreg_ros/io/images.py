@@ -51,6 +51,8 @@ class ImageCamera(NamedTuple):
     """(k,), coefficients of the model; empty for rectified images."""
     model: str
     """``plumb_bob``, ``rational_polynomial``, ``equidistant`` and the like."""
+    info_topic: str = ''
+    """Of the info that states the model; empty without one."""
 
 
 class Image(NamedTuple):
@@ -77,6 +79,21 @@ class RecordedImages:
                 self._delays[topic] = received_ns - stamp_ns
                 frame_id = str(clouds.header_of(message).frame_id).lstrip('/')
                 self.cameras.append(self._camera(topic, frame_id, message))
+
+    def without_images(self) -> list[ImageCamera]:
+        """Return the cameras that have a model and no images."""
+        known = {camera.info_topic for camera in self.cameras}
+        frames = {camera.frame_id for camera in self.cameras}
+        found = []
+        for name in self._topics.filled(INFO_TYPES):
+            first = next(self._messages({name}), None)
+            if first is None or name in known:
+                continue
+            frame_id = str(clouds.header_of(first[2]).frame_id).lstrip('/')
+            if frame_id not in frames:
+                bare = ImageCamera(name, frame_id, (0, 0), None, np.zeros(0), '')
+                found.append(_with_model(bare, name, first[2]))
+        return found
 
     def nearest(self, camera: ImageCamera, stamp_ns: int) -> Image:
         """Return the image of a camera nearest to a stamp; RecordingError if none is in `NEAR`."""
@@ -116,7 +133,7 @@ class RecordedImages:
         ):
             for name, found in infos:
                 if found is not None and is_own(name, found[2]):
-                    return _with_model(camera, found[2])
+                    return _with_model(camera, name, found[2])
         return camera
 
 
@@ -129,7 +146,7 @@ def _stamp_of(record: Record, message: Any) -> int:
         return poses.stamp_ns(clouds.header_of(message))
 
 
-def _with_model(camera: ImageCamera, info: Any) -> ImageCamera:
+def _with_model(camera: ImageCamera, info_topic: str, info: Any) -> ImageCamera:
     """Return a camera with the model of a CameraInfo; ROS 1 and Foxglove write capitals."""
 
     def values(name: str) -> Floats:
@@ -146,6 +163,7 @@ def _with_model(camera: ImageCamera, info: Any) -> ImageCamera:
         matrix=matrix if matrix.any() else None,  # zeros: not calibrated
         distortion=np.zeros(0) if is_rectified else values('d').ravel(),
         model=str(info.distortion_model),
+        info_topic=info_topic,
     )
 
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from contextlib import ExitStack
-from pathlib import Path
+from io import BytesIO
+import struct
 from typing import NamedTuple
+import zlib
 
 from boxreg_ros.errors import ConfigError, RecordingError, TransformUnavailable
 from boxreg_ros.io.images import Image, ImageCamera
@@ -26,6 +29,11 @@ class LabelCamera(NamedTuple):
     image: ImageCamera
     T_camera_sensor: Floats
     """Pose (4, 4) of the label frame in that of the camera."""
+
+    @property
+    def topics(self) -> tuple[str, str]:
+        """Return the topics of the images and of the model."""
+        return self.image.topic, self.image.info_topic
 
     @property
     def intrinsics(self) -> Floats:
@@ -69,45 +77,58 @@ class LabelCameras:
         """Close the recording."""
         self._opened.close()
 
-    def only(self, sensor_frame: str, topic: Path | None, needed_by: str) -> LabelCamera:
+    def only(self, sensor_frame: str, topic: str, needed_by: str) -> LabelCamera | None:
         """
         Return the only camera, or that of a topic of images or of its CameraInfo.
 
-        Raises ConfigError if there is none, or several and no topic.
+        Cameras without images count where no camera has any. None if there is no camera and no
+        topic; ConfigError if there are several and no topic, or none of the topic.
 
         """
-        found = self.known(sensor_frame, self._recording.start_ns)
-        if topic is not None:
-            found = [one for one in found if one.image.topic == str(topic)]
+        known = self.known(sensor_frame, self._recording.start_ns)
+        others = self._with_pose(self._images.without_images(), sensor_frame, 0)
+        found = known or others
+        if topic:
+            found = [one for one in (*known, *others) if topic in one.topics]
         if len(found) == 1:
             return found[0]
-        topics = ', '.join(one.image.topic for one in self.known(sensor_frame, 0)) or 'none'
+        if not found and not topic:
+            return None
+        topics = ', '.join(one.image.topic for one in (*known, *others)) or 'none'
         raise ConfigError(
             f'{needed_by}: expected the calibration of one camera, got '
-            f'{"none of " + str(topic) if topic else len(found)} in {self._recording}; cameras '
-            f'with images, a CameraInfo and a transform: {topics}; give --camera TOPIC, or '
-            f'--camera FILE'
+            f'{"none of " + topic if topic else len(found)} in {self._recording}; cameras '
+            f'with a CameraInfo and a transform: {topics}; give --camera TOPIC, or --camera FILE'
         )
 
     def known(self, sensor_frame: str, stamp_ns: int) -> list[LabelCamera]:
         """Return the cameras with a model whose pose in the frame of the labels is known."""
         if sensor_frame not in self._of_frame:
-            found = []
-            for image in self._images.cameras:
-                if image.matrix is None:
-                    continue
-                try:
-                    T = self._tree.lookup(image.frame_id, sensor_frame, stamp_ns)
-                except TransformUnavailable:
-                    continue  # it moves on the vehicle, or nobody says where it is
-                found.append(LabelCamera(image.topic.strip('/').replace('/', '_'), image, T))
-            self._of_frame[sensor_frame] = found
+            cameras = self._images.cameras
+            self._of_frame[sensor_frame] = self._with_pose(cameras, sensor_frame, stamp_ns)
         return self._of_frame[sensor_frame]
 
-    def images(self, sensor_frame: str, stamp_ns: int) -> list[tuple[LabelCamera, Image]]:
+    def _with_pose(
+        self, cameras: Iterable[ImageCamera], sensor_frame: str, stamp_ns: int
+    ) -> list[LabelCamera]:
+        """Return those of some cameras that have a model and a pose."""
+        found = []
+        for image in cameras:
+            if image.matrix is None:
+                continue
+            try:
+                T = self._tree.lookup(image.frame_id, sensor_frame, stamp_ns)
+            except TransformUnavailable:
+                continue  # it moves on the vehicle, or nobody says where it is
+            found.append(LabelCamera(image.topic.strip('/').replace('/', '_'), image, T))
+        return found
+
+    def images(
+        self, cameras: Iterable[LabelCamera], stamp_ns: int
+    ) -> list[tuple[LabelCamera, Image]]:
         """Return the image of each camera nearest to a stamp; those without one are counted."""
         found = []
-        for camera in self.known(sensor_frame, stamp_ns):
+        for camera in cameras:
             topic = camera.image.topic
             try:
                 found.append((camera, self._images.nearest(camera.image, stamp_ns)))
@@ -125,3 +146,31 @@ def cameras_of(recording: Recording | None, needed_by: str) -> LabelCameras:
             f'{needed_by}: expected a recording with camera images and a CameraInfo, got none'
         )
     return LabelCameras(recording)
+
+
+def as_png(image: Image) -> bytes:
+    """Return the content of an image as PNG, for formats that take no other."""
+    if image.media_type == 'image/png':
+        return image.content
+    try:
+        from PIL import Image as Picture
+    except ImportError as error:
+        raise ConfigError(f'images as PNG need Pillow: pip install pillow ({error})') from None
+    file = BytesIO()
+    Picture.open(BytesIO(image.content)).save(file, 'PNG')
+    return file.getvalue()
+
+
+def black_png(width: int, height: int) -> bytes:
+    """Return a PNG of black pixels."""
+    rows = bytes(1 + (width + 7) // 8) * height  # of one bit a pixel, after the kind of filter
+    chunks = [
+        (b'IHDR', struct.pack('>IIBBBBB', width, height, 1, 0, 0, 0, 0)),
+        (b'IDAT', zlib.compress(rows)),
+        (b'IEND', b''),
+    ]
+    png = b'\x89PNG\r\n\x1a\n'
+    for kind, data in chunks:
+        checksum = zlib.crc32(kind + data)
+        png += struct.pack('>I', len(data)) + kind + data + struct.pack('>I', checksum)
+    return png

@@ -9,6 +9,7 @@ words stays as it is: an evaluation does not count it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -72,6 +73,8 @@ TRANSLATIONS = (
 """Words of a name, and its names in nuScenes, Argoverse 2 and KITTI; the first row counts."""
 VOCABULARY_COLUMNS = (NUSCENES, ARGOVERSE2, KITTI)
 """Vocabularies of the columns of `TRANSLATIONS`."""
+MAX_NAMED = 5
+"""Most class names in a sentence; chosen."""
 
 
 class ClassNames:
@@ -103,6 +106,20 @@ class ClassNames:
                 )
         self.translated: dict[str, str] = {}
         """Names that were written otherwise than given, by the given one."""
+        self.uncounted: Counter[str] = Counter()
+        """Boxes by a name that the vocabulary lacks, which an evaluation does not count."""
+
+    def notes(self) -> list[str]:
+        """Return in a sentence which boxes an evaluation does not count; none if it counts all."""
+        if not self.uncounted:
+            return []
+        named = [repr(name) for name in list(self.uncounted)[:MAX_NAMED]]
+        if len(self.uncounted) > MAX_NAMED:
+            named.append(f'{len(self.uncounted) - MAX_NAMED} more')
+        return [
+            f'its evaluation has no class {", ".join(named)} and does not count these '
+            f'{self.uncounted.total():,} boxes; state names for them by --class-map FILE'
+        ]
 
     def of(self, class_name: str) -> str:
         """Return the name to write for a class name."""
@@ -114,6 +131,8 @@ class ClassNames:
             name = class_name
         if name != class_name:
             self.translated[class_name] = name
+        if self._vocabulary and name not in self._vocabulary:
+            self.uncounted[class_name] += 1
         return name
 
 

@@ -13,7 +13,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from boxreg_ros.io.images import Image
 from boxreg_ros.labels import cuboids
+from boxreg_ros.labels.cameras import LabelCamera
+from boxreg_ros.labels.cuboids import EVIDENCE_KEY
 from boxreg_ros.labels.files import at, following, from_json, JsonList, require_single
 from boxreg_ros.labels.protocol import absolute, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import ReadBox, TrackNumbers
@@ -26,13 +29,14 @@ FORMAT = replace(
         files='annotations/default.json, point_clouds/default/STAMP.pcd',
     ),
     sizes='length width height (x y z); height width length with --swap-axes',
-    options=('with_points', 'swap_axes'),
+    options=('with_points', 'with_images', 'swap_axes'),
     leaves_out='annotations that are no cuboids',
     read_back='datumaro 1.13.12',
 )
 ANNOTATIONS_FILE = 'annotations/default.json'
 POINT_CLOUD_MEDIA = 6
 """Number of the media type in Datumaro."""
+IMAGE_FOLDER = 'images/default'
 OWN_ATTRIBUTE = 'extent_covariance'
 """Attribute of the boxes that we write, and no other program."""
 SWAPPED_KEY = 'scale_is_height_width_length'
@@ -51,12 +55,14 @@ class Writer(cuboids.CuboidWriter):
 
     folders = ('annotations',)
     cloud_file = 'point_clouds/default/{name}.pcd'
+    image_file = f'{IMAGE_FOLDER}/{{name}}/{{camera}}.{{suffix}}'
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
         self._axes = 'zyx' if options.swap_axes else 'xyz'
         self._tracks = TrackNumbers()
         self._labels: dict[str, int] = {}
+        self._images: list[dict[str, Any]] = []  # of the current frame
         infos = self.about | {SWAPPED_KEY: options.swap_axes}
         head = {'dm_format_version': '1.0', 'media_type': POINT_CLOUD_MEDIA, 'infos': infos}
         self._items = JsonList(folder / ANNOTATIONS_FILE, head, 'items')
@@ -77,8 +83,24 @@ class Writer(cuboids.CuboidWriter):
                 'annotations': annotations,
                 'attr': {'frame': self.number},
                 'point_cloud': {'path': f'{self.name}.pcd'},
+                **({'related_images': self._images} if self._images else {}),
             }
         )
+
+    def add_images(self, images: Sequence[tuple[LabelCamera, Image, str]]) -> None:
+        """Hold the images of the next item; Datumaro has no place for their calibration."""
+        self._images = [
+            {
+                'path': path.removeprefix(f'{IMAGE_FOLDER}/'),
+                'size': list(camera.image.size[::-1]),  # height, width
+                EVIDENCE_KEY: {
+                    'camera': camera.name,
+                    'extrinsic': camera.T_camera_sensor[:3].ravel().tolist(),
+                    'intrinsic': camera.intrinsics.ravel().tolist(),
+                },
+            }
+            for camera, _, path in images
+        ]
 
     def finish(self) -> None:
         """Write the classes."""

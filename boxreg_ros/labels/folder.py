@@ -12,6 +12,7 @@ from typing import Any, ClassVar, TextIO
 from boxreg_ros.io.images import Image
 from boxreg_ros.labels.arrow import Table
 from boxreg_ros.labels.cameras import (
+    as_png,
     cameras_of,
     LabelCamera,
     LabelCameras,
@@ -46,7 +47,8 @@ class FolderWriter:
     image_file: ClassVar[str] = ''
     """
     Of the image of a frame, with the fields ``camera``, ``channel`` (in capitals), ``index`` (from
-    0), ``name``, ``number`` and ``suffix``; empty for none.
+    0), ``name``, ``number`` and ``suffix``; empty for none. One that ends in ``.png`` takes no
+    other format.
     """
     needs_clouds: ClassVar[bool] = False
     """Whether a frame without a cloud gets an empty file, because the tool needs one."""
@@ -79,6 +81,11 @@ class FolderWriter:
             self._stamps_file = self.text_file(STAMPS_FILE)
             self._poses_file = self.text_file(POSES_FILE)
 
+    @property
+    def notes(self) -> list[str]:
+        """Return what was assumed, and what programs that read the files leave out."""
+        return self.class_names.notes()
+
     def write(self, frame: LabelFrame) -> None:
         """Add a frame."""
         T = frame.T_fixed_sensor
@@ -90,12 +97,12 @@ class FolderWriter:
         self.name = frame_name(stamp_ns, self._used_stamps)
         self.about['fixed_frame'] = frame.fixed_frame
         self.about['sensor_frame'] = frame.sensor_frame
+        if self.cameras is not None:
+            self._add_images(self.cameras, frame)
         self.add(frame)
         if self._with_points and (self.needs_clouds or frame.sweep is not None):
             path = self.cloud_file.format(name=self.name, number=self.number)
             self.add_cloud(self.folder / path, frame)
-        if self.cameras is not None:
-            self._add_images(self.cameras, frame)
         if self.has_sidecar:
             values = np.full((3, 4), np.nan) if T is None else T[:3]
             self._stamps_file.write(f'{stamp_ns}\n')
@@ -105,31 +112,36 @@ class FolderWriter:
     def _add_images(self, cameras: LabelCameras, frame: LabelFrame) -> None:
         """Write the image of each camera that is nearest to a frame."""
         stamp_ns = frame.refined.boxes.stamp_ns
-        known = cameras.known(frame.sensor_frame, stamp_ns)
+        used = self.used_cameras(cameras.known(frame.sensor_frame, stamp_ns))
         if self.number == 0:
-            for camera in known:
+            for camera in used:
                 self.add_camera(camera)
         images = []
-        for camera, image in cameras.images(frame.sensor_frame, stamp_ns):
+        for camera, image in cameras.images(used, stamp_ns):
             path = self.image_file.format(
                 camera=camera.name,
                 channel=f'CAM_{camera.name.upper()}',
-                index=known.index(camera),
+                index=used.index(camera),
                 name=self.name,
                 number=self.number,
                 suffix=SUFFIXES_OF_IMAGES[image.media_type],
             )
             (self.folder / path).parent.mkdir(parents=True, exist_ok=True)
-            (self.folder / path).write_bytes(image.content)
+            content = as_png(image) if path.endswith('.png') else image.content
+            (self.folder / path).write_bytes(content)
             images.append((camera, image, path))
         self.add_images(images)
         self.about['images'] = dict(cameras.counts)
+
+    def used_cameras(self, cameras: Sequence[LabelCamera]) -> Sequence[LabelCamera]:
+        """Return those of the cameras of the recording that the format has a place for."""
+        return cameras
 
     def add_camera(self, camera: LabelCamera) -> None:
         """Write the calibration of a camera, where it is the same for all frames."""
 
     def add_images(self, images: Sequence[tuple[LabelCamera, Image, str]]) -> None:
-        """Write what belongs to the images of a frame, which are at paths in the folder."""
+        """Write, or hold for `add`, what belongs to the images of a frame at their paths."""
 
     def text_file(self, name: str) -> TextIO:
         """Open a text file of the folder, which is closed at the end."""
@@ -157,6 +169,8 @@ class FolderWriter:
         self.files.close()
         if self.class_names.translated:
             self.about['class_names'] = self.class_names.translated
+        if self.class_names.uncounted:
+            self.about['uncounted'] = dict(self.class_names.uncounted)
         write_provenance(self.folder, self.about)
 
 

@@ -11,15 +11,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.camera import Camera
-from boxreg_ros.labels.cameras import LabelCameras
+from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, following, read_provenance, require_single
 from boxreg_ros.labels.folder import FolderWriter
+from boxreg_ros.labels.kitti_camera import KittiCamera
 from boxreg_ros.labels.protocol import (
     absolute,
     Format,
@@ -43,7 +43,7 @@ FORMAT = Format(
     sizes='height width length',
     rotation="rotation_y about the camera's y; roll and pitch are lost",
     files='label_02/, calib/, velodyne/',
-    options=('camera', 'with_points', 'class_map'),
+    options=('camera', 'with_points', 'with_images', 'class_map'),
     leaves_out='regions without a 3D box (counted)',
     read_back='pykitti 0.3.1',
 )
@@ -69,12 +69,12 @@ class Writer(FolderWriter):
     form = 'kitti'
     folders = ('label_02', 'calib')
     cloud_file = f'velodyne/{SEQUENCE}/{{number:06d}}.bin'
+    image_file = f'image_02/{SEQUENCE}/{{number:06d}}.png'
     has_sidecar = True
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        self._camera = _camera_of(options)
+        self._camera = KittiCamera(options, 'format kitti')
         super().__init__(folder, provenance, options)
-        write_calibration(self._camera, folder / 'calib' / f'{SEQUENCE}.txt')
         self._file = self.text_file(f'label_02/{SEQUENCE}.txt')
         self._tracks = TrackNumbers()
         self._given_classes: dict[str, str] = {}  # by number of the track and class as written
@@ -83,7 +83,7 @@ class Writer(FolderWriter):
         """Add the lines of a frame."""
         rows, boxes = frame.boxes_in('sensor', self.dropped)
         array = frame.refined.boxes
-        truncation, columns = columns_of(self._camera, boxes)
+        truncation, columns = columns_of(self._camera.in_frame(frame.sensor_frame), boxes)
         for i, row in enumerate(rows):
             track = self._tracks.of(array.track_ids[row])
             given = array.class_names[row]
@@ -93,8 +93,18 @@ class Writer(FolderWriter):
             self._file.write(f'{self.number} {track} {name} {truncation[i]} {UNKNOWN_OCCLUSION} ')
             self._file.write(decimals(columns[i], array.scores[row]) + '\n')
 
+    @property
+    def notes(self) -> list[str]:
+        """Return what was assumed, the camera among it."""
+        return self._camera.notes + super().notes
+
+    def used_cameras(self, cameras: Sequence[LabelCamera]) -> Sequence[LabelCamera]:
+        """Return the camera that the boxes refer to."""
+        return self._camera.used(cameras)
+
     def finish(self) -> None:
-        """Name the tracks."""
+        """Name the tracks, and write the calibration."""
+        write_calibration(self._camera.camera, self.folder / 'calib' / f'{SEQUENCE}.txt')
         if names := self._tracks.names():
             self.about['tracks'] = names
         if self._given_classes:
@@ -258,16 +268,6 @@ def _boxes_by_frame(
         read_box = ReadBox(track_id, class_name, box, {'score': line.score})
         found.setdefault(line.frame, []).append(read_box)
     return found
-
-
-def _camera_of(options: Options) -> Camera:
-    """Return the camera of a file, else that of the recording."""
-    path = options.camera
-    if options.recording is None or (path is not None and path.is_file()):
-        return Camera.read(path, 'format kitti')
-    with closing(LabelCameras(options.recording)) as cameras:
-        sensor_frame = options.recording.sensor_frame()
-        return cameras.only(sensor_frame, path, 'format kitti').calibration()
 
 
 def write_calibration(

@@ -9,11 +9,12 @@ is 3, unknown. Names of files are stamps, see `per_frame`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.camera import Camera
+from boxreg_ros.labels.cameras import black_png, LabelCamera
 from boxreg_ros.labels.kitti import (
     boxes_of,
     columns_of,
@@ -25,6 +26,7 @@ from boxreg_ros.labels.kitti import (
     UNKNOWN_OCCLUSION,
     write_calibration,
 )
+from boxreg_ros.labels.kitti_camera import KittiCamera
 from boxreg_ros.labels.per_frame import EVIDENCE_FOLDER, numbers_of, PerFrameWriter, read_lines
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import ReadBox
@@ -39,11 +41,11 @@ FORMAT = Format(
     sizes='height width length',
     rotation="rotation_y about the camera's y; roll and pitch are lost",
     files='label_2/STAMP.txt, calib/STAMP.txt, velodyne/STAMP.bin',
-    options=('camera', 'with_points', 'class_map'),
+    options=('camera', 'with_points', 'with_images', 'class_map'),
     leaves_out='regions without a 3D box (counted), the rectangles in the image',
     read_back='datumaro 1.13.12',
 )
-LABEL_FOLDER = 'label_2'
+LABEL_FOLDER, IMAGE_FOLDER = 'label_2', 'image_2'
 OBJECT_COLUMNS = (15, 16)
 TRUNCATION = {INSIDE_IMAGE: '0.00', TRUNCATED: '-1.00', OUTSIDE_IMAGE: '1.00'}
 """Text of the values of KITTI tracking; the part outside of the image is not known."""
@@ -57,16 +59,31 @@ class Writer(PerFrameWriter):
     folders = (LABEL_FOLDER, 'calib', EVIDENCE_FOLDER)
     label_folder = LABEL_FOLDER
     cloud_file = 'velodyne/{name}.bin'
+    image_file = f'{IMAGE_FOLDER}/{{name}}.png'
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        self._camera = Camera.read(options.camera, 'format kitti_object')
+        self._chosen = KittiCamera(options, 'format kitti_object')
         super().__init__(folder, provenance, options)
 
     def add(self, frame: LabelFrame) -> None:
         """Write the files of a frame."""
+        self._camera = self._chosen.in_frame(frame.sensor_frame)
         super().add(frame)
         path = self.folder / 'calib' / f'{self.name}.txt'
         write_calibration(self._camera, path, CALIBRATION_NAMES)
+        if self._chosen.is_assumed:  # OpenPCDet takes the size of the image from its file
+            image = self.folder / IMAGE_FOLDER / f'{self.name}.png'
+            image.parent.mkdir(exist_ok=True)
+            image.write_bytes(black_png(*self._camera.size))
+
+    @property
+    def notes(self) -> list[str]:
+        """Return what was assumed, the camera among it."""
+        return self._chosen.notes + super().notes
+
+    def used_cameras(self, cameras: Sequence[LabelCamera]) -> Sequence[LabelCamera]:
+        """Return the camera that the boxes refer to."""
+        return self._chosen.used(cameras)
 
     def lines(self, array: BoxArray, rows: Ints, boxes: Floats) -> Iterator[str]:
         """Yield the line of each box; see `PerFrameWriter.lines`."""

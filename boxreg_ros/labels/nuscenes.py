@@ -14,18 +14,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 import hashlib
 from pathlib import Path
-import struct
 from typing import Any, TypeVar
-import zlib
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.images import Image
 from boxreg_ros.io.transforms import inverse, matrix
 from boxreg_ros.labels import files
-from boxreg_ros.labels.cameras import LabelCamera
+from boxreg_ros.labels.cameras import black_png, LabelCamera
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import (
     absolute,
+    AUTOMATIC_STATUS,
     Format,
     LabelFrame,
     Options,
@@ -117,7 +116,7 @@ class Writer(FolderWriter):
             rows_file.close()
         # The devkit requires a map.
         (self.folder / EMPTY_MAP).parent.mkdir()
-        (self.folder / EMPTY_MAP).write_bytes(_black_pixel())
+        (self.folder / EMPTY_MAP).write_bytes(black_png(1, 1))
 
     def _add_sample(self, stamp_ns: int, T_fixed_sensor: Floats) -> None:
         """Add the rows of a sample: itself, its sweep and the pose of the ego vehicle."""
@@ -464,8 +463,16 @@ def _annotated(
             for item, track in zip(items, tracks, strict=True)
         ],
         _boxes_of(items),
-        [item | {'num_points': item['num_lidar_pts']} for item in items],
+        [_evidence_of(item) for item in items],
     )
+
+
+def _evidence_of(item: dict[str, Any]) -> dict[str, Any]:
+    """Return what an annotation states of its box; T4 marks those that no person has made."""
+    evidence = item | {'num_points': item['num_lidar_pts']}
+    if item.get('automatic_annotation') is True:
+        evidence.setdefault('status', AUTOMATIC_STATUS)  # our files state another one
+    return evidence
 
 
 def _row_of(rows: Mapping[str, _T], token: str, table: str) -> _T:
@@ -517,17 +524,3 @@ def pose_matrix(item: dict[str, Any]) -> Floats:
     """Return the pose (4, 4) of a row of ``ego_pose`` or ``calibrated_sensor``."""
     qw, *qxyz = item['rotation']
     return matrix(np.array([*item['translation'], *qxyz, qw]))
-
-
-def _black_pixel() -> bytes:
-    """Return a PNG of one black pixel."""
-    chunks = [
-        (b'IHDR', struct.pack('>IIBBBBB', 1, 1, 8, 0, 0, 0, 0)),
-        (b'IDAT', zlib.compress(b'\0\0')),
-        (b'IEND', b''),
-    ]
-    png = b'\x89PNG\r\n\x1a\n'
-    for kind, data in chunks:
-        checksum = zlib.crc32(kind + data)
-        png += struct.pack('>I', len(data)) + kind + data + struct.pack('>I', checksum)
-    return png

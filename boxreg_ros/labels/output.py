@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import LabelFrame, LabelWriter, Options, Provenance
 from boxreg_ros.labels.registry import require_boxes, writer_for
 from boxreg_ros.structures import RefinedBoxes, REJECTED
 
@@ -40,6 +40,19 @@ class LabelOutput:
         """Return the number of boxes that a format cannot represent, by format and reason."""
         counts = {name: dict(+writer.dropped) for name, writer in self._writers.items()}
         return {name: dropped for name, dropped in counts.items() if dropped}
+
+    def notes(self) -> list[str]:
+        """Return what the writers assumed, see `notes_of`."""
+        return notes_of(self._writers)
+
+
+def notes_of(writers: Mapping[str, LabelWriter]) -> list[str]:
+    """Return what writers assumed, and what readers of their files leave out, with the format."""
+    return [
+        f'format {name}: {note}'
+        for name, writer in writers.items()
+        for note in getattr(writer, 'notes', ())
+    ]
 
 
 def with_csv(formats: Sequence[str]) -> tuple[str, ...]:

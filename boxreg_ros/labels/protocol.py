@@ -173,7 +173,7 @@ class Options:
     camera: Path | None = option(
         None,
         'camera calibration, for formats with image coordinates (default: the CameraInfo of the '
-        'only camera); a topic of images chooses one of several',
+        'only camera, else one is assumed); a topic of images chooses one of several',
         metavar='FILE|TOPIC',
         parse=Path,
     )
@@ -191,19 +191,53 @@ class Options:
     )
     recording: Recording | None = None
     """Source, open or closed, for formats that copy it."""
+    scene_camera: Camera | None = None
+    """Of the scene of a data set that is the source, where it has one."""
 
 
 class LabelWriter(Protocol):
-    """Writes the frames of one drive; memory must not grow with their number."""
+    """
+    Writes the frames of one drive; memory must not grow with their number.
+
+    A writer may also have ``notes``, a list of str: sentences about what it assumed, and about
+    boxes that programs which read the files leave out. They are printed and in ``summary.json``.
+
+    Attributes
+    ----------
+    dropped : Counter of str
+        Boxes that the format cannot represent, by `Reason`; `LabelFrame.boxes_in` counts them.
+
+    """
 
     dropped: Counter[str]
-    """Boxes that the format cannot represent, by reason."""
 
     def write(self, frame: LabelFrame) -> None:
-        """Add the boxes of one stamp; stamps ascend, except for boxes that arrived late."""
+        """
+        Add the boxes of one stamp.
+
+        Parameters
+        ----------
+        frame : LabelFrame
+            In the fixed frame where a transform is known [m, rad]. Stamps [ns] ascend, except for
+            boxes that arrived late; two frames may have the same stamp.
+
+        Raises
+        ------
+        OSError
+            If a file cannot be written; the folder of results is then removed as a whole.
+
+        """
 
     def close(self) -> None:
-        """Complete the files."""
+        """
+        Complete the files; nothing is written after it.
+
+        Raises
+        ------
+        OSError
+            If a file cannot be written.
+
+        """
 
 
 WriterFactory = Callable[[Path, Provenance, Options], LabelWriter]
@@ -220,11 +254,19 @@ class FormatModule(Protocol):
     """
     A module of `registry.FORMATS`.
 
-    A module whose files can be read back also has ``read(path)``, which yields a `LabelFrame`
-    per stamp and raises `RecordingError` for files that do not follow the format; one whose
-    paths may name a part of the files, ``PATH#PART``, has ``files_of(path)``. A module of a
-    data set may have ``read_scene(path, scene)``: it reads files, results of detectors and
-    trackers among them, whose stamps or calibration are those of a `SceneFrames`.
+    A module may have three functions more, each with a path of a file or folder.
+
+    ``read(path)``, if files can be read back, yields a `LabelFrame` per stamp, in the order of
+    time: boxes (n, 9) in the fixed or the sensor frame [m, rad], stamps [ns] as integers. What the
+    files have and a box cannot be made of is counted in `LabelFrame.left_out`, what they do not
+    state and was assumed is in `LabelFrame.note`. It raises `RecordingError` for files that do not
+    exist or do not follow the format, with the file and the place in it.
+
+    ``read_scene(path, scene)``, of a data set, yields the frames of a `SceneFrames`, whose stamps
+    and calibration hold: it reads results of detectors and trackers, too. It raises the same.
+
+    ``files_of(path)``, if paths may name a part of the files as ``PATH#PART``, returns the path
+    without the part.
 
     """
 

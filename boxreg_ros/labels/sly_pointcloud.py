@@ -9,17 +9,26 @@ which they take the track.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 import shutil
 from tempfile import TemporaryFile
 from typing import Any
 
+from boxreg_ros.io.images import Image
 from boxreg_ros.labels import cuboids
+from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, following, from_json, to_json, write_json
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import ReadBox, TrackNumbers
-from boxreg_ros.labels.supervisely import boxes_of, figure_of, key_of, meta_of, objects_by_key
+from boxreg_ros.labels.supervisely import (
+    boxes_of,
+    figure_of,
+    key_of,
+    meta_of,
+    objects_by_key,
+    write_calibrations,
+)
 
 FORMAT = cuboids.cuboid_format(
     name='sly_pointcloud',
@@ -43,6 +52,7 @@ class Writer(cuboids.CuboidWriter):
 
     folders = (f'ds0/{ANNOTATION_FOLDER}', 'ds0/pointcloud')
     cloud_file = 'ds0/pointcloud/{name}.pcd'
+    image_file = 'ds0/related_images/{name}_pcd/{camera}.{suffix}'
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         super().__init__(folder, provenance, options)
@@ -75,6 +85,10 @@ class Writer(cuboids.CuboidWriter):
         path = self.folder / 'ds0' / ANNOTATION_FOLDER / f'{self.name}{ANNOTATION_SUFFIX}'
         about = {'description': '', 'key': key, 'tags': []}
         write_json(path, about | {'objects': list(objects.values()), 'figures': figures})
+
+    def add_images(self, images: Sequence[tuple[LabelCamera, Image, str]]) -> None:
+        """Write the calibration beside each image of a frame."""
+        write_calibrations(self.folder, images)
 
     def finish(self) -> None:
         """Write the files of the project."""

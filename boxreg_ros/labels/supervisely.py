@@ -107,13 +107,7 @@ class Writer(cuboids.CuboidWriter):
 
     def add_images(self, images: Sequence[tuple[LabelCamera, Image, str]]) -> None:
         """Write the calibration beside each image of a frame."""
-        for camera, _, path in images:
-            sensors = {
-                'extrinsicMatrix': camera.T_camera_sensor[:3].ravel().tolist(),
-                'intrinsicMatrix': camera.intrinsics.ravel().tolist(),
-            }
-            meta = {'deviceId': camera.name, 'sensorsData': sensors}
-            write_json(self.folder / f'{path}.json', {'name': Path(path).name, 'meta': meta})
+        write_calibrations(self.folder, images)
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
@@ -157,6 +151,17 @@ def read(path: Path) -> Iterator[LabelFrame]:
             with at(f'frame {index}'):
                 boxes[Path(cloud).stem] = boxes_of(figures.get(index) or (), objects)
     yield from cuboids.read_frames(folder, list(boxes), lambda name: (boxes.get(name, []), {}))
+
+
+def write_calibrations(folder: Path, images: Iterable[tuple[LabelCamera, Image, str]]) -> None:
+    """Write the calibration beside images, which are at paths in a folder."""
+    for camera, _, path in images:
+        sensors = {
+            'extrinsicMatrix': camera.T_camera_sensor[:3].ravel().tolist(),
+            'intrinsicMatrix': camera.intrinsics.ravel().tolist(),
+        }
+        meta = {'deviceId': camera.name, 'sensorsData': sensors}
+        write_json(folder / f'{path}.json', {'name': Path(path).name, 'meta': meta})
 
 
 def objects_by_key(content: dict[str, Any]) -> dict[Any, dict[str, Any]]:

@@ -98,13 +98,17 @@ class Writer(FolderWriter):
         array = refined.boxes
         key = (self._segment, round(array.stamp_ns / 1000))
         for row, box in zip(rows, boxes.tolist(), strict=True):
+            class_name = self.class_names.of(array.class_names[row])
+            type_number = _type(class_name)
+            if not type_number:
+                self.class_names.uncounted[class_name] += 1
             self._boxes.add(
                 *key,
                 array.track_ids[row],
                 *box[BOX_CENTER],
                 *box[BOX_EXTENT],
                 float(wrap_angle(box[YAW])),
-                _type(self.class_names.of(array.class_names[row])),
+                type_number,
                 int(refined.num_points[row]),
                 *[None] * len(UNUSED_COLUMNS),
                 array.stamp_ns,

@@ -15,15 +15,21 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.axis_check import AxisCheck
 from boxreg_ros.io.fixed_frame import FixedFrameItems, StoredCloud
 from boxreg_ros.io.lidars import SINGLE_LIDAR
-from boxreg_ros.io.recording import Recording
-from boxreg_ros.labels import check_options, frames_of, LabelFrame, Provenance, writer_for
+from boxreg_ros.labels import (
+    check_options,
+    frames_of,
+    LabelFrame,
+    notes_of,
+    Provenance,
+    writer_for,
+)
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.labels.recording import config_hash, files_of
 from boxreg_ros.offline.arguments import add_options, values_of
 from boxreg_ros.offline.notes import left_out_line
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
-from boxreg_ros.offline.sources import label_frame_of
+from boxreg_ros.offline.sources import label_frame_of, writer_options
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, is_valid_box, Sweep
 
@@ -50,9 +56,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
     counts: Counter[str] = Counter()
     not_read: Counter[str] = Counter()
     assumed: list[str] = []
-    recording = request.recording() if request.recordings else None
-    images = recording if isinstance(recording, Recording) else None
-    options = replace(request.options, recording=images)
+    options = writer_options(request)
     axes = AxisCheck(request.convention, Config().drives)
     unused: dict[str, Any] = {'unreadable': 0, 'unused': '', 'damage': []}  # of the recording
     with claimed(out), whole_folder(out, request.inputs()) as folder:
@@ -85,6 +89,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             **unused,
             'warning': axes.finding,
             'left_out_of_labels': {name: found for name, found in left_out.items() if found},
+            'label_notes': notes_of(writers),
             'versions': {'boxreg_ros': __version__},
             'fingerprint': request.fingerprint(),
         }
@@ -246,6 +251,7 @@ def run(args: argparse.Namespace) -> int:
     for name, counts in summary['left_out_of_labels'].items():
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in counts.items())
         parts.append(f'{name} leaves out {reasons}')
+    parts += summary['label_notes']
     if summary['invalid_boxes']:
         parts.append(
             f'{summary["invalid_boxes"]:,} boxes are invalid: {Reason.INVALID_BOX.meaning}'

@@ -114,6 +114,7 @@ def _label_notes(summary: Summary) -> Iterator[str]:
     for name, found in summary.left_out_of_labels.items():
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in found.items())
         yield f'format {name} cannot represent some boxes, they are left out: {reasons}'
+    yield from summary.label_notes
     if summary.frames_without_cloud:
         yield (
             f'{summary.frames_without_cloud:,} of {summary.box_arrays:,} box arrays have no '

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from boxreg_ros.io.recording import Recording
 from boxreg_ros.labels import LabelFrame, LabelOutput, Provenance
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.reader import ReadItem, Source, uses_one_core
 from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.sources import writer_options
 from boxreg_ros.offline.workers import Background
 from boxreg_ros.reasons import Reason
 from boxreg_ros.review.corrections import Corrections
@@ -68,9 +68,7 @@ class Sink:
         if request.options.with_points:
             self._spool = Spool(folder, request.config)
         provenance = Provenance.of(request.recordings, request.config)
-        recording = request.recording()
-        bags = recording if isinstance(recording, Recording) else None
-        options = replace(request.options, recording=bags)
+        options = writer_options(request)
         self.output = LabelOutput(folder, request.box_formats, provenance, options)
         self.corrections = corrections
         # These import numba, after the fork of the reader.

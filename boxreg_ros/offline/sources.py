@@ -16,7 +16,7 @@ from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.items import EVERYTHING, Item, ItemSource, Wanted
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
-from boxreg_ros.labels import frames_of
+from boxreg_ros.labels import frames_of, module_of, Options
 from boxreg_ros.labels.merging import keyframes_of, LabelMerger
 from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.structures import BoxArray
@@ -85,6 +85,19 @@ def label_frame_of(
             f'{fixed_frame!r}; TF: {tree}; choose another with --label-frame'
         )
     return frame
+
+
+def writer_options(request: Request) -> Options:
+    """Return the options of the label writers, with the source as far as they use it."""
+    if not request.recordings:
+        return request.options
+    recording = request.recording()
+    if isinstance(recording, Recording):
+        return replace(request.options, recording=recording)
+    if not any('camera' in module_of(name).FORMAT.options for name in request.formats):
+        return request.options
+    with recording:
+        return replace(request.options, scene_camera=recording.camera)
 
 
 def source_of(request: Request) -> Recording | SceneRecording:

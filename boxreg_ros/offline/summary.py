@@ -65,6 +65,7 @@ class Summary:
     ids: str  # origin of the track ids
     # boxes that a format cannot represent, by reason
     left_out_of_labels: dict[str, dict[str, int]]
+    label_notes: list[str]  # what their writers assumed, and what an evaluation does not count
     unused_decisions: list[str]  # on tracks and boxes that the recording does not have
     frames_without_cloud: int
     versions: dict[str, str]  # of everything that can change the results
@@ -128,6 +129,7 @@ class Summary:
             or ('' if sink.boxes_in or request.boxes == NO_TOPIC else NO_BOXES),
             **findings.facts,
             left_out_of_labels=sink.output.left_out(),
+            label_notes=sink.output.notes(),
             unused_decisions=sink.corrections.unused(),
             frames_without_cloud=sink.without_cloud,
             versions=_versions(),

@@ -4,6 +4,7 @@ from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.labels.camera import Camera
 import layouts
 import numpy as np
 import pytest
@@ -76,3 +77,18 @@ def test_exports_of_argoverse2_keep_the_times_of_points(tmp_path):
     for sweep, original in zip(found, expected, strict=True):
         np.testing.assert_array_equal(sweep.points, original.points)
         np.testing.assert_allclose(sweep.times, original.times, atol=1e-9)
+
+
+def test_the_camera_of_a_scene_is_that_of_its_data_set(tmp_path):
+    layouts.kitti_tracking(tmp_path)
+    words = [
+        'relabel',
+        f'kitti-tracking:{tmp_path}',
+        '--formats=kitti,kitti_object',
+        '--set=solver.rounds=1',
+    ]
+    assert main([*words, '-o', str(tmp_path / 'out')]) == 0
+    (true,) = tmp_path.glob('training/calib/*.txt')
+    expected = Camera.read(true)
+    for path in (tmp_path / 'out').glob('kitti*/calib/*.txt'):
+        np.testing.assert_allclose(Camera.read(path).T_camera_sensor, expected.T_camera_sensor)

@@ -350,6 +350,22 @@ def test_class_names_are_those_of_the_evaluation_and_ours_are_read_back(tmp_path
     assert about['Van'] == classes['Van'] and 'ufo' not in about
 
 
+@pytest.mark.parametrize('name', ['nuscenes', 'argoverse2', 'kitti', 'kitti_object', 'waymo'])
+def test_classes_that_an_evaluation_does_not_count_are_said(tmp_path, name):
+    frame = frame_of([IN_FIXED] * 3, ['a', 'b', 'c'])
+    boxes = replace(frame.refined.boxes, class_names=('car', 'forklift', 'forklift'))
+    frames = [replace(frame, refined=replace(frame.refined, boxes=boxes))]
+    writer, folder = written(name, tmp_path, frames)
+    (note,) = writer.notes
+    assert note.startswith("its evaluation has no class 'forklift' and does not count these 2 box")
+    assert json.loads((folder / 'boxreg.json').read_text())['uncounted'] == {'forklift': 2}
+    class_map = tmp_path / 'classes.yaml'
+    official = {'nuscenes': 'vehicle.construction', 'argoverse2': 'LARGE_VEHICLE'}
+    class_map.write_text(f'forklift: {official.get(name, "Truck")}\n')
+    writer, _ = written(name, tmp_path / 'mapped', frames, class_map=class_map)
+    assert writer.notes == []
+
+
 @pytest.mark.parametrize(
     ('text', 'message'),
     [
@@ -699,9 +715,7 @@ def test_timestamps_of_kitti_raw(tmp_path):
     assert whole_stamps(path) == [seconds * 10**9 + 951199337, 1316955745951199337]
 
 
-def test_missing_camera_or_package_errors_name_the_remedy(tmp_path, monkeypatch):
-    with pytest.raises(ConfigError, match='--camera FILE'):
-        writer_for('kitti', tmp_path, Provenance())
+def test_errors_of_a_missing_package_name_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, 'pyarrow', None)
     with pytest.raises(ConfigError, match='pip install pyarrow'):
         module_of('parquet')
@@ -749,6 +763,19 @@ def test_nuscenes_devkit_reads_the_labels(tmp_path):
         assert first['track'] == second['track']
         assert (bool(first['next']), first['prev'], second['next']) == (True, '', '')
         np.testing.assert_allclose(first['velocity'], [2.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_t4_marks_what_no_person_has_made(tmp_path):
+    """Files of others have no values of ours beside the tables."""
+    _, folder = written('t4', tmp_path, [frame_of([IN_FIXED] * 2, ['a', 'b'])])
+    (folder / 'boxreg_values.json').unlink()
+    path = folder / 'annotation' / 'sample_annotation.json'
+    rows = json.loads(path.read_text())
+    rows[0]['automatic_annotation'] = False
+    path.write_text(json.dumps(rows))
+    (found,) = frames_of('t4', folder)
+    assert sorted(found.refined.status) == ['automatic', 'input']
+    assert found.keyframes().left_out == {'not_a_keyframe': 1}
 
 
 def test_t4_devkit_reads_the_labels(tmp_path):
