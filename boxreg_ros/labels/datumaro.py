@@ -20,6 +20,7 @@ from boxreg_ros.labels.cuboids import EVIDENCE_KEY
 from boxreg_ros.labels.files import at, following, from_json, JsonList, require_single
 from boxreg_ros.labels.protocol import absolute, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import ReadBox, TrackNumbers
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import INTERPOLATED
 
 FORMAT = replace(
@@ -162,7 +163,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         label_category = content.get('categories', {}).get('label', {})
         labels = [str(label['name'] or '') for label in label_category.get('labels', ())]
         is_swapped = bool(content.get('infos', {}).get(SWAPPED_KEY))
-        items: dict[str, list[ReadBox]] = {}
+        items: dict[str, cuboids.FrameBoxes] = {}
         numbers: dict[str, int] = {}
         for item in sorted(content['items'], key=_order):
             name = str(item['id'])
@@ -170,7 +171,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
                 items[name] = _cuboids(item.get('annotations') or (), labels, is_swapped)
                 numbers[name] = _order(item)[0]
     yield from cuboids.read_frames(
-        folder, list(items), lambda name: (items.get(name, []), {}), numbers
+        folder, list(items), lambda name: items.get(name, cuboids.NO_FRAME_BOXES), numbers
     )
 
 
@@ -181,14 +182,24 @@ def _order(item: dict[str, Any]) -> tuple[int, str]:
 
 def _cuboids(
     annotations: Sequence[dict[str, Any]], labels: list[str], is_swapped: bool
-) -> list[ReadBox]:
-    """Return the cuboids among the annotations of an item."""
-    found = []
+) -> cuboids.FrameBoxes:
+    """Return the cuboids among the annotations of an item, and the number without a box."""
+    found: list[ReadBox] = []
+    outside = 0
     for number, annotation in enumerate(annotations):
-        if annotation['type'] == 'cuboid_3d':
-            with at(f'annotation {number}'):
-                found.append(_cuboid(annotation, labels, is_swapped))
-    return found
+        if annotation['type'] != 'cuboid_3d':
+            continue
+        if _is_set((annotation.get('attributes') or {}).get('outside')):
+            outside += 1  # CVAT: the object has left
+            continue
+        with at(f'annotation {number}'):
+            found.append(_cuboid(annotation, labels, is_swapped))
+    return found, {Reason.NO_BOX.value: outside} if outside else {}
+
+
+def _is_set(attribute: object) -> bool:
+    """Return whether an attribute is true; some versions write it as text."""
+    return str(attribute).lower() == 'true'
 
 
 def _cuboid(annotation: dict[str, Any], labels: list[str], is_swapped: bool) -> ReadBox:
@@ -198,9 +209,11 @@ def _cuboid(annotation: dict[str, Any], labels: list[str], is_swapped: bool) -> 
     box = cuboids.box_from_cuboid(annotation['position'], annotation['rotation'], extent)
     track = attributes.get('track', attributes.get('track_id'))
     label_id = annotation.get('label_id')
+    if label_id is not None and not 0 <= label_id < len(labels):
+        raise ValueError(f'expected a label_id of {len(labels)} labels, got {label_id}')
     class_name = '' if label_id is None else labels[label_id]
     evidence: dict[str, Any] = {'score': _score(attributes)}
-    if attributes.get('keyframe') is False:
+    if str(attributes.get('keyframe', '')).lower() == 'false':
         evidence['status'] = INTERPOLATED
     if OWN_ATTRIBUTE in attributes:  # others may have a `status` of another meaning
         evidence = attributes

@@ -28,7 +28,7 @@ from boxreg_ros.labels.protocol import (
     Provenance,
     SceneFrames,
 )
-from boxreg_ros.labels.records import ReadBox, TrackNumbers
+from boxreg_ros.labels.records import ReadBox, require_radians, TrackNumbers
 from boxreg_ros.labels.sidecar import numbered_frames, numbered_scene
 from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import wrap_angle
@@ -160,7 +160,13 @@ def boxes_of(camera: Camera, numbers: Floats) -> Floats:
     boxes : array, shape (n, 9)
         In the frame of the LiDAR [m, rad].
 
+    Raises
+    ------
+    ValueError
+        If a rotation is in degrees.
+
     """
+    require_radians(numbers[:, 6])
     centres = numbers[:, 3:6].copy()
     centres[:, 1] -= numbers[:, 0] / 2
     return camera.from_upright(centres, numbers[:, 6], numbers[:, [2, 1, 0]])
@@ -260,7 +266,8 @@ def _boxes_by_frame(
     """Return the boxes of a label file in the LiDAR frame; tracks have the names beside it."""
     about = read_provenance(absolute(path).parent.parent)
     tracks, given = about.get('tracks', {}), about.get('given_classes', {})
-    boxes = boxes_of(camera, np.array([line.numbers for line in lines]).reshape(-1, 7))
+    with following(path, 'rotations in radians'):
+        boxes = boxes_of(camera, np.array([line.numbers for line in lines]).reshape(-1, 7))
     found: dict[int, list[ReadBox]] = {}
     for line, box in zip(lines, boxes, strict=True):
         track_id = tracks.get(line.track, line.track)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.cameras import black_png, LabelCamera
 from boxreg_ros.labels.kitti import (
@@ -105,7 +105,8 @@ def read(path: Path) -> Iterator[LabelFrame]:
     Parameters
     ----------
     path : Path
-        Folder with ``label_2/`` or ``data/`` (of results), or the folder of label files itself.
+        Folder with ``label_2/`` or ``data/`` (of results), the root of the data set with
+        ``training/``, or the folder of label files itself.
         ``calib/`` is in the same folder, or in one above it.
 
     Yields
@@ -119,7 +120,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         If a file is missing or does not follow the format.
 
     """
-    parts = [path / name for name in (LABEL_FOLDER, 'data')]
+    parts = [path / name for name in (LABEL_FOLDER, f'training/{LABEL_FOLDER}', 'data')]
     labels = next((part for part in parts if part.is_dir()), path)
     calibrations = _calibrations(labels)
     folder = calibrations.parent
@@ -155,7 +156,10 @@ def _calibrations(labels: Path) -> Path:
 
 def _camera(path: Path, known: dict[bytes, Camera]) -> Camera:
     """Return the calibration of a frame; most frames have that of the one before."""
-    content = path.read_bytes()
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f'{unreadable(path, error)}: the calibration of a frame') from None
     if content not in known:
         known.clear()
         known[content] = Camera.read(path)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from decimal import Decimal
 from itertools import count
 from math import isfinite
@@ -21,9 +21,9 @@ from typing import Any
 from boxreg_ros.io.transforms import inverse, moved_boxes
 from boxreg_ros.labels.files import at, following, from_json, to_json
 from boxreg_ros.labels.protocol import Format, INPUT_STATUS, LabelFrame, Options, Provenance
-from boxreg_ros.labels.records import ReadBox, refined_of
+from boxreg_ros.labels.records import ReadBox, refined_of, require_radians
 from boxreg_ros.labels.sidecar import STAMPS_FILE, whole_stamps
-from boxreg_ros.labels.stamps import stamps_ns
+from boxreg_ros.labels.stamps import read_stamp_values, Stamps
 from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import matrix_from_quaternion, matrix_from_rpy, rpy_from_quaternion
 from boxreg_ros.structures import (
@@ -249,10 +249,14 @@ def read(path: Path) -> Iterator[LabelFrame]:
         )
         stamps = _stamps(path, frames)
         objects.require_frames(len(frames))
-        for (number, frame), stamp_ns in zip(frames, stamps, strict=True):
+        in_time = sorted(zip(stamps.stamps_ns, frames, strict=True), key=lambda item: item[0])
+        note = stamps.note
+        for stamp_ns, (number, frame) in in_time:
             with at(f'frame {number}'):
                 found = list(_read_frame(number, frame, stamp_ns, objects, systems))
-            yield from found
+            for one in found:
+                yield replace(one, note=note) if note else one
+                note = ''
 
 
 def _items(parent: dict[str, Any], name: str) -> list[tuple[str, Any]]:
@@ -260,14 +264,14 @@ def _items(parent: dict[str, Any], name: str) -> list[tuple[str, Any]]:
     return list((parent.get(name) or {}).items())
 
 
-def _stamps(path: Path, frames: list[tuple[int, Any]]) -> list[int]:
+def _stamps(path: Path, frames: list[tuple[int, Any]]) -> Stamps:
     """Return the stamp of each frame [ns]; those of ``timestamps.txt`` where one has none."""
     properties = [frame.get('frame_properties') or {} for _, frame in frames]
     if properties and all('stamp_ns' in one for one in properties):  # files of `Writer`
-        return [int(one['stamp_ns']) for one in properties]
+        return Stamps([int(one['stamp_ns']) for one in properties], '')
     values = [one.get('timestamp') for one in properties]
     if None not in values:
-        return stamps_ns(values)
+        return read_stamp_values(values)
     file = path.with_name(STAMPS_FILE)
     number, _ = frames[values.index(None)]
     if not file.exists():
@@ -278,7 +282,7 @@ def _stamps(path: Path, frames: list[tuple[int, Any]]) -> list[int]:
     stamps = whole_stamps(file, len(frames))
     if len(stamps) != len(frames):
         raise ValueError(f'{file}: expected {len(frames)} stamps, got {len(stamps)}')
-    return stamps
+    return Stamps(stamps, '')
 
 
 class _Objects:
@@ -307,6 +311,8 @@ class _Objects:
         """Yield the cuboids of a frame with the uids of their objects."""
         own = set()
         for uid, item in _items(frame, 'objects'):
+            if (item or {}).get('type') and not self._classes.get(uid):
+                self._classes[uid] = str(item['type'])  # some programs state it in frames alone
             for cuboid in ((item or {}).get('object_data') or {}).get('cuboid') or ():
                 own.add((uid, cuboid.get('name')))
                 yield uid, cuboid
@@ -483,7 +489,7 @@ def _attributes(cuboid: dict[str, Any]) -> dict[str, Any]:
 
 def _of_others(attributes: dict[str, Any]) -> dict[str, Any]:
     """Return the evidence among the attributes of another program, whose words are its own."""
-    score = attributes.get('score')
+    score = attributes.get('score', attributes.get('confidence'))
     return {
         'score': score if isinstance(score, int | Decimal) else None,
         'status': INTERPOLATED if attributes.get('interpolated') is True else INPUT_STATUS,
@@ -495,5 +501,6 @@ def _box(values: list[float]) -> Floats:
     numbers = np.array(values, np.float64)
     if numbers.shape not in ((9,), (10,)):
         raise ValueError(f'expected 9 or 10 values of a cuboid, got {values!r}')
-    rpy = numbers[3:6] if len(numbers) == 9 else rpy_from_quaternion(numbers[3:7])
+    is_euler = len(numbers) == 9
+    rpy = require_radians(numbers[3:6]) if is_euler else rpy_from_quaternion(numbers[3:7])
     return np.concatenate([numbers[:3], numbers[-3:], rpy])

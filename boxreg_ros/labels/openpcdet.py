@@ -15,7 +15,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.cuboids import UNKNOWN_CLASS
 from boxreg_ros.labels.per_frame import EVIDENCE_FOLDER, numbers_of, PerFrameWriter, read_lines
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.records import ReadBox
+from boxreg_ros.labels.records import ReadBox, require_radians
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BoxArray, Floats, Ints, ROLL
 import numpy as np
@@ -110,6 +110,6 @@ def _boxes(name: str, words: list[list[str]]) -> list[ReadBox | None]:
     boxes: list[ReadBox | None] = []
     for line, numbers in zip(words, numbers_of(words, slice(7), COLUMN_COUNTS), strict=True):
         score = float(line[8]) if len(line) > 8 else None
-        box = [*numbers[:6], 0.0, 0.0, numbers[6]]
+        box = [*numbers[:6], 0.0, 0.0, float(require_radians(numbers[6]))]
         boxes.append(ReadBox('', line[7], box, {'score': score}))
     return boxes

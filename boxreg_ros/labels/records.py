@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 
 FIRST_ASSIGNED_NUMBER = 10**6
 """Track numbers below keep their value; assigned numbers start here (see `TrackNumbers`)."""
+LARGEST_ANGLE = 4 * np.pi
+"""Angles up to two turns are radians [rad]; chosen: most degrees of a drive have larger ones."""
 MIN_QUATERNION_NORM = 1e-6
 """A shorter quaternion states no orientation."""
 UPPER_TRIANGLE = np.triu_indices(6)
@@ -100,6 +102,18 @@ def boxes_from_quaternions(
     if is_rotation.any():
         angles[is_rotation] = rpy_from_quaternion(quaternion[is_rotation])
     return np.hstack([centre, extent, angles])
+
+
+def require_radians(angles: ArrayLike) -> Floats:
+    """Return angles [rad]; ValueError if one is larger than programs that add up turns state."""
+    values = np.asarray(angles, np.float64)
+    largest = np.abs(values).max(initial=0.0)
+    if largest > LARGEST_ANGLE:
+        raise ValueError(
+            f'expected angles in radians, got {largest:g}, which is in degrees: multiply all '
+            f'angles by pi / 180'
+        )
+    return values
 
 
 def numbers_of(boxes: BoxArray) -> Floats:

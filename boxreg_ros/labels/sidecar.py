@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, UTC
 from pathlib import Path
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels.files import frame_names
+from boxreg_ros.labels.files import following, frame_names
 from boxreg_ros.labels.protocol import LabelFrame, SceneFrames
 from boxreg_ros.labels.records import ReadBox, refined_of
-from boxreg_ros.labels.stamps import stamps_of_names
+from boxreg_ros.labels.stamps import stamps_ns, stamps_of_names
 from boxreg_ros.structures import Floats
 import numpy as np
 
@@ -152,29 +151,45 @@ def filled_stamps(stamps_ns: Sequence[int | None], count: int = 0) -> list[int]:
 
 def read_stamps(path: Path, names: Sequence[str] = ()) -> list[int | None]:
     """
-    Return the stamps of a file, one per line [ns]: integers, or UTC as in KITTI raw.
+    Return the stamps of a file [ns].
 
-    None for a blank line; `names` are those of frames, which state no stamps. Raises
-    RecordingError if the file cannot be read, or a line is neither.
+    Parameters
+    ----------
+    path : Path
+        A stamp per line, or a blank one: whole nanoseconds; a unit in which all are between 2001
+        and 2100; seconds with decimals; or moments, as in KITTI raw.
+    names : sequence of str
+        Of frames, which state no stamps; for the error.
+
+    Returns
+    -------
+    stamps_ns : list of int or None
+        One per line; None for a blank one.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read, or a line is no stamp.
 
     """
     try:
-        lines = path.read_text(encoding='utf-8').splitlines()
+        lines = [line.strip() for line in path.read_text(encoding='utf-8').splitlines()]
     except OSError:
         got = f' (names such as {names[0]!r} are none)' if names else ''
         raise RecordingError(
             f'{path}: not found, and these labels have no stamps of their own{got}; create it '
             f'with one stamp per frame, as whole nanoseconds'
         ) from None
-    stamps: list[int | None] = []
     for number, line in enumerate(lines, 1):
         try:
-            stamps.append(_stamp_ns(line.strip()) if line.strip() else None)
+            stamps_ns([line] if line else [])
         except ValueError:
             raise RecordingError(
-                f'{path}:{number}: expected whole nanoseconds, got {line.strip()!r}'
+                f'{path}:{number}: expected whole nanoseconds, got {line!r}'
             ) from None
-    return stamps
+    with following(path, 'stamps'):
+        known = iter(stamps_ns([line for line in lines if line], are_nanoseconds=True))
+    return [next(known) if line else None for line in lines]
 
 
 def read_poses(path: Path, count: int) -> list[Floats | None]:
@@ -194,11 +209,3 @@ def read_poses(path: Path, count: int) -> list[Floats | None]:
         raise RecordingError(f'{path}: expected {count} poses, one per stamp, got {len(rows)}')
     last_row = np.array([[0.0, 0.0, 0.0, 1.0]])
     return [np.vstack([row, last_row]) if np.isfinite(row).all() else None for row in rows]
-
-
-def _stamp_ns(text: str) -> int:
-    if text.isdigit():
-        return int(text)
-    moment, _, fraction = text.partition('.')
-    seconds = int(datetime.fromisoformat(moment).replace(tzinfo=UTC).timestamp())
-    return seconds * 10**9 + int(fraction.ljust(9, '0')[:9] or 0)

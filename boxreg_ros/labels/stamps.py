@@ -5,14 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import datetime, UTC
 from decimal import Decimal, InvalidOperation
+from itertools import pairwise
 import re
+from typing import NamedTuple
 
 STAMP_UNITS = ((11, 9), (14, 6), (17, 3), (19, 0))
 """
 Most digits of a stamp before its point, and the power of ten from its unit to nanoseconds.
 
-Seconds, milliseconds, microseconds and nanoseconds since 1970. Derived: eleven digits of seconds
-are the year 5138, twelve of milliseconds begin in 1973; so no stamp of a recording has two units.
+Of a file with one stamp that is in no unit between 2001 and 2100. Derived: eleven digits of
+seconds are the year 5138, twelve of milliseconds begin in 1973; so no stamp has two units.
+
+"""
+FIRST_SECOND, LAST_SECOND = 10**9, 4_102_444_800
+"""Stamps of clocks that are set lie between them [s since 1970]: 2001 to 2100; chosen."""
+LONGEST_STEP = 1000
+"""Labels of one drive are closer than this [s]; chosen: 15 minutes."""
+STEP_UNITS = ((10**7, 0, 'nanoseconds'), (10**4, 3, 'microseconds'), (10, 6, 'milliseconds'))
+"""
+Shortest time between two frames in a unit, its power of ten, and its name; the rest are seconds.
+
+Derived: labels have rates from 0.1 to 100 Hz, so each step has one unit.
 
 """
 NAME_DIGITS = {10: 9, 13: 6, 16: 3, 19: 0}
@@ -33,20 +46,36 @@ LAST_NS = 2**63 - 1
 """Largest stamp of 64 bits [ns]; it is of the year 2262."""
 
 
-def stamps_ns(values: Sequence[object]) -> list[int]:
+class Stamps(NamedTuple):
+    """The stamps of one label file."""
+
+    stamps_ns: list[int]
+    note: str
+    """That their unit was guessed; empty where they state it."""
+
+
+def stamps_ns(values: Sequence[object], *, are_nanoseconds: bool = False) -> list[int]:
+    """Return the stamps of one label file [ns]; see `read_stamp_values`."""
+    return read_stamp_values(values, are_nanoseconds=are_nanoseconds).stamps_ns
+
+
+def read_stamp_values(values: Sequence[object], *, are_nanoseconds: bool = False) -> Stamps:
     """
     Return the stamps of one label file [ns].
 
     Parameters
     ----------
     values : sequence of n numbers or str
-        Times since 1970 in one unit, which the largest states by its digits, see `STAMP_UNITS`:
-        numbers or decimals as text, which are exact, floats as their shortest decimals; or moments
-        as in ISO 8601, in UTC where they state no zone.
+        Times in one unit: numbers or decimals as text, which are exact, floats as their shortest
+        decimals; or moments as in ISO 8601, in UTC where they state no zone. Numbers are of the
+        unit in which they lie between 2001 and 2100. Those of a clock that began later, such as at
+        the first frame, are of the unit in which labels have a usual rate, see `STEP_UNITS`.
+    are_nanoseconds : bool
+        Whether whole numbers that do not lie between 2001 and 2100 are nanoseconds.
 
     Returns
     -------
-    stamps_ns : list of n int
+    stamps : Stamps
         Decimals below a nanosecond are cut off.
 
     Raises
@@ -59,13 +88,14 @@ def stamps_ns(values: Sequence[object]) -> list[int]:
     numbers = [
         _decimal(value) for value, moment in zip(values, moments, strict=True) if moment is None
     ]
-    exponent = _exponent(max(numbers, default=Decimal(0)))
+    is_whole = all(number == number.to_integral_value() for number in numbers)
+    exponent, note = _exponent(numbers, are_nanoseconds and is_whole)
     scaled = iter([int(number.scaleb(exponent)) for number in numbers])
     found = [next(scaled) if moment is None else moment for moment in moments]
     for value, stamp_ns in zip(values, found, strict=True):
         if not 0 <= stamp_ns <= LAST_NS:
             raise ValueError(f'expected a time since 1970, got {value}')
-    return found
+    return Stamps(found, note)
 
 
 def stamps_of_names(names: Sequence[str]) -> list[int] | None:
@@ -114,13 +144,33 @@ def _decimal(value: object) -> Decimal:
     return number
 
 
-def _exponent(largest: Decimal) -> int:
-    """Return the power of ten from the unit of a stamp to nanoseconds."""
+def _exponent(numbers: Sequence[Decimal], are_nanoseconds: bool) -> tuple[int, str]:
+    """Return the power of ten from the unit of stamps to nanoseconds, and a note on a guess."""
+    largest = max(numbers, default=Decimal(0))
+    ordered = sorted(set(numbers))
+    steps = sorted(after - before for before, after in pairwise(ordered))
+    step = steps[len(steps) // 2] if steps else None
+    for exponent in (9, 6, 3, 0):
+        is_of_drive = step is None or step.scaleb(exponent - 9) < LONGEST_STEP
+        if FIRST_SECOND <= largest.scaleb(exponent - 9) < LAST_SECOND and is_of_drive:
+            return (0 if are_nanoseconds and step is None else exponent), ''
+    if are_nanoseconds:
+        return 0, ''
+    if step is not None:
+        return _exponent_of_step(step)
     digits = max(largest.adjusted() + 1, 1)
     for most, exponent in STAMP_UNITS:
         if digits <= most:
-            return exponent
+            return exponent, ''
     raise ValueError(f'expected at most 19 digits of nanoseconds since 1970, got {largest}')
+
+
+def _exponent_of_step(step: Decimal) -> tuple[int, str]:
+    """Return the exponent of stamps by the time between two frames, and a note if not seconds."""
+    for shortest, exponent, unit in STEP_UNITS:
+        if step >= shortest:
+            return exponent, f'stamps: {step:f} from frame to frame are read as {unit}'
+    return 9, ''
 
 
 def _moment_ns(value: object) -> int | None:

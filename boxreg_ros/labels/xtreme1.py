@@ -177,7 +177,8 @@ def _results(content: Any) -> list[_Result]:
         without_box = 0
         for number, item in enumerate(result['objects'] or ()):
             with at(f'object {number}'):
-                if item.get('type', item.get('objType', BOX_TYPE)).upper() not in BOX_TYPES:
+                kind = item.get('type') or item.get('objType') or BOX_TYPE
+                if str(kind).upper() not in BOX_TYPES:
                     continue
                 if 'contour' in item and item['contour'] is None:
                     without_box += 1

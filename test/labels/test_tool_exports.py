@@ -8,6 +8,7 @@ from boxreg_ros.cli import main
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of
 from boxreg_ros.labels.merging import keyframes_of
+from boxreg_ros.labels.sidecar import whole_stamps
 from boxreg_ros.labels.stamps import stamps_ns, stamps_of_names
 from consumers import consumer
 import numpy as np
@@ -54,6 +55,12 @@ def put_stamps(folder, count, step=S // 10):
         ([0, '0.1'], [0, S // 10]),
         (['2023-11-14T22:13:20.123456789Z'], [AT + 123_456_789]),
         (['2023-11-14T23:13:20,5+01:00', '2023-11-14 22:13:20'], [AT + S // 2, AT]),
+        # Since the first frame, as Kognic states them: the rate of labels shows the unit.
+        ([0, 100, 200], [0, S // 10, S // 5]),
+        ([0, 50_000, 150_000], [0, S // 20, S * 15 // 100]),
+        ([5, 5.5, 6], [5 * S, 5 * S + S // 2, 6 * S]),
+        ([10**8, 2 * 10**8], [10**8, 2 * 10**8]),
+        ([1_600_000_000, 1_700_000_000], [1_600_000_000, 1_700_000_000]),  # 1.6 s in ns
     ],
 )
 def test_stamps_are_exact_in_any_unit(values, expected):
@@ -64,6 +71,22 @@ def test_stamps_are_exact_in_any_unit(values, expected):
 def test_values_that_are_no_stamps_are_refused(value):
     with pytest.raises(ValueError, match='expected'):
         stamps_ns([value])
+
+
+@pytest.mark.parametrize(
+    ('lines', 'expected'),
+    [
+        (['100', '200'], [100, 200]),  # whole nanoseconds, as we write them
+        (['1600000000', '', '1700000000'], [1_600_000_000, 1_650_000_000, 1_700_000_000]),
+        (['1700000000'], [1_700_000_000]),
+        (['1700000000000000', '1700000000100000'], [AT, AT + S // 10]),
+        (['1700000000.25', '1700000000.5'], [AT + S // 4, AT + S // 2]),
+        (['0.0', '0.1'], [0, S // 10]),
+    ],
+)
+def test_stamps_beside_labels_in_any_unit(tmp_path, lines, expected):
+    path = put(tmp_path / 'timestamps.txt', ''.join(f'{line}\n' for line in lines))
+    assert whole_stamps(path) == expected
 
 
 @pytest.mark.parametrize(
@@ -126,6 +149,16 @@ def test_datumaro_marks_what_cvat_interpolated(tmp_path):
     assert found.refined.status == ('input', 'interpolated', 'input')
     assert len(found.keyframes().refined.status) == 2
     assert found.keyframes().left_out == {'not_a_keyframe': 1}
+
+
+def test_datumaro_marks_objects_that_have_left_and_writes_flags_as_text(tmp_path):
+    boxes = [cuboid(1, outside=True), cuboid(2, keyframe='false'), cuboid(3, keyframe='true')]
+    (found,) = read('datumaro', datumaro(tmp_path, [{'id': f'{AT}', 'annotations': boxes}]))
+    assert found.refined.status == ('interpolated', 'input')
+    assert found.left_out == {'no_box': 1}
+    wrong = [{'id': f'{AT}', 'annotations': [cuboid(1) | {'label_id': 1}]}]
+    with pytest.raises(RecordingError, match='expected a label_id of 1 labels, got 1'):
+        read('datumaro', datumaro(tmp_path, wrong))
 
 
 def test_cvat_finds_the_tracks_of_our_export(tmp_path):
@@ -382,6 +415,27 @@ def test_openlabel_interpolated_by_its_tool(tmp_path):
     assert found.refined.status == ('interpolated',)
 
 
+def test_openlabel_with_stamps_since_the_first_frame_says_their_unit(tmp_path):
+    """Kognic: whole milliseconds. Frames in another order than their stamps are sorted."""
+    frames = {
+        str(i): {'frame_properties': {'timestamp': at}, 'objects': objects_of(val(i))}
+        for i, at in enumerate([100, 0, 200])
+    }
+    found = read('openlabel', openlabel(tmp_path / 'a.json', frames, CLASSES))
+    assert stamps(found) == [0, S // 10, S // 5]
+    assert [one.refined.boxes.boxes[0, 0] for one in found] == [1, 0, 2]
+    assert found[0].note == 'stamps: 100 from frame to frame are read as milliseconds'
+
+
+def test_openlabel_of_programs_that_state_classes_in_frames(tmp_path):
+    objects = objects_of(val(1, attributes={'num': [{'name': 'confidence', 'val': 0.5}]}))
+    objects['0']['type'] = 'truck'
+    frames = {'0': {'frame_properties': {'timestamp': 1}, 'objects': objects}}
+    (found,) = read('openlabel', openlabel(tmp_path / 'a.json', frames, {}))
+    assert found.refined.boxes.class_names == ('truck',)
+    assert found.refined.boxes.scores == [0.5]
+
+
 def test_openlabel_without_stamps_names_the_frame_and_the_file(tmp_path):
     frames = {'4': {'objects': objects_of(val(1))}}
     path = openlabel(tmp_path / 'a.json', frames, CLASSES)
@@ -434,6 +488,7 @@ def test_xtreme1_names_of_tracks_start_again_in_each_frame(tmp_path):
 def test_xtreme1_objects_without_contour_and_of_older_versions(tmp_path):
     null = object_of(1, contour=None)
     bare = {key: value for key, value in object_of(2).items() if not key.startswith('track')}
+    bare['type'] = None
     old = {'objType': '3d', 'classType': 'car', **object_of(3)['contour']}
     folder = xtreme1(
         tmp_path, [result('s', null)], [result('s', bare)], {'result': {'objects': [old]}},
@@ -538,6 +593,11 @@ def test_labels_without_a_valid_box_are_refused(tmp_path, capsys):
     assert '1 boxes are invalid' in printed and '1 boxes are left out (no_box)' in printed
 
 
+KITTI_CALIBRATION = (
+    'P2: 1 0 0 0 0 1 0 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n'
+    'Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n'
+)
+
 # One file per cloud ------------------------------------------------------------------------------
 
 
@@ -580,9 +640,7 @@ def test_lines_that_a_person_has_edited_lose_no_other_evidence(tmp_path):
 
 def test_kitti_object_of_a_detector(tmp_path):
     """Results have 16 columns, and the calibration is that of the data set above them."""
-    calibration = 'P2: 1 0 0 0 0 1 0 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n'
-    calibration += 'Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n'
-    put(tmp_path / 'calib' / '000003.txt', calibration)
+    put(tmp_path / 'calib' / '000003.txt', KITTI_CALIBRATION)
     put(tmp_path / 'results/data/000003.txt', 'Car -1 -1 0 0 0 9 9 1.5 1.8 4 1 2 10 -1.57 0.9\n')
     put_stamps(tmp_path, 1)
     (found,) = read('kitti_object', tmp_path / 'results')
@@ -591,9 +649,37 @@ def test_kitti_object_of_a_detector(tmp_path):
     np.testing.assert_allclose(boxes.boxes[0, :6], [10, -1, -2 + 0.75, 4, 1.8, 1.5])
     assert boxes.boxes[0, 8] == pytest.approx(1.57 - np.pi / 2)
     assert (boxes.scores[0], stamps([found])) == (0.9, [AT])
+    put(tmp_path / 'results/data/000004.txt', 'Car -1 -1 0 0 0 9 9 1.5 1.8 4 1 2 10 -1.57 0.9\n')
+    put_stamps(tmp_path, 2)
+    with pytest.raises(RecordingError, match=r'calib/000004.txt: cannot be read'):
+        read('kitti_object', tmp_path / 'results')
     shutil.rmtree(tmp_path / 'calib')
     with pytest.raises(RecordingError, match=r'expected calib/NAME.txt for each frame'):
         read('kitti_object', tmp_path / 'results')
+
+
+def test_the_root_of_kitti_object_is_enough(tmp_path):
+    put(tmp_path / 'training/calib' / f'{AT}.txt', KITTI_CALIBRATION)
+    line = 'Car 0 0 0 0 0 9 9 1.5 1.8 4 1 2 10 -1.57\n'
+    put(tmp_path / 'training/label_2' / f'{AT}.txt', line)
+    assert stamps(read('kitti_object', tmp_path)) == [AT]
+
+
+@pytest.mark.parametrize('angle', ['90', '-180'])
+def test_angles_in_degrees_are_refused(tmp_path, angle):
+    put(tmp_path / 'labels' / f'{AT}.txt', f'1 2 3 4 2 1.5 {angle} Car\n')
+    put(tmp_path / 'calib' / f'{AT}.txt', KITTI_CALIBRATION)
+    put(tmp_path / 'label_2' / f'{AT}.txt', f'Car 0 0 0 0 0 9 9 1.5 1.8 4 1 2 10 {angle}\n')
+    put(tmp_path / 'calib/0000.txt', KITTI_CALIBRATION)
+    put(tmp_path / 'label_02/0000.txt', f'0 1 Car 0 0 0 0 0 9 9 1.5 1.8 4 1 2 10 {angle}\n')
+    put_stamps(tmp_path, 1)
+    for name in ('openpcdet', 'kitti_object', 'kitti'):
+        with pytest.raises(RecordingError, match=r'expected angles in radians, got (90|180), '):
+            read(name, tmp_path)
+    cuboid_of_angles = {'name': 'box', 'val': [1, 2, 3, 0, 0, float(angle), 4, 2, 1.5]}
+    frames = {'0': {'frame_properties': {'timestamp': 1}, 'objects': objects_of(cuboid_of_angles)}}
+    with pytest.raises(RecordingError, match='frame 0: object 0: expected angles in radians'):
+        read('openlabel', openlabel(tmp_path / 'a.json', frames, CLASSES))
 
 
 def test_datumaro_reads_kitti_object(tmp_path):

@@ -295,6 +295,22 @@ def test_unusable_messages_are_skipped_and_reported(tmp_path, capsys):
     assert '2 messages could not be read' in capsys.readouterr().err
 
 
+def test_true_boxes_with_rounded_stamps_are_joined(tmp_path, capsys):
+    """In microseconds, by which most programs write stamps."""
+    made = Recorded(sweeps=8, start=1_700_000_000_000_000_789)
+    true = [
+        BoxArray(stamp // 1000 * 1000, 'odom', ('1', '2'), ('car', 'car'), np.ones(2), boxes)
+        for stamp, boxes in made.truth.items()
+    ]
+    truth, path = BoxTable.from_arrays(true, 'truth'), made.write(tmp_path / 'drive')
+    drive = Drive.of(Recording([path]), truth)
+    assert sorted(set(drive.truth.stamps_ns.tolist())) == made.stamps
+    truth.write(tmp_path / 'truth.csv')
+    assert cli.main(['calibrate', str(path), '--truth', str(tmp_path / 'truth.csv')]) == 0
+    expected = '8 of 8 stamps of the true boxes are up to 0.789 us from those of the boxes: joined'
+    assert expected in capsys.readouterr().err
+
+
 def test_truth_of_another_time_is_refused(street, scene, tmp_path, capsys):
     truth = replace(scene.truth, stamps_ns=scene.truth.stamps_ns + 10**12)
     truth.write(tmp_path / 'truth.csv')

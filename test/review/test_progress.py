@@ -1,12 +1,13 @@
 """The progress of a review over drives, and the agreement of people."""
 
+from dataclasses import replace
 import shutil
 
 from boxreg_ros.cli import main
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
-from boxreg_ros.review.progress import progress_of
+from boxreg_ros.review.progress import agreement, progress_of
 from boxreg_ros.review.server import review_server
 from browser import NEEDS_BROWSER, opened_page, press, serving
 import numpy as np
@@ -90,6 +91,20 @@ def test_progress_counts_decisions_and_the_time_between_them(outs, capsys):
     (first / 'review.csv').unlink()
     assert main(['review', str(first), '--progress']) == 1
     assert 'review.csv: cannot be read' in capsys.readouterr().err
+
+
+def test_boxes_of_people_with_rounded_stamps_are_compared(outs):
+    """One reviews a result whose recording has whole microseconds, and decides on that."""
+    first, second = outs
+    table = BoxTable.read(second / 'boxes.csv')
+    decide(first, pin_of(first, 'anna', at(0), 0.2))
+    pin = pin_of(second, 'ben', at(0), 0.4)
+    decide(second, replace(pin, stamp_ns=pin.stamp_ns + 789))
+    both, ours = agreement(outs)
+    row = table.track_ids.index('1')
+    boxes = table.boxes[row] + np.eye(9)[0] * [[0.2], [0.4]]
+    assert both.tolist() == iou_3d(boxes[:1], boxes[1:]).tolist()
+    assert len(ours) == 2
 
 
 @NEEDS_BROWSER

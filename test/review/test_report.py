@@ -280,6 +280,25 @@ def test_truth_of_another_drive_is_left_out_with_a_warning(tmp_path, capsys):
     assert not Page(out / 'report.html').data['has_truth']
 
 
+def test_truth_with_rounded_stamps_is_that_of_the_boxes(tmp_path, capsys):
+    """Stamps in milliseconds; the boxes of the truth are those of the result."""
+    drive = Drive(sweeps=6, start=1_700_000_000_000_456_789)
+    recording = drive.write(tmp_path / 'drive')
+    true = [
+        BoxArray(stamp // 10**6 * 10**6, 'odom', ('1', '2'), ('car', 'car'), np.ones(2), boxes)
+        for stamp, boxes in drive.truth.items()
+    ]
+    BoxTable.from_arrays(true, 'truth').write(tmp_path / 'truth.csv')
+    options = ['-o', tmp_path / 'out', '--report', '--truth', tmp_path / 'truth.csv']
+    words = ['relabel', recording, *options, '--set', 'solver.rounds=1']
+    assert main([str(word) for word in words]) == 0
+    expected = '6 of 6 stamps of the true boxes are up to 456.789 us from those of the results'
+    assert expected in capsys.readouterr().err
+    page = Page(tmp_path / 'out' / 'report.html')
+    assert page.data['has_truth']
+    assert len(page.part('1')['truth']) == 6
+
+
 def test_truth_and_input_models_that_cannot_be_read_are_refused_before_the_work(tmp_path):
     recording = Drive(sweeps=6).write(tmp_path / 'drive')
     junk = tmp_path / 'junk'
