@@ -17,53 +17,79 @@ from numpy.typing import NDArray
 class Dataset:
     """A data set, as the documentation and ``boxreg formats`` show it."""
 
-    name: str  # prefix on the command line
-    title: str  # name in prose
-    folder: str  # files and folders that are expected in the root folder
-    scene: str  # example of the name of a scene, or a word for it
-    labels: str  # label format of its results for ``--labels``; '' for none
-    remedy: str  # how to complete a folder with missing files
-    lidar: str = ''  # name of the main one; '' if the scene states it
-    packages: tuple[str, ...] = ()  # of pip, beyond those of boxreg_ros itself
-    reads: str = ''  # what is read, in a few words
-    leaves_out: str = ''  # what the data set has beside it
-    read_back: str = ''  # library and version that has the same clouds or poses, in the tests
+    name: str
+    """Prefix on the command line."""
+    title: str
+    """Name in prose."""
+    folder: str
+    """Files and folders that are expected in the root folder."""
+    scene: str
+    """Example of the name of a scene, or a word for it."""
+    labels: str
+    """Label format of its results for ``--labels``; empty for none."""
+    remedy: str
+    """How to complete a folder with missing files."""
+    lidar: str = ''
+    """Name of the main one; empty if the scene states it."""
+    packages: tuple[str, ...] = ()
+    """Of pip, beyond those of boxreg_ros itself."""
+    reads: str = ''
+    """What is read, in a few words."""
+    leaves_out: str = ''
+    """What the data set has beside it."""
+    read_back: str = ''
+    """Library and version that has the same clouds or poses, in the tests."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
     """The points of a sweep, in the frame of the clouds of its scene."""
 
-    points: NDArray[np.floating]  # (M, 3) [m]
-    intensities: Floats | None = None  # (M,) in the unit of the data set
-    times: Floats | None = None  # (M,) of measurement relative to the stamp [s]
-    # (K, 3) positions of the sensors [m]
+    points: NDArray[np.floating]
+    """(M, 3) [m]."""
+    intensities: Floats | None = None
+    """(M,) in the unit of the data set."""
+    times: Floats | None = None
+    """(M,) of measurement relative to the stamp [s]."""
     origins: Floats = field(default_factory=lambda: np.zeros((1, 3)))
-    sensors: NDArray[np.uint8] | None = None  # (M,) row of `origins`; None for one sensor
+    """(K, 3) positions of the sensors [m]."""
+    sensors: NDArray[np.uint8] | None = None
+    """(M,) row of `origins`; None for one sensor."""
 
 
 class SweepFile(NamedTuple):
     """A sweep that is not read yet."""
 
     stamp_ns: int
-    read: Callable[[], Cloud]  # raises UnsupportedMessage if the points cannot be read
-    lidar: str = ''  # of `Scene.lidars` that measured it
+    """Of the cloud, to which its times are relative [ns]."""
+    read: Callable[[], Cloud]
+    """Reads the points; raises UnsupportedMessage if they cannot be read."""
+    lidar: str = ''
+    """Of `Scene.lidars` that measured it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
     """One drive of a data set."""
 
-    frames: SceneFrames  # names and stamps of its frames, and the coordinate frames
-    points_topic: str  # name of the LiDAR, or of several, separated by commas
-    sweep_stamps_ns: Ints  # (S,) ascending
-    sweeps: Callable[[], Iterator[SweepFile]]  # in this order; one is in memory at a time
-    pose_stamps_ns: Ints  # (P,) ascending
-    poses: Floats  # (P, 7) x y z qx qy qz qw of the frame of the clouds in the fixed frame
-    boxes: Callable[[], Iterator[LabelFrame]] | None  # the annotations, if it has any
-    without_boxes: str = ''  # file or folder that would have annotations
-    # LiDARs whose sweeps have stamps of their own, to be merged by time; the first gives the stamp
+    frames: SceneFrames
+    """Names and stamps of its frames, and the coordinate frames."""
+    points_topic: str
+    """Name of the LiDAR, or of several, separated by commas."""
+    sweep_stamps_ns: Ints
+    """(S,) ascending [ns]."""
+    sweeps: Callable[[], Iterator[SweepFile]]
+    """Yields the S sweeps in this order; one is in memory at a time."""
+    pose_stamps_ns: Ints
+    """(P,) ascending [ns]."""
+    poses: Floats
+    """(P, 7) x y z qx qy qz qw of the frame of the clouds in the fixed frame [m]."""
+    boxes: Callable[[], Iterator[LabelFrame]] | None
+    """Yields the annotations in the order of their stamps; None if there are none."""
+    without_boxes: str = ''
+    """File or folder that would have annotations."""
     lidars: tuple[str, ...] = ()
+    """LiDARs whose sweeps have stamps of their own, merged by time; the first gives the stamp."""
 
 
 class DatasetModule(Protocol):
@@ -74,15 +100,65 @@ class DatasetModule(Protocol):
         """Return the description of the data set."""
 
     def scene_names(self, root: Path) -> list[str]:
-        """Return the names of all scenes in a folder; empty if it is not of this data set."""
+        """
+        Return the names of all scenes in a folder.
+
+        Parameters
+        ----------
+        root : Path
+            Folder that the archives were unpacked in.
+
+        Returns
+        -------
+        names : list of str
+            In the order in which they are listed; empty if the folder is not of this data set.
+
+        Raises
+        ------
+        RecordingError
+            If a table of scenes cannot be read.
+
+        """
 
     def inputs(self, root: Path, name: str) -> tuple[Path, ...]:
-        """Return the files and folders that a scene is read from, for its fingerprint."""
+        """
+        Return the files and folders that a scene is read from, for its fingerprint.
+
+        Parameters
+        ----------
+        root : Path
+            As of `scene_names`.
+        name : str
+            One of these names.
+
+        Returns
+        -------
+        paths : tuple of Path
+            Folders stand for all files below them.
+
+        """
 
     def open_scene(self, root: Path, name: str, lidars: Sequence[str]) -> Scene:
         """
-        Return a scene with these LiDARs, by their names; none for the main one.
+        Return a scene, without reading its clouds.
 
-        Raises RecordingError if a file is missing or does not follow the layout.
+        Parameters
+        ----------
+        root, name
+            As of `inputs`.
+        lidars : sequence of str
+            Names of the LiDARs to read; none for the main one.
+
+        Returns
+        -------
+        scene : Scene
+            Clouds are in the frame of the LiDAR, or of the vehicle for several [m], poses in the
+            fixed frame, stamps as integers [ns].
+
+        Raises
+        ------
+        RecordingError
+            If a file is missing or does not follow the layout, or there is no such LiDAR; with
+            the file, and the archive that has it.
 
         """

@@ -135,6 +135,10 @@ class ClassNames:
             self.uncounted[class_name] += 1
         return name
 
+    def word_of(self, class_name: str, unknown: str) -> str:
+        """Return the name to write where names are one word; `unknown` for boxes without one."""
+        return '_'.join(self.of(class_name).split()) or unknown
+
 
 @cache
 def official(class_name: str, vocabulary: tuple[str, ...], default: str | None = None) -> str:

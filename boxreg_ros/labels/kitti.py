@@ -87,7 +87,7 @@ class Writer(FolderWriter):
         for i, row in enumerate(rows):
             track = self._tracks.of(array.track_ids[row])
             given = array.class_names[row]
-            name = '_'.join(self.class_names.of(given).split()) or 'Misc'
+            name = self.class_names.word_of(given, 'Misc')
             if name != given:
                 self._given_classes[f'{track} {name}'] = given
             self._file.write(f'{self.number} {track} {name} {truncation[i]} {UNKNOWN_OCCLUSION} ')

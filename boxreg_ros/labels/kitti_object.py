@@ -89,7 +89,7 @@ class Writer(PerFrameWriter):
         """Yield the line of each box; see `PerFrameWriter.lines`."""
         truncation, columns = columns_of(self._camera, boxes)
         for i, row in enumerate(rows):
-            name = '_'.join(self.class_names.of(array.class_names[row]).split()) or 'Misc'
+            name = self.class_names.word_of(array.class_names[row], 'Misc')
             begin = f'{name} {TRUNCATION[int(truncation[i])]}'
             numbers = decimals(columns[i], array.scores[row])
             yield f'{begin} {UNKNOWN_OCCLUSION} {numbers}'

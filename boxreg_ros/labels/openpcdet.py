@@ -64,9 +64,7 @@ class Writer(PerFrameWriter):
         yaws = np.arctan2(headings[:, 1], headings[:, 0])
         for row, box, yaw in zip(rows, boxes, yaws, strict=True):
             numbers = ' '.join(f'{value:.6f}' for value in (*box[:ROLL], yaw))
-            class_name = (
-                '_'.join(self.class_names.of(array.class_names[row]).split()) or UNKNOWN_CLASS
-            )
+            class_name = self.class_names.word_of(array.class_names[row], UNKNOWN_CLASS)
             yield f'{numbers} {class_name}'
 
 
