@@ -249,13 +249,8 @@ def test_only_the_keyframes_of_a_person_are_followed(tmp_path, capsys):
         arrays.append(LabelFrame(refined, 'odom', 'lidar'))
         between += status.count('interpolated')
     write('csv', tmp_path, arrays)
-    words = [
-        'relabel',
-        str(drive.write(tmp_path / 'drive')),
-        '--keyframes',
-        '--set=solver.rounds=2',
-    ]
-    words += ['--labels', f'csv:{tmp_path}/boxes.csv', '-o', str(tmp_path / 'out')]
+    words = ['relabel', str(drive.write(tmp_path / 'drive')), '-o', str(tmp_path / 'out')]
+    words += ['--labels', f'csv:{tmp_path}/boxes.csv', '--keyframes', '--set=solver.rounds=2']
     assert main(words) == 0
     assert f'labels: {between} boxes are left out (not_a_key' in capsys.readouterr().err
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
