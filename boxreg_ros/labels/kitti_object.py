@@ -45,7 +45,8 @@ FORMAT = Format(
     leaves_out='regions without a 3D box (counted), the rectangles in the image',
     read_back='datumaro 1.13.12',
 )
-LABEL_FOLDER, IMAGE_FOLDER = 'label_2', 'image_2'
+LABEL_FOLDER = 'label_2'
+KITTI_IMAGES = 'image_2'
 OBJECT_COLUMNS = (15, 16)
 TRUNCATION = {INSIDE_IMAGE: '0.00', TRUNCATED: '-1.00', OUTSIDE_IMAGE: '1.00'}
 """Text of the values of KITTI tracking; the part outside of the image is not known."""
@@ -59,7 +60,7 @@ class Writer(PerFrameWriter):
     folders = (LABEL_FOLDER, 'calib', EVIDENCE_FOLDER)
     label_folder = LABEL_FOLDER
     cloud_file = 'velodyne/{name}.bin'
-    image_file = f'{IMAGE_FOLDER}/{{name}}.png'
+    image_file = f'{KITTI_IMAGES}/{{name}}.png'
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         self._chosen = KittiCamera(options, 'format kitti_object')
@@ -72,7 +73,7 @@ class Writer(PerFrameWriter):
         path = self.folder / 'calib' / f'{self.name}.txt'
         write_calibration(self._camera, path, CALIBRATION_NAMES)
         if self._chosen.is_assumed:  # OpenPCDet takes the size of the image from its file
-            image = self.folder / IMAGE_FOLDER / f'{self.name}.png'
+            image = self.folder / KITTI_IMAGES / f'{self.name}.png'
             image.parent.mkdir(exist_ok=True)
             image.write_bytes(black_png(*self._camera.size))
 

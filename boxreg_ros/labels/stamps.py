@@ -19,7 +19,7 @@ seconds are the year 5138, twelve of milliseconds begin in 1973; so no stamp has
 """
 FIRST_SECOND, LAST_SECOND = 10**9, 4_102_444_800
 """Stamps of clocks that are set lie between them [s since 1970]: 2001 to 2100; chosen."""
-LONGEST_STEP = 1000
+LONGEST_PAUSE = 1000
 """Labels of one drive are closer than this [s]; chosen: 15 minutes."""
 STEP_UNITS = ((10**7, 0, 'nanoseconds'), (10**4, 3, 'microseconds'), (10, 6, 'milliseconds'))
 """
@@ -151,7 +151,7 @@ def _exponent(numbers: Sequence[Decimal], are_nanoseconds: bool) -> tuple[int, s
     steps = sorted(after - before for before, after in pairwise(ordered))
     step = steps[len(steps) // 2] if steps else None
     for exponent in (9, 6, 3, 0):
-        is_of_drive = step is None or step.scaleb(exponent - 9) < LONGEST_STEP
+        is_of_drive = step is None or step.scaleb(exponent - 9) < LONGEST_PAUSE
         if FIRST_SECOND <= largest.scaleb(exponent - 9) < LAST_SECOND and is_of_drive:
             return (0 if are_nanoseconds and step is None else exponent), ''
     if are_nanoseconds:

@@ -299,7 +299,8 @@ def test_convert_on_the_command_line(tmp_path, drive, capsys):
     ('arguments', 'status', 'message'),
     [
         (['convert', '{csv}', '-o', '{out}', '--from', 'kiti', '--to', 'csv'], 2, 'one of csv'),
-        (['convert', '{csv}', '-o', '{out}', '--from', 'csv', '--to', 'kitti'], 2, '--camera'),
+        (['convert', '{csv}', '-o', '{out}', '--from', 'csv', '--to', 'kitti'], 1,
+         'no_transform 14; if the sensor poses are missing, give --recording'),
         (['convert', '{csv}', '-o', '{out}', '--from=csv', '--to=csv', '--camera', '{csv}'], 2,
          '--camera: expected a format that uses it (kitti, kitti_object), got csv; add one'),
         (['relabel', '{bag}', '-o', '{out}', '--formats', 'kitti', '--camera', '{csv}',
