@@ -18,6 +18,7 @@ MEASUREMENTS = {
     'follow': 'whole tracks from one box or a few of each object',
     'ablation': 'accuracy without each ingredient of the method',
     'speed': 'time per tick, per box and per window, and of relabel',
+    'pair': 'CPU seconds of this checkout beside those of another, by turns',
     'kinds': 'gain of each class of objects, with standard errors',
     'proposals': 'objects without boxes that are proposed, and false alarms',
     'tracks': 'broken tracks before and after each completing step',
