@@ -10,14 +10,16 @@ the wrong pose, and a moving object has gone on. Both are mended where the box w
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from math import inf
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.matching import Pair
 from boxreg_ros.core.measured_tracks import MeasuredTracks
+from boxreg_ros.core.observation import crop
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, LENGTH, Sweep, X, Y, YAW, Z
 import numpy as np
 
@@ -133,6 +135,28 @@ class _Sample(NamedTuple):
     costs: Floats
 
 
+class _Path(NamedTuple):
+    """Where the boxes of a track were in a sweep, by latency."""
+
+    track_id: str
+    boxes: Floats
+    """(C, 9), for each of `CANDIDATES`."""
+    velocities: Floats
+    """(C, 3), of the object [m/s]."""
+
+    @property
+    def shift(self) -> Floats:
+        """Return how the box moves for each second of latency, (3,) [m/s]."""
+        ends = self.boxes[-1, : Z + 1] - self.boxes[0, : Z + 1]
+        shift: Floats = ends / (CANDIDATES[-1] - CANDIDATES[0])
+        return shift
+
+    @property
+    def speed(self) -> float:
+        """Return the length of `shift` [m/s]."""
+        return float(np.linalg.norm(self.shift))
+
+
 class LatencyEvidence:
     """Comparisons of boxes with points, and the latency that they show. Not thread-safe."""
 
@@ -164,7 +188,7 @@ class LatencyEvidence:
         if self._has_new_samples:
             self._has_new_samples = False
             drifts = self._latency.drifts or self._forget_other_latency()
-            found = _estimated(self._samples)._replace(drifts=drifts)
+            found = _estimated([*self._samples])._replace(drifts=drifts)
             if abs(found.seconds - self._latency.seconds) < STEP:
                 found = found._replace(seconds=self._latency.seconds)
             self._latency = found
@@ -191,18 +215,20 @@ class LatencyEvidence:
         times_ns = sweep.stamp_ns + np.round(CANDIDATES * 1e9).astype(np.int64)
         covering = {k: track for k, track in tracks.by_id.items() if track.covers(times_ns)}
         compared = Counter(sample.track_id for sample in self._samples)
+        ordered = sorted(covering, key=compared.__getitem__)
         found = 0
-        for track_id in sorted(covering, key=compared.__getitem__):
-            boxes, velocities = covering[track_id].smoothed(times_ns)
-            duration = CANDIDATES[-1] - CANDIDATES[0]
-            shift = (boxes[-1, : Z + 1] - boxes[0, : Z + 1]) / duration  # per second of latency
-            speed = float(np.linalg.norm(shift))
-            costs = None
-            if speed > MIN_SPEED:
-                costs = _costs(sweep, boxes, shift, velocities.mean(0))
-            if costs is not None:
+        for first in range(0, len(ordered), OBJECTS_COMPARED):
+            paths = []
+            for track_id in ordered[first : first + OBJECTS_COMPARED]:
+                path = _Path(track_id, *covering[track_id].smoothed(times_ns))
+                if path.speed > MIN_SPEED:
+                    paths.append(path)
+            for path, points in zip(paths, _points_near(sweep, paths), strict=True):
+                costs = _costs(path, *points)
+                if costs is None or found == OBJECTS_COMPARED:
+                    continue
                 self._has_new_samples = True
-                self._samples.append(_Sample(sweep.stamp_ns, track_id, speed, costs))
+                self._samples.append(_Sample(sweep.stamp_ns, path.track_id, path.speed, costs))
                 found += 1
             if found == OBJECTS_COMPARED:
                 break
@@ -317,27 +343,26 @@ class LatencyCorrection:
         return pair
 
 
-def _costs(sweep: Sweep, boxes: Floats, shift: Floats, velocity: Floats) -> Floats | None:
+def _costs(path: _Path, points: Floats, times: Floats) -> Floats | None:
     """
-    Return how badly boxes (C, 9) along a path fit the points, (2, C); None with too few points.
+    Return how badly the boxes of a path fit points (M, 3), (2, C); None with too few points.
 
-    The path leads along `shift` (3,), while the object moves with `velocity` (3,) [m/s].
-
-    The part of the points outside of a box, and their mean distance from its faces: the first is
-    robust, the second precise. First for the points where they were seen, then for those at the
-    stamp.
+    `times` (M,) are relative to the stamp [s]. The part of the points outside of a box, and their
+    mean distance from its faces: the first is robust, the second precise. First for the points
+    where they were seen, then for those at the stamp.
 
     """
-    points = _points_near(sweep, boxes, shift)
-    costs = np.zeros((2, len(boxes)))
-    if points is None:
+    boxes = path.boxes
+    if len(points) < FEWEST_POINTS:
         return None
-    places, times = points
-    for row, at_stamp in enumerate((places, places - times[:, None] * velocity)):
-        offsets = at_stamp[:, None] - boxes[:, : Z + 1]  # (M, C, 3)
-        cos, sin = np.cos(boxes[:, YAW]), np.sin(boxes[:, YAW])
-        along = np.abs(cos * offsets[..., X] + sin * offsets[..., Y]) - boxes[:, LENGTH] / 2
-        across = np.abs(cos * offsets[..., Y] - sin * offsets[..., X]) - boxes[:, LENGTH + 1] / 2
+    costs = np.zeros((2, len(boxes)))
+    moved = points - times[:, None] * path.velocities.mean(0)
+    cos, sin = np.cos(boxes[:, YAW]), np.sin(boxes[:, YAW])
+    for row, at_stamp in enumerate((points, moved)):
+        x = at_stamp[:, None, X] - boxes[:, X]  # (M, C)
+        y = at_stamp[:, None, Y] - boxes[:, Y]
+        along = np.abs(cos * x + sin * y) - boxes[:, LENGTH] / 2
+        across = np.abs(cos * y - sin * x) - boxes[:, LENGTH + 1] / 2
         outside = np.maximum(along, across)
         is_of_path = (outside < PATH_REACH).any(1)
         if is_of_path.sum() < FEWEST_POINTS:
@@ -349,42 +374,51 @@ def _costs(sweep: Sweep, boxes: Floats, shift: Floats, velocity: Floats) -> Floa
     return costs
 
 
-def _points_near(sweep: Sweep, boxes: Floats, shift: Floats) -> tuple[Floats, Floats] | None:
-    """Return points (M, 3) around boxes along a path and their times (M,); None with too few."""
-    centers = boxes[:, : Z + 1]
-    middle = centers.mean(0)
+def _points_near(sweep: Sweep, paths: Sequence[_Path]) -> list[tuple[Floats, Floats]]:
+    """Return points (M, 3) around the boxes of each path, above the road, and their times (M,)."""
+    if not paths:
+        return []
+    around = np.array([_box_around(path) for path in paths])
+    near = crop(sweep, around, 0.0)
+    ends = np.searchsorted(near.owner, np.arange(len(paths) + 1)).tolist()
+    found = []
+    for path, (first, last) in enumerate(pairwise(ends)):
+        stride = max(1, -(-(last - first) // POINTS_COMPARED))
+        kept = slice(first, last, stride)
+        rows = near.row[kept]
+        points = near.offset[:, kept].T + around[path, : Z + 1]
+        times = np.zeros(len(rows)) if sweep.times is None else sweep.times[rows]
+        found.append((points, times))
+    return found
+
+
+def _box_around(path: _Path) -> Floats:
+    """Return the box (9,) that holds the boxes of a path, less the road below it."""
+    boxes = path.boxes
+    middle = boxes[:, : Z + 1].mean(0)
     length, width, height = boxes[0, BOX_EXTENT]
-    R, t = np.eye(3), np.zeros(3)
-    if sweep.T_frame_points is not None:
-        R, t = sweep.T_frame_points[:3, :3], sweep.T_frame_points[:3, 3]
-    ahead = shift / np.linalg.norm(shift)
+    heading = np.arctan2(path.shift[Y], path.shift[X])
+    ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
     beside = np.array([-ahead[Y], ahead[X], 0.0])
-    reach = np.abs((centers - middle) @ np.stack([ahead, beside], 1)).max(0)
+    reach = np.abs((boxes[:, : Z + 1] - middle) @ np.stack([ahead, beside], 1)).max(0)
     reach += np.array([length, width]) / 2 + PATH_REACH
-    there = ((middle - t) @ R).tolist()  # numbers of Python: the points stay single precision
-    x, y = sweep.points[:, X], sweep.points[:, Y]
-    radius = float(reach.sum())
-    near = np.flatnonzero((np.abs(x - there[X]) < radius) & (np.abs(y - there[Y]) < radius))
-    offsets = sweep.points[near] @ R.T + (t - middle)
-    above = offsets[:, Z] + height / 2
-    is_near = (np.abs(offsets @ np.stack([ahead, beside], 1)) < reach).all(1)
-    kept = np.flatnonzero(is_near & (above > ROAD_CLEARANCE) & (above < height + ROAD_CLEARANCE))
-    if len(kept) < FEWEST_POINTS:
-        return None
-    kept = kept[:: -(-len(kept) // POINTS_COMPARED)]
-    times = np.zeros(len(kept)) if sweep.times is None else sweep.times[near[kept]]
-    return offsets[kept] + middle, times
+    middle[Z] += ROAD_CLEARANCE
+    return np.array([*middle, *(2 * reach), height, 0.0, 0.0, heading])
 
 
-def _estimated(samples: Any) -> Latency:
+def _estimated(samples: Sequence[_Sample]) -> Latency:
     """Return the latency of least cost by some comparisons; each track has one weight."""
-    of_track: dict[str, list[_Sample]] = {}
-    for sample in samples:
-        of_track.setdefault(sample.track_id, []).append(sample)
-    if not of_track:
+    if not samples:
         return Latency(finding=NOTHING_MOVES)
-    costs = np.array([_weighted([one.costs for one in group]) for group in of_track.values()])
-    speed = np.mean([one.speed for group in of_track.values() for one in group])
+    track_ids = [*dict.fromkeys(sample.track_id for sample in samples)]
+    row_of = {track_id: row for row, track_id in enumerate(track_ids)}
+    rows = np.array([row_of[sample.track_id] for sample in samples])
+    counts = np.bincount(rows)[:, None, None]
+    costs = np.zeros((len(track_ids), 2, len(CANDIDATES)))
+    np.add.at(costs, rows, np.array([sample.costs for sample in samples]))
+    # The mean of each track, less for one that was compared a few times only.
+    costs *= np.minimum(1.0, counts / FULL_WEIGHT) / counts
+    speed = np.mean([sample.speed for sample in samples])
     n = len(costs)
     ways = [_minimum_and_jackknife(costs[:, way]) for way in (0, 1)]
     seen, at_stamp = costs.sum(0).argmin(1)
@@ -426,11 +460,6 @@ def _minimum_and_jackknife(costs: Floats) -> tuple[float, float]:
     others = np.array([_minimum(total - one) for one in costs]) if n > 1 else np.zeros(1)
     spread = (n - 1) / n * np.square(others - others.mean()).sum()
     return _minimum(total), float(np.sqrt(spread))
-
-
-def _weighted(costs: list[Floats]) -> Floats:
-    """Return the mean cost of a track, less for one that was compared a few times only."""
-    return np.asarray(np.mean(costs, 0) * min(1.0, len(costs) / FULL_WEIGHT))
 
 
 def _minimum(costs: Floats) -> float:

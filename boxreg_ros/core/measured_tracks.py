@@ -105,7 +105,9 @@ class MeasuredTrack:
 
     def forget_before(self, oldest_ns: float) -> None:
         """Remove the boxes with older stamps, but for the newest."""
-        old = sum(array.stamp_ns < oldest_ns for array in self._arrays[:-1])
+        old = 0
+        while old < len(self._arrays) - 1 and self._arrays[old].stamp_ns < oldest_ns:
+            old += 1
         del self._arrays[:old], self._boxes[:old]
 
     def covers(self, times_ns: Ints) -> bool:

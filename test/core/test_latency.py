@@ -64,12 +64,11 @@ def test_one_latency_is_found_and_none_where_there_is_none(sample_drive):
 
 def test_of_many_objects_every_one_is_evidence(sample_drive, monkeypatch):
     # Of a sweep 16 are compared at most: they take turns.
-    compared, of_sweep = Counter(), latency._costs
+    compared, sample = Counter(), latency._Sample
 
-    def counted(sweep, *rest):
-        costs = of_sweep(sweep, *rest)
-        compared[sweep.stamp_ns] += costs is not None
-        return costs
+    def counted(stamp_ns, *rest):
+        compared[stamp_ns] += 1
+        return sample(stamp_ns, *rest)
 
     one = estimated(sample_drive.sweeps, late(sample_drive.boxes, 0.3))
     crowd = [
@@ -81,7 +80,7 @@ def test_of_many_objects_every_one_is_evidence(sample_drive, monkeypatch):
         for array in sample_drive.boxes
     ]  # fmt: skip
     with monkeypatch.context() as patch:
-        patch.setattr(latency, '_costs', counted)
+        patch.setattr(latency, '_Sample', counted)
         found = estimated(sample_drive.sweeps, late(crowd, 0.3))
     assert max(compared.values()) == OBJECTS_COMPARED
     assert found.tracks == 10 * one.tracks > 2 * OBJECTS_COMPARED
