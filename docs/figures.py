@@ -59,7 +59,7 @@ PAGE_SIZE = (1366, 900)
 """Width and height of the screenshot [CSS pixels]: a small laptop."""
 SCALE = 1.2
 """Pixels of the screenshot per CSS pixel, so that small text is sharp on dense screens."""
-TIMEOUT = 120
+TIMEOUT = 600
 """Longest time that a browser may take [s]."""
 
 

@@ -84,7 +84,8 @@ def is_complete(records):
     diagnostics = messages(records, '/diagnostics')
     # The last LAG follow once the boxes have been silent.
     enough = number['refined'] == SWEEPS and number['final'] >= SWEEPS - LAG
-    return enough and bool(diagnostics)
+    finals = messages(records, '/refined_boxes_final')
+    return enough and len(finals) == number['final'] and bool(diagnostics)
 
 
 def write(folder, records):
