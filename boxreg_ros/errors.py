@@ -49,6 +49,18 @@ def remedy_of(error: OSError) -> str:
     return FILE_REMEDIES.get(error.errno or 0, OTHER_REMEDY)
 
 
+def description_of(error: Exception) -> str:
+    """Return what a failed run says of an error, with a remedy."""
+    if isinstance(error, BoxregError):
+        return str(error)
+    if isinstance(error, OSError):
+        return f'{error}; {remedy_of(error)}'
+    return (
+        f'unexpected {type(error).__name__}: {error}; this is a fault of boxreg: please report it '
+        f'with the traceback, which --debug prints'
+    )
+
+
 def unreadable(path: str | PathLike[str], error: OSError) -> str:
     """Return the message of a file that cannot be read, with the remedy for its cause."""
     return f'{path}: cannot be read: {error.strerror}; {remedy_of(error)}'

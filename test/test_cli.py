@@ -25,9 +25,6 @@ SLOW = [
     '--set', 'objective=paper', '--set', 'paper.iterations=10000', '--set', 'estimate=early',
 ]  # fmt: skip
 
-GO_ON = '; a run with --resume goes on where it was interrupted'
-"""What the message of a run that is ended advises."""
-
 
 def boxreg(capsys, *arguments):
     """Run the command in this process; return exit status, stdout and stderr."""
@@ -88,28 +85,6 @@ def test_options_are_used_by_the_run(tmp_path, capsys):
     assert (used.solver.rounds, used.solver.threads) == (1, 1)
     assert used.faces.sides == 0.07
     assert not (out / 'openlabel').exists()
-
-
-def test_resume_skips_a_run_with_the_same_settings(tmp_path, capsys):
-    recording = Drive(sweeps=3).write(tmp_path / 'drive')
-    command = ['relabel', recording, '-o', tmp_path / 'out', *QUICK, '--resume']
-    assert ' boxes in' in boxreg(capsys, *command)[1]
-    before = (tmp_path / 'out' / 'boxes.csv').stat().st_mtime_ns
-    assert 'up to date' in boxreg(capsys, *command)[1]
-    assert (tmp_path / 'out' / 'boxes.csv').stat().st_mtime_ns == before
-    assert ' boxes in' in boxreg(capsys, *command, '--set', 'max_gap=0.9')[1]
-
-
-def test_resume_with_results_inside_the_recording_or_missing_files(tmp_path, capsys):
-    folder = Drive(sweeps=3).write(tmp_path / 'drive', 'sqlite3')
-    out = folder / 'out'
-    formats = 'openlabel,mcap'
-    command = ['relabel', folder, '-o', out, *QUICK, '--formats', formats, '--report', '--resume']
-    assert ' boxes in' in boxreg(capsys, *command)[1]
-    assert 'up to date' in boxreg(capsys, *command)[1]
-    for name in ('boxes.csv', 'overlay.mcap', 'report.html', 'openlabel/labels.json'):
-        (out / name).unlink()
-        assert ' boxes in' in boxreg(capsys, *command)[1], f'without {name}'
 
 
 @pytest.mark.parametrize(
@@ -220,7 +195,7 @@ def test_run_that_refines_no_box_fails_and_keeps_the_result(tmp_path, capsys):
     first = Drive(sweeps=5).items[1:]
     drive.items += [item for item in first if item[0] == '/points'][:1]
     recording = drive.write(tmp_path / 'drive')
-    command = ['relabel', recording, '-o', tmp_path / 'out', *QUICK, '--resume']
+    command = ['relabel', recording, '-o', tmp_path / 'out', *QUICK]
     status, out, err = boxreg(capsys, *command)
     assert status == 1
     assert ': 10 boxes in, 0 refined, 10 kept (no_sweep 8, short_track 2)' in out
@@ -233,9 +208,6 @@ def test_run_that_refines_no_box_fails_and_keeps_the_result(tmp_path, capsys):
     assert line.startswith(expected)
     assert ', clouds ' in line
     assert (tmp_path / 'out' / 'boxes.csv').exists()
-    status, out, _ = boxreg(capsys, *command)
-    assert status == 1
-    assert 'up to date' in out
 
 
 def test_run_that_refines_less_than_half_says_why(tmp_path, capsys):
@@ -372,7 +344,7 @@ def test_help_and_version(capsys):
     assert status == 0
     for option in (
         '--points', '--boxes', '--fixed-frame', '--odometry', '--config', '--set', '--formats',
-        '--start', '--end', '--resume', '--workers',
+        '--start', '--end', '--workers',
     ):  # fmt: skip
         assert option in out
 
@@ -395,94 +367,8 @@ def test_an_interrupted_run_leaves_no_files(tmp_path, number):
     # of source text, as rosbags does with its generated readers. A shell shows 130 for both.
     assert process.returncode in ((130, -number) if number == signal.SIGINT else (128 + number,))
     cause = 'interrupted' if number == signal.SIGINT else f'ended by {number.name}'
-    assert (out, err) == ('', f'boxreg: {cause}; nothing was written{GO_ON}\n')
+    assert (out, err) == ('', f'boxreg: {cause}; nothing was written\n')
     assert list((tmp_path / 'results').iterdir()) == []
-
-
-def test_an_interrupted_run_does_not_wait_for_the_interpreter(tmp_path):
-    # To take down the interpreter takes up to a second: the process ends without that.
-    recording = Drive(sweeps=60).write(tmp_path / 'drive')
-    program = 'import atexit, boxreg_ros.cli as c; atexit.register(print, "late"); c.command()'
-    command = [sys.executable, '-c', program, 'relabel', recording, '-o', tmp_path / 'r' / 'out']
-    pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE, 'text': True}
-    process = subprocess.Popen([*map(str, command), *SLOW], cwd=ROOT, **pipes)
-    while not any((tmp_path / 'r').glob('.out.*')):
-        assert process.poll() is None
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    assert process.communicate(timeout=60) == (
-        '',
-        f'boxreg: interrupted; nothing was written{GO_ON}\n',
-    )
-    assert process.returncode == 130
-
-
-SIGNAL_THAT_IS_LOST = """
-import os, signal, sys, time
-class Finder:
-    def find_spec(self, name, path=None, target=None):
-        if name == os.environ['WHERE']:
-            os.kill(os.getpid(), signal.SIGINT)
-class Destroyed:
-    def __del__(self):
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.01)
-sys.meta_path.insert(0, Finder())
-from boxreg_ros.cli import command
-if os.environ['WHERE'] == 'fork':
-    os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.SIGINT))
-if os.environ['WHERE'] == 'destructor':
-    from boxreg_ros.review import risk
-    begun = risk.assess
-    def assess(*args):
-        Destroyed()
-        return begun(*args)
-    risk.assess = assess
-if os.environ['WHERE'] == 'callback':
-    from numba.core.codegen import JITCodeLibrary
-    load = JITCodeLibrary._object_getbuffer_hook
-    def hook(module):
-        os.kill(os.getpid(), signal.SIGINT)
-        return load(module)
-    JITCodeLibrary._object_getbuffer_hook = hook
-command()
-"""
-
-
-@pytest.mark.parametrize('where', ['llvmlite.binding.common', 'destructor', 'fork', 'callback'])
-def test_a_signal_where_an_exception_would_be_lost_is_raised_afterwards(tmp_path, where):
-    recording = Drive(sweeps=40).write(tmp_path / 'drive')
-    workers = 2 if where == 'fork' else 1
-    relabel = 'relabel', recording, '-o', tmp_path / 'r' / 'out', '--resume', '--workers', workers
-    done = ended(sys.executable, '-c', SIGNAL_THAT_IS_LOST, *relabel, *QUICK, WHERE=where)
-    words = 'nothing was written, the same command goes on'
-    assert done.stderr == f'boxreg: interrupted; {words}\n'
-    assert done.returncode == 130
-
-
-SIGNAL_IN_TORCH = """
-import os, sys
-class Finder:
-    def find_spec(self, name, path=None, target=None):
-        if name == 'torch.autograd':
-            os.kill(os.getpid(), int(os.environ['NUMBER']))
-sys.meta_path.insert(0, Finder())
-from boxreg_ros.cli import command
-command()
-"""
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_during_the_import_of_torch_ends_the_process_at_once(tmp_path, number):
-    # An exception would pass through its libraries, which abort.
-    recording = Drive(sweeps=4).write(tmp_path / 'drive')
-    # With one worker the process that reads the command line imports torch.
-    relabel = 'relabel', recording, '-o', tmp_path / 'out', '--workers', 1
-    done = ended(sys.executable, '-c', SIGNAL_IN_TORCH, *relabel, NUMBER=str(int(number)))
-    cause = 'interrupted' if number == signal.SIGINT else 'ended by SIGTERM'
-    assert done.stderr == f'boxreg: {cause}; nothing was written{GO_ON}\n'
-    assert done.returncode == 128 + number
-    assert not (tmp_path / 'out').exists()
 
 
 @pytest.mark.parametrize(
@@ -515,7 +401,7 @@ def test_a_run_that_is_interrupted_in_a_step_leaves_no_files(tmp_path, preloaded
     out = tmp_path / 'r' / 'out'
     command = ['relabel', recording, '-o', out, '--report', *QUICK]
     done = ended(preloaded_python, '-c', program, *command)
-    assert done.stderr == f'boxreg: interrupted; nothing was written{GO_ON}\n'
+    assert done.stderr == 'boxreg: interrupted; nothing was written\n'
     assert done.returncode == 130
     assert list((tmp_path / 'r').glob('*')) == []
 
@@ -551,7 +437,7 @@ command()
     'ending, status, line',
     [
         ('error', 1, "[Errno 28] No space left on device: 'labels.json'; free some space on"),
-        ('signal', 130, f'interrupted; nothing was written{GO_ON}'),
+        ('signal', 130, 'interrupted; nothing was written'),
     ],
 )
 def test_a_run_that_ends_while_results_wait_to_be_written(

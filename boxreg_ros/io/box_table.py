@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 import csv
@@ -22,9 +21,6 @@ COLUMNS = (
     'stamp_ns', 'frame_id', 'track_id', 'class_name', 'score', 'x', 'y', 'z',
     'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height', 'status', 'num_points',
 )  # fmt: skip
-UTF_16_MARKS = BOM_UTF16_LE, BOM_UTF16_BE
-EXPORTS = {'\0': 'UTF-16', ';': 'semicolons', '\t': 'tabs'}
-"""What a header has that a spreadsheet has exported in another form, and the name of the form."""
 FORMULA_STARTS = ('=', '+', '-', '@', '\t', '\r', "'")
 """Spreadsheets run cells that begin so as formulas, or hide the first character."""
 csv.field_size_limit(2**31 - 1)  # ids may be as long as messages
@@ -96,21 +92,17 @@ class BoxTable:
                 names = reader.fieldnames or ()
                 missing = [name for name in COLUMNS if name not in names]
                 if missing:
-                    for mark, found in EXPORTS.items():
-                        if mark in ''.join(names):
-                            raise _exported(path, found)
                     raise RecordingError(
                         f'{path}: not a table of boxes, columns missing: {", ".join(missing)}; '
-                        f'expected those of boxes.csv; add them, or give another file'
+                        f'expected those of boxes.csv, in UTF-8 with commas, got '
+                        f'{", ".join(names)[:100]!r}; add them, or give another file'
                     )
                 rows = [(reader.line_num, row) for row in reader]
         except OSError as error:
             raise RecordingError(unreadable(path, error)) from None
         except (UnicodeDecodeError, csv.Error) as error:
-            if isinstance(error, UnicodeDecodeError) and error.object.startswith(UTF_16_MARKS):
-                raise _exported(path, 'UTF-16') from None
             raise RecordingError(
-                f'{path}: cannot be read as CSV: {error}; give a table like boxes.csv'
+                f'{path}: cannot be read as CSV in UTF-8: {error}; give a table like boxes.csv'
             ) from None
         of_frame: dict[str, list[tuple[int, dict[str, str]]]] = {}
         for line, row in rows:
@@ -191,14 +183,6 @@ def csv_row(cells: Iterable[object]) -> str:
     row = StringIO(newline='')
     csv.writer(row, lineterminator='\r\n').writerow(cells)
     return row.getvalue()[:-2] + '\n'
-
-
-def _exported(path: str | Path, found: str) -> RecordingError:
-    """Return the error of a table that a spreadsheet has exported in another form."""
-    return RecordingError(
-        f'{path}: expected a table in UTF-8 with commas, got {found}, as spreadsheets export it; '
-        f'save it as "CSV UTF-8 (comma delimited)", with points in the numbers'
-    )
 
 
 @lru_cache(1024)

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from glob import glob
-import hashlib
 import os
 from pathlib import Path
 import re
 import shlex
-from typing import Any
 from urllib.parse import urlsplit
 
 from boxreg_ros.datasets.registry import address_of, all_scenes, resolved, scene_files
 from boxreg_ros.errors import BoxregError, ConfigError, RecordingError
-from boxreg_ros.io.storage.urls import entries_of, Entry, url_of
+from boxreg_ros.io.storage.urls import url_of
 from boxreg_ros.offline.result_folder import INPUT_MODEL
 
 MANIFESTS = ('.txt', '.lst')
@@ -25,14 +23,10 @@ COMMENT = re.compile(r'(^|\s)#.*')
 """A comment of a manifest; within a word, ``#`` begins the name of a scene."""
 SUFFIX = re.compile(r'(?<=.)\.(mcap|db3|bag|active)(\.zstd?)?$')
 """Suffixes of recordings; other dots belong to the name, as those of dates."""
-JOBS = 'jobs'
-"""Folder with the key and the log of each job."""
 LEARNING = 'learning'
 """Folder of the first results of `--learn`."""
-RESERVED = frozenset({JOBS, LEARNING, INPUT_MODEL, 'index.csv', 'summary.json', 'report.html'})
+RESERVED = frozenset({LEARNING, INPUT_MODEL, 'index.csv', 'summary.json', 'report.html'})
 """Names in the output that no drive may have."""
-READ_BYTES = 2**24
-"""Bytes that are read for the hash of a file until progress is noted; chosen."""
 
 
 @dataclass(frozen=True)
@@ -45,32 +39,10 @@ class Job:
     problem: str = ''  # why it cannot be done; empty if it can
 
     def size(self) -> int:
-        """Return the size of all files [bytes]; 0 where they cannot be found."""
+        """Return the size of all files on this machine [bytes]; 0 where they cannot be found."""
         with suppress(OSError, RecordingError):
-            local = sum(file.stat().st_size for file in self._files())
-            return local + sum(entry.size for entry in self._entries())
+            return sum(file.stat().st_size for file in self._files())
         return 0
-
-    def hashes(
-        self, earlier: Sequence[Sequence[Any]], advanced: Callable[[], None]
-    ) -> list[list[Any]]:
-        """
-        Return path, size, times and hash of each file; of a URL the tag or time of its server.
-
-        `earlier` is the return value of an earlier run: unchanged files are not read again.
-        `advanced` is called while files are read.
-
-        """
-        known = {tuple(found[:-1]): found[-1] for found in earlier}
-        hashes = []
-        for file in self._files():
-            about = file.stat()
-            # A copy may keep the time of its content; that of its inode is its own.
-            times = about.st_mtime_ns, about.st_ctime_ns
-            place = str(file.resolve()), about.st_size, *times
-            hashes.append([*place, known.get(place) or _hash(file, advanced)])
-        hashes += [[str(one.path), one.size, 0, 0, one.version] for one in self._entries()]
-        return hashes
 
     def _files(self) -> Iterator[Path]:
         """Yield all files of the recordings on this machine."""
@@ -84,24 +56,15 @@ class Job:
             inner = sorted(path.iterdir()) if path.is_dir() else [path]
             yield from (file for file in inner if file.is_file())
 
-    def _entries(self) -> Iterator[Entry]:
-        """Yield all files of the recordings behind URLs."""
-        for path in self.recordings:
-            if url_of(path) is not None and address_of(path) is None:
-                yield from entries_of(path)
 
-
-def jobs_of(
-    arguments: Sequence[Path], known: Mapping[str, Sequence[str]] | None = None
-) -> list[Job]:
+def jobs_of(arguments: Sequence[Path]) -> list[Job]:
     """
     Return one job per drive of recordings, patterns, manifests and data sets.
 
     A manifest is a text file with one drive per line: its recordings, merged by time. Relative
     paths begin at the manifest; ``#`` begins a comment. A data set without the name of a scene
     is one drive per scene. A drive that does not exist, or is named a second time, has a problem.
-    Drives that are done keep their names: `known` has the recordings by name. Raises ConfigError
-    if two drives have the same name.
+    Raises ConfigError if two drives have the same name.
 
     """
     drives: list[tuple[Path, ...]] = []
@@ -116,13 +79,11 @@ def jobs_of(
             drives.append((argument,))
     seen: set[Path] = set()
     jobs = [Job(str(drive[0]), _absolute(drive), _problem(drive, seen)) for drive in drives]
-    names = names_of([job.recordings for job in jobs if not job.problem], known or {})
+    names = names_of([job.recordings for job in jobs if not job.problem])
     return [job if job.problem else Job(names[job.recordings], job.recordings) for job in jobs]
 
 
-def names_of(
-    drives: Collection[tuple[Path, ...]], known: Mapping[str, Sequence[str]]
-) -> dict[tuple[Path, ...], str]:
+def names_of(drives: Collection[tuple[Path, ...]]) -> dict[tuple[Path, ...], str]:
     """
     Return a name for each drive: that of its first recording, with folders where it needs them.
 
@@ -130,10 +91,6 @@ def names_of(
     with all their folders.
 
     """
-    earlier = {tuple(map(Path, paths)): name for name, paths in known.items()}
-    names = {drive: earlier[drive] for drive in drives if drive in earlier}
-    taken = RESERVED | set(names.values())
-    taken |= {name for name, paths in known.items() if all(map(_is_there, paths))}
     parts = {drive: _parts(drive[0]) for drive in drives}
     plain = Counter((*part[:-1], _plain(part[-1])) for part in parts.values())
     for drive, (*folders, last) in parts.items():
@@ -142,14 +99,10 @@ def names_of(
     depths = dict.fromkeys(parts, 1)
     while True:
         found = {drive: '_'.join(parts[drive][-depth:]) for drive, depth in depths.items()}
-        uses = Counter(found.values())  # of drives that are done, too: shards agree at any time
-        same = [
-            drive
-            for drive, name in found.items()
-            if uses[name] > 1 or (name in taken and drive not in names)
-        ]
+        uses = Counter(found.values())
+        same = [drive for drive, name in found.items() if uses[name] > 1 or name in RESERVED]
         if not same:
-            return found | names
+            return found
         if all(depths[drive] >= len(parts[drive]) for drive in same):
             raise ConfigError(
                 f'drives: expected each to have a name of its own, got {str(same[0][0])!r} and '
@@ -170,12 +123,6 @@ def _parts(path: Path) -> tuple[str, ...]:
     split = urlsplit(url)
     path_of_url = split.path if split.scheme.startswith('http') else url.partition('//')[2]
     return tuple(part for part in (split.netloc, *path_of_url.split('/')) if part)
-
-
-def _is_there(recording: str) -> bool:
-    """Return whether a recording exists; one behind a URL is expected to."""
-    path = Path(recording)
-    return url_of(path) is not None or path.exists()
 
 
 def _plain(name: str) -> str:
@@ -233,13 +180,3 @@ def _problem(drive: tuple[Path, ...], seen: set[Path]) -> str:
             return 'expected each recording once, got it a second time; leave one out'
         seen.add(path.resolve())
     return ''
-
-
-def _hash(path: Path, advanced: Callable[[], None]) -> str:
-    """Return the SHA-256 of a file."""
-    digest = hashlib.sha256()
-    with path.open('rb') as file:
-        while block := file.read(READ_BYTES):
-            digest.update(block)
-            advanced()
-    return digest.hexdigest()

@@ -1,22 +1,11 @@
-"""Progress of a long run, displayed by the caller and watched by `boxreg batch`, and its times."""
+"""Progress of a long run, displayed by the caller, and its times."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-import os
+from contextlib import contextmanager
 import time
-
-PIPE = 'BOXREG_PROGRESS'
-"""Environment variable with the descriptor of a pipe that gets a byte for each step forward."""
-
-
-def advanced() -> None:
-    """Report a step forward to the process that watches this one, if there is one."""
-    if PIPE in os.environ:
-        with suppress(OSError):  # the pipe is full, or nobody reads it
-            os.write(int(os.environ[PIPE]), b'.')
 
 
 class Progress:

@@ -37,7 +37,7 @@ from boxreg_ros.offline.result_folder import (
 )
 from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.summary import Summary
-from boxreg_ros.offline.survey import journaled, Passes, Survey, survey
+from boxreg_ros.offline.survey import Passes, Survey, survey
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.structures import BoxArray
@@ -48,21 +48,17 @@ if TYPE_CHECKING:
     from boxreg_ros.core.latency import Latency
     from boxreg_ros.core.matching import Pair
     from boxreg_ros.core.registrar import BoxRegistrar
-    from boxreg_ros.offline.resume import EstimateJournal
     from boxreg_ros.offline.stored_sweeps import StoredSweeps
 
 
-def relabel(
-    request: Request, out: Path, progress: Progress | None = None, resume: bool = False
-) -> Summary:
+def relabel(request: Request, out: Path, progress: Progress | None = None) -> Summary:
     """
     Refine all boxes of a recording and write ``boxes.csv``, ``summary.json`` and other files.
 
     The folder `out` appears complete or not at all; an earlier result is replaced. `progress`
     shows the duration of the recording that has been read and its whole duration [s]; both count
-    once for each time that it is read: with completed tracks once more. With `resume` the run
-    keeps a journal, and goes on with that of an interrupted one, see `EstimateJournal`. Returned
-    is the content of ``summary.json``.
+    once for each time that it is read: with completed tracks once more. Returned is the
+    content of ``summary.json``.
 
     Raises RecordingError if the recording lacks something, or `out` is not an earlier result or
     cannot be written, and UnsupportedMessage if none of its clouds, or none of its messages of
@@ -78,11 +74,10 @@ def relabel(
     drives = _other_drives(request)
     shown = Passes(progress, 1 + (request.completes or corrections.adds))
     with claimed(out), ExitStack() as workers:
-        journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         if request.cloud_copies:
             with request.recording():  # both processes need the types of its messages
                 pass
-        first = survey(request, clock, shown, journal, corrections, drives)
+        first = survey(request, clock, shown, corrections, drives)
         sweeps = _stored_sweeps(request, out)
         receive = workers.enter_context(reader(request, sweeps))
         # The recording is opened while this process imports numba, which takes half a second.
@@ -101,7 +96,7 @@ def relabel(
             with Sink(folder, request, recording.source, clock, corrections) as sink:
                 registrar = BoxRegistrar(
                     request.config,
-                    journaled(submit, journal),
+                    submit,
                     drives=drives,
                     constants=None if first is None else first.constants,
                     latency=_known_latency(request, first),
@@ -179,13 +174,6 @@ def _write_points(
             labeller = labeller_of(tracks, (), registrar, request.config)
         with clock('points'):
             summary.points = PointProducts(folder, request, sweeps, labeller, frame).write()
-
-
-def _journal(out: Path, fingerprint: str) -> EstimateJournal:
-    """Return the journal of a run, not yet open."""
-    from boxreg_ros.offline.resume import EstimateJournal, journal_path
-
-    return EstimateJournal(journal_path(out), fingerprint)
 
 
 def _other_drives(request: Request) -> Drives:

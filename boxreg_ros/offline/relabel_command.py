@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 import sys
@@ -16,9 +17,9 @@ from boxreg_ros.offline.arguments import (
     Settings,
     values_of,
 )
-from boxreg_ros.offline.progress import advanced, Progress
+from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import CONFIG, spare, SUMMARY, whole_summary
+from boxreg_ros.offline.result_folder import CONFIG, spare, SUMMARY
 from boxreg_ros.options import option
 
 if TYPE_CHECKING:
@@ -70,12 +71,16 @@ def add_run_arguments(parser: argparse.ArgumentParser, out: Path | None = None) 
         '-o', '--out', type=Path, required=out is None, default=out,
         help=f'result folder; it is written completely or not at all{shown}',
     )  # fmt: skip
-    parser.add_argument(
-        '--resume', action='store_true',
-        help='go on with an interrupted run of the same request, files and settings; do nothing '
-        'if OUT holds its result',
-    )  # fmt: skip
     add_options(parser, Demands)
+
+
+def arguments_of(words: Sequence[str]) -> argparse.Namespace:
+    """Return the parsed arguments of `boxreg relabel`."""
+    parser = argparse.ArgumentParser('boxreg relabel')
+    add_arguments(parser)
+    args = parser.parse_args(words)
+    args.arguments = ['relabel', *words]
+    return args
 
 
 def run(args: argparse.Namespace) -> int:
@@ -88,44 +93,42 @@ def run(args: argparse.Namespace) -> int:
     """
     from boxreg_ros.offline.notes import closing_line, notes
     from boxreg_ros.offline.relabel import relabel
-    from boxreg_ros.offline.summary import Summary
 
     request = request_from(args)
     demands = Demands(**values_of(args, Demands))
-    earlier = whole_summary(args.out) if args.resume else None
-    if earlier and earlier['fingerprint'] == request.fingerprint():
-        print(f'{args.out}: up to date, made from the same files with the same settings')
-        return _status(Summary.from_json(earlier), demands)
     if args.config != args.out / CONFIG:  # this one is written again with the same content
         spare(args.out, [args.config])
     with ProgressBar() as bar:
-        summary = relabel(request, args.out, bar, args.resume)
+        summary = relabel(request, args.out, bar)
     if args.truth and not args.report:
         print(f'boxreg: --truth {args.truth}: not used without --report', file=sys.stderr)
     for note in notes(summary):
         print(f'boxreg: {note}', file=sys.stderr)
     print(closing_line(summary, args.out))
-    return _status(summary, demands)
+    problem = unmet(summary, demands)
+    if problem:
+        print(f'boxreg: {problem}', file=sys.stderr)
+    return FAILED if problem or summary.has_failed else DONE
 
 
-def _status(summary: Summary, demands: Demands) -> int:
-    """Return the exit status of a run; say on stderr if it misses ``--fail-under``."""
+def unmet(summary: Summary, demands: Demands) -> str:
+    """Return which demand the results of a run do not meet; empty if they meet all."""
     if summary.unused_decisions:
         from boxreg_ros.offline.notes import unused_line
 
-        print(f'boxreg: {unused_line(summary.unused_decisions)}', file=sys.stderr)
-        return FAILED
+        return unused_line(summary.unused_decisions)
     if summary.part_refined < demands.fail_under:
-        print(
-            f'boxreg: --fail-under: expected at least {demands.fail_under:.1%} of the boxes '
-            f'refined, got {summary.num_refined:,} of {summary.boxes_in:,}; the results are '
-            f'kept, see "reasons" in {SUMMARY}',
-            file=sys.stderr,
+        return (
+            f'--fail-under: expected at least {demands.fail_under:.1%} of the boxes refined, got '
+            f'{summary.num_refined:,} of {summary.boxes_in:,}; the results are kept, see '
+            f'"reasons" in {SUMMARY}'
         )
-        return FAILED
     if demands.strict and not summary.is_complete:
-        return FAILED
-    return FAILED if summary.has_failed else DONE
+        return (
+            '--strict: expected a recording that is read whole, got one with parts left out; the '
+            f'results are kept, see "damage" and "dropped" in {SUMMARY}'
+        )
+    return ''
 
 
 class ProgressBar(Progress):
@@ -158,7 +161,6 @@ class ProgressBar(Progress):
         if done > self._done:
             self._bar.update(done - self._done)
             self._done = done
-            advanced()
 
     def announce(self, activity: str) -> None:
         """Show the activity that the run waits for beside the bar."""
@@ -166,4 +168,3 @@ class ProgressBar(Progress):
             self._is_silent = False
             print(f'boxreg: {activity}', file=sys.stderr)
         self._bar.set_description_str(f'({activity})')
-        advanced()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 import errno
 import hashlib
 import json
@@ -13,15 +13,16 @@ import shutil
 from typing import Any
 
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.io.lock import locked
 from boxreg_ros.io.storage.urls import names_of, read_text, sizes_of, UPLOAD, upload, url_of
 from boxreg_ros.io.whole_files import DISK_ERRORS, store, store_folder, temporary_folder
-from boxreg_ros.offline.progress import advanced
+from filelock import FileLock, Timeout
 
 REFUSED_ERRORS = (
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.ENOENT,
 )  # fmt: skip
 """No permission, read-only file system, a file in place of a folder, no folders as in /proc."""
+WITHOUT_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP)
+"""Answers of file systems that have no locks, as of some clusters: everyone is let in."""
 SUMMARY = 'summary.json'
 CONFIG = 'config.yaml'
 INPUT_MODEL = 'input_model.json'
@@ -38,10 +39,15 @@ def earlier_summary(out: Path) -> dict[str, Any] | None:
     return summary if isinstance(summary, dict) and 'fingerprint' in summary else None
 
 
-def whole_summary(out: Path) -> dict[str, Any] | None:
-    """Return the summary of an earlier run; None without one, or if a file is missing or empty."""
+def whole_summary(out: Path, fingerprint: str) -> dict[str, Any] | None:
+    """
+    Return the summary of an earlier run of the same request and files.
+
+    None if there is none, or if a file of the result is missing or empty.
+
+    """
     summary = earlier_summary(out)
-    if summary is None:
+    if summary is None or summary['fingerprint'] != fingerprint:
         return None
     found = _sizes(out) if url_of(out) is None else sizes_of(out)
     listed = summary.get(FILES, {}).items()
@@ -80,14 +86,6 @@ def spare_file(out: Path, inputs: Iterable[Path]) -> None:
             )
 
 
-def alone(lock: Path, subject: str, seconds: float = 0.0) -> AbstractContextManager[object]:
-    """Keep other runs out by a lock file; object stores have none: a second run goes unnoticed."""
-    if url_of(lock) is not None:
-        return nullcontext()
-    lock.parent.mkdir(parents=True, exist_ok=True)
-    return locked(lock, subject, seconds)
-
-
 @contextmanager
 def claimed(out: Path) -> Iterator[None]:
     """
@@ -103,13 +101,38 @@ def claimed(out: Path) -> Iterator[None]:
             return
         whole = out.resolve()
         whole.parent.mkdir(parents=True, exist_ok=True)
-        with locked(_beside(whole, 'lock'), f'output {str(out)!r}'):
+        with _locked(_beside(whole, 'lock'), out):
             partial, earlier = _beside(whole, 'partial'), _beside(whole, 'earlier')
             if earlier.exists() and not whole.exists():  # killed between the two renames
                 os.replace(earlier, whole)
             for remains in (partial, earlier):
                 shutil.rmtree(remains, ignore_errors=True)
             yield
+
+
+@contextmanager
+def _locked(lock: Path, out: Path) -> Iterator[None]:
+    """Hold a lock until the end of the block or of this process."""
+    held = FileLock(lock)
+    try:
+        held.acquire(blocking=False)
+    except Timeout:
+        if not lock.exists():  # nothing can be made there, which FileLock takes for contention
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(lock)) from None
+        raise RecordingError(
+            f'output {str(out)!r}: expected one that no other process writes to, got one in use; '
+            f'wait until that has ended, or choose another with -o'
+        ) from None
+    except OSError as error:
+        if error.errno not in WITHOUT_LOCKS:
+            raise
+        yield
+        return
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)  # while it is held: a lock without a name is not taken
+        held.release()
 
 
 @contextmanager
@@ -155,7 +178,7 @@ def _uploaded_folder(out: Path) -> Iterator[Path]:
             raise _other_files(out)
     with temporary_folder() as folder:
         yield folder
-        upload(folder, out, SUMMARY, advanced)
+        upload(folder, out, SUMMARY)
 
 
 @contextmanager

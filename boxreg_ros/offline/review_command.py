@@ -15,9 +15,16 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.files import METADATA
 from boxreg_ros.offline import relabel_command
-from boxreg_ros.offline.arguments import add_options, Settings, values_of, words_of
+from boxreg_ros.offline.arguments import (
+    add_options,
+    request_from,
+    Settings,
+    values_of,
+    words_of,
+)
+from boxreg_ros.offline.relabel_command import arguments_of
 from boxreg_ros.offline.request import NO_TOPIC, Request
-from boxreg_ros.offline.result_folder import CONFIG, SUMMARY
+from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_summary
 from boxreg_ros.offline.sources import scene_address
 from boxreg_ros.review.scene import DriveSource
 from boxreg_ros.review.server import add_server_arguments, serve
@@ -52,18 +59,18 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or _out_of(args.paths)
     if out is None:
         return _serve(args.paths, args)
-    done = subprocess.run(
-        [
-            *(sys.executable, '-m', 'boxreg_ros.cli', 'relabel', *map(str, args.paths)),
-            *('-o', str(out), '--report', '--resume'),
-            *words_of(args, Request),
-            *words_of(args, Settings),
-            *(('--boxes', NO_TOPIC, '--proposals') if _has_no_boxes(args) else ()),
-        ],
-        check=False,
-    )
-    if done.returncode:
-        return done.returncode
+    words = [
+        *(*map(str, args.paths), '-o', str(out), '--report'),
+        *words_of(args, Request),
+        *words_of(args, Settings),
+        *(('--boxes', NO_TOPIC, '--proposals') if _has_no_boxes(args) else ()),
+    ]
+    request = request_from(arguments_of(words))
+    if whole_summary(out, request.fingerprint()) is None:  # else it may have been reviewed
+        command = [sys.executable, '-m', 'boxreg_ros.cli', 'relabel', *words]
+        done = subprocess.run(command, check=False)
+        if done.returncode:
+            return done.returncode
     return _serve([out], args)
 
 

@@ -16,11 +16,9 @@ if TYPE_CHECKING:
     from boxreg_ros.core.input_statistics import Drives
     from boxreg_ros.core.latency import Latency
     from boxreg_ros.core.method.constants import Constants
-    from boxreg_ros.core.registrar import Submit
     from boxreg_ros.io.sweep_store import SweepStore
     from boxreg_ros.offline.completion import Arrivals, Completion, Moved
     from boxreg_ros.offline.request import Request
-    from boxreg_ros.offline.resume import EstimateJournal
     from boxreg_ros.review.corrections import Corrections
     from boxreg_ros.tracks.complete import CompletionPlan
 
@@ -71,7 +69,6 @@ def survey(
     request: Request,
     clock: Stopwatch,
     progress: Passes,
-    journal: EstimateJournal | None,
     corrections: Corrections,
     drives: Drives,
 ) -> Survey | None:
@@ -107,7 +104,6 @@ def survey(
             submit = workers.enter_context(
                 registration_worker(request.config, clock, progress.progress.announce)
             )
-            submit = journaled(submit, journal)
             first = first_pass(
                 items, request.config, submit, fixed_frame, drives, corrections.to_register
             )
@@ -125,13 +121,6 @@ def survey(
         completion = Completion(plan, request.config, deviations)
         constants = None if deviations is None else numbers(deviations)
         return Survey(plan, completion, parts, ends_of(tracks), constants, in_time, latency)
-
-
-def journaled(submit: Submit | None, journal: EstimateJournal | None) -> Submit | None:
-    """Return `submit` with the estimates that a journal has."""
-    from boxreg_ros.core.registrar import submit_locally
-
-    return submit if journal is None else journal.journaled(submit or submit_locally)
 
 
 def _corrected(

@@ -368,7 +368,7 @@ def test_one_command_relabels_a_scene(tmp_path, name, capsys):
     assert main(['evaluate', str(out), address]) == 0
     assert main(['evaluate', address, address, '--json']) == 0
     assert '"iou_3d": 1.0' in capsys.readouterr().out
-    assert main(['relabel', address, '-o', str(out), '--resume', '--formats=csv']) == 0
+    assert main(['relabel', address, '-o', str(out), '--formats=csv']) == 0
 
 
 def test_clouds_of_a_scene_are_labelled_but_not_copied(tmp_path, capsys):

@@ -490,7 +490,7 @@ def test_relabel_lists_damages_and_strict_fails(tmp_path, drive, whole, capsys):
     with (out / 'overlay.mcap').open('rb') as file:
         assert len(list(make_reader(file).iter_messages('/points'))) >= 11
     assert main([*command, '--strict']) == 1
-    assert main([*command, '--strict', '--resume']) == 1
+    assert main([*command, '--strict']) == 1
 
 
 def test_stamps_of_zero_are_reported(tmp_path, capsys):

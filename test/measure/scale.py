@@ -18,9 +18,6 @@ from tempfile import TemporaryDirectory
 import time
 from typing import NamedTuple
 
-from boxreg_ros.errors import RecordingError
-from boxreg_ros.offline.job import jobs_of
-from boxreg_ros.offline.job_process import JobRunner
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from measure.common import BOXREG
@@ -38,8 +35,8 @@ STRAGGLER_PART, STRAGGLER_FACTOR = 0.01, 8.0
 """Jobs that take longer, on slow nodes or with many objects, and how much; chosen."""
 LOSS_PART = 0.05
 """Attempts whose node is lost; chosen: spot nodes are lost within hours."""
-UNIT_PART = 0.02
-"""Part of a job that a loss costs: a job of an hour has some 50 batches of windows."""
+LOST_PART = 0.5
+"""Part of a job that a loss costs on average: it is done again from its beginning. Derived."""
 PRICE = 0.04
 """Price of a core for an hour [USD]; of the order of a list price on demand."""
 
@@ -92,7 +89,7 @@ def simulated(seconds, rng, count=FLEET_JOBS, cores=FLEET_CORES):
     lengths = np.sort(lengths)[::-1].copy()  # the sizes are known; stragglers are not
     lengths[rng.random(count) < STRAGGLER_PART] *= STRAGGLER_FACTOR
     losses = rng.geometric(1 - LOSS_PART, count) - 1
-    work = lengths * (1 + UNIT_PART * losses)  # each is resumed from its journal
+    work = lengths * (1 + LOST_PART * losses)
     free = [0.0] * cores
     heapify(free)
     for length in work:
@@ -162,23 +159,27 @@ def _measured(recording, folder):
     )
     inspect_s = time.perf_counter() - begun
     facts = json.loads(shown.stdout)
-    (job,) = jobs_of([recording])
-    before = _children_seconds()
-    result = JobRunner(folder / 'jobs', OPTIONS, '')(job)
-    cpu_s = _children_seconds() - before
-    if not result.is_done:
-        raise RecordingError(f'{recording}: {result.last_line}')
+    out = folder / 'job'
+    begun = time.perf_counter()
+    process = subprocess.Popen([*BOXREG, 'relabel', str(recording), '-o', str(out), *OPTIONS])
+    _, status, used = os.wait4(process.pid, 0)
+    seconds = time.perf_counter() - begun
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, process.args)
+    summary = json.loads((out / 'summary.json').read_text(encoding='utf-8'))
+    cpu_s = used.ru_utime + used.ru_stime
     return {
         'gb': recording.stat().st_size / 1e9,
         'recording_s': facts['seconds'],
-        'sweeps': result.sweeps,
+        'sweeps': summary['sweeps'],
         'points_per_sweep': facts['sample']['points_per_sweep'],
-        'boxes': result.boxes_in,
+        'boxes': summary['boxes_in'],
         'inspect_s': inspect_s,
-        'seconds': result.seconds,
+        'seconds': seconds,
         'cpu_s': cpu_s,
         'hours_per_core_hour': facts['seconds'] / cpu_s,
-        'peak_mb': result.peak_mb,
+        'peak_mb': used.ru_maxrss * 1024 / 1e6,
     }
 
 

@@ -106,8 +106,8 @@ def test_a_pin_holds_the_true_box_at_its_stamp(drive):
 def test_a_fleet_takes_little_longer_than_cores_that_are_never_idle():
     fleet = scale.simulated(600.0, np.random.default_rng(1))
     assert fleet.least_hours <= fleet.hours < 1.5 * fleet.least_hours
-    # A loss costs a fiftieth of its job, and one attempt of twenty is lost.
-    assert fleet.lost == pytest.approx(scale.UNIT_PART * 0.05 / 0.95, rel=0.3)
+    # A loss costs half of its job, and one attempt of twenty is lost.
+    assert fleet.lost == pytest.approx(scale.LOST_PART * 0.05 / 0.95, rel=0.3)
     assert 0.6 < fleet.used <= 1
 
 

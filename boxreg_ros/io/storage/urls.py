@@ -117,9 +117,9 @@ def sizes_of(path: Path) -> dict[str, int]:
     }
 
 
-def upload(folder: Path, target: Path, last: str, advanced: Callable[[], None]) -> None:
+def upload(folder: Path, target: Path, last: str) -> None:
     """
-    Replace a folder behind a URL by one of this machine; call `advanced` after each file.
+    Replace a folder behind a URL by one of this machine.
 
     `last` marks a whole result: it is deleted first, and written when all others are. `UPLOAD` is
     there from before the first change until then.
@@ -133,7 +133,6 @@ def upload(folder: Path, target: Path, last: str, advanced: Callable[[], None]) 
     delete_files(target, [*first_deleted, *sorted(set(old) - files - {last, UPLOAD})])
     for file in sorted(files, key=lambda file: (file == last, file)):
         answer_of(target, partial(system.put_file, str(folder / file), f'{name}/{file}'))
-        advanced()
     delete_files(target, [UPLOAD])
 
 
