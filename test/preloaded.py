@@ -151,10 +151,6 @@ class PreloadedPython:
 
 def _run_for(launcher, arguments, environment, folder):
     """Run a launcher's command in the process just forked."""
-    if 'BOXREG_PROGRESS' in environment:
-        pipe = f'/proc/{launcher}/fd/{environment["BOXREG_PROGRESS"]}'
-        pipe = os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
-        environment['BOXREG_PROGRESS'] = str(pipe)
     for stream in (1, 2):
         os.dup2(os.open(f'/proc/{launcher}/fd/{stream}', os.O_WRONLY | os.O_APPEND), stream)
     # Those there were may be of files, and these of pipes.

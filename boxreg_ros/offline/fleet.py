@@ -148,8 +148,7 @@ def _on_workers(client: Any, commands: Mapping[str, Sequence[str]]) -> Iterator[
     Relabel drives on the workers of a cluster.
 
     No more than the workers have threads are submitted at a time: Dask takes a drive that waits at
-    a worker for killed with that, and those that wait at its scheduler did not go on after the
-    only worker was killed (distributed 2026.8.0).
+    a worker for killed with that (distributed 2026.8.0).
 
     """
     from distributed import as_completed, KilledWorker

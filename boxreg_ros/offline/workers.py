@@ -111,7 +111,9 @@ def _run(serve: Serve, connection: socket.socket) -> None:
             serve(receive, send)
         except Exception as error:
             error.add_note(format_exc())  # pickling drops the traceback
-            send(error)
+            # Except where tblib is installed: it pickles what led to the error, if that is possible.
+            error.__cause__ = error.__context__ = None
+            send(error.with_traceback(None))
 
 
 def _ends(connection: socket.socket) -> tuple[Receive, Send]:

@@ -108,6 +108,21 @@ def test_exception_is_raised_in_the_parent_with_its_traceback():
             process.receive()
 
 
+def test_exception_is_raised_whatever_led_to_it():
+    """Where tblib is installed, which comes with Dask, pickle takes what led to an error too."""
+    tblib = pytest.importorskip('tblib.pickling_support')
+
+    def fail(receive, send):
+        tblib.install()  # in the worker alone
+        try:
+            raise KeyError(lambda: None)  # no function of a function can be pickled
+        except KeyError:
+            raise ValueError('no answer') from None
+
+    with run_in_worker(fail, 'fails') as process, pytest.raises(ValueError, match='no answer'):
+        process.receive()
+
+
 def test_leaving_the_block_does_not_wait_for_the_worker():
     begun = time.monotonic()
     with (
