@@ -111,7 +111,7 @@ def _run(serve: Serve, connection: socket.socket) -> None:
             serve(receive, send)
         except Exception as error:
             error.add_note(format_exc())  # pickling drops the traceback
-            # Except where tblib is installed: it pickles what led to the error, if that is possible.
+            # Except where tblib is installed: it pickles all that led to the error, if it can be.
             error.__cause__ = error.__context__ = None
             send(error.with_traceback(None))
 

@@ -115,7 +115,7 @@ def test_exception_is_raised_whatever_led_to_it():
     def fail(receive, send):
         tblib.install()  # in the worker alone
         try:
-            raise KeyError(lambda: None)  # no function of a function can be pickled
+            raise KeyError(lambda: None)  # which cannot be pickled
         except KeyError:
             raise ValueError('no answer') from None
 
