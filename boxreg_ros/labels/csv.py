@@ -26,6 +26,9 @@ FORMAT = Format(
     sizes='length width height',
     rotation='quaternion x y z w',
     files='boxes.csv, covariances.csv',
+    reads='one row per box',
+    leaves_out='covariances.csv, proposals',
+    read_back='pandas 3.1.1',
 )
 
 

@@ -36,7 +36,12 @@ NO_FRAME_BOXES: FrameBoxes = ([], {})
 
 
 def cuboid_format(
-    name: str, title: str, files: str, leaves_out: str = '', read_back: str = ''
+    name: str,
+    title: str,
+    files: str,
+    reads: str = '',
+    leaves_out: str = '',
+    read_back: str = '',
 ) -> Format:
     """Return the format of a tool with these conventions."""
     return Format(
@@ -47,6 +52,7 @@ def cuboid_format(
         sizes='length width height (x y z)',
         rotation='angles x y z, R = Rx Ry Rz',
         files=files,
+        reads=reads,
         leaves_out=leaves_out,
         read_back=read_back,
         options=('with_points', 'with_images'),

@@ -31,8 +31,9 @@ FORMAT = replace(
     ),
     sizes='length width height (x y z); height width length with --swap-axes',
     options=('with_points', 'with_images', 'swap_axes'),
-    leaves_out='annotations that are no cuboids',
+    leaves_out='annotations that are no cuboids, objects outside (counted)',
     read_back='datumaro 1.13.12',
+    reads='cuboids; keyframes and tracks of CVAT',
 )
 ANNOTATIONS_FILE = 'annotations/default.json'
 POINT_CLOUD_MEDIA = 6

@@ -46,6 +46,7 @@ FORMAT = Format(
     options=('camera', 'with_points', 'with_images', 'class_map'),
     leaves_out='regions without a 3D box (counted)',
     read_back='pykitti 0.3.1',
+    reads='17 or 18 columns of one sequence, of labels or of a tracker',
 )
 SEQUENCE = '0000'
 INSIDE_IMAGE, TRUNCATED, OUTSIDE_IMAGE = 0, 1, 2

@@ -44,6 +44,7 @@ FORMAT = Format(
     options=('camera', 'with_points', 'with_images', 'class_map'),
     leaves_out='regions without a 3D box (counted), the rectangles in the image',
     read_back='datumaro 1.13.12',
+    reads='15 or 16 columns, of labels or of a detector',
 )
 LABEL_FOLDER = 'label_2'
 KITTI_IMAGES = 'image_2'

@@ -47,6 +47,7 @@ FORMAT = Format(
     files='labels.json',
     leaves_out='boxes of images, and all objects without a cuboid',
     read_back='vcd 6.0.3',
+    reads='cuboids of frames and of objects, poses, stamps in any unit or ISO 8601',
 )
 SCHEMA_VERSION = '1.0.0'
 COVARIANCE_DIGITS = 9
@@ -490,9 +491,11 @@ def _attributes(cuboid: dict[str, Any]) -> dict[str, Any]:
 def _of_others(attributes: dict[str, Any]) -> dict[str, Any]:
     """Return the evidence among the attributes of another program, whose words are its own."""
     score = attributes.get('score', attributes.get('confidence'))
+    flags = {name: str(attributes.get(name)).lower() for name in ('interpolated', 'keyframe')}
+    is_interpolated = flags['interpolated'] == 'true' or flags['keyframe'] == 'false'
     return {
         'score': score if isinstance(score, int | Decimal) else None,
-        'status': INTERPOLATED if attributes.get('interpolated') is True else INPUT_STATUS,
+        'status': INTERPOLATED if is_interpolated else INPUT_STATUS,
     }
 
 

@@ -29,6 +29,8 @@ FORMAT = Format(
     rotation='heading about z; roll and pitch are lost',
     files='labels/STAMP.txt, points/STAMP.npy, ImageSets/',
     options=('with_points', 'class_map'),
+    reads='lines of 8 columns, or 9 with a score; clouds state frames without boxes',
+    leaves_out='the points',
 )
 COLUMN_COUNTS = (8, 9)
 """x y z dx dy dz heading class, and a score in files of some detectors."""

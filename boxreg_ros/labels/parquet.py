@@ -38,6 +38,8 @@ FORMAT = Format(
     rotation='quaternion x y z w',
     files='boxes.parquet',
     packages=('pyarrow',),
+    reads='as `csv`',
+    read_back='pandas 3.1.1',
 )
 TEXT_COLUMNS = ('frame_id', 'track_id', 'class_name', 'status')
 INTEGER_COLUMNS = ('stamp_ns', 'num_points')

@@ -34,6 +34,7 @@ FORMAT = cuboids.cuboid_format(
     name='sly_pointcloud',
     title='Supervisely clouds, CVAT Sly Point Cloud',
     files='meta.json, key_id_map.json, ds0/ann/STAMP.pcd.json, ds0/pointcloud/STAMP.pcd',
+    reads='cuboids of a data set; those of a model or a tracker are marked; keyframes of CVAT',
     leaves_out='figures that are no cuboids',
     read_back='supervisely 6.74.51, datumaro 1.13.12',
 )

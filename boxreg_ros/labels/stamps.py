@@ -31,13 +31,14 @@ Derived: labels have rates from 0.1 to 100 Hz, so each step has one unit.
 NAME_DIGITS = {10: 9, 13: 6, 16: 3, 19: 0}
 """
 Powers of ten by the digits of a file name. Derived: stamps from 2001 to 2286 have exactly so
-many, and numbers of frames have fewer; names of `folder.frame_name` are filled up to 19.
+many, and numbers of frames have fewer or, as those of KITTI raw, begin with zeros; names of
+`folder.frame_name` are filled up to 19.
 
 """
-STAMP_NAME = re.compile(r'[A-Za-z_-]*?(\d+)(?:\.(\d{1,9})|[_-](\d{9})|(_\d{1,3})?)')
+STAMP_NAME = re.compile(r'(?:.*?[^\d.])??(\d+)(?:\.(\d{1,9})|[_-](\d{9})|(_\d{1,3})?)')
 """
-A stamp in a file name: after letters, a number with decimals, seconds and nine digits of
-nanoseconds, or a number with the count that `frame_name` gives to equal stamps.
+A stamp at the end of a file name, as those of nuScenes have it: a number with decimals, seconds
+and nine digits of nanoseconds, or a number with the count that `frame_name` gives to equal stamps.
 
 """
 ISO_FRACTION = re.compile(r'[.,](\d+)')
@@ -115,7 +116,7 @@ def stamps_of_names(names: Sequence[str]) -> list[int] | None:
 
     """
     found = [STAMP_NAME.fullmatch(name) for name in names]
-    units = {None if one is None else NAME_DIGITS.get(len(one[1])) for one in found}
+    units = {None if one is None else _exponent_of_digits(one[1]) for one in found}
     if len(units) != 1 or None in units:
         return None
     (exponent,) = units
@@ -127,6 +128,12 @@ def stamps_of_names(names: Sequence[str]) -> list[int] | None:
             return None
         stamps.append(int(one[1] + decimals.ljust(exponent, '0')))
     return stamps
+
+
+def _exponent_of_digits(digits: str) -> int | None:
+    """Return the power of ten from the unit of a name to nanoseconds; None for other numbers."""
+    exponent = NAME_DIGITS.get(len(digits))
+    return None if exponent and digits.startswith('0') else exponent
 
 
 def _decimal(value: object) -> Decimal:

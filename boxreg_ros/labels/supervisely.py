@@ -31,6 +31,7 @@ FORMAT = cuboids.cuboid_format(
     name='supervisely',
     title='Supervisely episodes',
     files='meta.json, episode/annotation.json, episode/pointcloud/STAMP.pcd',
+    reads='cuboids of an episode; those of a model or a tracker are marked',
     leaves_out='figures that are no cuboids',
     read_back='supervisely 6.74.51',
 )

@@ -29,6 +29,7 @@ FORMAT = cuboids.cuboid_format(
     name='sustechpoints',
     title='SUSTechPOINTS',
     files='label/STAMP.json, lidar/STAMP.pcd, desc.json',
+    reads='labels of a scene; what the tool interpolated or a model made is marked',
     leaves_out='attributes of objects',
 )
 

@@ -50,6 +50,7 @@ FORMAT = Format(
     options=('with_points', 'swap_axes'),
     leaves_out='poses with which Datumaro fills gaps (counted)',
     read_back='datumaro 1.13.12',
+    reads='those of KITTI, and of Datumaro and CVAT by their extents; keyframes',
 )
 FILE = 'tracklet_labels.xml'
 NAMES_FILE = 'frame_list.txt'

@@ -18,7 +18,13 @@ from boxreg_ros.io.images import Image
 from boxreg_ros.labels import cuboids
 from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, following, from_json, write_json
-from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import (
+    AUTOMATIC_STATUS,
+    INPUT_STATUS,
+    LabelFrame,
+    Options,
+    Provenance,
+)
 from boxreg_ros.labels.records import ReadBox
 from boxreg_ros.reasons import Reason
 
@@ -26,6 +32,7 @@ FORMAT = cuboids.cuboid_format(
     name='xtreme1',
     title='Xtreme1',
     files='scene_1/result/STAMP.json, scene_1/lidar_point_cloud_0/STAMP.pcd',
+    reads='one source of a scene (`PATH#SOURCE`), results of versions 0.5 to 0.7',
     leaves_out='other sources and objects without contour (counted), objects in images',
 )
 LIDAR_FOLDER = 'lidar_point_cloud_0'
@@ -173,6 +180,7 @@ def _results(content: Any) -> list[_Result]:
     found = []
     for part in parts:
         result = part.get('result') or part  # versions up to 0.5 have another level
+        source = str(part.get('sourceName') or '')
         boxes = []
         without_box = 0
         for number, item in enumerate(result['objects'] or ()):
@@ -183,8 +191,8 @@ def _results(content: Any) -> list[_Result]:
                 if 'contour' in item and item['contour'] is None:
                     without_box += 1
                     continue
-                boxes.append(_cuboid(item))
-        found.append(_Result(str(part.get('sourceName') or ''), boxes, without_box))
+                boxes.append(_cuboid(item, source))
+        found.append(_Result(source, boxes, without_box))
     return found
 
 
@@ -203,13 +211,17 @@ def _source(path: Path, sources: Counter[str], part: str) -> str:
     return GROUND_TRUTH if GROUND_TRUTH in sources else next(iter(sources), '')
 
 
-def _cuboid(item: dict[str, Any]) -> ReadBox:
+def _cuboid(item: dict[str, Any], source: str) -> ReadBox:
+    """Return the box of an object; of a model run, unless a person took it for ground truth."""
     contour = item.get('contour', item)
     own = item.get(cuboids.EVIDENCE_KEY)  # of our files, where boxes may lack a track id
     track_id = item.get('trackId') if own is None else item.get('trackName')
     box = cuboids.box_from_xyz(contour['center3D'], contour['rotation3D'], contour['size3D'])
+    score = item.get('modelConfidence', item.get('confidence'))
+    is_of_model = score is not None and source != GROUND_TRUTH
     evidence = {
-        'score': item.get('modelConfidence', item.get('confidence')),
+        'status': AUTOMATIC_STATUS if is_of_model else INPUT_STATUS,
+        'score': score,
         'num_points': contour.get('pointN'),
         **(own or {}),
     }

@@ -99,6 +99,10 @@ def test_stamps_beside_labels_in_any_unit(tmp_path, lines, expected):
         (['1700000000_000000007'], [AT + 7]),
         (['frame_1700000000123456'], [AT + 123_456_000]),
         (['0000000012300000000', '0000000012300000000_1'], [12_300_000_000] * 2),
+        (['n015-2018-07-18-11-07-57+0800__LIDAR_TOP__1531883530449377'], [1531883530449377000]),
+        (['frame_000001_1700000000123'], [AT + 123_000_000]),
+        (['0000000000', '0000000001'], None),  # of KITTI raw: numbers of frames
+        (['0000000000001'], None),
         (['000950', '000965'], None),
         (['1700000000', '1700000000123'], None),  # two units
         ([], None),
@@ -401,15 +405,15 @@ def test_openlabel_several_cuboids_of_an_object_and_null(tmp_path):
 
 
 def test_openlabel_interpolated_by_its_tool(tmp_path):
-    flags = {'boolean': [{'name': 'interpolated', 'val': True}], 'text': [{'name': 'status'}]}
-    frames = {
-        '0': {
-            'frame_properties': {'timestamp': 1},
-            'objects': objects_of(val(1, attributes=flags)),
-        }
-    }
+    flags = [
+        {'boolean': [{'name': 'interpolated', 'val': True}], 'text': [{'name': 'status'}]},
+        {'boolean': [{'name': 'keyframe', 'val': False}]},
+        {'text': [{'name': 'interpolated', 'val': 'false'}, {'name': 'keyframe', 'val': 'True'}]},
+    ]
+    cuboids = [val(i, attributes=flag) | {'name': f'{i}'} for i, flag in enumerate(flags)]
+    frames = {'0': {'frame_properties': {'timestamp': 1}, 'objects': objects_of(*cuboids)}}
     (found,) = read('openlabel', openlabel(tmp_path / 'a.json', frames, CLASSES))
-    assert found.refined.status == ('interpolated',)
+    assert found.refined.status == ('interpolated', 'interpolated', 'input')
 
 
 def test_openlabel_with_stamps_since_the_first_frame_says_their_unit(tmp_path):
@@ -475,6 +479,16 @@ def test_xtreme1_of_several_sources(tmp_path):
     folder = xtreme1(tmp_path / 'b', [model, other])
     with pytest.raises(RecordingError, match=r"'model 2' \(1 frames\); name the .*b#SOURCE"):
         read('xtreme1', folder)
+
+
+def test_xtreme1_marks_what_a_model_made(tmp_path):
+    """A person who takes a box of a model for ground truth leaves its confidence as it is."""
+    truth = result('Ground Truth', object_of(1, modelConfidence=0.9))
+    model = result('model', object_of(1.3, 'm', modelConfidence=0.8))
+    folder = xtreme1(tmp_path, [truth, model])
+    assert [one.refined.status for one in read('xtreme1', folder)] == [('input',)]
+    (found,) = frames_of('xtreme1', folder.with_name(f'{folder.name}#model'))
+    assert (found.refined.status, found.refined.boxes.scores[0]) == (('automatic',), 0.8)
 
 
 def test_xtreme1_names_of_tracks_start_again_in_each_frame(tmp_path):
