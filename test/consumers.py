@@ -473,6 +473,7 @@ def supervisely(folder):
             geometry = figure.geometry.to_json()
             figures.append({
                 'cloud': name, 'frame': figure.frame_index, 'geometry': geometry,
+                'status': str(figure.status),
                 'class': figure.parent_object.obj_class.name,
                 'tags': [
                     (tag.name, tag.value, tag.frame_range) for tag in figure.parent_object.tags

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.datasets.files import at_stamp, pose_rows, read_cloud, require, require_lidars
 from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.labels import frames_of, SceneFrames
 from boxreg_ros.labels.clouds import BIN_COLUMNS
 from boxreg_ros.labels.files import frame_names, from_json, json_items
@@ -235,6 +235,11 @@ def _sweep_files(
 
 def _cloud(root: Path, row: dict[str, Any]) -> Cloud:
     """Return the cloud of a row of ``sample_data`` in the frame of its LiDAR."""
+    if row.get('is_valid') is False:
+        raise UnsupportedMessage(
+            f'{root / row["filename"]}: expected a sweep that can be used, got one that is_valid '
+            f'of T4 excludes; it is left out'
+        )
     columns = BIN_COLUMNS['.pcd.bin']
     about = row.get('info_filename')
     if about and (root / about).is_file():

@@ -264,6 +264,21 @@ def test_clouds_of_nuscenes_tables_are_read_by_their_suffix(tmp_path):
     assert len(sweeps) == FRAMES
 
 
+def test_sweeps_that_t4_excludes_are_left_out_and_counted(tmp_path):
+    layouts.nuscenes(tmp_path)
+    table = tmp_path / 'v1.0-mini' / 'sample_data.json'
+    rows = json.loads(table.read_text())
+    for number, row in enumerate(row for row in rows if row['token'].startswith('sweep')):
+        row['is_valid'] = number not in (2, 5)
+    layouts.write_json(table, rows)
+    source = source_of('nuscenes', f'{tmp_path}#scene-0061')
+    sweeps, _ = read(source)
+    kept = [stamp for number, stamp in enumerate(layouts.stamps_ns()) if number not in (2, 5)]
+    assert [sweep.stamp_ns for sweep in sweeps] == kept
+    assert source.unreadable == {'LIDAR_TOP': 2}
+    assert 'is_valid of T4 excludes' in str(source.first_errors['LIDAR_TOP'])
+
+
 @pytest.mark.parametrize('is_linked', [True, False], ids=['linked', 'only scene'])
 def test_sweeps_that_name_no_sample_are_of_the_scene_that_they_are_linked_with(
     tmp_path, is_linked

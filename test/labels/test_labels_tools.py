@@ -146,7 +146,12 @@ def test_supervisely_golden_values_in_supervisely(tmp_path):
         for k, (n, status) in enumerate([(2, 'refined'), (1, 'refined'), (2, 'kept')])
     ]
     write('supervisely', tmp_path, frames, with_points=True)
+    path = tmp_path / 'supervisely' / 'episode' / 'annotation.json'
+    annotation = content(path)
+    annotation['frames'][0]['figures'][0] |= {'nnCreated': True, 'nnUpdated': True}
+    path.write_text(json.dumps(annotation))
     project = consumer('supervisely', tmp_path / 'supervisely')
+    assert project['figures'][0]['status'] == 'manual'  # its library forgets that of a model
     assert (project['type'], project['frames']) == ('point_cloud_episodes', 3)
     assert len(project['items']) == 3
     assert json.loads(project['description'])['config_hash'] == 'cafe'
