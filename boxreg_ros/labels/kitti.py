@@ -54,6 +54,8 @@ INSIDE_IMAGE, TRUNCATED, OUTSIDE_IMAGE = 0, 1, 2
 UNKNOWN_OCCLUSION = 3
 OTHER_COLUMNS = dict.fromkeys((15, 16), ': those of KITTI object, which is read as kitti_object')
 """Hint by the number of columns of another format."""
+NO_TRACK = '-1'
+"""Of boxes of a detector in this format."""
 IGNORED_CLASS = 'DontCare'
 """Regions without labels, which have no 3D box."""
 
@@ -271,7 +273,7 @@ def _boxes_by_frame(
         boxes = boxes_of(camera, np.array([line.numbers for line in lines]).reshape(-1, 7))
     found: dict[int, list[ReadBox]] = {}
     for line, box in zip(lines, boxes, strict=True):
-        track_id = tracks.get(line.track, line.track)
+        track_id = '' if line.track == NO_TRACK else tracks.get(line.track, line.track)
         class_name = given.get(f'{line.track} {line.class_name}', line.class_name)
         read_box = ReadBox(track_id, class_name, box, {'score': line.score})
         found.setdefault(line.frame, []).append(read_box)

@@ -122,5 +122,6 @@ def _cuboid(item: dict[str, Any]) -> ReadBox:
     annotator = item.get('annotator')
     status = STATUS_OF.get(annotator, AUTOMATIC_STATUS) if annotator else INPUT_STATUS
     evidence = {'status': status} | item.get(cuboids.EVIDENCE_KEY, {})
-    track_id, class_name = (str(item.get(key) or '') for key in ('obj_id', 'obj_type'))
-    return ReadBox(track_id, class_name, box, evidence)
+    track_id = item.get('obj_id')
+    class_name = str(item.get('obj_type') or '')
+    return ReadBox('' if track_id is None else str(track_id), class_name, box, evidence)

@@ -676,6 +676,16 @@ def test_the_root_of_kitti_object_is_enough(tmp_path):
     assert stamps(read('kitti_object', tmp_path)) == [AT]
 
 
+def test_track_ids_of_zero_are_ids_and_of_minus_one_none(tmp_path):
+    put(tmp_path / 'label' / f'{AT}.json', [psr(1, obj_id=0), psr(2, obj_id=None)])
+    assert ids(read('sustechpoints', tmp_path)) == [('0', '')]
+    put(tmp_path / 'calib/0000.txt', KITTI_CALIBRATION)
+    lines = [f'0 {track} Car 0 0 0 0 0 9 9 1.5 1.8 4 1 2 10 0\n' for track in (0, -1, -1)]
+    put(tmp_path / 'label_02/0000.txt', ''.join(lines))
+    put_stamps(tmp_path, 1)
+    assert ids(read('kitti', tmp_path)) == [('0', '', '')]
+
+
 @pytest.mark.parametrize('angle', ['90', '-180'])
 def test_angles_in_degrees_are_refused(tmp_path, angle):
     put(tmp_path / 'labels' / f'{AT}.txt', f'1 2 3 4 2 1.5 {angle} Car\n')
