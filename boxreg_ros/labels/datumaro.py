@@ -208,7 +208,7 @@ def _cuboid(annotation: dict[str, Any], labels: list[str], is_swapped: bool) -> 
     scale = annotation['scale']
     extent = scale[::-1] if is_swapped else scale
     box = cuboids.box_from_cuboid(annotation['position'], annotation['rotation'], extent)
-    track = attributes.get('track', attributes.get('track_id'))
+    track = attributes.get('track_id')
     label_id = annotation.get('label_id')
     if label_id is not None and not 0 <= label_id < len(labels):
         raise ValueError(f'expected a label_id of {len(labels)} labels, got {label_id}')
@@ -216,8 +216,9 @@ def _cuboid(annotation: dict[str, Any], labels: list[str], is_swapped: bool) -> 
     evidence: dict[str, Any] = {'score': _score(attributes)}
     if str(attributes.get('keyframe', '')).lower() == 'false':
         evidence['status'] = INTERPOLATED
-    if OWN_ATTRIBUTE in attributes:  # others may have a `status` of another meaning
+    if OWN_ATTRIBUTE in attributes:  # those of others may have another meaning
         evidence = attributes
+        track = attributes.get('track', track)
     return ReadBox('' if track is None else str(track), class_name, box, evidence)
 
 

@@ -206,7 +206,7 @@ def _status(figure: dict[str, Any], tags: dict[str, Any]) -> str:
     if str(tags.get('keyframe')).lower() == 'false':
         return INTERPOLATED
     is_of_model = figure.get('nnCreated') and figure.get('nnUpdated')
-    is_of_tracker = figure.get('trackId') is not None
+    is_of_tracker = figure.get('trackId') not in (None, '')
     return AUTOMATIC_STATUS if is_of_model or is_of_tracker else INPUT_STATUS
 
 

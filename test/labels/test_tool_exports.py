@@ -151,8 +151,10 @@ def datumaro(folder, items):
 
 def test_datumaro_marks_what_cvat_interpolated(tmp_path):
     boxes = [cuboid(1, keyframe=True), cuboid(2, keyframe=False), cuboid(3, status='parked')]
+    boxes[2]['attributes']['track'] = 'left'  # an attribute of a user
     folder = datumaro(tmp_path, [{'id': f'{AT}', 'annotations': boxes}])
     (found,) = read('datumaro', folder)
+    assert ids([found]) == [('0', '0', '0')]
     assert found.refined.status == ('input', 'interpolated', 'input')
     assert len(found.keyframes().refined.status) == 2
     assert found.keyframes().left_out == {'not_a_keyframe': 1}
