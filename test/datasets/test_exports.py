@@ -12,6 +12,7 @@ from relabel_results import rows_of
 from ros_messages import Drive
 import test_datasets
 
+QUICK = ['--set=solver.rounds=2', '--set=sampling.points=64']
 NUMBERS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height')
 CAMERA = """\
 projection_matrix: [720, 0, 600, 45, 0, 720, 170, 0.2, 0, 0, 1, 0.003]
@@ -30,7 +31,8 @@ EXPORTS = [
 
 def relabelled(out, source, *options):
     """Return the refined boxes by stamp and track, and their statuses."""
-    assert main(['relabel', str(source), '-o', str(out), '--formats=csv', *options]) == 0
+    words = ['relabel', str(source), '-o', str(out), '--formats=csv', *QUICK, *options]
+    assert main(words) == 0
     rows = {(row['stamp_ns'], row['track_id']): row for row in rows_of(out)}
     boxes = {key: [float(row[name]) for name in NUMBERS] for key, row in rows.items()}
     return boxes, {key: row['status'] for key, row in rows.items()}
