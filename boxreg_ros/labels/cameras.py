@@ -85,8 +85,9 @@ class LabelCameras:
         topic; ConfigError if there are several and no topic, or none of the topic.
 
         """
-        known = self.known(sensor_frame, self._recording.start_ns)
-        others = self._with_pose(self._images.without_images(), sensor_frame, 0)
+        start_ns = self._recording.start_ns
+        known = self.known(sensor_frame, start_ns)
+        others = self._with_pose(self._images.without_images(), sensor_frame, start_ns)
         found = known or others
         if topic:
             found = [one for one in (*known, *others) if topic in one.topics]
