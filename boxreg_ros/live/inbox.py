@@ -47,10 +47,11 @@ class Inbox:
             topic: deque() for topic in ('points', 'boxes', 'passing')
         }
 
-    def put_event(self, kind: str, content: Any) -> None:
-        """Add an event; none is ever dropped."""
+    def put_event(self, kind: str, content: Any, wakes: bool = True) -> None:
+        """Add an event; none is ever dropped. Transforms, which are polled, wake nobody."""
         self._events.append((kind, content))
-        self.wake_up.set()
+        if wakes:
+            self.wake_up.set()
 
     def put(self, topic: str, content: Any, lidar: str = '') -> Message | None:
         """Add a cloud or box array; return the oldest one of its kind if the queue is full."""

@@ -23,6 +23,7 @@ from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.model_file import ModelFile
 from boxreg_ros.live.params import changed, declare, numbers_as_declared, parameters_yaml
 from boxreg_ros.live.pipeline import MessagePipeline
+from boxreg_ros.live.polling import PolledClockNode
 from boxreg_ros.live.topics import FOLLOW_TOPIC, import_message, NodeTopics
 from boxreg_ros.live.transform_wait import TransformWait
 from boxreg_ros.live.worker import Worker
@@ -33,7 +34,6 @@ from msg_adapters.concatenation import INFO_TYPE
 from msg_adapters.serialized import serialized_adapter_for
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -44,15 +44,15 @@ GRAPH_PERIOD = 0.2
 """Time between two looks for the type of the boxes [s]."""
 STATUS_PERIOD = 1.0
 """Time between two messages on /diagnostics [s]."""
-ODOMETRY_DEPTH = 50
-"""Queue size of `odom`: a second at the rate of common odometry sources."""
+MOTION_DEPTH = 1000
+"""Queue size of `odom` and /tf: a second of five publishers of 200 Hz."""
 FOLLOW_DEPTH = 10
 """Queue size of `~/follow`, where a person publishes."""
 FINALS_MARGIN = 10
 """Queue size of the boxes beyond what may be published at once at the end."""
 
 
-class BoxregNode(Node):
+class BoxregNode(PolledClockNode):
     """
     Subscribes to clouds, boxes, TF and odometry; publishes refined boxes.
 
@@ -125,7 +125,7 @@ class BoxregNode(Node):
         )
         self.worker = Worker(
             self._live, self._inbox, self._health, self.get_logger(), self._budget,
-            options.backlog, self._markers, self._model,
+            options.backlog, self._markers, self._model, self._topics.poll,
         )  # fmt: skip
         if options.static_points:
             self._open_static_points(options.points_type)
@@ -206,16 +206,17 @@ class BoxregNode(Node):
             self._topics.subscribe(INFO_TYPE, lidars.info, put, qos(), is_required=True)
 
     def _subscribe_to_motion(self) -> None:
-        """Subscribe to odometry and transforms."""
-        qos = QoSProfile(depth=ODOMETRY_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._topics.subscribe('nav_msgs/msg/Odometry', 'odom', self._on_odometry, qos)
+        """Subscribe to odometry and transforms, which the worker polls."""
+        subscribe = partial(self._topics.subscribe, is_polled=True)
+        qos = QoSProfile(depth=MOTION_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        subscribe('nav_msgs/msg/Odometry', 'odom', self._on_odometry, qos)
+        reliable = QoSProfile(depth=MOTION_DEPTH)
         # That of tf2_ros.
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         try:
-            for topic, qos in (('/tf', QoSProfile(depth=100)), ('/tf_static', latched)):
+            for topic, qos in (('/tf', reliable), ('/tf_static', latched)):
                 callback = partial(self._on_transforms, topic)
-                kind = 'tf2_msgs/msg/TFMessage'
-                self._topics.subscribe(kind, topic, callback, qos, has_overrides=False)
+                subscribe('tf2_msgs/msg/TFMessage', topic, callback, qos, has_overrides=False)
         except UnsupportedMessage as error:
             self.get_logger().warning(f'transforms are not received, odometry is: {error}')
 
@@ -252,11 +253,11 @@ class BoxregNode(Node):
         )  # fmt: skip
         self.get_logger().info(f'boxes are {type_name}; {self._topics.description()}')
 
-    def _on_transforms(self, topic: str, msg: Any) -> None:
-        self._inbox.put_event(topic, (msg.transforms, time.monotonic_ns()))
+    def _on_transforms(self, topic: str, msg: Any, received_ns: int) -> None:
+        self._inbox.put_event(topic, (msg.transforms, received_ns), wakes=False)
 
-    def _on_odometry(self, msg: Any) -> None:
-        self._inbox.put_event('odom', (msg, time.monotonic_ns()))
+    def _on_odometry(self, msg: Any, received_ns: int) -> None:
+        self._inbox.put_event('odom', (msg, received_ns), wakes=False)
 
     def _on_points(self, lidar: str, msg: Any) -> None:
         self.worker.cloud_frame = header_of(msg).frame_id

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.live.diagnostics import diagnosis, Health
+from boxreg_ros.live.polling import PolledGroup, taken
 from boxreg_ros.reasons import Reason
 from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters import canonical
@@ -74,10 +75,12 @@ class Endpoint:
     name: str  # after them
     type_name: str  # as ``package/msg/Type``
     qos: QoSProfile  # overrides are written into it when the entity is made
-    callback: Callable[[Any], None] | None = None  # takes the messages of a subscription
+    callback: Callable[..., None] | None = None  # takes the messages of a subscription
     is_required: bool = False  # the node refines nothing without messages on it
     has_overrides: bool = True  # parameters may override the QoS profile
     is_raw: bool = False  # the callback takes bytes
+    # messages wait for `NodeTopics.poll`; the callback also takes the time of receipt [ns]
+    is_polled: bool = False
     entity: Any = None  # of rclpy, once made
     # when the endpoint was made (monotonic) [s]
     since: float = field(default_factory=time.monotonic)
@@ -90,23 +93,25 @@ class Endpoint:
 
 
 class NodeTopics:
-    """The topics of the node beside those of others; used by the executor's thread only."""
+    """The topics of the node beside those of others; for the executor's thread but for `poll`."""
 
     def __init__(self, node: Node, health: Health) -> None:
         self._node = node
         self._health = health
         self._endpoints: list[Endpoint] = []
         self._logged: set[str] = set()
+        self._polled = PolledGroup()
 
     def subscribe(
         self,
         type_name: str,
         topic: str,
-        callback: Callable[[Any], None],
+        callback: Callable[..., None],
         qos: QoSProfile,
         is_required: bool = False,
         has_overrides: bool = True,
         is_raw: bool = False,
+        is_polled: bool = False,
     ) -> None:
         """
         Create a subscription; the arguments are those of `Endpoint`.
@@ -119,7 +124,7 @@ class NodeTopics:
         """
         name = self._node.resolve_topic_name(topic)
         endpoint = Endpoint(
-            topic, name, type_name, qos, callback, is_required, has_overrides, is_raw
+            topic, name, type_name, qos, callback, is_required, has_overrides, is_raw, is_polled
         )
         self._refuse_two_types(endpoint)
         self._create_subscription(endpoint)
@@ -142,6 +147,14 @@ class NodeTopics:
         self._endpoints.append(endpoint)
         publisher: Publisher = endpoint.entity
         return publisher
+
+    def poll(self) -> None:
+        """Handle the messages of polled subscriptions that have arrived; in any one thread."""
+        for endpoint in self._endpoints:
+            if endpoint.is_polled and endpoint.callback is not None:
+                for message, received_ns in taken(endpoint.entity):
+                    endpoint.received += 1
+                    endpoint.callback(message, received_ns)
 
     def close(self) -> None:
         """Destroy all subscriptions and publishers."""
@@ -252,6 +265,7 @@ class NodeTopics:
             kind, endpoint.topic, partial(self._on_message, endpoint), endpoint.qos,
             event_callbacks=events, raw=endpoint.is_raw,
             qos_overriding_options=QOS_OVERRIDES if endpoint.has_overrides else None,
+            callback_group=self._polled if endpoint.is_polled else None,
         )  # fmt: skip
 
     def _on_message(self, endpoint: Endpoint, message: Any) -> None:

@@ -31,12 +31,13 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
-TRANSFORM_PERIOD = 0.02
-"""Longest pause between two looks whether the transforms of a message have arrived [s]."""
+TRANSFORM_PERIOD = 0.005
+"""Longest pause between two looks whether the transforms of a message have arrived [s]: the
+period of TF at 200 Hz."""
 HELD_PERIOD = 0.1
 """Longest pause while boxes are held [s]."""
-IDLE_PERIOD = 1.0
-"""Longest pause while nothing is held [s]."""
+IDLE_PERIOD = 0.5
+"""Longest pause while nothing is held [s]: the queues of transforms have room for a second."""
 BOXES_PATIENCE = 10.0
 """Boxes wait for the solver this many times longer than clouds before they pass through."""
 FULL_COLLECTION_PERIOD = 60.0
@@ -54,8 +55,9 @@ class Worker:
     The worker alone uses the registrar, its transforms and the markers. It shares the inbox and
     the counters with the executor's thread, which also sets `cloud_frame`, that of the newest
     cloud, and `cloud_received`, when it arrived (monotonic) [s]. A cloud may wait `backlog` [s]
-    for the solver. `fixed_frame` is empty until it is chosen, `tracks` counts those of the
-    newest boxes, `newest_transform_ns` is the stamp of the newest transform or odometry.
+    for the solver; `poll` puts transforms and odometry that have arrived into the inbox.
+    `fixed_frame` is empty until it is chosen, `tracks` counts those of the newest boxes,
+    `newest_transform_ns` is the stamp of the newest transform or odometry.
 
     """
 
@@ -69,6 +71,7 @@ class Worker:
         backlog: float,
         markers: Publisher,
         model: ModelFile,
+        poll: Callable[[], None],
     ) -> None:
         self.cloud_frame = ''
         self.cloud_received = 0.0
@@ -87,6 +90,7 @@ class Worker:
         self._board = MarkerBoard()
         self._markers = markers
         self._model = model
+        self._poll = poll
         self.static: Publisher | None = None  # of clouds without moving objects
         self._early: Publisher | None = None
         self._final: Publisher | None = None
@@ -242,7 +246,8 @@ class Worker:
         self._publish(self._guarded(release))
 
     def _take_events(self) -> None:
-        """Handle all events of the inbox, in the order of their arrival."""
+        """Handle all events of the inbox, in the order of their arrival, and transforms."""
+        self._poll()
         for kind, content in self._inbox.take_events():
             self._take_event(kind, content)
         tree = self._live.session.tree

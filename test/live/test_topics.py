@@ -1,15 +1,19 @@
 """Topics of the real node over DDS: QoS, types, silence and remaps in log and /diagnostics."""
 
+from functools import partial
+import time
 from types import SimpleNamespace
 
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.diagnostics import Health
+from boxreg_ros.live.polling import PolledClockNode
 from boxreg_ros.live.topics import import_message, mismatches, NodeTopics
 from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters.convention import Convention
 from preloaded import CODE, IMPATIENT_NODE
 import pytest
 from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from ros_graph import (
     DIAGNOSTICS,
@@ -22,8 +26,9 @@ from ros_graph import (
     UNKNOWN_NODE,
     values_of,
 )
-from ros_messages import DETECTIONS, Drive, MARKERS, POINTS, TF
+from ros_messages import DETECTIONS, Drive, MARKERS, ODOMETRY, POINTS, TF
 
+CLOCK = 'rosgraph_msgs/msg/Clock'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -52,6 +57,45 @@ def reported(graph, node, diagnostics, *parts):
 def subscribe(graph, type_name, topic, qos):
     """Subscribe and discard the messages."""
     graph.node.create_subscription(import_message(type_name), topic, lambda _: None, qos)
+
+
+def test_no_executor_wakes_for_transforms_odometry_and_clock(graph):
+    """They are taken when they are needed, all and in their order."""
+    kinds = {'/tf': TF, '/odom': ODOMETRY, '/clock': CLOCK}
+    for topic, kind in kinds.items():
+        graph.publisher(kind, topic)
+    node = PolledClockNode(
+        'ours', context=graph.context, cli_args=['--ros-args', '-p', 'use_sim_time:=true']
+    )
+    topics = NodeTopics(node, Health(node.get_logger()))
+    taken = []
+    for topic in ('/tf', '/odom'):
+        take = partial(lambda name, message, at_ns: taken.append((name, at_ns)), topic)
+        topics.subscribe(kinds[topic], topic, take, QoSProfile(depth=1000), is_polled=True)
+    executor = SingleThreadedExecutor(context=graph.context)
+    executor.add_node(node)
+    publishers = graph.publishers
+    graph.wait(lambda: all(p.get_subscription_count() for p in publishers.values()), 'discovery')
+    tf, odometry, clock = (import_message(kind)() for kind in kinds.values())
+    for k in range(300):
+        publishers['/tf'].publish(tf)
+        publishers['/odom'].publish(odometry)
+        clock.clock.sec = k + 1
+        publishers['/clock'].publish(clock)
+    executor.spin_once(timeout_sec=0.05)
+    executor.spin_once(timeout_sec=0.05)
+    assert taken == []
+
+    def is_complete():
+        topics.poll()
+        return len(taken) == 600 and node.get_clock().now().nanoseconds == 300 * 10**9
+
+    graph.wait(is_complete, 'all messages')
+    assert all(abs(time.monotonic_ns() - at_ns) < 60e9 for _, at_ns in taken)
+    assert [name for name, _ in taken].count('/tf') == 300
+    topics.close()
+    node.destroy_node()
+    executor.shutdown()
 
 
 def test_each_qos_mismatch_is_reported_with_topic_policy_and_side(graph):

@@ -41,6 +41,7 @@ def _measured(args, tracks, settings):
     """Return latency, accuracy and losses for a number of tracks and parameters of the node."""
     scope = argparse.Namespace(
         tracks=tracks, points=args.points, rate=10.0, seconds=args.seconds, delay=0.05,
+        motion=0.0, clock=0.0,
         transport='large', set=settings, record=None, keep_gigabytes=0.0,
     )  # fmt: skip
     report = measure(scope, keeps_messages=True)

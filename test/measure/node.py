@@ -16,7 +16,7 @@ import signal
 import struct
 import subprocess
 from tempfile import TemporaryDirectory
-from threading import Thread
+from threading import Event, Thread
 import time
 
 from boxreg_ros.errors import BoxregError
@@ -48,6 +48,8 @@ ARGUMENTS = {
     '--rate': (10.0, 'rate of the sensor [Hz]'),
     '--seconds': (60.0, 'seconds of data'),
     '--delay': (0.05, 'delay of the boxes after their cloud'),
+    '--motion': (0.0, 'rate of further odometry, and of TF of another robot [Hz]'),
+    '--clock': (0.0, 'rate of /clock, with use_sim_time [Hz]'),
     '--transport': (
         'large',
         'shared memory of share/fastdds.xml',
@@ -136,6 +138,8 @@ def publish(args):
         time.sleep(0.1)
     odometry = Odometry(child_frame_id='lidar')
     odometry.header.frame_id = 'odom'
+    ended = Event()
+    _start_streams(args, node, to_odom, ended)
     period_ns = 1e9 / args.rate
     begin_ns = time.time_ns()
     with args.log.open('w') as log:
@@ -155,9 +159,45 @@ def publish(args):
             moment_ns = time.monotonic_ns()
             to_boxes.publish(message)
             log.write(f'{stamp_ns} {moment_ns}\n')
+    ended.set()
     to_boxes.wait_for_all_acked(Duration(seconds=LAST_TIME))
     node.destroy_node()
     rclpy.shutdown()
+
+
+def _start_streams(args, node, to_odom, ended):
+    """Publish odometry, TF and /clock at their rates in threads, until an event is set."""
+    from geometry_msgs.msg import TransformStamped
+    from nav_msgs.msg import Odometry
+    from rosgraph_msgs.msg import Clock
+    from tf2_msgs.msg import TFMessage
+
+    def repeat(rate, messages):
+        due = time.monotonic()
+        while not ended.is_set():
+            for publisher, message, stamp in messages:
+                stamp.sec, stamp.nanosec = divmod(time.time_ns(), 10**9)
+                publisher.publish(message)
+            due += 1 / rate
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    transform = TransformStamped(child_frame_id='lidar_of_another')
+    transform.header.frame_id = 'another'
+    odometry = Odometry(child_frame_id='lidar')
+    odometry.header.frame_id = 'odom'
+    clock = Clock()
+    to_tf = node.create_publisher(TFMessage, '/tf', 100)
+    to_clock = node.create_publisher(Clock, '/clock', 1)
+    motion = [
+        (to_tf, TFMessage(transforms=[transform]), transform.header.stamp),
+        (to_odom, odometry, odometry.header.stamp),
+    ]
+    for rate, messages in (
+        (args.motion, motion),
+        (args.clock, [(to_clock, clock, clock.clock)]),
+    ):
+        if rate:
+            Thread(target=repeat, args=(rate, messages), daemon=True).start()
 
 
 def _set_ids_and_stamp(array, turn, stamp):
@@ -279,7 +319,7 @@ def node_command(parameters):
 
 def publisher_command(args, log):
     """Return the command of the publisher, which logs the box arrays sent."""
-    names = ('tracks', 'points', 'rate', 'seconds', 'delay')
+    names = ('tracks', 'points', 'rate', 'seconds', 'delay', 'motion', 'clock')
     options = [f'--{name}={getattr(args, name)}' for name in names]
     return [*MEASURE, 'node', '--role=publish', f'--log={log}', *options]
 

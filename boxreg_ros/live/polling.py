@@ -1,0 +1,81 @@
+"""Subscriptions that are read when their messages are needed, not whenever one arrives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import time
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import Clock
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+from rclpy.time_source import CLOCK_TOPIC
+
+
+class PolledGroup(CallbackGroup):
+    """
+    A group whose subscriptions no executor waits for; `taken` returns their messages.
+
+    An executor of rclpy takes a millisecond of CPU for each message. TF, odometry and /clock come
+    hundreds of times a second, and are needed once for each cloud. Events of the subscriptions,
+    which are rare, are handled as usual.
+
+    """
+
+    def can_execute(self, entity: Any) -> bool:
+        """Return whether an executor waits for an entity."""
+        return not isinstance(entity, Subscription)
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Return whether an executor may handle an entity."""
+        return self.can_execute(entity)
+
+    def ending_execution(self, entity: Any) -> None:
+        """Do nothing: entities do not exclude each other."""
+
+
+def taken(subscription: Any) -> Iterator[tuple[Any, int]]:
+    """Yield the messages that wait, oldest first, and when each was received (monotonic) [ns]."""
+    now_ns = time.monotonic_ns()
+    offset_ns = now_ns - time.time_ns()
+    while True:
+        with subscription.handle:
+            found = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        if found is None:
+            return
+        message, info = found
+        # By the clock of the system, which may be set; 0 where the middleware does not tell.
+        received_ns = info['received_timestamp']
+        yield message, min(now_ns, received_ns + offset_ns) if received_ns else now_ns
+
+
+class PolledClockNode(Node):
+    """A node that reads /clock when it is asked for the time, with `use_sim_time`."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        self._clock_group = PolledGroup()
+        self._clock_subscription: Any = None
+        super().__init__(*args, **options)
+
+    def create_subscription(self, msg_type: Any, topic: str, *args: Any, **options: Any) -> Any:
+        """Create a subscription, see `Node`; no executor waits for that of rclpy to /clock."""
+        if topic != CLOCK_TOPIC:
+            return super().create_subscription(msg_type, topic, *args, **options)
+        options['callback_group'] = self._clock_group
+        made = super().create_subscription(msg_type, topic, *args, **options)
+        self._clock_subscription = made
+        return made
+
+    def destroy_subscription(self, subscription: Subscription) -> bool:
+        """Destroy a subscription, see `Node`."""
+        if subscription is self._clock_subscription:
+            self._clock_subscription = None
+        return super().destroy_subscription(subscription)
+
+    def get_clock(self) -> Clock:
+        """Return the clock of the node, at the newest time of /clock."""
+        if self._clock_subscription is not None:
+            for message, _ in taken(self._clock_subscription):
+                self._clock_subscription.callback(message)
+        return super().get_clock()
