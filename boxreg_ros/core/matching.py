@@ -1,7 +1,7 @@
 """Pairing of sweeps and box arrays by header stamp; the same live and offline."""
 
 from bisect import insort
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from math import inf
 from typing import NamedTuple
@@ -14,6 +14,13 @@ from boxreg_ros.structures import BoxArray, Sweep
 AT_ONCE = 0.02
 """Boxes take a sweep this near in time without waiting for a nearer one [s]. Chosen: a fifth of
 the period of a LiDAR."""
+
+
+STEPS = 10
+"""Last steps between the stamps of sweeps that their period is known from; chosen: a second at
+10 Hz."""
+FEWEST_STEPS = 3
+"""Fewer steps are no period; chosen: one may follow a lost sweep."""
 
 
 class Pair(NamedTuple):
@@ -38,8 +45,10 @@ class StampMatcher:
     Pair sweeps with box arrays; pairs are returned in the order of the box arrays' stamps.
 
     A box array takes the nearest sweep within `AT_ONCE` at once. A sweep within `reach` is taken
-    as soon as a younger sweep than the boxes is known: no later one can be nearer, whichever kind
-    arrives first. A sweep may be paired with several box arrays. A box array whose sweep was
+    as soon as no later one can be nearer, whichever kind arrives first: when a younger sweep than
+    the boxes is known, or when the boxes are in the first half of the shortest step between the
+    last sweeps. Where the sweeps are further behind than boxes are held, as by another clock,
+    boxes wait for none. A sweep may be paired with several box arrays. A box array whose sweep was
     dropped is returned without one. At most `queue` sweeps and `queue` box arrays are held.
     Dropped sweeps are counted in `counts` by reason.
 
@@ -55,6 +64,7 @@ class StampMatcher:
         self._newest_boxes_ns = 0
         self._used_ns: set[int] = set()  # stamps of held sweeps that were paired
         self._newest_ns = -inf  # of all sweeps added
+        self._steps_ns = deque[float](maxlen=STEPS)
         self._oldest_ns = -inf  # sweeps before this one are late
 
     @property
@@ -70,6 +80,8 @@ class StampMatcher:
             self._counts[Reason.SWEEP_DUPLICATE] += 1
         else:
             insort(self._sweeps, sweep, key=lambda item: item.stamp_ns)
+        if -inf < self._newest_ns < sweep.stamp_ns:
+            self._steps_ns.append(sweep.stamp_ns - self._newest_ns)
         self._newest_ns = max(self._newest_ns, sweep.stamp_ns)
         return self._pop_pairs_of_sweeps()
 
@@ -111,7 +123,7 @@ class StampMatcher:
             offset_ns = self._reach_ns + 1
             if sweep is not None:
                 offset_ns = abs(sweep.stamp_ns - stamp_ns)
-            is_decided = offset_ns <= self._at_once_ns or self._newest_ns >= stamp_ns
+            is_decided = offset_ns <= self._at_once_ns or self._is_decided(stamp_ns)
             is_over_capacity = len(self._unpaired) > self._capacity
             if not (is_decided or is_over_capacity or is_flush):
                 return
@@ -124,7 +136,20 @@ class StampMatcher:
                 else:
                     _check_frames(sweep, boxes)
             yield Pair(self._unpaired.pop(0).boxes, sweep)
-            self._discard_before(stamp_ns - self._reach_ns)
+            # Boxes of another clock may be far ahead of all sweeps.
+            self._discard_before(min(stamp_ns, self._newest_ns) - self._reach_ns)
+
+    def _is_decided(self, stamp_ns: int) -> bool:
+        """Return whether no later sweep can be nearer to a stamp, or is waited for."""
+        if self._newest_ns >= stamp_ns:
+            return True
+        if len(self._steps_ns) < FEWEST_STEPS:
+            return False
+        behind_ns = stamp_ns - self._newest_ns
+        is_nearest = 2 * behind_ns < min(self._steps_ns)
+        # At most `queue` box arrays are held, for about as many steps.
+        is_apart = behind_ns - self._reach_ns > (self._capacity + 1) * max(self._steps_ns)
+        return is_nearest or is_apart
 
     def _discard_before(self, oldest_ns: float) -> None:
         """Discard older sweeps; count those that were paired with no box array."""

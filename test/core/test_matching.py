@@ -157,6 +157,36 @@ def test_boxes_between_sweeps_are_paired_when_a_younger_sweep_arrives(late):
     assert feed.counts == {'sweep_without_boxes': 1}
 
 
+def test_boxes_in_the_first_half_of_a_period_do_not_wait_for_the_next_sweep():
+    feed = Feed(reach=60)
+    assert feed.add('s0', 's100', 's203', 'b240') == []  # the period is not known yet
+    assert feed.add('s300') == [(240, 203)]
+    assert feed.add('b345') == [(345, 300)]
+    assert feed.add('b355') == []  # a sweep at 400 would be nearer
+    assert feed.add('s400') == [(355, 400)]
+    assert feed.add('s440', 's500', 'b545') == []  # steps of 40 ms, too
+    assert feed.add('s600') == [(545, 500)]
+
+
+def test_boxes_between_sweeps_take_the_same_sweep_whichever_comes_first():
+    sweeps = [f's{100 * k}' for k in range(12)]
+    for late in (22, 45, 55, 78):
+        arrays = [f'b{100 * k + late}' for k in range(5, 10)]
+        at_once = Feed(reach=60)
+        pairs = at_once.add(*sorted(sweeps + arrays, key=lambda item: int(item[1:])))
+        afterwards = Feed(reach=60, capacity=20)
+        assert pairs + at_once.flush() == afterwards.add(*sweeps, *arrays) + afterwards.flush()
+
+
+def test_boxes_wait_for_no_sweep_of_another_clock():
+    feed = Feed(capacity=5)
+    sweeps = [f's{100 * k}' for k in range(4)]
+    assert feed.add(*sweeps, 'b1000000') == [(1000000, None)]
+    assert feed.add('s400', 'b1000100', 's500') == [(1000100, None)]
+    assert feed.add('b1000') == []  # five sweeps behind: its own may come
+    assert feed.add('s600', 's1000') == [(1000, 1000)]
+
+
 def test_no_box_array_is_lost_in_any_order():
     # In every order each box array is returned once, with its own sweep or none, and sweeps
     # without boxes are counted. If each kind arrives in order, all are paired.
