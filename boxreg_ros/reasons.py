@@ -85,7 +85,7 @@ class Reason(StrEnum):
         'points_lost',
         'cloud',
         'lost by DDS between publisher and node',
-        ENLARGE_TRANSPORT,
+        f'{ENLARGE_TRANSPORT}; if the node was killed before, restart the driver, too',
     )
     BOXES_LOST = (
         'boxes_lost',
@@ -165,6 +165,12 @@ class Reason(StrEnum):
         'no cloud within `reach` of its stamp',
         'copy the stamp of the cloud to its boxes; check the counters of clouds; raise `queue` if '
         'boxes arrive more than `queue` clouds late',
+    )
+    CLOUD_DROPPED = (
+        'cloud_dropped',
+        'box',
+        'its cloud was dropped by the node, as `points_queue_full` counts',
+        REDUCE_LOAD,
     )
     SWEEP_LATE = (
         'sweep_late',

@@ -30,6 +30,8 @@ class Pair(NamedTuple):
     sweep: Sweep | None
     reason: str = ''
     """Why the boxes are kept, whether or not there is a sweep; empty for others."""
+    is_dropped: bool = False
+    """Whether the sweep of the boxes was dropped."""
 
 
 class _Unpaired(NamedTuple):
@@ -129,13 +131,14 @@ class StampMatcher:
                 return
             if offset_ns > self._reach_ns:
                 sweep = None
+            is_dropped = sweep is not None and sweep.is_dropped
             if sweep is not None:
                 self._used_ns.add(sweep.stamp_ns)
-                if sweep.is_dropped:
-                    sweep = None
-                else:
-                    _check_frames(sweep, boxes)
-            yield Pair(self._unpaired.pop(0).boxes, sweep)
+            if is_dropped:
+                sweep = None
+            if sweep is not None:
+                _check_frames(sweep, boxes)
+            yield Pair(self._unpaired.pop(0).boxes, sweep, is_dropped=is_dropped)
             # Boxes of another clock may be far ahead of all sweeps.
             self._discard_before(min(stamp_ns, self._newest_ns) - self._reach_ns)
 

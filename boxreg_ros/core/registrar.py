@@ -329,7 +329,7 @@ class BoxRegistrar:
         array.is_observed = sweep is not None and not reason
         if sweep is None:
             self.counts[Reason.BOXES_WITHOUT_SWEEP] += 1
-            reason = reason or Reason.NO_SWEEP
+            reason = reason or (Reason.CLOUD_DROPPED if pair.is_dropped else Reason.NO_SWEEP)
         array.set_reasons(reason)
         self._end_silent_tracks(boxes.stamp_ns)
         if sweep is not None:

@@ -216,7 +216,7 @@ class BoxregNode(PolledClockNode):
         try:
             for topic, qos in (('/tf', reliable), ('/tf_static', latched)):
                 callback = partial(self._on_transforms, topic)
-                subscribe('tf2_msgs/msg/TFMessage', topic, callback, qos, has_overrides=False)
+                subscribe('tf2_msgs/msg/TFMessage', topic, callback, qos)
         except UnsupportedMessage as error:
             self.get_logger().warning(f'transforms are not received, odometry is: {error}')
 

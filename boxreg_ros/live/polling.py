@@ -8,9 +8,13 @@ from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.time_source import CLOCK_TOPIC
+
+NO_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
+"""Of polled subscriptions: to wait for events of a reader of Fast DDS is to wait for its data."""
 
 
 class PolledGroup(CallbackGroup):
@@ -18,21 +22,20 @@ class PolledGroup(CallbackGroup):
     A group whose subscriptions no executor waits for; `taken` returns their messages.
 
     An executor of rclpy takes a millisecond of CPU for each message. TF, odometry and /clock come
-    hundreds of times a second, and are needed once for each cloud. Events of the subscriptions,
-    which are rare, are handled as usual.
+    hundreds of times a second, and are needed once for each cloud.
 
     """
 
     def can_execute(self, entity: Any) -> bool:
-        """Return whether an executor waits for an entity."""
-        return not isinstance(entity, Subscription)
+        """Return False: no executor waits for an entity."""
+        return False
 
     def beginning_execution(self, entity: Any) -> bool:
-        """Return whether an executor may handle an entity."""
-        return self.can_execute(entity)
+        """Return False: no executor may handle an entity."""
+        return False
 
     def ending_execution(self, entity: Any) -> None:
-        """Do nothing: entities do not exclude each other."""
+        """Do nothing: none has begun."""
 
 
 def taken(subscription: Any) -> Iterator[tuple[Any, int]]:
@@ -62,7 +65,7 @@ class PolledClockNode(Node):
         """Create a subscription, see `Node`; no executor waits for that of rclpy to /clock."""
         if topic != CLOCK_TOPIC:
             return super().create_subscription(msg_type, topic, *args, **options)
-        options['callback_group'] = self._clock_group
+        options |= {'callback_group': self._clock_group, 'event_callbacks': NO_EVENTS}
         made = super().create_subscription(msg_type, topic, *args, **options)
         self._clock_subscription = made
         return made

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.live.diagnostics import diagnosis, Health
-from boxreg_ros.live.polling import PolledGroup, taken
+from boxreg_ros.live.polling import NO_EVENTS, PolledGroup, taken
 from boxreg_ros.reasons import Reason
 from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters import canonical
@@ -77,7 +77,6 @@ class Endpoint:
     qos: QoSProfile  # overrides are written into it when the entity is made
     callback: Callable[..., None] | None = None  # takes the messages of a subscription
     is_required: bool = False  # the node refines nothing without messages on it
-    has_overrides: bool = True  # parameters may override the QoS profile
     is_raw: bool = False  # the callback takes bytes
     # messages wait for `NodeTopics.poll`; the callback also takes the time of receipt [ns]
     is_polled: bool = False
@@ -109,7 +108,6 @@ class NodeTopics:
         callback: Callable[..., None],
         qos: QoSProfile,
         is_required: bool = False,
-        has_overrides: bool = True,
         is_raw: bool = False,
         is_polled: bool = False,
     ) -> None:
@@ -123,9 +121,7 @@ class NodeTopics:
 
         """
         name = self._node.resolve_topic_name(topic)
-        endpoint = Endpoint(
-            topic, name, type_name, qos, callback, is_required, has_overrides, is_raw, is_polled
-        )
+        endpoint = Endpoint(topic, name, type_name, qos, callback, is_required, is_raw, is_polled)
         self._refuse_two_types(endpoint)
         self._create_subscription(endpoint)
         self._endpoints.append(endpoint)
@@ -254,17 +250,19 @@ class NodeTopics:
     def _create_subscription(self, endpoint: Endpoint) -> None:
         """Create the subscription of an endpoint, in place of the one it has."""
         kind = import_message(endpoint.type_name)
-        events = SubscriptionEventCallbacks(
-            incompatible_qos=partial(self._on_incompatible_publisher, endpoint),
-            message_lost=partial(self._on_lost, endpoint),
-        )
+        events = NO_EVENTS
+        if not endpoint.is_polled:
+            events = SubscriptionEventCallbacks(
+                incompatible_qos=partial(self._on_incompatible_publisher, endpoint),
+                message_lost=partial(self._on_lost, endpoint),
+            )
         if endpoint.entity is not None:
             self._node.destroy_subscription(endpoint.entity)
         _check_overrides(self._node, f'qos_overrides.{endpoint.name}.subscription')
         endpoint.entity = self._node.create_subscription(
             kind, endpoint.topic, partial(self._on_message, endpoint), endpoint.qos,
             event_callbacks=events, raw=endpoint.is_raw,
-            qos_overriding_options=QOS_OVERRIDES if endpoint.has_overrides else None,
+            qos_overriding_options=QOS_OVERRIDES,
             callback_group=self._polled if endpoint.is_polled else None,
         )  # fmt: skip
 

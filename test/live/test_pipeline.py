@@ -440,7 +440,7 @@ def test_boxes_do_not_wait_for_a_dropped_cloud():
     live = Live()
     out = live.lose(drive.stamps[3]) + live.feed(drive) + live.flush()
     kept = [item.refined.reasons for item in out if item.is_final]
-    assert kept[3] == ('no_sweep',) * 2
+    assert kept[3] == ('cloud_dropped',) * 2
     assert kept[4:] == [('', '')] * 2
     early = [vision.from_msg(item.message).stamp_ns for item in out if not item.is_final]
     assert early == drive.stamps
