@@ -166,6 +166,13 @@ class Reason(StrEnum):
         'copy the stamp of the cloud to its boxes; check the counters of clouds; raise `queue` if '
         'boxes arrive more than `queue` clouds late',
     )
+    COMPILING = (
+        'compiling',
+        'message',
+        'published unchanged, because the solver was compiled meanwhile, once after an '
+        'installation',
+        'run `boxreg compile` before the robot drives, and when an image is built',
+    )
     CLOUD_DROPPED = (
         'cloud_dropped',
         'box',

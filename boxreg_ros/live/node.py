@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 import gc
 from pathlib import Path
+from threading import Event, Thread
 import time
 from typing import Any
 
@@ -80,18 +82,19 @@ class BoxregNode(PolledClockNode):
         config, options = self._settings
         self._inbox = Inbox(config.queue, max(1, len(options.lidars.topics)))
         self._opened = ExitStack()
+        self._is_warm = Event()  # until then, boxes pass unchanged
+        self._failures: list[Exception] = []
 
     def configure(self) -> None:
         """Load or compile kernels, time a window, and make a registrar without any track."""
+        self.prepare()
+        self.warm_up(self.get_logger().info)
+
+    def prepare(self) -> None:
+        """Make a registrar without any track, and all that reading and passing boxes needs."""
         config, options = self._settings
-        with announced_compilation(self.get_logger().info):
-            warm_up(config)
-            warm_up_followed(config)
-            if options.static_points:
-                warm_up_labels(config)
-            cdr.walker()
+        cdr.walker()
         self._budget = TickBudget(options.deadline)
-        warm_up(config, self._budget.submit)  # once more, timed without imports and compilation
         report = self._health.report
         placement = SensorPlacement(options.lidars)
         session = Session(options.convention, config, options.fixed_frame, placement, report)
@@ -102,8 +105,45 @@ class BoxregNode(PolledClockNode):
         self._live = MessagePipeline(
             config, session, wait, report, self._budget, patience, self._model.drives
         )
+
+    def warm_up(self, announce: Callable[[str], None]) -> None:
+        """Load or compile kernels, with announcements, and time a window; boxes may pass."""
+        config, options = self._settings
+        begun = time.monotonic()
+        with announced_compilation(announce) as done:
+            warm_up(config)
+            warm_up_followed(config)
+            if options.static_points:
+                warm_up_labels(config)
+        if done.functions:
+            seconds = time.monotonic() - begun
+            self.get_logger().info(f'compiled {done.functions} functions in {seconds:.0f} s')
+        warm_up(config, self._budget.submit)  # once more, timed without imports and compilation
         gc.collect()
         gc.freeze()  # a collection of imported objects would take 50 ms, several times a minute
+        self._is_warm.set()
+
+    def warm_up_beside(self) -> None:
+        """Warm up; where that is to compile, return at once and go on in a thread."""
+        goes_on = Event()
+
+        def announce(text: str) -> None:
+            until = '' if goes_on.is_set() else '; boxes pass unchanged until then'
+            self.get_logger().info(f'{text}{until}')
+            goes_on.set()
+
+        def run() -> None:
+            try:
+                self.warm_up(announce)
+            except Exception as error:
+                self._failures.append(error)
+            self._is_warm.set()
+            goes_on.set()
+
+        Thread(target=run, daemon=True).start()
+        goes_on.wait()
+        if self._failures:
+            raise self._failures[0]
 
     def open_topics(self) -> None:
         """
@@ -155,7 +195,10 @@ class BoxregNode(PolledClockNode):
         self._opened.close()
 
     def run_worker(self) -> None:
-        """Process messages until `stop_worker`."""
+        """Process messages until `stop_worker`; raise the error of a compilation beside it."""
+        self.worker.pass_until(self._is_warm)
+        if self._failures:
+            raise self._failures[0]
         self.worker.run()
 
     def stop_worker(self) -> None:

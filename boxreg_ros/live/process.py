@@ -31,7 +31,8 @@ def make_node(program: str, arguments: list[str], is_managed: bool = False) -> B
     if is_managed:
         return BoxregLifecycleNode()
     node = BoxregNode()
-    node.configure()
+    node.prepare()
+    node.warm_up_beside()
     node.open_topics()
     return node
 

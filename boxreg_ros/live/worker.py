@@ -140,6 +140,22 @@ class Worker:
                 self._waited = self._complete_at - item.received
         self._finish(item)
 
+    def pass_until(self, is_warm: Event) -> None:
+        """Pass boxes through until an event is set: the solver is compiled meanwhile."""
+        passed = 0
+        while not (is_warm.is_set() or self._stopping.is_set()):
+            self._inbox.wake_up.clear()
+            self._take_events()
+            message = self._inbox.take()
+            if message is None:
+                self._inbox.wake_up.wait(HELD_PERIOD)
+            elif message.topic == 'boxes':
+                passed += 1
+                self._health.report(Reason.COMPILING, Reason.COMPILING.remedy)
+                self._publish(self._live.pass_through(message.content))
+        if passed:
+            self._logger.info(f'{passed} messages of boxes passed unchanged; the next are refined')
+
     def drop(self, message: Message) -> None:
         """Count a message that there is no time for, and pass boxes through; in any thread."""
         reason = REASONS[f'{message.topic}_queue_full']

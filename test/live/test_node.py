@@ -24,6 +24,7 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
 from ros_graph import (
     ended_cleanly,
+    first_sweeps,
     Graph,
     numbers_changed,
     play,
@@ -294,6 +295,41 @@ BoxRegistrar.add_sweep = slowly
 from boxreg_ros.live.main import main
 sys.exit(main())
 """
+
+
+FIRST_START = """
+import os, sys, time
+from boxreg_ros.live import node
+import numba
+warm_up = node.warm_up
+def compile_first(config, *others):
+    if not others:
+        numba.njit(lambda x: x + 1)(1)
+        while not os.path.exists({compiled!r}):
+            time.sleep(0.05)
+    warm_up(config, *others)
+node.warm_up = compile_first
+from boxreg_ros.live.main import main
+sys.exit(main())
+"""
+
+
+def test_boxes_pass_unchanged_while_the_solver_is_compiled(graph, tmp_path):
+    records = records_of(Drive(sweeps=8).write(tmp_path / 'drive'))
+    compiled = tmp_path / 'compiled'
+    code = FIRST_START.format(compiled=str(compiled))
+    node = graph.run(records, *QUICK, command=(CODE, code))
+    passing = first_sweeps(records, 2)
+    node.play(passing)
+    assert 'once after an installation' in node.output()
+    assert numbers_changed(node.early, passing) == [0, 0]
+    graph.wait(lambda: node.values().get('compiling') == '2', 'the counter')
+    compiled.touch()
+    graph.wait(lambda: '2 messages of boxes passed unchanged' in node.output(), 'the solver')
+    assert ' functions in ' in node.output()
+    node.play(records[len(passing) :])
+    assert sum(numbers_changed(node.early, records)[2:]) > 0
+    assert ended_cleanly(node)
 
 
 def test_boxes_that_wait_too_long_are_published_unchanged(graph, tmp_path):
