@@ -10,9 +10,11 @@ from typing import Any
 from uuid import uuid4
 
 from boxreg_ros.errors import BoxregError, UnsupportedMessage
-from boxreg_ros.live.node import BoxregNode
+from boxreg_ros.live.diagnostics import diagnosis
+from boxreg_ros.live.node import BoxregNode, STATUS_PERIOD
 from boxreg_ros.live.topics import import_message
 from boxreg_ros.live.worker import Worker
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.srv import ChangeState
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
@@ -26,6 +28,8 @@ HEARTBEAT_PERIOD = 0.1
 """Time between two heartbeats [s]; that of the nodes of Nav2."""
 HEARTBEAT_TIMEOUT = 4.0
 """Silence after which the other end takes the bond for broken [s]; that of Nav2 by default."""
+STATUS_DEPTH = 10
+"""Queue size of /diagnostics: as many seconds."""
 BOND_DEPTH = 10
 """Queue size: a second of heartbeats."""
 END_HEARD_TIME = 1.0
@@ -76,6 +80,29 @@ class Bond:
         self._publisher.publish(self._status)
 
 
+class InactiveStatus:
+    """Publish the state of a node on /diagnostics while it is not active, until `end`."""
+
+    def __init__(self, node: Node, state: Callable[[], str]) -> None:
+        self._node = node
+        self._state = state
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', STATUS_DEPTH)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(STATUS_PERIOD, self._publish, clock=steady)
+
+    def end(self) -> None:
+        """Publish no more."""
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_publisher(self._publisher)
+
+    def _publish(self) -> None:
+        name = f'{self._node.get_fully_qualified_name()}: registration'
+        status = diagnosis(name, DiagnosticStatus.OK, self._state(), {})
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+
+
 AnswerChange = Callable[[ChangeState.Request, ChangeState.Response], ChangeState.Response]
 
 
@@ -99,6 +126,10 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
         self._activated = Queue[Worker | None]()
         self._drained = Event()
         self._is_active = False
+        self._status = InactiveStatus(self, self._state_name)
+
+    def _state_name(self) -> str:
+        return str(self._state_machine.current_state[1])
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Warm up."""
@@ -112,6 +143,7 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
             self._drained.clear()
             self._activated.put(self.worker)
             self._bond = Bond.offered_by(self)
+            self._status.end()
         else:
             self.close_topics()
         return result
@@ -124,6 +156,7 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
         self.worker.stop()
         self._drained.wait()
         self.close_topics()
+        self._status = InactiveStatus(self, self._state_name)
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:

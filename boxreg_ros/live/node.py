@@ -20,6 +20,7 @@ from boxreg_ros.io.warm_up import warm_up, warm_up_followed, warm_up_labels
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.budget import TickBudget
+from boxreg_ros.live.debug_times import DebugTimes
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.model_file import ModelFile
@@ -167,6 +168,7 @@ class BoxregNode(PolledClockNode):
             self._live, self._inbox, self._health, self.get_logger(), self._budget,
             options.backlog, self._markers, self._model, self._topics.poll,
         )  # fmt: skip
+        self.worker.times = DebugTimes(self._topics, lambda: self.get_clock().now())
         if options.static_points:
             self._open_static_points(options.points_type)
         self._subscribe_to_points(options.points_type, options.lidars)

@@ -16,6 +16,7 @@ from boxreg_ros.io.label_messages import LabelMessage, to_text
 from boxreg_ros.io.markers import MarkerBoard
 from boxreg_ros.io.session import is_placeholder
 from boxreg_ros.live.budget import TickBudget
+from boxreg_ros.live.debug_times import DebugTimes
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.inbox import CloudPatience, Inbox, Message
 from boxreg_ros.live.model_file import ModelFile
@@ -96,6 +97,7 @@ class Worker:
         self._final: Publisher | None = None
         self.labels: Publisher | None = None  # of all that label files hold of final boxes
         self.early_status: Publisher | None = None  # of the same of early boxes
+        self.times: DebugTimes | None = None
         self._stopping = Event()
         self._confirmed: deque[Item] = deque()
         self._logged_layouts: set[str] = set()
@@ -377,6 +379,8 @@ class Worker:
             if out.received is not None:
                 took = self._budget.end()
                 self._health.add_latency(time.monotonic() - out.received, took)
+                if self.times is not None and took is not None and out.given is not None:
+                    self.times.add(out.given.stamp_ns, took)
             if out.given is not None:
                 self.tracks = len(set(out.given.track_ids) - {''})
             if out.refined is not None:

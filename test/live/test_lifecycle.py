@@ -39,6 +39,10 @@ def test_boxes_are_refined_while_the_node_is_active(graph, tmp_path):
     node = graph.run(records, *QUICK, command=COMMAND, connects=False)
     manager = Manager(graph)
     assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
+    graph.wait(
+        lambda: any(message.status[0].message == 'inactive' for message in node.diagnostics),
+        'the status of the inactive node',
+    )
     assert not any(p.get_subscription_count() for p in graph.publishers.values())
     for _ in range(2):  # the second time all is forgotten: the same stamps are no time jump
         assert manager.change(Transition.TRANSITION_ACTIVATE) == (True, 'active')

@@ -11,6 +11,7 @@ from threading import Event, Thread
 import time
 
 from boxreg_ros.config import Config, settings
+from boxreg_ros.io.label_messages import from_text, LABELS_TYPE
 from boxreg_ros.io.markers import BOX_NAMESPACES, MarkerBoard
 from boxreg_ros.live.topics import import_message
 from boxreg_ros.offline.calibrate import calibrated, GAPS, Measured, write_settings
@@ -295,6 +296,30 @@ BoxRegistrar.add_sweep = slowly
 from boxreg_ros.live.main import main
 sys.exit(main())
 """
+
+
+def test_each_early_box_has_a_status_and_each_array_its_times(graph, tmp_path):
+    records = records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
+    status = graph.collect(LABELS_TYPE, '/refined_boxes_status')
+    times = {
+        name: graph.collect('std_msgs/msg/Float64', f'/boxreg_node/debug/{name}')
+        for name in ('processing_time_ms', 'pipeline_latency_ms')
+    }
+    node = graph.run(records, *QUICK, '-p', f'boxes_type:={DETECTIONS}')
+    node.play(records)
+    graph.wait(lambda: len(status) == 6, 'the status of all boxes')
+    content = [from_text(message.data).refined for message in status]
+    assert [refined.boxes.stamp_ns for refined in content] == [stamp_of(m) for m in node.early]
+    assert all(refined.status == ('refined', 'refined') for refined in content[3:])
+    assert content[0].reasons == ('short_track', 'short_track')
+    graph.wait(lambda: all(len(values) >= 5 for values in times.values()), 'the times')
+    assert all(0 < message.data < 90e3 for message in times['processing_time_ms'])
+    # The stamps of the drive are long ago.
+    assert all(message.data > 90e3 for message in times['pipeline_latency_ms'])
+    values = node.values()
+    graph.wait(lambda: int(node.values().get('early_refined', 0)) >= 6, 'counters')
+    assert 'early_budget' not in values
+    assert ended_cleanly(node)
 
 
 FIRST_START = """
