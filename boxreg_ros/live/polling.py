@@ -14,7 +14,11 @@ from rclpy.subscription import Subscription
 from rclpy.time_source import CLOCK_TOPIC
 
 NO_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
-"""Of polled subscriptions: to wait for events of a reader of Fast DDS is to wait for its data."""
+"""
+Of polled subscriptions. An executor that waits for events of a subscription, and not for its
+messages, wakes again and again while messages wait: with rclpy 7 and Fast DDS 2.14 for 0.8 cores.
+
+"""
 
 
 class PolledGroup(CallbackGroup):
