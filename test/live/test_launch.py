@@ -95,9 +95,16 @@ def write_params(path, **settings):
     path.write_text(yaml.safe_dump(params))
 
 
+def environment_of_child(pid):
+    """Return the environment of the only child of a process."""
+    (child,) = Path(f'/proc/{pid}/task/{pid}/children').read_text().split()
+    return Path(f'/proc/{child}/environ').read_bytes()
+
+
 def test_boxes_are_refined_and_sigint_ends_everything(environment, tmp_path):
+    names = {'/points': '/lidar/points', '/tf': '/robot/tf', '/tf_static': '/robot/tf_static'}
     records = [
-        record._replace(topic=record.topic.replace('/points', '/lidar/points'))
+        record._replace(topic=names.get(record.topic, record.topic))
         for record in records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
     ]
     write_params(
@@ -107,16 +114,19 @@ def test_boxes_are_refined_and_sigint_ends_everything(environment, tmp_path):
     log = tmp_path / 'launch.log'
     with graph_in(tmp_path) as graph:
         publishers_for(graph, records)
-        early = graph.collect(DETECTIONS, '/front/refined_boxes')
+        early = graph.collect(DETECTIONS, '/front/better')
         environment['ROS_DOMAIN_ID'] = str(graph.domain)
         launching = launched(
             environment, log, 'points:=/lidar/points', 'boxes:=/boxes', 'namespace:=front',
             'name:=refiner', 'params:=robot.yaml', f'boxes_type:={DETECTIONS}',
+            'tf:=/robot/tf', 'tf_static:=/robot/tf_static', 'refined_boxes:=better',
+            'prefix:=env BOXREG_PREFIX=1',
         )  # fmt: skip
         with launching as process:
             graph.wait_until_connected()
             play(graph, records, early)
             assert numbers_changed(early, records) == [0, 0, *[2] * 4]
+            assert b'BOXREG_PREFIX=1' in environment_of_child(process.pid)
             os.killpg(process.pid, signal.SIGINT)  # as a terminal does
             assert process.wait(10.0) == 0
     output = log.read_text()
