@@ -2,7 +2,7 @@
 Rotations of boxes and frames as arrays: angles, matrices, quaternions.
 
 R = Rz(yaw) Ry(pitch) Rx(roll) maps box axes (x forward, y left, z up, REP 103) to the frame of
-the box. Quaternions are x y z w. All functions but `interpolate_rotation` accept any number of
+the box. Quaternions are x y z w. All functions but `interpolate_*` accept any number of
 leading dimensions, also none and empty ones; NaN gives NaN.
 
 """
@@ -170,6 +170,11 @@ def interpolate_rotation(first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: f
         Rotation matrix.
 
     """
+    return matrix_from_quaternion(interpolate_quaternion(first_xyzw, second_xyzw, share))
+
+
+def interpolate_quaternion(first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: float) -> Floats:
+    """Return the same rotation as `interpolate_rotation` as a quaternion (4,), x y z w."""
     first, second = _unit(np.stack([first_xyzw, second_xyzw]))
     if first @ second < 0:
         second = -second  # the same rotation, on the shortest path
@@ -177,7 +182,8 @@ def interpolate_rotation(first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: f
     # sin(part * angle) / sin(angle), with its limit for equal rotations
     parts = np.array([1 - share, share])
     weights = parts * np.sinc(parts * angle / np.pi) / np.sinc(angle / np.pi)
-    return matrix_from_quaternion(weights @ np.stack([first, second]))
+    interpolated: Floats = weights @ np.stack([first, second])
+    return interpolated
 
 
 def _unit(quaternion_xyzw: ArrayLike) -> Floats:

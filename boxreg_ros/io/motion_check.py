@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.clocks import clock_offset, likely_offset, MIN_CLOCK_OFFSET, ReceiveTimes
 from boxreg_ros.io.findings import Finding
-from boxreg_ros.io.transforms import Edge, inverse, matrix, TransformTree
+from boxreg_ros.io.transforms import Edge, inverse, matrix, MAX_LINEAR_GAP, TransformTree
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
@@ -34,13 +34,6 @@ MAX_EGO_SPEED = 100.0
 """Speed that no vehicle has [m/s]; derived: 360 km/h."""
 MIN_ALTERNATIONS = 3
 """Samples at impossible speed that mean two publishers; chosen: one or two are a restart."""
-SPARSE_PERIOD = 0.25
-"""
-Median period of a moving frame that is too long to interpolate [s].
-
-Derived: at 3 m/s^2 linear interpolation is off by a t^2 / 8 = 2.3 cm, at 1 s by 0.4 m.
-
-"""
 MAX_BOXES_DELAY = 1.0
 """Delay of boxes after their clouds that is reported [s]; a live detector takes 0.1 to 0.5 s."""
 LOOK_PERIOD = 10
@@ -307,12 +300,13 @@ def _sparse_text(moving: Sequence[Edge]) -> str:
         if len(edge.stamps) < 3:
             continue
         period = float(np.median(np.diff(edge.stamps))) * 1e-9
-        if period > SPARSE_PERIOD:
+        if period > MAX_LINEAR_GAP:
             return (
                 f'transform {edge.parent} -> {edge.child} comes every {period:.2g} s: expected '
-                f'every {SPARSE_PERIOD:g} s or more often; in between the motion is interpolated, '
-                f'which is off where the vehicle turns, brakes or accelerates; use a faster '
-                f'source of motion if the recording has one: --fixed-frame of it, or --odometry'
+                f'every {MAX_LINEAR_GAP:g} s or more often; in between the motion is interpolated '
+                f'by a polynomial, which is off by a few centimetres, and by more where the '
+                f'vehicle begins to turn or to brake; use a faster source of motion, if there is '
+                f'one: --odometry TOPIC comes before TF (node: publish the transform more often)'
             )
     return ''
 

@@ -39,7 +39,7 @@ class RecordedMotion:
     """
     Transforms and odometry of a recording, in the part from begin to end of receive time [ns].
 
-    `odometry_topic` is the one that was asked for, then the one in use. Of TF the topics are used
+    `odometry_topic` is the one that was asked for, which comes before TF, then the one in use. Of TF the topics are used
     that `tf` names, one or several; else those of all namespaces, but for others that state the
     same frames as the namespace of the clouds. `notes` say what was chosen.
 
@@ -60,6 +60,7 @@ class RecordedMotion:
         self._read = read
         self._start_ns, self._end_ns = part_ns
         self.odometry_topic = odometry_topic
+        self._is_odometry_asked = odometry_topic is not None
         self._points_topics = points_topics
         self._asked_tf = tf
         self._transforms: set[str] | None = None
@@ -190,9 +191,9 @@ class RecordedMotion:
             return frame
         found = self._search_transforms(tree, frame, wanted)
         odometry: list[str] = []
-        if found is None or wanted is None:
+        if found is None or wanted is None or self._is_odometry_asked:
             # Odometry is needed if TF has no motion, or if odometry moves the root of TF.
-            odometry = self._add_odometry(tree, frame, found)
+            odometry = self._add_odometry(tree, frame, None if self._is_odometry_asked else found)
             found = _fixed_frame(tree, frame, wanted)
         if found is not None:
             return found if wanted is not None else self._smooth_frame(tree, frame, found)
@@ -222,6 +223,7 @@ class RecordedMotion:
         jumps = JumpSearch()
         for begin_ns, end_ns in self._searched_parts():
             part = TransformTree(buffer_duration=WHOLE_SECONDS + 2 * SEARCH_SECONDS)
+            part.prefers_odometry = tree.prefers_odometry
             for record in self._read(self._static, None, None):
                 self.add(part, record)
             for record in self._read(self.topics - self._static, begin_ns, end_ns):
@@ -283,6 +285,12 @@ class RecordedMotion:
             odometry.append(f'{topic} ({message.header.frame_id} -> {child})')
             if child == root or (root is None and tree.connects(child, frame)):
                 relevant[topic] = message
+        if self._is_odometry_asked and not relevant:
+            raise RecordingError(
+                f'{self._decoder.origin}: odometry: expected a topic whose child frame transforms '
+                f'connect with that of the clouds, {frame!r}, got {"".join(odometry)}; TF: {tree}; '
+                f'leave --odometry out to use TF'
+            )
         own = nearest_namespace(self._points_topics, set(map(namespace_of, relevant)))
         near = [topic for topic in relevant if namespace_of(topic) == own]
         if len(relevant) > len(near) == 1:

@@ -278,7 +278,8 @@ class Recording:
         """
         Choose the source of the sensor's motion, and return the fixed frame.
 
-        TF is used where it connects the frames, else odometry. The default is the topmost frame
+        TF is used where it connects the frames, else odometry; odometry that was asked for comes
+        before TF. The default is the topmost frame
         that the frame of the clouds moves in. The empty `tree` then holds the static and the first
         moving transforms.
 
@@ -287,6 +288,7 @@ class Recording:
 
         """
         tree.clock_offset = self._clock_offset
+        tree.prefers_odometry = self._asked_odometry is not None
         first_error: RecordingError | None = None
         for frame in self._sensor_frames():  # the others go on where TF does not know one
             try:

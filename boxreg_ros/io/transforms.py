@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.clocks import ReceiveTimes
 from boxreg_ros.io.time_jumps import is_near, StreamClock, TIME_JUMP
 from boxreg_ros.rotations import (
-    interpolate_rotation,
+    interpolate_quaternion,
     matrix_from_quaternion,
     matrix_from_rpy,
     rpy_from_matrix,
@@ -32,6 +32,20 @@ Largest distance of a stamp from the known transforms of a moving frame [s].
 
 Two periods of a TF publisher of 10 Hz: one message may be late or lost. At 1 m/s^2 a motion
 carried on for that long is off by 2 cm.
+
+"""
+MAX_LINEAR_GAP = 0.25
+"""
+Longest gap between two samples of a moving frame that is interpolated linearly, as tf2 does [s].
+
+Derived: at 3 m/s^2 linear interpolation is off by a t^2 / 8 = 2.3 cm, at 1 s by 0.4 m.
+
+"""
+MAX_NODE_DISTANCE = 3.0
+"""
+Largest distance of a further sample, in parts of the gap that it helps to interpolate.
+
+Chosen: the motion before a long stop, or before the next one, says little of that in the gap.
 
 """
 POSES_SECONDS, POSES_PERIOD = 1.0, 0.1
@@ -104,14 +118,16 @@ class TransformTree:
 
     State: per pair of parent and child, one static transform or the samples of the last
     `buffer_duration` [s]. After a time jump of a pair, new samples replace the old ones. Between
-    samples, however far apart, positions are interpolated linearly and orientations along the
-    shortest rotation, as tf2 does; up to `max_extrapolation` [s] outside of them the motion is
-    extrapolated. A moving frame with one sample only counts as static once others are newer. Of a
-    frame that has two parents at once, the transforms to both are kept. Not thread-safe.
+    samples, positions are interpolated linearly and orientations along the shortest rotation, as
+    tf2 does; over gaps longer than `MAX_LINEAR_GAP` by the polynomial through up to two samples
+    on each side. Up to `max_extrapolation` [s] outside of them the motion is extrapolated. A
+    moving frame with one sample only counts as static once others are newer. Of a frame that has
+    two parents at once, the transforms to both are kept. Not thread-safe.
 
     A sample whose stamp is far ahead of its pair, which its time of receipt does not explain,
     waits for the next one to confirm it. `clock_offset` [s] is added to the stamps of moving
-    frames as they arrive.
+    frames as they arrive. With `prefers_odometry` the odometry of a frame takes the place of its
+    transform.
 
     """
 
@@ -124,6 +140,7 @@ class TransformTree:
         self._max_extrapolation_ns = round(max_extrapolation * 1e9)
         self._buffer_ns = round(buffer_duration * 1e9)
         self.clock_offset = clock_offset
+        self.prefers_odometry = False
         self.clear()
 
     def clear(self) -> None:
@@ -287,10 +304,19 @@ class TransformTree:
         """Return the pairs of frames from `source` up to the root of TF."""
         top = _name(source)
         path: list[Edge] = []
-        while top in self._tf and self._tf[top] not in path:
-            path.append(self._tf[top])
-            top = path[-1].parent
+        edge = self._above(top)
+        while edge is not None and edge not in path:
+            path.append(edge)
+            edge = self._above(edge.parent)
         return path
+
+    def _above(self, child: str) -> Edge | None:
+        """Return the edge from a frame up in TF, or in the odometry that takes its place."""
+        return self._replacement_of(child) or self._tf.get(child)
+
+    def _replacement_of(self, child: str) -> Edge | None:
+        """Return the odometry that takes the place of the transform of a frame."""
+        return self._odometry.get(child) if self.prefers_odometry else None
 
     def __str__(self) -> str:
         """Return all pairs of parent and child."""
@@ -411,7 +437,7 @@ class TransformTree:
         return newest_ns - edge.stamps[0] >= round(ONCE * 1e9)
 
     def _edges(self) -> list[Edge]:
-        return [*self._tf_edges(), *self._odometry.values()]
+        return list(dict.fromkeys((*self._tf_edges(), *self._odometry.values())))
 
     def _tf_edges(self) -> list[Edge]:
         """Return the edges of TF; those to other parents only where a frame has two at once."""
@@ -419,7 +445,11 @@ class TransformTree:
             edge for (_, child), edge in self._of_other_parents.items()
             if self._has_two_parents(child)
         ]  # fmt: skip
-        return [*self._tf.values(), *others]
+        edges = [*self._tf.values(), *others]
+        if not self.prefers_odometry:
+            return edges
+        kept = [edge for edge in edges if edge.child not in self._odometry]
+        return [*self._odometry.values(), *kept]
 
     def _route(self, target: str, source: str) -> list[tuple[Edge, bool]]:
         """Return the edges from `source` to `target`, each with True where it leads upward."""
@@ -584,9 +614,31 @@ class Edge:
         after = min(max(bisect_left(stamps, stamp_ns), 1), len(stamps) - 1)
         if stamps[after] == stamp_ns:
             return matrix(self.poses[after])
+        nodes = self._nodes(after)
+        return interpolated([stamps[i] for i in nodes], [self.poses[i] for i in nodes], stamp_ns)
+
+    def _nodes(self, after: int) -> list[int]:
+        """
+        Return the rows of the samples to interpolate the gap before row `after` by.
+
+        Over a long gap there is a further one on each side, where it is known, about as far apart
+        as the gap is long: the noise of a nearer one would be multiplied by the ratio of both.
+
+        """
         before = after - 1
-        share = (stamp_ns - stamps[before]) / (stamps[after] - stamps[before])
-        return interpolated(self.poses[before], self.poses[after], share)
+        stamps = self.stamps
+        gap_ns = stamps[after] - stamps[before]
+        nodes = [before, after]
+        if gap_ns <= MAX_LINEAR_GAP * 1e9:
+            return nodes
+        limit_ns = MAX_NODE_DISTANCE * gap_ns
+        earlier = min(bisect_left(stamps, stamps[before] - gap_ns), before - 1)
+        if earlier >= 0 and stamps[before] - stamps[earlier] <= limit_ns:
+            nodes.insert(0, earlier)
+        later = max(bisect_right(stamps, stamps[after] + gap_ns) - 1, after + 1)
+        if later < len(stamps) and stamps[later] - stamps[after] <= limit_ns:
+            nodes.append(later)
+        return nodes
 
 
 def matrix(pose: Floats) -> Floats:
@@ -605,12 +657,44 @@ def inverse(T: Floats) -> Floats:
     return inverted
 
 
-def interpolated(first: Floats, second: Floats, share: float) -> Floats:
-    """Return T (4, 4) between two poses: `share` 0 is the first, 1 the second."""
-    T = np.eye(4)
-    T[:3, :3] = interpolate_rotation(first[3:], second[3:], share)
-    T[:3, 3] = first[:3] + share * (second[:3] - first[:3])
-    return T
+def interpolated(stamps_ns: Sequence[int], poses: Sequence[Floats], stamp_ns: int) -> Floats:
+    """
+    Return the pose at a stamp, interpolated or extrapolated.
+
+    Positions are those of the polynomial of degree n - 1 through the samples. Neville's scheme
+    makes it of interpolations between two poses each, so that it holds for orientations, too.
+
+    Parameters
+    ----------
+    stamps_ns : sequence of int
+        Different stamps of n >= 2 samples [ns], ascending.
+    poses : sequence of array, shape (7,)
+        x y z qx qy qz qw at these stamps [m].
+    stamp_ns : int
+        The stamp to return the pose at [ns].
+
+    Returns
+    -------
+    T : array, shape (4, 4)
+        The pose as a transform.
+
+    """
+    values = list(poses)
+    for step in range(1, len(values)):
+        values = [
+            _between(
+                *values[row : row + 2],
+                (stamp_ns - stamps_ns[row]) / (stamps_ns[row + step] - stamps_ns[row]),
+            )
+            for row in range(len(values) - 1)
+        ]
+    return matrix(values[0])
+
+
+def _between(first: Floats, second: Floats, share: float) -> Floats:
+    """Return the pose (7,) between two poses: `share` 0 is the first, 1 the second."""
+    position = first[:3] + share * (second[:3] - first[:3])
+    return np.concatenate([position, interpolate_quaternion(first[3:], second[3:], share)])
 
 
 def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:

@@ -56,8 +56,8 @@ class Request:
     )
     odometry: str | None = option(
         None,
-        'odometry topic, used where TF does not connect the clouds with a fixed frame (default: '
-        'found by type)',
+        'odometry topic, used in place of TF (default: found by type, and used where TF does not '
+        'connect the clouds with a fixed frame)',
         metavar='TOPIC',
     )
     tf: tuple[str, ...] = option(

@@ -283,15 +283,38 @@ def test_a_frame_with_two_parents_is_named_and_either_may_be_chosen(tmp_path):
     np.testing.assert_allclose(origins[START + SECOND], [105, 0, 2], atol=1e-6)
 
 
-def test_sparse_transforms_are_named(tmp_path):
-    drive = Drive(sweeps=41)
+def with_sparse_transforms(sweeps):
+    """Return a drive with transforms at 1 Hz, and its motion as odometry at 10 Hz."""
+    drive = Drive(sweeps=sweeps)
+    m = drive.messages
     drive.items = [
-        item
-        for k, item in enumerate(drive.items)
-        if item[0] != '/tf' or (item[1] - START) % SECOND == 0
+        item for item in drive.items if item[0] != '/tf' or (item[1] - START) % SECOND == 0
     ]
-    found = read(drive, tmp_path)[2]
+    for k, stamp in enumerate(drive.stamps):
+        # Not where TF has it, to see which of both is used.
+        drive.items.append(('/odom', stamp, m.odometry(stamp, 'odom', 'base', (0.5 * k, 9, 0))))
+    drive.items.sort(key=lambda item: item[1])
+    return drive
+
+
+def test_sparse_transforms_are_named_and_odometry_may_take_their_place(tmp_path):
+    drive = with_sparse_transforms(41)
+    origins, _, found = read(drive, tmp_path)
     assert 'transform odom -> base comes every 1 s' in found
+    assert '--odometry TOPIC' in found
+    assert_true(origins, 41)
+    origins, frame, found = read(drive, tmp_path / 'odometry', odometry='/odom')
+    assert (frame, found) == ('odom', '')
+    assert_true({stamp: at - [0, 9, 0] for stamp, at in origins.items()}, 41)
+
+
+def test_odometry_of_another_frame_is_refused(tmp_path):
+    drive = Drive(sweeps=8)
+    m = drive.messages
+    drive.items.append(('/odom', START, m.odometry(START, 'odom', 'trailer', (0, 9, 0))))
+    drive.items.sort(key=lambda item: item[1])
+    with pytest.raises(RecordingError, match=r'got /odom \(odom -> trailer\)'):
+        read(drive, tmp_path, odometry='/odom')
 
 
 def test_boxes_without_a_frame_are_taken_to_be_in_that_of_the_clouds(tmp_path):
