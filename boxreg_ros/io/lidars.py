@@ -171,6 +171,14 @@ class SensorPlacement:
         )
         return replace(sweep, times=times * period)
 
+    def frame_of(self, msg: Any, topic: str) -> str:
+        """Return the frame of a cloud; where it is empty, the one that is named for its LiDAR."""
+        frame: str = clouds.header_of(msg).frame_id.lstrip('/')
+        if frame:
+            return frame
+        named = self._frames.get(topic if len(self.lidars.topics) > 1 else '', ())
+        return named[0] if len(named) == 1 else ''
+
     def sweep_of(self, msg: Any, topic: str) -> Sweep:
         """
         Return the sweep of a cloud, with its topic if there are several.
@@ -190,6 +198,8 @@ class SensorPlacement:
         if topic not in self.layouts:
             self.layouts[topic] = pointcloud.described(cloud, unit)
         sweep = self._with_times_of_sweep(pointcloud.from_msg(cloud, unit), topic)
+        if not sweep.frame_id:
+            sweep = replace(sweep, frame_id=self.frame_of(msg, topic))
         if self.lidars.info:
             return replace(sweep, rows=pointcloud.finite_rows(cloud))
         return replace(sweep, topic=topic) if len(self.lidars.topics) > 1 else sweep

@@ -150,6 +150,12 @@ class _RosDecoder:
         return True
 
     def _decoded(self, definition: TypeDefinition, data: bytes) -> Any:
+        encoding = ENCAPSULATIONS.get(bytes(data[:2]))
+        if encoding and not self._is_ros1:  # it might parse as plain CDR, with other values
+            raise UnsupportedMessage(
+                f'expected plain CDR, as the middlewares of ROS 2 write it, got {encoding}; '
+                f'convert the recording to plain CDR with the library that wrote it'
+            )
         store = definition.store
         decode = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
         view: Any = memoryview(data)  # parts of it are no copies
@@ -158,12 +164,6 @@ class _RosDecoder:
         # rosbags turns all errors of malformed bytes into SerdeError; the others mean that a
         # definition refers to a type that rosbags does not decode, as ``wstring``.
         except (SerdeError, TypesysError, KeyError) as error:
-            encoding = ENCAPSULATIONS.get(data[:2])
-            if encoding and not self._is_ros1:
-                raise UnsupportedMessage(
-                    f'expected plain CDR, as the middlewares of ROS 2 write it, got {encoding}; '
-                    f'convert the topic to plain CDR with the middleware that wrote it'
-                ) from None
             raise UnsupportedMessage(one_line(error)) from None
 
     def _absence(self) -> str:

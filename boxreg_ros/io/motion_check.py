@@ -9,11 +9,19 @@ clouds and boxes are moved by.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.clocks import clock_offset, likely_offset, MIN_CLOCK_OFFSET, ReceiveTimes
+from boxreg_ros.io.clocks import (
+    CAPACITY,
+    clock_offset,
+    COPY_NS,
+    likely_offset,
+    MIN_CLOCK_OFFSET,
+    ReceiveTimes,
+)
 from boxreg_ros.io.findings import Finding
 from boxreg_ros.io.transforms import Edge, inverse, matrix, MAX_LINEAR_GAP, TransformTree
 from boxreg_ros.reasons import Reason
@@ -36,6 +44,8 @@ MIN_ALTERNATIONS = 3
 """Samples at impossible speed that mean two publishers; chosen: one or two are a restart."""
 MAX_BOXES_DELAY = 1.0
 """Delay of boxes after their clouds that is reported [s]; a live detector takes 0.1 to 0.5 s."""
+MIN_COPIED = 0.5
+"""Part of the boxes with stamps of clouds that means that one clock has set both; chosen."""
 LOOK_PERIOD = 10
 """Clouds between two looks at what changes slowly; chosen: 1 s at 10 Hz."""
 FIRST_LOOK = 5
@@ -160,6 +170,8 @@ class MotionCheck:
         """Forget when messages were received: time has jumped. What was found stays."""
         self._clouds = ReceiveTimes()
         self._boxes = ReceiveTimes()
+        self._cloud_stamps = deque[int](maxlen=CAPACITY)
+        self._copied: list[bool] = []
         self._count = 0
 
     def add(self, item: Sweep | BoxArray, fixed_frame: str, received_ns: int | None) -> None:
@@ -180,7 +192,12 @@ class MotionCheck:
         if received_ns is not None:
             arrivals.add(received_ns, item.stamp_ns)
         if not isinstance(item, Sweep):
+            stamps_ns = self._cloud_stamps
+            if len(self._copied) < CAPACITY and stamps_ns and item.stamp_ns >= stamps_ns[0]:
+                nearest = min(abs(item.stamp_ns - stamp_ns) for stamp_ns in stamps_ns)
+                self._copied.append(nearest <= COPY_NS)
             return
+        self._cloud_stamps.append(item.stamp_ns)
         self._count += 1
         if self._count == FIRST_LOOK or self._count % LOOK_PERIOD == 0:
             self._look(fixed_frame, item.frame_id)
@@ -248,16 +265,17 @@ class MotionCheck:
         measured = clock_offset(self._clouds, self._boxes)
         if measured is None or -MIN_CLOCK_OFFSET < measured < MAX_BOXES_DELAY:
             return ''
+        if measured > 0 and sum(self._copied) >= MIN_COPIED * max(1, len(self._copied)):
+            return ''  # a slow detector copies the stamps of its clouds
         offset, names = likely_offset(measured)
         of_whom = f', as {names} are' if names else ''
-        doubt = ''
         if offset > 0:
-            doubt = 'unless the detector takes that long, '
+            of_whom += ', and of no other cloud'
         return (
             f'clocks: expected one for clouds and boxes, got stamps of the boxes '
             f'{abs(offset):g} s {"behind" if offset > 0 else "ahead of"} those of the clouds '
-            f'received at the same time{of_whom}; {doubt}correct them with '
-            f'--boxes-offset={offset:g} (node: boxes_offset:={offset:g})'
+            f'received at the same time{of_whom}; correct them with --boxes-offset={offset:g} '
+            f'(node: boxes_offset:={offset:g})'
         )
 
 

@@ -39,9 +39,9 @@ class RecordedMotion:
     """
     Transforms and odometry of a recording, in the part from begin to end of receive time [ns].
 
-    `odometry_topic` is the one that was asked for, which comes before TF, then the one in use. Of TF the topics are used
-    that `tf` names, one or several; else those of all namespaces, but for others that state the
-    same frames as the namespace of the clouds. `notes` say what was chosen.
+    `odometry_topic` is the one that was asked for, which comes before TF, then the one in use. Of
+    TF the topics are used that `tf` names, one or several; else those of all namespaces, but for
+    others that state the same frames as the namespace of the clouds. `notes` say what was chosen.
 
     """
 
@@ -180,13 +180,15 @@ class RecordedMotion:
         `frame`.
 
         """
-        if not frame:
-            raise RecordingError(
-                f'{self._decoder.origin}: expected clouds with a frame, got an empty frame_id; '
-                f'set it in the driver of the LiDAR'
-            )
         for record in self._read(self._static, None, None):
             self.add(tree, record)
+        if not frame:
+            self._search_transforms(tree, frame, wanted)
+            raise RecordingError(
+                f'{self._decoder.origin}: expected clouds with a frame, got an empty frame_id; '
+                f'name that of the LiDAR with --sensor-frame FRAME, one of '
+                f'{", ".join(tree.frames()) or "none in TF"}'
+            )
         if wanted is not None and wanted.lstrip('/') == frame:
             return frame
         found = self._search_transforms(tree, frame, wanted)
@@ -287,9 +289,9 @@ class RecordedMotion:
                 relevant[topic] = message
         if self._is_odometry_asked and not relevant:
             raise RecordingError(
-                f'{self._decoder.origin}: odometry: expected a topic whose child frame transforms '
-                f'connect with that of the clouds, {frame!r}, got {"".join(odometry)}; TF: {tree}; '
-                f'leave --odometry out to use TF'
+                f'{self._decoder.origin}: odometry: expected a topic whose child frame is '
+                f'connected with that of the clouds, {frame!r}, got {"".join(odometry)}; '
+                f'TF: {tree}; leave --odometry out to use TF'
             )
         own = nearest_namespace(self._points_topics, set(map(namespace_of, relevant)))
         near = [topic for topic in relevant if namespace_of(topic) == own]

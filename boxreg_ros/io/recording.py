@@ -247,7 +247,9 @@ class Recording:
     @property
     def finding(self) -> str:
         """Return what is unusual about the recordings as a whole; empty if nothing is."""
-        own = (*self._chosen, *self._joining(), *self._pauses(), self._timeline.finding)
+        own = (
+            *self._chosen, *self._joining(), *self._pauses(), *self._slow(), self._timeline.finding
+        )  # fmt: skip
         return '; '.join(filter(None, (*own, *self._motion.notes.values())))
 
     def _joining(self) -> Iterator[str]:
@@ -256,6 +258,16 @@ class Recording:
             yield (
                 f'{self.boxes_topic}: {self._joins} messages have the stamp of the one before '
                 f'them and other boxes: they are read as one message per stamp'
+            )
+
+    def _slow(self) -> Iterator[str]:
+        """Yield that the boxes are taken for those of a slow detector."""
+        late = self._timeline.as_slow.get(self.boxes_topic)
+        if late is not None:
+            yield (
+                f'{self.boxes_topic}: boxes have stamps of clouds that were received {late:.2f} s '
+                f'before them: they are taken for those of a slow detector and used at their '
+                f'stamps; if its clock is behind, correct them with --boxes-offset={late:.2f}'
             )
 
     def _pauses(self) -> Iterator[str]:
@@ -308,9 +320,12 @@ class Recording:
 
     def _sensor_frames(self) -> list[str]:
         """Return the frame of the first cloud of each topic that has any."""
-        found = [self._motion.first(topic) for topic in self.points_topics]
-        headers = [clouds.header_of(cloud) for cloud in found if cloud is not None]
-        frames = [str(header.frame_id).lstrip('/') for header in headers]
+        first = {topic: self._motion.first(topic) for topic in self.points_topics}
+        frames = [
+            self.placement.frame_of(cloud, topic)
+            for topic, cloud in first.items()
+            if cloud is not None
+        ]
         if not frames:
             topics = ', '.join(map(repr, self.points_topics))
             raise RecordingError(

@@ -15,6 +15,7 @@ from functools import cached_property
 from heapq import merge
 from itertools import islice
 
+from boxreg_ros.io.clocks import COPY_NS
 from boxreg_ros.io.storage.reader import Reader
 from boxreg_ros.io.storage.record import Record
 from msg_adapters import ADAPTERS
@@ -28,6 +29,11 @@ A live detector is slower than its clouds by 0.1 to 0.5 s; that order is the ord
 
 """
 
+COPIES = 3
+"""Messages of boxes whose stamps are compared with those of clouds; chosen."""
+NEAR_NS = 2 * 10**8
+"""Clouds are looked for so near to when one of a stamp is received [ns]; their delay varies."""
+
 StampOf = Callable[[Connection, bytes], int | None]
 
 
@@ -40,7 +46,8 @@ class MessageOrder:
     recording was played in a loop or paused, and receive times are kept there. Where all receive
     times are equal, as 0, all messages are ordered by stamp. `stamp_of` returns
     the stamp of a message [ns], None if it has none; `apart` has the topics that were recorded
-    apart, and how much later than the clouds [s].
+    apart, and how much later than the clouds [s]. Of these `as_slow` has boxes that were recorded
+    together with the clouds, as those of a slow detector are.
 
     """
 
@@ -58,6 +65,7 @@ class MessageOrder:
             self._end_ns = max(ends, default=self._end_ns) + 1
         self._known: dict[tuple[int, int], bool] = {}
         self.apart: dict[str, float] = {}
+        self.as_slow: dict[str, float] = {}
 
     def span_ns(self, topics: Collection[str]) -> tuple[int, int]:
         """Return begin and end of the files with clouds, or with `topics` not apart [ns]."""
@@ -135,16 +143,37 @@ class MessageOrder:
         Return whether a topic was recorded with the clouds, but stamped by another clock.
 
         Its receive times then begin and end with those of the clouds, its stamps do not. Boxes
-        that are late may also be those of a slow detector, whose stamps are right.
+        that are late may also be those of a slow detector, whose stamps are right: it copies them
+        from the clouds.
 
         """
-        if late_ns > 0 and connection.msgtype in ADAPTERS:
+        ends = self._ends(connection)
+        clouds = [received_ns for received_ns, _ in self._cloud_ends]
+        first_ns, last_ns = min(clouds), max(clouds)
+        due = [stamp_ns + (self._delay_ns or 0) for _, stamp_ns in ends]
+        received = abs(ends[0][0] - first_ns) + abs(ends[-1][0] - last_ns)
+        stamped = abs(due[0] - first_ns) + abs(due[-1] - last_ns)
+        if received >= stamped / 2:
             return False
-        begin_ns, end_ns = self._reader.span_ns(connection)
-        due = [stamp_ns + (self._delay_ns or 0) for _, stamp_ns in self._ends(connection)]
-        received = abs(begin_ns - self._begin_ns) + abs(end_ns - self._end_ns)
-        stamped = abs(due[0] - self._begin_ns) + abs(due[-1] - self._end_ns)
-        return received < stamped / 2
+        if late_ns > 0 and connection.msgtype in ADAPTERS and self._are_copied(connection):
+            self.as_slow[connection.topic] = late_ns * 1e-9
+            return False
+        return True
+
+    def _are_copied(self, connection: Connection) -> bool:
+        """Return whether boxes have stamps of clouds; True if no cloud is where they would be."""
+        found = []
+        for _, stamp_ns in self._stamped(connection, None):
+            due_ns = self._due_ns(stamp_ns)
+            if due_ns is None or not self._begin_ns <= due_ns <= self._end_ns:
+                continue
+            near = self._reader.messages(self._clouds, due_ns - NEAR_NS, due_ns + NEAR_NS)
+            stamps = (self._stamp_of(record.connection, record.data) for record in near)
+            offsets = [abs(stamp_ns - stamp) for stamp in stamps if stamp is not None]
+            found.append(min(offsets, default=0) <= COPY_NS)
+            if len(found) == COPIES:
+                break
+        return all(found)
 
     def _late_ns(self, connection: Connection) -> int:
         """Return the larger delay of the first and the last message [ns]; 0 if unknown."""
@@ -177,10 +206,14 @@ class MessageOrder:
                 yield record.received_ns, stamp_ns
 
     @cached_property
+    def _cloud_ends(self) -> list[tuple[int, int]]:
+        """Return receive times and stamps of the first and the last clouds [ns]."""
+        return [end for connection in self._clouds for end in self._ends(connection)]
+
+    @cached_property
     def _delay_ns(self) -> int | None:
         """Return the delay of the clouds after their stamps [ns]; None if it is not constant."""
-        ends = [end for connection in self._clouds for end in self._ends(connection)]
-        delays = [received_ns - stamp_ns for received_ns, stamp_ns in ends]
+        delays = [received_ns - stamp_ns for received_ns, stamp_ns in self._cloud_ends]
         if self._lacks_times:
             return 0
         # It changes when playback loops or pauses: stamps do not order the messages then.

@@ -32,6 +32,12 @@ import numpy as np
 if TYPE_CHECKING:  # it imports torch, which a process that only reads does not need
     from boxreg_ros.core.registrar import BoxRegistrar
 
+CLOUDS_WITHOUT_FRAME = (
+    "clouds have an empty frame_id: expected the name of the LiDAR's frame in TF; name it with "
+    "sensor_frames:=['FRAME'] (boxreg relabel: --sensor-frame FRAME), or set it in the driver"
+)
+"""What to do about clouds without a frame."""
+
 
 class Admitted(NamedTuple):
     """A sweep or boxes on the way to the registrar."""
@@ -84,6 +90,7 @@ class Session:
         self._id_check = None if convention.associate else IdCheck(config.max_gap)
         self._axis_check = AxisCheck(convention, config.drives)
         self._has_boxes_without_frame = False
+        self._has_clouds_without_frame = False
         self._pose_check = PoseCheck(self._convention, AT_ONCE)
 
     @property
@@ -174,13 +181,19 @@ class Session:
         """
         Return the fixed frame; choose it among the known transforms if it is not known yet.
 
-        Raises TransformUnavailable if no motion of `sensor_frame` is known, or no cloud has
-        arrived.
+        Raises TransformUnavailable if no motion of `sensor_frame` is known, no cloud has arrived,
+        or the clouds have no frame.
 
         """
+        lacks_frame = isinstance(item, Sweep) and not item.frame_id
+        self._has_clouds_without_frame |= lacks_frame
+        if lacks_frame:
+            raise TransformUnavailable(CLOUDS_WITHOUT_FRAME)
         if self.fixed_frame:
             return self.fixed_frame
         sensor_frame = item.frame_id if isinstance(item, Sweep) else self.sensor_frame
+        if not sensor_frame and self._has_clouds_without_frame:
+            raise TransformUnavailable(CLOUDS_WITHOUT_FRAME)
         if not sensor_frame:
             raise TransformUnavailable(
                 f'no point cloud has arrived, so the motion of the boxes in {item.frame_id!r} is '

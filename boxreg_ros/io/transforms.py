@@ -12,6 +12,7 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import TransformUnavailable
@@ -683,10 +684,11 @@ def interpolated(stamps_ns: Sequence[int], poses: Sequence[Floats], stamp_ns: in
     for step in range(1, len(values)):
         values = [
             _between(
-                *values[row : row + 2],
+                first,
+                second,
                 (stamp_ns - stamps_ns[row]) / (stamps_ns[row + step] - stamps_ns[row]),
             )
-            for row in range(len(values) - 1)
+            for row, (first, second) in enumerate(pairwise(values))
         ]
     return matrix(values[0])
 

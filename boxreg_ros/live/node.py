@@ -32,7 +32,7 @@ from boxreg_ros.live.transform_wait import TransformWait
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
 from msg_adapters import adapter_for, canonical, cdr
-from msg_adapters.clouds import header_of, POINTS_TYPE
+from msg_adapters.clouds import POINTS_TYPE
 from msg_adapters.concatenation import INFO_TYPE
 from msg_adapters.serialized import serialized_adapter_for
 from rcl_interfaces.msg import SetParametersResult
@@ -305,8 +305,7 @@ class BoxregNode(PolledClockNode):
         self._inbox.put_event('odom', (msg, received_ns), wakes=False)
 
     def _on_points(self, lidar: str, msg: Any) -> None:
-        self.worker.cloud_frame = header_of(msg).frame_id
-        self.worker.cloud_received = time.monotonic()
+        self.worker.note_cloud(msg, lidar)
         self._receive('points', msg, lidar)
 
     def _receive(self, topic: str, msg: Any, lidar: str = '') -> None:

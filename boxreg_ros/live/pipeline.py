@@ -260,14 +260,14 @@ class MessagePipeline:
 
     def _process_boxes(self, item: Item, given: BoxArray, admitted: Admitted) -> list[Outgoing]:
         """Add boxes to the registrar, with their ticket; pass them through without transforms."""
+        for found in self.session.findings:
+            self._report(found.reason, found.text, 1)
         placed = self._in_output_frame(item, given, admitted)
         if placed is None:
             return self.pass_through(item.message)
         shown, frame = placed
         assert isinstance(admitted.moved, BoxArray)
         self.silence.boxes_received = item.received
-        for found in self.session.findings:
-            self._report(found.reason, found.text, 1)
         boxes = self._tickets.issue(item, shown, admitted.moved, frame, self.config)
         return self._messages(self.registrar.add_boxes(boxes))
 

@@ -34,7 +34,7 @@ class TransformWait:
         if now >= item.received + self.timeout or is_placeholder(content):
             return True
         if isinstance(content, Sweep):
-            if self._is_unknown(content):
+            if self._is_unknown(content) or not content.frame_id:
                 return True
             if self._session.placement.awaits_info(content):
                 return False

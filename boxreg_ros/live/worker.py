@@ -54,10 +54,10 @@ class Worker:
     Registers boxes in a thread of its own, from `run` until `stop`.
 
     The worker alone uses the registrar, its transforms and the markers. It shares the inbox and
-    the counters with the executor's thread, which also sets `cloud_frame`, that of the newest
-    cloud, and `cloud_received`, when it arrived (monotonic) [s]. A cloud may wait `backlog` [s]
-    for the solver; `poll` puts transforms and odometry that have arrived into the inbox.
-    `fixed_frame` is empty until it is chosen, `tracks` counts those of the newest boxes,
+    the counters with the executor's thread, which also calls `note_cloud`: `cloud_frame` is that
+    of the newest cloud, `cloud_received` when it arrived (monotonic) [s]. A cloud may wait
+    `backlog` [s] for the solver; `poll` puts transforms and odometry that have arrived into the
+    inbox. `fixed_frame` is empty until it is chosen, `tracks` counts those of the newest boxes,
     `newest_transform_ns` is the stamp of the newest transform or odometry.
 
     """
@@ -157,6 +157,11 @@ class Worker:
                 self._publish(self._live.pass_through(message.content))
         if passed:
             self._logger.info(f'{passed} messages of boxes passed unchanged; the next are refined')
+
+    def note_cloud(self, message: Any, lidar: str) -> None:
+        """Note the frame of a cloud, and that it has arrived; in the executor's thread."""
+        self.cloud_frame = self._live.placement.frame_of(message, lidar)
+        self.cloud_received = time.monotonic()
 
     def drop(self, message: Message) -> None:
         """Count a message that there is no time for, and pass boxes through; in any thread."""

@@ -5,6 +5,7 @@ import json
 
 from boxreg_ros.cli import main
 from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.io.message_decoder import ENCAPSULATIONS
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.record import Record
 from boxreg_ros.io.transforms import TransformTree
@@ -14,7 +15,7 @@ from msg_adapters import ADAPTERS, pointcloud, vision
 from msg_adapters.convention import Convention
 import numpy as np
 import pytest
-from ros_messages import Drive, SCENE
+from ros_messages import DETECTIONS, Drive, SCENE
 
 BYTES = (0, 1, 127, 128, 255)
 
@@ -58,6 +59,22 @@ def test_corrupted_bytes_are_unreadable_or_decoded(tmp_path, topic):
         assert 0 < outcomes(recording, record, changed) < 300
         cut_off = [bytes(record.data[:size]) for size in range(12)]
         assert outcomes(recording, record, cut_off) == 0
+
+
+@pytest.mark.parametrize('kind', ['PL_CDR', 'XCDR2', 'D_CDR2', 'PL_CDR2'])
+def test_encodings_of_dds_that_are_not_plain_cdr_are_refused_by_name(tmp_path, kind):
+    """They may parse as plain CDR, too: XCDR2 aligns numbers of 8 bytes to 4, so values differ."""
+    drive = Drive(sweeps=1)
+    message = drive.items[-1][2]
+    with Recording([drive.write(tmp_path / 'drive')]) as recording:
+        record = next(recording._read({'/boxes'}))
+        for head in (head for head, name in ENCAPSULATIONS.items() if name == kind):
+            with pytest.raises(UnsupportedMessage, match=f'expected plain CDR, .* got {kind};'):
+                recording.box_message(record.connection, head + bytes(record.data)[2:])
+        store = drive.messages.store
+        of_big_endian = bytes(store.serialize_cdr(message, DETECTIONS, little_endian=False))
+        found = recording.box_message(record.connection, of_big_endian)[1]
+        np.testing.assert_array_equal(found.boxes, vision.from_msg(message).boxes)
 
 
 def tampered_json(value, rng):

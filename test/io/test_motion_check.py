@@ -168,6 +168,38 @@ def test_boxes_from_the_future_have_another_clock(tmp_path, seconds):
         assert not items.session.finding
 
 
+@pytest.mark.parametrize('seconds', [1.53, 18.04, 36.98])
+def test_boxes_whose_stamps_are_of_no_cloud_have_a_clock_that_is_behind(tmp_path, seconds):
+    drive = Drive(sweeps=30)
+    stamps_moved(drive, ('/boxes',), -seconds)
+    found = read(drive, tmp_path)[2]
+    offset = {18.04: 18, 36.98: 37}.get(seconds, seconds)
+    assert f'stamps of the boxes {offset} s behind those of the clouds' in found
+    assert 'and of no other cloud' in found
+    assert f'--boxes-offset={offset}' in found
+
+
+def test_boxes_with_stamps_of_earlier_clouds_are_those_of_a_slow_detector(tmp_path):
+    """It has run before the recording began; a clock 15 periods behind looks the same: said."""
+    drive = Drive(sweeps=40)
+    slow_ns = 3 * SECOND // 2
+    first_ns, last_ns = drive.stamps[15], drive.stamps[-1]
+    delayed = [(t, ns + slow_ns * (t == '/boxes'), message) for t, ns, message in drive.items]
+    kept = [item for item in delayed if item[0] != '/points' or item[1] >= first_ns]
+    drive.items = sorted((i for i in kept if i[1] <= last_ns), key=lambda item: item[1])
+    path = write_recording(tmp_path / 'drive', drive.items, messages=drive.messages)
+    with Recording([path]) as recording:
+        items = FixedFrameItems(recording, Config())
+        given = [item.given for item in items.read()]
+        assert not items.session.finding
+        assert 'those of a slow detector' in recording.finding
+        assert '--boxes-offset=1.50' in recording.finding
+        assert recording.apart == {'/boxes': pytest.approx(1.5)}
+    # Each array follows the cloud of its stamp.
+    stamps = [one.stamp_ns for one in given if one.stamp_ns >= first_ns]
+    assert sorted(stamps) == stamps
+
+
 def test_delays_of_a_common_clock_are_no_finding(tmp_path):
     """Clouds are received 0.2 s after their stamp, boxes 0.5 s, transforms at once."""
     drive = Drive(sweeps=20)
@@ -332,6 +364,19 @@ def test_boxes_without_a_frame_are_taken_to_be_in_that_of_the_clouds(tmp_path):
             np.testing.assert_allclose(
                 boxes.boxes[:, :3], drive.truth[boxes.stamp_ns][:, :3], atol=0.3
             )
+
+
+def test_clouds_without_a_frame_are_in_the_one_that_is_named(tmp_path):
+    drive = Drive(sweeps=8)
+    for topic, _, message in drive.items:
+        if topic == '/points':
+            message.header.frame_id = ''
+    for wanted in (None, ''):
+        with pytest.raises(RecordingError, match=r'empty frame_id; .*FRAME, one of base, l'):
+            read(drive, tmp_path / f'wanted{wanted}', wanted)
+    origins, frame, found = read(drive, tmp_path / 'named', lidars=Lidars(frames=('lidar',)))
+    assert (frame, found) == ('odom', '')
+    assert_true(origins, 8)
 
 
 def test_an_array_stamped_0_has_the_stamp_of_its_boxes(tmp_path):

@@ -219,16 +219,6 @@ def test_a_stationary_sensor_needs_the_fixed_frame_as_an_option(tmp_path):
     assert read(path, fixed_frame='base')[2] == 'base', 'connected by static transforms'
 
 
-def test_clouds_without_a_frame_are_refused(tmp_path):
-    drive = Drive()
-    for topic, _, message in drive.items:
-        if topic == '/points':
-            message.header.frame_id = ''
-    path = drive.write(tmp_path / 'drive')
-    for wanted in (None, ''):
-        assert 'got an empty frame_id; set it in the driver' in error_of(path, fixed_frame=wanted)
-
-
 def test_an_unknown_fixed_frame_is_refused(tmp_path):
     text = error_of(Drive().write(tmp_path / 'drive'), fixed_frame='world')
     assert "'world'" in text

@@ -255,6 +255,43 @@ def test_a_stationary_sensor_needs_no_transform():
     assert not live.reports
 
 
+@pytest.mark.parametrize('fixed_frame', ['', 'odom'])
+def test_clouds_without_a_frame_are_named_and_placed_by_the_frame_of_their_lidar(fixed_frame):
+    drive = Drive(sweeps=4)
+    for message in items_of(drive, '/points'):
+        message.header.frame_id = ''
+    live = Live(fixed_frame)
+    live.session.sensor_frame = ''
+    live.feed(drive)
+    reasons = {reason for reason, _, _ in live.reports}
+    expected = {'sweep_without_transform'} | ({'no_transform'} if not fixed_frame else set())
+    assert reasons == expected
+    assert all('clouds have an empty frame_id' in text for _, text, _ in live.reports)
+    assert all("sensor_frames:=['FRAME']" in text for _, text, _ in live.reports)
+
+    placement = Live(lidars=Lidars(frames=('lidar',))).placement
+    cloud = items_of(drive, '/points')[0]
+    assert placement.frame_of(cloud, '') == placement.sweep_of(cloud, '').frame_id == 'lidar'
+
+
+def test_findings_are_reported_where_no_transform_is_known_too():
+    """The clock of clouds and boxes is ahead of TF by 18 s: no transform covers their stamps."""
+    drive = Drive(sweeps=8)
+    live = Live()
+    for topic, received_ns, message in drive.items:
+        if topic in ('/tf', '/tf_static'):
+            live.session.tree.add_transforms(
+                message.transforms, topic == '/tf_static', received_ns
+            )
+            continue
+        for one in (message, *getattr(message, 'detections', [])):
+            one.header.stamp.sec += 18
+        live.process(received(topic, message, received_ns * 1e-9))
+    texts = [text for reason, text, _ in live.reports if reason == 'clock_offset']
+    assert '18 s ahead of those of odom -> base' in texts[-1]
+    assert 'clock_offset:=18' in texts[-1]
+
+
 def test_empty_arrays_without_stamp_cause_no_wait_and_no_report():
     drive = Drive(sweeps=2)
     empty, stamped = items_of(drive, '/boxes')
