@@ -160,7 +160,7 @@ class Worker:
 
     def note_cloud(self, message: Any, lidar: str) -> None:
         """Note the frame of a cloud, and that it has arrived; in the executor's thread."""
-        self.cloud_frame = self._live.placement.frame_of(message, lidar)
+        self.cloud_frame = self._live.session.placement.frame_of(message, lidar)
         self.cloud_received = time.monotonic()
 
     def drop(self, message: Message) -> None:

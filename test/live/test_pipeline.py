@@ -269,7 +269,7 @@ def test_clouds_without_a_frame_are_named_and_placed_by_the_frame_of_their_lidar
     assert all('clouds have an empty frame_id' in text for _, text, _ in live.reports)
     assert all("sensor_frames:=['FRAME']" in text for _, text, _ in live.reports)
 
-    placement = Live(lidars=Lidars(frames=('lidar',))).placement
+    placement = SensorPlacement(Lidars(frames=('lidar',)))
     cloud = items_of(drive, '/points')[0]
     assert placement.frame_of(cloud, '') == placement.sweep_of(cloud, '').frame_id == 'lidar'
 
