@@ -58,9 +58,11 @@ PACKETS = {
     'nebula_msgs/msg/NebulaPackets': 'nebula_ros with launch_hw false',
     'robosense_msgs/msg/RobosenseScan': 'nebula_ros with launch_hw false',
     'rslidar_msg/msg/RslidarPacket': 'rslidar_sdk with msg_source 2',
-    'rslidar_msg/msg/RslidarScan': 'rslidar_sdk with msg_source 2',
-    'rslidar_msgs/msg/rslidarScan': 'rslidar_sdk with msg_source 2',
-    'seyond/msg/SeyondScan': 'seyond_ros_driver with packet_mode, played back',
+    'rslidar_msg/msg/RslidarScan': 'rslidar_sdk 1.3 with msg_source 2',
+    'rslidar_msgs/msg/rslidarScan': (
+        'rslidar_sdk 1.3 with msg_source 2 (later: built with ENABLE_SOURCE_PACKET_LEGACY=ON)'
+    ),
+    'seyond/msg/SeyondScan': 'start.py of seyond with replay_rosbag:=true',
 }
 """Types of the packets of a LiDAR -> what converts them to points."""
 LIVOX_FIELDS = {'x': 'f4', 'y': 'f4', 'z': 'f4', 'reflectivity': 'u1', 'offset_time': 'u4'}
@@ -71,8 +73,21 @@ def plain(msg: Any) -> Any:
     """
     Return the cloud of a message of `CLOUD_TYPES` with the attributes of a PointCloud2.
 
-    Raises UnsupportedMessage if the compressed data are damaged or of an unknown format, or a
-    package that decompresses them is not installed.
+    Parameters
+    ----------
+    msg : message
+        Of one of these types; a PointCloud2 is returned as it is.
+
+    Returns
+    -------
+    cloud : object
+        With the fields of a ``sensor_msgs/PointCloud2``, decompressed, in the frame of `msg`.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If the compressed data are damaged or of an unknown format, or a package that decompresses
+        them is not installed.
 
     """
     if hasattr(msg, 'compressed_data'):

@@ -31,11 +31,28 @@ def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
     """
     Return the finite points of a PointCloud2, in its frame, with their times.
 
-    Points are float32; float64 if the coordinates are float64 or 32-bit integers, to keep them
-    exact. Raises UnsupportedMessage if there are no fields x, y, z, a field has an unknown
-    datatype, the sizes in the message contradict each other, or the times of a known layout are in
-    a wrong unit.
+    Parameters
+    ----------
+    msg : sensor_msgs/PointCloud2
+        As rclpy, rosbags or mcap decode it, or `clouds.plain` returns it.
+    time_unit : str
+        Unit of the times of the points, one of `TIME_UNIT_CHOICES`; default: derived.
 
+    Returns
+    -------
+    sweep : Sweep
+        `points` (M, 3) [m] in the frame of the message, `times` (M,) relative to the stamp [s] or
+        None. Points are float32; float64 if the coordinates are float64 or 32-bit integers, to
+        keep them exact.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If there are no fields x, y, z, a field has an unknown datatype, the sizes in the message
+        contradict each other, or the times of a known layout are in a wrong unit.
+
+    Notes
+    -----
     The layouts of `point_layout.LAYOUTS` state field and unit of the times. In other layouts times
     are read from the first of the fields ``t``, ``time``, ``timestamp``, ``offset_time``,
     ``time_stamp``; unit and origin are derived from type and magnitude. A float64 field within 1 s
@@ -121,10 +138,23 @@ def positions(msg: Any) -> Floats:
 
 def intensities(msg: Any) -> Floats | None:
     """
-    Return one intensity per point of `from_msg`, (M,), in the unit of the sensor.
+    Return one intensity per point of `from_msg`.
 
-    None if the message has none of the fields ``intensity``, ``i``, ``reflectivity``. Values that
-    are not finite are 0. Raises as `from_msg`.
+    Parameters
+    ----------
+    msg : sensor_msgs/PointCloud2
+        As of `from_msg`.
+
+    Returns
+    -------
+    intensities : array, shape (M,), or None
+        In the unit of the sensor, 0 where not finite; None if the message has none of the fields
+        ``intensity``, ``i``, ``reflectivity``.
+
+    Raises
+    ------
+    UnsupportedMessage
+        As `from_msg`.
 
     """
     if not msg.width * msg.height:

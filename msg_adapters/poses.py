@@ -32,8 +32,21 @@ def require_fields(kind: str, items: Iterable[Any], names: Sequence[str]) -> Non
     Raise UnsupportedMessage if a message lacks a field that an adapter reads.
 
     Recordings contain their own message definitions, and JSON has none, so a message of a known
-    name may lack one. `names` are paths of attributes, as ``'pose.position'``. One item is enough
-    where all have the same definition.
+    name may lack one.
+
+    Parameters
+    ----------
+    kind : str
+        Type of the message, for errors.
+    items : iterable
+        Parts of the message; one is enough where all have the same definition.
+    names : sequence of str
+        Paths of attributes, as ``'pose.position'``.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If one of the items lacks one of them.
 
     """
     for item in items:
@@ -95,10 +108,25 @@ def common_stamp_and_frame(kind: str, headers: Iterable[tuple[int, str]]) -> tup
 
 def boxes_of(poses: Sequence[Any], sizes: Sequence[Any]) -> Floats:
     """
-    Return boxes (n, 9) from ``geometry_msgs`` poses and full extents, vectors or sequences.
+    Return boxes of poses and extents.
 
-    A box whose quaternion is not of unit length gets NaN angles, so that it is an invalid box.
-    Raises UnsupportedMessage if a value is not a number, or a size does not have three.
+    Parameters
+    ----------
+    poses : sequence of n geometry_msgs/Pose
+        Of the centres of the boxes, x forward, y left, z up.
+    sizes : sequence of n geometry_msgs/Vector3, or of three numbers each
+        Full length, width and height [m].
+
+    Returns
+    -------
+    boxes : array, shape (n, 9)
+        x y z length width height roll pitch yaw [m, rad], in the frame of the poses. A box whose
+        quaternion is not of unit length gets NaN angles, so that it is an invalid box.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If a value is not a number, or a size does not have three.
 
     """
     if not len(poses):
@@ -184,10 +212,22 @@ def with_orientation(pose: Any, quaternion_xyzw: Sequence[float]) -> Any:
 
 def with_box(pose: Any, size: Any, box: Floats, quaternion_xyzw: Floats) -> tuple[Any, Any]:
     """
-    Return copies of a pose and a size, a vector or a sequence, with the values of `box`.
+    Return copies of a pose and a size with the values of a box.
 
-    Where position, orientation or size is not finite, the message's own remains, so that no NaN
-    is published.
+    Parameters
+    ----------
+    pose, size : geometry_msgs/Pose, and Vector3 or a sequence
+        Those of the message. Where position, orientation or size of `box` is not finite, they
+        remain, so that no NaN is published.
+    box : array, shape (9,)
+        x y z length width height roll pitch yaw [m, rad].
+    quaternion_xyzw : array, shape (4,)
+        Its orientation, as of `quaternions_of`.
+
+    Returns
+    -------
+    pose, size
+        Of the classes of the arguments.
 
     """
     if np.isfinite(box[BOX_CENTER]).all():
@@ -211,7 +251,22 @@ def with_covariance(
     """
     Return a copy of a ``PoseWithCovariance`` with another pose and covariance.
 
-    If `covariance` (6, 6) is NaN or None, the message's own remains, rotated by `T_out_in`.
+    Parameters
+    ----------
+    posed : geometry_msgs/PoseWithCovariance
+        That of the message.
+    pose : geometry_msgs/Pose
+        The new pose.
+    covariance : array, shape (6, 6), or None
+        Of x y z roll pitch yaw [m, rad]; if it is NaN or None, that of the message remains,
+        rotated by `T_out_in`.
+    T_out_in : array, shape (4, 4), or None
+        Maps the frame of the message to that of `pose`; None if they are the same.
+
+    Returns
+    -------
+    geometry_msgs/PoseWithCovariance
+        A copy.
 
     """
     own = np.array(posed.covariance, dtype=np.float64).reshape(6, 6)
@@ -222,10 +277,20 @@ def with_covariance(
 
 def turned_covariances(covariances: Floats, T_frame_boxes: Floats) -> Floats:
     """
-    Return covariances (..., 6, 6) of x y z roll pitch yaw in another frame.
+    Return covariances of boxes in another frame.
 
-    The covariance of roll, pitch and yaw is not changed. That is exact for frames that differ by
-    a rotation about z, and the tilt between frames in practice is small.
+    Parameters
+    ----------
+    covariances : array, shape (..., 6, 6)
+        Of x y z roll pitch yaw [m, rad].
+    T_frame_boxes : array, shape (4, 4)
+        Maps the frame of the boxes to the other one.
+
+    Returns
+    -------
+    array, shape (..., 6, 6)
+        The covariance of roll, pitch and yaw is not changed. That is exact for frames that differ
+        by a rotation about z, and the tilt between frames in practice is small.
 
     """
     J = np.eye(6)

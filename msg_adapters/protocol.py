@@ -24,6 +24,18 @@ class Adapter(Protocol):
         A box whose orientation or numbers are not valid is part of the result with NaN in their
         place: it is an invalid box, which is returned unchanged later.
 
+        Parameters
+        ----------
+        msg : message
+            Of a type of the family, as rclpy, rosbags or mcap decode it. It is not modified.
+
+        Returns
+        -------
+        boxes : BoxArray
+            Of n boxes: `boxes` (n, 9) of centre x y z, length width height [m] and roll pitch yaw
+            [rad], in the frame `frame_id`; `stamp_ns` is that of the header, 0 where it has none;
+            `track_ids` are '' where the message has none.
+
         Raises
         ------
         UnsupportedMessage
@@ -56,6 +68,11 @@ class Adapter(Protocol):
             Transform from the frame of the message to that of `boxes`, if they differ. It is
             applied to the copied fields.
 
+        Returns
+        -------
+        message
+            A copy, of the class of `msg`.
+
         """
 
     def with_added(self, msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
@@ -72,5 +89,15 @@ class Adapter(Protocol):
             For each added box an earlier message of the same type, and its row in the
             `BoxArray` of that. All fields are copied but stamp, frame and score: the score is 0,
             because the detector has not found the object.
+
+        Returns
+        -------
+        message
+            A copy, with as many more boxes as there are `sources`, in their order.
+
+        Raises
+        ------
+        UnsupportedMessage
+            If the boxes of `msg` are not of one frame and stamp.
 
         """

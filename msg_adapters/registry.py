@@ -139,11 +139,25 @@ def canonical(type_name: str) -> str:
 
 def adapter_for(type_name: str, convention: Convention | None = None) -> Adapter:
     """
-    Return the adapter of a message type, ``package/msg/Type``.
+    Return the adapter of a message type.
 
-    Without a convention, pose and size are as the type defines them, and types without ids are
-    accepted. Raises UnsupportedMessage if no adapter reads the type, or it has no track ids and
-    none are assigned.
+    Parameters
+    ----------
+    type_name : str
+        ``package/msg/Type``, or ``package/Type``.
+    convention : Convention, optional
+        How the publisher fills pose and size. Without one they are as the type defines them, and
+        types without ids are accepted.
+
+    Returns
+    -------
+    adapter : Adapter
+        Its boxes have their centre as reference and x forward, whatever the convention.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If no adapter reads the type, or it has no track ids and `convention` assigns none.
 
     """
     name = canonical(type_name)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast, Self
 
@@ -18,6 +17,7 @@ from boxreg_ros.io.definitions import known_store
 from boxreg_ros.io.foxglove import encoded
 from boxreg_ros.io.images import RecordedImages
 from boxreg_ros.io.items import EVERYTHING, Item, LOOKAHEAD_NS, requested_part, Wanted
+from boxreg_ros.io.joining import are_parts, JOIN_NS, joined
 from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder
 from boxreg_ros.io.recorded_motion import RecordedMotion
@@ -30,13 +30,8 @@ from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from msg_adapters import adapter_for, clouds, pointcloud, poses
 from msg_adapters.convention import Convention, STANDARD
-import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.typesys.store import Typestore
-
-JOIN_NS = 20 * 10**6
-"""Box arrays of one stamp that are received within this time are one array [ns]; chosen: they are
-published in a burst, and detectors are slower."""
 
 
 class Recording:
@@ -439,21 +434,3 @@ class Recording:
                 self.placement.add_info(message)
         except UnsupportedMessage as error:
             self._decoder.count_unreadable(topic, error)
-
-
-def are_parts(boxes: BoxArray, more: BoxArray) -> bool:
-    """Return whether two arrays have different objects of one stamp, in one frame."""
-    is_same = (boxes.stamp_ns, boxes.frame_id) == (more.stamp_ns, more.frame_id)
-    has_ids = '' not in boxes.track_ids and '' not in more.track_ids
-    return is_same and has_ids and set(boxes.track_ids).isdisjoint(more.track_ids)
-
-
-def joined(boxes: BoxArray, more: BoxArray) -> BoxArray:
-    """Return the boxes of two arrays of one stamp and frame."""
-    return replace(
-        boxes,
-        track_ids=boxes.track_ids + more.track_ids,
-        class_names=boxes.class_names + more.class_names,
-        scores=np.concatenate([boxes.scores, more.scores]),
-        boxes=np.concatenate([boxes.boxes, more.boxes]),
-    )

@@ -17,6 +17,7 @@ from boxreg_ros.io.session import Admitted, is_placeholder, Session
 from boxreg_ros.io.time_jumps import Held, JumpConfirmation
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.live.budget import TickBudget
+from boxreg_ros.live.bursts import Bursts
 from boxreg_ros.live.following import Following
 from boxreg_ros.live.outgoing import Outgoing, OutgoingQueue
 from boxreg_ros.live.silence import Silence
@@ -43,6 +44,8 @@ class MessagePipeline:
 
         message --> confirm --> session --+-- cloud --> merged --+--> registrar --> messages
                                           +-- boxes --> ticket --+
+
+    Messages of boxes of one stamp are joined before `confirm` takes them.
 
     The registrar has the order of the boxes; what is published for them is in their ticket. Not
     thread-safe.
@@ -95,6 +98,7 @@ class MessagePipeline:
             self.static_points = StaticPoints(static_patience, self.registrar)
         self.silence = Silence(self.registrar)
         self._jumps = JumpConfirmation[Item]()
+        self._bursts = Bursts()
         self._tickets = Tickets()
         self._queue = OutgoingQueue(self.following, self.static_points)
 
@@ -117,7 +121,12 @@ class MessagePipeline:
     @property
     def is_holding(self) -> bool:
         """Return whether messages wait for a cloud, further observations or confirmation."""
-        return self.registrar.num_held > 0 or bool(self._jumps.held)
+        return self.registrar.num_held > 0 or bool(self._jumps.held) or self.is_joining
+
+    @property
+    def is_joining(self) -> bool:
+        """Return whether a message of boxes waits for others of its stamp."""
+        return self._bursts.held is not None
 
     # ------------------------------------------------------------ one message
 
@@ -130,6 +139,22 @@ class MessagePipeline:
         """
         if is_placeholder(item.content):
             return [item], []
+        if isinstance(item.content, Sweep):
+            return self._confirmed(item)
+        return self._all_confirmed(self._bursts.add(item))
+
+    def _all_confirmed(self, whole: list[Item]) -> tuple[list[Item], list[Outgoing]]:
+        """Return the messages to process next, and what to publish before, of several ones."""
+        items: list[Item] = []
+        ready: list[Outgoing] = []
+        for item in whole:
+            confirmed, released = self._confirmed(item)
+            items += confirmed
+            ready += released
+        return items, ready
+
+    def _confirmed(self, item: Item) -> tuple[list[Item], list[Outgoing]]:
+        """Return as `confirm`, for a cloud or for all boxes of a stamp."""
         confirmed = self._jumps.add(item, item.content, item.received_ns)
         ready = self._not_used(confirmed.ahead)
         if not confirmed.has_jumped:
@@ -145,14 +170,22 @@ class MessagePipeline:
         self.session.tree.rewind(stamp_ns)
         return confirmed.items, ready
 
-    def release(self, now: float = inf) -> tuple[list[Item], list[Outgoing]]:
-        """Return what no other message has confirmed in time: late ones, and those not used."""
-        late: list[Item] = []
+    def release(
+        self, now: float = inf, more_boxes: bool = False
+    ) -> tuple[list[Item], list[Outgoing]]:
+        """
+        Return what no other message has confirmed in time: late ones, and those not used.
+
+        While there are `more_boxes`, those that wait for others of their stamp wait on.
+
+        """
+        whole = [] if more_boxes else self._bursts.release(now)
+        late, ready = self._all_confirmed(whole)
         ahead: list[Item] = []
         for held in self._jumps.held:
             if now >= held.item.received + _patience(held):
                 (ahead if held.is_ahead else late).extend(self._jumps.release(held))
-        return late, self._not_used(ahead)
+        return late, ready + self._not_used(ahead)
 
     def process(self, item: Item) -> list[Outgoing]:
         """Take a message to the registrar; return the messages that are ready to be published."""
@@ -205,7 +238,7 @@ class MessagePipeline:
     def reset(self) -> list[Outgoing]:
         """Forget everything but the transforms; return everything that is held."""
         ready = self._start_anew()
-        for item in self._jumps.release():
+        for item in (*self._jumps.release(), *self._bursts.release()):
             if not isinstance(item.content, Sweep):
                 ready += self.pass_through(item.message)
         self._jumps.restart()

@@ -16,6 +16,7 @@ from boxreg_ros.io.label_messages import LabelMessage, to_text
 from boxreg_ros.io.markers import MarkerBoard
 from boxreg_ros.io.session import is_placeholder
 from boxreg_ros.live.budget import TickBudget
+from boxreg_ros.live.bursts import JOIN_TIME, JoiningAdapter, messages_of
 from boxreg_ros.live.debug_times import DebugTimes
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.inbox import CloudPatience, Inbox, Message
@@ -105,7 +106,7 @@ class Worker:
 
     def open_boxes(self, adapter: Adapter, early: Publisher, final: Publisher) -> None:
         """Set adapter and publishers of the boxes; to be called before they are subscribed to."""
-        self._live.adapter = adapter
+        self._live.adapter = JoiningAdapter(adapter)
         self._early = early
         self._final = final
 
@@ -176,7 +177,8 @@ class Worker:
 
     def _next(self) -> Item | None:
         """Return the next message decoded, or None if there is none to process now."""
-        late, ready = self._live.release(time.monotonic())
+        more_boxes = self._inbox.sizes()['boxes_waiting'] > 0
+        late, ready = self._live.release(time.monotonic(), more_boxes)
         self._confirmed.extend(late)
         self._publish(ready)
         if not self._confirmed:
@@ -256,6 +258,8 @@ class Worker:
             self._catch_up(spare)
             return
         period = HELD_PERIOD if self._live.is_holding else IDLE_PERIOD
+        if self._live.is_joining:
+            period = JOIN_TIME
         if self._live.static_points is not None:
             period = min(period, self._live.static_points.due(now))
         self._inbox.wake_up.wait(period)
@@ -377,8 +381,9 @@ class Worker:
         for out in ready:
             publisher = self._final if out.is_final else self._early
             assert publisher is not None  # made before boxes are subscribed to
-            publisher.publish(out.message)
-            self._health.count('final_published' if out.is_final else 'early_published')
+            for message in messages_of(out.message):
+                publisher.publish(message)
+                self._health.count('final_published' if out.is_final else 'early_published')
             if out.is_final:
                 continue
             if out.received is not None:

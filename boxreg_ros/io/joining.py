@@ -1,0 +1,30 @@
+"""Arrays of boxes of one stamp in several messages: one per object, or one per class."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from boxreg_ros.structures import BoxArray
+import numpy as np
+
+JOIN_NS = 20 * 10**6
+"""Box arrays of one stamp that are received within this time are one array [ns]; chosen: they are
+published in a burst, and detectors are slower."""
+
+
+def are_parts(boxes: BoxArray, more: BoxArray) -> bool:
+    """Return whether two arrays have different objects of one stamp, in one frame."""
+    is_same = (boxes.stamp_ns, boxes.frame_id) == (more.stamp_ns, more.frame_id)
+    has_ids = '' not in boxes.track_ids and '' not in more.track_ids
+    return is_same and has_ids and set(boxes.track_ids).isdisjoint(more.track_ids)
+
+
+def joined(boxes: BoxArray, more: BoxArray) -> BoxArray:
+    """Return the boxes of two arrays of one stamp and frame."""
+    return replace(
+        boxes,
+        track_ids=boxes.track_ids + more.track_ids,
+        class_names=boxes.class_names + more.class_names,
+        scores=np.concatenate([boxes.scores, more.scores]),
+        boxes=np.concatenate([boxes.boxes, more.boxes]),
+    )
