@@ -91,6 +91,11 @@ def likely_offset(offset: float) -> tuple[float, str]:
     return round(offset, 2), ''
 
 
+def seconds_text(seconds: float) -> str:
+    """Return seconds with up to two decimals and all digits before them, as options take them."""
+    return f'{seconds:.2f}'.rstrip('0').rstrip('.')
+
+
 def _nearest(received_ns: list[int], wanted_ns: int) -> int | None:
     """Return the row of the receive time next to another; None if it is not near."""
     after = bisect_left(received_ns, wanted_ns)

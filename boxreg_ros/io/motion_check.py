@@ -9,7 +9,7 @@ clouds and boxes are moved by.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -21,6 +21,7 @@ from boxreg_ros.io.clocks import (
     likely_offset,
     MIN_CLOCK_OFFSET,
     ReceiveTimes,
+    seconds_text,
 )
 from boxreg_ros.io.findings import Finding
 from boxreg_ros.io.transforms import Edge, inverse, matrix, MAX_LINEAR_GAP, TransformTree
@@ -42,12 +43,16 @@ MAX_EGO_SPEED = 100.0
 """Speed that no vehicle has [m/s]; derived: 360 km/h."""
 MIN_ALTERNATIONS = 3
 """Samples at impossible speed that mean two publishers; chosen: one or two are a restart."""
+MIN_REVERSALS = 3
+"""Steps in a row, each back along the one before it, that no vehicle makes; chosen."""
 MAX_BOXES_DELAY = 1.0
 """Delay of boxes after their clouds that is reported [s]; a live detector takes 0.1 to 0.5 s."""
 MIN_COPIED = 0.5
 """Part of the boxes with stamps of clouds that means that one clock has set both; chosen."""
 LOOK_PERIOD = 10
 """Clouds between two looks at what changes slowly; chosen: 1 s at 10 Hz."""
+SETTLED_CLOUDS = 15
+"""Clouds by which an offset of clocks that was found at the first look is confirmed; chosen."""
 FIRST_LOOK = 5
 """Cloud of the first look, for short recordings."""
 LIDAR_WORDS = (
@@ -96,8 +101,10 @@ class JumpSearch:
     steps: dict[tuple[str, str], FrameSteps] = field(default_factory=dict)
     """By parent and child, of the transforms that stepped."""
     alternations: dict[tuple[str, str], FrameSteps] = field(default_factory=dict)
-    """FrameSteps of the motion itself at a speed that no vehicle has."""
+    """FrameSteps of the motion itself that no vehicle makes: too fast, or to and fro."""
     _seen_ns: dict[tuple[str, str], int] = field(default_factory=dict)
+    _reversals: Counter[tuple[str, str]] = field(default_factory=Counter)
+    """Steps to and fro up to the last sample."""
 
     def look(self, tree: TransformTree, fixed_frame: str, sensor_frame: str) -> None:
         """Add the samples that are new in `tree`, between both frames."""
@@ -143,11 +150,16 @@ class JumpSearch:
             known.add(step, stamp_ns)
 
     def _add_speed(self, edge: Edge, row: int) -> None:
-        """Note two samples of the motion that lie too far apart."""
-        way = float(np.linalg.norm(edge.poses[row][:3] - edge.poses[row - 1][:3]))
+        """Note two samples of the motion that lie too far apart, or go to and fro."""
+        key = edge.parent, edge.child
+        step = edge.poses[row][:3] - edge.poses[row - 1][:3]
+        way = float(np.linalg.norm(step))
         seconds = (edge.stamps[row] - edge.stamps[row - 1]) * 1e-9
-        if way > 1.0 and way > MAX_EGO_SPEED * seconds:
-            key = edge.parent, edge.child
+        before = edge.poses[row - 1][:3] - edge.poses[max(row - 2, 0)][:3]
+        goes_back = min(way, float(np.linalg.norm(before))) >= MIN_STEP and step @ before < 0
+        self._reversals[key] = self._reversals[key] + 1 if goes_back else 0
+        is_too_fast = way > MIN_STEP and way > MAX_EGO_SPEED * seconds
+        if is_too_fast or self._reversals[key] >= MIN_REVERSALS:
             self.alternations.setdefault(key, FrameSteps(*key)).add(way, edge.stamps[row])
 
 
@@ -221,6 +233,9 @@ class MotionCheck:
         for kind, text in found.items():
             if text:
                 self.findings[kind] = Finding(REASONS_OF[kind], text)
+        for kind in ('clock', 'boxes_clock'):
+            if not found[kind] and len(self._clouds.received_ns) >= SETTLED_CLOUDS:
+                self.findings.pop(kind, None)  # an offset of the first ones that is not constant
 
     def _jump_text(self, fixed_frame: str, frame: str) -> str:
         smooth = self._jumps.smooth_frame(self._tree, fixed_frame, frame)
@@ -238,8 +253,9 @@ class MotionCheck:
                 return (
                     f'transform {steps.parent} -> {steps.child}: expected one motion, got '
                     f'{steps.count} jumps of up to {steps.largest:.1f} m between samples, the '
-                    f'first at {steps.first_ns} ns, faster than any vehicle: two publishers state '
-                    f'it; choose another source of motion, with --fixed-frame or --odometry'
+                    f'first at {steps.first_ns} ns, to and fro or faster than any vehicle: two '
+                    f'publishers state it; choose another source of motion, with --fixed-frame '
+                    f'or --odometry'
                 )
         return ''
 
@@ -250,14 +266,14 @@ class MotionCheck:
         if edge is None or measured is None or abs(measured) < MIN_CLOCK_OFFSET:
             return ''
         offset, names = likely_offset(measured)
-        total = round(offset + self._tree.clock_offset, 2)
+        total = seconds_text(offset + self._tree.clock_offset)
         of_whom = f', as {names} are' if names else ''
         return (
             f'clocks: expected one for clouds and motion, got stamps of the clouds '
-            f'{abs(offset):g} s {"ahead of" if offset > 0 else "behind"} those of {edge.parent} '
-            f'-> {edge.child} received at the same time{of_whom}: each cloud is placed by the '
-            f'pose of another moment; correct the motion with --clock-offset={total:g} (node: '
-            f'clock_offset:={total:g})'
+            f'{seconds_text(abs(offset))} s {"ahead of" if offset > 0 else "behind"} those of '
+            f'{edge.parent} -> {edge.child} received at the same time{of_whom}: each cloud is '
+            f'placed by the pose of another moment; correct the motion with --clock-offset={total} (node: '
+            f'clock_offset:={total})'
         )
 
     def _boxes_clock_text(self) -> str:
@@ -271,11 +287,12 @@ class MotionCheck:
         of_whom = f', as {names} are' if names else ''
         if offset > 0:
             of_whom += ', and of no other cloud'
+        shown = seconds_text(offset)
         return (
             f'clocks: expected one for clouds and boxes, got stamps of the boxes '
-            f'{abs(offset):g} s {"behind" if offset > 0 else "ahead of"} those of the clouds '
-            f'received at the same time{of_whom}; correct them with --boxes-offset={offset:g} '
-            f'(node: boxes_offset:={offset:g})'
+            f'{shown.lstrip("-")} s {"behind" if offset > 0 else "ahead of"} those of the clouds '
+            f'received at the same time{of_whom}; correct them with --boxes-offset={shown} '
+            f'(node: boxes_offset:={shown})'
         )
 
 

@@ -179,6 +179,20 @@ def test_boxes_whose_stamps_are_of_no_cloud_have_a_clock_that_is_behind(tmp_path
     assert f'--boxes-offset={offset}' in found
 
 
+def test_an_offset_is_named_with_all_digits_and_only_if_it_is_constant(tmp_path):
+    drive = Drive(sweeps=30)
+    stamps_moved(drive, ('/points', '/boxes'), 1234567 - START // SECOND)
+    assert f'--clock-offset={1234567 - START // SECOND} ' in read(drive, tmp_path)[2]
+    drive = Drive(sweeps=30)
+    for topic, received_ns, message in drive.items:  # in us, as if they were ns
+        if topic in ('/points', '/boxes'):
+            for one in (message, *getattr(message, 'detections', [])):
+                one.header.stamp.sec, one.header.stamp.nanosec = divmod(
+                    received_ns // 1000, SECOND
+                )
+    assert '--clock-offset' not in read(drive, tmp_path / 'unit')[2]
+
+
 def test_boxes_with_stamps_of_earlier_clouds_are_those_of_a_slow_detector(tmp_path):
     """It has run before the recording began; a clock 15 periods behind looks the same: said."""
     drive = Drive(sweeps=40)
@@ -285,6 +299,25 @@ def test_two_publishers_of_one_motion_are_named(tmp_path):
     found = read(drive, tmp_path)[2]
     assert 'transform odom -> base: expected one motion, got' in found
     assert 'two publishers' in found
+
+
+@pytest.mark.parametrize('delay_ns', [3, 50_000_000])
+def test_publishers_that_disagree_by_less_than_a_metre_are_named_too(tmp_path, delay_ns):
+    drive = Drive(sweeps=12)
+    m = drive.messages
+    for k, stamp in enumerate(drive.stamps):
+        at = stamp + delay_ns
+        drive.items.append(('/tf', at, m.tf(m.transform(at, 'odom', 'base', (0.5 * k, 0.4, 0)))))
+    drive.items.sort(key=lambda item: item[1])
+    assert 'two publishers state it' in read(drive, tmp_path)[2]
+
+
+def test_steps_of_a_localisation_are_no_second_publisher(tmp_path):
+    """They move the vehicle in the map, back and on, twice a second."""
+    drive = Drive(sweeps=30)
+    for k, (_, _, message) in enumerate(item for item in drive.items if item[0] == '/tf'):
+        message.transforms[0].transform.translation.x -= 0.7 * (k // 5 % 2)
+    assert 'publishers' not in read(drive, tmp_path)[2]
 
 
 def test_a_static_transform_published_once_on_tf_is_used_at_all_times(tmp_path):
