@@ -26,7 +26,7 @@ Centre and extents have six degrees of freedom: chi-square has 99.7 % below 20.
 """
 MIN_JUMPS = 5
 """Jumps of ids from object to object that a finding needs; chosen."""
-MIN_JUMP_SHARE = 0.03
+MIN_JUMP_SHARE = 0.02
 """
 Share of the boxes at which ids jump.
 
@@ -238,10 +238,16 @@ class IdCheck:
             self.boxes += 1
             is_others = associated[row] != costs.track_ids[own] and associated[row] in known
             self.jumps += bool(is_others and cost[own] >= GATE)
-        self._id_of = {name: self._id_of[name] for name in known if name in self._id_of}
-        self._id_of |= {
-            name: given for name, given in zip(associated, boxes.track_ids, strict=True) if name
+        given = {
+            name: track_id
+            for name, track_id in zip(associated, boxes.track_ids, strict=True)
+            if name
         }
+        # An id is that of the track that had it last: where two boxes of a message have one id,
+        # or boxes lie on one another, another track has it for a moment.
+        others = {name: self._id_of[name] for name in known if name in self._id_of}
+        kept = {name: one for name, one in others.items() if one not in boxes.track_ids}
+        self._id_of = kept | given
 
     @property
     def finding(self) -> str:

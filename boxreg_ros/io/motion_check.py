@@ -272,8 +272,8 @@ class MotionCheck:
             f'clocks: expected one for clouds and motion, got stamps of the clouds '
             f'{seconds_text(abs(offset))} s {"ahead of" if offset > 0 else "behind"} those of '
             f'{edge.parent} -> {edge.child} received at the same time{of_whom}: each cloud is '
-            f'placed by the pose of another moment; correct the motion with --clock-offset={total} (node: '
-            f'clock_offset:={total})'
+            f'placed by the pose of another moment; correct the motion with '
+            f'--clock-offset={total} (node: clock_offset:={total})'
         )
 
     def _boxes_clock_text(self) -> str:

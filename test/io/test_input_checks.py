@@ -71,6 +71,29 @@ def test_ids_that_move_up_when_an_object_leaves_are_found():
     assert id_finding(arrays()).finding
 
 
+def test_ids_of_which_some_are_rows_are_found():
+    """A tracker has ids for five cars; three parked ones have the row, by their distance."""
+
+    def arrays():
+        for k, (stamp, ids, boxes) in enumerate(street()):
+            order = np.argsort(np.abs(boxes[:3, 0] - k))
+            rows = [*order, *range(3, len(boxes))]
+            yield array(stamp, ['0', '1', '2', *ids[3:]], boxes[rows])
+
+    assert id_finding(arrays()).finding
+
+
+def test_an_id_that_two_boxes_have_in_one_message_is_no_finding():
+    """The second box begins a track, which has no part in where the id is afterwards."""
+
+    def arrays():
+        for k, (stamp, ids, boxes) in enumerate(street()):
+            rows = [*range(len(boxes)), 7] if k == 7 else range(len(boxes))
+            yield array(stamp, [ids[row] for row in rows[:8]] + ['0'] * (k == 7), boxes[rows])
+
+    assert id_finding(arrays()).jumps <= 1
+
+
 def test_a_switch_of_a_tracker_is_no_finding():
     def arrays():
         for k, (stamp, ids, boxes) in enumerate(street()):

@@ -187,8 +187,7 @@ def spoiled(drive):
 def test_unusual_boxes_are_counted_and_escaped(tmp_path):
     recording = spoiled(Drive(sweeps=18)).write(tmp_path / 'drive')
     config = QUICK.updated({'complete.fill': True})
-    # By default the boxes in one place would be associated.
-    summary, page = run(recording, tmp_path / 'out', config=config, keep_ids=True)
+    summary, page = run(recording, tmp_path / 'out', config=config)
     assert summary.status['interpolated'] == 2
     assert set(summary.reasons) >= {
         'no_transform', 'invalid_box', 'no_track_id', 'no_points',
