@@ -239,8 +239,8 @@ class Reason(StrEnum):
     POINT_TIMES = (
         'point_times',
         'message',
-        'the times of the points of its clouds are parts of a revolution, not seconds; they are '
-        'read as such',
+        'the times of the points of its clouds are parts of a revolution, and are read as such, '
+        'or are of no known unit, and are not used; the log says which',
         'correct the driver of the LiDAR, which would give exact times',
     )
     LATENCY = (

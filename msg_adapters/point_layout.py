@@ -26,6 +26,13 @@ MAX_TIME_OFFSET = 1.0
 """Largest difference between the time of a point and the stamp [s]; one revolution is shorter."""
 MIN_DURATION = 1e-3
 """A whole cloud takes longer [s]; chosen: a hundredth of a revolution at 10 Hz."""
+MAX_DISTANCE = 0.05
+"""
+Largest distance of relative times of a whole cloud from the stamp, beside their duration [s].
+
+Chosen: half a revolution at 10 Hz. Seconds of the day, or microseconds of the hour, lie elsewhere.
+
+"""
 WILD_SHARE = 0.02
 """Part of the points at each end of their times that may have wild ones; chosen."""
 MIN_TIMES = 100
@@ -112,6 +119,8 @@ def reading_of(
     # Integers are no seconds: a second has too few of them.
     possible = [name for name in TIME_UNITS if name != 's' or raw.dtype.kind == 'f']
     likely = fitting(possible)
+    if layout is None and likely is not None and _is_elsewhere(len(raw), ends, likely):
+        return None
     if layout is None or likely is None:
         return likely
     stated = fitting((layout.unit,))
@@ -183,6 +192,13 @@ def _fitting(
         if max(abs(low), abs(high)) * TIME_UNITS[unit] <= MAX_TIME_OFFSET:
             return TimeReading(unit, False)
     return None
+
+
+def _is_elsewhere(count: int, ends: tuple[float, float], reading: TimeReading) -> bool:
+    """Return whether relative times of many points are not of a sweep about the stamp."""
+    low, high = (end * TIME_UNITS[reading.unit] for end in ends)
+    nearest = max(low, -high, 0.0)
+    return count >= MIN_TIMES and not reading.is_absolute and nearest > high - low + MAX_DISTANCE
 
 
 def _is_too_short(count: int, ends: tuple[float, float], reading: TimeReading) -> bool:

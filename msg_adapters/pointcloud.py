@@ -25,6 +25,8 @@ MAX_COORDINATE = 1e7
 NEXT_TO_NOTHING = 1e-9
 """Smaller coordinates but 0 are of none [m]; chosen."""
 INTENSITY_FIELDS = ('intensity', 'i', 'reflectivity')
+NOT_USED = 'are not used'
+"""Words of `described` about times of no unit."""
 
 
 def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
@@ -109,8 +111,8 @@ def described(msg: Any, time_unit: str = AUTO) -> str:
     )
     if reading is None:
         return (
-            f'{name}: times in {time_field} are not used: in no unit are they within '
-            f'{point_layout.MAX_TIME_OFFSET:g} s of the stamp'
+            f'{name}: times in {time_field} {NOT_USED}: in no unit are they those of a sweep '
+            f'within {point_layout.MAX_TIME_OFFSET:g} s of the stamp'
         )
     times = point_layout.seconds_of(raw, stamp_ns(msg.header), reading)
     origin = 'absolute' if reading.is_absolute else 'relative to the stamp'

@@ -39,7 +39,11 @@ A cloud may arrive after the first cloud of the next period, but not after two p
 PERIOD_STAMPS = 6
 """Stamps that the period of the clouds is taken from; chosen."""
 WHOLE_REVOLUTION = 0.9
-"""Part of a second from which times from 0 on are those of a whole revolution of 1; chosen."""
+"""Part of its length that times over a whole revolution have; chosen: ends are not measured."""
+LONG_SWEEP = 0.25
+"""Longer sweeps are not read as such before the period is known [s]; slow LiDARs have 5 Hz."""
+MAX_REVOLUTIONS = 1.5
+"""Length of times, in periods of clouds, that no sweep has; chosen: clouds overlap a little."""
 MAX_PERIOD = 0.5
 """Period from which times over a second may be those of the clouds [s]: they overlap at most."""
 CLOUD_MERGED, CLOUD_LATE, CLOUD_MISSING = 'merged', Reason.CLOUD_LATE, Reason.CLOUD_MISSING
@@ -126,7 +130,7 @@ class SensorPlacement:
 
     State: the newest info messages of concatenated clouds, and in `layouts` the layout of the
     first cloud of each topic and how the times of its points are read; `normalised` says of which
-    topics they are parts of a revolution. Not thread-safe.
+    topics they are parts of a revolution, or of no unit. Not thread-safe.
 
     """
 
@@ -146,9 +150,10 @@ class SensorPlacement:
         """
         Return a sweep whose times of the points are those within it.
 
-        Some drivers number the points from 0 to 1 over a revolution. Times over a whole second are
-        such parts if clouds come more often: they are multiplied by the period of the clouds. As
-        long as that is not known, the points have none.
+        Some drivers number the points over a revolution, from 0 to 1, in degrees or in ticks. No
+        sweep is longer than the period of the clouds: times from about 0 on that are longer are
+        such parts, and are scaled to it. As long as the period is not known, points with times
+        beyond `LONG_SWEEP` have none.
 
         """
         stamps_ns = self._stamps_ns.setdefault(topic, deque(maxlen=PERIOD_STAMPS))
@@ -157,19 +162,21 @@ class SensorPlacement:
         if times is None or not len(times):
             return sweep
         low, high = float(times.min()), float(times.max())
-        if not (0 <= low < 1 - WHOLE_REVOLUTION and WHOLE_REVOLUTION < high <= 1):
+        if not (0 <= low < (1 - WHOLE_REVOLUTION) * high and high > LONG_SWEEP):
             return sweep
         if len(stamps_ns) < 2:
             return replace(sweep, times=None)
-        period = float(np.median(np.diff(sorted(stamps_ns)))) * 1e-9
-        if not 0 < period < MAX_PERIOD:
+        periods = np.diff(sorted(stamps_ns)) * 1e-9
+        period = float(np.median(periods))
+        if not 0 < period < MAX_PERIOD or high < MAX_REVOLUTIONS * periods.max():
             return sweep
+        whole = 1.0 if WHOLE_REVOLUTION < high <= 1 else high
         self.normalised[topic] = (
             f'times of the points{f" of {topic}" if topic else ""} run over {high - low:.2f} s, '
-            f'while clouds come every {period:.3f} s: they are parts of a revolution, from 0 to '
-            f'1, and are read as such'
+            f'while clouds come every {period:.3f} s: they are parts of a revolution, and are '
+            f'read as such'
         )
-        return replace(sweep, times=times * period)
+        return replace(sweep, times=times * (period / whole))
 
     def frame_of(self, msg: Any, topic: str) -> str:
         """Return the frame of a cloud; where it is empty, the one that is named for its LiDAR."""
@@ -197,6 +204,12 @@ class SensorPlacement:
         unit = self.lidars.time_unit
         if topic not in self.layouts:
             self.layouts[topic] = pointcloud.described(cloud, unit)
+            if pointcloud.NOT_USED in self.layouts[topic]:
+                self.normalised[topic] = (
+                    f'clouds{f" of {topic}" if topic else ""}: {self.layouts[topic]}; all points '
+                    f'count as measured at the stamp: state the unit with --time-unit (node: '
+                    f'time_unit) if it is another'
+                )
         sweep = self._with_times_of_sweep(pointcloud.from_msg(cloud, unit), topic)
         if not sweep.frame_id:
             sweep = replace(sweep, frame_id=self.frame_of(msg, topic))

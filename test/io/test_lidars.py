@@ -256,23 +256,46 @@ def test_what_is_missing_of_a_lidar_is_named(kind, lidars, reason, text):
     assert sweep.origins is None
 
 
-def test_times_that_are_parts_of_a_revolution_become_seconds():
+@pytest.mark.parametrize('whole', [1.0, 360.0, 300_000.0], ids=['parts', 'degrees', 'ticks'])
+def test_times_that_are_parts_of_a_revolution_become_seconds(whole):
+    """No sweep is longer than the period of the clouds, whatever the unit."""
     m = Messages()
     placement = SensorPlacement()
     parts = np.linspace(0, 1, 500)
     columns = [(name, 'f4', np.ones(500)) for name in ('x', 'y', 'z')]
     for k in range(4):
         stamp = START + k * SECOND // 10
-        message = m.cloud(stamp, 'lidar', [*columns, ('time', 'f4', parts)])
+        message = m.cloud(stamp, 'lidar', [*columns, ('time', 'f4', whole * parts)])
         sweep = placement.sweep_of(message, '')
         if k == 0:
             assert sweep.times is None  # their period is not known yet
         else:
             np.testing.assert_allclose(sweep.times, parts / 10, atol=1e-6)
     assert 'clouds come every 0.100 s: they are parts of a revolution' in placement.normalised['']
+
+
+def test_a_revolution_in_a_second_is_read_as_it_is():
+    m = Messages()
+    parts = np.linspace(0, 1, 500)
+    columns = [(name, 'f4', np.ones(500)) for name in ('x', 'y', 'z')]
     slow = SensorPlacement()
-    for k in range(3):  # one revolution in a second
+    for k in range(3):
         message = m.cloud(START + k * SECOND, 'lidar', [*columns, ('time', 'f4', parts)])
         sweep = slow.sweep_of(message, '')
     np.testing.assert_allclose(sweep.times, parts, atol=1e-6)
     assert not slow.normalised
+
+
+@pytest.mark.parametrize(
+    'kind, first', [('f8', 79_200.0), ('u4', 800_000_000)], ids=['s_of_day', 'us_of_hour']
+)
+def test_times_on_another_clock_are_not_used_and_said_so(kind, first):
+    """They would be a constant offset of all points from the stamp."""
+    m = Messages()
+    columns = [(name, 'f4', np.ones(500)) for name in ('x', 'y', 'z')]
+    length = {'f8': 0.1, 'u4': 100_000}[kind]
+    times = np.linspace(first, first + length, 500)
+    message = m.cloud(START, 'lidar', [*columns, ('t', kind, times)])
+    placement = SensorPlacement()
+    assert placement.sweep_of(message, '').times is None
+    assert 'times in t are not used' in placement.normalised['']
