@@ -29,6 +29,7 @@ def finals(drive, **settings):
     """Return the final messages of a drive, by stamp and id, and the counts."""
     live = Live(**settings)
     live.adapter = JoiningAdapter(vision)
+    live.joins = True
     out = live.feed(drive)
     items, ready = live.release()
     out += ready

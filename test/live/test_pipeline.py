@@ -5,6 +5,7 @@ from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.session import Session
 from boxreg_ros.io.transforms import matrix
+from boxreg_ros.live.bursts import JOIN_TIME
 from boxreg_ros.live.outgoing import refined_to_frame
 from boxreg_ros.live.pipeline import MessagePipeline
 from boxreg_ros.live.transform_wait import TransformWait
@@ -19,6 +20,9 @@ from ros_messages import DETECTIONS, Drive, MARKERS, SECOND, START, TRACKED
 
 class Live(MessagePipeline):
     """A driver whose input is a `Drive`; `reports` are (reason, text, number)."""
+
+    joins = False
+    """Whether messages of boxes with one stamp may follow each other."""
 
     def __init__(
         self, fixed_frame='', output_frame='', timeout=1.0, convention=STANDARD,
@@ -46,6 +50,9 @@ class Live(MessagePipeline):
             else:
                 item = received(topic, message, now, self.adapter)
                 confirmed, ready = self.confirm(item)
+                if self.is_joining and not self.joins:  # no other message of its stamp comes
+                    late, more = self.release(now + JOIN_TIME)
+                    confirmed, ready = confirmed + late, ready + more
                 out += ready
                 for each in confirmed:
                     assert self.wait.is_over(each, now + 0.5) or not self.session.fixed_frame
