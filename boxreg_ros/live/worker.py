@@ -379,11 +379,7 @@ class Worker:
 
     def _publish(self, ready: list[Outgoing]) -> None:
         for out in ready:
-            publisher = self._final if out.is_final else self._early
-            assert publisher is not None  # made before boxes are subscribed to
-            for message in messages_of(out.message):
-                publisher.publish(message)
-                self._health.count('final_published' if out.is_final else 'early_published')
+            self._publish_boxes(out)
             if out.is_final:
                 continue
             if out.received is not None:
@@ -406,6 +402,14 @@ class Worker:
                 self._markers.publish(self._board.update_finals(out.refined))
             else:
                 self._markers.publish(self._board.update(out.given, out.refined))
+
+    def _publish_boxes(self, out: Outgoing) -> None:
+        """Publish the message, or the messages of one stamp, of early or final boxes."""
+        publisher = self._final if out.is_final else self._early
+        assert publisher is not None  # made before boxes are subscribed to
+        for message in messages_of(out.message):
+            publisher.publish(message)
+            self._health.count('final_published' if out.is_final else 'early_published')
 
     def _save_model(self) -> None:
         """Write what the drive has shown of its detector, and log where drives differ."""
