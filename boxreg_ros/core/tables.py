@@ -21,10 +21,13 @@ def joined(items: Sequence[tuple[Any, int]]) -> tuple[list[Any], Ints]:
     And the row (n,) of each item in their concatenation.
 
     """
-    of_id = {id(table): table for table, _ in items}
+    owners, rows = zip(*items, strict=True) if items else ((), ())
+    ids = list(map(id, owners))
+    of_id = dict(zip(ids, owners, strict=True))
     lengths = [len(table[0]) for table in of_id.values()]
     first = dict(zip(of_id, accumulate(lengths, initial=0), strict=False))
-    return list(of_id.values()), np.array([first[id(table)] + row for table, row in items], int)
+    before = np.array([first[number] for number in ids], int)
+    return list(of_id.values()), before + np.array(rows, int)
 
 
 def by_table(items: Sequence[tuple[Any, int]]) -> list[tuple[Any, list[int], list[int]]]:
