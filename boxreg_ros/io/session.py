@@ -225,11 +225,15 @@ class Session:
         poses = axes or self._pose_check.finding
         if poses:
             found.append(Finding(Reason.POSE_REFERENCE, poses))
-        ids = '' if self._id_check is None else self._id_check.finding
-        if ids:
+        if self.jumping_ids:
             how = 'set associate:=true (boxreg relabel: --associate)'
-            found.append(Finding(Reason.TRACK_IDS_JUMP, f'{ids}; {how}'))
+            found.append(Finding(Reason.TRACK_IDS_JUMP, f'{self.jumping_ids}; {how}'))
         return found
+
+    @property
+    def jumping_ids(self) -> str:
+        """Return that ids of the input jump from object to object; empty if they do not."""
+        return '' if self._id_check is None else self._id_check.finding
 
     @property
     def finding(self) -> str:

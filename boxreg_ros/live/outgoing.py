@@ -93,7 +93,9 @@ class OutgoingQueue:
 
 
 def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:
-    """Return refined boxes and their covariances in another frame."""
+    """Return refined boxes and their covariances in another frame; unchanged in the same."""
+    if frame_id == refined.boxes.frame_id:
+        return refined
     return replace(
         refined,
         boxes=boxes_to_frame(refined.boxes, T_frame_boxes, frame_id),

@@ -16,9 +16,8 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ConfigError, RecordingError, TransferError
+from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
-from boxreg_ros.io.id_assignment import IdCheck
 from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.progress import Stopwatch
@@ -28,15 +27,17 @@ from boxreg_ros.offline.stored_sweeps import StoredPlace, StoredSweeps
 from boxreg_ros.offline.workers import Background, Receive, run_in_worker, Send
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from msg_adapters.clouds import POINTS_TYPE
-import numpy as np
 
 MESSAGES_AHEAD = 4
 """Messages that are read before the receiver has taken those before them: two clouds, their boxes.
 Swept: with 1, 2, 8 and 32 a run took 8.2, 7.5, 7.8 and 8.4 s, and each message 1.5 MB."""
-SAMPLES = 4
-"""Parts of a long recording in which the ids of its boxes are looked at; chosen."""
-SAMPLED_SECONDS = 5.0
-"""Their duration [s]; chosen."""
+IDS_SECONDS = 20.0
+"""Boxes are checked for jumping ids this long, or to the end, before a run is begun again [s];
+chosen: 200 box arrays at 10 Hz, in which a tracker may switch now and then."""
+
+
+class JumpingIds(RecordingError):
+    """The ids of a topic of boxes jump from object to object."""
 
 
 class ReadItem(NamedTuple):
@@ -80,8 +81,8 @@ class RecordingReader:
     Read an open recording and bring its items into the fixed frame.
 
     The stages ``read``, ``decode`` and ``transform`` are measured by the clock. All sweeps are
-    stored in `sweeps`. `source` is known before the first item. Where `jumping_ids` says that the
-    ids of the input jump from object to object, boxes are associated instead.
+    stored in `sweeps`. `source` is known before the first item. Where `jumping_ids` of the
+    request says that the ids of the input jump from object to object, boxes are associated.
 
     """
 
@@ -91,16 +92,16 @@ class RecordingReader:
         request: Request,
         clock: Stopwatch,
         sweeps: StoredSweeps | None = None,
-        jumping_ids: str = '',
     ) -> None:
         self._recording = recording
-        self._jumping_ids = jumping_ids
+        self._jumping_ids = request.jumping_ids
+        self._checks_ids = _may_associate(request)
         self._clock = clock
         self._sweeps = sweeps
         self._with_points = request.options.with_points
         self._with_times = request.config.sampling.deskew
         convention = request.convention
-        if jumping_ids:
+        if request.jumping_ids:
             convention = replace(convention, associate=True)
         self._items = FixedFrameItems(
             recording, request.config, convention, request.fixed_frame, clock
@@ -121,10 +122,12 @@ class RecordingReader:
         """
         Yield clouds and boxes in the order they were received.
 
-        Raises UnsupportedMessage at the end, if no cloud, or no message of boxes, was readable.
+        Raises UnsupportedMessage at the end, if no cloud, or no message of boxes, was readable,
+        and JumpingIds if boxes are to be associated, of which nobody has said whether they are.
 
         """
         yield from self._read()
+        self._check_ids()
         self._recording.check_readable()
 
     def _read(self) -> Iterator[ReadItem]:
@@ -138,6 +141,17 @@ class RecordingReader:
             with self._clock('transform'):
                 read_item = self._trimmed(item)
             yield read_item
+            if isinstance(item.given, BoxArray) and read_item.seconds >= IDS_SECONDS:
+                self._check_ids()
+
+    def _check_ids(self) -> None:
+        """Raise JumpingIds if the ids of the boxes so far jump from object to object."""
+        found = self._items.session.jumping_ids
+        if self._checks_ids and found:
+            raise JumpingIds(
+                f'{found}; boxes are associated over time instead, as with --associate; set '
+                f'--keep-ids to take the ids as they are'
+            )
 
     def findings(self) -> Findings:
         """Return the properties that are known after the last item."""
@@ -197,49 +211,17 @@ class RecordingReader:
         )  # fmt: skip
 
 
-def _sampled_parts(request: Request) -> list[Request]:
-    """Return requests of the parts of a recording that show its properties: all of a short one."""
-    with request.recording() as recording:
-        seconds = (recording.end_ns - recording.start_ns) * 1e-9
-    parts = [(request.start, request.end)]
-    if seconds > 2 * SAMPLES * SAMPLED_SECONDS:
-        starts = (request.start or 0.0) + (np.arange(SAMPLES) + 0.5) / SAMPLES * seconds
-        parts = [(start, start + SAMPLED_SECONDS) for start in starts.tolist()]
-    return [replace(request, start=start, end=end, report=False) for start, end in parts]
-
-
-def jumping_ids_of(request: Request) -> str:
+def _may_associate(request: Request) -> bool:
     """
-    Return that the ids of a topic of boxes jump from object to object, in words; '' if not.
+    Return whether boxes are associated where their ids jump from object to object.
 
-    Ids of label files are a person's, and are kept.
+    Ids of label files and scenes are a person's, and are kept.
 
     """
     is_topic = request.labels is None and request.boxes != NO_TOPIC
     is_asked = request.keep_ids or request.keyframes or request.convention.associate
-    if is_asked or not is_topic or scene_address(request.recordings) is not None:
-        return ''
-    check = IdCheck(request.config.max_gap)
-    for part in _sampled_parts(request):
-        check.forget()
-        try:
-            with part.recording() as recording:
-                items = FixedFrameItems(recording, part.config, part.convention, part.fixed_frame)
-                for item in items.read(with_clouds=False):
-                    if item.restarts:
-                        check.forget()
-                    if isinstance(item.moved, BoxArray):
-                        check.add(item.moved)
-        except TransferError:
-            raise
-        except RecordingError:  # what is wrong is said on reading
-            continue
-    if not check.finding:
-        return ''
-    return (
-        f'{check.finding}; boxes are associated over time instead, as with --associate; set '
-        f'--keep-ids to take the ids as they are'
-    )
+    is_known = is_asked or bool(request.jumping_ids)
+    return is_topic and not is_known and scene_address(request.recordings) is None
 
 
 @contextmanager
@@ -299,10 +281,9 @@ def _messages(
     request: Request, sweeps: StoredSweeps | None
 ) -> Generator[Source | ReadItem | Findings]:
     """Yield the source of a recording, all its items, and the findings."""
-    jumping_ids = jumping_ids_of(request)
     with request.recording() as recording:
         _check_copies(request, recording)
-        reading = RecordingReader(recording, request, Stopwatch(), sweeps, jumping_ids)
+        reading = RecordingReader(recording, request, Stopwatch(), sweeps)
         yield reading.source
         yield from reading
         yield reading.findings()

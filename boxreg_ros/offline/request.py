@@ -172,6 +172,8 @@ class Request:
         parse=Path,
     )
 
+    # Why boxes are associated that nobody has asked to be; found by reading them
+    jumping_ids: str = field(default='', repr=False, compare=False)
     # arguments of `boxreg`, if these made it
     command: tuple[str, ...] = field(default=(), repr=False, compare=False)
 

@@ -18,6 +18,7 @@ from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.labels import Options
 from boxreg_ros.labels.cloud_spool import Spool
+from boxreg_ros.offline import reader as reading
 from boxreg_ros.offline.convert import convert
 from boxreg_ros.offline.notes import closing_line, notes
 from boxreg_ros.offline.relabel import relabel, Request
@@ -43,6 +44,50 @@ def run(recording, out, **options):
 
 def keys(rows):
     return [(int(row['stamp_ns']), row['track_id']) for row in rows]
+
+
+@pytest.mark.parametrize('checked_after, threads', [(0.5, 1), (20.0, 2)])
+def test_boxes_whose_ids_jump_are_associated(tmp_path, monkeypatch, checked_after, threads):
+    """The rows of a message as ids: the run begins again, once it has seen enough of them."""
+    monkeypatch.setattr(reading, 'IDS_SECONDS', checked_after)
+    drive = Drive(sweeps=12)
+    for number in range(0, 12, 2):
+        drive.replace('/boxes', number, lambda message: message.detections.reverse())
+        drive.replace('/boxes', number, lambda message: rename(message, '1', '2'))
+    path = drive.write(tmp_path / 'drive')
+    settings = {'solver.threads': threads}
+    summary, rows = run(path, tmp_path / 'out', settings=settings)
+    assert (summary.ids, summary.associated_tracks) == ('by association', 2)
+    assert 'track ids jump' in summary.warning and '--keep-ids' in summary.warning
+    own = {}
+    for row in rows:
+        own.setdefault(row['track_id'], []).append(float(row['y']))
+    assert [round(np.median(own[name])) for name in sorted(own)] in ([4, -3], [-3, 4])
+    assert all(np.ptp(y) < 1 for y in own.values())
+    summary, _ = run(path, tmp_path / 'out', settings=settings, keep_ids=True)
+    assert summary.ids == 'of the input'
+    assert 'track ids jump' in summary.warning
+
+
+def rename(message, *names):
+    """Set the ids of detections."""
+    for detection, name in zip(message.detections, names, strict=True):
+        detection.id = name
+
+
+@pytest.mark.parametrize('completes, passes', [(False, 1), (True, 2)])
+def test_a_recording_is_opened_once_for_each_pass(tmp_path, monkeypatch, completes, passes):
+    path = Drive(sweeps=4).write(tmp_path / 'drive')
+    opened = []
+    enter = Recording.__enter__
+
+    def noted(recording):
+        opened.append(recording)
+        return enter(recording)
+
+    monkeypatch.setattr(Recording, '__enter__', noted)
+    run(path, tmp_path / 'out', settings={'solver.threads': 1, 'complete.fill': completes})
+    assert len(opened) == passes
 
 
 @pytest.mark.parametrize('setting', ['auto', 'stamp'])
