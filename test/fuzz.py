@@ -140,7 +140,7 @@ def messages(folder):
             if record.connection.topic == '/tf':
                 recording._follow(TransformTree(), tampered)
             else:
-                recording._item(tampered, with_intensities=True)
+                recording._contents.item(tampered, (), with_intensities=True)
 
         yield f'message {topic}', bytes(record.data), read
 

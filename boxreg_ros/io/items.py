@@ -91,15 +91,20 @@ class ItemSource(Protocol):
     start_ns: int
     end_ns: int
     """End of the part that is read, in receive time, as `start_ns` [ns]."""
-    unreadable: Counter[str]
-    first_errors: dict[str, UnsupportedMessage]
-    """Of each topic with messages that could not be decoded; `unreadable` counts them."""
     outside: int
     """Boxes that do not belong to the part that is read."""
     left_out: Counter[str]
     """Boxes of label files that are not used, by reason."""
     label_notes: list[str]
     """What the reader of label files assumed of them."""
+
+    @property
+    def unreadable(self) -> Counter[str]:
+        """Return the number of messages that could not be decoded, by topic."""
+
+    @property
+    def first_errors(self) -> dict[str, UnsupportedMessage]:
+        """Return the error of the first of them, by topic."""
 
     @property
     def odometry_topic(self) -> str | None:

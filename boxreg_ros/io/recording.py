@@ -10,15 +10,15 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast, Self
+from typing import Any, cast, NamedTuple, Self
 
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.definitions import known_store
 from boxreg_ros.io.foxglove import encoded
 from boxreg_ros.io.images import RecordedImages
 from boxreg_ros.io.items import EVERYTHING, Item, LOOKAHEAD_NS, requested_part, Wanted
-from boxreg_ros.io.joining import are_parts, JOIN_NS, joined
 from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
+from boxreg_ros.io.message_contents import MessageContents
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder
 from boxreg_ros.io.recorded_motion import RecordedMotion
 from boxreg_ros.io.resync import MessageOrder
@@ -27,11 +27,26 @@ from boxreg_ros.io.storage.reader import Reader
 from boxreg_ros.io.storage.record import Damage, Record
 from boxreg_ros.io.topics import ODOMETRY_TYPE, Topics
 from boxreg_ros.io.transforms import TransformTree
-from boxreg_ros.structures import BoxArray, Floats, Sweep
-from msg_adapters import adapter_for, clouds, pointcloud, poses
+from boxreg_ros.structures import BoxArray, Floats
+from msg_adapters import adapter_for, clouds, poses
 from msg_adapters.convention import Convention, STANDARD
 from rosbags.interfaces import Connection
 from rosbags.typesys.store import Typestore
+
+
+class Asked(NamedTuple):
+    """What a user says about a recording; topics that are not named are found by type."""
+
+    lidars: Lidars
+    boxes: str | None
+    odometry: str | None
+    start: float | None
+    """Of the part that is read, from the beginning [s]; so is `end`."""
+    end: float | None
+    convention: Convention
+    tf: Sequence[str]
+    clock_offset: float
+    """Added to the stamps of motion [s]."""
 
 
 class Recording:
@@ -66,21 +81,12 @@ class Recording:
         tf: Sequence[str] = (),
         clock_offset: float = 0.0,
     ) -> None:
-        self._convention = convention
-        self._asked_tf = tf
-        self._clock_offset = clock_offset
         self._paths = [Path(path) for path in paths]
-        self._lidars = lidars
-        self._sensor_frame = ''
-        self._asked_boxes, self._asked_odometry = boxes, odometry
-        self._start, self._end = start, end
+        self._asked = Asked(lidars, boxes, odometry, start, end, convention, tf, clock_offset)
+        self._sensor_frame = ''  # once it is chosen
         self.outside = 0
         self.left_out: Counter[str] = Counter()
         self.label_notes: list[str] = []
-        self._decoded_topics: set[str] = set()
-        self._waiting: deque[Record] = deque()
-        self._joined: set[int] = set()
-        self._joins = 0
 
     def __enter__(self) -> Self:
         """Open all files and find the topics."""
@@ -88,53 +94,74 @@ class Recording:
         self.files = [file for part in parts for file in part.files]
         self._reader = Reader(parts)
         try:
-            self._find_topics()
-            self._find_part()
+            self._open()
         except BaseException:
             self._reader.close()
             raise
         return self
 
-    def _find_topics(self) -> None:
-        """Find the topics, and complete the definitions of their messages."""
-        self._topics = Topics(self._reader.connections, str(self))
-        self.topics = self._topics.kinds
-        self.is2 = self._reader.is2
-        lidars, self.points_topic = self._topics.find_lidars(self._lidars)
+    def _open(self) -> None:
+        """Find the topics, the definitions of their messages, the part to read, and its motion."""
+        asked = self._asked
+        self._topics = topics = Topics(self._reader.connections, str(self))
+        lidars, self.points_topic = topics.find_lidars(asked.lidars)
         self.placement = SensorPlacement(lidars)
-        self.points_topics = lidars.topics
         self.boxes_topic = ''
+        adapter = None
         if self.has_boxes:
-            self.boxes_topic = self._topics.find_boxes(
-                self._asked_boxes, self._convention.associate
-            )
-            self._adapter = adapter_for(self.topics[self.boxes_topic], self._convention)
-        self.data_topics = {*self.points_topics, self.boxes_topic}
-        if self._asked_odometry:
-            self._topics.find('odometry', 'odometry', (ODOMETRY_TYPE,), self._asked_odometry)
+            self.boxes_topic = topics.find_boxes(asked.boxes, asked.convention.associate)
+            adapter = adapter_for(topics.kinds[self.boxes_topic], asked.convention)
+        if asked.odometry:
+            topics.find('odometry', 'odometry', (ODOMETRY_TYPE,), asked.odometry)
         self._decoder = MessageDecoder(str(self))
-        motion = self._topics.transforms | self._topics.of((ODOMETRY_TYPE,))
-        chosen = map(self.choose_definition, self._topics.connections(self.data_topics | motion))
+        self._contents = MessageContents(self._decoder, self.placement, self.boxes_topic, adapter)
+        motion = topics.transforms | topics.of((ODOMETRY_TYPE,))
+        chosen = map(self.choose_definition, topics.connections(self.data_topics | motion))
         self._chosen = list(filter(None, chosen))
-        self.unreadable: Counter[str] = self._decoder.unreadable
-        self.first_errors: dict[str, UnsupportedMessage] = self._decoder.first_errors
-
-    def _find_part(self) -> None:
-        """Find the part that is read, and the motion in it."""
-        topics = self._topics
         self._timeline = MessageOrder(self._reader, self.points_topic, self._stamp_of)
-        motion = (topics.transforms - topics.static_transforms) | topics.of((ODOMETRY_TYPE,))
-        begin_ns, last_ns = self._timeline.span_ns(self.data_topics | motion)
-        part_ns = requested_part(str(self), begin_ns, last_ns, self._start, self._end)
+        span_ns = self._timeline.span_ns(self.data_topics | motion - topics.static_transforms)
+        part_ns = requested_part(str(self), *span_ns, asked.start, asked.end)
         self.start_ns, self.end_ns = part_ns
-        self.part_ns = (
-            self.start_ns if self._start else None,
-            None if self._end is None else self.end_ns,
-        )
         self._motion = RecordedMotion(
-            topics, self._decoder, self._read, part_ns, self._asked_odometry,
-            self.points_topics, self._asked_tf,
+            topics, self._decoder, self._read, part_ns, asked.odometry, self.points_topics,
+            asked.tf,
         )  # fmt: skip
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Return the types of all topics."""
+        return self._topics.kinds
+
+    @property
+    def is2(self) -> bool:
+        """Return whether messages are encoded as by ROS 2."""
+        return self._reader.is2
+
+    @property
+    def points_topics(self) -> tuple[str, ...]:
+        """Return the topics of the clouds."""
+        return self.placement.lidars.topics
+
+    @property
+    def data_topics(self) -> set[str]:
+        """Return the topics of clouds and boxes."""
+        return {*self.points_topics, self.boxes_topic}
+
+    @property
+    def part_ns(self) -> tuple[int | None, int | None]:
+        """Return begin and end that were asked for, in receive time [ns]; None where not."""
+        begin = self.start_ns if self._asked.start else None
+        return begin, None if self._asked.end is None else self.end_ns
+
+    @property
+    def unreadable(self) -> Counter[str]:
+        """Return the number of messages that could not be decoded, by topic."""
+        return self._decoder.unreadable
+
+    @property
+    def first_errors(self) -> dict[str, UnsupportedMessage]:
+        """Return the error of the first of them."""
+        return self._decoder.first_errors
 
     def __exit__(self, *_: object) -> None:
         """Close all files."""
@@ -154,21 +181,17 @@ class Recording:
 
         """
         self._decoder.reset()
-        self._decoded_topics.clear()
+        self._contents.reset()
         topics = self.data_topics if wanted.clouds else {self.boxes_topic}
-        records = self._records(tree, topics)
+        waiting = deque[Record]()
+        records = self._records(tree, topics, waiting)
         while True:
             with wanted.stage('read'):
                 record = next(records, None)
             if record is None:
                 return
-            if id(record) in self._joined:
-                self._joined.remove(id(record))
-                continue
             with wanted.stage('decode'):
-                item = self._item(record, wanted.intensities)
-                if item is not None and isinstance(item.content, BoxArray):
-                    item = item._replace(content=self._whole(item.content, record))
+                item = self._contents.item(record, waiting, wanted.intensities)
             if item is not None:
                 yield item
 
@@ -181,19 +204,19 @@ class Recording:
         """Raise UnsupportedMessage, after the last item, if no cloud or no boxes were readable."""
         for topic, first in self.first_errors.items():
             alike = self.points_topics if topic in self.points_topics else {topic}
-            if topic in self.data_topics and self._decoded_topics.isdisjoint(alike):
+            if topic in self.data_topics and self._contents.decoded_topics.isdisjoint(alike):
                 raise UnsupportedMessage(f'no message on {topic!r} can be read; first: {first}')
 
     def box_message(self, connection: Connection, data: bytes) -> tuple[Any, BoxArray]:
         """Return a message of the boxes' topic, and its boxes; UnsupportedMessage if malformed."""
         message = self._decoder.decoded(connection, data)
-        return message, cast(BoxArray, self._content(self.boxes_topic, message))
+        return message, cast(BoxArray, self._contents.of(self.boxes_topic, message))
 
     def with_boxes(
         self, connection: Connection, message: Any, boxes: BoxArray, covariances: Floats
     ) -> bytes:
         """Return the bytes of a message of the boxes' topic with its boxes replaced."""
-        replaced = self._adapter.to_msg(message, boxes, covariances)
+        replaced = self._contents.with_boxes(message, boxes, covariances)
         store = self.store_of(connection)
         if store is None:
             return encoded(replaced)
@@ -243,17 +266,10 @@ class Recording:
     def finding(self) -> str:
         """Return what is unusual about the recordings as a whole; empty if nothing is."""
         own = (
-            *self._chosen, *self._joining(), *self._pauses(), *self._slow(), self._timeline.finding
+            *self._chosen, self._contents.finding, *self._pauses(), *self._slow(),
+            self._timeline.finding,
         )  # fmt: skip
         return '; '.join(filter(None, (*own, *self._motion.notes.values())))
-
-    def _joining(self) -> Iterator[str]:
-        """Yield that messages with boxes were joined, if some were."""
-        if self._joins:
-            yield (
-                f'{self.boxes_topic}: {self._joins} messages have the stamp of the one before '
-                f'them and other boxes: they are read as one message per stamp'
-            )
 
     def _slow(self) -> Iterator[str]:
         """Yield that the boxes are taken for those of a slow detector."""
@@ -294,8 +310,8 @@ class Recording:
         the clouds.
 
         """
-        tree.clock_offset = self._clock_offset
-        tree.prefers_odometry = self._asked_odometry is not None
+        tree.clock_offset = self._asked.clock_offset
+        tree.prefers_odometry = self._asked.odometry is not None
         first_error: RecordingError | None = None
         for frame in self._sensor_frames():  # the others go on where TF does not know one
             try:
@@ -335,14 +351,15 @@ class Recording:
         """Yield the messages on some topics in order."""
         return self._timeline.messages(self._topics.connections(topics), start_ns, end_ns)
 
-    def _records(self, tree: TransformTree, topics: set[str]) -> Iterator[Record]:
-        """Yield the messages on `topics`, still encoded, while `tree` follows."""
+    def _records(
+        self, tree: TransformTree, topics: set[str], waiting: deque[Record]
+    ) -> Iterator[Record]:
+        """Yield the messages on `topics`, still encoded, while `tree` and `waiting` are ahead."""
         tree.rewind(0)  # motions that were read to choose a frame are read again
         ahead_topics = self._ahead_topics()
         begin, end = self.part_ns
         read_from = begin and begin - LOOKAHEAD_NS
         read_to = end and end + LOOKAHEAD_NS
-        self._waiting = waiting = deque[Record]()
         for record in self._read(topics | ahead_topics, read_from, read_to):
             # Those complete first: after a pause, this record resets the tree.
             while waiting and waiting[0].received_ns <= record.received_ns - LOOKAHEAD_NS:
@@ -359,52 +376,6 @@ class Recording:
         info = self.placement.lidars.info
         return self._motion.topics | ({info} if info else set())
 
-    def _item(self, record: Record, with_intensities: bool) -> Item | None:
-        """Return a message decoded; None, and counted, if it cannot be."""
-        topic = record.connection.topic
-        try:
-            message = self._decoder.message(record)
-            content = self._content(topic, message)
-        except UnsupportedMessage as error:
-            self._decoder.count_unreadable(topic, error)
-            return None
-        self._decoded_topics.add(topic)
-        intensities = None
-        if with_intensities and isinstance(content, Sweep):
-            try:
-                intensities = pointcloud.intensities(clouds.plain(message))
-            except UnsupportedMessage as error:
-                self._decoder.count_unreadable(topic, error)
-        return Item(record.received_ns, content, intensities)
-
-    def _whole(self, boxes: BoxArray, record: Record) -> BoxArray:
-        """Return the boxes of a message, and of those behind it that have others of its stamp."""
-        for other in self._waiting:
-            if other.received_ns - record.received_ns > JOIN_NS:
-                break
-            if other.connection.topic != self.boxes_topic:
-                continue
-            try:
-                message = self._decoder.message(other)
-                more = self._content(self.boxes_topic, message)
-            except UnsupportedMessage:
-                continue  # counted in its turn
-            assert isinstance(more, BoxArray)
-            if not are_parts(boxes, more):
-                break
-            boxes = joined(boxes, more)
-            self._joined.add(id(other))
-            self._joins += 1
-        return boxes
-
-    def _content(self, topic: str, message: Any) -> Sweep | BoxArray:
-        """Return the sweep or the boxes of a message; UnsupportedMessage if it has none."""
-        with malformed(f'topic {topic!r}'):
-            if topic in self.points_topics:
-                return self.placement.sweep_of(message, topic)
-            boxes: BoxArray = self._adapter.from_msg(message)
-        return boxes
-
     def _stamp_of(self, connection: Connection, data: bytes) -> int | None:
         """Return the stamp of clouds, boxes and motion [ns]; None if there is none."""
         if connection.topic in self._topics.static_transforms:
@@ -412,13 +383,14 @@ class Recording:
         try:
             message = self._decoder.message(Record(connection, 0, data))
             if connection.topic == self.boxes_topic:
-                return self._content(connection.topic, message).stamp_ns or None
+                return self._contents.of(connection.topic, message).stamp_ns or None
             stamped = getattr(message, 'transforms', [message])
             with malformed(f'topic {connection.topic!r}'):
                 header = clouds.header_of(stamped[0]) if len(stamped) else None
             stamp_ns = 0 if header is None else poses.stamp_ns(header)
-            is_motion = connection.topic not in self.data_topics
-            return (stamp_ns and stamp_ns + is_motion * round(self._clock_offset * 1e9)) or None
+            if stamp_ns and connection.topic not in self.data_topics:
+                stamp_ns += round(self._asked.clock_offset * 1e9)
+            return stamp_ns or None
         except UnsupportedMessage:
             return None
 

@@ -1,5 +1,6 @@
 """MCAP files of Foxglove's schemas: protobuf, JSON, and both mixed with ROS messages."""
 
+from collections import deque
 from dataclasses import replace
 import json
 import sys
@@ -149,7 +150,7 @@ def test_other_fields_are_copied_in_the_encoding_of_the_input(tmp_path, encoding
     with path.open('rb') as file:
         ((_, _, raw),) = make_reader(file).iter_messages('/boxes')
     with Recording([path]) as recording:
-        (record,) = recording._records(TransformTree(), {'/boxes'})
+        (record,) = recording._records(TransformTree(), {'/boxes'}, deque())
         message = recording._decoder.message(record)
         adapter = adapter_for(SCENE)
         boxes = adapter.from_msg(message)

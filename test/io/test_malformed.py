@@ -43,7 +43,7 @@ def outcomes(recording, record, changed):
             recording._follow(TransformTree(), tampered)
             decoded += recording.unreadable.total() == before
         else:
-            decoded += recording._item(tampered, with_intensities=True) is not None
+            decoded += recording._contents.item(tampered, (), with_intensities=True) is not None
     return decoded
 
 
@@ -150,4 +150,4 @@ def test_a_field_that_the_definition_lacks_is_unreadable(tmp_path):
         message = recording._decoder.message(record)
         del message.detections[0].bbox.__dict__['size']
         with pytest.raises(UnsupportedMessage, match=r"topic '/boxes'.*field 'size'"):
-            recording._content('/boxes', message)
+            recording._contents.of('/boxes', message)

@@ -1,5 +1,6 @@
 """All types of box messages: values, copied fields, and the same bytes in all libraries."""
 
+from collections import deque
 from dataclasses import replace
 import sys
 from types import SimpleNamespace
@@ -337,7 +338,7 @@ def test_forks_of_jsk_boxes_are_read_by_the_definition_in_the_recording(tmp_path
     with pytest.raises(UnsupportedMessage, match='--associate'), Recording([path]):
         pass
     with Recording([path], convention=Convention(associate=True)) as recording:
-        (record,) = recording._records(TransformTree(), {'/boxes'})
+        (record,) = recording._records(TransformTree(), {'/boxes'}, deque())
         raw, boxes = recording.box_message(record.connection, record.data)
     np.testing.assert_allclose(boxes.boxes, INPUT_BOXES[:1], atol=1e-12)
     out = adapter_for(JSK).to_msg(raw, moved_boxes(boxes))

@@ -1,0 +1,119 @@
+"""Clouds and boxes of the messages of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.io.items import Item
+from boxreg_ros.io.joining import are_parts, JOIN_NS, joined
+from boxreg_ros.io.lidars import SensorPlacement
+from boxreg_ros.io.message_decoder import malformed, MessageDecoder
+from boxreg_ros.io.storage.record import Record
+from boxreg_ros.structures import BoxArray, Floats, Sweep
+from msg_adapters import Adapter, clouds, pointcloud
+
+
+class MessageContents:
+    """
+    Read clouds and boxes of messages; box arrays of one stamp, received at once, are one array.
+
+    `adapter` reads the messages on `boxes_topic`; there are none without it. `decoded_topics` are
+    those with messages that could be read since `reset`.
+
+    """
+
+    def __init__(
+        self,
+        decoder: MessageDecoder,
+        placement: SensorPlacement,
+        boxes_topic: str,
+        adapter: Adapter | None,
+    ) -> None:
+        self.decoded_topics: set[str] = set()
+        self._decoder = decoder
+        self._placement = placement
+        self._boxes_topic = boxes_topic
+        self._adapter = adapter
+        self._joined: set[int] = set()  # records whose boxes are in an array before them, by id
+        self._joins = 0
+
+    def reset(self) -> None:
+        """Forget which topics could be read: the recording is read again."""
+        self.decoded_topics.clear()
+
+    @property
+    def finding(self) -> str:
+        """Return that messages with boxes were joined; empty if none were."""
+        if not self._joins:
+            return ''
+        return (
+            f'{self._boxes_topic}: {self._joins} messages have the stamp of the one before '
+            f'them and other boxes: they are read as one message per stamp'
+        )
+
+    def item(self, record: Record, later: Iterable[Record], with_intensities: bool) -> Item | None:
+        """
+        Return a message decoded; None, and counted, if it cannot be.
+
+        Boxes are joined with those of the same stamp among the `later` records, which have no
+        item of their own then.
+
+        """
+        if id(record) in self._joined:
+            self._joined.remove(id(record))
+            return None
+        topic = record.connection.topic
+        try:
+            message = self._decoder.message(record)
+            content = self.of(topic, message)
+        except UnsupportedMessage as error:
+            self._decoder.count_unreadable(topic, error)
+            return None
+        self.decoded_topics.add(topic)
+        if isinstance(content, BoxArray):
+            return Item(record.received_ns, self._whole(content, record, later))
+        intensities = self._intensities(topic, message) if with_intensities else None
+        return Item(record.received_ns, content, intensities)
+
+    def of(self, topic: str, message: Any) -> Sweep | BoxArray:
+        """Return the sweep or the boxes of a message; UnsupportedMessage if it has none."""
+        with malformed(f'topic {topic!r}'):
+            if topic in self._placement.lidars.topics:
+                return self._placement.sweep_of(message, topic)
+            assert self._adapter is not None  # there is no other topic
+            boxes: BoxArray = self._adapter.from_msg(message)
+        return boxes
+
+    def with_boxes(self, message: Any, boxes: BoxArray, covariances: Floats) -> Any:
+        """Return a copy of a message of the boxes' topic with its boxes replaced."""
+        assert self._adapter is not None  # it has read the message
+        return self._adapter.to_msg(message, boxes, covariances)
+
+    def _intensities(self, topic: str, message: Any) -> Floats | None:
+        """Return the intensities of a cloud; None, and counted, where they cannot be read."""
+        try:
+            return pointcloud.intensities(clouds.plain(message))
+        except UnsupportedMessage as error:
+            self._decoder.count_unreadable(topic, error)
+            return None
+
+    def _whole(self, boxes: BoxArray, record: Record, later: Iterable[Record]) -> BoxArray:
+        """Return the boxes of a message, and of those behind it that have others of its stamp."""
+        for other in later:
+            if other.received_ns - record.received_ns > JOIN_NS:
+                break
+            if other.connection.topic != self._boxes_topic:
+                continue
+            try:
+                more = self.of(self._boxes_topic, self._decoder.message(other))
+            except UnsupportedMessage:
+                continue  # counted in its turn
+            assert isinstance(more, BoxArray)
+            if not are_parts(boxes, more):
+                break
+            boxes = joined(boxes, more)
+            self._joined.add(id(other))
+            self._joins += 1
+        return boxes
