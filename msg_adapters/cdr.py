@@ -118,8 +118,9 @@ class Fields:
     """
     The fields that a `Layout` has found in a message.
 
-    `body` are the bytes after its header, filled up to a multiple of 8 with zeros. `places` has
-    offset in `body` and count (numbers, letters, items) of each field by path, (k, 2).
+    `data` is the message, `body` its bytes after the header, filled up to a multiple of 8 with
+    zeros. `places` has offset in `body` and count (numbers, letters, items) of each field by path,
+    (k, 2).
 
     """
 
@@ -129,10 +130,14 @@ class Fields:
         body: NDArray[np.uint8],
         places: dict[str, NDArray[np.int64]],
     ) -> None:
-        self._data = data
+        self.data = data
         self._body = body
         self._places = places
         self._strings: dict[str, list[bytes]] = {}  # by path, once they are asked for
+
+    def copied(self) -> Fields:
+        """Return fields to put other numbers into, which do not change these."""
+        return Fields(self.data, self._body.copy(), self._places)
 
     def counts(self, path: str) -> NDArray[np.int64]:
         """Return how many elements (k,) a sequence or array has, for each item that it is in."""
@@ -160,7 +165,7 @@ class Fields:
 
     def message(self) -> bytes:
         """Return the message with the numbers that were put."""
-        return self._data[:HEADER] + self._body[: len(self._data) - HEADER].tobytes()
+        return self.data[:HEADER] + self._body[: len(self.data) - HEADER].tobytes()
 
     def _encoded(self, path: str) -> list[bytes]:
         """Return strings without the zero that ends each."""
@@ -168,7 +173,7 @@ class Fields:
             offset, length = self._places[path].T
             begin = HEADER + offset
             ends = (begin + np.maximum(length - 1, 0)).tolist()
-            data = self._data
+            data = self.data
             self._strings[path] = [
                 data[first:end] for first, end in zip(begin.tolist(), ends, strict=True)
             ]

@@ -9,6 +9,7 @@ boxes) after they have been deserialised.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,6 +23,9 @@ from msg_adapters.registry import adapter_for, ConvertingAdapter
 import numpy as np
 from numpy.typing import NDArray
 
+MOST_WALKED = 32
+"""Newest messages whose fields are kept from reading to writing; derived: the early boxes of one
+are written at once, the final ones `lag` messages later, 10 by default."""
 POSE_WIDTH, SIZE_WIDTH, COVARIANCE_WIDTH = 7, 3, 36
 """Numbers of a pose (position, quaternion), of a size and of a covariance."""
 HALF_TURN_SIGNS = np.tile([-1.0, -1.0, 1.0], 2)
@@ -96,6 +100,7 @@ class SerializedAdapter:
         at = self._at
         paths = (at.stamp, *at.frames, at.pose, at.size, at.covariance, *at.others)
         self._layout = Layout(kind, [path for path in dict.fromkeys(paths) if path])
+        self._walked = deque[Fields](maxlen=MOST_WALKED)
 
     def from_msg(self, msg: bytes) -> BoxArray:
         """Return the boxes of a message, see `Adapter`."""
@@ -134,6 +139,7 @@ class SerializedAdapter:
         if fields is None or fields.texts(at.frames[0])[0] != boxes.frame_id:
             given = self._deserialize(msg, self._kind)
             return self._inner.to_msg(given, boxes, covariances, T_out_in)
+        fields = fields.copied()  # the final boxes are written into the same message
         rows = self._rows(fields)
         pose = fields.numbers(at.pose, '<f8', POSE_WIDTH)
         size = fields.numbers(at.size, '<f8', SIZE_WIDTH)
@@ -160,7 +166,7 @@ class SerializedAdapter:
 
     def _ordinary(self, msg: bytes) -> Fields | None:
         """Return the fields of a message with one frame and one stamp that has boxes."""
-        fields = self._layout.fields_of(msg)
+        fields = self._fields_of(msg)
         if fields is None:
             return None
         at = self._at
@@ -171,6 +177,16 @@ class SerializedAdapter:
         is_one = len(frames) == 1 and '' not in frames and is_stamped
         has_boxes = len(fields.counts(at.pose)) > 0
         return fields if is_one and has_boxes and at.is_ordinary(fields) else None
+
+    def _fields_of(self, msg: bytes) -> Fields | None:
+        """Return the fields of a message, which is walked through once."""
+        for known in self._walked:
+            if known.data is msg:
+                return known
+        fields = self._layout.fields_of(msg)
+        if fields is not None:
+            self._walked.append(fields)
+        return fields
 
     def _rows(self, fields: Fields) -> Any:
         """Return which of the poses are those of boxes, as an index."""

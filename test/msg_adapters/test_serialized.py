@@ -108,6 +108,26 @@ def test_boxes_are_read_and_written_without_objects(type_name):
     assert not Adapters(type_name).check(message_of(type_name, n=0))  # no stamp, no frame
 
 
+def test_a_message_is_walked_through_once(monkeypatch):
+    """For reading, and for writing early and final boxes, which do not change each other."""
+    walked = []
+    fields_of = Layout.fields_of
+
+    def noted(layout, data):
+        walked.append(data)
+        return fields_of(layout, data)
+
+    monkeypatch.setattr(Layout, 'fields_of', noted)
+    adapter = Adapters(MARKERS).fast
+    data = serialize_message(message_of(MARKERS))
+    given = adapter.from_msg(data)
+    early, final = (replace(given, boxes=given.boxes + shift) for shift in (0.1, 0.2))
+    written = [adapter.to_msg(data, boxes) for boxes in (early, final, given)]
+    assert walked == [data]
+    for message, boxes in zip(written, (early, final, given), strict=True):
+        np.testing.assert_allclose(adapter.from_msg(message).boxes, boxes.boxes, atol=1e-9)
+
+
 @pytest.mark.parametrize('type_name', BOX_FIELDS)
 def test_boxes_of_earlier_messages_are_added_by_the_objects(type_name):
     adapters = Adapters(type_name)
