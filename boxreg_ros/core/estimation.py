@@ -39,7 +39,9 @@ KEPT_REASONS = (Reason.NO_POINTS, Reason.NOT_FINITE, Reason.NO_GAIN, Reason.NOT_
 
 
 @one_torch_thread()
-def register(windows: list[Window], config: Config, model: InputModel) -> list[Estimate | None]:
+def estimate_windows(
+    windows: list[Window], config: Config, model: InputModel
+) -> list[Estimate | None]:
     """
     Refine the boxes of many windows, each of its own track.
 

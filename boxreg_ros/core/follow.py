@@ -20,7 +20,7 @@ from boxreg_ros.core.following.tracker import (
 )
 from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.core.observation import GOOD_POINTS, NEARBY
-from boxreg_ros.core.refine import RefinedTrack, registered, Track
+from boxreg_ros.core.refine import refined_tracks, RefinedTrack, Track
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import (
@@ -337,7 +337,7 @@ def solved(
     """Return the tracks refined, the seeds as boxes of a person that evidence may move."""
     usual = keyframe_deviations(tracks, points, config, origins)
     given = [_track(track, points, origins) for track in tracks if len(track.rows)]
-    found = registered(given, config, person.numbers(usual))
+    found = refined_tracks(given, config, person.numbers(usual))
     steps = person.corrections(*_fits(given, found), usual)
     boxes = {}
     first = 0
@@ -362,7 +362,7 @@ def keyframe_deviations(
     usual = person.DEVIATIONS
     if count < FOLLOW.min_keyframes:
         return usual
-    found = registered(some, config, person.numbers(usual))
+    found = refined_tracks(some, config, person.numbers(usual))
     larger: Floats = np.maximum(person.shown(*_fits(some, found), usual), usual)
     return larger
 

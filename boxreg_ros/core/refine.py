@@ -215,11 +215,11 @@ def refine(tracks: Iterable[Track], config: Config | None = None) -> list[Refine
         raise ConfigError(f'config: expected a Config, got {config!r}; see Config.from_dict')
     return [
         _with_pins(track, refined)
-        for track, refined in zip(tracks, registered(tracks, config), strict=True)
+        for track, refined in zip(tracks, refined_tracks(tracks, config), strict=True)
     ]
 
 
-def registered(
+def refined_tracks(
     tracks: Sequence[Track], config: Config, constants: Constants | None = None
 ) -> list[RefinedTrack]:
     """Refine tracks as `refine`, but pinned boxes as well; `constants` as of `BoxRegistrar`."""

@@ -31,7 +31,7 @@ import numpy as np
 GetEstimates = Callable[[], list[Estimate | None]]
 """Waits for the estimates of submitted windows, None for windows that are too short."""
 Submit = Callable[[list[Window], Config, InputModel], GetEstimates]
-"""Starts `register` with the same arguments, perhaps in another process."""
+"""Starts `estimate_windows` with the same arguments, perhaps in another process."""
 Prepare = Callable[[Pair], BoxArray]
 """Returns the boxes to register in place of those of a pair, which are in time."""
 Budget = Callable[[int], int]
@@ -67,9 +67,9 @@ class BoxRegistrar:
     config : Config
         Settings.
     submit : callable, optional
-        Starts `register` elsewhere, with its arguments, and returns a callable that waits for
-        the estimates. With `estimate` 'track' the registrar goes on meanwhile: the boxes returned
-        are the same, but one call of `register` later. Default: `register` runs at once.
+        Starts `estimate_windows` elsewhere, with its arguments, and returns a callable that waits
+        for the estimates. With `estimate` 'track' the registrar goes on meanwhile: the boxes
+        returned are the same, but one submission later. Default: it runs at once, here.
     budget : callable, optional
         Called once for each box array with `estimate` 'early' or 'final'; limits the windows that
         are solved for it. Default: all are.
@@ -611,7 +611,7 @@ class _SubmittedTrack(NamedTuple):
 
 
 def submit_locally(windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
-    """Return a function that runs `register` in this process, which imports torch."""
-    from boxreg_ros.core.registration import register
+    """Return a function that runs `estimate_windows` in this process, which imports torch."""
+    from boxreg_ros.core.estimation import estimate_windows
 
-    return partial(register, windows, config, model)
+    return partial(estimate_windows, windows, config, model)

@@ -1,5 +1,5 @@
 """
-Input and output of registration: the window of one track, and its estimate, in numpy.
+Input and output of the estimation: the window of one track, and its estimate, in numpy.
 
 A process that collects windows for another one to solve imports no torch, which takes a second
 and 150 MB.

@@ -10,13 +10,13 @@ from statistics import median
 import time
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.estimation import estimate_windows
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.registrar import GetEstimates
-from boxreg_ros.core.registration import register
 from boxreg_ros.core.window import Estimate, Window
 
 Solve = Callable[[list[Window], Config, InputModel], list[Estimate | None]]
-"""Solves windows, see `register`."""
+"""Solves windows, see `estimate_windows`."""
 PART_OF_PERIOD = 0.8
 """Part of the period of the boxes that is the default deadline; chosen: the rest is for decoding
 clouds, and for final boxes and markers, which are published after the early boxes."""
@@ -54,7 +54,7 @@ class TickBudget:
 
     `deadline`, which may change, is the maximum time from complete data to published early boxes
     [s]; negative: `PART_OF_PERIOD` of the measured period of the boxes. `solve` does the same as
-    `register`, and `clock` is monotonic [s].
+    `estimate_windows`, and `clock` is monotonic [s].
 
     """
 
@@ -62,7 +62,7 @@ class TickBudget:
         self,
         deadline: float,
         clock: Callable[[], float] = time.monotonic,
-        solve: Solve = register,
+        solve: Solve = estimate_windows,
     ) -> None:
         self.deadline = deadline
         self._clock = clock

@@ -1,5 +1,5 @@
 """
-Registration of windows in a worker process while this one takes the recording on.
+Estimation of windows in a worker process while this one takes the recording on.
 
 Only the worker imports torch, which takes a second and 150 MB.
 
@@ -29,16 +29,16 @@ from boxreg_ros.offline.workers import Receive, run_in_worker, Send, WorkerProce
 
 
 @contextmanager
-def registration_worker(
+def estimation_worker(
     config: Config, clock: Stopwatch, announce: Callable[[str], None]
 ) -> Iterator[Submit | None]:
     """
-    Yield a function that starts `register` in a worker process, for `BoxRegistrar`.
+    Yield a function that starts `estimate_windows` in a worker process, for `BoxRegistrar`.
 
     Yield None where a worker is no gain or cannot work: a sliding window is awaited before the
     next sweep is taken, a run on one core is one process, and only the CPU can be used after a
-    fork. The time in `register` is added to the stage ``solve`` of the clock; `announce` is called
-    with what is waited for where that takes long.
+    fork. The time in `estimate_windows` is added to the stage ``solve`` of the clock; `announce`
+    is called with what is waited for where that takes long.
 
     """
     if config.estimate != 'track' or uses_one_core(config):
@@ -48,7 +48,7 @@ def registration_worker(
     with announced_compilation(announce):
         warm_up_crop(config)  # the worker then shares what numba sets up
     with (
-        run_in_worker(partial(_serve, config), 'registers windows') as process,
+        run_in_worker(partial(_serve, config), 'estimates windows') as process,
         announced_compilation(announce),
     ):
         yield _Dispatcher(process, clock, announce)
@@ -76,7 +76,7 @@ class _Dispatcher:
                 self._announce(received)
                 received = self._process.receive()
             estimates, state, seconds = received
-            vars(model).update(state)  # `register` has updated the copy in the worker
+            vars(model).update(state)  # `estimate_windows` has updated the copy in the worker
             self._clock.add('solve', seconds)
             return cast(list[Estimate | None], estimates)
 
@@ -84,17 +84,17 @@ class _Dispatcher:
 
 
 def _serve(config: Config, receive: Receive, send: Send) -> None:
-    """Register windows in the worker until the connection is closed."""
+    """Estimate windows in the worker until the connection is closed."""
     with announced_compilation(send), ThreadPoolExecutor(1) as pool:
         warmed_up = pool.submit(warm_up, config)  # while the first windows fill and are received
         while True:
             received = receive()
             warmed_up.result()
-            send(_registered(*received))
+            send(_estimated(*received))
             del received  # before the next windows are received
 
 
-def _registered(packed: Any, config: Config, model: InputModel) -> tuple[Any, ...]:
+def _estimated(packed: Any, config: Config, model: InputModel) -> tuple[Any, ...]:
     """Return the estimates of windows, the state of the input model, and the time taken [s]."""
     begun = time.perf_counter()
     estimates = submit_locally(_unpacked(*packed), config, model)()

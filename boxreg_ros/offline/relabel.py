@@ -78,15 +78,13 @@ def _relabel(request: Request, out: Path, progress: Progress, fingerprint: str) 
         first = survey(request, clock, shown, corrections, drives)
         sweeps = _stored_sweeps(request, out)
         receive = workers.enter_context(reader(request, sweeps))
+        from boxreg_ros.offline.estimation_worker import estimation_worker
         from boxreg_ros.offline.main_process import MainProcess
-        from boxreg_ros.offline.registration_worker import registration_worker
 
         recording = ReadAhead(receive)
         if first is None:
             clock.begun('start')
-        submit = workers.enter_context(
-            registration_worker(request.config, clock, progress.announce)
-        )
+        submit = workers.enter_context(estimation_worker(request.config, clock, progress.announce))
         run = MainProcess(request, recording, drives, first, sweeps, truth, clock)
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock, corrections) as sink:

@@ -99,10 +99,10 @@ def survey(
                     _corrected(items, corrections), fixed_frame, request.config, corrections
                 )
         elif request.completes:
-            from boxreg_ros.offline.registration_worker import registration_worker
+            from boxreg_ros.offline.estimation_worker import estimation_worker
 
             submit = workers.enter_context(
-                registration_worker(request.config, clock, progress.progress.announce)
+                estimation_worker(request.config, clock, progress.progress.announce)
             )
             first = first_pass(
                 items, request.config, submit, fixed_frame, drives, corrections.to_register

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.articulation import changes_shape, extent_ranges
+from boxreg_ros.core.estimation import estimate_windows
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.problem import NO_RANGE
-from boxreg_ros.core.registration import register
 from boxreg_ros.reasons import Reason
 from boxreg_ros.simulation.simulate import simulate
 from measure.drives import Drive
@@ -79,7 +79,7 @@ def test_a_body_once_seen_to_bend_is_kept_by_later_windows():
             observations=whole.observations[first : first + 10], num_new=10 - len(start),
             start=start, prior=prior,
         )  # fmt: skip
-        (found,) = register([one], LIVE, InputModel(LIVE.faces))
+        (found,) = estimate_windows([one], LIVE, InputModel(LIVE.faces))
         prior, start = found.prior, found.boxes[1:]
         reasons.append(set(found.reasons))
     assert reasons[:5] == [{''}] * 5

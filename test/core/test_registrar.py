@@ -5,13 +5,13 @@ from itertools import pairwise
 
 from boxreg_ros import Config, refine
 from boxreg_ros.config import Ingredients
-from boxreg_ros.core import registration
+from boxreg_ros.core import estimation
+from boxreg_ros.core.estimation import estimate_windows, solve
 from boxreg_ros.core.geometry import face_distances
 from boxreg_ros.core.latency import Latency
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.problem import stack_windows
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.core.registration import register, solve
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest
@@ -463,9 +463,9 @@ def test_tracks_are_solved_together_when_a_window_is_full(monkeypatch):
 
     def noted(windows, config, model):
         calls.append({w.track_id: len(w.observations) for w in windows})
-        return register(windows, config, model)
+        return estimate_windows(windows, config, model)
 
-    monkeypatch.setattr('boxreg_ros.core.registration.register', noted)
+    monkeypatch.setattr('boxreg_ros.core.estimation.estimate_windows', noted)
     registrar = BoxRegistrar(config_with('track', track_window=12, max_gap=0.3))
     results = fed(registrar, stream_of([long, short, late])) + registrar.flush()
     assert calls == [
@@ -484,7 +484,7 @@ def test_live_windows_are_warm_after_the_first_one(monkeypatch):
         asked.append((problem.boxes.shape[1], is_warm))
         return solve(problem, config, model, is_warm)
 
-    monkeypatch.setattr(registration, 'solve', note)
+    monkeypatch.setattr(estimation, 'solve', note)
     config = config_with()
     fed(BoxRegistrar(config), stream_of([track_of(drive(8), np.random.default_rng(0), 'a')]))
     assert asked == [(3, False), (4, True), (5, True), (6, True), (6, True), (6, True)]
@@ -668,7 +668,7 @@ def test_torch_uses_one_thread_while_registering(stream, monkeypatch):
         threads.append(torch.get_num_threads())
         return stack_windows(*args)
 
-    monkeypatch.setattr('boxreg_ros.core.registration.stack_windows', noted)
+    monkeypatch.setattr('boxreg_ros.core.estimation.stack_windows', noted)
     torch.set_num_threads(2)
     try:
         run(stream, config_with())

@@ -8,13 +8,12 @@ import sys
 import time
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.estimation import estimate_windows
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.core.registration import register
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.io.compilation import announced_compilation, COMPILING
-from boxreg_ros.offline import registration_worker as registration
+from boxreg_ros.offline.estimation_worker import estimation_worker
 from boxreg_ros.offline.progress import Stopwatch
-from boxreg_ros.offline.registration_worker import registration_worker
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.relabel_command import ProgressBar
 from boxreg_ros.offline.workers import run_in_worker
@@ -156,12 +155,12 @@ def test_worker_where_sigchld_is_ignored():
 
 
 @pytest.mark.parametrize('offset_ns', [0, 30_000_000])
-def test_registration_worker_returns_the_same_boxes(stream, offset_ns):
+def test_estimation_worker_returns_the_same_boxes(stream, offset_ns):
     stream = [(type(s)(s.stamp_ns + offset_ns, s.frame_id, s.points), b) for s, b in stream]
     direct = BoxRegistrar(SHORT)
     expected = fed(direct, stream) + direct.flush()
     clock = Stopwatch()
-    with registration_worker(SHORT, clock, print) as begin:
+    with estimation_worker(SHORT, clock, print) as begin:
         registrar = BoxRegistrar(SHORT, begin)
         early = fed(registrar, stream)
         assert 0 < len(early) < len(stream)  # some boxes are returned before the end
@@ -173,13 +172,13 @@ def test_registration_worker_returns_the_same_boxes(stream, offset_ns):
     assert clock.seconds()['solve'] > 0
 
 
-def test_registrar_takes_input_while_windows_are_registered(stream):
+def test_registrar_takes_input_while_windows_are_estimated(stream):
     """Estimates are awaited when the next windows are full, or at the end."""
     events = []
 
     def begin(windows, config, model):
         events.append('begin')
-        estimates = register(windows, config, model)
+        estimates = estimate_windows(windows, config, model)
         return lambda: events.append('wait') or estimates
 
     registrar = BoxRegistrar(SHORT, begin)
@@ -197,7 +196,7 @@ def test_registrar_takes_input_while_windows_are_registered(stream):
 
 @pytest.mark.parametrize('changes', [{'estimate': 'final'}, {'solver.threads': 1}])
 def test_no_worker_for_sliding_windows_or_one_core(changes):
-    with registration_worker(SHORT.updated(changes), Stopwatch(), print) as begin:
+    with estimation_worker(SHORT.updated(changes), Stopwatch(), print) as begin:
         assert begin is None
 
 
@@ -229,8 +228,8 @@ def test_compilation_in_the_worker_is_announced_while_its_estimates_are_awaited(
     stream, monkeypatch
 ):
     texts = []
-    monkeypatch.setattr(registration, 'warm_up', compile_something)
-    with registration_worker(SHORT, Stopwatch(), texts.append) as begin:
+    monkeypatch.setattr('boxreg_ros.offline.estimation_worker.warm_up', compile_something)
+    with estimation_worker(SHORT, Stopwatch(), texts.append) as begin:
         registrar = BoxRegistrar(SHORT, begin)
         assert len(fed(registrar, stream) + registrar.flush()) == len(stream)
     assert texts == [COMPILING]
@@ -274,13 +273,13 @@ def test_exception_in_the_worker_ends_relabel(tmp_path, monkeypatch):
         raise ValueError('no such window')
 
     recording = Drive(sweeps=30).write(tmp_path / 'drive')
-    monkeypatch.setattr('boxreg_ros.core.registration.register', fail)  # the fork copies it
+    monkeypatch.setattr('boxreg_ros.core.estimation.estimate_windows', fail)  # the fork copies it
     with pytest.raises(ValueError, match='no such window'):
         relabel(Request((recording,), config=SHORT), tmp_path / 'out')
     assert sorted(item.name for item in tmp_path.iterdir()) == ['drive']
 
 
-@pytest.mark.parametrize('which', ['registers windows', 'reads the recording'])
+@pytest.mark.parametrize('which', ['estimates windows', 'reads the recording'])
 def test_killed_worker_is_an_error_with_a_remedy(tmp_path, monkeypatch, which):
     recording = Drive(sweeps=120).write(tmp_path / 'drive')
     added = []
@@ -291,7 +290,7 @@ def test_killed_worker_is_an_error_with_a_remedy(tmp_path, monkeypatch, which):
         # Boxes of the warm-up are added before there are two workers.
         pids = sorted({*children_of(parent)} - others)
         if not added and len(pids) == 2:
-            os.kill(pids[which == 'registers windows'], signal.SIGKILL)  # as without memory
+            os.kill(pids[which == 'estimates windows'], signal.SIGKILL)  # as without memory
             added.append(boxes)
         return add(self, boxes)
 
