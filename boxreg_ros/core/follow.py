@@ -10,14 +10,10 @@ from typing import NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core.following import person
 from boxreg_ros.core.following.between import between
+from boxreg_ros.core.following.object_points import Owned
+from boxreg_ros.core.following.start_speed import POSE4, Seeds
 from boxreg_ros.core.following.sweeps import ascending, nearest, Points, SightLimits, Sweeps
-from boxreg_ros.core.following.tracker import (
-    Follower,
-    Owned,
-    POSE4,
-    Seeds,
-    Way,
-)
+from boxreg_ros.core.following.tracker import Follower, Way
 from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.core.observation import GOOD_POINTS, NEARBY
 from boxreg_ros.core.refine import refined_tracks, RefinedTrack, Track

@@ -5,8 +5,9 @@ from dataclasses import replace
 from boxreg_ros import follow, ShapeError
 from boxreg_ros.core.following import person
 from boxreg_ros.core.following.between import closed
+from boxreg_ros.core.following.motion_kinds import MOTIONS, steering
 from boxreg_ros.core.following.person import corrections, DEVIATIONS
-from boxreg_ros.core.following.tracker import MOTIONS, steering, Way
+from boxreg_ros.core.following.tracker import Way
 from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.structures import BoxArray, HUMAN, INTERPOLATED

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from boxreg_ros.core.following.tracker import (
-    Follower,
-    POSE4,
-    Seeds,
-    Way,
-)
+from boxreg_ros.core.following.start_speed import POSE4, Seeds
+from boxreg_ros.core.following.tracker import Follower, Way
 from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, Ints
