@@ -14,7 +14,7 @@ from typing import TextIO
 from uuid import uuid4
 
 from boxreg_ros.errors import TransferError
-from boxreg_ros.io.storage.urls import url_of, write_text
+from boxreg_ros.io.storage.urls import url_of, write_bytes
 
 DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 """Disk full, file larger than the limit of the process, quota used up."""
@@ -38,7 +38,7 @@ def written_whole(path: Path) -> Iterator[TextIO]:
     if url_of(path) is not None:
         text = StringIO()
         yield text
-        write_text(path, text.getvalue().encode(errors='backslashreplace').decode())
+        write_bytes(path, text.getvalue().encode(errors='backslashreplace'))
         return
     partial = path.with_name(f'.{path.name}.{uuid4().hex[:8]}.partial')
     try:

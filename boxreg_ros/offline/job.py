@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 from boxreg_ros.datasets.registry import address_of, all_scenes, resolved, scene_files
 from boxreg_ros.errors import BoxregError, ConfigError, RecordingError
-from boxreg_ros.io.storage.urls import url_of
+from boxreg_ros.io.storage.urls import entries_of, url_of
 from boxreg_ros.offline.result_folder import INPUT_MODEL
 
 MANIFESTS = ('.txt', '.lst')
@@ -41,20 +41,16 @@ class Job:
     def size(self) -> int:
         """Return the size of all files on this machine [bytes]; 0 where they cannot be found."""
         with suppress(OSError, RecordingError):
-            return sum(file.stat().st_size for file in self._files())
+            local = [path for path in self._paths() if url_of(path) is None]
+            return sum(entry.size for path in local for entry in entries_of(path))
         return 0
 
-    def _files(self) -> Iterator[Path]:
-        """Yield all files of the recordings on this machine."""
+    def _paths(self) -> Iterator[Path]:
+        """Yield the files or folders of the recordings."""
         for path in self.recordings:
             address = address_of(path)
-            if address is not None:  # before `url_of`: it looks like a URL
-                yield from scene_files(address)
-                continue
-            if url_of(path) is not None:
-                continue
-            inner = sorted(path.iterdir()) if path.is_dir() else [path]
-            yield from (file for file in inner if file.is_file())
+            # Before `url_of`: an address looks like a URL.
+            yield from [path] if address is None else scene_files(address)
 
 
 def jobs_of(arguments: Sequence[Path]) -> list[Job]:

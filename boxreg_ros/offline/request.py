@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from argparse import ArgumentTypeError
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 import hashlib
 from math import isfinite
@@ -291,37 +290,19 @@ class Request:
     def drive_name(self) -> str:
         """Return a name of the drive: a hash of the names and sizes of its recordings."""
         names = [path.name for path in self.recordings]
-        files: list[tuple[str, int]] = []
-        for path in (part for recording in self.recordings for part in _parts_of(recording)):
-            if url_of(path) is not None:
-                files += [(Path(str(one.path)).name, one.size) for one in entries_of(path)]
-            elif path.is_dir():
-                inner = filter(Path.is_file, sorted(path.iterdir()))
-                files += [(file.name, file.stat().st_size) for file in inner]
-            elif path.exists():
-                files.append((path.name, path.stat().st_size))
+        parts = [part for recording in self.recordings for part in _parts_of(recording)]
+        files = [(one.path.name, one.size) for part in parts for one in entries_of(part)]
         return hashlib.sha256(repr((names, files, self.start, self.end)).encode()).hexdigest()[:16]
 
     def fingerprint(self) -> str:
         """Return a hash of the request and of its input files, by size and modification time."""
         files = []
         for path in self.inputs():
-            if url_of(path) is not None:
-                files += [(str(one.path), one.size, one.version) for one in entries_of(path)]
-        for file in self._input_files():
-            status = file.stat()
-            files.append((str(file.resolve()), status.st_size, str(status.st_mtime_ns)))
-        return hashlib.sha256(repr((__version__, self, files)).encode()).hexdigest()
-
-    def _input_files(self) -> Iterator[Path]:
-        """Yield every input file, those of folders included."""
-        for path in self.inputs():
-            if path.is_file():
-                yield path
-                continue
             # Subfolders of a recording are not part of it; one may hold the results.
-            pattern = '*' if path in self.recordings else '**/*'
-            yield from (file for file in sorted(path.glob(pattern)) if file.is_file())
+            for one in entries_of(path, is_deep=path not in self.recordings):
+                place = one.path if url_of(path) is not None else one.path.resolve()
+                files.append((str(place), one.size, one.version))
+        return hashlib.sha256(repr((__version__, self, files)).encode()).hexdigest()
 
 
 def _parts_of(path: Path) -> tuple[Path, ...]:

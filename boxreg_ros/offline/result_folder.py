@@ -13,7 +13,7 @@ import shutil
 from typing import Any
 
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.io.storage.urls import names_of, read_text, sizes_of, UPLOAD, upload, url_of
+from boxreg_ros.io.storage.urls import read_text, sizes_of, UPLOAD, upload, url_of
 from boxreg_ros.io.whole_files import DISK_ERRORS, store, store_folder, temporary_folder
 from filelock import FileLock, Timeout
 
@@ -173,7 +173,7 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
 def _uploaded_folder(out: Path) -> Iterator[Path]:
     """Yield a folder of this machine that is uploaded to the URL `out` on success."""
     if earlier_summary(out) is None:
-        names = names_of(out)
+        names = sizes_of(out)
         if names and UPLOAD not in names:
             raise _other_files(out)
     with temporary_folder() as folder:

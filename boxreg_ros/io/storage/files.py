@@ -97,40 +97,28 @@ def opened(path: Path) -> StorageFile:
             f'{str(path)!r}: expected an .mcap, .db3 or .bag file, or a rosbag2 folder, got '
             f'another; give a recording, or correct the suffix of its name'
         )
-    if url_of(path) is not None:
-        return _opened_remote(path, opener)
-    try:
-        path.open('rb').close()
-    except OSError as error:
-        raise TransferError(unreadable(path, error)) from None
-    if path.suffix not in COMPRESSED:
+    is_remote, is_compressed = url_of(path) is not None, path.suffix in COMPRESSED
+    if not is_remote:
+        try:
+            path.open('rb').close()
+        except OSError as error:
+            raise TransferError(unreadable(path, error)) from None
+    if not is_compressed and (not is_remote or opener is McapFile):  # MCAP is read by blocks
         return opener(path, None)
     with temporary_folder() as folder:
-        return _opened_compressed(path, folder, opener, path)
+        file, damage = path, None
+        if is_remote:
+            from boxreg_ros.io.storage.remote_file import download  # fsspec takes 0.5 s
 
-
-def _opened_remote(path: Path, opener: Opener) -> StorageFile:
-    """Open a file behind a URL: MCAP by blocks, a copy of other formats."""
-    from boxreg_ros.io.storage.remote_file import download  # fsspec takes 0.5 s
-
-    if opener is McapFile and path.suffix not in COMPRESSED:
-        return opener(path, None)
-    with temporary_folder() as folder:
-        copy = folder / path.name
-        download(path, copy)
-        if path.suffix in COMPRESSED:
-            return _opened_compressed(copy, folder, opener, path)
-        return opener(copy, path)
-
-
-def _opened_compressed(file: Path, folder: Path, opener: Opener, origin: Path) -> StorageFile:
-    """Unpack a file to a folder, and open it."""
-    plain = folder / file.stem
-    damage = _unpack(file, plain, origin)
-    unpacked = opener(plain, origin)
-    if damage is not None:
-        unpacked.damages = {damage: None, **unpacked.damages}
-    return unpacked
+            file = folder / path.name
+            download(path, file)
+        if is_compressed:
+            packed, file = file, folder / path.stem
+            damage = _unpack(packed, file, path)
+        found = opener(file, path)
+        if damage is not None:
+            found.damages = {damage: None, **found.damages}
+        return found
 
 
 class Files:

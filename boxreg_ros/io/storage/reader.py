@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import closing, contextmanager, ExitStack
+from contextlib import closing, ExitStack
 from types import SimpleNamespace
 from typing import Any
 
-from boxreg_ros.errors import BoxregError, RecordingError, UnsupportedMessage
+from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.storage.files import encoding_of, Files, merged_streams, Part
-from boxreg_ros.io.storage.record import Damage, one_line, Record
+from boxreg_ros.io.storage.record import Damage, one_line, readable, Record
 from rosbags.interfaces import Connection
 import zstandard
 
 MESSAGE_MARKS = ('__msgtype__', 'DESCRIPTOR', 'get_fields_and_field_types')
 """Class attributes of messages: of rosbags, of protobuf, of rclpy."""
+RECORDINGS = 'an MCAP file, rosbag2 folder, .db3 file or ROS 1 bag'
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 """Begin of a message that rosbag2 has compressed; CDR begins with 0 and 0 to 3."""
 MAX_MESSAGE_BYTES = 2**30
@@ -81,7 +82,7 @@ class Reader:
                 streams.append(
                     (file.start_time, _renamed(file.messages(own, start, stop), wanted))
                 )
-        with readable(self._origin):  # no code of ours runs in the streams
+        with readable(self._origin, RECORDINGS, 'copy it again, or leave it out'):
             yield from merged_streams(streams)
 
 
@@ -101,26 +102,6 @@ def decompressed(data: bytes) -> bytes:
         return zstandard.decompress(data, MAX_MESSAGE_BYTES if size < 0 else size)
     except zstandard.ZstdError as error:
         raise UnsupportedMessage(one_line(error)) from None
-
-
-@contextmanager
-def readable(origin: str) -> Iterator[None]:
-    """
-    Turn errors of the formats' libraries into RecordingError; `origin` names the files.
-
-    Damaged files make these libraries, sqlite3 and the decompressors raise errors of any class,
-    so only calls of these libraries may stand in the block.
-
-    """
-    try:
-        yield
-    except BoxregError:
-        raise
-    except Exception as error:
-        raise RecordingError(
-            f'{origin}: expected an MCAP file, rosbag2 folder, .db3 file or ROS 1 bag, got: '
-            f'{one_line(error)}; copy or record it again'
-        ) from None
 
 
 def is_message(value: object) -> bool:

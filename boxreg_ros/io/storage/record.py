@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from boxreg_ros.errors import BoxregError, RecordingError, TransferError, unreadable
 from rosbags.interfaces import Connection
 
 NO_MESSAGES_NS = (2**63 - 1, 0)
@@ -96,3 +98,50 @@ def shown(path: Path, origin: Path | None) -> str:
 def one_line(error: Exception) -> str:
     """Return the text of an error in one line."""
     return ' '.join(str(error).split()).rstrip('.') or type(error).__name__
+
+
+@contextmanager
+def readable(
+    name: str, expected: str, remedy: str, transfer_errors: tuple[type[Exception], ...] = ()
+) -> Iterator[None]:
+    """
+    Turn errors of the libraries that read a file in a block into errors with a remedy.
+
+    Damaged files make these libraries raise errors of any class, so only calls of them may stand
+    in the block.
+
+    Parameters
+    ----------
+    name
+        The file, or several.
+    expected
+        What it should be.
+    remedy
+        What helps where its content is damaged.
+    transfer_errors
+        Errors of the library that are not about the content: no room for a sort, say.
+
+    Raises
+    ------
+    RecordingError
+        If the content is damaged.
+    TransferError
+        If its bytes cannot be read.
+
+    """
+    try:
+        yield
+    except BoxregError:
+        raise
+    except Exception as error:
+        cause = error.__cause__ or error
+        if isinstance(cause, OSError) and cause.errno is not None:
+            raise TransferError(unreadable(name, cause)) from None
+        if isinstance(cause, transfer_errors):
+            raise TransferError(
+                f'{name}: cannot be read: {one_line(error)}; check its disk, and the room in the '
+                f'folder of temporary files (TMPDIR)'
+            ) from None
+        raise RecordingError(
+            f'{name}: expected {expected}, got: {one_line(error)}; {remedy}'
+        ) from None

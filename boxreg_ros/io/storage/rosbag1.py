@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-from boxreg_ros.errors import BoxregError, RecordingError, TransferError, unreadable
-from boxreg_ros.io.storage.record import Damage, Damages, one_line, Record, shown
+from boxreg_ros.io.storage.record import Damage, Damages, readable, Record, shown
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import ChunkInfo
@@ -73,21 +72,10 @@ class Rosbag1File:
             reason = 'bytes behind the index are not read'
             self.damages[Damage(self.name, reason, end_byte, size)] = None
 
-    @contextmanager
-    def _readable(self) -> Iterator[None]:
-        """Turn the errors of rosbags in a block into RecordingError."""
-        try:
-            yield
-        except BoxregError:
-            raise
-        except Exception as error:  # of any class, for malformed content
-            cause = error.__cause__ or error
-            if isinstance(cause, OSError) and cause.errno is not None:
-                raise TransferError(unreadable(self.name, cause)) from None
-            raise RecordingError(
-                f'{self.name}: expected a whole ROS 1 bag with an index, got: {one_line(error)}; '
-                f'copy it again, or mend it by ROS 1: rosbag reindex {self.name}'
-            ) from None
+    def _readable(self) -> AbstractContextManager[None]:
+        """Return a block in which errors of rosbags become errors with a remedy."""
+        remedy = f'copy it again, or mend it by ROS 1: rosbag reindex {self.name}'
+        return readable(self.name, 'a whole ROS 1 bag with an index', remedy)
 
 
 class _Reader(Reader):

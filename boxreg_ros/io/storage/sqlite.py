@@ -9,14 +9,13 @@ topic whose definition was not found, or on a path with characters that have a m
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from pathlib import Path
 import shutil
 from urllib.parse import quote
 
 import apsw
-from boxreg_ros.errors import BoxregError, RecordingError, TransferError
-from boxreg_ros.io.storage.record import Damage, Damages, one_line, Record, shown
+from boxreg_ros.io.storage.record import Damage, Damages, readable, Record, shown
 from boxreg_ros.io.whole_files import temporary_folder
 from rosbags.interfaces import Connection
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
@@ -108,24 +107,15 @@ class SqliteFile:
     def _note(self, reason: str, time_ns: int | None = None) -> None:
         self.damages[Damage(self.name, reason, None, None, time_ns, time_ns)] = None
 
-    @contextmanager
-    def _readable(self) -> Iterator[None]:
-        """Turn the errors of rosbags and sqlite in a block into errors with a remedy."""
-        try:
-            yield
-        except BoxregError:
-            raise
-        except Exception as error:  # of any class, for malformed content
-            if isinstance(error.__cause__ or error, TRANSFER_ERRORS):
-                raise TransferError(
-                    f'{self.name}: cannot be read: {one_line(error)}; check its disk, and the '
-                    f'room in the folder of temporary files (TMPDIR)'
-                ) from None
-            raise RecordingError(
-                f'{self.name}: expected a whole database of rosbag2, got: {one_line(error)}; copy '
-                f'it again, or read what is left of it: sqlite3 {self.name} .recover | sqlite3 '
-                f'recovered.db3'
-            ) from None
+    def _readable(self) -> AbstractContextManager[None]:
+        """Return a block in which errors of rosbags and sqlite become errors with a remedy."""
+        return readable(
+            self.name,
+            'a whole database of rosbag2',
+            f'copy it again, or read what is left of it: sqlite3 {self.name} .recover | sqlite3 '
+            f'recovered.db3',
+            TRANSFER_ERRORS,
+        )
 
 
 @contextmanager

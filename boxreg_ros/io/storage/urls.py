@@ -37,7 +37,7 @@ _T = TypeVar('_T')
 
 
 class Entry(NamedTuple):
-    """Name, size [bytes] and version (tag or time) of a file behind a URL."""
+    """Name, size [bytes] and version (tag or time) of a file."""
 
     path: Path
     size: int
@@ -57,8 +57,27 @@ def entry_of(path: Path) -> Entry:
     return _entry(path, about)
 
 
-def entries_of(path: Path) -> list[Entry]:
-    """Return a file behind a URL, or the files in the folder that it is, sorted by name."""
+def entries_of(path: Path, is_deep: bool = False) -> list[Entry]:
+    """
+    Return a file, or the files in the folder that it is, sorted by name; none if there is none.
+
+    Parameters
+    ----------
+    path
+        A path of this machine, or a URL.
+    is_deep
+        Whether files in folders of it belong to it, too; of this machine only.
+
+    Raises
+    ------
+    TransferError
+        If there is nothing behind a URL, or no answer.
+
+    """
+    if url_of(path) is None:
+        inner = sorted(path.glob('**/*' if is_deep else '*')) if path.is_dir() else [path]
+        found = [(file, file.stat()) for file in inner if file.is_file()]
+        return [Entry(file, about.st_size, str(about.st_mtime_ns)) for file, about in found]
     system, name = system_of(path)
     about = answer_of(path, lambda: system.info(name, **limit_of(system)))
     if about['type'] != 'directory':
@@ -73,21 +92,11 @@ def read_text(path: Path) -> str:
     """Return the text of a file of this machine or behind a URL; OSError if there is none."""
     if url_of(path) is None:
         return path.read_text(encoding='utf-8')
-    return read_bytes(path).decode()
-
-
-def read_bytes(path: Path) -> bytes:
-    """Return the content of a file behind a URL; OSError if there is none."""
     system, name = system_of(path)
     content = answer_of(
         path, lambda: system.cat_file(name, **limit_of(system)), missing_is_error=False
     )
-    return bytes(content)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file behind a URL; it appears whole."""
-    write_bytes(path, text.encode())
+    return bytes(content).decode()
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -101,11 +110,6 @@ def delete_files(path: Path, names: Iterable[str]) -> None:
     system, name = system_of(path)
     for one in names:
         answer_of(path, partial(system.rm_file, f'{name}/{one}'))
-
-
-def names_of(path: Path) -> list[str]:
-    """Return the names of all files below a folder behind a URL; none if it does not exist."""
-    return list(sizes_of(path))
 
 
 def sizes_of(path: Path) -> dict[str, int]:
@@ -128,7 +132,7 @@ def upload(folder: Path, target: Path, last: str) -> None:
     system, name = system_of(target)
     files = {str(file.relative_to(folder)) for file in folder.rglob('*') if file.is_file()}
     write_bytes(target / UPLOAD, b'')
-    old = names_of(target)
+    old = sizes_of(target)
     first_deleted = [last] if last in old else []
     delete_files(target, [*first_deleted, *sorted(set(old) - files - {last, UPLOAD})])
     for file in sorted(files, key=lambda file: (file == last, file)):
