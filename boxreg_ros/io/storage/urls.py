@@ -75,9 +75,9 @@ def entries_of(path: Path, is_deep: bool = False) -> list[Entry]:
 
     """
     if url_of(path) is None:
-        inner = sorted(path.glob('**/*' if is_deep else '*')) if path.is_dir() else [path]
-        found = [(file, file.stat()) for file in inner if file.is_file()]
-        return [Entry(file, about.st_size, str(about.st_mtime_ns)) for file, about in found]
+        paths = sorted(path.glob('**/*' if is_deep else '*')) if path.is_dir() else [path]
+        found = [(file, file.stat()) for file in paths if file.is_file()]
+        return [Entry(file, status.st_size, str(status.st_mtime_ns)) for file, status in found]
     system, name = system_of(path)
     about = answer_of(path, lambda: system.info(name, **limit_of(system)))
     if about['type'] != 'directory':
