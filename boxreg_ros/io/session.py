@@ -23,7 +23,7 @@ from boxreg_ros.io.id_assignment import IdCheck, Tracker
 from boxreg_ros.io.lidars import ignore, MergedSweep, Report, SensorPlacement, SweepMerger
 from boxreg_ros.io.motion_check import MotionCheck
 from boxreg_ros.io.pose_check import PoseCheck
-from boxreg_ros.io.transforms import move_to_frame, TransformTree
+from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame, TransformTree
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention
@@ -142,12 +142,13 @@ class Session:
             missing = Reason.SWEEP_WITHOUT_TRANSFORM if is_sweep else Reason.NO_TRANSFORM
             return Admitted(None, None, missing, str(error))
         reason, detail = None, ''
-        moved = move_to_frame(item, T_fixed_item, self.fixed_frame)
-        if isinstance(moved, Sweep):
+        moved: Sweep | BoxArray
+        if isinstance(item, Sweep):
+            moved = sweep_to_frame(item, T_fixed_item, self.fixed_frame)
             moved, reason, detail = self.placement.placed(moved, self.tree)
         else:
             motion = self.tree.motion(self.fixed_frame, item.frame_id, item.stamp_ns)
-            moved = replace(moved, motion=motion)
+            moved = boxes_to_frame(item, T_fixed_item, self.fixed_frame, motion)
         self._pose_check.add(moved)
         if isinstance(moved, BoxArray):
             if self._tracker is not None:

@@ -720,10 +720,12 @@ def move_to_frame(item: Sweep | BoxArray, T_frame_item: Floats, frame_id: str) -
     return boxes_to_frame(item, T_frame_item, frame_id)
 
 
-def boxes_to_frame(boxes: BoxArray, T_frame_boxes: Floats, frame_id: str) -> BoxArray:
-    """Return the boxes in another frame; NaN stays NaN."""
+def boxes_to_frame(
+    boxes: BoxArray, T_frame_boxes: Floats, frame_id: str, motion: FrameMotion | None = None
+) -> BoxArray:
+    """Return the boxes in another frame, with the `motion` of their own; NaN stays NaN."""
     moved = moved_boxes(boxes.boxes, T_frame_boxes)
-    return replace(boxes, frame_id=frame_id, boxes=moved, motion=None)
+    return replace(boxes, frame_id=frame_id, boxes=moved, motion=motion)
 
 
 def moved_boxes(boxes: Floats, T_frame_boxes: Floats) -> Floats:

@@ -83,12 +83,13 @@ class Tickets:
 
         """
         assert isinstance(item.content, BoxArray)
+        has_new_ids = moved.track_ids != item.content.track_ids
         ticket = Ticket(
             item.message,
-            replace(shown, track_ids=moved.track_ids),
+            replace(shown, track_ids=moved.track_ids) if has_new_ids else shown,
             item.received,
             frame,
-            moved.track_ids != item.content.track_ids,
+            has_new_ids,
             self._earlier(item.message, moved, config),
         )
         return replace(moved, ticket=ticket)
