@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+import shlex
 from typing import Any
 
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MERGED, CLOUD_MISSING
@@ -54,6 +55,12 @@ def closing_line(summary: Summary, out: Path) -> str:
     if Reason.UNREADABLE in summary.dropped:
         line += f'; {summary.dropped["unreadable"]:,} messages could not be read'
     return line
+
+
+def next_line(out: Path, has_report: bool) -> str:
+    """Return the command to look at a result."""
+    command = f'next: boxreg review {shlex.quote(str(out))}'
+    return command if has_report else f'{command} (after the same run with --report)'
 
 
 def unused_line(unused: Sequence[str]) -> str:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
+import os
 from pathlib import Path
 import sys
 from typing import Self, TYPE_CHECKING
 
 from boxreg_ros.io.compilation import COMPILING
+from boxreg_ros.io.steps import advanced, PROGRESS
 from boxreg_ros.offline.arguments import (
     add_options,
     add_recordings,
@@ -91,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     the result is kept.
 
     """
-    from boxreg_ros.offline.notes import closing_line, notes
+    from boxreg_ros.offline.notes import closing_line, next_line, notes
     from boxreg_ros.offline.relabel import relabel
 
     request = request_from(args)
@@ -105,6 +107,8 @@ def run(args: argparse.Namespace) -> int:
     for note in notes(summary):
         print(f'boxreg: {note}', file=sys.stderr)
     print(closing_line(summary, args.out))
+    if PROGRESS not in os.environ:  # a person has started it
+        print(next_line(args.out, request.report))
     problem = unmet(summary, demands)
     if problem:
         print(f'boxreg: {problem}', file=sys.stderr)
@@ -161,6 +165,7 @@ class ProgressBar(Progress):
         if done > self._done:
             self._bar.update(done - self._done)
             self._done = done
+            advanced(done, total)
 
     def announce(self, activity: str) -> None:
         """Show the activity that the run waits for beside the bar."""

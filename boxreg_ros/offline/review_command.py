@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 import json
+import os
 from pathlib import Path
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from typing import NoReturn
 from boxreg_ros.config import Config
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.steps import PROGRESS
 from boxreg_ros.io.storage.files import METADATA
 from boxreg_ros.offline import relabel_command
 from boxreg_ros.offline.arguments import (
@@ -27,7 +29,7 @@ from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_summary
 from boxreg_ros.offline.sources import scene_address
 from boxreg_ros.review.scene import DriveSource
-from boxreg_ros.review.server import add_server_arguments, serve
+from boxreg_ros.review.server import add_server_arguments, classes_of, serve
 from msg_adapters import ADAPTERS
 
 
@@ -68,7 +70,9 @@ def run(args: argparse.Namespace) -> int:
     request = request_from(arguments_of(words))
     if whole_summary(out, request.fingerprint()) is None:  # else it may have been reviewed
         command = [sys.executable, '-m', 'boxreg_ros.cli', 'relabel', *words]
-        done = subprocess.run(command, check=False)
+        # This program goes on, not the person.
+        environment = {**os.environ, PROGRESS: os.devnull}
+        done = subprocess.run(command, check=False, env=environment)
         if done.returncode:
             return done.returncode
     return _serve([out], args)
@@ -95,7 +99,7 @@ def _has_no_boxes(args: argparse.Namespace) -> bool:
 
 def _serve(outs: Sequence[Path], args: argparse.Namespace) -> int:
     results = [(out, drive_of(out) if (out / SUMMARY).is_file() else None) for out in outs]
-    return serve(results, args.port, args.who)
+    return serve(results, args.port, args.who, args.opens, classes_of(args.classes))
 
 
 def _print_progress(outs: Sequence[Path]) -> int:
@@ -120,7 +124,17 @@ def drive_of(out: Path) -> DriveSource | None:
         values['labels'] = name, _within(folder, path)
     request = Request(tuple(_within(folder, path) for path in args.recordings), **values)
     config = Config.from_yaml(out / CONFIG)
-    return DriveSource(request.recording, request.convention, summary['fixed_frame'], config)
+    return DriveSource(
+        request.recording, request.convention, summary['fixed_frame'], config, _titles,
+        tuple(request.formats),
+    )  # fmt: skip
+
+
+def _titles() -> dict[str, str]:
+    """Return the label formats with their titles."""
+    from boxreg_ros.offline.formats import rows
+
+    return {name: title for name, title, *_ in rows()}
 
 
 class _Parser(argparse.ArgumentParser):
