@@ -21,6 +21,9 @@ os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 # The wheels of ROS need it where ROS itself is not installed.
 os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
 
+# The secret of the tests' reviews, not that of the user.
+os.environ['XDG_STATE_HOME'] = str(Path(tempfile.gettempdir(), f'boxreg_ros_state_{os.getpid()}'))
+
 # A shell without job control starts background processes with SIGINT ignored, and their children
 # inherit this. `boxreg` then ignores SIGINT as well, but some tests send it.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -3,28 +3,36 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from datetime import datetime, UTC
+import os
 from pathlib import Path
+import re
 import secrets
 import sys
+from tempfile import NamedTemporaryFile
 from threading import Lock, Thread
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
+from zipfile import ZipFile
 
 import anyio
 from boxreg_ros.errors import BoxregError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.steps import PIPE
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, WITH_BOX
+from boxreg_ros.review.differences import differences
 from boxreg_ros.review.progress import agreement_text, PAUSE, progress_of, total, UNREAD
 from boxreg_ros.review.report import page_environment, PAGE_VERSION, REPORT, style
 from boxreg_ros.review.requests import box_of, json_of, posted, STAMP, stamp_of, text_of
 from boxreg_ros.review.scene import DriveSource
 from boxreg_ros.review.scene_routes import SceneRoutes
 from boxreg_ros.review.solve import ReportParts
+from boxreg_ros.review.token import review_token
 import orjson
 from starlette import responses
 from starlette.applications import Starlette
+from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -34,6 +42,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 PROPOSALS = 'proposals.csv'
+BOXES = 'boxes.csv'
+SUMMARY = 'summary.json'
 MAX_ROWS = 10_000
 """Most decisions of a request: a track that is made of as many parts; chosen."""
 OPEN_SECONDS = 600.0
@@ -61,12 +71,21 @@ DRIVES_TEMPLATE = 'drives.html.j2'
 DRIVES_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'"
 
 
+class ReviewApplication(NamedTuple):
+    """The application, its token, and the reviews that it serves."""
+
+    application: ASGIApp
+    token: str
+    reviews: list[Review]
+
+
 def review_application(
     results: Sequence[tuple[Path, DriveSource | None]],
     port: int,
     who: str,
     is_ending: Callable[[], bool],
-) -> tuple[ASGIApp, str]:
+    classes: Sequence[str] = (),
+) -> ReviewApplication:
     """
     Return the application for result folders, and the token that requests need.
 
@@ -77,11 +96,11 @@ def review_application(
     RecordingError if decisions or summary cannot be read.
 
     """
-    token = secrets.token_urlsafe(16)
-    reviews = [_Review(out, who, is_ending, source) for out, source in results]
+    token = review_token([out for out, _ in results])
+    reviews = [Review(out, who, is_ending, source, token, classes) for out, source in results]
     applications = [review.application() for review in reviews]
     if len(reviews) == 1:
-        return _Guard(applications[0], port, token), token
+        return ReviewApplication(_Guard(applications[0], port, token), token, reviews)
 
     async def page(_: Request) -> Response:
         text = await run_in_threadpool(_page_of_drives, reviews)
@@ -89,7 +108,8 @@ def review_application(
         return responses.HTMLResponse(text, headers=headers)
 
     mounts = [Mount(f'/{number}', app=one) for number, one in enumerate(applications)]
-    return _Guard(Starlette(routes=[Route('/', page), *mounts]), port, token), token
+    application = Starlette(routes=[Route('/', page), *mounts])
+    return ReviewApplication(_Guard(application, port, token), token, reviews)
 
 
 class _Guard:
@@ -131,12 +151,33 @@ class _Guard:
         await answer(scope, receive, send_with_headers)
 
 
-class _Review:
-    """The state of a review, and the answers to its requests."""
+class Review:
+    """The state of a review, and the answers to its requests. It goes on in what it writes."""
 
     def __init__(
-        self, out: Path, who: str, is_ending: Callable[[], bool], source: DriveSource | None
+        self,
+        out: Path,
+        who: str,
+        is_ending: Callable[[], bool],
+        source: DriveSource | None,
+        token: str,
+        classes: Sequence[str] = (),
     ) -> None:
+        self._classes = list(classes)
+        self.listeners = 0
+        self._open: dict[str, tuple[str, float]] = {}  # tracks by page, and since when
+        self._who = who
+        self._token = token
+        self._log_lock = Lock()
+        self._save_lock = asyncio.Lock()
+        self._is_ending = is_ending
+        self._source = source
+        self._progress = ''  # of the run that writes labels, as JSON
+        self._written = 0  # how often labels were written
+        self._load(out)
+
+    def _load(self, out: Path) -> None:
+        """Take over a result."""
         self._page = (out / REPORT).read_bytes()
         if MARK not in self._page[:MARK_WITHIN]:
             raise RecordingError(
@@ -144,18 +185,12 @@ class _Review:
                 f'boxreg relabel RECORDING -o NEW --report with the same options'
             )
         self._parts = ReportParts(out, self._page)
-        self._summary = orjson.loads((out / 'summary.json').read_bytes())
+        self._summary = orjson.loads((out / SUMMARY).read_bytes())
         self._frame_id: str = self._summary['fixed_frame']
         self.out = out
-        self.listeners = 0
-        self._open: dict[str, tuple[str, float]] = {}  # tracks by page, and since when
-        self._who = who
         self._proposals = _proposals_of(out)
+        self._changes = _changes_of(out, self._summary)
         self._log = DecisionLog(out / DECISIONS)
-        self._log_lock = Lock()
-        self._save_lock = asyncio.Lock()
-        self._is_ending = is_ending
-        self._source = source
         Thread(target=self._parts.warm_up, daemon=True).start()
 
     def application(self) -> Starlette:
@@ -166,9 +201,11 @@ class _Review:
             Route('/decisions', self.decide, methods=['POST']),
             Route('/events', self.events),
             Route('/open', self.note_open, methods=['POST']),
-            Route('/solve', posted(self._parts.solved), methods=['POST']),
-            Route('/risk', posted(self._parts.risks), methods=['POST']),
+            Route('/solve', posted(lambda sent: self._parts.solved(sent)), methods=['POST']),
+            Route('/risk', posted(lambda sent: self._parts.risks(sent)), methods=['POST']),
             Route('/save', self.save, methods=['POST']),
+            Route('/files', self.files),
+            Route('/download', self.download),
         ]
         if self._source is not None:
             routes += SceneRoutes(self._source, self._frame_id).routes()
@@ -187,7 +224,14 @@ class _Review:
         """Return all decisions."""
         await run_in_threadpool(self._refresh)
         has_scene = self._source is not None
-        more = {'who': self._who, 'has_scene': has_scene, 'proposals': self._proposals}
+        more = {
+            'who': self._who,
+            'token': self._token,
+            'has_scene': has_scene,
+            'proposals': self._proposals,
+            'changes': self._changes,
+            'classes': self._classes,
+        }
         return JSONResponse({**self._since(0), **more})
 
     async def decide(self, request: Request) -> Response:
@@ -220,11 +264,51 @@ class _Review:
 
     async def save(self, request: Request) -> Response:
         """Run the command of the result again with the decisions, into a folder beside it."""
-        await json_of(request)
+        formats = await run_in_threadpool(self._formats_of, await json_of(request))
         if self._save_lock.locked():
             raise HTTPException(409, 'label files are being written already: wait for them')
         async with self._save_lock:
-            return await self._relabel()
+            try:
+                return await self._relabel(formats)
+            finally:
+                self._progress = ''
+
+    async def files(self, _: Request) -> Response:
+        """Return the files of the result, and the formats that can be written."""
+        listed = self._summary.get('files', {}).items()
+        formats = {} if self._source is None else await run_in_threadpool(self._source.formats)
+        chosen = () if self._source is None else self._source.chosen
+        return JSONResponse({
+            'folder': str(self.out.resolve()),
+            'files': [{'name': name, 'size': about['size']} for name, about in listed],
+            'formats': [
+                {'name': name, 'title': title, 'is_chosen': name in chosen}
+                for name, title in formats.items()
+            ],
+        })  # fmt: skip
+
+    async def download(self, request: Request) -> Response:
+        """Return a file of the result, or a folder of it as one archive."""
+        name = request.query_params.get('name', '')
+        names = [SUMMARY, *self._summary.get('files', {})]
+        if name in names:
+            return responses.FileResponse(self.out / name, filename=Path(name).name)
+        inside = [one for one in names if one.startswith(f'{name}/')]
+        if not inside:
+            raise RecordingError(f'name: expected a file of the result, got {name!r:.80}')
+        path = await run_in_threadpool(_archive, self.out, inside)
+        task = BackgroundTask(path.unlink)
+        return responses.FileResponse(path, filename=f'{Path(name).name}.zip', background=task)
+
+    def _formats_of(self, sent: Mapping[str, Any]) -> list[str]:
+        """Return the formats that a request asks for; none for those of the result."""
+        names = sent.get('formats', [])
+        known = {} if self._source is None or not names else self._source.formats()
+        if not isinstance(names, list) or not all(name in known for name in names):
+            raise RecordingError(
+                f'formats: expected some of {", ".join(known)}, got {names!r:.80}'
+            )
+        return names
 
     def _refresh(self) -> None:
         with self._log_lock:
@@ -254,8 +338,15 @@ class _Review:
     async def _stream(self, seen: int) -> AsyncIterator[bytes]:
         yield b'retry: 1000\n\n'
         self.listeners += 1
+        progress, written = '', self._written
         try:
             while not self._is_ending():
+                if self._progress != progress:
+                    progress = self._progress
+                    yield f'event: progress\ndata: {progress or "{}"}\n\n'.encode()
+                if self._written != written:
+                    written = self._written
+                    yield f'event: written\ndata: {written}\n\n'.encode()
                 await run_in_threadpool(self._refresh)
                 if len(self._log.decisions) != seen:
                     first = seen if seen < len(self._log.decisions) else 0
@@ -281,10 +372,10 @@ class _Review:
             end_ns=stamp_of(sent, 'end_ns'),
             value=text_of(sent, 'value'),
             who=text_of(sent, 'who') or self._who,
-            when=datetime.now(UTC).isoformat(timespec='seconds'),
+            when=datetime.now(UTC).isoformat(timespec='milliseconds'),
         )
 
-    async def _relabel(self) -> Response:
+    async def _relabel(self, formats: Sequence[str]) -> Response:
         command = self._summary['command']
         folder = Path(self._summary['folder'])
         decisions = (self.out / DECISIONS).resolve()
@@ -294,27 +385,58 @@ class _Review:
                 f'{command[:1]}, or the folder is gone; run boxreg relabel RECORDING -o NEW '
                 f'--decisions {decisions}'
             )
-        out = self.out.resolve()
-        new = out.with_name(f'{out.name}.corrected')
+        new = _next_folder(self.out.resolve())
         more = ['-o', str(new), '--report']
+        if formats:
+            more += ['--formats', ','.join(formats)]
         if decisions.exists():
             more += ['--decisions', str(decisions)]
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, '-m', 'boxreg_ros.cli', *command, *more,
-            cwd=folder,
-            stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
-        )  # fmt: skip
+        steps, step = os.pipe()
+        os.set_blocking(step, False)  # a run does not wait for its reader
+        try:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable, '-m', 'boxreg_ros.cli', *command, *more,
+                cwd=folder, pass_fds=[step], env={**os.environ, PIPE: str(step)},
+                stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+            )  # fmt: skip
+        finally:
+            os.close(step)
+        watching = asyncio.create_task(self._watch(steps))
         try:
             output, errors = await process.communicate()
         finally:
+            watching.cancel()
             if process.returncode is None:
                 process.terminate()  # it removes what it has begun
         lines = [part.decode(errors='replace').splitlines() for part in (output, errors)]
         if not lines[0]:  # nothing was written
             raise RecordingError(lines[1][-1] if lines[1] else 'boxreg relabel failed')
         error = lines[1].pop() if process.returncode and lines[1] else ''
-        found = {'out': str(new), 'line': lines[0][-1], 'notes': lines[1], 'error': error}
-        return JSONResponse(found)
+        await run_in_threadpool(self._go_on_in, new)
+        found = {'line': lines[0][-1], 'notes': lines[1], 'error': error}
+        return JSONResponse({'out': str(new), 'written': self._written, **found})
+
+    async def _watch(self, steps: int) -> None:
+        """Note the progress of a run, a line of which is what is done, and the total [s]."""
+        reader = asyncio.StreamReader()
+        with os.fdopen(steps, 'rb') as pipe:
+            loop = asyncio.get_running_loop()
+            await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), pipe)
+            async for line in reader:
+                done, total_seconds = map(float, line.split())
+                if total_seconds:
+                    self._progress = orjson.dumps({'done': done, 'total': total_seconds}).decode()
+
+    def _go_on_in(self, new: Path) -> None:
+        """Go on in the result that was written, with what was decided meanwhile."""
+        with self._log_lock, self._log.locked():
+            before = list(self._log.decisions)
+            self._load(new)
+            late = before[len(self._log.decisions) :]
+            if late:
+                self._log.append(late)
+        self._written += 1
+        print(f'written: {new}; to go on another time: boxreg review {new}', flush=True)
 
 
 async def _refused(_: Request, error: Exception) -> Response:
@@ -325,7 +447,41 @@ async def _failed(_: Request, error: Exception) -> Response:
     return PlainTextResponse(f'expected a file that can be written, got: {error}', 500)
 
 
-def _page_of_drives(reviews: Sequence[_Review]) -> str:
+def _changes_of(out: Path, summary: Mapping[str, Any]) -> list[dict[str, Any]] | None:
+    """Return what changed since the result whose decisions this one has; None without one."""
+    command = summary['command'][::-1]  # of several, the last one holds
+    if '--decisions' not in command:
+        return None
+    path = command[command.index('--decisions') - 1]
+    earlier = Path(summary['folder'], path).parent
+    if not (earlier / BOXES).is_file() or earlier.resolve() == out.resolve():
+        return None
+    return differences(BoxTable.read(earlier / BOXES), BoxTable.read(out / BOXES))
+
+
+def _next_folder(out: Path) -> Path:
+    """Return the folder beside a result for the labels with its decisions; no other's is lost."""
+    found = re.fullmatch(r'(.+)\.corrected(?:-(\d+))?', out.name)
+    base, number = (found[1], int(found[2] or 1)) if found else (out.name, 0)
+    ours = out / DECISIONS
+    known = ours.read_bytes() if ours.exists() else b''
+    while True:
+        number += 1
+        new = out.with_name(f'{base}.corrected' + (f'-{number}' if number > 1 else ''))
+        theirs = new / DECISIONS
+        if not theirs.exists() or known.startswith(theirs.read_bytes()):
+            return new
+
+
+def _archive(out: Path, names: Sequence[str]) -> Path:
+    """Return a temporary archive of some files of a result."""
+    with NamedTemporaryFile(suffix='.zip', delete=False) as file, ZipFile(file, 'w') as archive:
+        for name in names:
+            archive.write(out / name, name)
+    return Path(file.name)
+
+
+def _page_of_drives(reviews: Sequence[Review]) -> str:
     """Return the page of the progress of all drives, the most risk left first."""
     found = []
     problems = []

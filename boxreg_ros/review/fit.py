@@ -28,7 +28,7 @@ MAX_HEIGHT = 4.5
 MAX_AWAY = 1.5
 """An object is not farther from the place that a person points at [m]; chosen."""
 MIN_POINTS = 5
-"""Fewer points do not show an object."""
+"""Fewer points do not show the shape of an object."""
 ANGLES = np.radians(np.arange(0, 90, 1.5))
 """Headings that are tried [rad]."""
 LEAST_DISTANCE = 0.05
@@ -66,8 +66,9 @@ def fitted(
     The points (M, 3) around it that are above the road and touch each other are the object. The
     heading is that whose sides are nearest to the points (the closeness of L-shapes), and the half
     of it that is nearer to the heading of the sensor [rad]. Sides that the sensor, at (2,), does
-    not see are completed by the size of the class, one of `extents` or of `USUAL_EXTENTS`. Raises
-    RecordingError if there is no object at the place.
+    not see are completed by the size of the class, one of `extents` or of `USUAL_EXTENTS`. Fewer
+    than `MIN_POINTS` points get a box of the usual size around their middle, of the first class.
+    Raises RecordingError if there is no point of an object at the place.
 
     """
     near = points[(np.abs(points[:, :2] - place) < FIT_REACH).all(1)].astype(np.float64)
@@ -75,12 +76,17 @@ def fitted(
     height = near[:, 2] - road
     near, road = (a[(height > FIT_CLEARANCE) & (height < MAX_HEIGHT)] for a in (near, road))
     own = _touching(near[:, :2], place)
-    if own.sum() < MIN_POINTS:
+    if not own.any():
         raise RecordingError(
-            f'place: expected points of an object above the road, got {own.sum()} within '
-            f'{MAX_AWAY:g} m of it; point at the middle of its points, or at another sweep'
+            f'place: expected points of an object above the road, got none within '
+            f'{MAX_AWAY:g} m of it; point at its points, or drag from its rear to its front'
         )
     cluster, bottom = near[own], float(np.median(road[own]))
+    if len(cluster) < MIN_POINTS:
+        class_name, usual = next(iter((extents or USUAL_EXTENTS).items()))
+        center = cluster[:, :2].mean(0)
+        pose = [*center, bottom + usual[2] / 2, *usual, 0, 0, heading]
+        return Fitted(np.array(pose), class_name, len(cluster))
     yaw, class_name, usual = _shape(cluster, bottom, extents or USUAL_EXTENTS)
     if np.cos(yaw - heading) < 0:
         yaw += np.pi

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from typing import Any, NamedTuple, Protocol
 import zlib
 
+from boxreg_ros.core.observation import GROUND_CLEARANCE
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.review.changes import ious, median, TrackChanges
 from boxreg_ros.review.quality import quality
@@ -21,6 +22,7 @@ from boxreg_ros.structures import (
     COASTED,
     EXTENDED,
     Floats,
+    HEIGHT,
     HUMAN,
     INTERPOLATED,
     Ints,
@@ -153,6 +155,7 @@ class TrackPart:
             'begin': int(track.stamps_ns[0] - stamps_ns[0]) * 1e-9,
             'seconds': float(track.stamps_ns[-1] - track.stamps_ns[0]) * 1e-9,
             'points': median(track.num_points),
+            'near': self._near(),
             'refined': float(track.is_refined.sum() / boxes) if boxes else None,
             'status': dict(status),
             'reasons': dict(Counter(filter(None, track.reasons.tolist())).most_common()),
@@ -171,6 +174,13 @@ class TrackPart:
             'why': self._why,
             'added': _is_added(track),
         }
+
+    def _near(self) -> float:
+        """Return the median number of points near a box that are above its lower face."""
+        known = np.where(np.isfinite(self._track.boxes), self._track.boxes, self._track.given)
+        floor = known[:, Z] - known[:, HEIGHT] / 2 + GROUND_CLEARANCE
+        pairs = zip(self._points, floor, strict=True)
+        return median([float((points[:, Z] > lowest).sum()) for points, lowest in pairs])
 
     def part(self, begin_ns: int, max_points: int) -> dict[str, Any]:
         """Return all boxes of the track, with at most `max_points` points each."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from tempfile import gettempdir
@@ -48,6 +48,10 @@ class DriveSource:
     """Of the result."""
     config: Config
     """Of the result."""
+    formats: Callable[[], Mapping[str, str]] = dict
+    """Returns the label formats that can be written, each with its title."""
+    chosen: Sequence[str] = ()
+    """Those of the result."""
 
 
 class DriveScene:

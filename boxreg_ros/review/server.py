@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from getpass import getuser
+import os
 from pathlib import Path
 import signal
 import socket
+import sys
+from threading import Thread
 from typing import TYPE_CHECKING
+import webbrowser
 
 from boxreg_ros.errors import ConfigError, RecordingError
 
@@ -35,42 +39,86 @@ def add_server_arguments(parser: argparse.ArgumentParser) -> None:
         '--who', default=_user(), metavar='NAME',
         help='name beside the decisions; the page can change it (default: %(default)s)',
     )  # fmt: skip
+    parser.add_argument(
+        '--classes', type=Path, metavar='FILE',
+        help='classes to choose from, one a line; the first nine have the keys 1 to 9 (default: '
+        'those of the result)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--no-browser', dest='opens', action='store_false',
+        help='open no browser where there is one',
+    )  # fmt: skip
 
 
-def serve(results: Results, port: int, who: str) -> int:
+def classes_of(path: Path | None) -> list[str]:
+    """Return the classes of a file, one a line; RecordingError if it cannot be read."""
+    if path is None:
+        return []
+    try:
+        lines = path.read_text(encoding='utf-8-sig').splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingError(
+            f'{path}: expected a text file with one class a line, got: {error}; give another with '
+            f'--classes'
+        ) from None
+    return list(dict.fromkeys(name.strip() for name in lines if name.strip()))
+
+
+def serve(
+    results: Results, port: int, who: str, opens: bool = True, classes: Sequence[str] = ()
+) -> int:
     """Serve until interrupted, or ended by a signal: each decision is saved already."""
-    server = review_server(results, port, who)
+    server = review_server(results, port, who, classes)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
             signal.signal(number, lambda *_: server.shutdown())
     print(server.address, flush=True)
     for path in server.log_paths:
         print(f'decisions: {path}; Ctrl-C ends', flush=True)
+    if opens and has_screen():
+        Thread(target=webbrowser.open, args=[server.address], daemon=True).start()
     server.serve_forever()
     for path in filter(Path.exists, server.log_paths):
         print(f'to apply them: boxreg relabel RECORDING -o NEW --decisions {path}')
     return 0
 
 
+def has_screen() -> bool:
+    """Return whether a browser would open before the person who has started the program."""
+    if 'SSH_CONNECTION' in os.environ:
+        return False
+    if sys.platform.startswith('linux'):
+        return bool(os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
+    return True
+
+
 class ReviewServer:
     """A server for result folders on loopback; its `address` has the token that opens the page."""
 
-    def __init__(self, results: Results, bound: socket.socket, who: str) -> None:
+    def __init__(
+        self, results: Results, bound: socket.socket, who: str, classes: Sequence[str]
+    ) -> None:
         from boxreg_ros.review.application import review_application, TimedProtocol
-        from boxreg_ros.review.decisions import DECISIONS
         from uvicorn import Config, Server
 
         self._socket = bound
         self.server_port = int(bound.getsockname()[1])
-        application, token = review_application(results, self.server_port, who, self._is_ending)
-        self.log_paths = [out / DECISIONS for out, _ in results]
-        self.address = f'http://{HOST}:{self.server_port}/?token={token}'
+        found = review_application(results, self.server_port, who, self._is_ending, classes)
+        self._reviews = found.reviews
+        self.address = f'http://{HOST}:{self.server_port}/?token={found.token}'
         config = Config(
-            application, http=TimedProtocol, ws='none', lifespan='off', log_config=None,
+            found.application, http=TimedProtocol, ws='none', lifespan='off', log_config=None,
             log_level='critical', server_header=False, date_header=False,
             timeout_graceful_shutdown=SHUTDOWN_SECONDS,
         )  # fmt: skip
         self._server = Server(config)
+
+    @property
+    def log_paths(self) -> list[Path]:
+        """Return the files of decisions, of the results that were written meanwhile."""
+        from boxreg_ros.review.decisions import DECISIONS
+
+        return [review.out / DECISIONS for review in self._reviews]
 
     def serve_forever(self) -> None:
         """Serve until `shutdown`."""
@@ -84,7 +132,9 @@ class ReviewServer:
         return self._server.should_exit
 
 
-def review_server(results: Results, port: int, who: str = '') -> ReviewServer:
+def review_server(
+    results: Results, port: int, who: str = '', classes: Sequence[str] = ()
+) -> ReviewServer:
     """
     Return a server, bound to loopback, for result folders and their recordings.
 
@@ -113,7 +163,7 @@ def review_server(results: Results, port: int, who: str = '') -> ReviewServer:
             f'port: expected a free one, got {port} ({error}); choose another with --port, or 0 '
             f'for any'
         ) from None
-    return ReviewServer(results, bound, who or _user())
+    return ReviewServer(results, bound, who or _user(), classes)
 
 
 def _user() -> str:

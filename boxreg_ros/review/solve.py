@@ -6,6 +6,7 @@ from base64 import b64decode
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 import re
 from threading import Lock
@@ -22,6 +23,8 @@ from boxreg_ros.structures import BOX_EXTENT, Floats, is_valid_box, LENGTH, Z
 import numpy as np
 import orjson
 
+MAX_READ = 8
+"""Tracks that stay read: a box is dragged step by step; chosen."""
 PART = re.compile(rb'id="part-(\d+)">([^<]*)<')
 
 
@@ -37,6 +40,7 @@ class ReportParts:
     def __init__(self, out: Path, page: bytes) -> None:
         self._config_path = out / 'config.yaml'
         self._texts = {int(number): text for number, text in PART.findall(page)}
+        self._part = lru_cache(MAX_READ)(self._read_part)
         self._lock = Lock()
 
     def warm_up(self) -> None:
@@ -49,9 +53,10 @@ class ReportParts:
         Return the boxes of a track, solved again, as JSON; RecordingError without a usable box.
 
         It is sent as its ``class``; ``pieces``, with the ``index`` of a track in the report,
-        ``begin`` and ``end`` stamp; and ``pins``: boxes (9,) in the fixed frame by stamp. The
-        answer has ``stamps``, ``boxes`` (n, 9) in the fixed frame, and ``status``, of the input
-        boxes.
+        ``begin`` and ``end`` stamp; and ``pins``: boxes (9,) in the fixed frame by stamp. With a
+        stamp as ``near``, that of a box that is dragged, only the windows that have it are solved.
+        The answer has ``stamps``, ``boxes`` (n, 9) in the fixed frame, and ``status``, of the
+        input boxes.
 
         """
         from boxreg_ros.core.refine import refine, Track
@@ -61,9 +66,14 @@ class ReportParts:
             pins = {int(stamp): np.array(box, np.float64).reshape(9) for stamp, box in given}
             rows = [row for piece in sent['pieces'] for row in self._rows(piece)]
             class_name = str(sent['class'])
+            near = int(sent['near']) if 'near' in sent else None
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise RecordingError(f'solve: expected a track of the report, got: {error}') from None
+        config = replace(Config.from_yaml(self._config_path), estimate='track')
         rows = _with_pins(sorted(rows, key=lambda row: row[0]), pins)
+        if near is not None:
+            middle = sum(row[0] < near for row in rows)
+            rows = rows[max(0, middle - config.window + 1) : middle + config.window]
         if not rows:
             raise RecordingError('solve: expected a track with input boxes, got none')
         stamps, boxes, points, origins = zip(*rows, strict=True)
@@ -71,7 +81,6 @@ class ReportParts:
             '1', class_name, np.array(stamps), np.array(boxes), points, np.array(origins),
             pinned=np.isin(stamps, list(pins)),
         )  # fmt: skip
-        config = replace(Config.from_yaml(self._config_path), estimate='track')
         with self._lock:
             (found,) = refine([track], config)
         names = [str(stamp) for stamp in stamps]
@@ -99,7 +108,7 @@ class ReportParts:
         _, points = self._points_of(part)[row]
         return as_json(risks_of_box(part, row, box, class_name, points))
 
-    def _part(self, index: int) -> dict[str, Any]:
+    def _read_part(self, index: int) -> dict[str, Any]:
         found: dict[str, Any] = orjson.loads(zlib.decompress(b64decode(self._texts[index])))
         return found
 
