@@ -46,7 +46,8 @@ PAGE = Path(__file__).parent / 'page'
 TEMPLATE = 'report.html.j2'
 SCRIPTS = (
     'base', 'geometry', 'log', 'tracks', 'added', 'list', 'overview', 'timeline', 'views',
-    'charts', 'edit', 'decide', 'sweeps', 'camera', 'scene', 'keys', 'main',
+    'charts', 'edit', 'decide', 'written', 'sweeps', 'camera', 'points', 'scene',
+    'keys', 'main',
 )  # fmt: skip
 """Parts of the script, in the order that they are joined in."""
 MAX_MAP_SENSOR = 2000

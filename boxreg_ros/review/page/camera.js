@@ -81,8 +81,23 @@ function outlineIn(camera, pose, box) {
     pixelOf(camera, [0, 1, 2].map(k => c[a][k] + i / PARTS * (c[b][k] - c[a][k])))));
 }
 
-// Draw an image with boxes `{ name, box, isBold }`; `focus` is a box that it is enlarged around, or null.
-function drawImage(canvas, camera, found, boxes, focus) {
+const MAX_DOTS = 12000;             // points that are drawn in an image
+const FARTHEST = 60;               // the last colour of distances [m]
+
+// Points of a sweep in an image, red nearby, blue far away.
+function drawDots(context, at, camera, pose, { points, origin }) {
+  const every = 3 * Math.ceil(points.length / 3 / MAX_DOTS);
+  for (let i = 0; i < points.length; i += every) {
+    const point = inCamera(pose, [points[i] + origin[0], points[i + 1] + origin[1], points[i + 2] + origin[2]]), pixel = pixelOf(camera, point);
+    if (!pixel || pixel[0] < 0 || pixel[1] < 0 || pixel[0] > camera.size[0] || pixel[1] > camera.size[1]) continue;
+    context.fillStyle = `hsl(${240 * Math.min(1, point[2] / FARTHEST)} 90% 50%)`;
+    const [x, y] = at(pixel);
+    context.fillRect(x - 1, y - 1, 2, 2);
+  }
+}
+
+// Draw an image with boxes `{ name, box, isBold }` and the points of a sweep, if any; `focus` is a box that it is enlarged around, or null.
+function drawImage(canvas, camera, found, boxes, focus, sweep = null) {
   const scale = devicePixelRatio, width = canvas.clientWidth, height = canvas.clientHeight;
   canvas.width = Math.round(width * scale);
   canvas.height = Math.round(height * scale);
@@ -107,6 +122,7 @@ function drawImage(canvas, camera, found, boxes, focus) {
   canvas.at = at;
   context.drawImage(bitmap, ...at([-0.5, -0.5]), zoom * bitmap.width, zoom * bitmap.height);
   if (!model) return;
+  if (sweep) drawDots(context, at, model, pose, sweep);
   for (const { name, box, isBold } of boxes) {
     context.strokeStyle = colour(name);
     context.lineWidth = isBold ? 2 : 1;
@@ -162,7 +178,7 @@ function fillCameras(known) {
 // All images of the sweep of the drive that is shown, each with all boxes.
 async function drawCameras() {
   const stamp = sceneStamp(), known = await camerasAt(stamp), box = $('drive-cameras');
-  box.hidden = !known.length;
+  box.hidden = $('scene-image').hidden = !known.length;
   if (box.children.length !== known.length) {
     fill(box, ...known.map(({ topic }) => element('figure', {}, element('figcaption', {}, topic), element('canvas', { role: 'img', 'aria-label': `Image of ${topic}` }))));
     drawScene();
@@ -173,7 +189,7 @@ async function drawCameras() {
       const boxes = scene.boxes.filter(({ isGone: gone }) => !gone).map(({ track, box: one }) => ({ name: 'refined', box: one, isBold: track === view.open }));
       if (scene.fit) boxes.push({ name: 'human', box: scene.fit.box, isBold: true });
       box.children[index].querySelector('figcaption').textContent = [camera.topic, found.error].filter(Boolean).join(' · ');
-      drawImage(box.children[index].querySelector('canvas'), camera, found, boxes, null);
+      drawImage(box.children[index].querySelector('canvas'), camera, found, boxes, null, $('scene-in-image').checked ? scene.sweep : null);
     });
   }
 }

@@ -22,6 +22,9 @@ function judgementOf(track) {
   return covering('judgement', inputOf(s, k), stampOf(s, k)).filter(isOfTrack).at(-1);
 }
 
+// Whether a person has accepted or corrected a box.
+const isAccepted = (s, k) => ['accept', 'pin'].includes(covering('judgement', inputOf(s, k), stampOf(s, k)).at(-1)?.decision);
+
 // The judgement of the box that is shown alone, or of its range.
 function judgementOfBox() {
   const scope = scopeOfBox(boxAt(view.row));
@@ -78,6 +81,18 @@ async function acceptAndGoOn() {
   if (!open.length) return say('All tracks of the list are decided.');
   const place = open.find(track => view.shown.indexOf(track) > view.place) ?? open[0];
   openTrack(place.index);
+}
+
+// Accept the tracks of the list that have no decision and a smaller risk, at once: one step to undo.
+async function acceptBelow() {
+  if (isCorrecting()) return;
+  const text = await ask('Accept all with a risk below [m]', 'Of the tracks in the list without a decision; rejected ones are left out.', [], [], '0.3');
+  const limit = Number(text);
+  if (!text || !(limit > 0)) return;
+  const open = view.shown.filter(track => !decidedOf(track) && !isRejected(track) && track.risk < limit);
+  if (!open.length) return say('No track of the list is below.');
+  const rows = open.flatMap(track => scopesOf(track.members()).map(scope => rowOf(scope, 'accept')));
+  if (await decide(rows)) say(`${open.length} ${open.length === 1 ? 'track' : 'tracks'} accepted; z undoes it.`);
 }
 
 // Note the track that this page has open; the ids of those that other pages have.
@@ -142,12 +157,32 @@ async function rename() {
   return decide(scopesOf(current().members()).map(scope => rowOf(scope, 'rename', { value: id })));
 }
 
+// The classes to choose from: those of the file that the server was given, else of the drive; the first nine have keys.
+const classNames = () => (view.classes.length ? view.classes : [...new Set(DATA.tracks.map(track => track.class))].sort());
+
 async function reclass() {
   if (isCorrecting()) return;
-  const names = [...new Set(TRACKS.map(track => track.class))].sort();
-  const name = await ask('Class of the track', '', names.map(one => [one, one]), names, current().class);
-  if (!name || name === current().class) return;
+  const names = classNames();
+  return classify(await ask('Class of the track', '', names.map((one, k) => [one, k < 9 ? `${k + 1} ${one}` : one]), names, current().class));
+}
+
+async function classify(name) {
+  if (!name || isCorrecting() || (name === current().class && view.mark === null)) return;
   return decideAbout(chosenScopes(view.mark !== null).map(scope => rowOf(scope, 'reclass', { value: name })));
+}
+
+// Turn the whole track by 180°: an added object is followed again from its turned boxes; else each box is
+// pinned as it is shown, turned, so that no later step decides about its heading.
+async function turnRound() {
+  if (isCorrecting()) return;
+  const rows = current().members().flatMap(([s, k], row) => {
+    const scope = scopeOfBox([s, k]), held = pinOf(row), shown = view.part.usable[row];
+    const isSeed = isAdded(s, k);
+    if ((isSeed && !held) || !shown || isDeleted(s, k)) return [];
+    const box = flipped(held ? held.box : moved(shown, view.part.origin, 1));
+    return [isSeed ? rowOf(scope, 'add', { box, value: held.value }) : rowOf(scope, 'pin', { box, comment: held?.comment ?? '' })];
+  });
+  return rows.length ? decide(rows) : undefined;
 }
 
 // Ask for a text; null if the person gives none.
@@ -170,14 +205,12 @@ async function solve() {
   if (!IS_REVIEW || isCorrecting()) return;
   const track = current();
   if (track.pieces.some(({ s }) => DATA.tracks[s].added)) return say('An added object is solved whenever one of its boxes is corrected.');
-  const pieces = track.pieces.flatMap(({ s, rows }) => runsOfRows(s, rows).map(([a, b]) => ({ index: s, begin: stampOf(s, a), end: stampOf(s, b) })));
-  const pins = {};
-  view.part.stamps.forEach((stamp, row) => { const found = pinOf(row); if (found) pins[stamp] = found.box; });
+  const pins = pinsOf();
   say('Solving …');
   const begin = performance.now();
   let found;
   try {
-    found = await post('solve', { class: track.class, pieces, pins });
+    found = await post('solve', { ...solvable(track), pins });
   } catch (error) {
     say('');
     return fail(`The track was not solved: ${error.message}`);
@@ -204,26 +237,10 @@ function runsOfRows(s, rows) {
   return runs;
 }
 
-// Write the label files of the run, with all decisions, into a folder beside the first result.
-async function save() {
-  if (!IS_REVIEW || isCorrecting() || view.isSaving) return;
-  view.isSaving = true;
-  say('Writing the label files …');
-  try {
-    const { line, notes, error } = await post('save', {});
-    say([line, ...notes].join(' '));
-    if (error) fail(error);
-  } catch (error) {
-    say('');
-    fail(`The label files were not written, the earlier ones are as they were: ${error.message}`);
-  }
-  view.isSaving = false;
-}
-
 // The buttons.
 function drawDecisions() {
   drawNumbers();
-  $('detail').classList.toggle('editing', Boolean(view.edit));
+  for (const id of ['detail', 'decide']) $(id).classList.toggle('editing', Boolean(view.edit));
   if (document.activeElement?.id.startsWith('comment')) return;
   const button = (name, text, title, onclick, isPressed = null) => element('button', { 'data-do': name, title, onclick, 'aria-pressed': isPressed === null ? null : String(isPressed) }, text);
   const track = current(), isMarked = view.mark !== null;
@@ -233,15 +250,16 @@ function drawDecisions() {
     button('next', 'Accept, next', 'Accept the track and open the next one without a decision (Enter)', acceptAndGoOn));
   fill($('edit-track'), element('span'),
     button('delete', 'Delete', 'Delete the track, or restore it (d)', () => remove(false), isGone(track)),
-    button('split', 'Split here', 'This box and all after it become a track of their own (s)', split),
+    button('split', 'Split', 'This box and all after it become a track of their own (s)', split),
     button('join', 'Join …', 'Join with a track that continues this one (j)', join),
     button('rename', 'Id …', 'Change the id (n)', rename),
     button('reclass', 'Class …', 'Change the class, of the track or of the marked boxes (k)', reclass),
+    button('turn', 'Turn', 'Turn the whole track by 180° (t)', turnRound),
     button('solve', 'Solve', 'Solve the track again with the pinned boxes (o)', solve),
-    button('undo', 'Undo', 'Undo the last decision, of any track (z)', undo));
+    button('undo', 'Undo', 'Undo your last decision, of any track (z)', undo), button('redo', 'Redo', 'Do it again (y)', redo));
   fill($('decide-box'), element('span', {}, what), ...judgements(true),
     button('delete-box', 'Delete', `Delete, or restore, ${isMarked ? 'the marked boxes' : 'this box'} (Shift d)`, () => remove(true), isDeleted(...boxAt(view.row))),
-    button('mark', isMarked ? `From ${view.mark + 1}` : 'From here', 'Decide about all boxes from here to the one shown then (b)', mark, isMarked),
+    button('mark', isMarked ? `From ${view.mark + 1}` : 'From', 'Decide about all boxes from here to the one shown then (b)', mark, isMarked),
     view.edit ? button('pin', 'Pin', 'Save this box (Enter)', pin) : button('edit', pinOf(view.row) ? 'Edit pin' : 'Edit', 'Correct this box (e)', edit),
     view.edit ? button('cancel', 'Cancel', 'Discard this correction (Escape)', discard)
       : (pinOf(view.row) ? button('unpin', 'Unpin', 'Remove the pin', () => decide([takenBack(pinOf(view.row))])) : null));

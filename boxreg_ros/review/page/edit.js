@@ -31,21 +31,24 @@ function edit() {
   view.edit = (human ? human[1] : view.part.usable[view.row]).slice();
   view.steps = [];
   view.isMoved = false;
-  view.risks = null;
+  view.risks = view.followed = null;
   $('mode').value = 'sweep';
   step(view.row, true);
   $('top').focus({ preventScroll: true });
 }
 
 async function pin() {
-  const box = moved(view.edit, view.part.origin, 1);
-  view.edit = null;
-  view.isMoved = false;
-  $('failure').hidden = true;
+  const edited = view.edit, box = moved(edited, view.part.origin, 1);
   const scope = scopeOfBox(boxAt(view.row));
   const comment = heldOf(scope)?.comment ?? '';
   const seed = isAdded(...boxAt(view.row)) ? seedsOf(scope.track_id)[0] : null;
-  if (await decide([seed ? rowOf(scope, 'add', { box, value: seed.value }) : rowOf(scope, 'pin', { box, comment })])) view.solved = null;
+  view.isMoved = false;  // what follows a decision may open another track
+  if (!await decide([seed ? rowOf(scope, 'add', { box, value: seed.value }) : rowOf(scope, 'pin', { box, comment })])) {
+    view.isMoved = view.edit === edited;  // it is not saved: the box stays
+    return;
+  }
+  if (view.edit === edited) view.edit = null;
+  view.solved = null;
   step(view.row, true);
 }
 
@@ -84,7 +87,7 @@ function redrawEdit() {
   });
 }
 
-// The risk of the box as it is dragged, one request after the other.
+// The risk of the box as it is dragged, and the boxes before and after it that follow it, one request after the other.
 async function askRisk() {
   const [s, k] = boxAt(view.row);
   view.riskWanted = true;
@@ -92,20 +95,35 @@ async function askRisk() {
   view.isAsking = true;
   while (view.riskWanted && view.edit) {
     view.riskWanted = false;
-    const box = view.edit;
+    const edited = view.edit, box = moved(edited, view.part.origin, 1), stamp = view.part.stamps[view.row];
     try {
-      const risks = await post('risk', { index: s, row: k, class: current().class, box: moved(box, view.part.origin, 1) });
-      view.risks = view.edit ? risks : null;
+      const risks = await post('risk', { index: s, row: k, class: current().class, box });
+      const found = await post('solve', { ...solvable(current()), pins: { ...pinsOf(), [stamp]: box }, near: stamp });
+      if (view.edit !== edited) break;  // it is another box, or none
+      view.risks = risks;
+      view.followed = new Map(found.stamps.map((one, at) => [one, found.boxes[at]]));
     } catch { break; }  // the page says when the server is gone: with the next decision
     drawNumbers();
+    drawViews();
   }
   view.isAsking = false;
+}
+
+// A track and its pinned boxes, as the server solves it.
+function solvable(track) {
+  const pieces = track.pieces.flatMap(({ s, rows }) => runsOfRows(s, rows).map(([a, b]) => ({ index: s, begin: stampOf(s, a), end: stampOf(s, b) })));
+  return { class: track.class, pieces };
+}
+
+function pinsOf() {
+  const pins = {};
+  view.part.stamps.forEach((stamp, row) => { const found = pinOf(row); if (found) pins[stamp] = found.box; });
+  return pins;
 }
 
 // The numbers of the box, which can be typed, and what follows from them.
 function drawNumbers() {
   $('numbers').hidden = !view.edit;
-  $('edit-track').hidden = Boolean(view.edit);  // the numbers take their place
   if (!view.edit) return;
   const box = moved(view.edit, view.part.origin, 1);
   for (const [name, , column, scale, digits] of TYPED) {
@@ -126,7 +144,7 @@ function setUpNumbers() {
       view.edit[column] = value;
       redrawEdit();
     } });
-    $('typed').append(element('label', {}, letter + ' ', input));
+    $('typed').append(element('label', { class: column < 2 ? 'place' : null }, letter + ' ', input));
   }
 }
 
@@ -166,7 +184,7 @@ function setUpDragging(canvas) {
   };
   canvas.addEventListener('wheel', event => {
     event.preventDefault();
-    zoomBy(event.deltaY < 0 ? ZOOM_STEP : 1 / ZOOM_STEP, canvas, event);
+    zoomBy(wheelFactor(event), canvas, event);
   }, { passive: false });
   canvas.ondblclick = () => { if (!view.edit) resetViews(); };
   canvas.onpointerup = canvas.onpointercancel = () => { grip = null; };
@@ -174,9 +192,14 @@ function setUpDragging(canvas) {
 
 // What a place in the axes of the box takes hold of: the stroke, a face, the box, or null.
 function gripAt(at, canvas) {
-  const [right, up] = VIEWS[canvas.id], reach = GRIP / canvas.zoom;
-  const half = [3, 4, 5].map(c => view.edit[c] / 2);
-  if (canvas.id === 'top' && Math.abs(at[1]) < half[1] / 2 && at[0] > half[0] + reach && at[0] < 1.3 * half[0] + reach) return { turns: true };
+  const [right, up] = VIEWS[canvas.id];
+  return gripOf(at, view.edit, GRIP / canvas.zoom, [right, up]);
+}
+
+/** @returns {any} */
+function gripOf(at, box, reach, [right, up]) {
+  const half = [3, 4, 5].map(c => box[c] / 2);
+  if (up === 1 && Math.abs(at[1]) < half[1] / 2 && at[0] > half[0] + reach && at[0] < 1.3 * half[0] + reach) return { turns: true };
   if ([right, up].some(a => Math.abs(at[a]) > half[a] + reach)) return null;
   const face = [right, up].find(a => Math.abs(Math.abs(at[a]) - half[a]) < reach);
   return { last: at, face: face === undefined ? null : [face, Math.sign(at[face])] };

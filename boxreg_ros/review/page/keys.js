@@ -26,13 +26,16 @@ const REVIEW_KEYS = {
   s: ['s', 'split: this box and all after it become a track of their own', () => split()],
   j: ['j', 'join with a track that continues this one', () => join()],
   n: ['n', 'change the id of the track', () => rename()],
+  t: ['t', 'turn the whole track by 180°: its boxes are pinned as they are shown, turned', () => turnRound()],
   k: ['k', 'change the class of the track, or of the marked boxes', () => reclass()],
+  1: ['1 … 9', 'give the track, or the marked boxes, the class with this number', event => classify(classNames()[Number(event.key) - 1])],
   c: ['c', 'comment on the track; with Shift on this box', event => $(event.shiftKey ? 'comment-box' : 'comment').focus()],
   e: ['e', 'correct this box', () => edit()],
   o: ['o', 'solve the track again with its pinned boxes', () => solve()],
   i: ['i', 'add an object: click its points in the drive, then Enter follows it both ways', () => inDrive(() => startAdding(true))],
   p: ['p', 'the next object that the run proposes; Enter follows it', () => inDrive(nextProposal)],
-  z: ['z', 'undo the last decision', () => undo()],
+  z: ['z  y', 'undo your last decision, and do it again', event => (event.shiftKey ? redo() : undo())],
+  y: ['', '', () => redo()],
 };
 const SCENE_KEYS = {
   ArrowLeft: ['←  →', 'step one sweep; with Shift ten', event => showScene(scene.at - (event.shiftKey ? 10 : 1))],
@@ -42,13 +45,18 @@ const SCENE_KEYS = {
   ' ': ['', '', () => playScene()],
   '+': ['', '', () => zoomScene(ZOOM_STEP)],
   '-': ['', '', () => zoomScene(1 / ZOOM_STEP)],
-  0: ['', '', () => { scene.offset = [0, 0]; scene.zoom = $('scene-view').clientWidth / SHOWN; drawScene(); }],
+  0: ['', '', () => wholeScene()],
   v: ['v', 'the scene in 3D, or from above; dragging with Shift, or with the right button, turns it', () => toggleSpace()],
+  1: ['1 … 9', 'the class of the object that is added', event => chooseClass(classNames()[Number(event.key) - 1])],
+  f: ['f', 'turn the object that is added by 180°', () => flipFit()],
+  c: ['c', 'copy the box of the open track from the sweep nearest to this one', () => copyBox()],
+  e: ['e', 'correct the box below the pointer, or of the open track: drag it, an edge or its front; Enter saves it', () => editBox()],
   i: ['', '', () => startAdding()],
   p: ['', '', () => nextProposal()],
   Enter: ['', '', () => keepFit()],
   Escape: ['', '', () => startAdding(false)],
-  z: ['', '', () => undo()],
+  z: ['', '', event => (event.shiftKey ? redo() : undo())],
+  y: ['', '', () => redo()],
 };
 const EDIT_KEYS = {
   ArrowRight: ['←  →', 'move 2 cm along, as in the views; with Shift 10 cm', n => moveEdit(n * STEP, 0, 0)],
@@ -93,12 +101,14 @@ function onKey(event) {
     if (event.key === 'Escape' || event.key === 'Enter') target.blur();
     return;
   }
+  const digit = /^[1-9]$/.test(name) ? '1' : name;
   const isTracks = !$('tracks').hidden && view.part, isScene = !$('drive').hidden;
-  if (name === 'Enter' && target.matches('button, a')) return;
+  // A tab that is open already, and what the mouse has pressed, leave Enter to the page.
+  if (name === 'Enter' && target.matches('button, a') && !target.matches('[role=tab][aria-selected=true]')) return;
   if (name === ' ' && target.matches('button, a, input') && !isTracks && !isScene) return;
-  if (isScene && SCENE_KEYS[name]) {
+  if (isScene && SCENE_KEYS[digit]) {
     event.preventDefault();
-    return SCENE_KEYS[name][2](event);
+    return SCENE_KEYS[digit][2](event);
   }
   if (!isTracks && event.key !== '?' && event.key !== '/') return;
   const isView = ['+', '-', '0', ' '].includes(name);
@@ -109,10 +119,17 @@ function onKey(event) {
     if (EDIT_KEYS[name]) rememberEdit();
     return key[2](event.shiftKey ? 5 : 1);
   }
-  const key = KEYS[name] ?? (IS_REVIEW ? REVIEW_KEYS[name] : undefined);
+  const key = KEYS[name] ?? (IS_REVIEW ? REVIEW_KEYS[digit] : undefined);
   if (!key) return;
   event.preventDefault();
   key[2](event);
+}
+
+function leaveFocus(event) {
+  event.preventDefault();
+  /** @type {any} */
+  const focused = document.activeElement;
+  if (focused?.matches('input, select, button')) focused.blur();  // a text that was typed is saved
 }
 
 function setUpKeys() {
@@ -122,6 +139,8 @@ function setUpKeys() {
     element('tr', {}, element('th', { colspan: 2 }, 'While correcting a box')), ...lines(EDIT_KEYS), ...lines(END_EDIT_KEYS)] : [];
   fill($('keys'), ...groups.flatMap(lines), ...editing);
   document.addEventListener('keydown', onKey);
+  // The mouse leaves the focus where it is: Enter after a click is the key of the page, and does not press the button again.
+  document.addEventListener('mousedown', event => { if (/** @type {any} */ (event.target).closest?.('main button, header button')) leaveFocus(event); });
   $('ask-form').onsubmit = event => { event.preventDefault(); $('ask').close('=' + $('ask-text').value.trim()); };
   $('ask-cancel').onclick = () => $('ask').close('');
   $('help-button').onclick = () => $('help').showModal();

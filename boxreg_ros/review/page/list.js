@@ -6,6 +6,7 @@ const CHANGED = {
   moved: ['moved more than 0.2 m', t => t.shift > 0.2],
   turned: ['turned more than 2°', t => t.turn > 2],
   flipped: ['heading flipped', t => t.flips > 0],
+  written: ['changed by the decisions', t => view.changed.has(t.id)],
   resized: ['resized more than 0.2 m', t => t.resized > 0.2],
 };
 const sumOf = counts => Object.entries(counts).map(([name, count]) => `${name} ${count}`).join(', ');
@@ -26,6 +27,7 @@ function columns() {
     ['decision', 'decision', t => decidedOf(t), t => decidedOf(t), 9, 'your decision, and the number of boxes with one of their own'],
     ['why', 'why', t => t.why, t => partsOf(t.why)[0] ?? '', 18, 'the most unusual part of the risk; ends are front and rear'],
     ['points', 'points', t => t.points, t => number(t.points, 0), 5, 'median of the points inside the boxes'],
+    ['near', 'near', t => t.near, t => number(t.near, 0), 5, 'median of the points within 0.6 m of the boxes and above their lower face: most ghosts have none'],
     ['boxes', 'boxes', t => t.boxes, t => t.boxes + (t.interpolated ? ` + ${t.interpolated}` : ''), 6, 'boxes of the input + boxes that were added'],
     ['rules', 'rules', t => rulesOf(t).length || null, t => rulesOf(t).join(', '), 8, 'rules of boxreg check that the refined boxes violate'],
     ['iou', 'IoU', t => t.after.iou, t => `${number(t.before.iou, 3)} → ${number(t.after.iou, 3)}`, 9, 'mean 3D IoU with the true boxes, input → refined'],
@@ -38,11 +40,14 @@ function columns() {
     ['sharper', 'cells [%]', t => t.sharper, t => number(t.sharper, 0), 5.5, `change of the number of cells of ${DATA.cell} m that the points of all sweeps fill: negative is sharper`],
     ['reasons', 'kept because', t => sumOf(t.reasons), t => sumOf(t.reasons), 12, 'reasons of the input boxes that were returned unchanged'],
   ];
-  const hidden = new Set([...(DATA.has_truth ? [] : ['iou']), ...(IS_REVIEW ? [] : ['decision'])]);
+  const hidden = new Set([...(DATA.has_truth ? [] : ['iou']), ...(IS_REVIEW ? [] : ['decision']), ...(view.sort === 'near' ? [] : ['near'])]);
   return all.filter(([name]) => !hidden.has(name));
 }
 const TEXT = new Set(['id', 'class', 'why', 'decision', 'rules', 'reasons']);
 
+// Rejected by the run alone: no label, unless a person accepts it.
+const MISTAKES = 'rejected: look for mistakes';
+const isRejected = track => track.status.rejected > 0 && Object.keys(track.status).length === 1;
 const isGone = track => track.deleted > 0 && track.deleted === track.members().length;
 
 // The decision about a track, and how many of its boxes have one.
@@ -64,12 +69,19 @@ function compare(a, b) {
   return a - b;
 }
 
+// Those with the most points near them are the likeliest mistakes: ghosts have few.
+function sortMistakes() {
+  if ($('f-status').value === MISTAKES) [view.sort, view.descending] = ['near', true];
+  else if (view.sort === 'near') [view.sort, view.descending] = ['rank', false];
+  drawList();
+}
+
 function isShown(track) {
   const text = $('f-text').value.trim().toLowerCase();
   const [name, status, reason, rule, change, decision] = ['class', 'status', 'reason', 'rule', 'change', 'decision'].map(f => $('f-' + f).value);
   if (text && !track.id.toLowerCase().includes(text) && !track.class.toLowerCase().includes(text)) return false;
   if (name && track.class !== name.slice(1)) return false;
-  if (status && !(status in track.status)) return false;
+  if (status === MISTAKES ? !isRejected(track) : status && !(status in track.status)) return false;
   if (reason && !causesOf(track).includes(reason) && !(reason in track.reasons)) return false;
   if (rule && !rulesOf(track).includes(rule)) return false;
   if (change && !CHANGED[change][1](track)) return false;
@@ -113,6 +125,7 @@ function drawLines() {
   const space = lines => (lines > 0 ? [element('tr', { 'aria-hidden': 'true' }, element('td', { class: 'space', colspan: found.length, style: `height: ${LINE * lines}px` }))] : []);
   const hint = TRACKS.length ? '' : 'No boxes.' + (hasScene ? ' Objects are added in Drive: i, then a click on the points, or p for those that are proposed.' : '');
   $('detail').hidden = Boolean(hint);
+  $('decide').hidden = Boolean(hint) || !IS_REVIEW;
   $('rows-hint').textContent = hint;
   fill(box.querySelector('tbody'), ...space(first), ...view.shown.slice(first, last).map(track => lineOf(track, found)), ...space(view.shown.length - last));
   box.querySelector('table').setAttribute('aria-rowcount', view.shown.length);
@@ -142,14 +155,15 @@ const filters = () => [...document.querySelectorAll('.filters input, .filters se
 
 function clearFilters() {
   for (const input of filters()) input.value = input.matches('select') ? '' : input.defaultValue;
-  drawList();
+  sortMistakes();
 }
 
 function sortBy(name) {
+  const isKeyed = document.activeElement?.matches('[data-sort]');
   view.descending = view.sort === name ? !view.descending : !TEXT.has(name) && name !== 'rank';
   view.sort = name;
   drawList();
-  $('rows').querySelector(`[data-sort=${name}]`).focus();
+  if (isKeyed) $('rows').querySelector(`[data-sort=${name}]`).focus();
 }
 
 function options(id, first, entries) {
@@ -159,13 +173,14 @@ function options(id, first, entries) {
 function setUpList() {
   const every = key => [...new Set(DATA.tracks.flatMap(track => key(track)))].sort();
   options('f-class', 'any class', every(t => [t.class]).map(name => ['=' + name, name]));
-  options('f-status', 'any status', every(t => Object.keys(t.status)).map(name => [name, name]));
+  options('f-status', 'any status', [...every(t => Object.keys(t.status)).map(name => [name, name]), ...(DATA.tracks.some(isRejected) ? [[MISTAKES, MISTAKES]] : [])]);
   options('f-reason', 'any reason', [...every(causesOf).map(name => [name, name]), ...every(t => Object.keys(t.reasons)).map(name => [name, 'kept: ' + name])]);
   options('f-rule', 'any rule', every(rulesOf).map(name => [name, name]));
   options('f-change', 'any change', Object.entries(CHANGED).map(([name, [text]]) => [name, text]));
   options('f-decision', 'any decision', [['open', 'no decision'], ['accept', 'accepted'], ['reject', 'rejected'], ['unsure', 'unsure'], ['delete', 'deleted'], ['id', 'id changed'], ['class', 'class changed'], ['comment', 'comment only'], ['box', 'boxes decided']]);
   $('f-decision').hidden = !IS_REVIEW;
   for (const input of filters()) input.oninput = drawList;
+  $('f-status').oninput = sortMistakes;
   $('f-clear').onclick = clearFilters;
   $('rows').onscroll = drawLines;
   drawList();

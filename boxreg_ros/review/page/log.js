@@ -2,11 +2,15 @@
 // A row is about boxes of the input: a track, one of its boxes, or those between two stamps. Of
 // several rows of one topic about the same boxes the last one holds.
 
+const ROUNDING = 1e-6;             // of boxes in the file [m, rad]
+const RETRY = 1000;                // of a server that refuses to stream [ms]
 const TOPIC_OF = { accept: 'judgement', reject: 'judgement', unsure: 'judgement', pin: 'judgement', none: 'judgement',
                    delete: 'deletion', restore: 'deletion', rename: 'id', reclass: 'class', add: 'addition', withdraw: 'addition' };
 const TAKEN_BACK = { judgement: 'none', deletion: 'restore', id: 'rename', class: 'reclass', addition: 'withdraw' };
-/** @type {{ count: number, held: Map<string, Row>, ofInput: Map<string, Row[]>, made: Row[][], who: string, answered?: Promise<any> }} */
-const log = { count: 0, held: new Map(), ofInput: new Map(), made: [], who: '' };
+// What was decided at once, and what held before; those of `log.who` are undone and redone one by one.
+/** @typedef {{ before: Row[], after: Row[] }} Made */
+/** @type {{ count: number, rows: Row[], held: Map<string, Row>, ofInput: Map<string, Row[]>, made: Made[], undone: Made[], who: string, answered?: Promise<any>, stepping: Promise<any> }} */
+const log = { count: 0, rows: [], held: new Map(), ofInput: new Map(), made: [], undone: [], who: '', stepping: Promise.resolve() };
 
 const scopeKey = (topic, row) => JSON.stringify([topic, row.track_id, row.stamp_ns, row.end_ns]);
 const keyOf = row => scopeKey(TOPIC_OF[row.decision], row);
@@ -26,30 +30,74 @@ function covering(topic, input, stamp) {
 }
 
 function receive({ first, rows }) {
-  if (first === 0 && rows.length < log.count) { log.count = 0; log.held.clear(); }  // the file was replaced
+  if (first === 0 && rows.length < log.count) forget();  // the file was replaced
   const fresh = rows.slice(log.count - first);
   if (!fresh.length) return;
   log.count = first + rows.length;
-  for (const row of fresh) {
-    log.held.delete(keyOf(row));
-    if (!isTakenBack(row) || row.comment) log.held.set(keyOf(row), row);
+  log.rows.push(...fresh);
+  takeOver(fresh);
+  return fresh;
+}
+
+function forget() {
+  log.held.clear();
+  log.count = log.rows.length = log.made.length = log.undone.length = 0;
+}
+
+// Undo and redo are about the decisions of another person from now on.
+function setPerson(who) {
+  const rows = [...log.rows];
+  forget();
+  log.who = who;
+  if (rows.length) receive({ first: 0, rows });
+}
+
+// Rows that were written at once have the same time; each holds until the next one about its boxes.
+function takeOver(rows) {
+  for (let first = 0, end = 0; first < rows.length; first = end) {
+    while (end < rows.length && rows[end].who === rows[first].who && rows[end].when === rows[first].when) end++;
+    const after = rows.slice(first, end);
+    if (after[0].who === log.who && after[0].when) noteMade(after.map(row => log.held.get(keyOf(row)) ?? takenBack(row)), after);
+    for (const row of after) {
+      log.held.delete(keyOf(row));
+      if (!isTakenBack(row) || row.comment) log.held.set(keyOf(row), row);
+    }
   }
   log.ofInput.clear();
   for (const row of log.held.values()) {
     if (!log.ofInput.has(row.track_id)) log.ofInput.set(row.track_id, []);
     log.ofInput.get(row.track_id).push(row);
   }
-  return fresh;
+}
+
+// Whether rows state the same, whoever wrote them.
+const isSameRow = (a, b) => keyOf(a) === keyOf(b) && a.decision === b.decision && a.comment === b.comment && a.value === b.value
+  && (a.box === null) === (b.box === null) && (a.box ?? []).every((v, k) => Math.abs(v - b.box[k]) < ROUNDING);
+const isSame = (first, second) => first?.length === second.length && first.every((row, k) => isSameRow(row, second[k]));
+
+// The history is that of the file: rows that restore what held before an own decision undo it.
+function noteMade(before, after) {
+  if (isSame(log.made.at(-1)?.before, after)) return void log.undone.push(log.made.pop());
+  if (isSame(log.undone.at(-1)?.after, after)) return void log.made.push(log.undone.pop());
+  log.made.push({ before, after });
+  log.undone.length = 0;
 }
 
 async function post(path, content) {
-  const response = await fetch(path, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(content) });
+  const response = await fetch(path, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(content) })
+    .catch(error => { setLost(true); throw error; });
   if (response.ok || response.status === 409 && response.headers.get('content-type') === 'application/json') return response.json();
   throw new Error(await response.text());
 }
 
-// Write rows to the file, all or none, and note them for undo; whether that was done.
-async function store(rows, note) {
+// The banner: nothing is saved until the server answers again, which `listen` waits for.
+function setLost(isLost) {
+  if (!isLost && !$('lost').hidden) say('boxreg review answers again.');
+  $('lost').hidden = !isLost;
+}
+
+// Write rows to the file, all or none; whether that was done.
+async function decide(rows) {
   let found;
   const answered = post('decisions', { seen: log.count, rows: rows.map(row => ({ ...row, who: log.who })) });
   log.answered = answered.catch(() => {});
@@ -60,21 +108,28 @@ async function store(rows, note) {
     return false;
   }
   $('failure').hidden = true;
-  if (!found.message) note();
   await showDecisions(receive(found));
   if (found.message) fail(found.message);
   return !found.message;
 }
 
-async function decide(rows) {
-  const before = rows.map(row => log.held.get(keyOf(row)) ?? takenBack(row));
-  return store(rows, () => log.made.push(before));
+// One step back or forth, after the one that is under way.
+const undo = () => takeStep(() => log.made.at(-1), 'before', 'after', 'Nothing of yours to undo.');
+const redo = () => takeStep(() => log.undone.at(-1), 'after', 'before', 'Nothing of yours to do again.');
+
+function takeStep(next, wanted, now, nothing) {
+  log.stepping = log.stepping.then(async () => {
+    const found = next();
+    if (!found) return say(nothing);
+    if (isCorrecting()) return;
+    const other = found[now].map(row => log.held.get(keyOf(row)) ?? takenBack(row)).find((row, k) => !isSameRow(row, found[now][k]));
+    if (other) return fail(`${other.who || 'Another person'} has decided about track ${other.track_id} since (${other.decision}): nothing was changed. Decide about it anew.`);
+    if (await decide(found[wanted])) openDecided(found[wanted][0]);
+  });
+  return log.stepping;
 }
 
-async function undo() {
-  const before = log.made.at(-1);
-  if (!before || isCorrecting() || !await store(before, () => log.made.pop())) return;
-  const [{ track_id: input, stamp_ns: stamp }] = before;
+function openDecided({ track_id: input, stamp_ns: stamp }) {
   const index = TRACKS.findIndex(track => track.members().some(([s, k]) => inputOf(s, k) === input && (!stamp || stampOf(s, k) === stamp)));
   if (index >= 0) openTrack(index, stamp || null);
 }
@@ -82,6 +137,13 @@ async function undo() {
 // Decisions of other tabs and other people, as they are made.
 function listen() {
   const source = new EventSource('events?seen=' + log.count);
+  source.onopen = () => setLost(false);
+  source.onerror = () => {
+    setLost(true);
+    if (source.readyState === EventSource.CLOSED) setTimeout(listen, RETRY);  // refused: it asks no more
+  };
+  source.addEventListener('progress', event => drawProgress(JSON.parse(event.data)));
+  source.addEventListener('written', event => followWritten(Number(event.data)));
   source.onmessage = async event => {
     await log.answered;  // decisions of this tab are not those of another
     const fresh = receive(JSON.parse(event.data));

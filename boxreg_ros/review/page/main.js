@@ -170,6 +170,14 @@ function selectTab(name) {
   showTab(name);
 }
 
+// The buttons in the views: closer, farther, all of it.
+function zoomByButton(sign) {
+  const isScene = !$('drive').hidden;
+  if (!sign) return isScene ? wholeScene() : resetViews();
+  const factor = ZOOM_STEP ** (2 * sign);
+  return isScene ? zoomScene(factor) : zoomBy(factor);
+}
+
 function redrawAll() {
   view.space = view.charts = false;
   $('map').replaceChildren();
@@ -179,42 +187,39 @@ function redrawAll() {
 }
 
 function setUpPerson(who) {
-  log.who = localStorage.getItem('who') ?? who;
-  $('who').value = log.who;
+  const named = localStorage.getItem('who') ?? who;
+  $('who').value = named;
+  setPerson(named || who);
   $('who').onchange = event => {
-    log.who = event.target.value.trim();
-    localStorage.setItem('who', log.who);
+    localStorage.setItem('who', event.target.value.trim());
+    setPerson(event.target.value.trim() || who);
   };
 }
 
 async function main() {
   await painted();  // title and figures, before the lists of many tracks are made
-  DATA = JSON.parse(await inflate($('data').textContent));
+  await readResult();
   if (IS_REVIEW) {
-    if (location.search) history.replaceState(null, '', location.pathname + location.hash);  // the token
-    const found = await (await fetch('decisions')).json();
-    receive(found);
-    setUpPerson(found.who);
-    hasScene = found.has_scene;
-    scene.proposals = found.proposals;
     $('tab-drive').hidden = !hasScene;
     setUpScene();
     $('all-drives').hidden = location.pathname === '/';
     $('all-drives').href = '../';
     setUpNumbers();
-    $('decide').hidden = $('save-button').hidden = $('person').hidden = false;
+    setUpFiles();
+    $('decide').hidden = $('save-button').hidden = $('files-button').hidden = $('person').hidden = $('accept-below').hidden = false;
     $('save-button').onclick = save;
+    $('accept-below').onclick = acceptBelow;
     listen();
-  }
-  TRACKS = buildTracks();
-  if (hasScene && [...log.held.values()].some(row => row.decision === 'add')) {
-    await followAdded();
-    TRACKS = buildTracks();
   }
   setUpList();
   setUpTimeline();
   setUpKeys();
-  for (const name of Object.keys(VIEWS)) setUpDragging($(name));
+  for (const name of Object.keys(VIEWS)) {
+    setUpPinch($(name), (factor, event) => zoomBy(factor, $(name), event));
+    setUpDragging($(name));
+  }
+  setUpSizes();
+  for (const one of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll('[data-zoom]'))) one.onclick = () => zoomByButton(Number(one.dataset.zoom));
   for (const one of TABS) $('tab-' + one).onclick = () => {
     selectTab(one);
     if (one === 'tracks') $('rows').focus({ preventScroll: true });
@@ -228,7 +233,6 @@ async function main() {
     drawLines();
     if (!$('overview').hidden) drawTimeline();
     drawScene();
-    if (view.part && !$('tracks').hidden) { drawViews(); drawCursor(); }
   });
   for (const media of ['(prefers-color-scheme: dark)', 'print']) matchMedia(media).addEventListener('change', redrawAll);
   await followHash();

@@ -4,10 +4,11 @@ const CLICK = 4;                   // a pointer that moves less has clicked [px]
 const LABELLED = 5;                // ids are written at this zoom and above [px/m]
 const ROAD = 0.4;                  // above the road: points of objects [m]
 const SHOWN = 90;                  // of the drive around the sensor [m]
+const DRAWN = [4.5, 1.9, 1.6];     // length, width and height of a box by hand where the drive has none of its class [m]
 const PICKED = 6;                  // a click is on a point this near [px]
 const TILT = { usual: 1, most: 1.3, pace: 0.006 };  // of the view in 3D, from above [rad], and of a drag [rad/px]
 /** @type {{ [name: string]: any, sweep: Sweep, boxes: SceneBox[], fit: Fit, slim: Map<number, SlimPart> }} */
-const scene = { at: 0, zoom: 0, offset: [0, 0], tilt: 0, turn: 0, sweep: null, boxes: [], isAdding: false, fit: null, proposals: [], proposal: -1, playing: 0, slim: new Map() };
+const scene = { at: 0, zoom: 0, offset: [0, 0], tilt: 0, turn: 0, sweep: null, boxes: [], clouds: [], isAdding: false, fit: null, proposals: [], proposal: -1, playing: 0, slim: new Map() };
 /** @type {Record<string, [string, number, number]>} */
 const LOOKS = { road: ['around', 0.45, 1], object: ['points', 0.9, 1.6] };  // colour, opacity, size [px]
 const sceneStamp = () => DATA.stamps[scene.at];
@@ -28,7 +29,7 @@ async function boxesAt(at) {
   for (const track of TRACKS) {
     for (const [s, k] of track.members().filter(([t, l]) => DATA.tracks[t].at[l] === at)) {
       const part = await slimPart(s), box = part.usable[k];
-      if (box) found.push({ track, box: moved(box, part.origin, 1), isGone: isDeleted(s, k) || part.status[k] === 'rejected' });
+      if (box) found.push({ s, k, track, status: part.status[k], box: moved(box, part.origin, 1), isGone: isDeleted(s, k) || (part.status[k] === 'rejected' && !isAccepted(s, k)) });
     }
   }
   return found;
@@ -53,7 +54,7 @@ async function showScene(at, isNew = false) {
   }
   const boxes = await boxesAt(at);
   if (scene.at !== at) return;
-  Object.assign(scene, { sweep, boxes });
+  Object.assign(scene, { sweep, boxes, clouds: [sweep] });
   scene.zoom ||= $('scene-view').clientWidth / SHOWN;
   scene.road = roadOf(sweep);
   const count = sweep.points.length / 3;
@@ -63,6 +64,19 @@ async function showScene(at, isNew = false) {
   view.hashTimer = setTimeout(() => { if (!$('drive').hidden) history.replaceState(null, '', '#' + new URLSearchParams({ scene: stamp })); }, 200);
   drawScene();
   drawCameras();
+  addClouds(at);
+}
+
+// Draw the sweeps nearest to this one with it, as they are read.
+async function addClouds(at) {
+  const count = Number($('scene-sweeps').value);
+  const near = DATA.stamps.map((_, k) => k).sort((a, b) => Math.abs(a - at) - Math.abs(b - at)).slice(1, count);
+  for (const k of near) {
+    const cloud = await sweepAt(DATA.stamps[k]).catch(() => null);
+    if (scene.at !== at || Number($('scene-sweeps').value) !== count) return;
+    if (cloud && !scene.clouds.includes(cloud)) scene.clouds.push(cloud);
+  }
+  if (near.length) drawScene();
 }
 
 // The height of the road below the sensor: the lower tenth of the points near it.
@@ -83,7 +97,7 @@ function sceneAxes() {
   const [c, s, flat, steep] = [Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt)];
   const turned = (x, y) => [c * (x - center[0]) + s * (y - center[1]), c * (y - center[1]) - s * (x - center[0])];
   return {
-    width, height,
+    width, height, center,
     /** @type {(place: number[]) => [number, number]} */
     to: ([x, y, z = center[2]]) => {
       const [right, ahead] = turned(x, y);
@@ -114,13 +128,15 @@ function pickedPlace(event) {
 
 function drawScene() {
   if (!scene.sweep || $('drive').hidden) return;
-  const canvas = $('scene-view'), scale = devicePixelRatio, { width, height, to } = sceneAxes();
+  const canvas = $('scene-view'), scale = devicePixelRatio, axes = sceneAxes(), { width, height, to } = axes;
   canvas.width = Math.round(width * scale);
   canvas.height = Math.round(height * scale);
   const context = canvas.getContext('2d', { willReadFrequently: true });
   context.setTransform(scale, 0, 0, scale, 0, 0);
-  const { points, origin, sensor } = scene.sweep;
-  for (const isObject of [false, true]) {
+  const { points, origin, sensor } = scene.sweep, mode = $('scene-colour').value;
+  const key = [mode, scene.road, colour('points'), mode === 'object' || mode === 'height' ? '' : `${scene.at} ${log.count}`].join(' ');
+  const isDrawn = drawClouds($('scene-points'), scene.clouds, axes, key);
+  for (const isObject of isDrawn ? [] : [false, true]) {
     const [name, alpha, size] = isObject ? LOOKS.object : LOOKS.road;
     context.fillStyle = colour(name);
     context.globalAlpha = alpha;
@@ -132,8 +148,8 @@ function drawScene() {
   }
   context.globalAlpha = 1;
   context.font = '11px system-ui, sans-serif';
-  for (const { track, box, isGone: gone } of scene.boxes) drawSceneBox(context, to, box, gone ? 'around' : 'refined', track.id, gone, track === view.open);
-  if (scene.fit) drawSceneBox(context, to, scene.fit.box, 'human', scene.fit.class, false, true);
+  for (const one of scene.boxes) drawSceneBox(context, to, one.box, boxColour(one), one.track.id, one.isGone, one.track === view.open);
+  if (scene.fit) drawSceneBox(context, to, scene.fit.box, colour('human'), scene.fit.class, false, true);
   const [x, y] = to(sensor), nose = to([sensor[0] + 2 * Math.cos(sensor[3]), sensor[1] + 2 * Math.sin(sensor[3])]);
   context.strokeStyle = colour('input');
   context.lineWidth = 2;
@@ -145,11 +161,11 @@ function drawScene() {
   drawSceneTools();
 }
 
-function drawSceneBox(context, to, box, name, text, isDashed, isBold) {
+function drawSceneBox(context, to, box, style, text, isDashed, isBold) {
   const space = corners(box), c = space.map(to), middle = k => (space[4][k] + space[6][k]) / 2;
   const nose = [0, 1, 2].map(k => (space[4][k] + space[7][k]) / 2);
   const lines = [...BOX_EDGES.map(edge => edge.map(k => c[k])), [nose, nose.map((v, k) => v + 0.25 * (v - middle(k)))].map(to)];
-  context.strokeStyle = context.fillStyle = colour(name);
+  context.strokeStyle = context.fillStyle = style;
   context.lineWidth = isBold ? 2.5 : 1.5;
   context.setLineDash(isDashed ? [4, 4] : []);
   context.beginPath();
@@ -169,7 +185,7 @@ function drawSceneTools() {
   $('scene-fit').hidden = !scene.fit;
   drawProposals();
   $('scene-hint').textContent = scene.fit ? `${number(scene.fit.points, 0)} points, ${scene.fit.box.slice(3, 6).map(v => number(v, 1)).join(' × ')} m. Enter follows it both ways.`
-    : scene.isAdding ? 'Click the points of the object.' : 'Click a box to open its track. Drag moves, the wheel zooms, a drag with Shift turns.';
+    : scene.isAdding ? 'Click the points of the object, or drag from its rear to its front.' : 'Click a box to open its track. Drag moves, the wheel zooms, a drag with Shift turns.';
 }
 
 function sceneBoxAt(place) {
@@ -185,8 +201,8 @@ function startAdding(isAdding = !scene.isAdding) {
   drawScene();
 }
 
-// The box of the object at a place, of its class by size or of the one chosen.
-async function fitAt(place, name = '') {
+// The median extents of each class of the drive.
+function usualExtents() {
   const sizes = new Map();
   for (const track of TRACKS) {
     if (!track.extents[1].every(isKnown)) continue;
@@ -194,8 +210,84 @@ async function fitAt(place, name = '') {
     sizes.get(track.class).push(track.extents[1]);
   }
   const median = values => values.sort((a, b) => a - b)[values.length >> 1];
-  const extents = Object.fromEntries([...sizes].map(([one, rows]) => [one, [0, 1, 2].map(k => median(rows.map(row => row[k])))]));
-  const stamp = sceneStamp();
+  return Object.fromEntries([...sizes].map(([one, rows]) => [one, [0, 1, 2].map(k => median(rows.map(row => row[k])))]));
+}
+
+// A box by hand: from its rear to its front, as wide and as high as its class.
+/** @type {(rear: number[], front: number[]) => void} */
+function drawByHand([x, y], [u, v]) {
+  const usual = usualExtents(), name = classNames()[0] ?? 'car';
+  const [, width, height] = usual[name] ?? DRAWN;
+  const box = [(x + u) / 2, (y + v) / 2, scene.sweep.origin[2] + scene.road + height / 2, Math.hypot(u - x, v - y), width, height, 0, 0, Math.atan2(v - y, u - x)];
+  offerFit({ box, class: name, points: numInside(scenePoints(), box), stamp: scene.sweep.stamp, place: box.slice(0, 2), isByHand: true });
+}
+
+function scenePoints() {
+  const { points, origin } = scene.sweep, found = [];
+  for (let i = 0; i < points.length; i += 3) found.push([points[i] + origin[0], points[i + 1] + origin[1], points[i + 2] + origin[2]]);
+  return found;
+}
+
+// Correct a box of the scene: that of a track, or below the pointer.
+function editBox(track = view.open) {
+  const one = scene.boxes.find(box => box === scene.hovered) ?? scene.boxes.find(box => box.track === track);
+  if (!one) return say('Point at a box, or open its track first.');
+  const { track_id: of, stamp_ns: stamp } = scopeOfBox([one.s, one.k]), pin = log.held.get(scopeKey(isAdded(one.s, one.k) ? 'addition' : 'judgement', scopeOfBox([one.s, one.k])));
+  const box = ['pin', 'add'].includes(pin?.decision) ? pin.box : one.box;
+  offerFit({ box: box.slice(), class: one.track.class, points: numInside(scenePoints(), box), stamp, place: box.slice(0, 2), isByHand: true, of });
+}
+
+// What the pointer takes hold of in the box that is offered, from above.
+function sceneGrip(event) {
+  if (!scene.fit || scene.isAdding || event.shiftKey || event.button || scene.tilt) return null;
+  const { box } = scene.fit, at = toFrame([...sceneAxes().from(event), box[2]], box, rotation(box));
+  return gripOf(at, box, GRIP / scene.zoom, [0, 1]);
+}
+
+function dragFit(grip, event) {
+  const fit = scene.fit, R = rotation(fit.box), at = toFrame([...sceneAxes().from(event), fit.box[2]], fit.box, R);
+  const box = fit.box.slice(), shift = [0, 0, 0];
+  if (grip.turns) box[8] += Math.atan2(at[1], at[0]);
+  else if (grip.face) {
+    const [axis, sign] = grip.face, size = Math.max(LEAST_SIZE, box[3 + axis] / 2 + sign * at[axis]);
+    shift[axis] = sign * (size - box[3 + axis]) / 2;
+    box[3 + axis] = size;
+  } else for (const k of [0, 1]) shift[k] = at[k] - grip.last[k];
+  box.splice(0, 3, ...fromFrame(shift, fit.box, R));
+  Object.assign(fit, { box, place: box.slice(0, 2), isByHand: true, points: numInside(scenePoints(), box) });
+  drawScene();
+}
+
+function flipFit() {
+  if (!scene.fit) return;
+  scene.fit.box = flipped(scene.fit.box);
+  drawScene();
+  drawCameras();
+}
+
+// Another class: what was drawn by hand or copied keeps its place and size.
+function chooseClass(name) {
+  if (!scene.fit || !name) return;
+  if (!scene.fit.isByHand) return fitAt(scene.fit.place, name);
+  offerFit({ ...scene.fit, class: name });
+}
+
+// Offer the box of the open track here, moved as between, or beyond, its two nearest boxes.
+function copyBox() {
+  const part = view.part, stamp = scene.sweep?.stamp;
+  if (!part || !stamp) return say('Open the track first, then copy its box in Drive.');
+  const at = secondsOf(stamp), rows = [...part.usable.keys()].filter(row => part.usable[row]);
+  if (rows.length < 1) return;
+  const [a, b = a] = rows.sort((j, k) => Math.abs(secondsOf(part.stamps[j]) - at) - Math.abs(secondsOf(part.stamps[k]) - at));
+  const [first, second] = [a, b].map(row => moved(pinOf(row) ? moved(pinOf(row).box, part.origin, -1) : part.usable[row], part.origin, 1));
+  const [s, t] = [a, b].map(row => secondsOf(part.stamps[row])), share = a === b ? 0 : (at - s) / (t - s);
+  const box = first.map((v, k) => (k < 3 ? v + share * (second[k] - v) : v));
+  offerFit({ box, class: current().class, points: numInside(scenePoints(), box), stamp, place: box.slice(0, 2), isByHand: true, of: scopeOfBox(boxAt(a)).track_id });
+}
+
+// The box of the object at a place, of its class by size or of the one chosen.
+async function fitAt(place, name = '') {
+  const extents = usualExtents(), stamp = sceneStamp();
   let found;
   try {
     found = await post('fit', { stamp, place, class: name, extents });
@@ -239,20 +331,34 @@ const nextProposal = () => showProposal((scene.proposal + 1) % Math.max(1, openP
 function offerFit(fit) {
   $('failure').hidden = true;
   scene.fit = fit;
-  const names = [...new Set([...TRACKS.map(track => track.class), fit.class, 'car', 'truck', 'bus', 'cyclist', 'pedestrian'])].sort();
+  const names = [...new Set([...classNames(), fit.class, ...(view.classes.length ? [] : ['car', 'truck', 'bus', 'cyclist', 'pedestrian'])])];
   fill($('scene-class'), ...names.map(one => element('option', { value: one, selected: one === fit.class }, one)));
   drawScene();
   drawCameras();
 }
 
+// A copied box is one more of its track: a seed of an added object, else a pin, which a run uses as a keyframe.
+/** @param {Fit} fit */
+async function keepCopy({ of, stamp, box, class: name }) {
+  const scope = { track_id: of, stamp_ns: stamp, end_ns: '' };
+  if (!await decide([seedsOf(of).length ? rowOf(scope, 'add', { box, value: name }) : rowOf(scope, 'pin', { box })])) return false;
+  const row = view.part ? view.part.stamps.indexOf(stamp) : -1;
+  say(row >= 0 ? `Track ${of} has this box.` : `Track ${of} has this box in the labels that are written next.`);
+  return true;
+}
+
 async function keepFit() {
   const { fit } = scene;
   if (!fit) return;
-  scene.fit = null;
+  if (scene.isKeeping) return;
+  scene.isKeeping = true;
+  const isAdded = await (fit.of ? keepCopy(fit) : addObject(fit.stamp, fit.box, $('scene-class').value));
+  scene.isKeeping = false;
+  if (!isAdded) return;  // it is not saved: the box stays
   scene.isAdding = false;
   scene.proposal = -1;
+  if (scene.fit === fit) scene.fit = null;
   drawSceneTools();
-  await addObject(fit.stamp, fit.box, $('scene-class').value);
 }
 
 function playScene() {
@@ -279,6 +385,12 @@ function tiltScene(tilt, turn = 0) {
 
 const toggleSpace = () => (scene.tilt ? tiltScene(0) : tiltScene(TILT.usual, scene.sweep.sensor[3] - Math.PI / 2));
 
+function wholeScene() {
+  scene.offset = [0, 0];
+  scene.zoom = $('scene-view').clientWidth / SHOWN;
+  drawScene();
+}
+
 function zoomScene(factor, event = null) {
   const place = event && sceneAxes().from(event);
   scene.zoom = Math.max(1, Math.min(120, scene.zoom * factor));
@@ -291,21 +403,24 @@ function zoomScene(factor, event = null) {
 
 function setUpScene() {
   const canvas = $('scene-view');
+  setUpPinch(canvas, (factor, event) => scene.sweep && zoomScene(factor, event));
   let drag = null;
   canvas.onpointerdown = event => {
     if (!scene.sweep) return;
     canvas.setPointerCapture(event.pointerId);
-    drag = { place: sceneAxes().from(event), x: event.clientX, y: event.clientY, far: 0, turns: event.shiftKey || event.button > 0 };
+    drag = { place: sceneAxes().from(event), x: event.clientX, y: event.clientY, far: 0, turns: event.shiftKey || event.button > 0, draws: scene.isAdding && !event.shiftKey && !event.button, grip: sceneGrip(event) };
   };
   canvas.onpointermove = event => {
     if (!drag) {
-      const found = scene.sweep && sceneBoxAt(sceneAxes().from(event));
+      const found = scene.hovered = scene.sweep && sceneBoxAt(sceneAxes().from(event));
       canvas.title = found ? `${found.track.id} ${found.track.class}` : '';
       return;
     }
     const [dx, dy] = [event.clientX - drag.x, event.clientY - drag.y];
     drag.far += Math.hypot(dx, dy);
     if (drag.far < CLICK) return;
+    if (drag.grip) return dragFit(drag.grip, event);
+    if (drag.draws) return drawByHand(drag.place, sceneAxes().from(event));
     [drag.x, drag.y] = [event.clientX, event.clientY];
     if (drag.turns) return tiltScene(scene.tilt - TILT.pace * dy, scene.turn - TILT.pace * dx);
     const now = sceneAxes().from(event);
@@ -314,8 +429,10 @@ function setUpScene() {
   };
   canvas.onpointerup = event => {
     const isClick = drag && drag.far < CLICK;
+    const isHeld = drag?.grip;
     drag = null;
-    if (!isClick) return;
+    if (isHeld) drawCameras();
+    if (!isClick || isHeld) return;
     const place = pickedPlace(event);
     if (scene.isAdding) return void fitAt(place);
     const found = sceneBoxAt(place);
@@ -324,9 +441,12 @@ function setUpScene() {
   canvas.onpointercancel = () => { drag = null; };
   canvas.addEventListener('wheel', event => {
     event.preventDefault();
-    if (scene.sweep) zoomScene(event.deltaY < 0 ? ZOOM_STEP : 1 / ZOOM_STEP, event);
+    if (scene.sweep) zoomScene(wheelFactor(event), event);
   }, { passive: false });
   $('camera-choice').onchange = drawCamera;
+  $('scene-colour').onchange = drawScene;
+  $('scene-sweeps').onchange = () => showScene(scene.at, true);
+  $('scene-in-image').onchange = drawCameras;
   $('scene-time').oninput = () => showScene(Number($('scene-time').value));
   $('scene-play').onclick = playScene;
   canvas.oncontextmenu = event => event.preventDefault();
@@ -335,5 +455,5 @@ function setUpScene() {
   $('scene-add').onclick = () => startAdding();
   $('scene-follow').onclick = keepFit;
   $('scene-cancel').onclick = () => startAdding(false);
-  $('scene-class').onchange = event => fitAt(scene.fit.place, event.target.value);
+  $('scene-class').onchange = event => chooseClass(event.target.value);
 }

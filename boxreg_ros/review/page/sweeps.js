@@ -1,6 +1,6 @@
 // Whole clouds of the recording, which the server reads when they are asked for -------------------
 
-const MAX_SWEEPS = 12;             // that stay read
+const MAX_SWEEPS = 24;             // that stay read
 const AWAY = 0.15;                 // a sweep farther from a stamp is not that of its boxes [s]
 const HEAD = 64;                   // bytes before the points: stamp, origin, position and heading of the sensor
 const sweeps = new Map();          // by stamp, as promises

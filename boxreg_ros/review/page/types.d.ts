@@ -9,7 +9,7 @@ interface Figures { flips: number; jitter: number | null; yaw_jitter: number | n
 /** A track of the report, or of an object that a person has added. */
 interface Source {
   id: string; class: string; boxes: number; interpolated: number; at: number[]; states: string;
-  inputs: string[]; owners: number[] | null; begin: number; seconds: number; points: number | null;
+  near: number | null; inputs: string[]; owners: number[] | null; begin: number; seconds: number; points: number | null;
   refined: number | null; status: Record<string, number>; reasons: Record<string, number>;
   shift: number | null; turn: number | null; deviation: number | null; flips: number;
   extents: (number | null)[][]; resized: number | null; before: Figures; after: Figures;
@@ -48,8 +48,8 @@ interface Report {
 interface Sweep { stamp: string; origin: number[]; sensor: number[]; points: Float32Array }
 interface Camera { topic: string; size: number[]; matrix: number[][] | null; distortion: number[]; model: string; pose: number[][] | null }
 type SlimPart = Pick<Part, 'origin' | 'usable' | 'stamps' | 'status'>;
-interface SceneBox { track: Track; box: number[]; isGone: boolean }
-interface Fit { box: number[]; class: string; points: number; stamp: string; place: number[] }
+interface SceneBox { s: number; k: number; status: string; track: Track; box: number[]; isGone: boolean }
+interface Fit { box: number[]; class: string; points: number; stamp: string; place: number[]; isByHand?: boolean; of?: string }
 interface Line { name: string; dash: number[]; corners: Point[] }
 
 interface HTMLCanvasElement { zoom: number; seconds(clientX: number): number; at(pixel: number[]): number[] }

@@ -10,8 +10,8 @@ const ZOOM = { least: 0.1, most: 20 };
 // The axes to the right and upwards, by view, and the corners of the outline that is seen.
 /** @type {Record<string, [number, number, number[]]>} */
 const VIEWS = { top: [0, 1, [4, 5, 6, 7]], side: [0, 2, [0, 1, 5, 4]], front: [1, 2, [0, 3, 7, 4]] };
-const NAMES = ['around', 'input', 'refined', 'truth', 'solved', 'human'];
-const DASHES = { input: [6, 4], truth: [2, 3] };
+const NAMES = ['around', 'beside', 'input', 'refined', 'truth', 'solved', 'human'];
+const DASHES = { input: [6, 4], truth: [2, 3], beside: [1, 3] };
 
 function currentBoxes() {
   const part = view.part, row = view.row;
@@ -60,14 +60,23 @@ function drawViews() {
   const near = mode === 'sweep' ? aroundAt(part.stamps[view.row], part.origin) : [];
   const cloud = mode === 'sweep' && view.cloud?.track === view.open && view.cloud.stamp === part.stamps[view.row] ? view.cloud.points : null;
   view.far = cloud ? cloud.map(inFrame) : near.flatMap(({ points }) => points.map(inFrame));
-  view.lines = [...near.map(({ box }) => ['around', box]), ...boxes]
+  view.lines = [...near.map(({ box }) => ['around', box]), ...boxesBeside(), ...boxes]
     .map(([name, box]) => ({ name, dash: DASHES[name] ?? [], corners: corners(box).map(inFrame) }));
   for (const [name, axes] of Object.entries(VIEWS)) drawFlat($(name), ...axes);
   drawSpace();
   drawCamera();
-  const labels = { around: 'neighbours', refined: part.status[view.row] === 'kept' ? 'kept' : 'refined', truth: 'true', solved: 'solved again' };
+  const labels = { around: 'neighbours', refined: part.status[view.row] === 'kept' ? 'kept' : 'refined', truth: 'true', solved: 'solved again', beside: 'before and after' };
   const shown = NAMES.filter(name => view.lines.some(line => line.name === name));
-  fill($('legend'), ...shown.map(name => element('span', {}, element('i', { style: `border-color: var(--${name}); border-top-style: ${{ input: 'dashed', truth: 'dotted' }[name] ?? 'solid'}` }), labels[name] ?? name)));
+  fill($('legend'), ...shown.map(name => element('span', {}, element('i', { style: `border-color: var(--${name}); border-top-style: ${{ input: 'dashed', truth: 'dotted', beside: 'dotted' }[name] ?? 'solid'}` }), labels[name] ?? name)));
+}
+
+const BESIDE = 5;                  // boxes before and after the one that is dragged
+
+// While a box is dragged: the boxes beside it in time, as they follow it.
+function boxesBeside() {
+  if (!view.edit || !view.followed) return [];
+  const rows = Array.from({ length: 2 * BESIDE + 1 }, (_, k) => view.row + k - BESIDE).filter(row => row !== view.row);
+  return rows.map(row => view.followed.get(view.part.stamps[row])).filter(Boolean).map(box => ['beside', moved(box, view.part.origin, -1)]);
 }
 
 // A box with numbers that are not finite has no place.
@@ -103,7 +112,7 @@ function drawFlat(canvas, right, up, outline) {
   for (const { name, dash, corners: c } of view.lines) {
     if (name === 'around' && !c.some(isNear)) continue;
     context.strokeStyle = colour(name);
-    context.lineWidth = name === 'human' ? 2.5 : name === 'around' ? 1 : 1.8;
+    context.lineWidth = name === 'human' ? 2.5 : ['around', 'beside'].includes(name) ? 1 : 1.8;
     context.setLineDash(dash);
     context.beginPath();
     outline.forEach((k, i) => context[i ? 'lineTo' : 'moveTo'](...at(c[k])));
@@ -146,6 +155,14 @@ function drawPoints(context, points, at, size, alpha, name) {
   context.globalAlpha = 1;
 }
 
+const NOTCH = 100;                 // of a wheel [px]
+const LINES = [1, 16, 400];        // pixels of a pixel, a line and a page of the wheel
+// How much a turn of the wheel zooms: by its length. A pinch on a trackpad is a turn with Ctrl, of a tenth of the length.
+function wheelFactor(event) {
+  const notches = event.deltaY * LINES[event.deltaMode] / NOTCH;
+  return ZOOM_STEP ** Math.max(-3, Math.min(3, -(event.ctrlKey ? 10 : 1) * notches));
+}
+
 // Zoom all views; the place under the pointer, in the frame of the box, stays there.
 function zoomBy(factor, canvas = null, event = null) {
   const before = view.zoom;
@@ -157,6 +174,33 @@ function zoomBy(factor, canvas = null, event = null) {
     view.center[up] -= part * (event.clientY - bounds.top - bounds.height / 2);
   }
   drawViews();
+}
+
+// Two fingers: `zoom` gets the factor, and the event with the place.
+function setUpPinch(canvas, zoom) {
+  const fingers = new Map();
+  const apart = () => { const [a, b] = [...fingers.values()]; return Math.max(1, Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY)); };
+  canvas.addEventListener('pointerdown', event => { if (event.pointerType === 'touch') fingers.set(event.pointerId, event); });
+  canvas.addEventListener('pointermove', event => {
+    if (!fingers.has(event.pointerId)) return;
+    const before = fingers.size === 2 ? apart() : 0;
+    fingers.set(event.pointerId, event);
+    if (!before) return;
+    event.stopImmediatePropagation();  // it moves nothing
+    zoom(apart() / before, event);
+  });
+  for (const name of ['pointerup', 'pointercancel']) canvas.addEventListener(name, event => fingers.delete(event.pointerId));
+}
+
+// Views are drawn again when they change their size: a camera may have appeared beside them.
+function setUpSizes() {
+  const observer = new ResizeObserver(() => {
+    if (!view.part || $('tracks').hidden) return;
+    drawViews();
+    drawCursor();
+    if (view.space) Plotly.Plots.resize('space');
+  });
+  for (const name of [...Object.keys(VIEWS), 'space']) observer.observe($(name));
 }
 
 function resetViews() {

@@ -1,0 +1,167 @@
+// The points of sweeps, drawn by the GPU below the boxes of the scene ------------------------------
+// One program and one call for each sweep. Positions are relative to the origin of the drive, so that
+// numbers of 32 bits are exact to a tenth of a millimetre, and are uploaded once.
+
+const MAX_BUFFERS = 24;            // sweeps that stay on the GPU
+const VERTEX = `#version 300 es
+in vec3 place; in vec4 tint; uniform vec3 center; uniform vec4 turn; uniform vec2 scale; uniform float size; out vec4 colour;
+void main() {
+  vec3 d = place - center;
+  vec2 flat_ = vec2(turn.x * d.x + turn.y * d.y, turn.x * d.y - turn.y * d.x);
+  float up = turn.z * flat_.y + turn.w * d.z, depth = turn.w * flat_.y - turn.z * d.z;
+  gl_Position = vec4(scale * vec2(flat_.x, up), clamp(depth / 1000.0, -1.0, 1.0), 1.0);
+  gl_PointSize = size;
+  colour = tint;
+}`;
+const FRAGMENT = `#version 300 es
+precision highp float; in vec4 colour; out vec4 shown;
+void main() { shown = vec4(colour.rgb * colour.a, colour.a); }`;
+
+/** @type {any} */
+const gpu = { buffers: new Map() };
+
+// The context with its program; null where there is no WebGL 2: points are drawn by the processor then.
+function gpuOf(canvas) {
+  if (gpu.isAsked) return gpu.gl;
+  gpu.isAsked = true;
+  const gl = gpu.gl = canvas.getContext('webgl2', { antialias: false, alpha: true });
+  if (!gl) return null;
+  const program = gl.createProgram();
+  for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+  }
+  gl.linkProgram(program);
+  gpu.program = program;
+  gpu.at = Object.fromEntries(['center', 'turn', 'scale', 'size'].map(name => [name, gl.getUniformLocation(program, name)]));
+  canvas.addEventListener('webglcontextlost', event => { event.preventDefault(); gpu.buffers.clear(); });
+  canvas.addEventListener('webglcontextrestored', () => { gpu.isAsked = false; gpu.buffers.clear(); drawScene(); });
+  return gl;
+}
+
+// The buffers of a sweep: places, and colours that are uploaded again when `key` changes.
+function bufferOf(gl, sweep, key) {
+  let known = gpu.buffers.get(sweep);
+  if (!known) {
+    known = { array: gl.createVertexArray(), places: gl.createBuffer(), tints: gl.createBuffer(), key: null };
+    gl.bindVertexArray(known.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, known.places);
+    gl.bufferData(gl.ARRAY_BUFFER, sweep.points, gl.STATIC_DRAW);
+    attribute(gl, 'place', 3, gl.FLOAT, false);
+    gl.bindBuffer(gl.ARRAY_BUFFER, known.tints);
+    attribute(gl, 'tint', 4, gl.UNSIGNED_BYTE, true);
+  }
+  if (known.key !== key) {
+    gl.bindBuffer(gl.ARRAY_BUFFER, known.tints);
+    gl.bufferData(gl.ARRAY_BUFFER, tintsOf(sweep), gl.STATIC_DRAW);
+    known.key = key;
+  }
+  gpu.buffers.delete(sweep);
+  gpu.buffers.set(sweep, known);  // the newest is last
+  for (const [old, { array, places, tints }] of gpu.buffers) {
+    if (gpu.buffers.size <= MAX_BUFFERS) break;
+    gpu.buffers.delete(old);
+    gl.deleteVertexArray(array);
+    gl.deleteBuffer(places);
+    gl.deleteBuffer(tints);
+  }
+  return known;
+}
+
+function attribute(gl, name, count, kind, isShare) {
+  const at = gl.getAttribLocation(gpu.program, name);
+  gl.enableVertexAttribArray(at);
+  gl.vertexAttribPointer(at, count, kind, isShare, 0, 0);
+}
+
+// Draw sweeps; whether there is a GPU to do so.
+function drawClouds(canvas, clouds, axes, key) {
+  const gl = gpuOf(canvas);
+  if (!gl) return false;
+  const scale = devicePixelRatio, { width, height } = axes;
+  canvas.width = Math.round(width * scale);
+  canvas.height = Math.round(height * scale);
+  gl.viewport(0, 0, canvas.width, canvas.height);
+  gl.clearColor(0, 0, 0, 0);
+  gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+  gl.enable(gl.DEPTH_TEST);  // the foremost point is seen; the page is behind pale ones
+  gl.useProgram(gpu.program);
+  const { zoom, tilt, turn } = scene;
+  gl.uniform4f(gpu.at.turn, Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt));
+  gl.uniform2f(gpu.at.scale, 2 * zoom / width, 2 * zoom / height);
+  gl.uniform1f(gpu.at.size, scale * (zoom > CLOSE_UP ? 2.5 : 1.6));
+  for (const sweep of clouds) {
+    gl.bindVertexArray(bufferOf(gl, sweep, key).array);
+    const [x, y, z] = axes.center.map((v, k) => v - sweep.origin[k]);
+    gl.uniform3f(gpu.at.center, x, y, z);
+    gl.drawArrays(gl.POINTS, 0, sweep.points.length / 3);
+  }
+  gl.bindVertexArray(null);
+  return true;
+}
+
+// Colours --------------------------------------------------------------------------------------
+
+const CLOSE_UP = 20;               // points are drawn larger from this zoom on [px/m]
+const HIGH = 3;                    // above the road: the last colour of heights [m]
+const STATUS_COLOURS = { refined: 'refined', kept: 'input', human: 'human', interpolated: 'truth', extended: 'truth', coasted: 'truth' };
+const rgbOf = name => colour(name).match(/[0-9a-f]{2}/gi).map(v => parseInt(v, 16));
+
+// A hue for a number of a list, far from those before it: steps of the golden angle.
+const hueOf = k => (137.5 * k) % 360;
+const textHash = text => [...text].reduce((sum, c) => (31 * sum + c.charCodeAt(0)) % 9973, 7);
+
+// The colour of a box, as a style.
+function boxColour({ track, isGone: gone, status }) {
+  const mode = $('scene-colour').value;
+  if (gone) return colour('around');
+  if (mode === 'class') return `hsl(${hueOf(classNames().indexOf(track.class) + 1)} 70% 45%)`;
+  if (mode === 'track') return `hsl(${hueOf(textHash(track.id))} 70% 45%)`;
+  if (mode === 'status') return colour(STATUS_COLOURS[status] ?? 'around');
+  return colour('refined');
+}
+
+const painter = document.createElement('canvas').getContext('2d', { willReadFrequently: true });
+
+function rgbOfStyle(style) {
+  painter.fillStyle = style;
+  painter.fillRect(0, 0, 1, 1);
+  return painter.getImageData(0, 0, 1, 1).data;
+}
+
+// Red, green, blue and opacity of each point of a sweep.
+function tintsOf(sweep) {
+  const mode = $('scene-colour').value, { points } = sweep, tints = new Uint8Array(points.length / 3 * 4);
+  const [road, object] = [rgbOf(LOOKS.road[0]), rgbOf(LOOKS.object[0])];
+  for (let i = 0, j = 0; i < points.length; i += 3, j += 4) {
+    const above = points[i + 2] - scene.road, isObject = above > ROAD;
+    const [r, g, b] = mode === 'height' ? heightColour(above) : isObject ? object : road;
+    tints[j] = r; tints[j + 1] = g; tints[j + 2] = b;
+    tints[j + 3] = 255 * (isObject || mode === 'height' ? LOOKS.object[1] : LOOKS.road[1]);
+  }
+  if (['class', 'track', 'status'].includes(mode) && sweep === scene.sweep) tintBoxes(sweep, tints);
+  return tints;
+}
+
+// From blue on the road to red above: the hues between, each as bright.
+function heightColour(above) {
+  const t = Math.max(0, Math.min(1, above / HIGH)), hue = 4 * (1 - t);
+  const channel = k => { const v = (k + hue) % 6; return 200 * (1 - Math.max(0, Math.min(v, 4 - v, 1))) + 30; };
+  return [channel(5), channel(3), channel(1)];
+}
+
+// The points in a box have its colour.
+function tintBoxes({ points, origin }, tints) {
+  for (const one of scene.boxes) {
+    const { box } = one, R = rotation(box), reach = Math.hypot(box[3], box[4], box[5]) / 2;
+    const [x, y, z] = [0, 1, 2].map(k => box[k] - origin[k]), [r, g, b] = rgbOfStyle(boxColour(one));
+    for (let i = 0, j = 0; i < points.length; i += 3, j += 4) {
+      const d = [points[i] - x, points[i + 1] - y, points[i + 2] - z];
+      if (Math.abs(d[0]) > reach || Math.abs(d[1]) > reach) continue;
+      const isInside = [0, 1, 2].every(k => Math.abs(d[0] * R[0][k] + d[1] * R[1][k] + d[2] * R[2][k]) <= box[3 + k] / 2);
+      if (isInside) tints.set([r, g, b, 255], j);
+    }
+  }
+}
