@@ -104,6 +104,13 @@ def test_rejected_boxes_are_no_labels(completed, capsys):
     assert np.isnan(labels['9']).all()
 
 
+def open_box(page, track_id, row):
+    """Open a box of a track, with the focus in the views."""
+    page.evaluate(f"openTrack(TRACKS.findIndex(t => t.id === '{track_id}'), null, {row})")
+    page.wait_for_function(f"view.part && current().id === '{track_id}'")
+    page.locator('#top').focus()
+
+
 def rules_of(summary):
     """Return the number of violations of each rule, before and after."""
     names = summary['rules']['before'].keys() | summary['rules']['after'].keys()
@@ -172,17 +179,24 @@ def test_joined_tracks_stay_one_however_long_the_pause(completed, tmp_path, caps
     assert set(words_of(rows, '2', stamps)) == {'', 'rejected'}
 
 
-def test_halves_of_a_split_are_not_followed_into_each_other(tmp_path, capsys):
-    """Boxes between keyframes that are deleted stay away; a corrected one is a new keyframe."""
+@pytest.fixture(scope='module')
+def followed(tmp_path_factory):
+    """Return a run with --keyframes, its stamps, and its result without decisions."""
+    folder = tmp_path_factory.mktemp('followed')
     drive = Drive(sweeps=13)
     for k in range(13):
         if k % 4:
             drive.replace('/boxes', k, lambda message: message.detections.clear())
-    stamps = drive.stamps
-    run = Run(drive.write(tmp_path / 'drive'), '--keyframes')
-    before = run(tmp_path / 'before')
-    table = BoxTable.read(tmp_path / 'before' / 'boxes.csv')
-    assert '' not in words_of(before, '2', stamps)
+    recording = drive.write(folder / 'drive')
+    before = Run(recording, '--keyframes', '--report')(folder / 'out')
+    assert '' not in words_of(before, '2', drive.stamps)
+    return Run(recording, '--keyframes'), drive.stamps, folder / 'out'
+
+
+def corrected_by_file(followed, folder):
+    """Split, delete and correct by a file; return the rows that are written and the pinned box."""
+    run, stamps, out = followed
+    table = BoxTable.read(out / 'boxes.csv')
     keys = zip(table.track_ids, table.stamps_ns.tolist(), strict=True)
     pin = table.boxes[list(keys).index(('1', stamps[6]))] + [0.2, 0, 0, 0, 0, 0, 0, 0, 0]
     decisions = [
@@ -190,8 +204,43 @@ def test_halves_of_a_split_are_not_followed_into_each_other(tmp_path, capsys):
         Decision('1', stamps[2], 'delete'),
         Decision('1', stamps[6], 'pin', '', table.frame_id, pin),
     ]
-    rows = run(tmp_path / 'after', decisions)
-    assert run.status == 0, capsys.readouterr().err
+    rows = run(folder / 'after', decisions)
+    assert run.status == 0
+    return rows, pin
+
+
+def corrected_by_page(followed, folder):
+    """Do the same in the page."""
+    out = shutil.copytree(followed[2], folder / 'out')
+    with (
+        serving(review_server([(out, drive_of(out))], 0, 'anna')) as server,
+        opened_page(server.address + '#track=2') as page,
+    ):
+        open_box(page, '2', 6)
+        press(page, 's', "current().id === '2_2'")
+        open_box(page, '1', 2)
+        press(page, 'Shift+D', 'current().deleted === 1')
+        open_box(page, '1', 6)
+        page.keyboard.press('e')
+        page.keyboard.press('Shift+ArrowRight')
+        page.keyboard.press('Shift+ArrowRight')
+        pin = page.evaluate('moved(view.edit, view.part.origin, 1)')
+        press(page, 'Enter', 'pinOf(view.row) !== null')
+        press(page, 'Control+s', "$('notice').textContent.includes('boxes in')", timeout=120_000)
+        assert page.locator('#failure').is_hidden()
+    rows = rows_in(folder / 'out.corrected' / 'boxes.csv')
+    return {(row['track_id'], int(row['stamp_ns'])): row for row in rows}, pin
+
+
+@pytest.mark.parametrize(
+    'corrected', [corrected_by_file, pytest.param(corrected_by_page, marks=NEEDS_BROWSER)]
+)
+def test_halves_of_a_split_are_not_followed_into_each_other(
+    followed, tmp_path, quick_python, corrected
+):
+    """Boxes between keyframes that are deleted stay away; a corrected one is a new keyframe."""
+    stamps = followed[1]
+    rows, pin = corrected(followed, tmp_path)
     first = words_of(rows, '2', stamps)
     assert '' not in first[:5]
     assert first[6:] == [''] * 7
@@ -204,8 +253,43 @@ def test_halves_of_a_split_are_not_followed_into_each_other(tmp_path, capsys):
     np.testing.assert_allclose(found, pin[:3], atol=1e-6)
 
 
+def accept_a_mistake(page):
+    """Accept a track that the run has rejected: it is no label until then."""
+    page.select_option('#f-status', 'rejected: look for mistakes')
+    assert page.evaluate('view.shown.map(track => track.id)') == ['9']
+    assert page.evaluate('view.sort') == 'near'
+    page.evaluate('openTrack(view.shown[0].index)')
+    page.wait_for_function("view.part && current().id === '9'")
+    pale = "scene.boxes.find(one => one.track.id === '9').isGone"
+    page.evaluate('showScene(8, true)')
+    page.wait_for_function('scene.sweep && scene.at === 8')
+    assert page.evaluate(pale)
+    press(page, 'a', "judgementOf(current())?.decision === 'accept'")
+    page.evaluate('showScene(8, true)')
+    page.wait_for_function(f'!{pale}')
+    page.click('#f-clear')
+
+
+def delete_and_join(page):
+    """Delete a stretch of a track, split it, and join its halves again."""
+    open_box(page, '1', 3)
+    page.keyboard.press('b')
+    page.evaluate('step(5)')
+    press(page, 'Shift+D', 'current().deleted === 3')
+    open_box(page, '1', 8)
+    press(page, 's', "current().id === '1_2'")
+    open_box(page, '1', 0)
+    page.keyboard.press('j')
+    page.wait_for_selector('#ask[open]')
+    page.fill('#ask-text', '1_2')
+    page.keyboard.press('Enter')
+    page.wait_for_function("!TRACKS.some(track => track.id === '1_2')")
+
+
 @NEEDS_BROWSER
-def test_decisions_of_the_page_are_all_in_the_labels_that_it_writes(completed, tmp_path):
+def test_decisions_of_the_page_are_all_in_the_labels_that_it_writes(
+    completed, tmp_path, quick_python
+):
     """Also about boxes that the run has added; what cannot be used is an error in the page."""
     _, stamps, _, made = completed
     out = shutil.copytree(made, tmp_path / 'out')
@@ -213,33 +297,31 @@ def test_decisions_of_the_page_are_all_in_the_labels_that_it_writes(completed, t
         serving(review_server([(out, drive_of(out))], 0, 'anna')) as server,
         opened_page(server.address + '#track=2') as page,
     ):
-
-        def open_box(track_id, row):
-            page.evaluate(f"openTrack(TRACKS.findIndex(t => t.id === '{track_id}'), null, {row})")
-            page.wait_for_function(f"view.part && current().id === '{track_id}'")
-            page.locator('#top').focus()
-
-        open_box('9', 0)
-        press(page, 'a', "judgementOf(current())?.decision === 'accept'")
-        open_box('1', 15)  # added at the end
+        accept_a_mistake(page)
+        delete_and_join(page)
+        open_box(page, '1', 15)  # added at the end
+        press(page, 'Shift+D', 'current().deleted === 4')
+        open_box(page, '2', 4)  # added in the gap
         press(page, 'Shift+D', 'current().deleted === 1')
-        open_box('2', 4)  # added in the gap
-        press(page, 'Shift+D', 'current().deleted === 1')
-        open_box('2', 5)
+        open_box(page, '2', 5)
         page.keyboard.press('e')
         page.keyboard.press('ArrowUp')
         corrected = page.evaluate('moved(view.edit, view.part.origin, 1)')
         press(page, 'Enter', 'pinOf(view.row) !== null')
-        open_box('2', 1)
+        open_box(page, '2', 1)
         page.keyboard.press('b')
         page.evaluate('step(2)')
         page.keyboard.press('k')
         page.wait_for_selector('#ask[open]')
         page.fill('#ask-text', 'truck')
         page.keyboard.press('Enter')
-        page.wait_for_function('log.made.length === 5')
-        open_box('2', 10)
+        page.wait_for_function('log.made.length === 8')
+        open_box(page, '2', 10)
         press(page, 's', "current().id === '2_2'")
+        open_box(page, '2_2', 4)
+        page.keyboard.press('b')
+        page.evaluate('step(5)')
+        press(page, 'Shift+D', 'current().deleted === 2')  # the end of its input
         DecisionLog(out / DECISIONS).append([Decision('nobody', None, 'delete')])
         page.keyboard.press('Control+s')
         page.wait_for_selector('#failure:not([hidden])', timeout=120_000)
@@ -252,8 +334,13 @@ def test_decisions_of_the_page_are_all_in_the_labels_that_it_writes(completed, t
     found = [float(rows['2', stamps[5]][name]) for name in ('x', 'y', 'z')]
     np.testing.assert_allclose(found, corrected[:3], atol=1e-6)
     assert words[10:] == [''] * 6
-    assert '' not in words_of(rows, '2_2', stamps)[10:]
-    assert words_of(rows, '1', stamps)[13:] == ['extended', 'extended', '']
+    second = words_of(rows, '2_2', stamps)[10:]
+    assert '' not in second[:4]
+    assert second[4:] == ['rejected'] * 2
+    words = words_of(rows, '1', stamps)
+    assert words[3:6] == ['rejected'] * 3
+    assert words[13:] == ['extended', 'extended', '']
+    assert {name for name, _ in rows} == {'1', '2', '2_2', '9'}
     assert set(words_of(rows, '9', stamps)[8:10]) <= {'refined', 'kept'}
     classes = [rows['2', stamp]['class_name'] for stamp in stamps[:4]]
     assert classes == ['car', 'truck', 'truck', 'car']

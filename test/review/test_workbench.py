@@ -45,7 +45,7 @@ def made(tmp_path_factory):
 
 
 @pytest.fixture
-def server(made, tmp_path):
+def server(made, tmp_path, quick_python):
     """Return a running server for a copy of the result."""
     out = shutil.copytree(made / 'out', tmp_path / 'out')
     with serving(review_server([(out, drive_of(out))], 0, 'anna')) as found:

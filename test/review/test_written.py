@@ -1,0 +1,162 @@
+"""A drive is finished in the page: labels are written, opened, listed and downloaded there."""
+
+import os
+import shutil
+import signal
+import subprocess
+from zipfile import ZipFile
+
+from boxreg_ros.cli import main
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.review_command import drive_of
+from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
+from boxreg_ros.review.differences import differences
+from boxreg_ros.review.server import review_server
+from boxreg_ros.review.token import review_token
+from boxreg_ros.structures import BoxArray
+from browser import NEEDS_BROWSER, opened_page, press, serving
+import numpy as np
+import pytest
+from ros_messages import Drive
+
+pytest.importorskip('plotly')
+QUICK = ['--set', 'solver.rounds=2', '--set', 'sampling.points=64', '--formats', 'csv']
+
+
+@pytest.fixture(scope='module')
+def made(tmp_path_factory):
+    """Return a result of two tracks."""
+    folder = tmp_path_factory.mktemp('written')
+    recording = Drive(sweeps=10).write(folder / 'drive')
+    assert main(['relabel', str(recording), '-o', str(folder / 'out'), '--report', *QUICK]) == 0
+    return folder / 'out'
+
+
+@NEEDS_BROWSER
+def test_the_new_result_opens_with_what_changed_and_its_files(made, tmp_path, quick_python):
+    out = shutil.copytree(made, tmp_path / 'out')
+    with (
+        serving(review_server([(out, drive_of(out))], 0, 'anna')) as server,
+        opened_page(server.address + '#track=1') as page,
+    ):
+        colleague = page.context.browser.new_page(bypass_csp=True)
+        colleague.goto(server.address + '#track=2')
+        colleague.wait_for_selector('html[data-ready]', timeout=60_000)
+        press(page, 'd', 'isGone(current())')
+        page.evaluate("""(() => {
+          window.said = [];
+          new MutationObserver(() => said.push($('notice').textContent))
+            .observe($('notice'), { childList: true }); })()""")
+        page.click('#files-button')
+        page.wait_for_selector('#files[open]')
+        assert not page.is_checked('#files-formats [value=openlabel]')
+        page.check('#files-formats [value=openlabel]')
+        page.click('#files-write')
+        page.wait_for_function("$('notice').textContent.includes('Writing')")
+        late = Decision('2', None, 'unsure', who='ben', when='2026-01-01T00:00:00+00:00')
+        DecisionLog(out / DECISIONS).append([late])
+        page.wait_for_function("$('notice').textContent.includes('boxes in')", timeout=120_000)
+        assert any('of 1 s of the drive' in text for text in page.evaluate('said'))
+        # The page goes on in the new result, that of a colleague as well.
+        new = tmp_path / 'out.corrected'
+        assert server.log_paths == [new / DECISIONS]
+        assert page.is_visible('#overview')
+        assert page.inner_text('#written-text') == 'The decisions changed boxes of 1 track:'
+        assert page.inner_text('#written-rows').split() == ['1', '10', 'removed']
+        assert page.evaluate('[...view.changed]') == ['1']
+        colleague.wait_for_function("$('notice').textContent.includes('the new result')")
+        assert colleague.evaluate('view.changed.size') == 1
+        colleague.context.close()
+        page.wait_for_function('log.count === 2')  # none is lost that was made meanwhile
+        # Its files.
+        page.click('#files-button')
+        page.wait_for_selector('#files[open]')
+        assert page.inner_text('#files-folder') == str(new)
+        with page.expect_download() as found:
+            page.click('#files-rows a >> text=boxes.csv')
+        assert found.value.path().read_bytes() == (new / 'boxes.csv').read_bytes()
+        with page.expect_download() as found:
+            page.click('#files-rows a >> text=openlabel/')
+        with ZipFile(found.value.path()) as archive:
+            (name,) = archive.namelist()
+            assert archive.read(name) == (new / name).read_bytes()
+        page.keyboard.press('Escape')
+        # What is decided next is in the new folder, and the next labels go beside it.
+        page.click('#tab-tracks')
+        press(page, 'c', "document.activeElement.id === 'comment'")
+        page.keyboard.type('seen')
+        press(page, 'Enter', 'log.count === 3')
+    assert [one.comment for one in read_decisions(new / DECISIONS)] == ['', '', 'seen']
+    assert len(read_decisions(out / DECISIONS)) == 2
+    rejected = [s == 'rejected' for s in BoxTable.read(new / 'boxes.csv').status]
+    assert sum(rejected) == 10
+
+
+def test_differences_are_those_of_labels():
+    box = np.array([1.0, 2, 0, 4, 2, 1.5, 0, 0, 0])
+
+    def table(*rows):
+        arrays = []
+        for stamp, names, classes, shift in rows:
+            boxes = np.tile(box, (len(names), 1))
+            boxes[:, 0] += shift
+            arrays.append(BoxArray(stamp, 'odom', names, classes, np.ones(len(names)), boxes))
+        return BoxTable.from_arrays(arrays)
+
+    before = table((1, ('a', 'b'), ('car', 'car'), 0), (2, ('a', 'b'), ('car', 'car'), 0))
+    after = table((1, ('a', 'b'), ('car', 'van'), 0.25), (3, ('a',), ('car',), 0))
+    assert differences(before, before) == []
+    none = {'added': 0, 'removed': 0, 'changed': 0, 'shift': 0.0, 'class': ''}
+    assert differences(before, after) == [
+        {'id': 'a', **none, 'added': 1, 'removed': 1, 'changed': 1, 'shift': 0.25},
+        {'id': 'b', **none, 'removed': 1, 'changed': 1, 'shift': 0.25, 'class': 'van'},
+    ]
+
+
+def test_the_token_is_that_of_the_user_and_the_results(tmp_path, monkeypatch):
+    monkeypatch.setenv('XDG_STATE_HOME', str(tmp_path / 'state'))
+    token = review_token([tmp_path / 'out'])
+    assert review_token([tmp_path / 'out']) == token
+    assert review_token([tmp_path / 'other']) != token
+    secret = tmp_path / 'state/boxreg/review_secret'
+    assert secret.stat().st_mode & 0o777 == 0o600
+    secret.write_bytes(b'')  # damaged: a token of this start
+    assert review_token([tmp_path / 'out']) != review_token([tmp_path / 'out'])
+    monkeypatch.setenv('XDG_STATE_HOME', '/proc/none')
+    assert len(review_token([tmp_path / 'out'])) == len(token)
+
+
+@pytest.mark.parametrize('has_screen', [True, False])
+def test_the_browser_opens_where_there_is_a_screen(made, tmp_path, preloaded_python, has_screen):
+    opened = tmp_path / 'opened'
+    script = tmp_path / 'browser'
+    script.write_text(f'#!/bin/sh\necho "$1" > {opened}.part; mv {opened}.part {opened}\n')
+    script.chmod(0o755)
+    environment = {name: os.environ[name] for name in os.environ if 'SSH' not in name}
+    environment |= {'BROWSER': f'{script} %s', 'DISPLAY': ':9' if has_screen else ''}
+    environment.pop('WAYLAND_DISPLAY', None)
+    command = [preloaded_python, '-m', 'boxreg_ros.cli', 'review', str(made), '--port', '0']
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True) as process:
+        try:
+            address = process.stdout.readline().strip()
+            process.stdout.readline()
+            for _ in range(200 if has_screen else 0):
+                if opened.exists():
+                    break
+                with pytest.raises(subprocess.TimeoutExpired):
+                    process.wait(0.05)
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert opened.exists() == has_screen
+    if has_screen:
+        assert opened.read_text().strip() == address
+
+
+def test_a_run_ends_with_the_next_command(made, tmp_path, capsys):
+    recording = made.with_name('drive')
+    out = tmp_path / 'a result'
+    assert main(['relabel', str(recording), '-o', str(out), *QUICK]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == f"next: boxreg review '{out}' (after the same run with --report)"
