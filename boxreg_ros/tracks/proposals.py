@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, ROLL, WIDTH
+from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
+from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, ROLL, WIDTH, YAW
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -51,6 +51,12 @@ MOVED = 1.5
 STRAIGHT_PART = 0.7
 STEADY = 0.25
 """Deviation of the centre and of the sides of what stands, from sweep to sweep [m]."""
+
+SECOND_NS = 10**9
+LANE_WIDTH, LANE_LENGTH = 2.5, 40.0
+"""Boxes beside a lane line up to this far across and along [m]; chosen: lanes are 2.5 to 3.5 m."""
+PARALLEL = 0.94
+"""Cosine of the angle between boxes of one lane; chosen: 20 degrees."""
 
 VEHICLE_SIZES = (1.2, 18.0), 3.2, (0.9, TOP)
 PERSON_SIZES = (0.2, 1.1), 0.9, (1.2, 2.1)
@@ -98,11 +104,16 @@ class Proposer:
     def __init__(self) -> None:
         self._open: list[Chain] = []
         self._ended: list[Chain] = []
+        self._known = np.zeros((0, 9))  # boxes of known objects of one sweep in each second
+        self._known_ns = -SECOND_NS
 
     def add(
         self, stamp_ns: int, points: NDArray[np.floating], origin: Floats, boxes: Floats
     ) -> None:
         """Add a sweep: points (M, 3), sensor position (3,), boxes (n, 9) of known objects."""
+        if stamp_ns - self._known_ns >= SECOND_NS:
+            self._known = np.concatenate([self._known, boxes])
+            self._known_ns = stamp_ns
         chains, self._open = self._open, []
         for chain in chains:
             goes_on = 0 < stamp_ns - chain[-1].stamp_ns <= MAX_GAP_NS
@@ -126,6 +137,9 @@ class Proposer:
         """Return all proposals, longest first."""
         chains = [c for c in self._ended + self._open if len(c) >= MIN_SWEEPS]
         found = [one for one in map(_proposal, chains) if one is not None]
+        moving = [one.box for one in found if one.speed]
+        known = np.concatenate([self._known, np.reshape(moving, (-1, 9))])
+        found = [one if one.speed else _headed(one, known) for one in found]
         return sorted(found, key=lambda one: (-len(one.stamps_ns), one.stamp_ns))
 
 
@@ -266,6 +280,30 @@ def _proposal(clusters: Chain) -> Proposal | None:
     speed = distance / ((stamps_ns[-1] - stamps_ns[0]) * 1e-9) if moves else 0.0
     box = _box(best, class_name, heading)
     return Proposal(class_name, best.stamp_ns, box, len(best.points), stamps_ns, speed)
+
+
+def _headed(one: Proposal, known: Floats) -> Proposal:
+    """
+    Return a proposal that stands, with the heading of the lane it is in.
+
+    That of the nearest box of `known` (n, 9) that is parallel to it, no farther away across than
+    `LANE_WIDTH` and along than `LANE_LENGTH`; without one it stays as it is.
+
+    """
+    x, y, yaw = one.box[0], one.box[1], one.box[YAW]
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    along = np.abs(cos * (known[:, 0] - x) + sin * (known[:, 1] - y))
+    across = np.abs(cos * (known[:, 1] - y) - sin * (known[:, 0] - x))
+    agreement = np.cos(known[:, YAW] - yaw)
+    is_near = (along < LANE_LENGTH) & (across < LANE_WIDTH) & (np.abs(agreement) > PARALLEL)
+    if not is_near.any():
+        return one
+    nearest = np.flatnonzero(is_near)[(along + across)[is_near].argmin()]
+    if agreement[nearest] > 0:
+        return one
+    box = one.box.copy()
+    box[YAW] = wrap_angle(yaw + np.pi)
+    return one._replace(box=box)
 
 
 def _is_steady(centres: Floats, sides: Floats) -> bool:
