@@ -151,7 +151,7 @@ function selectLine() {
 }
 
 /** @returns {any[]} */
-const filters = () => [...document.querySelectorAll('.filters input, .filters select')];
+const filters = () => [...document.querySelectorAll('#list .filters input, #list .filters select')];
 
 function clearFilters() {
   for (const input of filters()) input.value = input.matches('select') ? '' : input.defaultValue;
