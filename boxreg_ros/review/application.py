@@ -240,7 +240,8 @@ class Review:
         rows = sent.get('rows')
         if not isinstance(rows, list) or not 0 < len(rows) <= MAX_ROWS:
             raise RecordingError(f'rows: expected 1 to {MAX_ROWS} decisions in a list')
-        new = [self._decision(row) for row in rows]
+        when = datetime.now(UTC).isoformat(timespec='milliseconds')  # one for all: undone at once
+        new = [self._decision(row, when) for row in rows]
         return await run_in_threadpool(self._append, new, sent.get('seen'))
 
     async def events(self, request: Request) -> Response:
@@ -357,7 +358,7 @@ class Review:
         finally:
             self.listeners -= 1
 
-    def _decision(self, sent: object) -> Decision:
+    def _decision(self, sent: object, when: str) -> Decision:
         """Return the decision that the page has sent."""
         if not isinstance(sent, dict):
             raise RecordingError('decision: expected an object')
@@ -372,7 +373,7 @@ class Review:
             end_ns=stamp_of(sent, 'end_ns'),
             value=text_of(sent, 'value'),
             who=text_of(sent, 'who') or self._who,
-            when=datetime.now(UTC).isoformat(timespec='milliseconds'),
+            when=when,
         )
 
     async def _relabel(self, formats: Sequence[str]) -> Response:

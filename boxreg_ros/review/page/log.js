@@ -72,7 +72,7 @@ function takeOver(rows) {
 
 // Whether rows state the same, whoever wrote them.
 const isSameRow = (a, b) => keyOf(a) === keyOf(b) && a.decision === b.decision && a.comment === b.comment && a.value === b.value
-  && (a.box === null) === (b.box === null) && (a.box ?? []).every((v, k) => Math.abs(v - b.box[k]) < ROUNDING);
+  && (a.box === null) === (b.box === null) && (a.box ?? []).every((v, k) => Math.abs(k < 6 ? v - b.box[k] : Math.sin((v - b.box[k]) / 2)) < ROUNDING);
 const isSame = (first, second) => first?.length === second.length && first.every((row, k) => isSameRow(row, second[k]));
 
 // The history is that of the file: rows that restore what held before an own decision undo it.
