@@ -1,15 +1,15 @@
 """
 Draw every picture of the README and of the documentation: ``make figures``.
 
-Each picture comes from a run of ``boxreg`` on this machine. The report's picture is a screenshot
-and needs Chromium; where there is none, that picture alone stays as it is.
+Each picture comes from a run of ``boxreg`` on this machine. Those of the page are screenshots and
+need Chromium; where there is none, these stay as they are.
 
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import csv
 from dataclasses import replace
 from io import BytesIO
@@ -20,23 +20,27 @@ import sys
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.core.matching import StampMatcher
 from boxreg_ros.core.observation import GROUND_CLEARANCE
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.drive import Drive
+from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.changes import Changes, TrackChanges
 from boxreg_ros.review.report import REPORT
+from boxreg_ros.review.server import review_server
 from boxreg_ros.review.track_points import PointCollector, SHOWN_MARGIN
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, RefinedBoxes, ROLL, Sweep, X, Y, Z
-from browser import BROWSER_OPTIONS, BROWSERS
+from browser import BROWSER_OPTIONS, BROWSERS, end_shared_browser, opened_page, serving
 import matplotlib
 from measure import MEASURE
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 ROOT = Path(__file__).resolve().parents[1]
 STREET = ROOT / 'bags' / 'street.mcap'
@@ -49,6 +53,16 @@ POINT_STEP = 3
 """Every n-th point is drawn."""
 RESULT = 'street'
 """Result folder of `STREET`, inside of the folder of the runs."""
+DRIVE = 'drive'
+"""Result folder of the same recording without its boxes."""
+FILM = {'viewport': {'width': 1280, 'height': 720}, 'device_scale_factor': 0.8}
+"""Size of the moving picture [CSS pixels], and pixels per CSS pixel."""
+FILMED = 3
+"""Objects that are added in it."""
+SETTLE = 1200
+"""Time for a page to draw all it shows [ms]."""
+QUALITY = 60
+"""Of the moving picture, from 0 to 100: text stays sharp in under 300 kB."""
 SCREENSHOT_OPTIONS = (
     '--headless', *BROWSER_OPTIONS, '--virtual-time-budget=20000', '--disable-quic',
     '--no-first-run', '--disable-background-networking', '--disable-component-update',
@@ -76,13 +90,8 @@ def draw_car(runs: Path, target: Path) -> None:
 
 def draw_report(runs: Path, target: Path) -> None:
     """Take a screenshot of one track of the report, if there is a browser."""
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    browser = browser_for(target)
     if browser is None:
-        print(
-            f'{target.name}: not drawn again: expected one of {", ".join(BROWSERS)} on PATH, '
-            f'found none; install it (apt install chromium) and run this again',
-            file=sys.stderr,
-        )
         return
     screenshot = runs / target.name
     width, height = PAGE_SIZE
@@ -94,7 +103,68 @@ def draw_report(runs: Path, target: Path) -> None:
     ]  # fmt: skip
     subprocess.run(command, check=True, capture_output=True, timeout=TIMEOUT)
     with Image.open(screenshot) as picture:  # a palette holds the colours in a third of the size
-        picture.convert('RGB').quantize(256).save(target, optimize=True)
+        about = PngInfo()
+        about.add_text('Software', f'boxreg_ros {__version__}')
+        picture.convert('RGB').quantize(256).save(target, optimize=True, pnginfo=about)
+
+
+def browser_for(target: Path) -> str | None:
+    """Return the browser; None, said on stderr, if there is none: a picture stays as it is."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        print(
+            f'{target.name}: not drawn again: expected one of {", ".join(BROWSERS)} on PATH, '
+            f'found none; install it (apt install chromium) and run this again',
+            file=sys.stderr,
+        )
+    return browser
+
+
+def draw_review(runs: Path, target: Path) -> None:
+    """Film a review, if there is a browser: tracks from proposals, then before and after."""
+    if browser_for(target) is None:
+        return
+    boxreg(
+        'relabel', STREET, '-o', DRIVE, '--report', '--boxes', 'none', '--proposals', folder=runs
+    )
+    frames = [*proposals_frames(runs / DRIVE), *before_and_after_frames(runs / RESULT)]
+    pictures = [Image.open(BytesIO(png)).convert('RGB') for png, _ in frames]
+    pictures[0].save(
+        target, save_all=True, append_images=pictures[1:], duration=[ms for _, ms in frames],
+        loop=0, quality=QUALITY, method=6,
+    )  # fmt: skip
+
+
+def proposals_frames(out: Path) -> Iterator[tuple[bytes, int]]:
+    """Yield screenshots of adding objects by two keys each, and how long each is shown [ms]."""
+    with (
+        serving(review_server([(out, drive_of(out))], 0, 'you')) as server,
+        opened_page(server.address + '#drive', **FILM) as page,
+    ):
+        page.wait_for_function('scene.sweep')
+        yield page.screenshot(), 900
+        for count in range(1, FILMED + 1):
+            page.keyboard.press('p')
+            page.wait_for_function("scene.fit && !$('drive').hidden")
+            page.wait_for_timeout(SETTLE)
+            yield page.screenshot(), 700
+            page.keyboard.press('Enter')
+            page.wait_for_function(
+                f"TRACKS.length === {count} && !$('tracks').hidden && view.space", timeout=120_000
+            )
+            page.wait_for_timeout(SETTLE)
+            yield page.screenshot(), 700
+
+
+def before_and_after_frames(out: Path) -> Iterator[tuple[bytes, int]]:
+    """Yield screenshots of a track: its points in the input boxes and in the refined ones."""
+    url = f'{(out / REPORT).as_uri()}#track={densest_vehicle(out)}'
+    with opened_page(url, **FILM) as page:
+        page.wait_for_function('view.space')
+        for mode in ('before', 'after') * 2:
+            page.select_option('#mode', mode)
+            page.wait_for_timeout(SETTLE)
+            yield page.screenshot(), 1200
 
 
 def densest_vehicle(result: Path) -> str:
@@ -118,6 +188,7 @@ def draw_paper(runs: Path, target: Path) -> None:
 PICTURES = {
     'docs/images/car_before_after.png': draw_car,
     'docs/images/report.png': draw_report,
+    'docs/images/review.webp': draw_review,
     'bags/paper.png': draw_paper,
 }
 """The function that draws each picture; it gets the folder of the runs and the file to write."""
@@ -228,6 +299,7 @@ def main() -> None:
         boxreg('relabel', STREET, '-o', RESULT, '--report', '--truth', truth, folder=runs)
         for name, draw in PICTURES.items():
             draw(runs, ROOT / name)
+        end_shared_browser()
 
 
 if __name__ == '__main__':

@@ -8,6 +8,7 @@ import re
 import shutil
 import zlib
 
+from boxreg_ros import __version__
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
@@ -81,6 +82,22 @@ def test_stored_pictures_are_sharp_and_small(name):
     with Image.open(path) as picture:
         assert max(picture.size) >= 1000
         assert pixels(picture).std() > 5
+
+
+def test_the_report_is_shown_as_this_version_draws_it():
+    with Image.open(ROOT / 'docs/images/report.png') as picture:
+        assert picture.text['Software'] == f'boxreg_ros {__version__}', 'run make figures'
+
+
+def test_the_first_page_of_the_docs_moves():
+    (name,) = [name for name in shown_pictures(ROOT / 'docs/index.md') if name.endswith('webp')]
+    with Image.open(ROOT / name) as film:
+        seconds = 0.0
+        for frame in range(film.n_frames):
+            film.seek(frame)
+            film.load()
+            seconds += film.info['duration'] / 1000
+    assert 8 < seconds < 15
 
 
 def test_make_figures_draws_the_pictures():
