@@ -62,6 +62,12 @@ def preloaded_python(tmp_path_factory):
 
 
 @pytest.fixture
+def quick_python(preloaded_python, monkeypatch):
+    """Let the page of a review write labels in processes with all modules."""
+    monkeypatch.setattr(sys, 'executable', preloaded_python)
+
+
+@pytest.fixture
 def set_constants(monkeypatch):
     """Return a function that changes numbers of the method, until the end of the test."""
 

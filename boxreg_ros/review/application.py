@@ -19,7 +19,7 @@ from zipfile import ZipFile
 import anyio
 from boxreg_ros.errors import BoxregError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.steps import PIPE
+from boxreg_ros.io.steps import PROGRESS
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, WITH_BOX
 from boxreg_ros.review.differences import differences
 from boxreg_ros.review.progress import agreement_text, PAUSE, progress_of, total, UNREAD
@@ -392,23 +392,19 @@ class Review:
             more += ['--formats', ','.join(formats)]
         if decisions.exists():
             more += ['--decisions', str(decisions)]
-        steps, step = os.pipe()
-        os.set_blocking(step, False)  # a run does not wait for its reader
-        try:
+        with NamedTemporaryFile() as steps:
             process = await asyncio.create_subprocess_exec(
                 sys.executable, '-m', 'boxreg_ros.cli', *command, *more,
-                cwd=folder, pass_fds=[step], env={**os.environ, PIPE: str(step)},
+                cwd=folder, env={**os.environ, PROGRESS: steps.name},
                 stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
             )  # fmt: skip
-        finally:
-            os.close(step)
-        watching = asyncio.create_task(self._watch(steps))
-        try:
-            output, errors = await process.communicate()
-        finally:
-            watching.cancel()
-            if process.returncode is None:
-                process.terminate()  # it removes what it has begun
+            watching = asyncio.create_task(self._watch(Path(steps.name)))
+            try:
+                output, errors = await process.communicate()
+            finally:
+                watching.cancel()
+                if process.returncode is None:
+                    process.terminate()  # it removes what it has begun
         lines = [part.decode(errors='replace').splitlines() for part in (output, errors)]
         if not lines[0]:  # nothing was written
             raise RecordingError(lines[1][-1] if lines[1] else 'boxreg relabel failed')
@@ -417,16 +413,14 @@ class Review:
         found = {'line': lines[0][-1], 'notes': lines[1], 'error': error}
         return JSONResponse({'out': str(new), 'written': self._written, **found})
 
-    async def _watch(self, steps: int) -> None:
-        """Note the progress of a run, a line of which is what is done, and the total [s]."""
-        reader = asyncio.StreamReader()
-        with os.fdopen(steps, 'rb') as pipe:
-            loop = asyncio.get_running_loop()
-            await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), pipe)
-            async for line in reader:
-                done, total_seconds = map(float, line.split())
-                if total_seconds:
-                    self._progress = orjson.dumps({'done': done, 'total': total_seconds}).decode()
+    async def _watch(self, steps: Path) -> None:
+        """Note the progress of a run, which has what is done, and the total, in a file [s]."""
+        while True:
+            await anyio.sleep(POLL_SECONDS)
+            words = steps.read_text(encoding='utf-8').split()
+            if len(words) == 2:  # else it is being written
+                done, total_seconds = map(float, words)
+                self._progress = orjson.dumps({'done': done, 'total': total_seconds}).decode()
 
     def _go_on_in(self, new: Path) -> None:
         """Go on in the result that was written, with what was decided meanwhile."""
