@@ -222,7 +222,7 @@ class MotionCheck:
         self._jumps.look(tree, fixed_frame, frame)
         found = {
             'jumps': self._jump_text(fixed_frame, frame),
-            'publishers': self._publisher_text(),
+            'publishers': self._publisher_text() or _contradiction_text(route),
             'clock': self._clock_text(moving),
             'boxes_clock': self._boxes_clock_text(),
             'sensor': '' if self._named_sensors else registered_text(tree, fixed_frame, frame),
@@ -327,6 +327,19 @@ def registered_text(tree: TransformTree, fixed_frame: str, frame: str) -> str:
         f'the LiDAR; name its frame: --sensor-frame {names[0]}{more} (node: '
         f"sensor_frames:=['{names[0]}'])"
     )
+
+
+def _contradiction_text(route: Sequence[Edge]) -> str:
+    """Return which transform has several positions at one stamp."""
+    for edge in route:
+        if not edge.is_static and edge.contradictions >= MIN_ALTERNATIONS:
+            return (
+                f'transform {edge.parent} -> {edge.child}: expected one position at each stamp, '
+                f'got {edge.contradictions} other ones at stamps that were known, up to '
+                f'{edge.stamps[-1]} ns: two publishers state it, or one that sets no stamps; '
+                f'choose another source of motion, with --fixed-frame or --odometry'
+            )
+    return ''
 
 
 def _sparse_text(moving: Sequence[Edge]) -> str:

@@ -35,6 +35,8 @@ Two periods of a TF publisher of 10 Hz: one message may be late or lost. At 1 m/
 carried on for that long is off by 2 cm.
 
 """
+SAME_POSITION = 0.01
+"""Positions of one frame at one stamp differ by less [m]; chosen: one centimetre of rounding."""
 MAX_LINEAR_GAP = 0.25
 """
 Longest gap between two samples of a moving frame that is interpolated linearly, as tf2 does [s].
@@ -478,6 +480,8 @@ class Edge:
         Stamps of the samples, ascending [ns]; one for a static pair.
     poses : list of (7,) float64
         x y z qx qy qz qw of the child in the parent at these stamps [m].
+    contradictions : int
+        Samples of a moving pair with the stamp of another one, but at another position.
     arrivals : ReceiveTimes
         When the first samples were received.
     num_ahead : int
@@ -493,6 +497,7 @@ class Edge:
         self.stamps: list[int] = []
         self.poses: list[Floats] = []
         self.arrivals = ReceiveTimes()
+        self.contradictions = 0
         self.num_ahead = 0
         self._jump_detector = TimeJumpDetector()
         self._clock = StreamClock()
@@ -545,6 +550,9 @@ class Edge:
             first, end = 0, len(self.stamps)
         else:
             first, end = bisect_left(self.stamps, stamp_ns), bisect_right(self.stamps, stamp_ns)
+            if end > first:
+                apart = np.linalg.norm(self.poses[first][:3] - values[:3])
+                self.contradictions += bool(apart > SAME_POSITION)
         self.stamps[first:end], self.poses[first:end] = [stamp_ns], [values]
         old = bisect_left(self.stamps, self.stamps[-1] - self._buffer_ns)
         # Two samples stay at any age: extrapolation needs a velocity.

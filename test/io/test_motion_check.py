@@ -312,6 +312,24 @@ def test_publishers_that_disagree_by_less_than_a_metre_are_named_too(tmp_path, d
     assert 'two publishers state it' in read(drive, tmp_path)[2]
 
 
+@pytest.mark.parametrize('case', ['second publisher', 'no stamps'])
+def test_positions_that_contradict_each_other_at_one_stamp_are_named(tmp_path, case):
+    drive = Drive(sweeps=12)
+    m = drive.messages
+    if case == 'no stamps':
+        for topic, _, message in drive.items:
+            if topic == '/tf':
+                message.transforms[0].header.stamp.sec = 0
+                message.transforms[0].header.stamp.nanosec = 0
+    else:
+        for k, stamp in enumerate(drive.stamps):
+            message = m.tf(m.transform(stamp, 'odom', 'base', (0.5 * k, 0.1, 0)))
+            drive.items.append(('/tf', stamp, message))
+        drive.items.sort(key=lambda item: item[1])
+    found = read(drive, tmp_path)[2]
+    assert 'transform odom -> base: expected one position at each stamp' in found
+
+
 def test_steps_of_a_localisation_are_no_second_publisher(tmp_path):
     """They move the vehicle in the map, back and on, twice a second."""
     drive = Drive(sweeps=30)
