@@ -15,7 +15,7 @@ import zstandard
 
 MESSAGE_MARKS = ('__msgtype__', 'DESCRIPTOR', 'get_fields_and_field_types')
 """Class attributes of messages: of rosbags, of protobuf, of rclpy."""
-RECORDINGS = 'an MCAP file, rosbag2 folder, .db3 file or ROS 1 bag'
+READ_FORMATS = 'an MCAP file, rosbag2 folder, .db3 file or ROS 1 bag'
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 """Begin of a message that rosbag2 has compressed; CDR begins with 0 and 0 to 3."""
 MAX_MESSAGE_BYTES = 2**30
@@ -82,7 +82,7 @@ class Reader:
                 streams.append(
                     (file.start_time, _renamed(file.messages(own, start, stop), wanted))
                 )
-        with readable(self._origin, RECORDINGS, 'copy it again, or leave it out'):
+        with readable(self._origin, READ_FORMATS, 'copy it again, or leave it out'):
             yield from merged_streams(streams)
 
 
