@@ -51,12 +51,13 @@ def ended(*command, **environment):
     )  # fmt: skip
 
 
-def test_relabel_prints_one_closing_line(tmp_path, capsys):
+def test_relabel_prints_one_closing_line_and_what_comes_next(tmp_path, capsys):
     recording = Drive(sweeps=5).write(tmp_path / 'drive')
     out = tmp_path / 'out'
     status, text, err = boxreg(capsys, 'relabel', recording, '-o', out, *QUICK)
     assert (status, err) == (0, '')
-    (line,) = text.splitlines()
+    line, following = text.splitlines()
+    assert following.startswith(f'next: boxreg review {out}')
     assert line.startswith(f'{out}: 10 boxes in, ')
     assert 'refined' in line
     assert 'kept' in line
@@ -512,5 +513,5 @@ def test_a_terminal_shows_a_progress_bar(tmp_path):
     os.close(leader)
     out = process.communicate(timeout=60)[0]
     assert process.returncode == 0
-    assert len(out.splitlines()) == 1
+    assert len(out.splitlines()) == 2
     assert b's of the recording' in shown.getvalue()

@@ -74,9 +74,9 @@ def test_the_image_compiles_once_for_every_user_and_cpu(cache, tmp_path):
 def test_the_first_start_of_a_node_says_that_it_compiles(cache, tmp_path):
     with graph_in(tmp_path) as graph:
         node = graph.start(command=('-m', 'boxreg_ros.live.main'))
-        graph.wait(lambda: 'waiting for the type of' in node.output(), 'the start')
+        graph.wait(lambda: 'compiling the reader' in node.output(), 'the announcement')
         assert ended_cleanly(node)
-    lines = [line for line in node.output().splitlines() if 'compiling the solver' in line]
+    lines = [line for line in node.output().splitlines() if 'compiling the reader' in line]
     assert lines and '[INFO]' in lines[0]
 
 

@@ -101,10 +101,10 @@ class JumpSearch:
     steps: dict[tuple[str, str], FrameSteps] = field(default_factory=dict)
     """By parent and child, of the transforms that stepped."""
     alternations: dict[tuple[str, str], FrameSteps] = field(default_factory=dict)
-    """FrameSteps of the motion itself that no vehicle makes: too fast, or to and fro."""
+    """FrameSteps of the motion itself that no vehicle makes: too fast, or back and forth."""
     _seen_ns: dict[tuple[str, str], int] = field(default_factory=dict)
     _reversals: Counter[tuple[str, str]] = field(default_factory=Counter)
-    """Steps to and fro up to the last sample."""
+    """Steps back and forth up to the last sample."""
 
     def look(self, tree: TransformTree, fixed_frame: str, sensor_frame: str) -> None:
         """Add the samples that are new in `tree`, between both frames."""
@@ -150,7 +150,7 @@ class JumpSearch:
             known.add(step, stamp_ns)
 
     def _add_speed(self, edge: Edge, row: int) -> None:
-        """Note two samples of the motion that lie too far apart, or go to and fro."""
+        """Note two samples of the motion that lie too far apart, or go back and forth."""
         key = edge.parent, edge.child
         step = edge.poses[row][:3] - edge.poses[row - 1][:3]
         way = float(np.linalg.norm(step))
@@ -253,8 +253,8 @@ class MotionCheck:
                 return (
                     f'transform {steps.parent} -> {steps.child}: expected one motion, got '
                     f'{steps.count} jumps of up to {steps.largest:.1f} m between samples, the '
-                    f'first at {steps.first_ns} ns, to and fro or faster than any vehicle: two '
-                    f'publishers state it; choose another source of motion, with --fixed-frame '
+                    f'first at {steps.first_ns} ns, back and forth or faster than any vehicle: '
+                    f'two publishers state it; choose another source of motion, with --fixed-frame '
                     f'or --odometry'
                 )
         return ''

@@ -516,7 +516,8 @@ class Edge:
         """
         Add x y z qx qy qz qw; a second one of the same stamp replaces the first.
 
-        One with a time of receipt whose stamp is ahead of all others is held.
+        One with a time of receipt whose stamp is ahead of all others is held, until the next
+        sample confirms it, or a cloud of its time asks for it.
 
         """
         if received_ns is None or self.is_static:
@@ -536,6 +537,14 @@ class Edge:
             self._use(*held[:2])
         self._clock.note(stamp_ns, received_ns)
         self._use(stamp_ns, pose)
+
+    def _confirm(self, stamp_ns: int) -> None:
+        """Use the sample that is held if it is of the time of a stamp of another stream."""
+        held = self._ahead
+        if held is not None and abs(stamp_ns - held[0]) <= round(TIME_JUMP * 1e9):
+            self._ahead = None
+            self._clock.note(held[0], held[2])
+            self._use(*held[:2])
 
     def _use(self, stamp_ns: int, pose: tuple[float, ...]) -> None:
         values = np.array(pose, dtype=np.float64)
@@ -590,12 +599,14 @@ class Edge:
 
     def covers(self, stamp_ns: int) -> bool:
         """Return whether a stamp lies between samples, or the pair is static."""
+        self._confirm(stamp_ns)
         if self.is_static:
             return bool(self.stamps)
         return bool(self.stamps) and self.stamps[0] <= stamp_ns <= self.stamps[-1]
 
     def at(self, stamp_ns: int, max_extrapolation_ns: int, is_constant: bool = False) -> Floats:
         """Return ``T_parent_child`` at a stamp; at any if its only sample is `is_constant`."""
+        self._confirm(stamp_ns)
         if is_constant:
             return matrix(self.poses[0])
         if self._last_found is None or self._last_found[0] != stamp_ns:

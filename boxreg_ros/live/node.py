@@ -43,6 +43,7 @@ from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
 NAME = 'boxreg_node'
+COMPILING_READER = 'compiling the reader of messages, once after an installation: some seconds'
 GRAPH_PERIOD = 0.2
 """Time between two looks for the type of the boxes [s]."""
 STATUS_PERIOD = 1.0
@@ -94,7 +95,8 @@ class BoxregNode(PolledClockNode):
     def prepare(self) -> None:
         """Make a registrar without any track, and all that reading and passing boxes needs."""
         config, options = self._settings
-        cdr.walker()
+        with announced_compilation(lambda _: self.get_logger().info(COMPILING_READER)):
+            cdr.walker()
         self._budget = TickBudget(options.deadline)
         report = self._health.report
         placement = SensorPlacement(options.lidars)

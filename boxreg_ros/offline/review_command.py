@@ -75,6 +75,8 @@ def run(args: argparse.Namespace) -> int:
         done = subprocess.run(command, check=False, env=environment)
         if done.returncode:
             return done.returncode
+    else:
+        print(f'{out}: up to date', flush=True)
     return _serve([out], args)
 
 

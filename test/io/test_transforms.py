@@ -378,6 +378,16 @@ def test_a_single_stamp_ahead_is_not_used(is_odometry):
     assert tree.stamps_ahead.total() == 1
 
 
+def test_a_cloud_of_its_time_confirms_a_sample_ahead():
+    tree = TransformTree()
+    for seconds, received in ((100.0, 100.0), (100.1, 100.1), (102.3, 100.2)):
+        sample = M.transform(round(seconds * S), 'odom', 'base', (seconds, 0, 0))
+        tree.add_transforms(M.tf(sample).transforms, False, round(received * S))
+    assert not tree.covers('odom', 'base', 101 * S)  # of no cloud of its time
+    assert tree.covers('odom', 'base', round(102.3 * S))
+    assert tree.stamps_ahead.total() == 0
+
+
 def test_two_consecutive_old_stamps_are_a_time_jump():
     detector = TimeJumpDetector()
     jumps = [

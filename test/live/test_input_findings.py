@@ -63,7 +63,7 @@ def registered(drive):
         (
             (other_clock, second_robot),
             'odom',
-            {'clock_offset': 'clock_offset:=0.7', 'transform_fault': 'two publishers state it'},
+            {'clock_offset': 'clock_offset:=', 'transform_fault': 'two publishers state it'},
         ),
         ((registered,), 'odom', {'sensor_position': "sensor_frames:=['lidar']"}),
     ],

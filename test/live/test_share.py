@@ -91,7 +91,10 @@ def test_launch_file_starts_the_node_with_its_arguments():
     # As a parameter of launch, a file that does not exist would be a mere warning.
     words = ' '.join(node.get('ros_args').split())
     assert words.startswith('--log-level $(var log_level) --params-file $(var params) $(if ')
-    assert {item.get('from') for item in node.iter('remap')} == {'points', 'boxes', 'odom'}
+    assert {item.get('from') for item in node.iter('remap')} == {
+        'points', 'boxes', 'odom', '/tf', '/tf_static',
+        'refined_boxes', 'refined_boxes_final', 'refined_markers',
+    }  # fmt: skip
     for name in ('boxes_type', 'use_sim_time'):  # after the file: they win where they are given
         assert arguments[name].get('default') == ''
         assert f'{name}:=$(var {name})' in words
