@@ -254,8 +254,8 @@ class MotionCheck:
                     f'transform {steps.parent} -> {steps.child}: expected one motion, got '
                     f'{steps.count} jumps of up to {steps.largest:.1f} m between samples, the '
                     f'first at {steps.first_ns} ns, back and forth or faster than any vehicle: '
-                    f'two publishers state it; choose another source of motion, with --fixed-frame '
-                    f'or --odometry'
+                    f'two publishers state it; choose another source of motion, with '
+                    f'--fixed-frame or --odometry'
                 )
         return ''
 
