@@ -174,7 +174,7 @@ def test_boxes_wait_half_a_second_for_clouds_after_the_lidar_stops(graph, tmp_pa
     node.play(records[:half])
     play(graph, [record for record in records[half:] if record.topic != '/points'])
     graph.wait(lambda: len(node.early) == 12, 'boxes without their clouds')
-    graph.wait(lambda: node.values().get('no_sweep') == '12', 'counters')
+    graph.wait(lambda: int(node.values().get('no_sweep', 0)) >= 12, 'counters')
     slowest = [values_of([d]).get('latency most [ms]', 0) for d in node.diagnostics]
     assert 500.0 <= max(map(float, slowest)) < 2900.0  # silence gives up boxes after 3 s
     assert ended_cleanly(node)
