@@ -16,6 +16,9 @@ A stamp this far before the newest is a time jump [s].
 Longer than any message is late on its way, shorter than a recording that is played in a loop.
 
 """
+SAME_TIME = 10.0
+"""Stamps ahead that differ by less confirm each other [s]; chosen: longer than the pauses of a
+stream after a gap, shorter than any wrong clock."""
 PERIODS_AHEAD = 10
 """A stamp is ahead by so many periods of its stream, and more; chosen: in a stream of 10 Hz that
 is as long as `TIME_JUMP`."""
@@ -96,7 +99,7 @@ class JumpConfirmation(Generic[_T]):
         self.restart()
 
     def restart(self) -> None:
-        """Forget all stamps, and what is held."""
+        """Forget all stamps and the items that wait for a second one."""
         self._clocks: dict[str, StreamClock] = {}
         self._held: list[Held[_T]] = []
 
@@ -141,14 +144,14 @@ class JumpConfirmation(Generic[_T]):
         return Confirmed([*(held.item for held in confirming), item], has_jumped)
 
     def release(self, held: Held[_T] | None = None) -> list[_T]:
-        """Return an item that is held, or all that are: no other confirms or refutes them."""
+        """Remove and return one item that waits, or all: no other confirms or refutes them."""
         released = [one for one in self._held if held is None or one is held]
         self._held = [one for one in self._held if one not in released]
         return [one.item for one in released]
 
     @property
     def held(self) -> list[Held[_T]]:
-        """Return what is held, in the order of its arrival."""
+        """Return the items that wait for a second one, in order of arrival."""
         return list(self._held)
 
     def _is_reached(self, stamp_ns: int) -> bool:
@@ -158,7 +161,7 @@ class JumpConfirmation(Generic[_T]):
         return any(one is not None and one + margin_ns >= stamp_ns for one in newest)
 
     def _refuted(self, stream: str) -> Confirmed[_T]:
-        """Return what is held of a stream whose stamps go on as before."""
+        """Remove the items of a stream that wait: its next stamp fits those before them."""
         refuted = [held for held in self._held if held.stream == stream]
         self._held = [held for held in self._held if held.stream != stream]
         return Confirmed(
@@ -168,8 +171,8 @@ class JumpConfirmation(Generic[_T]):
 
 
 def is_near(first_ns: int, second_ns: int) -> bool:
-    """Return whether two stamps ahead are of the same time [ns]."""
-    return abs(first_ns - second_ns) <= round(PERIODS_AHEAD * TIME_JUMP * 1e9)
+    """Return whether two stamps that are ahead differ by `SAME_TIME` at most [ns]."""
+    return abs(first_ns - second_ns) <= round(SAME_TIME * 1e9)
 
 
 def _stream_of(content: Sweep | BoxArray) -> str:

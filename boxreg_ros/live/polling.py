@@ -52,7 +52,7 @@ def taken(subscription: Any) -> Iterator[tuple[Any, int]]:
         if found is None:
             return
         message, info = found
-        # By the clock of the system, which may be set; 0 where the middleware does not tell.
+        # On the system clock, which can be set; 0 if the middleware does not report it.
         received_ns = info['received_timestamp']
         yield message, min(now_ns, received_ns + offset_ns) if received_ns else now_ns
 

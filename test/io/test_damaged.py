@@ -515,6 +515,14 @@ def test_nothing_readable_is_an_error(tmp_path, whole):
         read(path)
 
 
+@pytest.mark.parametrize('name', ['drive.mcap', 'drive.db3', 'drive.bag'])
+def test_an_empty_file_is_named_as_one(tmp_path, name):
+    # No tool mends it: none is advised.
+    (tmp_path / name).touch()
+    with pytest.raises(RecordingError, match='got an empty file; copy it again, or leave it out'):
+        read(tmp_path / name)
+
+
 def test_time_between_chunks_is_that_of_the_receiver(tmp_path, drive, whole):
     with closing(opened(whole)) as file:
         assert (file.start_time, file.end_time) == (START, drive.stamps[-1] + 1)

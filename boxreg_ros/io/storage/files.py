@@ -100,9 +100,14 @@ def opened(path: Path) -> StorageFile:
     is_remote, is_compressed = url_of(path) is not None, path.suffix in COMPRESSED
     if not is_remote:
         try:
-            path.open('rb').close()
+            with path.open('rb') as file:
+                is_empty = not file.read(1)
         except OSError as error:
             raise TransferError(unreadable(path, error)) from None
+        if is_empty:
+            raise RecordingError(
+                f'{path}: expected a recording, got an empty file; copy it again, or leave it out'
+            )
     if not is_compressed and (not is_remote or opener is McapFile):  # MCAP is read by blocks
         return opener(path, None)
     with temporary_folder() as folder:

@@ -354,8 +354,8 @@ class McapFile:
         if not self._chunks:
             raise RecordingError(
                 f'{self.name}: no message can be read; expected an MCAP file, got '
-                f'{self._file.size} bytes without a whole chunk ({one_line(error)}); {REMEDY} '
-                f'{self.name}'
+                f'{self._file.size} bytes without a whole chunk ({one_line(error)}); copy it '
+                f'again, or leave it out'
             ) from None
         reason = 'interrupted or damaged: no whole record from here on'
         if not isinstance(error, EndOfFile):

@@ -41,7 +41,7 @@ def _command(case: str, path: Path, folder: Path) -> dict[str, float]:
     command = [sys.executable, '-m', 'boxreg_ros.cli', case]
     environment = dict(os.environ)
     if case == 'relabel':
-        command += [str(path), '-o', str(folder / 'out'), '--quiet']
+        command += [str(path), '-o', str(folder / 'out')]
     else:
         environment['NUMBA_CACHE_DIR'] = str(folder)
     subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)
