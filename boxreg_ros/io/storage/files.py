@@ -100,8 +100,8 @@ def opened(path: Path) -> StorageFile:
     is_remote, is_compressed = url_of(path) is not None, path.suffix in COMPRESSED
     if not is_remote:
         try:
-            with path.open('rb') as file:
-                is_empty = not file.read(1)
+            with path.open('rb') as stream:
+                is_empty = not stream.read(1)
         except OSError as error:
             raise TransferError(unreadable(path, error)) from None
         if is_empty:

@@ -94,7 +94,8 @@ function onKey(event) {
     return void save();
   }
   if (event.ctrlKey || event.metaKey || event.altKey) return;
-  const target = event.target;
+  // The focus stays in a dialog for a moment after it has closed.
+  const target = event.target.closest('dialog') ? document.body : event.target;
   const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   const plays = name === ' ' && target.matches('select, [type=number]');  // a space is no part of their values
   if (target.matches('input:not([type=range], [type=checkbox]), textarea, select') && !plays) {
