@@ -28,6 +28,8 @@ NOTABLE = 0.05
 """Less is neither corrected nor a warning [s]: without latency, estimates err by up to 0.04 s."""
 CANDIDATES = np.arange(-0.2, 0.801, 0.05)
 """Latencies that are compared [s]; negative ones are of boxes that are predicted too far."""
+ALL, ENDS = np.arange(len(CANDIDATES)), np.array([0, len(CANDIDATES) - 1])
+"""Rows of all candidates, and of the two that show whether an object moves."""
 SAMPLE_PERIOD = 0.3
 """Least time between sweeps whose points are compared with boxes [s]."""
 MIN_SPEED = 2.0
@@ -147,14 +149,18 @@ class _Path(NamedTuple):
     @property
     def shift(self) -> Floats:
         """Return how the box moves for each second of latency, (3,) [m/s]."""
-        ends = self.boxes[-1, : Z + 1] - self.boxes[0, : Z + 1]
-        shift: Floats = ends / (CANDIDATES[-1] - CANDIDATES[0])
-        return shift
+        return _shift(self.boxes[:, : Z + 1])
 
     @property
     def speed(self) -> float:
         """Return the length of `shift` [m/s]."""
         return float(np.linalg.norm(self.shift))
+
+
+def _shift(centers: Floats) -> Floats:
+    """Return how centres (C, ..., 3), one for each candidate, move by latency, (..., 3) [m/s]."""
+    shift: Floats = (centers[-1] - centers[0]) / (CANDIDATES[-1] - CANDIDATES[0])
+    return shift
 
 
 class LatencyEvidence:
@@ -213,16 +219,17 @@ class LatencyEvidence:
     def _compare(self, sweep: Sweep, tracks: MeasuredTracks) -> None:
         """Compare the points of a sweep with the boxes of objects that move in their frame."""
         times_ns = sweep.stamp_ns + np.round(CANDIDATES * 1e9).astype(np.int64)
-        covering = {k: track for k, track in tracks.by_id.items() if track.covers(times_ns)}
+        covering = [name for name, track in tracks.by_id.items() if track.covers(times_ns)]
+        if not covering:
+            return
+        shifts = _shift(tracks.smoothed_centers(covering, times_ns[ENDS], ENDS))
+        is_moving = np.linalg.norm(shifts, axis=1) > MIN_SPEED
         compared = Counter(sample.track_id for sample in self._samples)
-        ordered = sorted(covering, key=compared.__getitem__)
+        moving = sorted(np.array(covering)[is_moving].tolist(), key=compared.__getitem__)
         found = 0
-        for first in range(0, len(ordered), OBJECTS_COMPARED):
-            paths = []
-            for track_id in ordered[first : first + OBJECTS_COMPARED]:
-                path = _Path(track_id, *covering[track_id].smoothed(times_ns))
-                if path.speed > MIN_SPEED:
-                    paths.append(path)
+        for first in range(0, len(moving), OBJECTS_COMPARED):
+            some = moving[first : first + OBJECTS_COMPARED]
+            paths = [_Path(name, *tracks.by_id[name].smoothed(times_ns, ALL)) for name in some]
             for path, points in zip(paths, _points_near(sweep, paths), strict=True):
                 costs = _costs(path, *points)
                 if costs is None or found == OBJECTS_COMPARED:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 
 from boxreg_ros.config import Config
@@ -24,6 +25,7 @@ from boxreg_ros.structures import (
     Z,
 )
 import numpy as np
+from numpy.typing import NDArray
 
 SMOOTHING = 0.35
 """Reach of the local lines through a track [s]: noise must not be motion; chosen."""
@@ -110,6 +112,10 @@ class MeasuredTrack:
             old += 1
         del self._arrays[:old], self._boxes[:old]
 
+    def items(self) -> Iterator[tuple[MeasuredArray, Floats]]:
+        """Return the boxes (9,), each with the array that it is of."""
+        return zip(self._arrays, self._boxes, strict=True)
+
     def covers(self, times_ns: Ints) -> bool:
         """Return whether all times are within those of the boxes."""
         first_ns = self._arrays[0].stamp_ns
@@ -143,7 +149,7 @@ class MeasuredTrack:
         found[YAW] = wrap_angle(found[YAW])
         return found
 
-    def smoothed(self, times_ns: Ints) -> tuple[Floats, Floats]:
+    def smoothed(self, times_ns: Ints, candidates: Ints) -> tuple[Floats, Floats]:
         """
         Return boxes at some times, each for its own candidate of the latency.
 
@@ -153,6 +159,8 @@ class MeasuredTrack:
         ----------
         times_ns : array, shape (C,)
             Times in the stamps of the boxes, one for each candidate [ns].
+        candidates : array, shape (C,)
+            Their rows among those that the tracks are made with.
 
         Returns
         -------
@@ -162,17 +170,11 @@ class MeasuredTrack:
             Slopes of the lines through the centres [m/s].
 
         """
-        seconds = (self._stamps_ns()[:, None] - times_ns) * 1e-9  # (n, C)
-        weights = np.clip(SMOOTHING - np.abs(seconds), 1e-6, None)
-        weights /= weights.sum(0)
-        mean = (weights * seconds).sum(0)
-        offsets = seconds - mean
-        spread = (weights * offsets**2).sum(0)
-        boxes = self._of_candidates(len(times_ns))
-        middle = np.einsum('nc,cnk->ck', weights, boxes)
-        slope = np.einsum('nc,cnk->ck', weights * offsets, boxes) / spread[:, None]
-        found: Floats = middle - mean[:, None] * slope
-        found[:, BOX_EXTENT] = np.median(boxes[0][:, BOX_EXTENT], axis=0)
+        boxes = self._of_candidates(candidates)
+        seconds = (self._stamps_ns()[:, None] - times_ns) * 1e-9
+        present = np.ones((len(boxes), 1))
+        found, slope = (one[:, 0] for one in _on_lines(seconds, present, boxes[:, :, None]))
+        found[:, BOX_EXTENT] = np.median(boxes[:, 0, BOX_EXTENT], axis=0)
         return found, slope[:, : Z + 1]
 
     def _stamps_ns(self) -> Ints:
@@ -184,19 +186,50 @@ class MeasuredTrack:
         T = np.array([array.displacement(latency) for array in self._arrays[begin:end]])
         return displaced(boxes, T)
 
-    def _of_candidates(self, count: int) -> Floats:
-        """Return all boxes where they were measured by each candidate, (C, n, 9)."""
-        given = np.array(self._boxes)
-        boxes = np.tile(given, (count, 1, 1))
+    def _of_candidates(self, candidates: Ints) -> Floats:
+        """Return all boxes where they were measured by some candidates, (n, C, 9)."""
+        boxes = np.repeat(np.array(self._boxes)[:, None], len(candidates), axis=1)
         known = [array.of_candidates for array in self._arrays]
         moving = [row for row, T in enumerate(known) if T is not None]
         if moving:
-            T = np.array([known[row] for row in moving])  # (n, C, 4, 4)
-            centers = np.einsum('ncij,nj->cni', T[..., :3, :3], given[moving, : Z + 1])
-            boxes[:, moving, : Z + 1] = centers + np.moveaxis(T[..., :3, 3], 0, 1)
-            boxes[:, moving, YAW] += np.arctan2(T[..., 1, 0], T[..., 0, 0]).T
-        boxes[..., YAW] = np.unwrap(boxes[..., YAW], period=np.pi, axis=1)
+            T = np.array([known[row] for row in moving])[:, candidates]  # (n, C, 4, 4)
+            centers = np.einsum('ncij,ncj->nci', T[..., :3, :3], boxes[moving, :, : Z + 1])
+            boxes[moving, :, : Z + 1] = centers + T[..., :3, 3]
+            boxes[moving, :, YAW] += np.arctan2(T[..., 1, 0], T[..., 0, 0])
+        boxes[..., YAW] = np.unwrap(boxes[..., YAW], period=np.pi, axis=0)
         return boxes
+
+
+def _on_lines(
+    seconds: NDArray[np.floating], present: Floats, values: Floats
+) -> tuple[Floats, Floats]:
+    """
+    Return values and slopes of K tracks at C times, on local lines through n samples.
+
+    Parameters
+    ----------
+    seconds : array, shape (n, C)
+        Times of the samples, relative to those that are asked for [s].
+    present : array, shape (n, K)
+        1 where a track has a sample, else 0.
+    values : array, shape (n, C, K, d)
+        The samples.
+
+    Returns
+    -------
+    values, slopes : array, shape (C, K, d)
+        The slopes are for each second.
+
+    """
+    seconds = seconds[:, :, None]
+    weights = np.clip(SMOOTHING - np.abs(seconds), 1e-6, None) * present[:, None]
+    weights = weights / weights.sum(0)
+    mean = (weights * seconds).sum(0)
+    offsets = seconds - mean
+    spread = (weights * offsets**2).sum(0)
+    middle = np.einsum('nck,nckd->ckd', weights, values)
+    slope = np.einsum('nck,nckd->ckd', weights * offsets, values) / spread[:, :, None]
+    return middle - mean[:, :, None] * slope, slope
 
 
 class MeasuredTracks:
@@ -219,6 +252,26 @@ class MeasuredTracks:
             del self.by_id[name]
         for track in self.by_id.values():
             track.forget_before(oldest_ns)
+
+    def smoothed_centers(self, track_ids: list[str], times_ns: Ints, candidates: Ints) -> Floats:
+        """Return the centres (C, K, 3) of the boxes that `smoothed` returns, of several tracks."""
+        row_of: dict[MeasuredArray, int] = {}
+        cells = []
+        for column, track_id in enumerate(track_ids):
+            for array, box in self.by_id[track_id].items():
+                cells.append((row_of.setdefault(array, len(row_of)), column, box[: Z + 1]))
+        rows, columns, centers = zip(*cells, strict=True)
+        values = np.zeros((len(row_of), len(candidates), len(track_ids), 3))
+        present = np.zeros((len(row_of), len(track_ids)))
+        present[rows, columns] = 1.0
+        values[rows, :, columns] = np.array(centers)[:, None]
+        for array, row in row_of.items():
+            if array.of_candidates is not None:
+                T = array.of_candidates[candidates]
+                values[row] = values[row] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+        stamps_ns = np.array([array.stamp_ns for array in row_of])
+        seconds = (stamps_ns[:, None] - times_ns) * 1e-9
+        return _on_lines(seconds, present, values)[0]
 
     def at_stamp(self, boxes: BoxArray, latency: float) -> Floats:
         """Return the boxes (n, 9) of an array where their objects are at its stamp."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -78,6 +79,34 @@ class _Tracks:
         )
         return self.centers + seconds[:, None] * self.velocities, covariances
 
+    def distances(
+        self, stamp_ns: int, boxes: Floats, columns: Ints | slice = slice(None)
+    ) -> Floats:
+        """
+        Return squared distances of boxes from tracks at a stamp, in standard deviations.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Stamp of the boxes [ns].
+        boxes : array, shape (n, 9) or (n, 1, 9)
+            One for each of `columns`, or each for all of them.
+        columns : array, shape (n,), or slice
+            The tracks.
+
+        Returns
+        -------
+        distances : array, shape (n,) or (n, tracks)
+            Of centres and extents together.
+
+        """
+        centers, covariances = (values[columns] for values in self.predicted(stamp_ns))
+        away = np.square(boxes[..., BOX_CENTER] - centers).sum(axis=-1)
+        ratios = boxes[..., BOX_EXTENT] / self.extents[columns]
+        unlike = np.square(np.log(ratios)).sum(axis=-1)
+        found: Floats = away / (covariances[:, 0] + CENTER_STD**2) + unlike / LOG_EXTENT_STD**2
+        return found
+
     def update(self, columns: Ints, stamp_ns: int, boxes: Floats) -> None:
         """Update the filters of some tracks with their newest boxes (n, 9)."""
         centers, covariances = (values[columns] for values in self.predicted(stamp_ns))
@@ -144,6 +173,11 @@ class Tracker:
         self._newest_ns: int | None = None
         self.costs = Costs(np.zeros(0, np.int64), [], np.zeros((0, 0)))
 
+    @property
+    def track_ids(self) -> list[str]:
+        """Return the ids of the tracks that may go on."""
+        return self._tracks.ids
+
     def identify(self, boxes: BoxArray) -> BoxArray:
         """
         Return boxes in a fixed frame with ids; invalid boxes get the id ``''``.
@@ -155,50 +189,83 @@ class Tracker:
         """
         from scipy.optimize import linear_sum_assignment  # slow, and only association needs it
 
-        stamp_ns, max_gap_ns = boxes.stamp_ns, round(self.max_gap * 1e9)
+        is_late = self._is_late(boxes.stamp_ns)
+        rows = np.flatnonzero(is_valid_box(boxes.boxes))
+        costs = self._tracks.distances(boxes.stamp_ns, boxes.boxes[rows, None])
+        self.costs = Costs(rows, list(self._tracks.ids), costs)
+        # Costs are cut off at the gate: a pair beyond it costs as much as no pair.
+        chosen, columns = linear_sum_assignment(np.minimum(costs, GATE))
+        is_near = costs[chosen, columns] < GATE
+        return self._assign(boxes, rows, rows[chosen[is_near]], columns[is_near], is_late)
+
+    def keep(self, boxes: BoxArray, track_of: Mapping[str, str]) -> BoxArray | None:
+        """
+        Return the boxes with the ids that were assigned to their own, or None if one is far off.
+
+        Parameters
+        ----------
+        boxes : BoxArray
+            In a fixed frame; invalid boxes get the id ``''``.
+        track_of : mapping of str to str
+            Assigned ids by those of the input. A box with another one starts a track.
+
+        Returns
+        -------
+        BoxArray or None
+            As of `identify`; None, and nothing is changed but that old tracks have ended, where a
+            box is beyond the gate of its track, or two boxes have one.
+
+        """
+        is_late = self._is_late(boxes.stamp_ns)
+        rows = np.flatnonzero(is_valid_box(boxes.boxes))
+        column_of = {name: column for column, name in enumerate(self._tracks.ids)}
+        names = [track_of.get(boxes.track_ids[row], '') for row in rows.tolist()]
+        columns = np.array([column_of.get(name, -1) for name in names], np.int64)
+        kept, columns = rows[columns >= 0], columns[columns >= 0]
+        if len(np.unique(columns)) < len(columns):
+            return None
+        if (self._tracks.distances(boxes.stamp_ns, boxes.boxes[kept], columns) >= GATE).any():
+            return None
+        return self._assign(boxes, rows, kept, columns, is_late)
+
+    def _is_late(self, stamp_ns: int) -> bool:
+        """Return whether an array is older than others before; end the tracks that it ends."""
+        max_gap_ns = round(self.max_gap * 1e9)
         if self._newest_ns is not None and stamp_ns < self._newest_ns - max_gap_ns:
             self.forget()  # a recording in a loop
         is_late = self._newest_ns is not None and stamp_ns <= self._newest_ns
         if not is_late:
             self._newest_ns = stamp_ns
             self._tracks = self._tracks.kept(self._tracks.stamps_ns >= stamp_ns - max_gap_ns)
-        rows = np.flatnonzero(is_valid_box(boxes.boxes))
+        return is_late
+
+    def _assign(
+        self, boxes: BoxArray, rows: Ints, chosen: Ints, columns: Ints, is_late: bool
+    ) -> BoxArray:
+        """Return boxes with ids: some of the valid `rows` continue tracks, others start one."""
         tracks = self._tracks
-        costs = self._costs(stamp_ns, boxes.boxes[rows])
-        self.costs = Costs(rows, list(tracks.ids), costs)
         ids = [''] * len(boxes.boxes)
-        # Costs are cut off at the gate: a pair beyond it costs as much as no pair.
-        chosen, columns = linear_sum_assignment(np.minimum(costs, GATE))
-        is_near = costs[chosen, columns] < GATE
-        chosen, columns = chosen[is_near], columns[is_near]
-        for row, column in zip(rows[chosen].tolist(), columns.tolist(), strict=True):
+        for row, column in zip(chosen.tolist(), columns.tolist(), strict=True):
             ids[row] = tracks.ids[column]
-        new = np.setdiff1d(rows, rows[chosen])
+        new = np.setdiff1d(rows, chosen)
         names = [str(self.count + number) for number in range(1, len(new) + 1)]
         self.count += len(new)
         for row, name in zip(new.tolist(), names, strict=True):
             ids[row] = name
         if not is_late:
-            tracks.update(columns, stamp_ns, boxes.boxes[rows[chosen]])
-            self._tracks = tracks.joined(_Tracks.started(names, stamp_ns, boxes.boxes[new]))
+            tracks.update(columns, boxes.stamp_ns, boxes.boxes[chosen])
+            started = _Tracks.started(names, boxes.stamp_ns, boxes.boxes[new])
+            self._tracks = tracks.joined(started)
         return replace(boxes, track_ids=tuple(ids))
-
-    def _costs(self, stamp_ns: int, boxes: Floats) -> Floats:
-        """Return the squared distances (boxes, tracks) in standard deviations."""
-        centers, covariances = self._tracks.predicted(stamp_ns)
-        away = np.square(boxes[:, None, BOX_CENTER] - centers).sum(axis=2)
-        unlike = np.square(np.log(boxes[:, None, BOX_EXTENT] / self._tracks.extents)).sum(axis=2)
-        costs: Floats = away / (covariances[:, 0] + CENTER_STD**2) + unlike / LOG_EXTENT_STD**2
-        return costs
 
 
 class IdCheck:
     """
     Detect ids that jump from object to object: rows of a message, ids that are given anew.
 
-    Boxes are also associated by their motion alone. An id jumps where its box does not fit the
-    track that had the id before, and is associated with that of another object. `finding` says so
-    once enough have; it is empty before.
+    Where a box does not fit the track that had its id before, boxes are also associated by their
+    motion alone: the id jumps if that gives the box to another object. `finding` says so once
+    enough have; it is empty before.
 
     """
 
@@ -211,7 +278,7 @@ class IdCheck:
     def forget(self) -> None:
         """Forget all tracks, after a time jump; counts stay."""
         self._tracker.forget()
-        self._id_of: dict[str, str] = {}  # of the input, by that of the association
+        self._track_of: dict[str, str] = {}  # of the association, by the id of the input
 
     def add(self, boxes: BoxArray) -> None:
         """
@@ -223,31 +290,31 @@ class IdCheck:
             In a fixed frame, with the ids of the input; those without an id do not count.
 
         """
-        associated = self._tracker.identify(boxes).track_ids
+        if '' in boxes.track_ids:
+            boxes = boxes.take([row for row, name in enumerate(boxes.track_ids) if name])
+        associated = self._tracker.keep(boxes, self._track_of)
+        if associated is None:
+            associated = self._tracker.identify(boxes)
+            self.jumps += self._jumps(boxes, associated)
+        self.boxes += sum(track_id in self._track_of for track_id in boxes.track_ids)
+        pairs = zip(boxes.track_ids, associated.track_ids, strict=True)
+        given = {track_id: name for track_id, name in pairs if name}
+        # A track has the id that came with it last; where boxes lie on one another, another
+        # track has it for a moment.
+        others = set(self._tracker.track_ids) - set(given.values())
+        kept = {track_id: name for track_id, name in self._track_of.items() if name in others}
+        self._track_of = kept | given
+
+    def _jumps(self, boxes: BoxArray, associated: BoxArray) -> int:
+        """Count the boxes that are far from the track of their id, and on that of another."""
         costs = self._tracker.costs
-        column_of = {
-            self._id_of[name]: column
-            for column, name in enumerate(costs.track_ids)
-            if name in self._id_of
-        }
-        known = set(costs.track_ids)
+        column_of = {name: column for column, name in enumerate(costs.track_ids)}
+        count = 0
         for row, cost in zip(costs.rows.tolist(), costs.values, strict=True):
-            own = column_of.get(boxes.track_ids[row])
-            if own is None or not boxes.track_ids[row]:
-                continue
-            self.boxes += 1
-            is_others = associated[row] != costs.track_ids[own] and associated[row] in known
-            self.jumps += bool(is_others and cost[own] >= GATE)
-        given = {
-            name: track_id
-            for name, track_id in zip(associated, boxes.track_ids, strict=True)
-            if name
-        }
-        # An id is that of the track that had it last: where two boxes of a message have one id,
-        # or boxes lie on one another, another track has it for a moment.
-        others = {name: self._id_of[name] for name in known if name in self._id_of}
-        kept = {name: one for name, one in others.items() if one not in boxes.track_ids}
-        self._id_of = kept | given
+            own = column_of.get(self._track_of.get(boxes.track_ids[row], ''))
+            if own is not None and cost[own] >= GATE:
+                count += associated.track_ids[row] in column_of
+        return count
 
     @property
     def finding(self) -> str:
