@@ -205,8 +205,9 @@ class Reason(StrEnum):
     TRACK_IDS_JUMP = (
         'track_ids_jump',
         'message',
-        'its track ids go from object to object, such as ids that are the row in the message; the '
-        'log has the figures',
+        'its track ids do not identify objects over time: they go from object to object, such as '
+        'ids that are the row in the message, are new in each message, or are missing; the log '
+        'has the figures',
         'set `associate`, or run a tracker before this node',
     )
     CLOCK_OFFSET = (

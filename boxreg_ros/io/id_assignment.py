@@ -37,6 +37,15 @@ more.
 """
 
 
+MIN_UNUSABLE_SHARE = 0.5
+"""
+Share of the boxes without an id, or with one that no box had before.
+
+Chosen: objects come and go, and trackers begin again after gaps, at far fewer boxes.
+
+"""
+
+
 @dataclass(eq=False, slots=True)
 class _Tracks:
     """
@@ -261,7 +270,7 @@ class Tracker:
 
 class IdCheck:
     """
-    Detect ids that jump from object to object: rows of a message, ids that are given anew.
+    Detect ids that do not identify objects over time: rows of a message, new ones, or none.
 
     Where a box does not fit the track that had its id before, boxes are also associated by their
     motion alone: the id jumps if that gives the box to another object. `finding` says so once
@@ -273,6 +282,10 @@ class IdCheck:
         self._tracker = Tracker(max_gap)
         self.jumps = 0
         self.boxes = 0
+        self.new = 0
+        self.compared = 0
+        self.nameless = 0
+        self.count = 0
         self.forget()
 
     def forget(self) -> None:
@@ -287,16 +300,22 @@ class IdCheck:
         Parameters
         ----------
         boxes : BoxArray
-            In a fixed frame, with the ids of the input; those without an id do not count.
+            In a fixed frame, with the ids of the input.
 
         """
+        self.count += len(boxes.track_ids)
         if '' in boxes.track_ids:
+            self.nameless += boxes.track_ids.count('')
             boxes = boxes.take([row for row, name in enumerate(boxes.track_ids) if name])
         associated = self._tracker.keep(boxes, self._track_of)
         if associated is None:
             associated = self._tracker.identify(boxes)
             self.jumps += self._jumps(boxes, associated)
-        self.boxes += sum(track_id in self._track_of for track_id in boxes.track_ids)
+        known = sum(track_id in self._track_of for track_id in boxes.track_ids)
+        self.boxes += known
+        if not set(self._tracker.track_ids).isdisjoint(self._track_of.values()):
+            self.compared += len(boxes.track_ids)
+            self.new += len(boxes.track_ids) - known
         pairs = zip(boxes.track_ids, associated.track_ids, strict=True)
         given = {track_id: name for track_id, name in pairs if name}
         # A track has the id that came with it last; where boxes lie on one another, another
@@ -318,7 +337,14 @@ class IdCheck:
 
     @property
     def finding(self) -> str:
-        """Return that the ids jump; empty if they do not, or too few boxes are known."""
+        """Return that the ids identify no objects; empty if they do, or few boxes are known."""
+        if self.nameless >= max(MIN_JUMPS, MIN_UNUSABLE_SHARE * self.count):
+            return f'{self.nameless} of {self.count} boxes have no track id'
+        if self.new >= max(MIN_JUMPS, MIN_UNUSABLE_SHARE * self.compared):
+            return (
+                f'track ids are new at {self.new} of {self.compared} boxes: expected one id for '
+                f'each object over time, got one for each box'
+            )
         if self.jumps < MIN_JUMPS or self.jumps < MIN_JUMP_SHARE * self.boxes:
             return ''
         return (

@@ -13,10 +13,21 @@ published in a burst, and detectors are slower."""
 
 
 def are_parts(boxes: BoxArray, more: BoxArray) -> bool:
-    """Return whether two arrays have different objects of one stamp, in one frame."""
-    is_same = (boxes.stamp_ns, boxes.frame_id) == (more.stamp_ns, more.frame_id)
-    has_ids = '' not in boxes.track_ids and '' not in more.track_ids
-    return is_same and has_ids and set(boxes.track_ids).isdisjoint(more.track_ids)
+    """
+    Return whether two arrays have different objects of one stamp, in one frame.
+
+    Their ids say so, or their classes, where a detector publishes one array for each.
+
+    """
+    if (boxes.stamp_ns, boxes.frame_id) != (more.stamp_ns, more.frame_id):
+        return False
+    return any(
+        '' not in (*names, *others) and set(names).isdisjoint(others)
+        for names, others in (
+            (boxes.track_ids, more.track_ids),
+            (boxes.class_names, more.class_names),
+        )
+    )
 
 
 def joined(boxes: BoxArray, more: BoxArray) -> BoxArray:

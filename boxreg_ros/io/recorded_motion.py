@@ -206,6 +206,14 @@ class RecordedMotion:
                 f'{origin}: no transforms connect the fixed frame {wanted!r} with the frame of '
                 f'the clouds {frame!r}; {known}; leave --fixed-frame out to have one chosen'
             )
+        alike = tree.alike(frame)
+        if alike:
+            roots = sorted({path[-1].parent for path in map(tree.path, alike) if path})
+            raise RecordingError(
+                f'{origin}: expected transforms of the frame of the clouds {frame!r}, got those '
+                f'of {", ".join(alike)}, which differ by a prefix; choose one by its fixed frame: '
+                f'--fixed-frame {roots[0]}{" or ".join(["", *roots[1:]])}; {known}'
+            )
         raise RecordingError(
             f'{origin}: neither /tf nor odometry has the motion of the frame of the clouds '
             f'{frame!r}; {known}; if it does not move, set --fixed-frame {shlex.quote(frame)}'
@@ -284,6 +292,13 @@ class RecordedMotion:
             if message is None:
                 continue
             child = message.child_frame_id.lstrip('/')
+            if not child:
+                path = tree.path(frame)
+                child = tree.odometry_child = path[-1].parent if path else frame
+                self.notes['child'] = (
+                    f'{topic}: expected the frame of the vehicle in child_frame_id, got none: it '
+                    f'is taken for {child!r}, the topmost frame of the clouds'
+                )
             odometry.append(f'{topic} ({message.header.frame_id} -> {child})')
             if child == root or (root is None and tree.connects(child, frame)):
                 relevant[topic] = message

@@ -215,6 +215,14 @@ class Session:
         """Return the faults of the input, and guesses about it, that were found so far."""
         found = [*self._motion_check.findings.values()]
         found += [Finding(Reason.POINT_TIMES, text) for text in self.placement.normalised.values()]
+        if self.tree.same_frames:
+            same = sorted(self.tree.same_frames.items())
+            pairs = ', '.join(f'{full!r} and {rest!r}' for full, rest in same)
+            text = (
+                f'frames: expected one name for each, got names that differ by a prefix alone: '
+                f'{pairs}; each pair is taken for one frame, since nothing else connects them'
+            )
+            found.append(Finding(Reason.TRANSFORM_FAULT, text))
         if self._has_boxes_without_frame:
             text = (
                 f'boxes have an empty frame_id: expected the name of their frame; they are taken '
@@ -233,7 +241,7 @@ class Session:
 
     @property
     def jumping_ids(self) -> str:
-        """Return that ids of the input jump from object to object; empty if they do not."""
+        """Return that ids of the input do not identify objects; empty if they do."""
         return '' if self._id_check is None else self._id_check.finding
 
     @property

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import TransformUnavailable
@@ -125,12 +126,14 @@ class TransformTree:
     tf2 does; over gaps longer than `MAX_LINEAR_GAP` by the polynomial through up to two samples
     on each side. Up to `max_extrapolation` [s] outside of them the motion is extrapolated. A
     moving frame with one sample only counts as static once others are newer. Of a frame that has
-    two parents at once, the transforms to both are kept. Not thread-safe.
+    two parents at once, the transforms to both are kept. Where nothing else connects two frames,
+    those whose names differ by one and the same prefix, as ``r1/lidar`` and ``lidar``, are taken
+    for one; `same_frames` has them. Not thread-safe.
 
     A sample whose stamp is far ahead of its pair, which its time of receipt does not explain,
     waits for the next one to confirm it. `clock_offset` [s] is added to the stamps of moving
     frames as they arrive. With `prefers_odometry` the odometry of a frame takes the place of its
-    transform.
+    transform. Odometry without a child frame is that of `odometry_child`.
 
     """
 
@@ -144,6 +147,7 @@ class TransformTree:
         self._buffer_ns = round(buffer_duration * 1e9)
         self.clock_offset = clock_offset
         self.prefers_odometry = False
+        self.odometry_child = ''
         self.clear()
 
     def clear(self) -> None:
@@ -154,6 +158,8 @@ class TransformTree:
         self._parent_changes: Counter[str] = Counter()
         self._parents: dict[str, list[str]] = {}  # of children with several, as they came
         self._routes: dict[tuple[str, str], list[tuple[Edge, bool]]] = {}
+        self.same_frames: dict[str, str] = {}
+        """Frames that are taken for one, since one name is the other with a prefix."""
         self._frames_limit = FRAMES_BEFORE_CLEANUP
 
     def add_transforms(
@@ -257,8 +263,9 @@ class TransformTree:
         for edge in self._edges():
             children.setdefault(edge.parent, []).append(edge)
         found = set()
-        queue = [(_name(frame), False)]
-        seen = {_name(frame)}
+        first = self._known(frame)
+        queue = [(first, False)]
+        seen = {first}
         for parent, is_moving in queue:
             below = children.get(parent, [])
             if is_moving and not below:
@@ -291,7 +298,7 @@ class TransformTree:
         known.
 
         """
-        source = _name(source)
+        source = self._known(source)
         path = self.path(source)
         top = path[-1].parent if path else source
         if top in self._odometry:
@@ -305,7 +312,7 @@ class TransformTree:
 
     def path(self, source: str) -> list[Edge]:
         """Return the pairs of frames from `source` up to the root of TF."""
-        top = _name(source)
+        top = self._known(source)
         path: list[Edge] = []
         edge = self._above(top)
         while edge is not None and edge not in path:
@@ -357,6 +364,8 @@ class TransformTree:
         received_ns: int | None,
     ) -> None:
         parent, child = _name(item.header.frame_id), _name(item.child_frame_id)
+        if edges is self._odometry:
+            child = child or self.odometry_child
         if not parent or not child:
             return  # refused by tf2, too; errors of lookups list the known transforms
         stamp_ns = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
@@ -380,7 +389,7 @@ class TransformTree:
         edge = edges.get(child)
         if edge is None:
             edge = edges[child] = Edge(parent, child, self._buffer_ns)
-            self._routes.clear()
+            self._forget_routes()
         elif edge.parent != parent:
             edge = self._of_another_parent(edges, edge, parent, is_static)
         edge.is_static |= is_static
@@ -409,7 +418,7 @@ class TransformTree:
         other = self._of_other_parents.get((parent, child))
         if self._has_two_parents(child) and other is not None:
             return other
-        self._routes.clear()
+        self._forget_routes()
         self._parent_changes[child] += 1
         parents = self._parents.setdefault(child, [edge.parent])
         if parent not in parents:
@@ -454,6 +463,56 @@ class TransformTree:
         kept = [edge for edge in edges if edge.child not in self._odometry]
         return [*self._odometry.values(), *kept]
 
+    def alike(self, frame: str) -> list[str]:
+        """Return the known frames whose name is that of another with a prefix, or without one."""
+        name = _name(frame)
+        pairs = self._same_by_prefix({name, *self.frames()}).values()
+        return sorted({other for pair in pairs for other in pair.get(name, ())})
+
+    def _known(self, frame: str) -> str:
+        """Return the name by which transforms know a frame: its own, or the only one alike."""
+        name = _name(frame)
+        known = self.frames()
+        others = [] if name in known else self.alike(name)
+        return others[0] if len(others) == 1 else name
+
+    def _same_by_prefix(self, names: set[str]) -> dict[str, dict[str, list[str]]]:
+        """Return for each prefix the names that are alike but for it, by both of their names."""
+        found: dict[str, dict[str, list[str]]] = {}
+        for name in names:
+            for at in (place for place, letter in enumerate(name) if letter == '/'):
+                prefix, rest = name[:at], name[at + 1 :]
+                if rest in names:
+                    same = found.setdefault(prefix, {})
+                    same.setdefault(name, []).append(rest)
+                    same.setdefault(rest, []).append(name)
+        return found
+
+    def _prefixed_route(self, target: str, source: str) -> list[tuple[Edge, bool]] | None:
+        """Return the route where names that differ by one prefix are one; None if not unique."""
+        edges = self._edges()
+        names = {target, source, *self.frames()}
+        routes = {
+            prefix: route
+            for prefix, same in self._same_by_prefix(names).items()
+            if (route := _connect(target, source, edges, same)) is not None
+        }
+        if len(routes) != 1:
+            return None
+        ((prefix, route),) = routes.items()
+        on_route = {name for edge, _ in route for name in (edge.parent, edge.child)}
+        for name in {target, source, *on_route}:
+            rest = name.removeprefix(f'{prefix}/')
+            full = f'{prefix}/{rest}'
+            if rest in {target, source, *on_route} and full in names and rest != full:
+                self.same_frames[full] = rest
+        return route
+
+    def _forget_routes(self) -> None:
+        """Look for routes anew: a pair of frames has come."""
+        self._routes.clear()
+        self.same_frames.clear()
+
     def _route(self, target: str, source: str) -> list[tuple[Edge, bool]]:
         """Return the edges from `source` to `target`, each with True where it leads upward."""
         key = (_name(target), _name(source))
@@ -461,6 +520,8 @@ class TransformTree:
             route = _connect(*key, self._tf_edges())
             if route is None:
                 route = _connect(*key, self._edges())
+            if route is None:
+                route = self._prefixed_route(*key)
             if route is None:
                 raise TransformUnavailable(
                     f'no transform from {source!r} to {target!r}; known: {self}; publish the '
@@ -626,8 +687,7 @@ class Edge:
             raise TransformUnavailable(
                 f'transform {self.parent} -> {self.child} is known from {stamps[0]} to '
                 f'{stamps[-1]} ns: expected to cover {stamp_ns} ns within '
-                f'{max_extrapolation_ns * 1e-9:g} s; check that its stamps use the clock of the '
-                f'point cloud'
+                f'{max_extrapolation_ns * 1e-9:g} s; {self._remedy(outside)}'
             )
         if self.is_static or len(stamps) == 1:
             return matrix(self.poses[0])
@@ -636,6 +696,19 @@ class Edge:
             return matrix(self.poses[after])
         nodes = self._nodes(after)
         return interpolated([stamps[i] for i in nodes], [self.poses[i] for i in nodes], stamp_ns)
+
+    def _remedy(self, outside_ns: int) -> str:
+        """Return what to do about a stamp so far from all samples [ns]."""
+        if len(self.stamps) < 2:
+            return 'check that its stamps use the clock of the point cloud'
+        period_ns = float(np.median(np.diff(self.stamps)))
+        if period_ns > MAX_LINEAR_GAP * 1e9 and outside_ns < 2 * period_ns:
+            return (
+                f'it comes every {period_ns * 1e-9:.2g} s, too rarely to carry the motion on for '
+                f'{outside_ns * 1e-9:.2g} s; use a faster source of motion, if there is one: '
+                f'--odometry TOPIC comes before TF'
+            )
+        return 'check that its stamps use the clock of the point cloud'
 
     def _nodes(self, after: int) -> list[int]:
         """
@@ -761,8 +834,13 @@ def _name(frame_id: str) -> str:
     return frame_id.lstrip('/')
 
 
-def _connect(target: str, source: str, edges: Iterable[Edge]) -> list[tuple[Edge, bool]] | None:
-    """Return the shortest path from `source` to `target` over `edges`, or None."""
+def _connect(
+    target: str,
+    source: str,
+    edges: Iterable[Edge],
+    same: Mapping[str, Sequence[str]] = MappingProxyType({}),
+) -> list[tuple[Edge, bool]] | None:
+    """Return the shortest path from `source` to `target`, or None; `same` has names of one."""
     neighbours: dict[str, list[tuple[Edge, bool]]] = {}
     for edge in edges:
         neighbours.setdefault(edge.child, []).append((edge, True))
@@ -770,6 +848,9 @@ def _connect(target: str, source: str, edges: Iterable[Edge]) -> list[tuple[Edge
     routes: dict[str, list[tuple[Edge, bool]]] = {source: []}
     queue = [source]
     for frame in queue:
+        others = [name for name in same.get(frame, ()) if name not in routes]
+        routes |= dict.fromkeys(others, routes[frame])
+        queue += others
         for edge, is_upward in neighbours.get(frame, ()):
             following = edge.parent if is_upward else edge.child
             if following not in routes:

@@ -37,7 +37,7 @@ chosen: 200 box arrays at 10 Hz, in which a tracker may switch now and then."""
 
 
 class JumpingIds(RecordingError):
-    """The ids of a topic of boxes jump from object to object."""
+    """The ids of a topic of boxes do not identify objects over time."""
 
 
 class ReadItem(NamedTuple):
@@ -82,7 +82,7 @@ class RecordingReader:
 
     The stages ``read``, ``decode`` and ``transform`` are measured by the clock. All sweeps are
     stored in `sweeps`. `source` is known before the first item. Where `jumping_ids` of the
-    request says that the ids of the input jump from object to object, boxes are associated.
+    request says that the ids of the input do not identify objects, boxes are associated.
 
     """
 
@@ -145,7 +145,7 @@ class RecordingReader:
                 self._check_ids()
 
     def _check_ids(self) -> None:
-        """Raise JumpingIds if the ids of the boxes so far jump from object to object."""
+        """Raise JumpingIds if the ids of the boxes so far do not identify objects."""
         found = self._items.session.jumping_ids
         if self._checks_ids and found:
             raise JumpingIds(
@@ -213,7 +213,7 @@ class RecordingReader:
 
 def _may_associate(request: Request) -> bool:
     """
-    Return whether boxes are associated where their ids jump from object to object.
+    Return whether boxes are associated where their ids do not identify objects.
 
     Ids of label files and scenes are a person's, and are kept.
 

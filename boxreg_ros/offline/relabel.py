@@ -38,7 +38,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> Su
     shows the duration of the recording that has been read and its whole duration [s]; both count
     once for each time that it is read: with completed tracks once more. Returned is the
     content of ``summary.json``. A run begins again, with boxes that are associated, where the ids
-    of their topic turn out to jump from object to object.
+    of their topic turn out not to identify objects over time.
 
     Raises RecordingError if the recording lacks something, or `out` is not an earlier result or
     cannot be written, and UnsupportedMessage if none of its clouds, or none of its messages of

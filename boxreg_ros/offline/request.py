@@ -76,7 +76,7 @@ class Request:
     convention: Convention = STANDARD
     keep_ids: bool = option(
         False,
-        'take the track ids of a topic as they are, even where they jump from object to object; '
+        'take the track ids of a topic as they are, even where they do not identify objects; '
         'by default boxes are then associated, as with --associate',
     )
     labels: tuple[str, Path] | None = option(

@@ -107,6 +107,23 @@ def test_a_switch_of_a_tracker_is_no_finding():
     assert not check.finding
 
 
+def test_ids_that_are_new_or_missing_are_found_and_others_are_not():
+    def arrays(names):
+        for k, (stamp, ids, boxes) in enumerate(street()):
+            yield array(stamp, [names(k, name) for name in ids], boxes)
+
+    counted = id_finding(arrays(lambda k, name: f'{k} {name}'))
+    assert counted.finding.startswith('track ids are new at 232 of 232 boxes')
+    assert id_finding(arrays(lambda k, name: '')).finding == '240 of 240 boxes have no track id'
+    # A tracker that begins again twice, and gives no ids to two of eight objects.
+    again = id_finding(arrays(lambda k, name: f'{k // 10} {name}' if name < '6' else ''))
+    assert (again.finding, again.new, again.nameless) == ('', 12, 60)
+    # Of boxes further apart than `max_gap` nothing is known.
+    counted = list(arrays(lambda k, name: f'{k} {name}'))
+    rare = counted[::29]
+    assert id_finding(rare).finding == ''
+
+
 def axes_of(frames, convention, checked=STANDARD, name='car'):
     """Return the check of boxes that a publisher states in a convention."""
     check = AxisCheck(checked, Config().drives)

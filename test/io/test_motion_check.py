@@ -101,6 +101,55 @@ def test_a_copy_of_tf_and_frames_with_prefixes_are_no_second_robot(tmp_path):
     assert not found
 
 
+@pytest.mark.parametrize('prefixed', ['clouds', 'boxes', 'transforms', 'odometry'])
+def test_frames_that_differ_by_a_prefix_are_taken_for_one_and_named(tmp_path, prefixed):
+    drive = Drive(sweeps=8, motion='odometry' if prefixed == 'odometry' else 'tf')
+    topics = {
+        'clouds': ('/points', '/boxes'), 'boxes': ('/boxes',), 'transforms': ('/tf', '/tf_static'),
+        'odometry': ('/odom',),
+    }  # fmt: skip
+    for topic, _, message in drive.items:
+        if topic not in topics[prefixed]:
+            continue
+        stamped = getattr(message, 'transforms', [message])
+        for one in (*stamped, *getattr(message, 'detections', [])):
+            one.header.frame_id = f'r1/{one.header.frame_id}'
+            if hasattr(one, 'child_frame_id'):
+                one.child_frame_id = f'r1/{one.child_frame_id}'
+    origins, fixed_frame, found = read(drive, tmp_path)
+    assert_true(origins, 8)
+    assert fixed_frame == ('r1/odom' if prefixed in ('transforms', 'odometry') else 'odom')
+    name = 'base' if prefixed == 'odometry' else 'lidar'
+    assert f"'r1/{name}' and '{name}'; each pair is taken for one frame" in found
+
+
+def test_a_frame_of_one_of_two_prefixes_needs_a_choice(tmp_path):
+    drive = Drive(sweeps=8)
+    m = drive.messages
+    moving = [received for topic, received, _ in drive.items if topic == '/tf']
+    drive.items = [item for item in drive.items if item[0] not in ('/tf', '/tf_static')]
+    for k, stamp in enumerate(moving):
+        poses = [('r1', 0.5 * k), ('r2', 20)]
+        stated = [m.transform(stamp, f'{r}/odom', f'{r}/lidar', (x, 0, 2)) for r, x in poses]
+        drive.items.insert(0, ('/tf', stamp, m.tf(*stated)))
+    drive.items.sort(key=lambda item: item[1])
+    with pytest.raises(RecordingError, match='--fixed-frame r1/odom or r2/odom'):
+        read(drive, tmp_path)
+    origins, _, found = read(drive, tmp_path / 'asked', fixed_frame='r1/odom')
+    assert_true(origins, 8)
+    assert "'r1/lidar' and 'lidar'" in found
+
+
+def test_odometry_without_a_child_frame_is_that_of_the_vehicle(tmp_path):
+    drive = Drive(sweeps=8, motion='odometry')
+    for number in range(8):
+        drive.replace('/odom', number, lambda message: setattr(message, 'child_frame_id', ''))
+    origins, _, found = read(drive, tmp_path)
+    assert_true(origins, 8)
+    assert '/odom: expected the frame of the vehicle in child_frame_id, got none' in found
+    assert "'base'" in found
+
+
 def test_odometry_is_that_of_the_namespace_of_the_clouds(tmp_path):
     drive = Drive(sweeps=8, motion='odometry')
     m = drive.messages

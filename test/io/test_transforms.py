@@ -216,6 +216,40 @@ def test_invalid_transforms_are_skipped():
         broken.lookup('odom', 'base', S)
 
 
+@pytest.mark.parametrize(
+    ('period', 'stamp', 'remedy'),
+    [(1.0, 3.6, 'comes every 1 s.*--odometry'), (1.0, 9.0, 'clock'), (0.1, 0.6, 'clock')],
+)
+def test_motion_is_not_carried_on_beyond_sparse_samples(period, stamp, remedy):
+    """At 1 m/s^2 it would be off by 0.5 m after 1 s."""
+    tree = tree_of(*((round(k * period * S), 'odom', 'base', (k, 0, 0)) for k in range(4)))
+    with pytest.raises(TransformUnavailable, match=remedy):
+        tree.lookup('odom', 'base', round(stamp * S))
+
+
+def test_frames_that_differ_by_a_prefix_are_one_where_nothing_else_connects_them():
+    static = [(0, 'base', 'lidar', (1, 0, 2))]
+    tree = tree_of((S, 'r1/odom', 'r1/base', (5, 0, 0)), static=static)
+    np.testing.assert_array_equal(tree.lookup('r1/odom', 'lidar', S)[:3, 3], [6, 0, 2])
+    assert tree.same_frames == {'r1/base': 'base'}
+    assert (tree.fixed_frame('r1/base'), tree.alike('odom')) == ('r1/odom', ['r1/odom'])
+    np.testing.assert_array_equal(tree.lookup('odom', 'r1/lidar', S)[:3, 3], [6, 0, 2])
+    tree.add_transforms(M.tf(M.transform(S, 'odom', 'base', (7, 0, 0))).transforms)
+    np.testing.assert_array_equal(tree.lookup('odom', 'lidar', S)[:3, 3], [8, 0, 2])
+    assert tree.same_frames == {}
+
+
+def test_a_frame_that_two_prefixes_fit_is_none_of_them():
+    tree = tree_of(*((S, f'{robot}/odom', f'{robot}/lidar', (5, 0, 0)) for robot in ('a', 'b')))
+    assert tree.fixed_frame('lidar') is None
+    assert tree.alike('lidar') == ['a/lidar', 'b/lidar']
+    with pytest.raises(TransformUnavailable, match="'lidar' to 'odom'"):
+        tree.lookup('odom', 'lidar', S)
+    # The fixed frame chooses one.
+    np.testing.assert_array_equal(tree.lookup('b/odom', 'lidar', S)[:3, 3], [5, 0, 0])
+    assert tree.same_frames == {'b/lidar': 'lidar'}
+
+
 def test_the_leading_slash_of_ros1_frames_is_ignored():
     tree = tree_of((S, '/odom', '/base', (1, 0, 0)))
     assert tree.lookup('odom', '/base', S)[0, 3] == 1.0

@@ -1,4 +1,5 @@
 from collections import Counter
+from copy import deepcopy
 from dataclasses import replace
 import json
 import os
@@ -67,6 +68,36 @@ def test_boxes_whose_ids_jump_are_associated(tmp_path, monkeypatch, checked_afte
     summary, _ = run(path, tmp_path / 'out', settings=settings, keep_ids=True)
     assert summary.ids == 'of the input'
     assert 'track ids jump' in summary.warning
+
+
+@pytest.mark.parametrize('kind', ['none', 'new'])
+def test_boxes_whose_ids_identify_nothing_are_associated(tmp_path, kind):
+    """A message for each class, without ids; and ids that count all boxes."""
+    drive = Drive(sweeps=8)
+    items = []
+    for topic, received_ns, message in drive.items:
+        if topic != '/boxes':
+            items.append((topic, received_ns, message))
+            continue
+        count = len(items)
+        rename(message, *(('', '') if kind == 'none' else (f'{count}', f'{count + 1}')))
+        for result in message.detections[1].results:
+            result.hypothesis.class_id = 'van'
+        parts = message.detections if kind == 'none' else [message.detections]
+        for part in parts:
+            own = deepcopy(message)
+            own.detections = part if kind == 'new' else [part]
+            items.append((topic, received_ns + len(items), own))
+    drive.items = items
+    path = drive.write(tmp_path / 'drive')
+    summary, rows = run(path, tmp_path / 'out')
+    assert (summary.ids, summary.associated_tracks, len(rows)) == ('by association', 2, 16)
+    assert 'duplicate_stamp' not in summary.reasons
+    said = {'none': '16 of 16 boxes have no track id', 'new': 'track ids are new at 14 of 14'}
+    assert said[kind] in summary.warning
+    assert ('read as one message per stamp' in summary.warning) == (kind == 'none')
+    kept, _ = run(path, tmp_path / 'out', keep_ids=True)
+    assert kept.status['kept'] == 16
 
 
 def rename(message, *names):
