@@ -70,8 +70,8 @@ STEP = 0.02
 """The latency that is corrected changes by this or more [s]: each step is a jump of the boxes."""
 FIRST_SECONDS = 10.0
 """With `estimate` 'track' boxes wait for the latency that the first seconds show [s]."""
-FIRST_POINTS = 2**24
-"""Points of the sweeps that wait with them, at most: 200 MB."""
+FIRST_POINTS = 2**23
+"""Points of the sweeps that wait with them, at most: 100 MB."""
 
 
 NOTHING_MOVES = 'nothing moves that boxes and points could be compared by'
