@@ -13,7 +13,7 @@ header.
 
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from boxreg_ros.errors import ShapeError
@@ -288,6 +288,8 @@ class BoxArray:
     motion : FrameMotion or None
         Of the frame that the boxes were measured in, before they were brought to `frame_id`: late
         boxes were measured at an earlier pose. None if that frame does not move in `frame_id`.
+    attributes : tuple of n mappings of str to str, or empty
+        Attributes of each object by name, as label files have them; empty where no box has any.
 
     """
 
@@ -300,6 +302,7 @@ class BoxArray:
     ticket: object = field(default=None, repr=False)
     pinned: NDArray[np.bool_] | None = None
     motion: FrameMotion | None = None
+    attributes: tuple[Mapping[str, str], ...] = ()
 
     def __post_init__(self) -> None:
         """Check that all columns have one length; convert lists to arrays and tuples."""
@@ -327,7 +330,12 @@ class BoxArray:
             scores=self.scores[rows],
             boxes=self.boxes[rows],
             pinned=None if self.pinned is None else self.pinned[rows],
+            attributes=tuple(self.attributes[row] for row in rows) if self.attributes else (),
         )
+
+    def attributes_of(self, row: int) -> Mapping[str, str]:
+        """Return the attributes of a box by name."""
+        return self.attributes[row] if self.attributes else {}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -79,6 +79,20 @@ def nuscenes(folder, version):
     return boxes
 
 
+def nuscenes_attributes(folder, version):
+    """Return the names of the attributes of each instance in the first sample."""
+    from nuscenes.nuscenes import NuScenes
+
+    data = NuScenes(version, folder, verbose=False)
+    found = {}
+    for name in data.sample[0]['anns']:
+        row = data.get('sample_annotation', name)
+        tokens = row['attribute_tokens']
+        track = data.get('instance', row['instance_token'])['instance_name']
+        found[track] = sorted(data.get('attribute', token)['name'] for token in tokens)
+    return found
+
+
 def lidarseg(folder, version):
     """Return the points of each category of each sample, and of each panoptic instance."""
     import numpy as np
@@ -485,6 +499,24 @@ def supervisely(folder):
     }  # fmt: skip
 
 
+def supervisely_tags(folder):
+    """Return value and range of the tags of each track of a project, but id and status."""
+    from importlib import import_module
+
+    import_supervisely()
+    episodes = import_module('supervisely.project.pointcloud_episode_project')
+
+    project = episodes.PointcloudEpisodeProject(folder, episodes.OpenMode.READ)
+    (data,) = project.datasets
+    found = {}
+    for item in data.get_ann(project.meta).objects:
+        tags = {tag.name: [tag.value, list(tag.frame_range or ())] for tag in item.tags}
+        track, _ = tags.pop('track_id')
+        tags.pop('status')
+        found[track] = tags
+    return found
+
+
 def supervisely_clouds(folder):
     """Return every figure of every cloud of a project of point clouds, and its name."""
     from importlib import import_module
@@ -603,6 +635,24 @@ def vcd_labels(path):
         }
         for number, frame in root['frames'].items()
     }
+
+
+def vcd_attributes(path):
+    """Return truths and texts of the cuboids of the first frame by object, but its evidence."""
+    from vcd import core
+
+    label = core.OpenLABEL()
+    label.load_from_file(path, validation=True)
+    root = label.get_root()
+    found = {}
+    for uid, item in next(iter(root['frames'].values()))['objects'].items():
+        (cuboid,) = item['object_data']['cuboid']
+        kinds = cuboid['attributes']
+        values = [*kinds.get('boolean', ()), *kinds['text']]
+        found[root['objects'][uid]['name']] = {
+            one['name']: one['val'] for one in values if one['name'] not in ('status', 'reason')
+        }
+    return found
 
 
 def cloud(path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from boxreg_ros.structures import BoxArray
@@ -38,4 +39,13 @@ def joined(boxes: BoxArray, more: BoxArray) -> BoxArray:
         class_names=boxes.class_names + more.class_names,
         scores=np.concatenate([boxes.scores, more.scores]),
         boxes=np.concatenate([boxes.boxes, more.boxes]),
+        attributes=_both_attributes(boxes, more),
+    )
+
+
+def _both_attributes(boxes: BoxArray, more: BoxArray) -> tuple[Mapping[str, str], ...]:
+    if not (boxes.attributes or more.attributes):
+        return ()
+    return tuple(
+        one.attributes_of(row) for one in (boxes, more) for row in range(len(one.track_ids))
     )

@@ -1,4 +1,10 @@
-"""``boxes.csv``: one row per box, with its frame; ``covariances.csv``: how certain each is."""
+"""
+``boxes.csv``: one row per box, with its frame; ``covariances.csv``: how certain each is.
+
+``attributes.csv`` has a row per box and attribute, where boxes have any: the columns of
+``boxes.csv`` are the same for all.
+
+"""
 
 from __future__ import annotations
 
@@ -6,15 +12,19 @@ from collections import Counter
 from collections.abc import Iterator
 import csv
 from pathlib import Path
+from typing import IO
 
-from boxreg_ros.io.box_table import BoxTable, cell, COLUMNS, csv_row
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.box_table import BoxTable, cell, COLUMNS, csv_row, protected, unprotected
 from boxreg_ros.io.covariance_table import COVARIANCES, CovarianceWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import numbers_of, refined_boxes
-from boxreg_ros.structures import Floats, PROPOSED
+from boxreg_ros.structures import BoxArray, Floats, PROPOSED
 import numpy as np
 import orjson
 
+ATTRIBUTES = 'attributes.csv'
+ATTRIBUTE_COLUMNS = ('stamp_ns', 'track_id', 'name', 'value')
 PLAIN_RANGE = 1e-4, 1e16
 """Python writes the magnitudes from the first to the second without an exponent."""
 
@@ -25,7 +35,7 @@ FORMAT = Format(
     reference='centre',
     sizes='length width height',
     rotation='quaternion x y z w',
-    files='boxes.csv, covariances.csv',
+    files='boxes.csv, covariances.csv, attributes.csv',
     reads='one row per box',
     leaves_out='covariances.csv, proposals',
     read_back='pandas 3.1.1',
@@ -47,6 +57,7 @@ class Writer:
         self._file = self._path.open('w', newline='', encoding='utf-8')
         self._file.write(','.join(COLUMNS) + '\n')
         self._covariances = CovarianceWriter(folder / COVARIANCES)
+        self._attributes: IO[str] | None = None
         self._newest_ns: int | None = None
         self._is_sorted = True
 
@@ -67,11 +78,26 @@ class Writer:
             for track_id, class_name, texts, status, num_points in rows
         ]
         self._file.write(''.join(lines))
+        self._write_attributes(boxes)
+
+    def _write_attributes(self, boxes: BoxArray) -> None:
+        if not any(boxes.attributes):
+            return
+        if self._attributes is None:
+            path = self._path.with_name(ATTRIBUTES)
+            self._attributes = path.open('w', newline='', encoding='utf-8')
+            self._attributes.write(csv_row(ATTRIBUTE_COLUMNS))
+        for track_id, attributes in zip(boxes.track_ids, boxes.attributes, strict=True):
+            for name, value in attributes.items():
+                words = map(protected, (track_id, name, value))
+                self._attributes.write(csv_row((str(boxes.stamp_ns), *words)))
 
     def close(self) -> None:
         """Close the file; sort it if boxes arrived late."""
         self._file.close()
         self._covariances.close()
+        if self._attributes is not None:
+            self._attributes.close()
         if self._is_sorted:
             return
         with self._path.open(newline='', encoding='utf-8') as file:
@@ -108,6 +134,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         name: table.rows(np.array(table.status) != PROPOSED)
         for name, table in BoxTable.read_frames(path).items()
     }
+    attributes = _read_attributes(path.with_name(ATTRIBUTES)) if path.name == 'boxes.csv' else {}
     fixed_frame = max(tables, key=lambda name: len(tables[name].boxes), default='')
     groups = []
     for name, table in tables.items():
@@ -124,10 +151,34 @@ def read(path: Path) -> Iterator[LabelFrame]:
             [table.class_names[i] for i in rows],
             table.boxes[rows],
             [
-                {'score': score, 'status': table.status[i], 'num_points': count}
+                {
+                    'score': score,
+                    'status': table.status[i],
+                    'num_points': count,
+                    'attributes': attributes.get((stamp_ns, table.track_ids[i])),
+                }
                 for i, score, count in zip(
                     rows, table.scores[rows], table.num_points[rows], strict=True
                 )
             ],
         )
         yield LabelFrame(refined, fixed_frame, '')
+
+
+def _read_attributes(path: Path) -> dict[tuple[int, str], dict[str, str]]:
+    """Return the attributes of each box by stamp and track id; empty without the file."""
+    found: dict[tuple[int, str], dict[str, str]] = {}
+    if not path.exists():
+        return found
+    try:
+        with path.open(newline='', encoding='utf-8-sig') as file:
+            for row in csv.DictReader(file):
+                key = int(row['stamp_ns']), unprotected(row['track_id'])
+                name, value = unprotected(row['name']), unprotected(row['value'])
+                found.setdefault(key, {})[name] = value
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
+        raise RecordingError(
+            f'{path}: expected the columns {", ".join(ATTRIBUTE_COLUMNS)}, got {error}; correct '
+            f'the file, or delete it'
+        ) from None
+    return found

@@ -104,7 +104,8 @@ class Cuboid:
     extent: dict[str, float]
     """By axis, in full [m]."""
     evidence: dict[str, Any]
-    """As of `evidence_of`, with num_points; of the covariance the upper triangle, row by row."""
+    """As of `evidence_of`, with num_points; of the covariance the upper triangle by rows. Where
+    the object has attributes, they are in it too."""
 
 
 class CuboidWriter(FolderWriter):
@@ -119,6 +120,7 @@ class CuboidWriter(FolderWriter):
         array = frame.refined.boxes
         for row, box, angles in zip(rows.tolist(), boxes, xyz_angles(boxes), strict=True):
             evidence = evidence_of(frame.refined, row)
+            attributes = array.attributes_of(row)
             yield Cuboid(
                 row,
                 array.track_ids[row],
@@ -133,6 +135,7 @@ class CuboidWriter(FolderWriter):
                     'score': evidence['score'],
                     'covariance': frame.refined.covariances[row][UPPER_TRIANGLE].tolist(),
                     'extent_covariance': evidence['extent_covariance'],
+                    **({'attributes': dict(attributes)} if attributes else {}),
                 },
             )
 

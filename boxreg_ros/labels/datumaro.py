@@ -15,6 +15,14 @@ from typing import Any
 
 from boxreg_ros.io.images import Image
 from boxreg_ros.labels import cuboids
+from boxreg_ros.labels.attributes import (
+    attributes_from,
+    FALSE,
+    is_set,
+    OCCLUDED,
+    plain,
+    TRUE,
+)
 from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.cuboids import EVIDENCE_KEY
 from boxreg_ros.labels.files import at, following, from_json, JsonList, require_single
@@ -41,6 +49,11 @@ POINT_CLOUD_MEDIA = 6
 IMAGE_FOLDER = 'images/default'
 OWN_ATTRIBUTE = 'extent_covariance'
 """Attribute of the boxes that we write, and no other program."""
+NO_ATTRIBUTES = (
+    'track_id', 'track', OCCLUDED, 'outside', 'keyframe', 'score',
+    'status', 'reason', 'num_points', 'covariance', 'extent_covariance',
+)  # fmt: skip
+"""Names among the attributes of a box that are none of the object."""
 SWAPPED_KEY = 'scale_is_height_width_length'
 """Key of the header that states `Options.swap_axes`."""
 
@@ -64,6 +77,7 @@ class Writer(cuboids.CuboidWriter):
         self._axes = 'zyx' if options.swap_axes else 'xyz'
         self._tracks = TrackNumbers()
         self._labels: dict[str, int] = {}
+        self._attributes: set[str] = set()
         self._images: list[dict[str, Any]] = []  # of the current frame
         infos = self.about | {SWAPPED_KEY: options.swap_axes}
         head = {'dm_format_version': '1.0', 'media_type': POINT_CLOUD_MEDIA, 'infos': infos}
@@ -106,17 +120,23 @@ class Writer(cuboids.CuboidWriter):
 
     def finish(self) -> None:
         """Write the classes."""
-        labels = [{'name': name, 'parent': '', 'attributes': []} for name in self._labels]
+        names = sorted(self._attributes)  # CVAT takes those alone that the labels declare
+        labels = [{'name': name, 'parent': '', 'attributes': names} for name in self._labels]
         self._items.close({'categories': {'label': {'labels': labels, 'attributes': []}}})
 
     def _annotation(self, index: int, track_number: int, cuboid: cuboids.Cuboid) -> dict[str, Any]:
         """Return the annotation of a cuboid; its class is added to the labels."""
         label_id = self._labels.setdefault(cuboid.class_name, len(self._labels))
         # CVAT imports as tracks only what has keyframes, and interpolates between them.
+        evidence = dict(cuboid.evidence)
+        given = evidence.pop('attributes', {})
+        others = {name: plain(value) for name, value in given.items() if name != OCCLUDED}
+        self._attributes |= others.keys()
         attributes = {
+            **others,
             'track_id': track_number,
             'track': cuboid.track_id,
-            'occluded': False,
+            'occluded': is_set(given.get(OCCLUDED, FALSE)),
             'keyframe': True,
         }
         return {
@@ -127,7 +147,7 @@ class Writer(cuboids.CuboidWriter):
             'position': list(cuboid.position.values()),
             'rotation': list(cuboid.angles.values()),
             'scale': [cuboid.extent[axis] for axis in self._axes],
-            'attributes': attributes | cuboid.evidence,
+            'attributes': attributes | evidence,
         }
 
 
@@ -217,8 +237,11 @@ def _cuboid(annotation: dict[str, Any], labels: list[str], is_swapped: bool) -> 
     if str(attributes.get('keyframe', '')).lower() == 'false':
         evidence['status'] = INTERPOLATED
     if OWN_ATTRIBUTE in attributes:  # those of others may have another meaning
-        evidence = attributes
+        evidence = dict(attributes)
         track = attributes.get('track', track)
+    evidence['attributes'] = attributes_from(attributes, NO_ATTRIBUTES)
+    if _is_set(attributes.get(OCCLUDED)):  # CVAT states the other value of every box
+        evidence['attributes'][OCCLUDED] = TRUE
     return ReadBox('' if track is None else str(track), class_name, box, evidence)
 
 

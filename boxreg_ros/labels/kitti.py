@@ -3,18 +3,21 @@ KITTI tracking: one line per box, in the rectified frame of a camera.
 
 The folder is one sequence of the benchmark: ``label_02/0000.txt``, ``calib/0000.txt`` and
 ``velodyne/0000``. Boxes outside of the image are written too, with truncation 2 and a rectangle
-of -1. Occlusion is 3, unknown. Stamps and poses are in the files of `sidecar`.
+of -1. Occlusion is 3, unknown, where boxes have no attribute ``occluded``. Stamps and poses are in
+the files of `sidecar`.
 
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.labels.attributes import FALSE, is_set, OCCLUDED, PARTLY, TRUE
+from boxreg_ros.labels.attributes import TRUNCATED as TRUNCATED_NAME
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, following, read_provenance, require_single
@@ -52,6 +55,8 @@ SEQUENCE = '0000'
 INSIDE_IMAGE, TRUNCATED, OUTSIDE_IMAGE = 0, 1, 2
 """Values of truncation."""
 UNKNOWN_OCCLUSION = 3
+OCCLUSION = {FALSE: 0, PARTLY: 1, TRUE: 2}
+"""By the value of the attribute."""
 OTHER_COLUMNS = dict.fromkeys((15, 16), ': those of KITTI object, which is read as kitti_object')
 """Hint by the number of columns of another format."""
 NO_TRACK = '-1'
@@ -93,7 +98,9 @@ class Writer(FolderWriter):
             name = self.class_names.word_of(given, 'Misc')
             if name != given:
                 self._given_classes[f'{track} {name}'] = given
-            self._file.write(f'{self.number} {track} {name} {truncation[i]} {UNKNOWN_OCCLUSION} ')
+            attributes = array.attributes_of(row)
+            cut = truncation_of(attributes, int(truncation[i]))
+            self._file.write(f'{self.number} {track} {name} {cut} {occlusion_of(attributes)} ')
             self._file.write(decimals(columns[i], array.scores[row]) + '\n')
 
     @property
@@ -112,6 +119,30 @@ class Writer(FolderWriter):
             self.about['tracks'] = names
         if self._given_classes:
             self.about['given_classes'] = self._given_classes
+
+
+def occlusion_of(attributes: Mapping[str, str], unknown: int = UNKNOWN_OCCLUSION) -> int:
+    """Return the occlusion of a box as KITTI numbers it; `unknown` without the attribute."""
+    value = attributes.get(OCCLUDED, '').lower()
+    default = TRUE if is_set(value) else FALSE
+    return OCCLUSION.get(value, OCCLUSION[default]) if value else unknown
+
+
+def truncation_of(attributes: Mapping[str, str], seen: int) -> int:
+    """Return the truncation of a box: the attribute, else that of its rectangle, `seen`."""
+    if seen == OUTSIDE_IMAGE or TRUNCATED_NAME not in attributes:
+        return seen
+    return TRUNCATED if is_set(attributes[TRUNCATED_NAME]) else INSIDE_IMAGE
+
+
+def attributes_of(truncation: str, occlusion: str) -> dict[str, str]:
+    """Return the attributes of the columns of KITTI; unknown ones are none."""
+    names = {str(number): value for value, number in OCCLUSION.items()}
+    found = {OCCLUDED: names[occlusion]} if occlusion in names else {}
+    part = float(truncation)
+    if 0 <= part <= 1:
+        found[TRUNCATED_NAME] = TRUE if part == 1 else truncation if part else FALSE
+    return found
 
 
 def columns_of(camera: Camera, boxes: Floats) -> tuple[Ints, Floats]:
@@ -189,6 +220,7 @@ class _Line(NamedTuple):
     class_name: str
     numbers: list[float]
     score: float
+    attributes: Mapping[str, str]
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
@@ -259,7 +291,8 @@ def _read_lines(path: Path) -> tuple[list[_Line], dict[int, Counter[str]]]:
                     continue
                 numbers = [float(word) for word in words[10:17]]
                 score = float(words[17]) if len(words) > 17 else np.nan
-                lines.append(_Line(frame, words[1], words[2], numbers, score))
+                attributes = attributes_of(*words[3:5])
+                lines.append(_Line(frame, words[1], words[2], numbers, score, attributes))
     return lines, left_out
 
 
@@ -275,7 +308,8 @@ def _boxes_by_frame(
     for line, box in zip(lines, boxes, strict=True):
         track_id = '' if line.track == NO_TRACK else tracks.get(line.track, line.track)
         class_name = given.get(f'{line.track} {line.class_name}', line.class_name)
-        read_box = ReadBox(track_id, class_name, box, {'score': line.score})
+        evidence = {'score': line.score, 'attributes': line.attributes}
+        read_box = ReadBox(track_id, class_name, box, evidence)
         found.setdefault(line.frame, []).append(read_box)
     return found
 

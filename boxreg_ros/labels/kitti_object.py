@@ -2,28 +2,32 @@
 KITTI object detection: ``label_2/NAME.txt`` with ``calib/NAME.txt`` and ``velodyne/NAME.bin``.
 
 The 15 columns of a label, and the score of a result, are those of KITTI tracking without frame and
-track. Truncation is 0 inside of the image, 1 outside of it and -1, unknown, at its edge; occlusion
-is 3, unknown. Names of files are stamps, see `per_frame`.
+track. Without attributes, truncation is 0 inside of the image, 1 outside of it and -1, unknown, at
+its edge, and occlusion is 3, unknown. Names of files are stamps, see `per_frame`.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from boxreg_ros.errors import RecordingError, unreadable
+from boxreg_ros.labels.attributes import TRUNCATED as TRUNCATED_NAME
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.cameras import black_png, LabelCamera
 from boxreg_ros.labels.kitti import (
+    attributes_of,
     boxes_of,
     columns_of,
     decimals,
     IGNORED_CLASS,
     INSIDE_IMAGE,
+    occlusion_of,
     OUTSIDE_IMAGE,
     TRUNCATED,
-    UNKNOWN_OCCLUSION,
+    truncation_of,
     write_calibration,
 )
 from boxreg_ros.labels.kitti_camera import KittiCamera
@@ -92,9 +96,12 @@ class Writer(PerFrameWriter):
         truncation, columns = columns_of(self._camera, boxes)
         for i, row in enumerate(rows):
             name = self.class_names.word_of(array.class_names[row], 'Misc')
-            begin = f'{name} {TRUNCATION[int(truncation[i])]}'
+            attributes = array.attributes_of(row)
+            cut = TRUNCATION[truncation_of(attributes, int(truncation[i]))]
+            with suppress(ValueError):  # the part that is stated
+                cut = f'{float(attributes.get(TRUNCATED_NAME, "")):.2f}'
             numbers = decimals(columns[i], array.scores[row])
-            yield f'{begin} {UNKNOWN_OCCLUSION} {numbers}'
+            yield f'{name} {cut} {occlusion_of(attributes)} {numbers}'
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
@@ -137,7 +144,8 @@ def read(path: Path) -> Iterator[LabelFrame]:
         for line, box in zip(words, boxes, strict=True):
             score = float(line[15]) if len(line) > 15 else None
             is_region = line[0] == IGNORED_CLASS
-            found.append(None if is_region else ReadBox('', line[0], box, {'score': score}))
+            evidence = {'score': score, 'attributes': attributes_of(*line[1:3])}
+            found.append(None if is_region else ReadBox('', line[0], box, evidence))
         return found
 
     what = '15 or 16 columns of KITTI object'

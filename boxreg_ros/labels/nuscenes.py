@@ -20,6 +20,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.images import Image
 from boxreg_ros.io.transforms import inverse, matrix
 from boxreg_ros.labels import files
+from boxreg_ros.labels.attributes import of_nuscenes, to_nuscenes
 from boxreg_ros.labels.cameras import black_png, LabelCamera
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import (
@@ -49,7 +50,7 @@ FORMAT = Format(
     files='v1.0-boxreg/, samples/, maps/',
     options=('with_points', 'with_images', 'class_map'),
     reads='annotations of all scenes; results of the detection and the tracking task',
-    leaves_out='attributes, visibility, velocities, radar',
+    leaves_out='visibility, velocities, radar',
     read_back='nuscenes-devkit 1.2.0',
 )
 STREAMED_TABLES = ('sample', 'sample_data', 'sample_annotation', 'ego_pose')
@@ -58,6 +59,8 @@ OWN_VALUES = 'boxreg_values.json'
 """Values without a column in the tables of T4, by the token of their row."""
 DISTORTIONS = (4, 5, 8, 12, 14)
 """Numbers of coefficients that T4 takes, those of OpenCV."""
+ATTRIBUTE_GROUPS = ('vehicle', 'cycle', 'pedestrian')
+"""First words of the attributes of nuScenes."""
 EMPTY_MAP = 'maps/empty.png'
 
 
@@ -91,6 +94,7 @@ class Writer(FolderWriter):
         self._sensors: list[dict[str, Any]] = []  # the cameras
         self._calibrations: list[dict[str, Any]] = []
         self._categories: dict[str, str] = {}
+        self._attributes: dict[str, str] = {}
         self._drive = f'{self.about["recordings"]} {self.about["config_hash"]}'
         self._num_single = 0  # annotations that are an instance of their own
 
@@ -232,11 +236,15 @@ class Writer(FolderWriter):
             token = self._token('annotation', f'{sample} {key}')
             own = self._evidence(refined, row) | {'stamp_ns': array.stamp_ns}
             own['class_name'] = array.class_names[row]
+            attributes = array.attributes_of(row)
+            names = self.attribute_names(attributes)
+            if attributes:
+                own['attributes'] = dict(attributes)
             annotation = {
                 'token': token,
                 'sample_token': sample,
                 'instance_token': self._instance(key, track_id, class_name, token),
-                'attribute_tokens': [],
+                'attribute_tokens': [self._attribute(name) for name in names],
                 'visibility_token': 'unavailable',
                 'translation': centre,
                 'size': size,
@@ -255,6 +263,15 @@ class Writer(FolderWriter):
     def _own_columns(self, token: str, values: dict[str, Any]) -> dict[str, Any]:
         """Return the columns for values that the devkit does not know; it ignores them."""
         return values
+
+    def attribute_names(self, attributes: Mapping[str, str]) -> list[str]:
+        """Return the one attribute that the evaluation of nuScenes allows, of its own groups."""
+        names = to_nuscenes(attributes, 'vehicle.parked')
+        return [name for name in names if name.partition('.')[0] in ATTRIBUTE_GROUPS][:1]
+
+    def _attribute(self, name: str) -> str:
+        """Return the token of an attribute."""
+        return self._attributes.setdefault(name, self._token('attribute', name))
 
     def _evidence(self, refined: RefinedBoxes, row: int) -> dict[str, Any]:
         """Return what an annotation states beside the columns of the devkit."""
@@ -320,7 +337,10 @@ class Writer(FolderWriter):
         area = {'log_tokens': [log], 'category': '', 'filename': EMPTY_MAP}
         return {
             'category': categories,
-            'attribute': [],
+            'attribute': [
+                {'token': token, 'name': name, 'description': ''}
+                for name, token in self._attributes.items()
+            ],
             'visibility': [{'token': 'unavailable', 'level': 'unavailable', 'description': ''}],
             'instance': list(self._instances.values()),
             'sensor': [
@@ -362,8 +382,9 @@ def _read_tables(tables: Path) -> Iterator[LabelFrame]:
     poses = _poses(tables)
     annotations: dict[str, list[dict[str, Any]]] = {}
     own = own_values(tables.parent)
+    attributes = _attribute_names(tables)
     for item in files.from_json(tables / 'sample_annotation.json'):
-        whole = item | own.get(item['token'], {})
+        whole = _with_attributes(item, attributes) | own.get(item['token'], {})
         annotations.setdefault(item['sample_token'], []).append(whole)
     samples = sorted(files.from_json(tables / 'sample.json'), key=lambda item: item['timestamp'])
     fixed_frame, sensor_frame = files.frame_names(tables.parent)
@@ -393,9 +414,11 @@ def _scene_annotations(tables: Path, scene: SceneFrames) -> dict[str, RefinedBox
     """Return the annotations of a scene by sample."""
     annotations: dict[str, list[dict[str, Any]]] = {token: [] for token in scene.stamps_ns}
     own = own_values(tables.parent)
+    attributes = _attribute_names(tables)
     for item in files.json_items(tables / 'sample_annotation.json'):
         if item['sample_token'] in annotations:
-            annotations[item['sample_token']].append(item | own.get(item['token'], {}))
+            whole = _with_attributes(item, attributes) | own.get(item['token'], {})
+            annotations[item['sample_token']].append(whole)
     used = {item['instance_token'] for items in annotations.values() for item in items}
     rows = files.json_items(tables / 'instance.json')
     instances = {item['token']: item for item in rows if item['token'] in used}
@@ -439,6 +462,17 @@ def own_values(folder: Path) -> dict[str, dict[str, Any]]:
     """Return what our exports of T4 state beside the tables, by token; empty for others."""
     path = folder / OWN_VALUES
     return {item['token']: item for item in files.json_items(path)} if path.is_file() else {}
+
+
+def _attribute_names(tables: Path) -> dict[str, str]:
+    path = tables / 'attribute.json'
+    return {item['token']: item['name'] for item in files.from_json(path)} if path.exists() else {}
+
+
+def _with_attributes(item: dict[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    """Return an annotation with the attributes of its tokens, unless it states them itself."""
+    tokens = item.get('attribute_tokens') or ()
+    return {'attributes': of_nuscenes([names[one] for one in tokens if one in names])} | item
 
 
 def _category_names(tables: Path) -> dict[str, str]:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.io.transforms import inverse, moved_boxes
+from boxreg_ros.labels.attributes import attributes_from, plain
 from boxreg_ros.labels.files import at, following, from_json, to_json
 from boxreg_ros.labels.protocol import Format, INPUT_STATUS, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import ReadBox, refined_of, require_radians
@@ -54,7 +55,7 @@ COVARIANCE_DIGITS = 9
 """Decimals of covariances: a standard deviation of 0.03 mm. Full precision doubles the file."""
 FIXED_TYPES = ('scene_cs', 'geo_cs', 'geo_utm', 'geo_wgs84')
 """Types of coordinate systems that do not move with a sensor or a vehicle."""
-OBJECT_DATA_POINTER = {
+OBJECT_DATA_POINTER: dict[str, Any] = {
     'type': 'cuboid',
     'attribute_pointers': {
         'status': 'text',
@@ -65,6 +66,11 @@ OBJECT_DATA_POINTER = {
         'extent_covariance': 'vec',
     },
 }
+
+NO_ATTRIBUTES = (
+    *OBJECT_DATA_POINTER['attribute_pointers'], 'confidence', 'interpolated', 'keyframe',
+)  # fmt: skip
+"""Names among the attributes of a cuboid that are none of the object."""
 
 
 class Writer:
@@ -102,6 +108,7 @@ class Writer:
         for name, cuboid in zip(names, _cuboids(refined), strict=True):
             number = self._number(*name, objects)
             objects[number] = {'object_data': {'cuboid': [cuboid]}}
+            self._point_to(number, cuboid)
         properties: dict[str, Any] = {
             'timestamp': boxes.stamp_ns / 1e9,
             'stamp_ns': boxes.stamp_ns,
@@ -153,6 +160,15 @@ class Writer:
             intervals.append({'frame_start': self._frames, 'frame_end': self._frames})
         return number
 
+    def _point_to(self, number: int, cuboid: dict[str, Any]) -> None:
+        """Add the attributes of a cuboid that few have to the pointers of its object."""
+        pointer = self._objects[number]['object_data_pointers']['box']
+        for kind in ('boolean', 'text'):
+            for item in cuboid['attributes'].get(kind, ()):
+                if item['name'] not in pointer['attribute_pointers']:
+                    known = pointer['attribute_pointers']
+                    pointer['attribute_pointers'] = known | {item['name']: kind}
+
     def _new_object(self, track_id: str, class_name: str) -> int:
         """Add an object and return its number; the first of a track stands for the track."""
         number = next(self._numbers)
@@ -179,11 +195,12 @@ def _cuboids(refined: RefinedBoxes) -> Iterator[dict[str, Any]]:
     extents = refined.extent_covariances.reshape(-1, 9).round(COVARIANCE_DIGITS)
     columns = (values, refined.num_points, boxes.scores, covariances, extents)
     rows = zip(refined.status, refined.reasons, *(c.tolist() for c in columns), strict=True)
-    for status, reason, value, num_points, score, covariance, extent_covariance in rows:
+    for i, row in enumerate(rows):
+        status, reason, value, num_points, score, covariance, extent_covariance = row
         numbers = [{'name': 'num_points', 'val': num_points}]
         if isfinite(score):
             numbers.append({'name': 'score', 'val': score})
-        attributes = {
+        attributes: dict[str, list[dict[str, Any]]] = {
             'text': [{'name': 'status', 'val': status}, {'name': 'reason', 'val': reason}],
             'num': numbers,
             'vec': [
@@ -191,6 +208,9 @@ def _cuboids(refined: RefinedBoxes) -> Iterator[dict[str, Any]]:
                 {'name': 'extent_covariance', 'val': extent_covariance},
             ],
         }
+        for name, word in boxes.attributes_of(i).items():
+            kind = 'boolean' if isinstance(plain(word), bool) else 'text'
+            attributes.setdefault(kind, []).append({'name': name, 'val': plain(word)})
         yield {
             'name': 'box',
             'coordinate_system': boxes.frame_id,
@@ -333,9 +353,9 @@ class _Objects:
         if track_id and track_id in others:
             track_id = f'{track_id}/{cuboid.get("name", len(others))}'
         class_name = self._classes.get(uid, '')
-        evidence = _attributes(cuboid)
-        if not self._are_own:
-            evidence = _of_others(evidence)
+        values = _attributes(cuboid)
+        evidence = dict(values) if self._are_own else _of_others(values)
+        evidence['attributes'] = attributes_from(values, NO_ATTRIBUTES)
         return ReadBox(track_id, class_name, _box(cuboid['val']), evidence)
 
     def require_frames(self, count: int) -> None:

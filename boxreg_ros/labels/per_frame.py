@@ -74,6 +74,7 @@ def _evidence(frame: LabelFrame, row: int) -> dict[str, Any]:
         'track_id': array.track_ids[row],
         'class_name': array.class_names[row],
         'num_points': int(frame.refined.num_points[row]),
+        'attributes': dict(array.attributes_of(row)),
         **evidence_of(frame.refined, row),
     }
 

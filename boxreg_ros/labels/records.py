@@ -48,15 +48,16 @@ def refined_boxes(
     """
     Return the n boxes (n, 9) of one stamp [ns] as read from a file.
 
-    `evidence` has the values of a box by the names of `evidence_of` and ``num_points``; others are
-    ignored. Of a value that is missing or None the default is taken: score NaN, status
-    `INPUT_STATUS`, 0 points, unit matrices, no reason.
+    `evidence` has the values of a box by the names of `evidence_of`, ``num_points`` and
+    ``attributes``; others are ignored. Of a value that is missing or None the default is taken:
+    score NaN, status `INPUT_STATUS`, 0 points, unit matrices, no reason, no attributes.
 
     """
     n = len(track_ids)
     items = evidence or [{}] * n
     scores = [item.get('score') for item in items]
     extents = [item.get('extent_covariance') for item in items]
+    attributes = tuple(item.get('attributes') or {} for item in items)
     return RefinedBoxes(
         BoxArray(
             stamp_ns,
@@ -65,6 +66,7 @@ def refined_boxes(
             tuple(class_names),
             np.array(scores, np.float64),
             np.asarray(boxes, np.float64).reshape(n, 9),
+            attributes=attributes if any(attributes) else (),
         ),
         tuple(str(item.get('status') or INPUT_STATUS) for item in items),
         tuple(str(item.get('reason') or '') for item in items),

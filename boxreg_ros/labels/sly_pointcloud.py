@@ -27,6 +27,7 @@ from boxreg_ros.labels.supervisely import (
     key_of,
     meta_of,
     objects_by_key,
+    TAGS,
     write_calibrations,
 )
 
@@ -60,6 +61,7 @@ class Writer(cuboids.CuboidWriter):
         self._classes: dict[str, None] = {}
         self._tracks = TrackNumbers()
         self._objects: dict[str, int] = {}
+        self._tags: dict[str, None] = dict.fromkeys(TAGS)
         self._figures = 0
         # Figures are as many as boxes: their numbers wait in a file.
         self._figure_ids = TemporaryFile('w+', encoding='utf-8', dir=folder)  # noqa: SIM115
@@ -93,7 +95,7 @@ class Writer(cuboids.CuboidWriter):
 
     def finish(self) -> None:
         """Write the files of the project."""
-        write_json(self.folder / 'meta.json', meta_of(self._classes, 'point_clouds'))
+        write_json(self.folder / 'meta.json', meta_of(self._classes, 'point_clouds', self._tags))
         with (self.folder / 'key_id_map.json').open('w', encoding='utf-8') as file:
             file.write(f'{{"tags": {{}},\n"objects": {to_json(self._objects)}')
             for name, numbers in (('figures', self._figure_ids), ('videos', self._cloud_ids)):
@@ -105,16 +107,20 @@ class Writer(cuboids.CuboidWriter):
             file.write('}\n')
 
     def _object(self, cuboid: cuboids.Cuboid, others: dict[str, Any]) -> dict[str, Any]:
-        """Return the object of a cuboid, with its status as a tag."""
+        """Return the object of a cuboid, with its status and attributes as tags."""
         key = key_of(f'object/{cuboid.class_name}/{cuboid.track_id}')
         if not cuboid.track_id or key in others:
             key = key_of(f'object/{self.number}/{cuboid.row}')
         else:
             self._objects.setdefault(key, self._tracks.of(cuboid.track_id))
         self._objects.setdefault(key, self._tracks.of(''))
-        status = cuboid.evidence['status']
-        tag = {'key': key_of(f'{key}/{self.number}'), 'name': 'status', 'value': status}
-        return {'key': key, 'classTitle': cuboid.class_name, 'tags': [tag]}
+        values = {'status': cuboid.evidence['status'], **cuboid.evidence.get('attributes', {})}
+        tags = []
+        for name, value in values.items():
+            self._tags.setdefault(name)
+            own_key = key_of(f'{key}/{self.number}/{name}')
+            tags.append({'key': own_key, 'name': name, 'value': value})
+        return {'key': key, 'classTitle': cuboid.class_name, 'tags': tags}
 
 
 def read(path: Path) -> Iterator[LabelFrame]:

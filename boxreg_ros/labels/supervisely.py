@@ -15,6 +15,7 @@ from uuid import NAMESPACE_URL, uuid5
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.images import Image
 from boxreg_ros.labels import cuboids
+from boxreg_ros.labels.attributes import attributes_from, TRUE
 from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, following, from_json, JsonList, to_json, write_json
 from boxreg_ros.labels.protocol import (
@@ -38,6 +39,7 @@ FORMAT = cuboids.cuboid_format(
 ANNOTATION_FILE = 'annotation.json'
 CUBOID = 'cuboid_3d'
 TAGS = ('track_id', 'status')
+NO_ATTRIBUTES = (*TAGS, 'keyframe')
 
 
 class Writer(cuboids.CuboidWriter):
@@ -61,6 +63,7 @@ class Writer(cuboids.CuboidWriter):
         self._records = JsonList(self._episode / ANNOTATION_FILE, head, 'frames')
         self._clouds: list[str] = []
         self._objects: dict[str, dict[str, Any]] = {}
+        self._tags: dict[str, None] = dict.fromkeys(TAGS)
 
     def add(self, frame: LabelFrame) -> None:
         """Add the record of a frame."""
@@ -76,39 +79,45 @@ class Writer(cuboids.CuboidWriter):
         objects = list(self._objects.values())
         self._records.close({'objects': objects, 'framesCount': len(self._clouds)})
         classes = dict.fromkeys(item['classTitle'] for item in objects)
-        write_json(self.folder / 'meta.json', meta_of(classes, 'point_cloud_episodes'))
+        write_json(self.folder / 'meta.json', meta_of(classes, 'point_cloud_episodes', self._tags))
         ids: dict[str, Any] = {kind: {} for kind in ('tags', 'objects', 'figures', 'videos')}
         write_json(self.folder / 'key_id_map.json', ids)
         write_json(self._episode / 'frame_pointcloud_map.json', dict(enumerate(self._clouds)))
 
     def _add_to_object(self, cuboid: cuboids.Cuboid, number: int) -> str:
-        """Return the key of the object of a cuboid; add its status in frame `number`."""
+        """Return the key of the object of a cuboid; add its tags in frame `number`."""
         suffix = '' if cuboid.track_id else f'{number}/{cuboid.row}'
         key = key_of(f'object/{cuboid.class_name}/{cuboid.track_id}/{suffix}')
         if key not in self._objects:
             tag = {'key': key_of(f'{key}/track'), 'name': 'track_id', 'value': cuboid.track_id}
             self._objects[key] = {'key': key, 'classTitle': cuboid.class_name, 'tags': [tag]}
         tags = self._objects[key]['tags']
-        status = cuboid.evidence['status']
-        last = tags[-1]
-        if last['name'] == 'status' and last['value'] == status:
-            if last['frameRange'][1] == number - 1:
-                last['frameRange'][1] = number
-            if last['frameRange'][1] == number:
-                return key
-        tags.append(
-            {
-                'key': key_of(f'{key}/{number}/{status}'),
-                'name': 'status',
-                'value': status,
-                'frameRange': [number, number],
-            }
-        )
+        values = {'status': cuboid.evidence['status'], **cuboid.evidence.get('attributes', {})}
+        for name, value in values.items():
+            self._tags.setdefault(name)
+            _tag(tags, name, value, number)
         return key
 
     def add_images(self, images: Sequence[tuple[LabelCamera, Image, str]]) -> None:
         """Write the calibration beside each image of a frame."""
         write_calibrations(self.folder, images)
+
+
+def _tag(tags: list[dict[str, Any]], name: str, value: str, number: int) -> None:
+    """Add a tag in frame `number`, or prolong its last one if that is of the frame before."""
+    last = next((tag for tag in reversed(tags[1:]) if tag['name'] == name), None)
+    if last and last['value'] == value and last['frameRange'][1] >= number - 1:
+        last['frameRange'][1] = number
+        return
+    object_key = tags[0]['key']
+    tags.append(
+        {
+            'key': key_of(f'{object_key}/{number}/{name}/{value}'),
+            'name': name,
+            'value': value,
+            'frameRange': [number, number],
+        }
+    )
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
@@ -150,7 +159,8 @@ def read(path: Path) -> Iterator[LabelFrame]:
         boxes = {}
         for index, cloud in sorted(clouds.items(), key=lambda item: int(item[0])):
             with at(f'frame {index}'):
-                boxes[Path(cloud).stem] = boxes_of(figures.get(index) or (), objects)
+                found = boxes_of(figures.get(index) or (), objects, int(index))
+                boxes[Path(cloud).stem] = found
     yield from cuboids.read_frames(folder, list(boxes), lambda name: (boxes.get(name, []), {}))
 
 
@@ -173,26 +183,43 @@ def objects_by_key(content: dict[str, Any]) -> dict[Any, dict[str, Any]]:
 
 
 def boxes_of(
-    figures: Iterable[dict[str, Any]], objects: dict[Any, dict[str, Any]]
+    figures: Iterable[dict[str, Any]], objects: dict[Any, dict[str, Any]], index: int = 0
 ) -> list[ReadBox]:
-    """Return the cuboids of figures; ValueError or KeyError for those of another layout."""
+    """
+    Return the cuboids of figures in the frame `index`.
+
+    Raises ValueError or KeyError for those of another layout.
+
+    """
     boxes = []
     for number, figure in enumerate(figures):
         with at(f'figure {number}'):
             if figure['geometryType'] == CUBOID:
                 key = figure['objectKey'] if 'objectKey' in figure else figure['objectId']
-                boxes.append(_cuboid(figure, objects[key], key))
+                boxes.append(_cuboid(figure, objects[key], key, index))
     return boxes
 
 
-def _cuboid(figure: dict[str, Any], parent: dict[str, Any], key: Any) -> ReadBox:
-    """Return the cuboid of a figure; `parent` is its object."""
+def _cuboid(figure: dict[str, Any], parent: dict[str, Any], key: Any, index: int) -> ReadBox:
+    """Return the cuboid of a figure in the frame `index`; `parent` is its object."""
     tags = {tag['name']: tag.get('value') for tag in parent.get('tags') or ()}
+    # Tags without a value are set by being there; those of objects may be for some frames.
+    given = [
+        (tag['name'], TRUE if tag.get('value') is None else tag['value'])
+        for tag in (*(parent.get('tags') or ()), *(figure.get('tags') or ()))
+        if _is_in(tag.get('frameRange'), index)
+    ]
     geometry = figure['geometry']
     box = cuboids.box_from_xyz(geometry['position'], geometry['rotation'], geometry['dimensions'])
-    evidence = {'status': _status(figure, tags)} | figure.get(cuboids.EVIDENCE_KEY, {})
+    attributes = attributes_from(dict(given), NO_ATTRIBUTES)
+    evidence = {'status': _status(figure, tags), 'attributes': attributes}
+    evidence |= figure.get(cuboids.EVIDENCE_KEY, {})
     track_id = evidence.get('track_id', tags.get('track_id', key))
     return ReadBox(str(track_id), str(parent['classTitle'] or ''), box, evidence)
+
+
+def _is_in(frames: Sequence[int] | None, index: int) -> bool:
+    return not frames or frames[0] <= index <= frames[-1]
 
 
 def _status(figure: dict[str, Any], tags: dict[str, Any]) -> str:
@@ -225,7 +252,7 @@ def figure_of(cuboid: cuboids.Cuboid, number: int, object_key: str) -> dict[str,
     }
 
 
-def meta_of(classes: Iterable[str], kind: str) -> dict[str, Any]:
+def meta_of(classes: Iterable[str], kind: str, tags: Iterable[str] = TAGS) -> dict[str, Any]:
     """Return the content of ``meta.json``: classes and tags of a project of a kind."""
     return {
         'classes': [
@@ -233,7 +260,7 @@ def meta_of(classes: Iterable[str], kind: str) -> dict[str, Any]:
             for title in classes
         ],
         'tags': [
-            {'name': name, 'value_type': 'any_string', 'color': _colour(name)} for name in TAGS
+            {'name': name, 'value_type': 'any_string', 'color': _colour(name)} for name in tags
         ],
         'projectType': kind,
     }

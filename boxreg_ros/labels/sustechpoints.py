@@ -8,11 +8,12 @@ distinguishes them from boxes that a person drew or edited, and does not learn f
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from boxreg_ros.labels import cuboids
+from boxreg_ros.labels.attributes import is_set, PARTLY, TRUE
 from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, write_json
 from boxreg_ros.labels.protocol import (
@@ -30,7 +31,6 @@ FORMAT = cuboids.cuboid_format(
     title='SUSTechPOINTS',
     files='label/STAMP.json, lidar/STAMP.pcd, desc.json',
     reads='labels of a scene; what the tool interpolated or a model made is marked',
-    leaves_out='attributes of objects',
 )
 
 
@@ -102,10 +102,17 @@ def _item(cuboid: cuboids.Cuboid) -> dict[str, Any]:
         },
         'obj_type': cuboid.class_name,
         'obj_id': cuboid.track_id,
-        'obj_attr': '',
+        'obj_attr': ','.join(_words(cuboid.evidence.get('attributes', {}))),
         'annotator': cuboids.EVIDENCE_KEY,
         cuboids.EVIDENCE_KEY: cuboid.evidence,
     }
+
+
+def _words(attributes: Mapping[str, str]) -> Iterator[str]:
+    """Yield attributes as the tool has them: words, with commas between them."""
+    for name, value in attributes.items():
+        if is_set(value):
+            yield name if value in (TRUE, PARTLY) else f'{name} {value}'
 
 
 def _cuboids(content: Any) -> cuboids.FrameBoxes:
@@ -121,7 +128,9 @@ def _cuboid(item: dict[str, Any]) -> ReadBox:
     box = cuboids.box_from_xyz(psr['position'], psr['rotation'], psr['scale'])
     annotator = item.get('annotator')
     status = STATUS_OF.get(annotator, AUTOMATIC_STATUS) if annotator else INPUT_STATUS
-    evidence = {'status': status} | item.get(cuboids.EVIDENCE_KEY, {})
+    words = str(item.get('obj_attr') or '').split(',')
+    attributes = {word.strip(): TRUE for word in words if word.strip()}
+    evidence = {'status': status, 'attributes': attributes} | item.get(cuboids.EVIDENCE_KEY, {})
     track_id = item.get('obj_id')
     class_name = str(item.get('obj_type') or '')
     return ReadBox('' if track_id is None else str(track_id), class_name, box, evidence)

@@ -9,12 +9,13 @@ columns have the velocity, and whether a program made the box, with its name and
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from boxreg_ros.labels import nuscenes
+from boxreg_ros.labels.attributes import to_nuscenes
 from boxreg_ros.labels.files import JsonList
 from boxreg_ros.labels.nuscenes import OWN_VALUES, read, read_scene
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
@@ -61,6 +62,10 @@ class Writer(nuscenes.Writer):
         """Complete the tables and the file of values."""
         super().finish()
         self._own_values.close()
+
+    def attribute_names(self, attributes: Mapping[str, str]) -> list[str]:
+        """Return all attributes: T4 has groups of its own for occlusion and truncation."""
+        return to_nuscenes(attributes, 'vehicle_state.parked')
 
     def _link(self, table: str, row: dict[str, Any], instance: str = '', camera: str = '') -> None:
         """Hold a row as that class does; annotations get their velocity."""

@@ -10,7 +10,7 @@ see `_convention_of`; ``--swap-axes`` writes files for them.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 import re
@@ -21,8 +21,10 @@ from xml.etree import ElementTree
 from xml.sax.saxutils import escape, unescape
 
 from boxreg_ros.config import Config
+from boxreg_ros.labels.attributes import attributes_from, OCCLUDED
 from boxreg_ros.labels.files import at, following, to_json
 from boxreg_ros.labels.folder import FolderWriter
+from boxreg_ros.labels.kitti import attributes_of, occlusion_of, truncation_of
 from boxreg_ros.labels.protocol import (
     Format,
     INPUT_STATUS,
@@ -84,12 +86,18 @@ TAIL = '</tracklets>\n</boost_serialization>\n'
 INTERPOLATED_STATE = 1
 LABELLED_STATE = 2
 OUTSIDE_TRUNCATIONS = ('2', 'TruncationStates.OUT_IMAGE')
+NAMED_FLAGS = {
+    'VISIBLE': 0, 'PARTLY': 1, 'FULLY': 2, 'OCCLUSION_UNSET': -1,
+    'IN_IMAGE': 0, 'TRUNCATED': 1, 'OUT_IMAGE': 2, 'BEHIND_IMAGE': 99, 'TRUNCATION_UNSET': -1,
+}  # fmt: skip
+"""Values of occlusion and truncation by their names in Datumaro, after a full stop."""
+UNSET_OCCLUSION = -1
 UNSET_OCCLUSIONS = ('-1', 'OcclusionStates.OCCLUSION_UNSET')
 """Of poses with which Datumaro fills a gap; version 1.13 writes the names of its constants."""
-UNKNOWN_TRUNCATION = {False: '99', True: '-1'}
+UNKNOWN_TRUNCATION = {False: 99, True: -1}
 """Unknown truncation by `Options.swap_axes`: of KITTI and of Datumaro."""
 FLAGS = """\
-<occlusion>-1</occlusion><occlusion_kf>0</occlusion_kf><truncation>{unknown}</truncation>\
+<occlusion>{occlusion}</occlusion><occlusion_kf>0</occlusion_kf><truncation>{truncation}</truncation>\
 <amt_occlusion>-1</amt_occlusion><amt_occlusion_kf>-1</amt_occlusion_kf>\
 <amt_border_l>-1</amt_border_l><amt_border_r>-1</amt_border_r><amt_border_kf>-1</amt_border_kf>"""
 
@@ -103,6 +111,7 @@ class _Tracklet:
     first_frame: int
     boxes: list[Floats] = field(default_factory=list)
     states: list[int] = field(default_factory=list)
+    attributes: list[Mapping[str, str]] = field(default_factory=list)
 
 
 class Writer(FolderWriter):
@@ -138,6 +147,7 @@ class Writer(FolderWriter):
             continued[key] = tracklet
             is_interpolated = frame.refined.status[row] in NOT_OF_A_PERSON
             tracklet.boxes.append(box)
+            tracklet.attributes.append(array.attributes_of(row))
             tracklet.states.append(INTERPOLATED_STATE if is_interpolated else LABELLED_STATE)
         for tracklet in self._open.values():
             self._write(tracklet)
@@ -162,7 +172,6 @@ class Writer(FolderWriter):
         poses = np.hstack([_shifted_centres(boxes, shift), boxes[:, ROLL : YAW + 1]])
         class_name = ' '.join(tracklet.class_name.split())
         class_name = INVALID_CHARACTERS.sub('\N{REPLACEMENT CHARACTER}', class_name) or 'Misc'
-        flags = FLAGS.format(unknown=UNKNOWN_TRUNCATION[self._is_swapped])
         item_id, poses_id, pose_id = CLASS_IDS if self._count == 0 else ('', '', '')
         lines = [
             f'<item{item_id}>',
@@ -173,7 +182,12 @@ class Writer(FolderWriter):
             f'<poses{poses_id}>',
             f'<count>{len(poses)}</count>\n<item_version>2</item_version>',
         ]
-        for pose, state in zip(poses.tolist(), tracklet.states, strict=True):
+        columns = poses.tolist(), tracklet.states, tracklet.attributes
+        for pose, state, attributes in zip(*columns, strict=True):
+            flags = FLAGS.format(
+                occlusion=occlusion_of(attributes, UNSET_OCCLUSION),
+                truncation=truncation_of(attributes, UNKNOWN_TRUNCATION[self._is_swapped]),
+            )
             tagged = zip(POSE_TAGS, pose, strict=True)
             values = ''.join(f'<{tag}>{value!r}</{tag}>' for tag, value in tagged)
             lines.append(f'<item{pose_id}>{values}<state>{state}</state>{flags}</item>')
@@ -349,7 +363,8 @@ def _add(
         box = np.array([*values[:3], *extent, *values[3:]])
         if not convention.is_centre:
             box[BOX_CENTER] = _shifted_centres(box[None], extent[2] / 2)[0]
-        read_box = ReadBox(track_id, class_name, box, {'status': status})
+        evidence = {'status': status, 'attributes': _attributes(pose)}
+        read_box = ReadBox(track_id, class_name, box, evidence)
         content.boxes.setdefault(index, []).append(read_box)
 
 
@@ -382,6 +397,18 @@ class _DatumaroStatus:
             return None
         is_interpolated = self._has_keyframes and not _keyframe(pose)
         return INTERPOLATED if is_interpolated else INPUT_STATUS
+
+
+def _attributes(pose: ElementTree.Element) -> dict[str, str]:
+    """Return the attributes of a pose: its flags, and those that Datumaro adds."""
+    flags = ((pose.findtext(tag) or '').strip() for tag in ('truncation', 'occlusion'))
+    numbers = [str(NAMED_FLAGS.get(flag.rpartition('.')[2], flag or '-1')) for flag in flags]
+    found = attributes_of(*numbers)
+    for attribute in pose.findall('attributes/attribute'):
+        name, value = (attribute.findtext(tag) or '' for tag in ('name', 'value'))
+        if name not in ('keyframe', OCCLUDED, 'track_id', 'outside'):
+            found |= attributes_from({name: value})
+    return found
 
 
 def _keyframe(pose: ElementTree.Element) -> bool:

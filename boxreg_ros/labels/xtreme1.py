@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.images import Image
 from boxreg_ros.labels import cuboids
+from boxreg_ros.labels.attributes import attributes_from
 from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, following, from_json, write_json
 from boxreg_ros.labels.protocol import (
@@ -211,6 +212,15 @@ def _source(path: Path, sources: Counter[str], part: str) -> str:
     return GROUND_TRUTH if GROUND_TRUTH in sources else next(iter(sources), '')
 
 
+def _attributes(item: dict[str, Any]) -> dict[str, str]:
+    """Return the attributes of an object: those of its class, one value or several each."""
+    values: dict[str, object] = {}
+    for one in item.get('classValues') or ():
+        value = one.get('value')
+        values[str(one.get('name'))] = ', '.join(value) if isinstance(value, list) else value
+    return attributes_from(values)
+
+
 def _cuboid(item: dict[str, Any], source: str) -> ReadBox:
     """Return the box of an object; of a model run, unless a person took it for ground truth."""
     contour = item.get('contour', item)
@@ -223,6 +233,7 @@ def _cuboid(item: dict[str, Any], source: str) -> ReadBox:
         'status': AUTOMATIC_STATUS if is_of_model else INPUT_STATUS,
         'score': score,
         'num_points': contour.get('pointN'),
+        'attributes': _attributes(item),
         **(own or {}),
     }
     class_name = item.get('className') or item.get('classType') or item.get('modelClass') or ''

@@ -118,8 +118,10 @@ def with_boxes_in_time(
     """Yield the items of a recording with the boxes that a `FirstPass` has brought in time."""
     arrays = iter(in_time)
     for item in items:
-        is_boxes = isinstance(item.moved, BoxArray)
-        yield item._replace(moved=replace(next(arrays), ticket=None)) if is_boxes else item
+        if isinstance(item.moved, BoxArray):  # the first pass does without attributes
+            boxes = replace(next(arrays), ticket=None, attributes=item.moved.attributes)
+            item = item._replace(moved=boxes)
+        yield item
 
 
 def with_empty_arrays(

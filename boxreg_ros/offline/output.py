@@ -188,6 +188,7 @@ class Sink:
 
     def _put(self, refined: RefinedBoxes, place: ArrayPlace) -> None:
         """Count the boxes of one array and write them in all formats; in the thread."""
+        refined = self.corrections.with_attributes(place.boxes, refined)
         count = len(place.boxes.track_ids)
         self.boxes_out += len(refined.status)
         self._boxes_added += len(refined.status) - count

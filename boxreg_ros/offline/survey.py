@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.offline.progress import Progress, Stopwatch
@@ -86,7 +86,7 @@ def survey(
         clock.begun('start')
         fixed_frame = recording.source.fixed_frame
         items: Iterable[tuple[Moved, bool]] = (
-            (item.moved, item.restarts) for item in progress.each(recording)
+            (_plain(item.moved), item.restarts) for item in progress.each(recording)
         )
         stores: list[SweepStore] = []
         if corrections.adds:
@@ -121,6 +121,11 @@ def survey(
         completion = Completion(plan, request.config, deviations)
         constants = None if deviations is None else numbers(deviations)
         return Survey(plan, completion, parts, ends_of(tracks), constants, in_time, latency)
+
+
+def _plain(item: Moved) -> Moved:
+    """Return boxes without attributes, which the plan does not need."""
+    return replace(item, attributes=()) if isinstance(item, BoxArray) else item
 
 
 def _corrected(

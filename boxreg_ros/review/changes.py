@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from boxreg_ros.core.metrics import iou_3d, pose_errors
@@ -57,6 +57,8 @@ class TrackChanges:
     """(n,), why a box was kept; empty for the others."""
     num_points: Ints
     """(n,), inside the input boxes."""
+    attributes: tuple[Mapping[str, str], ...] = ()
+    """Of each object, by name; empty where no box has any."""
 
     @property
     def is_label(self) -> NDArray[np.bool_]:
@@ -100,6 +102,7 @@ class Changes:
         # near points (2), early estimates (9).
         self._numbers: list[Floats] = []
         self._counts: list[Ints] = []  # rows of stamp, number of points
+        self._attributes: dict[int, Mapping[str, str]] = {}  # by number of the box
 
     def add(
         self,
@@ -140,6 +143,8 @@ class Changes:
             )
         )
         self._counts.append(np.column_stack([np.full(n, boxes.stamp_ns), refined.num_points]))
+        first = len(self._names)
+        self._attributes |= {first + row: one for row, one in enumerate(boxes.attributes) if one}
         added_ids = added_ids or ('',) * (n - len(given.track_ids))
         input_ids = (*given.track_ids, *added_ids)
         names = boxes.track_ids, boxes.class_names, refined.status, refined.reasons, input_ids
@@ -181,9 +186,14 @@ class Changes:
                     status=status,
                     reasons=np.array(reasons),
                     num_points=counts[rows, 1],
+                    attributes=self._attributes_of(rows),
                 )
             )
         return sorted(found, key=lambda track: -np.nan_to_num(track.shift, nan=-1.0))
+
+    def _attributes_of(self, rows: Sequence[int]) -> tuple[Mapping[str, str], ...]:
+        found = tuple(self._attributes.get(row, {}) for row in rows)
+        return found if any(found) else ()
 
     def _rows_by_track(self, stamps_ns: Ints) -> dict[str, list[int]]:
         """Return the rows of each track id, by stamp."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TYPE_CHECKING
 
@@ -54,6 +54,7 @@ class Corrections:
         self._input_ids: dict[tuple[str, int], str] = {}  # by new id and stamp, where renamed
         self._own_ids: set[str] = set()  # of input boxes that are not renamed
         self._boxes: set[tuple[str, int]] = set()  # of tracks with a pin: id and stamp, as given
+        self._before: dict[str, tuple[str, Mapping[str, str]]] = {}  # id, attributes; by new id
         self._origins: dict[str, list[tuple[int, str]]] = {}  # stamps and first ids of added boxes
 
     def unused(self) -> list[str]:
@@ -205,6 +206,7 @@ class Corrections:
         frame.
 
         """
+        given = replace(given, attributes=())  # `with_attributes` gives the result its own
         if not self._of_track:
             return given
         rows = self._left(given)
@@ -279,6 +281,45 @@ class Corrections:
             reasons=tuple(reasons),
             covariances=covariances,
         )
+
+    def with_attributes(self, given: BoxArray, refined: RefinedBoxes) -> RefinedBoxes:
+        """
+        Return a result of `apply` with the attributes of its boxes, as decided or as in the input.
+
+        A box that the input does not have has those of the box before it in its track. Results
+        are given in the order of stamps.
+
+        """
+        found: list[Mapping[str, str]] = []
+        for row, track_id in enumerate(refined.boxes.track_ids):
+            if row < len(given.track_ids):
+                own, input_id = given.attributes_of(row), given.track_ids[row]
+                self._before[track_id] = input_id, own
+            else:
+                input_id, own = self._before.get(track_id) or (self._first_id(track_id), {})
+                input_id = self.origin_of(given.stamp_ns, track_id) or input_id
+            found.append({**own, **self._decided_attributes(input_id, given.stamp_ns)})
+        attributes = tuple(found) if any(found) else ()
+        return replace(refined, boxes=replace(refined.boxes, attributes=attributes))
+
+    def _first_id(self, track_id: str) -> str:
+        """Return an id in the input of a track whose boxes there are later."""
+        return next(
+            (
+                one.track_id
+                for decisions in self._of_track.values()
+                for one in decisions
+                if one.kind == 'rename' and one.value == track_id
+            ),
+            track_id,
+        )
+
+    def _decided_attributes(self, input_id: str, stamp_ns: int) -> dict[str, str]:
+        topics = dict.fromkeys(
+            one.topic for one in self._of_track.get(input_id, ()) if one.kind == 'attribute'
+        )
+        found = (self._last(topic, input_id, stamp_ns) for topic in topics)
+        return dict(one.attribute for one in found if one is not None)
 
     def _left(self, given: BoxArray) -> list[int]:
         """Return the rows of the boxes that are not deleted."""

@@ -37,6 +37,7 @@ KINDS_OF_TOPIC: Mapping[str, tuple[str, ...]] = {
     'id': ('rename',),
     'class': ('reclass',),
     'addition': ('add', 'withdraw'),
+    'attribute': ('attribute',),
 }
 """Kinds of decisions by topic: a decision replaces those of its topic about the same boxes."""
 WITH_BOX = ('pin', 'add')
@@ -77,7 +78,7 @@ class Decision:
     end_ns: int | None = None
     """Last stamp of a range [ns]; None for one box, or the whole track."""
     value: str = ''
-    """New id or class."""
+    """New id or class, or an attribute: NAME=VALUE, without a value to take it back."""
     who: str = ''
     when: str = ''
     """In UTC (ISO 8601)."""
@@ -92,6 +93,11 @@ class Decision:
         self._check_stamps()
         if self.kind in WITH_BOX:
             self._check_box()
+        if self.kind == 'attribute' and not (self.attribute[0] and '=' in self.value):
+            raise RecordingError(
+                f'attribute of track {self.track_id!r:.80}: expected NAME=VALUE, got '
+                f'{self.value!r:.80}; decide again, or remove the row'
+            )
 
     def _check_stamps(self) -> None:
         stamps = [stamp for stamp in (self.stamp_ns, self.end_ns) if stamp is not None]
@@ -121,8 +127,15 @@ class Decision:
 
     @property
     def topic(self) -> str:
-        """Return the topic of the decision, one of `KINDS_OF_TOPIC`."""
-        return TOPIC_OF[self.kind]
+        """Return the topic of the decision: of `KINDS_OF_TOPIC`, an attribute with its name."""
+        topic = TOPIC_OF[self.kind]
+        return f'{topic} {self.attribute[0]}' if self.kind == 'attribute' else topic
+
+    @property
+    def attribute(self) -> tuple[str, str]:
+        """Return name and value of an attribute."""
+        name, _, value = self.value.partition('=')
+        return name, value
 
     @property
     def scope(self) -> Scope:
@@ -134,6 +147,8 @@ class Decision:
         """Return whether there is no decision any more."""
         if self.kind in ('rename', 'reclass'):
             return not self.value
+        if self.kind == 'attribute':
+            return not self.attribute[1]
         return self.kind in ('none', 'restore', 'withdraw')
 
     def covers(self, stamp_ns: int) -> bool:

@@ -213,6 +213,7 @@ class TrackPart:
             'near': track.near_points,
             'usual': [self._usual.outside, self._usual.sizes.get(track.class_name)],
             'num_points': track.num_points,
+            'attributes': track.attributes,
             'counts': [len(points) for points in shown],
             'points': b64encode(every.astype('<i2').tobytes()).decode('ascii'),
         }

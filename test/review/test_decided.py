@@ -1,14 +1,16 @@
 """What a person has decided binds the steps that complete tracks, and those that follow them."""
 
+import csv
 from dataclasses import replace
 import json
 import shutil
 
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.changes import Changes
-from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
+from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, kept
 from browser import NEEDS_BROWSER, opened_page, press, serving
@@ -344,3 +346,100 @@ def test_decisions_of_the_page_are_all_in_the_labels_that_it_writes(
     assert set(words_of(rows, '9', stamps)[8:10]) <= {'refined', 'kept'}
     classes = [rows['2', stamp]['class_name'] for stamp in stamps[:4]]
     assert classes == ['car', 'truck', 'truck', 'car']
+
+
+def attributes_in(out):
+    """Return the attributes of each box of a result, by track and stamp."""
+    found = {}
+    for row in rows_in(out / 'attributes.csv'):
+        key = row['track_id'], int(row['stamp_ns'])
+        found.setdefault(key, {})[row['name']] = row['value']
+    return found
+
+
+def test_attributes_bind_every_box_and_reach_the_formats(completed, tmp_path):
+    run, stamps, _, _ = completed
+    decisions = [
+        Decision('1', None, 'attribute', value='parked=true'),
+        Decision('2', stamps[3], 'attribute', end_ns=stamps[9], value='occluded=partly'),
+        Decision('2', stamps[5], 'attribute', value='occluded=true'),
+        Decision('2', None, 'attribute', value='night=true'),
+        Decision('2', None, 'attribute', value='night='),  # taken back
+        Decision('2', stamps[10], 'rename', end_ns=stamps[-1], value='2_2'),
+    ]
+    out = tmp_path / 'out'
+    rows = run(out, decisions)
+    found = attributes_in(out)
+    of_one = [found[key]['parked'] for key in rows if key[0] == '1']
+    assert of_one == ['true'] * SWEEPS  # the last three are extended
+    of_two = [found.get(('2', stamp), {}) for stamp in stamps[:10]]
+    assert of_two == [{}] * 3 + [
+        {'occluded': 'true' if k == 5 else 'partly'} for k in range(3, 10)
+    ]  # three of them are interpolated
+    assert not any(key[0] == '2_2' for key in found)
+    convert = ['convert', str(out), '--from', 'csv', '--to', 'openlabel', '-o']
+    assert main([*convert, str(tmp_path / 'labels')]) == 0
+    frames = frames_of('openlabel', tmp_path / 'labels' / 'openlabel')
+    assert {
+        (name, frame.refined.boxes.stamp_ns): dict(own)
+        for frame in frames
+        for name, own in zip(*of_boxes(frame.refined.boxes), strict=True)
+        if own
+    } == found  # fmt: skip
+
+
+def of_boxes(boxes):
+    return boxes.track_ids, boxes.attributes or ({},) * len(boxes.track_ids)
+
+
+def test_attributes_of_label_files_pass_a_run(completed, tmp_path):
+    """An added box has those of the box before it."""
+    _, stamps, _, out = completed
+    labels = tmp_path / 'labels'
+    shutil.copytree(out, labels)
+    table = rows_in(labels / 'boxes.csv')
+    keyframes = [row for row in table if row['track_id'] == '2' and row['status'] == 'refined']
+    with (labels / 'boxes.csv').open('w', newline='') as file:
+        writer = csv.DictWriter(file, table[0].keys())
+        writer.writeheader()
+        writer.writerows(keyframes)
+    lines = [f'{row["stamp_ns"]},2,colour,red' for row in keyframes[:4]]
+    (labels / 'attributes.csv').write_text('\n'.join(['stamp_ns,track_id,name,value', *lines]))
+    recording = out.parent / 'drive'
+    again = Run(recording, '--complete', f'--labels=csv:{labels}')(tmp_path / 'out')
+    found = attributes_in(tmp_path / 'out')
+    assert [words_of(again, '2', stamps)[k] for k in GAP] == ['interpolated'] * 3
+    assert [found.get(('2', stamp), {}).get('colour', '') for stamp in stamps] == [
+        'red' if k < 7 else '' for k in range(SWEEPS)
+    ]
+
+
+@NEEDS_BROWSER
+def test_attributes_are_set_in_the_page(completed, tmp_path):
+    _, stamps, _, out = completed
+    out = shutil.copytree(out, tmp_path / 'out')
+    with (
+        serving(review_server([(out, drive_of(out))], 0, 'anna')) as server,
+        opened_page(server.address) as page,
+    ):
+        open_box(page, '1', 2)
+        page.keyboard.press('x')
+        page.wait_for_selector('#ask[open]')
+        assert '4 parked' in page.inner_text('#ask-proposals')
+        press(page, '4', "attributesAt(15).parked === 'true'")
+        page.wait_for_function("$('clock').textContent.includes('parked')")
+        press(page, 'b', 'view.mark === 2')
+        page.evaluate('step(4)')
+        page.keyboard.press('x')
+        page.wait_for_selector('#ask[open]')
+        page.fill('#ask-text', 'weather=rain')
+        press(page, 'Enter', "attributesAt(3).weather === 'rain' && view.mark === null")
+        assert page.evaluate('[attributesAt(1), attributesAt(5)]') == [{'parked': 'true'}] * 2
+        page.keyboard.press('x')
+        page.wait_for_selector('#ask[open]')
+        assert '4 not parked' in page.inner_text('#ask-proposals')
+        page.keyboard.press('Escape')
+        press(page, 'z', 'attributesAt(3).weather === undefined')
+        press(page, 'y', "attributesAt(3).weather === 'rain'")
+    found = [(one.stamp_ns, one.end_ns, one.value) for one in read_decisions(out / DECISIONS)]
+    assert found[:2] == [(None, None, 'parked=true'), (stamps[2], stamps[4], 'weather=rain')]

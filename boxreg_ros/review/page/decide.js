@@ -171,6 +171,34 @@ async function classify(name) {
   return decideAbout(chosenScopes(view.mark !== null).map(scope => rowOf(scope, 'reclass', { value: name })));
 }
 
+// The attributes of a box: as decided, else as in the input. Values are text; true is not said.
+const USUAL_ATTRIBUTES = ['occluded=true', 'occluded=partly', 'truncated=true', 'parked=true'];
+function attributesAt(row) {
+  const [s, k] = boxAt(row), found = { ...view.part.attributes?.[row] };
+  const decided = (log.ofInput.get(inputOf(s, k)) ?? []).filter(one => one.decision === 'attribute' && covers(one, stampOf(s, k)));
+  for (const { value } of decided) found[value.split('=')[0]] = value.slice(value.indexOf('=') + 1);
+  return found;
+}
+
+const attributeText = (name, value) => ({ true: name, false: `not ${name}` }[value] ?? `${name}: ${value}`);
+const attributesText = row => Object.entries(attributesAt(row)).filter(([, value]) => value !== 'false').map(([name, value]) => attributeText(name, value)).join(', ');
+
+// Set an attribute of the track, of the marked boxes or, with `isBox`, of this one.
+async function describe(isBox) {
+  if (isCorrecting()) return;
+  const held = attributesAt(view.row);
+  const known = Object.entries(held).filter(([name]) => !['occluded', 'truncated', 'parked'].includes(name)).map(([name, value]) => `${name}=${value}`);
+  const offered = [...USUAL_ATTRIBUTES, ...known].map(one => {
+    const [name, value] = one.split('=');
+    return held[name] === value ? `${name}=false` : one;
+  });
+  const text = await ask(`Attribute of ${view.mark !== null ? 'the marked boxes' : isBox ? 'this box' : 'the track'}`, 'NAME=VALUE, or a name alone for true',
+    offered.map((one, k) => [one, `${k + 1} ${attributeText(...one.split('='))}`]), offered);
+  const [name, value = 'true'] = (text ?? '').split(/=(.*)/s).map(part => part.trim());
+  if (!name) return;
+  return decideAbout(chosenScopes(isBox || view.mark !== null).map(scope => rowOf(scope, 'attribute', { value: `${name}=${value}` })));
+}
+
 // Turn the whole track by 180°: an added object is followed again from its turned boxes; else each box is
 // pinned as it is shown, turned, so that no later step decides about its heading.
 async function turnRound() {
@@ -194,6 +222,12 @@ function ask(title, note, proposals, known, value = '') {
   fill($('ask-known'), ...known.map(one => element('option', { value: one })));
   fill($('ask-proposals'), ...proposals.map(([one, text]) => element('button', { type: 'button', onclick: () => dialog.close('=' + one) }, text)));
   dialog.returnValue = '';
+  dialog.onkeydown = event => {
+    const chosen = proposals[Number(event.key) - 1];
+    if (!chosen || event.target === input) return;
+    event.preventDefault();
+    dialog.close('=' + chosen[0]);
+  };
   dialog.showModal();
   if (proposals.length && !value) $('ask-proposals').firstChild.focus();
   else input.select();
@@ -254,6 +288,7 @@ function drawDecisions() {
     button('join', 'Join …', 'Join with a track that continues this one (j)', join),
     button('rename', 'Id …', 'Change the id (n)', rename),
     button('reclass', 'Class …', 'Change the class, of the track or of the marked boxes (k)', reclass),
+    button('describe', 'Attribute …', 'Occluded, truncated, parked or another attribute of the track, or of the marked boxes (x)', () => describe(false)),
     button('turn', 'Turn', 'Turn the whole track by 180° (t)', turnRound),
     button('solve', 'Solve', 'Solve the track again with the pinned boxes (o)', solve),
     button('undo', 'Undo', 'Undo your last decision, of any track (z)', undo), button('redo', 'Redo', 'Do it again (y)', redo));

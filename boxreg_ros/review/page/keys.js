@@ -29,6 +29,7 @@ const REVIEW_KEYS = {
   t: ['t', 'turn the whole track by 180°: its boxes are pinned as they are shown, turned', () => turnRound()],
   k: ['k', 'change the class of the track, or of the marked boxes', () => reclass()],
   1: ['1 … 9', 'give the track, or the marked boxes, the class with this number', event => classify(classNames()[Number(event.key) - 1])],
+  x: ['x', 'set an attribute of the track, as occluded or parked, or of the marked boxes; with Shift of this box', event => describe(event.shiftKey)],
   c: ['c', 'comment on the track; with Shift on this box', event => $(event.shiftKey ? 'comment-box' : 'comment').focus()],
   e: ['e', 'correct this box', () => edit()],
   o: ['o', 'solve the track again with its pinned boxes', () => solve()],

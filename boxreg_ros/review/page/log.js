@@ -5,18 +5,20 @@
 const ROUNDING = 1e-6;             // of boxes in the file [m, rad]
 const RETRY = 1000;                // of a server that refuses to stream [ms]
 const TOPIC_OF = { accept: 'judgement', reject: 'judgement', unsure: 'judgement', pin: 'judgement', none: 'judgement',
-                   delete: 'deletion', restore: 'deletion', rename: 'id', reclass: 'class', add: 'addition', withdraw: 'addition' };
-const TAKEN_BACK = { judgement: 'none', deletion: 'restore', id: 'rename', class: 'reclass', addition: 'withdraw' };
+                   delete: 'deletion', restore: 'deletion', rename: 'id', reclass: 'class', add: 'addition', withdraw: 'addition', attribute: 'attribute' };
+const TAKEN_BACK = { judgement: 'none', deletion: 'restore', id: 'rename', class: 'reclass', addition: 'withdraw', attribute: 'attribute' };
 // What was decided at once, and what held before; those of `log.who` are undone and redone one by one.
 /** @typedef {{ before: Row[], after: Row[] }} Made */
 /** @type {{ count: number, rows: Row[], held: Map<string, Row>, ofInput: Map<string, Row[]>, made: Made[], undone: Made[], who: string, answered?: Promise<any>, stepping: Promise<any> }} */
 const log = { count: 0, rows: [], held: new Map(), ofInput: new Map(), made: [], undone: [], who: '', stepping: Promise.resolve() };
 
 const scopeKey = (topic, row) => JSON.stringify([topic, row.track_id, row.stamp_ns, row.end_ns]);
-const keyOf = row => scopeKey(TOPIC_OF[row.decision], row);
-const isTakenBack = row => ['none', 'restore', 'withdraw'].includes(row.decision) || (['rename', 'reclass'].includes(row.decision) && !row.value);
+// An attribute is a topic of its own: NAME=VALUE, without a value to take it back.
+const topicOf = row => (row.decision === 'attribute' ? `attribute ${row.value.split('=')[0]}` : TOPIC_OF[row.decision]);
+const keyOf = row => scopeKey(topicOf(row), row);
+const isTakenBack = row => ['none', 'restore', 'withdraw'].includes(row.decision) || (['rename', 'reclass'].includes(row.decision) && !row.value) || (row.decision === 'attribute' && row.value.endsWith('='));
 const rowOf = (scope, decision, more = {}) => ({ ...scope, decision, comment: '', value: '', box: null, ...more });
-const takenBack = row => rowOf({ track_id: row.track_id, stamp_ns: row.stamp_ns, end_ns: row.end_ns }, TAKEN_BACK[TOPIC_OF[row.decision]]);
+const takenBack = row => rowOf({ track_id: row.track_id, stamp_ns: row.stamp_ns, end_ns: row.end_ns }, TAKEN_BACK[TOPIC_OF[row.decision]], row.decision === 'attribute' ? { value: `${row.value.split('=')[0]}=` } : {});
 
 function covers(row, stamp) {
   if (!row.stamp_ns) return true;
@@ -158,7 +160,7 @@ function listen() {
 async function showDecisions(fresh) {
   if (!fresh) return;
   if (fresh.some(row => TOPIC_OF[row.decision] === 'addition')) await followAdded();
-  if (fresh.some(row => TOPIC_OF[row.decision] !== 'judgement')) await rebuildTracks();
+  if (fresh.some(row => !['judgement', 'attribute'].includes(TOPIC_OF[row.decision]))) await rebuildTracks();
   drawList();
   if (view.part) step(view.row, true);
   else if (!$('tracks').hidden && view.shown.length) openTrack(view.shown[Math.min(view.place, view.shown.length - 1)].index);

@@ -83,7 +83,7 @@ function step(row, isNew = false) {
   const mine = IS_REVIEW ? heldOf(scopeOfBox(boxAt(row))) : null;
   const facts = [`${row + 1}/${part.stamps.length}`, `${number(part.times[row], 2)} s`, part.status[row] + (part.reasons[row] ? ` (${part.reasons[row]})` : ''),
     IS_REVIEW && isDeleted(...boxAt(row)) ? 'deleted' : '', mine ? (mine.decision === 'none' ? mine.comment : mine.decision) : '',
-    `${part.num_points[row]} points`, `risk ${number(part.risk[row])} m`,
+    attributesText(row), `${part.num_points[row]} points`, `risk ${number(part.risk[row])} m`,
     isKnown(part.iou[1][row]) ? `IoU ${number(part.iou[0][row])} → ${number(part.iou[1][row])}` : ''];
   $('clock').textContent = facts.filter(Boolean).join(' · ');
   $('clock').title = `${$('clock').textContent} · stamp ${part.stamps[row]} ns`;

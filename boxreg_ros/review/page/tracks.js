@@ -138,12 +138,13 @@ async function loadTrack(track) {
   for (const { s } of track.pieces) parts.set(s, await loadPart(s));
   if (track.isWhole) return parts.get(track.pieces[0].s);
   const { origin } = parts.values().next().value;
-  const whole = { origin, iou: [[], []], points: [] };
+  const whole = { origin, iou: [[], []], points: [], attributes: [] };
   for (const name of [...ROW_FIELDS, ...BOX_FIELDS]) whole[name] = [];
   for (const [s, k] of track.members()) {
     const part = parts.get(s);
     for (const name of ROW_FIELDS) whole[name].push(part[name][k]);
     for (const name of BOX_FIELDS) whole[name].push(part[name][k].map((v, i) => (v === null || i > 2 ? v : v + part.origin[i] - origin[i])));
+    whole.attributes.push(part.attributes?.[k] ?? {});
     for (const which of [0, 1]) whole.iou[which].push(part.iou[which][k]);
     for (let i = 3 * part.first[k]; i < 3 * part.first[k + 1]; i++) whole.points.push(part.points[i]);
   }

@@ -30,7 +30,7 @@ interface Part {
   origin: number[]; stamps: string[]; times: number[]; given: any[]; boxes: any[]; truth: any[];
   iou: (number | null)[][]; sensor: any[]; status: string[]; reasons: string[]; flipped: boolean[];
   change: any[]; deviations: any[]; extent_deviations: any[]; risk: number[]; faces: number[][]; num_points: number[];
-  counts: number[]; points: Int16Array | number[]; first: number[]; usable: any[];
+  attributes: Record<string, string>[]; counts: number[]; points: Int16Array | number[]; first: number[]; usable: any[];
 }
 
 /** A row of decisions.csv. */
