@@ -28,6 +28,7 @@ from boxreg_ros.offline.relabel_command import arguments_of
 from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_summary
 from boxreg_ros.offline.sources import scene_address
+from boxreg_ros.review.folders import newest_of
 from boxreg_ros.review.scene import DriveSource
 from boxreg_ros.review.server import add_server_arguments, classes_of, serve
 from msg_adapters import ADAPTERS
@@ -57,10 +58,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve a result until interrupted; return the status of a run that fails before."""
     if args.progress:
-        return _print_progress(args.paths)
+        return _print_progress([newest_of(out) for out in args.paths])
     out = args.out or _out_of(args.paths)
     if out is None:
-        return _serve(args.paths, args)
+        return _serve([_newest(path) for path in args.paths], args)
     words = [
         *(*map(str, args.paths), '-o', str(out), '--report'),
         *words_of(args, Request),
@@ -77,7 +78,19 @@ def run(args: argparse.Namespace) -> int:
             return done.returncode
     else:
         print(f'{out}: up to date', flush=True)
-    return _serve([out], args)
+    return _serve([_newest(out)], args)
+
+
+def _newest(out: Path) -> Path:
+    """Return the result that a review goes on in, and say where it is another folder."""
+    newest = newest_of(out)
+    if newest != out:
+        print(
+            f'{out}: goes on in {newest}, which was written from it with all of its decisions; '
+            f'to open {out.name} itself, rename {newest.name}',
+            flush=True,
+        )
+    return newest
 
 
 def _out_of(paths: Sequence[Path]) -> Path | None:

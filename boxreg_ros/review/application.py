@@ -7,7 +7,6 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from datetime import datetime, UTC
 import os
 from pathlib import Path
-import re
 import secrets
 import sys
 from tempfile import NamedTemporaryFile
@@ -22,6 +21,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.steps import PROGRESS
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, WITH_BOX
 from boxreg_ros.review.differences import differences
+from boxreg_ros.review.folders import next_folder, SUMMARY
 from boxreg_ros.review.progress import agreement_text, PAUSE, progress_of, total, UNREAD
 from boxreg_ros.review.report import page_environment, PAGE_VERSION, REPORT, style
 from boxreg_ros.review.requests import box_of, json_of, posted, STAMP, stamp_of, text_of
@@ -43,7 +43,6 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 PROPOSALS = 'proposals.csv'
 BOXES = 'boxes.csv'
-SUMMARY = 'summary.json'
 MAX_ROWS = 10_000
 """Most decisions of a request: a track that is made of as many parts; chosen."""
 OPEN_SECONDS = 600.0
@@ -386,7 +385,7 @@ class Review:
                 f'{command[:1]}, or the folder is gone; run boxreg relabel RECORDING -o NEW '
                 f'--decisions {decisions}'
             )
-        new = _next_folder(self.out.resolve())
+        new = next_folder(self.out.resolve())
         more = ['-o', str(new), '--report']
         if formats:
             more += ['--formats', ','.join(formats)]
@@ -452,20 +451,6 @@ def _changes_of(out: Path, summary: Mapping[str, Any]) -> list[dict[str, Any]] |
     if not (earlier / BOXES).is_file() or earlier.resolve() == out.resolve():
         return None
     return differences(BoxTable.read(earlier / BOXES), BoxTable.read(out / BOXES))
-
-
-def _next_folder(out: Path) -> Path:
-    """Return the folder beside a result for the labels with its decisions; no other's is lost."""
-    found = re.fullmatch(r'(.+)\.corrected(?:-(\d+))?', out.name)
-    base, number = (found[1], int(found[2] or 1)) if found else (out.name, 0)
-    ours = out / DECISIONS
-    known = ours.read_bytes() if ours.exists() else b''
-    while True:
-        number += 1
-        new = out.with_name(f'{base}.corrected' + (f'-{number}' if number > 1 else ''))
-        theirs = new / DECISIONS
-        if not theirs.exists() or known.startswith(theirs.read_bytes()):
-            return new
 
 
 def _archive(out: Path, names: Sequence[str]) -> Path:

@@ -73,7 +73,7 @@ def measure(folder, seed=0):
     out = folder / 'out'
     labels = f'csv:{folder / "planted.csv"}'
     command = ['relabel', str(STREET / 'street.mcap'), '-o', str(out), '--report']
-    command += ['--labels', labels, '--formats', 'csv']
+    command += ['--labels', labels, '--formats', 'csv', '--complete']
     subprocess.run([*BOXREG, *command], stdout=subprocess.DEVNULL, check=True)
     begin = time.perf_counter()
     labeller = reviewed(out, truth)

@@ -78,6 +78,29 @@ def test_boxes_are_shown_in_the_nearest_image_of_the_best_camera(tmp_path):
           const c = document.querySelectorAll('#drive-cameras canvas')[1], [x, y] = c.at([9, 9]);
           return [...c.getContext('2d').getImageData(x, y, 1, 1).data]; })()""")
         assert np.abs(np.subtract(shown, [0, 0, 200, 255])).max() < 6  # bgr8
+        # The points of the sweep in the image, by their distance: grey pixels get colours.
+        coloured = """(async () => {
+          const c = document.querySelector('#drive-cameras canvas'), context = c.getContext('2d');
+          const stamp = sceneStamp(), camera = (await camerasAt(stamp))[0];
+          const { pose } = await imageAt(0, stamp);
+          const { points, origin } = scene.sweep, found = [];
+          for (let i = 0; i < points.length; i += 3) {
+            const at = inCamera(pose, [0, 1, 2].map(k => points[i + k] + origin[k]));
+            const pixel = pixelOf(camera, at);
+            if (!pixel || pixel.some((v, k) => v < 2 || v > camera.size[k] - 2)) continue;
+            const rgb = [...context.getImageData(...c.at(pixel), 1, 1).data].slice(0, 3);
+            found.push(Math.max(...rgb) - Math.min(...rgb) > 60);
+          }
+          return [found.length, found.filter(Boolean).length]; })()"""
+        count, before = page.evaluate(coloured)
+        assert count > 50
+        assert before < count / 2  # the outlines of boxes
+        page.check('#scene-in-image')
+        page.wait_for_timeout(300)
+        assert page.evaluate(coloured)[1] > 0.9 * count
+        page.uncheck('#scene-in-image')
+        page.wait_for_timeout(300)
+        assert page.evaluate(coloured) == [count, before]
 
 
 @NEEDS_BROWSER

@@ -3,6 +3,7 @@
 from contextlib import ExitStack
 from dataclasses import replace
 import math
+import shutil
 import signal
 import subprocess
 
@@ -37,13 +38,18 @@ def drive():
     return found
 
 
-@pytest.fixture
-def out(drive, tmp_path):
-    recording = drive.write(tmp_path / 'drive')
-    folder = tmp_path / 'out'
-    command = ['relabel', str(recording), '-o', str(folder), '--report', *FORMATS, *QUICK]
+@pytest.fixture(scope='module')
+def made(drive, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('scene')
+    recording = drive.write(folder / 'drive')
+    command = ['relabel', str(recording), '-o', str(folder / 'out'), '--report', *FORMATS, *QUICK]
     assert main(command) == 0
-    return folder
+    return folder / 'out'
+
+
+@pytest.fixture
+def out(made, tmp_path):
+    return shutil.copytree(made, tmp_path / 'out')
 
 
 @pytest.fixture
@@ -113,6 +119,12 @@ def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serv
         page.keyboard.press('Home')
         page.keyboard.press('e')
         page.keyboard.press('Shift+ArrowRight')
+        # The object follows the box before it is kept.
+        page.wait_for_function('view.followed && !view.isAsking', timeout=60_000)
+        moved = page.evaluate("""[0, 1].map(row =>
+          moved(view.part.usable[row], view.part.origin, 1).map((v, k) =>
+            view.followed.get(view.part.stamps[row])[k] - v).slice(0, 2))""")
+        assert (np.linalg.norm(moved, axis=1) > 0.01).all()
         press(page, 'Enter', "view.part.status.filter(one => one === 'human').length === 2")
         assert page.evaluate('view.row') == 0
         assert 'human' in page.inner_text('#clock')

@@ -11,6 +11,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.differences import differences
+from boxreg_ros.review.folders import newest_of
 from boxreg_ros.review.server import review_server
 from boxreg_ros.review.token import review_token
 from boxreg_ros.structures import BoxArray
@@ -125,6 +126,25 @@ def test_the_token_is_that_of_the_user_and_the_results(tmp_path, monkeypatch):
     assert review_token([tmp_path / 'out']) != review_token([tmp_path / 'out'])
     monkeypatch.setenv('XDG_STATE_HOME', '/proc/none')
     assert len(review_token([tmp_path / 'out'])) == len(token)
+
+
+def test_a_review_goes_on_in_the_newest_result(made, tmp_path, capsys):
+    out = tmp_path / 'out'
+    folders = [out, tmp_path / 'out.corrected', tmp_path / 'out.corrected-2']
+    for number, folder in enumerate(folders):
+        shutil.copytree(made, folder)
+        DecisionLog(folder / DECISIONS).append([Decision('1', None, 'accept')] * number)
+        os.utime(folder / 'summary.json', ns=(number, number))
+    assert newest_of(out) == folders[2]
+    capsys.readouterr()
+    assert main(['review', str(out), '--progress']) == 0
+    assert 'out.corrected-2' in capsys.readouterr().out
+    DecisionLog(folders[1] / DECISIONS).append([Decision('2', None, 'accept')])
+    assert newest_of(out) == folders[1]  # the last one lacks a decision
+    assert newest_of(folders[2]) == folders[2]
+    os.utime(out / 'summary.json', ns=(9, 9))  # relabelled since
+    assert newest_of(out) == out
+    assert newest_of(tmp_path / 'absent') == tmp_path / 'absent'
 
 
 @pytest.mark.parametrize('has_screen', [True, False])

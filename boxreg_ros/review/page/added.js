@@ -22,6 +22,8 @@ async function followAdded() {
   for (const id of ids) await followOne(id);
 }
 
+const askToFollow = (id, name, seeds) => post('follow', { id, class: name, begin_ns: DATA.begin_ns, seeds: seeds.map(row => ({ stamp: row.stamp_ns, box: row.box })) });
+
 async function followOne(id) {
   const seeds = seedsOf(id), key = JSON.stringify(seeds.map(row => [row.stamp_ns, row.box, row.value]));
   if (additions.get(id)?.key === key) return;
@@ -34,7 +36,7 @@ async function followOne(id) {
   say(`Following ${id} …`);
   let found;
   try {
-    found = await post('follow', { id, class: seeds[0].value, begin_ns: DATA.begin_ns, seeds: seeds.map(row => ({ stamp: row.stamp_ns, box: row.box })) });
+    found = await askToFollow(id, seeds[0].value, seeds);
   } catch (error) {
     say('');
     return fail(`The object ${id} was not followed: ${error.message}`);

@@ -91,14 +91,15 @@ function redrawEdit() {
 async function askRisk() {
   const [s, k] = boxAt(view.row);
   view.riskWanted = true;
-  if (view.isAsking || DATA.tracks[s].added) return;
+  if (view.isAsking) return;
   view.isAsking = true;
   while (view.riskWanted && view.edit) {
     view.riskWanted = false;
     const edited = view.edit, box = moved(edited, view.part.origin, 1), stamp = view.part.stamps[view.row];
     try {
-      const risks = await post('risk', { index: s, row: k, class: current().class, box });
-      const found = await post('solve', { ...solvable(current()), pins: { ...pinsOf(), [stamp]: box }, near: stamp });
+      const risks = isAdded(s, k) ? null : await post('risk', { index: s, row: k, class: current().class, box });
+      const found = isAdded(s, k) ? await followed(inputOf(s, k), stamp, box)
+        : await post('solve', { ...solvable(current()), pins: { ...pinsOf(), [stamp]: box }, near: stamp });
       if (view.edit !== edited) break;  // it is another box, or none
       view.risks = risks;
       view.followed = new Map(found.stamps.map((one, at) => [one, found.boxes[at]]));
@@ -107,6 +108,13 @@ async function askRisk() {
     drawViews();
   }
   view.isAsking = false;
+}
+
+// The boxes of an added object as it is followed with one more box.
+async function followed(id, stamp, box) {
+  const seeds = [...seedsOf(id).filter(row => row.stamp_ns !== stamp), { stamp_ns: stamp, box }];
+  const { part } = await askToFollow(id, seedsOf(id)[0].value, seeds);
+  return { stamps: part.stamps, boxes: part.boxes.map(one => moved(one, part.origin, 1)) };
 }
 
 // A track and its pinned boxes, as the server solves it.
