@@ -266,7 +266,7 @@ class Reason(StrEnum):
         'no_track_id',
         'box',
         'has no track id',
-        'set `associate`, or run a tracker before this node',
+        'set `associate` (`--associate`), or run a tracker before this node',
     )
     DUPLICATE_TRACK_ID = (
         'duplicate_track_id',

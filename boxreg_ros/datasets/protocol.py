@@ -90,6 +90,8 @@ class Scene:
     """File or folder that would have annotations."""
     lidars: tuple[str, ...] = ()
     """LiDARs whose sweeps have stamps of their own, merged by time; the first gives the stamp."""
+    note: str = ''
+    """What was assumed, since the files do not state it."""
 
 
 class DatasetModule(Protocol):

@@ -19,6 +19,7 @@ DATASETS = {
     'argoverse2': 'boxreg_ros.datasets.argoverse2',
     'waymo': 'boxreg_ros.datasets.waymo',
     'pandaset': 'boxreg_ros.datasets.pandaset',
+    'openpcdet': 'boxreg_ros.datasets.openpcdet',
 }
 """Prefix on the command line -> module that implements `protocol.DatasetModule`."""
 MAX_NAMED = 5

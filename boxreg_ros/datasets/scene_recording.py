@@ -40,7 +40,6 @@ class SceneRecording:
     has_boxes = True
     odometry_topic: str | None = None
     apart: ClassVar[dict[str, float]] = {}  # no topic was recorded apart
-    finding = ''
     damages: ClassVar[list[Damage]] = []  # sweeps that cannot be read are counted
 
     def __init__(
@@ -98,6 +97,11 @@ class SceneRecording:
         if self._labels is None and self._scene.boxes is not None:
             counts[ANNOTATIONS] = len(self._scene.frames.stamps_ns)
         return counts
+
+    @property
+    def finding(self) -> str:
+        """Return what was assumed of the scene; empty if its files state everything."""
+        return self._scene.note
 
     @property
     def files(self) -> list[Path]:

@@ -30,7 +30,7 @@ FORMAT = Format(
     files='labels/STAMP.txt, points/STAMP.npy, ImageSets/',
     options=('with_points', 'class_map'),
     reads='lines of 8 columns, or 9 with a score; clouds state frames without boxes',
-    leaves_out='the points',
+    leaves_out='the points, which `openpcdet:FOLDER` reads',
 )
 COLUMN_COUNTS = (8, 9)
 """x y z dx dy dz heading class, and a score in files of some detectors."""

@@ -26,6 +26,7 @@ EXPORTS = [
     ('argoverse2', 'argoverse2', True),
     ('kitti-tracking', 'kitti', False),
     ('kitti-raw', 'tracklets', False),
+    ('openpcdet', 'openpcdet', False),
 ]
 
 
@@ -65,6 +66,35 @@ def test_an_export_gives_the_result_of_its_recording(
     assert 'refined' in statuses.values()
     for key, numbers in boxes.items():
         np.testing.assert_allclose(found[key], numbers, atol=1e-6)
+
+
+def test_clouds_of_openpcdet_without_poses_are_those_of_a_lidar_that_stands(tmp_path, capsys):
+    """Files of others: ``.npy`` and ``.bin``, no ids, no poses, stamps as names."""
+    rng = np.random.default_rng(0)
+    for name in ('points', 'labels'):
+        (tmp_path / name).mkdir()
+    for k in range(6):
+        box = np.array([10.0 + k, 3.0, 0.0, 4.2, 1.8, 1.6, 0.0])
+        unit = rng.uniform(-0.5, 0.5, (200, 3))
+        unit[:100, 0] = unit[100:, 1] = -0.5
+        rows = np.column_stack([unit * box[3:6] + box[:3], np.ones(200)]).astype(np.float32)
+        path = tmp_path / 'points' / f'{1_700_000_000 + k // 10}.{k % 10}00000000'
+        if k % 2:
+            np.save(f'{path}.npy', rows)
+        else:
+            rows.tofile(f'{path}.bin')
+        line = ' '.join(map(str, box)) + ' Vehicle\n'
+        (tmp_path / 'labels' / f'{path.name}.txt').write_text(line)
+    source = f'openpcdet:{tmp_path}'
+    boxes, statuses = relabelled(tmp_path / 'out', source, '--associate')
+    assert list(statuses.values()) == ['refined'] * 6
+    assert {track_id for _, track_id in boxes} == {'1'}
+    np.testing.assert_allclose([b[0] for b in boxes.values()], 10 + np.arange(6), atol=0.1)
+    assert 'poses.txt: expected the poses of the LiDAR' in capsys.readouterr().err
+    (tmp_path / 'points' / '1700000000.100000000.npy').write_bytes(b'no numbers')
+    _, statuses = relabelled(tmp_path / 'out', source, '--associate')
+    assert len(statuses) == 6
+    assert '1700000000.100000000.npy: expected an array of numbers' in capsys.readouterr().err
 
 
 def test_exports_of_argoverse2_keep_the_times_of_points(tmp_path):
