@@ -13,7 +13,7 @@ from typing import Any, overload, TYPE_CHECKING
 
 from boxreg_ros.structures import Floats
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -196,3 +196,31 @@ def _unit(quaternion_xyzw: ArrayLike) -> Floats:
         scaled = q / largest  # so that no square overflows or vanishes
     unit: Floats = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
     return unit
+
+
+def rotated_kinematics(kinematics: NDArray[np.void], R: Floats) -> NDArray[np.void]:
+    """
+    Return velocities and accelerations in other axes.
+
+    Parameters
+    ----------
+    kinematics : array, shape (n,)
+        Records `KINEMATICS`.
+    R : array, shape (3, 3) or (n, 3, 3)
+        Maps the axes of `kinematics` to the others.
+
+    Returns
+    -------
+    array, shape (n,)
+        A copy. Rates of yaw do not change: that is exact for rotations about z, and the tilt
+        between frames in practice is small.
+
+    """
+    R = np.broadcast_to(R, (len(kinematics), 3, 3))
+    J = np.tile(np.eye(4), (len(kinematics), 1, 1))
+    J[:, :3, :3] = R
+    found = kinematics.copy()
+    for name, by in (('velocity', J), ('acceleration', R)):
+        found[name] = (by @ kinematics[name][..., None])[..., 0]
+        found[f'{name}_covariance'] = by @ kinematics[f'{name}_covariance'] @ by.swapaxes(1, 2)
+    return found

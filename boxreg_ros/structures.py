@@ -43,6 +43,28 @@ PROPOSED = 'proposed'
 HUMAN = 'human'
 """Status of a box that a person has corrected and pinned."""
 
+KINEMATICS = np.dtype(
+    [
+        ('velocity', float, 4),
+        ('velocity_covariance', float, (4, 4)),
+        ('acceleration', float, 3),
+        ('acceleration_covariance', float, (3, 3)),
+        ('has_velocity', bool),
+        ('has_acceleration', bool),
+    ],
+    align=True,
+)
+"""
+Motion of one box over ground, in the axes of its frame, a record; finite always, 0 where unknown.
+
+velocity, velocity_covariance
+    Of x y z [m/s] and of yaw [rad/s], (4,) and (4, 4).
+acceleration, acceleration_covariance
+    Of x y z [m/s^2], (3,) and (3, 3).
+has_velocity, has_acceleration
+    Whether they are known.
+"""
+
 FLOAT32_RANGE = 4096.0
 """Nearer to the origin, float32 coordinates are 0.25 mm apart or less [m]: 2**(12 - 24) m."""
 BLOCK_POINTS = 2**15
@@ -290,6 +312,8 @@ class BoxArray:
         boxes were measured at an earlier pose. None if that frame does not move in `frame_id`.
     attributes : tuple of n mappings of str to str, or empty
         Attributes of each object by name, as label files have them; empty where no box has any.
+    kinematics : array, shape (n,), or None
+        Velocities and accelerations, records `KINEMATICS`. None for an input.
 
     """
 
@@ -303,6 +327,7 @@ class BoxArray:
     pinned: NDArray[np.bool_] | None = None
     motion: FrameMotion | None = None
     attributes: tuple[Mapping[str, str], ...] = ()
+    kinematics: NDArray[np.void] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Check that all columns have one length; convert lists to arrays and tuples."""
@@ -317,6 +342,8 @@ class BoxArray:
         if self.pinned is not None:
             self._set('pinned', np.asarray(self.pinned, bool))
             _check_shape('pinned', self.pinned.shape, (n,))
+        if self.kinematics is not None:
+            _check_shape('kinematics', self.kinematics.shape, (n,))
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)  # the class is frozen
@@ -331,11 +358,19 @@ class BoxArray:
             boxes=self.boxes[rows],
             pinned=None if self.pinned is None else self.pinned[rows],
             attributes=tuple(self.attributes[row] for row in rows) if self.attributes else (),
+            kinematics=None if self.kinematics is None else self.kinematics[rows],
         )
 
     def attributes_of(self, row: int) -> Mapping[str, str]:
         """Return the attributes of a box by name."""
         return self.attributes[row] if self.attributes else {}
+
+    @property
+    def known_kinematics(self) -> NDArray[np.void]:
+        """Return `kinematics`, those of an input as unknown."""
+        if self.kinematics is None:
+            return np.zeros(len(self.track_ids), KINEMATICS)
+        return self.kinematics
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,6 +15,7 @@ from typing import Any
 from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, WIDTH, YAW
 from msg_adapters import poses
 import numpy as np
+from numpy.typing import NDArray
 
 LABELS = (
     'unknown', 'car', 'truck', 'bus', 'trailer', 'motorcycle', 'bicycle', 'pedestrian', 'animal',
@@ -37,6 +38,8 @@ PREDICTED_FIELDS = ('initial_pose_with_covariance.pose', 'predicted_paths')
 """Fields of the kinematics that are read, and those of a PredictedObject."""
 INITIAL = 'initial_'
 """Begin of the names of pose, twist and acceleration in the kinematics of a PredictedObject."""
+MOTIONS = (('twist', 'twist', 'velocity'), ('acceleration', 'accel', 'acceleration'))
+"""Names of a motion in the kinematics, of the message within, and in `KINEMATICS`."""
 
 
 def from_msg(msg: Any) -> BoxArray:
@@ -74,12 +77,13 @@ def to_msg(
     """
     Return a copy with the boxes replaced; see `Adapter.to_msg`.
 
-    Fields in the frame of the object follow its box: the footprint is scaled, twist and
-    acceleration are rotated where the heading flips by 180 degrees. Predicted paths change their
-    frame only.
+    Fields in the frame of the object follow its box: the footprint is scaled. Twist and
+    acceleration are those of the box where they are known, else they are rotated where the heading
+    flips by 180 degrees. Predicted paths change their frame only.
 
     """
     quaternions_xyzw = poses.quaternions_of(boxes.boxes)
+    own_motion = poses.kinematics_of_axes(boxes)
     objects = []
     for i, (o, box) in enumerate(zip(msg.objects, boxes.boxes, strict=True)):
         covariance = None if covariances is None else covariances[i]
@@ -90,6 +94,8 @@ def to_msg(
             size = poses.replaced(size, x=diameter, y=diameter)
         is_flipped = bool(poses.forward_of(given_pose) @ poses.forward_of(pose) < 0)
         kinematics = _with_pose(o.kinematics, pose, covariance, T_out_in, is_flipped)
+        if own_motion is not None:
+            kinematics = _with_motion(kinematics, own_motion[i : i + 1])
         shape = poses.replaced(o.shape, dimensions=size, footprint=_scaled_footprint(o.shape, box))
         objects.append(poses.replaced(o, kinematics=kinematics, shape=shape))
     header = poses.with_frame(msg.header, boxes.frame_id)
@@ -124,7 +130,7 @@ def _with_pose(
         is_estimated = covariance is not None and bool(np.isfinite(covariance).all())
         fields['has_position_covariance'] = is_estimated or kinematics.has_position_covariance
     if is_flipped:
-        for name, inner in (('twist', 'twist'), ('acceleration', 'accel')):
+        for name, inner, _ in MOTIONS:
             motion = getattr(kinematics, f'{prefix}{name}_with_covariance', None)
             if motion is not None:
                 rotated = poses.rotated_motion(motion, inner, HALF_TURN)
@@ -134,6 +140,22 @@ def _with_pose(
             poses.replaced(path, path=[poses.moved(step, T_out_in) for step in path.path])
             for path in kinematics.predicted_paths
         ]
+    return poses.replaced(kinematics, **fields)
+
+
+def _with_motion(kinematics: Any, found: NDArray[np.void]) -> Any:
+    """Return a copy with twist and acceleration of `found` (1,), in the axes of the object."""
+    prefix = _prefix_of(kinematics)
+    fields: dict[str, Any] = {}
+    for name, inner, key in MOTIONS:
+        motion = getattr(kinematics, f'{prefix}{name}_with_covariance', None)
+        if motion is not None and found[f'has_{key}'][0]:
+            own = poses.motion_numbers(motion, inner)[None]
+            numbers = poses.with_kinematics(own, found, key)[0]
+            written = poses.with_motion_numbers(motion, inner, numbers)
+            fields[f'{prefix}{name}_with_covariance'] = written
+    if hasattr(kinematics, 'has_twist') and found['has_velocity'][0]:
+        fields |= {'has_twist': True, 'has_twist_covariance': True}
     return poses.replaced(kinematics, **fields)
 
 

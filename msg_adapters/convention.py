@@ -20,6 +20,7 @@ from boxreg_ros.structures import (
     YAW,
 )
 import numpy as np
+from numpy.typing import NDArray
 
 REFERENCES = {
     'center': (0.0, 0.0, 0.0),
@@ -125,7 +126,7 @@ class Convention:
         changed = self._rotated(boxes.boxes, -FORWARD[self.forward_axis])
         changed[:, BOX_CENTER] += self._offsets(boxes.boxes)
         changed[:, self._columns] = boxes.boxes[:, BOX_EXTENT]
-        return replace(boxes, boxes=changed)
+        return replace(boxes, boxes=changed, kinematics=self._kinematics(boxes))
 
     def covariances_from_centers(self, boxes: BoxArray, covariances: Floats) -> Floats:
         """Return covariances (n, 6, 6) of centre poses as those of this convention."""
@@ -138,6 +139,20 @@ class Convention:
             inverse = np.linalg.pinv(np.nan_to_num(rotated_axes))
             J[:, 3:, 3:] = (axes @ inverse).swapaxes(1, 2)
         return J @ covariances @ J.swapaxes(1, 2)
+
+    def _kinematics(self, boxes: BoxArray) -> NDArray[np.void] | None:
+        """Return the kinematics of the references of boxes, which turn about their centres."""
+        if boxes.kinematics is None:
+            return None
+        found = boxes.kinematics.copy()
+        offsets = np.nan_to_num(self._offsets(boxes.boxes))
+        rates = found['velocity'][:, 3]
+        J = np.tile(np.eye(4), (len(found), 1, 1))
+        J[:, 0, 3], J[:, 1, 3] = -offsets[:, 1], offsets[:, 0]
+        found['velocity'] = (J @ found['velocity'][..., None])[..., 0]
+        found['velocity_covariance'] = J @ found['velocity_covariance'] @ J.swapaxes(1, 2)
+        found['acceleration'][:, :2] -= rates[:, None] ** 2 * offsets[:, :2]
+        return found
 
     @property
     def _columns(self) -> list[int]:

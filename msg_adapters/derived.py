@@ -15,6 +15,7 @@ from typing import Any
 from boxreg_ros.structures import BoxArray, Floats
 from msg_adapters import poses
 import numpy as np
+from numpy.typing import NDArray
 
 BOX = 1
 CLASS_NAMES = (
@@ -59,17 +60,29 @@ def from_msg(msg: Any) -> BoxArray:
 def to_msg(
     msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
-    """Return a copy with the boxes replaced; see `Adapter.to_msg`."""
+    """
+    Return a copy with the boxes replaced; see `Adapter.to_msg`.
+
+    Twist and acceleration, in the axes of the frame, are those of the box where they are known.
+
+    """
     quaternions_xyzw = poses.quaternions_of(boxes.boxes)
+    kinematics = boxes.kinematics
     objects = []
     i = 0  # index of the next box
     for o in msg.objects:
         pose = poses.moved(_pose(o), T_out_in)
         size = o.shape.dimensions
         covariance = None
+        twist = poses.rotated_motion(o.twist, 'twist', T_out_in)
+        accel = poses.rotated_motion(o.accel, 'accel', T_out_in)
         if _is_box(o):
             pose, size = poses.with_box(pose, size, boxes.boxes[i], quaternions_xyzw[i])
             covariance = None if covariances is None else covariances[i]
+            if kinematics is not None:
+                own = kinematics[i : i + 1]
+                twist = _with_motion(twist, 'twist', own, 'velocity')
+                accel = _with_motion(accel, 'accel', own, 'acceleration')
             i += 1
         if hasattr(o.pose, 'covariance'):
             pose = poses.with_covariance(o.pose, pose, covariance, T_out_in)
@@ -78,8 +91,8 @@ def to_msg(
                 o,
                 header=poses.with_frame(o.header, boxes.frame_id),
                 pose=pose,
-                twist=poses.rotated_motion(o.twist, 'twist', T_out_in),
-                accel=poses.rotated_motion(o.accel, 'accel', T_out_in),
+                twist=twist,
+                accel=accel,
                 shape=poses.replaced(o.shape, dimensions=size),
                 polygon=poses.moved_polygon(o.polygon, T_out_in),
             )
@@ -87,6 +100,14 @@ def to_msg(
     return poses.replaced(
         msg, header=poses.with_frame(msg.header, boxes.frame_id), objects=objects
     )
+
+
+def _with_motion(motion: Any, name: str, found: NDArray[np.void], key: str) -> Any:
+    """Return a twist or an accel with the one `found` (1,), where it is known."""
+    if not found[f'has_{key}'][0]:
+        return motion
+    own = poses.motion_numbers(motion, name)[None]
+    return poses.with_motion_numbers(motion, name, poses.with_kinematics(own, found, key)[0])
 
 
 def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:

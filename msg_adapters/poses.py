@@ -11,15 +11,20 @@ from typing import Any
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.rotations import (
     matrix_from_quaternion,
+    matrix_from_rpy,
     quaternion_from_matrix,
     quaternion_from_rpy,
+    rotated_kinematics,
     rpy_from_quaternion,
 )
-from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, ROLL
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, Floats, ROLL
 import numpy as np
+from numpy.typing import NDArray
 
 UNIT_TOLERANCE = 0.01
 """Tolerance of a squared quaternion norm, the same as in tf2."""
+MOTION_AXES = {'velocity': [0, 1, 2, 5], 'acceleration': [0, 1, 2]}
+"""Places of `KINEMATICS` among the six numbers of a twist or an accel."""
 
 
 def stamp_ns(header: Any) -> int:
@@ -335,6 +340,75 @@ def rotated_motion(motion: Any, name: str, T_out_in: Floats | None) -> Any:
         J = np.kron(np.eye(2), T_out_in[:3, :3])
         covariance = (J @ np.reshape(covariance, (6, 6)) @ J.T).ravel()
     return replaced(motion, **{name: inner, 'covariance': covariance})
+
+
+def motion_numbers(motion: Any, name: str) -> Floats:
+    """
+    Return the numbers of a twist or an accel in the order of the message: 6, or 42.
+
+    Those of a stamped one, with `name` as in `rotated_motion`, are followed by its covariance.
+
+    """
+    inner = getattr(motion, name) if hasattr(motion, 'covariance') else motion
+    own = [getattr(part, axis) for part in (inner.linear, inner.angular) for axis in 'xyz']
+    return np.concatenate([own, getattr(motion, 'covariance', [])]).astype(np.float64)
+
+
+def with_motion_numbers(motion: Any, name: str, numbers: Floats) -> Any:
+    """Return a copy of a twist or an accel with the numbers of `motion_numbers`."""
+    if hasattr(motion, 'covariance'):
+        inner = with_motion_numbers(getattr(motion, name), name, numbers[:6])
+        return replaced(motion, **{name: inner, 'covariance': numbers[6:]})
+    parts = {}
+    for part, values in (('linear', numbers[:3]), ('angular', numbers[3:])):
+        xyz = dict(zip('xyz', values.tolist(), strict=True))
+        parts[part] = replaced(getattr(motion, part), **xyz)
+    return replaced(motion, **parts)
+
+
+def with_kinematics(own: Floats, kinematics: NDArray[np.void] | None, name: str) -> Floats:
+    """
+    Return the numbers of twists or accels where they are known, and `own` elsewhere.
+
+    Parameters
+    ----------
+    own : array, shape (n, 6) or (n, 42)
+        Of the message, as of `motion_numbers`.
+    kinematics : array, shape (n,), or None
+        Records `KINEMATICS` in the axes of the message.
+    name : str
+        ``velocity`` or ``acceleration``, of the records.
+
+    Returns
+    -------
+    array, of the shape of `own`
+        Roll and pitch, and the acceleration of yaw, remain those of the message.
+
+    """
+    if kinematics is None:
+        return own
+    axes = MOTION_AXES[name]
+    new = own.copy()
+    new[:, axes] = kinematics[name]
+    if own.shape[1] > 6:
+        covariances = new[:, 6:].reshape(-1, 6, 6)  # a view
+        covariances[:, axes, :] = 0.0
+        covariances[:, :, axes] = 0.0
+        rows, columns = np.ix_(axes, axes)
+        covariances[:, rows, columns] = kinematics[f'{name}_covariance']
+    return np.where(kinematics[f'has_{name}'][:, None], new, own)
+
+
+def kinematics_of_axes(boxes: BoxArray) -> NDArray[np.void] | None:
+    """Return the kinematics of boxes in the axes of each box, none for those without angles."""
+    if boxes.kinematics is None:
+        return None
+    R = matrix_from_rpy(np.nan_to_num(boxes.boxes[:, ROLL:]))
+    found = rotated_kinematics(boxes.kinematics, R.swapaxes(1, 2))
+    is_known = np.isfinite(boxes.boxes[:, ROLL:]).all(1)
+    found['has_velocity'] &= is_known
+    found['has_acceleration'] &= is_known
+    return found
 
 
 def moved(pose: Any, T_out_in: Floats | None) -> Any:

@@ -60,7 +60,8 @@ class Adapter(Protocol):
             The message that `from_msg` has read. It is not modified; fields that are not part of
             a `BoxArray` are copied.
         boxes : BoxArray
-            As many boxes, in the same order, in the frame ``boxes.frame_id``.
+            As many boxes, in the same order, in the frame ``boxes.frame_id``. Their kinematics are
+            written where they are known and the type has fields for them.
         covariances : array, shape (n, 6, 6), optional
             Covariances of x y z roll pitch yaw [m, rad], written where the type has a field for
             them. Where one is NaN, the covariance of the message remains.

@@ -32,8 +32,8 @@ TRACKED_TYPE = MessageType(
     track_id='UUID in hexadecimal',
     class_and_score='most probable label, `existence_probability`',
     also_written=(
-        'covariance; footprint, scaled with the box; twist and acceleration, rotated where '
-        'the heading flips'
+        'covariance; twist and acceleration in the axes of the object; footprint, scaled with the '
+        'box'
     ),
 )
 PREDICTED_TYPE = replace(
@@ -43,8 +43,8 @@ DETECTED_TYPE = MessageType(
     'msg_adapters.autoware',
     class_and_score='most probable label, `existence_probability`',
     also_written=(
-        'covariance and `has_position_covariance`; footprint, scaled with the box; twist, '
-        'rotated where the heading flips'
+        'covariance and `has_position_covariance`; twist in the axes of the object, `has_twist`; '
+        'footprint, scaled with the box'
     ),
 )
 MESSAGE_TYPES = {
@@ -65,13 +65,16 @@ MESSAGE_TYPES = {
         'msg_adapters.derived',
         track_id='`id`',
         class_and_score='`classification`, `classification_certainty`',
-        also_written='objects that are not a BOX only change their frame',
+        also_written='twist and acceleration; objects that are not a BOX only change their frame',
     ),
     'derived_object_msgs/msg/ObjectWithCovarianceArray': MessageType(
         'msg_adapters.derived',
         track_id='`id`',
         class_and_score='`classification`, `classification_certainty`',
-        also_written='covariance; objects that are not a BOX only change their frame',
+        also_written=(
+            'covariance, twist and acceleration; objects that are not a BOX only change their '
+            'frame'
+        ),
     ),
     'foxglove_msgs/msg/SceneUpdate': MessageType(
         'msg_adapters.foxglove',

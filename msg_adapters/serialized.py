@@ -271,6 +271,7 @@ FOOTPRINT = 'objects.shape.footprint.points'
 TWIST_FIELD = KINEMATICS + 'twist_with_covariance.twist.linear.x'
 ACCELERATION_FIELD = KINEMATICS + 'acceleration_with_covariance.accel.linear.x'
 HAS_COVARIANCE = KINEMATICS + 'has_position_covariance'
+HAS_TWIST = KINEMATICS + 'has_twist'
 AUTOWARE_FIELDS = (
     'objects.existence_probability', 'objects.classification', 'objects.classification.label',
     'objects.classification.probability', KINEMATICS + 'orientation_availability', TWIST_FIELD,
@@ -312,7 +313,7 @@ def _is_oriented(fields: Fields) -> NDArray[np.bool_]:
 
 
 def _write_footprints_and_motion(fields: Fields, rewrite: Rewrite, *motions: str) -> None:
-    """Scale footprints with their boxes, and rotate the motion where the heading flips."""
+    """Scale footprints with their boxes; write the motion, or rotate it with the heading."""
     new_size = rewrite.boxes.boxes[:, LENGTH : WIDTH + 1]
     old_size = rewrite.old_size[:, :2]
     is_scaled = (old_size > 0).all(1) & np.isfinite(new_size).all(1)
@@ -323,10 +324,11 @@ def _write_footprints_and_motion(fields: Fields, rewrite: Rewrite, *motions: str
     fields.put(FOOTPRINT + '.x', scaled.astype('<f4'))
     is_flipped = (_forward(rewrite.old_pose) * _forward(rewrite.new_pose)).sum(1) < 0
     signs = np.concatenate([HALF_TURN_SIGNS, np.outer(HALF_TURN_SIGNS, HALF_TURN_SIGNS).ravel()])
-    for path in motions:
+    known = poses.kinematics_of_axes(rewrite.boxes)
+    for path, name in zip(motions, poses.MOTION_AXES, strict=False):
         motion = fields.numbers(path, '<f8', len(signs))
         motion[is_flipped] *= signs
-        fields.put(path, motion)
+        fields.put(path, poses.with_kinematics(motion, known, name))
 
 
 def _write_tracked(fields: Fields, rewrite: Rewrite) -> None:
@@ -338,6 +340,9 @@ def _write_detected(fields: Fields, rewrite: Rewrite) -> None:
     own = fields.numbers(HAS_COVARIANCE, '|u1')
     is_estimated = np.isfinite(rewrite.covariance).all(1, keepdims=True)
     fields.put(HAS_COVARIANCE, own | is_estimated.astype('|u1'))
+    has_velocity = rewrite.boxes.known_kinematics['has_velocity']
+    has_twist = fields.numbers(HAS_TWIST, '|u1', 2)
+    fields.put(HAS_TWIST, has_twist | has_velocity[:, None].astype('|u1'))
 
 
 def _forward(pose: Floats) -> Floats:
@@ -352,6 +357,26 @@ DIMENSIONS = 'objects.shape.dimensions'
 OBJECT_FIELDS = (
     'objects.id', 'objects.object_classified', 'objects.shape.type', 'objects.classification',
 )  # fmt: skip
+
+
+def _motion_fields(of_twist: str = '', of_accel: str = '') -> tuple[str, str]:
+    """Return the first numbers of twist and acceleration, with the names of those within."""
+    return f'objects.twist{of_twist}.linear.x', f'objects.accel{of_accel}.linear.x'
+
+
+def _writes_motion(fields_of_motion: tuple[str, str], width: int) -> Callable[..., None]:
+    """Return a function that writes twist and acceleration, of `width` numbers each."""
+
+    def write(fields: Fields, rewrite: Rewrite) -> None:
+        for path, name in zip(fields_of_motion, poses.MOTION_AXES, strict=True):
+            own = fields.numbers(path, '<f8', width)
+            fields.put(path, poses.with_kinematics(own, rewrite.boxes.kinematics, name))
+
+    return write
+
+
+PLAIN_MOTION = _motion_fields()
+MOTION_WITH_COVARIANCE = _motion_fields('.twist', '.accel')
 
 
 def _has_boxes_only(fields: Fields) -> bool:
@@ -411,7 +436,7 @@ DETECTED_OBJECTS = BoxFields(
     KINEMATICS + 'pose_with_covariance.pose.position.x',
     'objects.shape.dimensions.x',
     _autoware_labels,
-    others=(*AUTOWARE_FIELDS, HAS_COVARIANCE),
+    others=(*AUTOWARE_FIELDS, HAS_COVARIANCE, HAS_TWIST),
     covariance=KINEMATICS + 'pose_with_covariance.covariance',
     is_ordinary=_has_no_cylinder,
     has_angles=_is_oriented,
@@ -422,8 +447,9 @@ OBJECT_ARRAY = BoxFields(
     'objects.pose.position.x',
     DIMENSIONS,
     _object_labels,
-    others=OBJECT_FIELDS,
+    others=(*OBJECT_FIELDS, *PLAIN_MOTION),
     is_ordinary=_has_boxes_only,
+    write=_writes_motion(PLAIN_MOTION, 6),
 )
 BOX_FIELDS = {
     'vision_msgs/msg/Detection3DArray': BoxFields(
@@ -450,7 +476,9 @@ BOX_FIELDS = {
     'autoware_perception_msgs/msg/DetectedObjects': DETECTED_OBJECTS,
     'derived_object_msgs/msg/ObjectArray': OBJECT_ARRAY,
     'derived_object_msgs/msg/ObjectWithCovarianceArray': replace(
-        OBJECT_ARRAY, pose='objects.pose.pose.position.x', covariance='objects.pose.covariance'
+        OBJECT_ARRAY, pose='objects.pose.pose.position.x', covariance='objects.pose.covariance',
+        others=(*OBJECT_FIELDS, *MOTION_WITH_COVARIANCE),
+        write=_writes_motion(MOTION_WITH_COVARIANCE, 42),
     ),
     'foxglove_msgs/msg/SceneUpdate': BoxFields(
         ('entities.frame_id',),

@@ -4,6 +4,8 @@ import csv
 import json
 
 from boxreg_ros.cli import main
+from boxreg_ros.io.velocity_table import read_velocities
+from boxreg_ros.rotations import matrix_from_rpy
 from lidar_drives import LidarDrive
 from msg_adapters import adapter_for, ADAPTERS, WITHOUT_IDS
 from msg_adapters.clouds import COMPRESSED_TYPE
@@ -11,12 +13,26 @@ from msg_adapters.poses import quaternions_of
 import numpy as np
 import pytest
 from ros_graph import ended_cleanly, graph_in, play, records_of, RELIABLE, ROOT, stamp_of
-from ros_messages import DETECTIONS, Drive, JSK, MARKERS, SECOND
+from ros_messages import (
+    DETECTIONS,
+    Drive,
+    JSK,
+    MARKERS,
+    OBJECTS,
+    OBJECTS_WITH_COVARIANCE,
+    PREDICTED,
+    SECOND,
+    TRACKED,
+)
 
 NUMBERS = ['x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height']
 SETTINGS = {'window': 5, 'lag': 3}
 UNHURRIED = ['transform_timeout:=20.0', 'backlog:=60.0', 'deadline:=60.0']
 """So that on a busy machine no transform is extrapolated, and no box left out for its deadline."""
+
+
+MOVING_TYPES = (TRACKED, PREDICTED, OBJECTS, OBJECTS_WITH_COVARIANCE)
+"""Types with ids that have a twist."""
 
 
 def relabelled(path, out, *more, settings=SETTINGS):
@@ -271,6 +287,33 @@ def test_publisher_node_and_subscriber_of_every_family(tmp_path, type_name):
     assert np.abs(rows - list(expected.values())).max() < 1e-6
     ids = [track_id for _, track_id in expected]
     assert ids == ids[:2] * 8  # stable
+    if type_name in MOVING_TYPES:
+        assert_same_velocities(final, type_name, tmp_path / 'out' / 'velocities.csv')
+
+
+def assert_same_velocities(messages, type_name, path):
+    """Compare the published twists, in the axes of the boxes or of the frame, with the table."""
+    known = read_velocities(path)
+    assert len(known) > len(messages)
+    compared = 0
+    for message in messages:
+        boxes = adapter_for(type_name).from_msg(message)
+        for track_id, box, item in zip(boxes.track_ids, boxes.boxes, message.objects, strict=True):
+            record = known.get((boxes.stamp_ns, track_id))
+            if record is None:
+                continue
+            kinematics = getattr(item, 'kinematics', None)
+            if kinematics is None:
+                twist, R = getattr(item.twist, 'twist', item.twist), np.eye(3)
+            else:
+                prefix = 'initial_' if hasattr(kinematics, 'predicted_paths') else ''
+                twist = getattr(kinematics, f'{prefix}twist_with_covariance').twist
+                R = matrix_from_rpy(box[6:])
+            found = R @ [twist.linear.x, twist.linear.y, twist.linear.z]
+            expected = record['velocity']
+            np.testing.assert_allclose([*found, twist.angular.z], expected, rtol=1e-6, atol=1e-6)
+            compared += 1
+    assert compared == len(known)
 
 
 def test_boxes_without_ids_are_refused_by_node_and_relabel(tmp_path, capsys):

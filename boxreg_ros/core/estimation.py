@@ -30,7 +30,7 @@ from boxreg_ros.core.threads import one_torch_thread, run, shared_between
 from boxreg_ros.core.window import Estimate, Estimates, MarginalisationPrior, Window
 from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import Floats, Ints, KEPT, POSE, REFINED, ROLL
+from boxreg_ros.structures import Floats, Ints, KEPT, KINEMATICS, POSE, REFINED, ROLL
 import numpy as np
 from numpy.typing import NDArray
 
@@ -121,7 +121,7 @@ def _accepted(
 
     """
     poses, valid = solution.poses, problem.valid
-    covariances, extent_covariances, distances = solution.posterior
+    covariances, extent_covariances, distances, kinematics = solution.posterior
     extent = problem.boxes[..., 3:6]
     if config.extent == 'track':
         extent = np.repeat(solution.shared[:, None, EXTENT:BIAS], problem.length, axis=1)
@@ -146,7 +146,11 @@ def _accepted(
         extent_covariances[b, i] = np.eye(3)
         distances[b, i] = 0.0
         near_points[b, i] = 0
-    columns = found, status, reasons, covariances, extent_covariances, distances, near_points
+        kinematics[b, i] = np.zeros((), KINEMATICS)
+    columns = (
+        found, status, reasons, covariances, extent_covariances, distances, near_points,
+        kinematics,
+    )  # fmt: skip
     table = Estimates(*(part[valid] for part in columns))
     ends = np.cumsum(problem.lengths).tolist()
     return list(map(Estimate, repeat(table), [0, *ends], ends, priors))

@@ -14,7 +14,7 @@ from boxreg_ros.core.lbfgs import HISTORY, minimize
 from boxreg_ros.core.method.arrays import INPUTS, Posterior, PRIOR, Solution
 from boxreg_ros.core.problem import Problem
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import Floats, POSE
+from boxreg_ros.structures import Floats, KINEMATICS, POSE
 import numpy as np
 import torch
 from torch import Tensor
@@ -224,7 +224,8 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
     of_poses, of_extents = np.zeros((B, length, 6, 6)), np.zeros((B, 3, 3))
     of_poses[...] = _diagonal(problem.of_class['pose'] ** 2)[:, None]
     of_extents[...] = _diagonal((mean * problem.of_class['extent'][:, None]) ** 2)
-    posterior = Posterior(of_poses, of_extents, np.zeros((B, length, 6)))
+    unknown = np.zeros((B, length), KINEMATICS)  # its terms have no scale
+    posterior = Posterior(of_poses, of_extents, np.zeros((B, length, 6)), unknown)
     no_prior = np.zeros((0, PRIOR)), np.zeros((0, PRIOR)), np.zeros((0, PRIOR, PRIOR))
     poses = x.numpy().reshape(B, length, 6)
     return Solution(poses, shared, np.zeros((B, 3, 3)), posterior, *no_prior)

@@ -25,6 +25,7 @@ from boxreg_ros.structures import (
     Floats,
     is_valid_box,
     KEPT,
+    KINEMATICS,
     LENGTH,
     REFINED,
     RefinedBoxes,
@@ -170,6 +171,7 @@ class PendingArray:
             extent_covariances=np.tile(np.eye(3), (n, 1, 1)),
             face_distances=np.zeros((n, 6)),
             near_points=np.zeros((n, 2), np.int64),
+            kinematics=np.zeros(n, KINEMATICS),
         )
         known = {row: found for row, found in enumerate(self.estimates) if found is not None}
         estimated = np.array([*known], int)
@@ -181,7 +183,7 @@ class PendingArray:
         is_returned[self.followed] = True
         columns.status[self.num_given :] = COASTED
         whole = RefinedBoxes(
-            replace(self.input, boxes=columns.boxes),
+            replace(self.input, boxes=columns.boxes, kinematics=columns.kinematics),
             tuple(columns.status.tolist()),
             tuple(map(str, columns.reasons)),
             self.num_points.copy(),

@@ -20,6 +20,7 @@ from boxreg_ros.structures import (
     INTERPOLATED,
     Ints,
     is_valid_box,
+    KINEMATICS,
     RefinedBoxes,
     ROLL,
     Sweep,
@@ -161,6 +162,8 @@ class RefinedTrack:
         Of x y z roll pitch yaw [m, rad].
     extent_covariances : array, shape (N, 3, 3)
         Of length, width and height [m].
+    kinematics : array, shape (N,)
+        Velocities and accelerations with covariances, records `structures.KINEMATICS`.
 
     """
 
@@ -170,6 +173,7 @@ class RefinedTrack:
     reasons: tuple[str, ...]
     covariances: Floats
     extent_covariances: Floats
+    kinematics: NDArray[np.void]
 
 
 class _Place(NamedTuple):
@@ -287,6 +291,9 @@ def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> Refine
     reasons = [result.reasons[i] for result, i in rows]
     covariances = np.array([result.covariances[i] for result, i in rows]).reshape(-1, 6, 6)
     extents = np.array([result.extent_covariances[i] for result, i in rows]).reshape(-1, 3, 3)
+    kinematics = np.zeros(len(rows), KINEMATICS)
+    for place, (result, i) in enumerate(rows):
+        kinematics[place] = result.boxes.known_kinematics[i]
     is_valid = np.array([reason != Reason.INVALID_BOX for reason in reasons], dtype=bool)
     if rows and not is_valid.any():
         raise ShapeError(
@@ -300,7 +307,7 @@ def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> Refine
         )
         for row in np.flatnonzero(~is_valid):
             status[row] = INTERPOLATED
-    columns = tuple(status), tuple(reasons), covariances, extents
+    columns = tuple(status), tuple(reasons), covariances, extents, kinematics
     return RefinedTrack(track.track_id, boxes, *columns)
 
 

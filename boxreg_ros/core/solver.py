@@ -18,7 +18,7 @@ from boxreg_ros.core.method.arrays import BIAS, EXTENT, Posterior, PRIOR, SHARED
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.problem import Problem
 from boxreg_ros.core.threads import run, shared_between
-from boxreg_ros.structures import Floats, Ints, POSE
+from boxreg_ros.structures import Floats, Ints, KINEMATICS, POSE
 import numpy as np
 from numpy.typing import NDArray
 import torch
@@ -128,7 +128,10 @@ def start(problem: Problem, config: Config, plan: SolverPlan, inputs: Inputs) ->
     leaving = B if plan.marginalises and config.window == N else 0
     solution = Solution(
         problem.start[..., POSE].copy(), shared, evidence,
-        Posterior(np.zeros((B, N, 6, 6)), np.zeros((B, 3, 3)), np.zeros((B, N, 6))),
+        Posterior(
+            np.zeros((B, N, 6, 6)), np.zeros((B, 3, 3)), np.zeros((B, N, 6)),
+            np.zeros((B, N), KINEMATICS),
+        ),
         np.full((leaving, PRIOR), np.nan), np.full((leaving, PRIOR), np.nan),
         np.full((leaving, PRIOR, PRIOR), np.nan),
     )  # fmt: skip

@@ -92,6 +92,8 @@ class Estimates(NamedTuple):
     """(n, 6), as in `RefinedBoxes`."""
     near_points: Ints
     """(n, 2), likewise."""
+    kinematics: NDArray[np.void]
+    """(n,), records `KINEMATICS`; unknown for kept boxes."""
 
 
 class Estimate(NamedTuple):

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import ShapeError, UnsupportedMessage
-from boxreg_ros.structures import BoxArray, RefinedBoxes
+from boxreg_ros.structures import BoxArray, KINEMATICS, RefinedBoxes
 import numpy as np
 import orjson
 
@@ -29,6 +29,8 @@ SHAPES = {
     'extent_covariances': (3, 3),
 }
 """Shape of the numbers of one box."""
+OF_KINEMATICS = tuple(KINEMATICS.names or ())
+"""Names of the numbers of `KINEMATICS`."""
 
 
 class LabelMessage(NamedTuple):
@@ -50,6 +52,8 @@ def to_text(content: LabelMessage) -> str:
         for name in (*NAMES_OF_BOX, *SHAPES)
     }
     arrays = {name: np.ascontiguousarray(columns[name]) for name in SHAPES}
+    kinematics = boxes.known_kinematics
+    arrays |= {name: np.ascontiguousarray(kinematics[name]) for name in OF_KINEMATICS}
     table = {
         'stamp_ns': boxes.stamp_ns,
         'frame_id': boxes.frame_id,
@@ -69,9 +73,13 @@ def from_text(text: str) -> LabelMessage:
             name: np.array(table[name], np.float64).reshape(n, *shape)
             for name, shape in SHAPES.items()
         }
+        kinematics = np.zeros(n, KINEMATICS)
+        for name in OF_KINEMATICS:
+            if n:
+                kinematics[name] = table[name]
         boxes = BoxArray(
             table['stamp_ns'], table['frame_id'], texts['track_ids'], texts['class_names'],
-            numbers['scores'], numbers['boxes'],
+            numbers['scores'], numbers['boxes'], kinematics=kinematics,
         )  # fmt: skip
         refined = RefinedBoxes(
             boxes, texts['status'], texts['reasons'], numbers['num_points'].astype(np.int64),

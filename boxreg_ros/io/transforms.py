@@ -23,6 +23,7 @@ from boxreg_ros.rotations import (
     interpolate_quaternion,
     matrix_from_quaternion,
     matrix_from_rpy,
+    rotated_kinematics,
     rpy_from_matrix,
 )
 from boxreg_ros.structures import BOX_CENTER, BoxArray, Floats, FrameMotion, ROLL, Sweep
@@ -815,9 +816,17 @@ def move_to_frame(item: Sweep | BoxArray, T_frame_item: Floats, frame_id: str) -
 def boxes_to_frame(
     boxes: BoxArray, T_frame_boxes: Floats, frame_id: str, motion: FrameMotion | None = None
 ) -> BoxArray:
-    """Return the boxes in another frame, with the `motion` of their own; NaN stays NaN."""
+    """
+    Return the boxes in another frame, with the `motion` of their own; NaN stays NaN.
+
+    Their kinematics are in its axes, but over ground: a moving frame takes nothing off.
+
+    """
     moved = moved_boxes(boxes.boxes, T_frame_boxes)
-    return replace(boxes, frame_id=frame_id, boxes=moved, motion=motion)
+    kinematics = boxes.kinematics
+    if kinematics is not None:
+        kinematics = rotated_kinematics(kinematics, T_frame_boxes[:3, :3])
+    return replace(boxes, frame_id=frame_id, boxes=moved, motion=motion, kinematics=kinematics)
 
 
 def moved_boxes(boxes: Floats, T_frame_boxes: Floats) -> Floats:

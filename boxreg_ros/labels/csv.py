@@ -1,5 +1,5 @@
 """
-``boxes.csv``: one row per box, with its frame; ``covariances.csv``: how certain each is.
+``boxes.csv``: one row per box, with its frame; beside it covariances and velocities.
 
 ``attributes.csv`` has a row per box and attribute, where boxes have any: the columns of
 ``boxes.csv`` are the same for all.
@@ -17,6 +17,7 @@ from typing import IO
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable, cell, COLUMNS, csv_row, protected, unprotected
 from boxreg_ros.io.covariance_table import COVARIANCES, CovarianceWriter
+from boxreg_ros.io.velocity_table import VELOCITIES, VelocityWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import numbers_of, refined_boxes
 from boxreg_ros.structures import BoxArray, Floats, PROPOSED
@@ -35,9 +36,9 @@ FORMAT = Format(
     reference='centre',
     sizes='length width height',
     rotation='quaternion x y z w',
-    files='boxes.csv, covariances.csv, attributes.csv',
+    files='boxes.csv, covariances.csv, velocities.csv, attributes.csv',
     reads='one row per box',
-    leaves_out='covariances.csv, proposals',
+    leaves_out='covariances.csv, velocities.csv, proposals',
     read_back='pandas 3.1.1',
 )
 
@@ -58,6 +59,7 @@ class Writer:
         self._file.write(','.join(COLUMNS) + '\n')
         self._covariances = CovarianceWriter(folder / COVARIANCES)
         self._attributes: IO[str] | None = None
+        self._velocities = VelocityWriter(folder / VELOCITIES)
         self._newest_ns: int | None = None
         self._is_sorted = True
 
@@ -65,6 +67,7 @@ class Writer:
         """Add one row per box."""
         refined = frame.refined
         self._covariances.write(refined, frame.T_fixed_sensor)
+        self._velocities.write(refined)
         boxes = refined.boxes
         stamp_ns = boxes.stamp_ns
         if self._newest_ns is not None and stamp_ns < self._newest_ns:
@@ -98,6 +101,7 @@ class Writer:
         self._covariances.close()
         if self._attributes is not None:
             self._attributes.close()
+        self._velocities.close()
         if self._is_sorted:
             return
         with self._path.open(newline='', encoding='utf-8') as file:

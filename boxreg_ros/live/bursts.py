@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import reduce
 from math import inf
 from typing import Any, NamedTuple
@@ -130,13 +129,7 @@ def _joined(held: Item, item: Item) -> Item:
 
 
 def _rows(boxes: BoxArray, rows: slice) -> BoxArray:
-    return replace(
-        boxes,
-        track_ids=boxes.track_ids[rows],
-        class_names=boxes.class_names[rows],
-        scores=boxes.scores[rows],
-        boxes=boxes.boxes[rows],
-    )
+    return boxes.take(range(len(boxes.track_ids))[rows])
 
 
 def _source(message: Any, row: int) -> tuple[Any, int]:

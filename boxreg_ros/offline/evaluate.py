@@ -15,14 +15,25 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance, COVARIANCES, read_covariances
 from boxreg_ros.io.stamp_join import joined_stamps
 from boxreg_ros.io.times import time_range
+from boxreg_ros.io.velocity_table import read_velocities, VELOCITIES
 from boxreg_ros.offline.arguments import add_options, request_from, TOPICS, words_of
-from boxreg_ros.offline.box_scores import by_overlap, groups, match, RECALLS, Scores, summarise
+from boxreg_ros.offline.box_scores import (
+    by_overlap,
+    groups,
+    match,
+    Matches,
+    RECALLS,
+    Scores,
+    summarise,
+)
 from boxreg_ros.offline.consistency import consistency
 from boxreg_ros.offline.consistency import table as consistency_table
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import earlier_summary
 from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.track_scores import has_trackeval, LEAST_IOU, track_scores, TrackScores
+from boxreg_ros.offline.velocity_scores import beside, velocity_scores, VelocityScores
+from boxreg_ros.offline.velocity_scores import table as velocity_table
 from boxreg_ros.structures import is_valid_box, REJECTED
 import numpy as np
 
@@ -47,6 +58,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--classes', nargs='+', default=[], metavar='WORD',
         help='compare only true boxes whose class name contains one of these words, as in '
         'car,van,truck',
+    )  # fmt: skip
+    parser.add_argument(
+        '--input', type=Path, metavar='RECORDING',
+        help='recording of the result: the velocities of its boxes are compared as well',
     )  # fmt: skip
     add_options(parser, Request, *TOPICS, 'fixed_frame')
     parser.add_argument('--json', action='store_true', help='print one JSON object')
@@ -78,17 +93,21 @@ def run(args: argparse.Namespace) -> int:
     if not has_trackeval():
         _warn('HOTA and IDF1 need the package trackeval: pip install trackeval')
     certainty = consistency(matches, predicted, truth, _covariances(args.predicted))
+    velocities = _velocities(args, matches, predicted, truth, classes)
     if args.json:
         report = _report(overall, groups(matches)) | {'tracks': asdict(tracks)}
+        report['velocities'] = {name: scores._asdict() for name, scores in velocities.items()}
         if certainty:
             report['consistency'] = {name: group._asdict() for name, group in certainty.items()}
         print(json.dumps(finite(report)))
     else:
         _print_tables(overall, groups(matches))
         print(_track_lines(tracks))
+        if any(scores.boxes for scores in velocities.values()):
+            print('\n' + velocity_table(velocities))
         if certainty:
-            folder = args.predicted if args.predicted.is_dir() else args.predicted.parent
-            estimate = (earlier_summary(folder) or {}).get('estimate', 'written')
+            summary = earlier_summary(_folder(args.predicted)) or {}
+            estimate = summary.get('estimate', 'written')
             print(f'\ncovariances of the {estimate} estimate')
             print(consistency_table(certainty))
     return 0 if matches.is_matched.any() else 1
@@ -96,10 +115,36 @@ def run(args: argparse.Namespace) -> int:
 
 def _covariances(source: Path) -> dict[tuple[int, str], BoxCovariance]:
     """Return the covariances beside a table of boxes; none for other sources."""
-    folder = source if source.is_dir() else source.parent
-    path = folder / COVARIANCES
-    is_table = source.name == 'boxes.csv' or (source / 'boxes.csv').is_file()
-    return read_covariances(path) if is_table and path.is_file() else {}
+    path = _folder(source) / COVARIANCES
+    return read_covariances(path) if _is_table(source) and path.is_file() else {}
+
+
+def _velocities(
+    args: argparse.Namespace,
+    matches: Matches,
+    predicted: BoxTable,
+    truth: BoxTable,
+    classes: list[str],
+) -> dict[str, VelocityScores]:
+    """Return the scores of velocities of the boxes, and of the input if it is given."""
+    path = _folder(args.predicted) / VELOCITIES
+    known = read_velocities(path) if _is_table(args.predicted) and path.is_file() else None
+    found = [('boxes', velocity_scores(matches, predicted, truth, known))]
+    if args.input is not None:
+        boxes = _of_recording(args, args.input)
+        of_input = match(boxes, _joined(args, boxes, truth), args.min_points, classes, by_overlap)
+        found.insert(0, ('input', velocity_scores(of_input, boxes, truth)))
+    return beside(found)
+
+
+def _folder(source: Path) -> Path:
+    """Return the folder of a table of boxes."""
+    return source if source.is_dir() else source.parent
+
+
+def _is_table(source: Path) -> bool:
+    """Return whether a source is the table of a result, not a recording or another file."""
+    return source.name == 'boxes.csv' or (source / 'boxes.csv').is_file()
 
 
 def _track_lines(scores: TrackScores) -> str:
@@ -126,13 +171,18 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
         source = source / 'boxes.csv'
     if source.suffix == '.csv':
         unused = words_of(args, Request, *TOPICS, 'fixed_frame')
-        if unused:
+        if unused and args.input is None:
             raise ConfigError(
                 f'{" ".join(unused)}: expected with a recording only, got the table '
                 f'{str(source)!r}; leave them out'
             )
         found = _table_in_frame(BoxTable.read_frames(source), frame_id)
         return found.rows(np.array([status != REJECTED for status in found.status], bool))
+    return _of_recording(args, source)
+
+
+def _of_recording(args: argparse.Namespace, source: Path) -> BoxTable:
+    """Return the input boxes of a recording."""
     from boxreg_ros.io.fixed_frame import input_boxes  # slow to import: it reads bags
 
     recording = request_from(args, source).recording()

@@ -433,6 +433,7 @@ def _joined(first: RefinedBoxes, second: RefinedBoxes) -> RefinedBoxes:
             scores=both('scores', boxes),
             boxes=both('boxes', boxes),
             pinned=None,
+            kinematics=both('known_kinematics', boxes),
         ),
         status=(*first.status, *second.status),
         reasons=(*first.reasons, *second.reasons),

@@ -1,6 +1,7 @@
 """The queues between the threads of the node: capacity, order, and clouds that give way."""
 
 from boxreg_ros.live.inbox import BOXES_PER_CLOUD, CloudPatience, Inbox
+import numpy as np
 import pytest
 
 
@@ -65,3 +66,29 @@ def test_clouds_beyond_the_backlog_are_dropped():
     assert run_queue(0.2, [0.03, 0.5, 0.03, 0.03, 0.03, 0.03]) == [
         *(0.0, 0.0, None, None), *(pytest.approx(0.2), pytest.approx(0.13)),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize('seconds', [0.11, 0.15, 0.3])
+def test_the_newest_first_drops_no_more_clouds_than_waiting_in_order(seconds):
+    """A solver that takes longer than the period of 0.1 s, and a quarter more at random."""
+
+    class InOrder(CloudPatience):
+        def is_overdue(self, waited, deadline, has_newer):
+            return waited > self.backlog
+
+    of_newest, of_order = (overloaded(policy(0.5), seconds) for policy in (CloudPatience, InOrder))
+    assert of_newest[0] <= of_order[0] + 0.05
+    assert of_newest[1] < 0.6 * of_order[1]
+
+
+def overloaded(patience, seconds, clouds=1000):
+    """Return the share of dropped clouds, and the median of the waits of the others [s]."""
+    factors = np.random.default_rng(0).uniform(0.75, 1.25, clouds)
+    now, waits = 0.0, []
+    for turn in range(clouds):
+        arrived = 0.1 * turn
+        now = max(now, arrived)
+        if not patience.is_overdue(now - arrived, 0.08, now >= arrived + 0.1):
+            waits.append(now - arrived)
+            now += seconds * factors[turn]
+    return 1 - len(waits) / clouds, np.median(waits)

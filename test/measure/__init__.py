@@ -27,12 +27,14 @@ MEASUREMENTS = {
     'points': 'labels of points against those of a simulation',
     'lidars': 'accuracy on a truck with LiDARs at its corners',
     'covariance': 'covariances against errors, by estimate and class',
+    'velocities': 'errors of velocities of the input and of each estimate',
     'review': 'how early the review list shows the bad tracks',
     'labeller': 'actions of a labeller until a drive with planted errors is right',
     'report': 'first paint and frame times of report.html',
     'scale': 'core hours and memory per hour, and a simulated fleet',
     'load': 'latency and accuracy of the live node by number of tracks',
     'node': 'latency and memory of the live node, over DDS',
+    'robot': 'the live node at the rates of a robot, as a table',
     'renew': 'run the command of each stored measurement again, and store its output',
 }
 """Modules of this package, each with `ARGUMENTS` and `run`, and their summaries."""

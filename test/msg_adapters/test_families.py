@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import TransformTree
-from boxreg_ros.structures import is_valid_box
+from boxreg_ros.io.transforms import boxes_to_frame, TransformTree
+from boxreg_ros.structures import is_valid_box, KINEMATICS
 from msg_adapters import adapter_for, ADAPTERS, MESSAGE_COLUMNS, rows, WITHOUT_IDS
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
@@ -196,6 +196,94 @@ def test_twist_is_rotated_where_the_heading_flips(type_name):
     if type_name in WITH_UUID:
         moving = getattr(out.objects[0].kinematics, f'{prefix}acceleration_with_covariance')
         assert moving.accel.linear.x == -0.25
+
+
+def turning_boxes(given, yaw, speed, frame_id='lidar'):
+    """Return `given` at a yaw, each driving forward, in a left turn of 0.2 rad/s."""
+    boxes = given.boxes.copy()
+    boxes[:, 6:] = 0.0, 0.0, yaw
+    kinematics = np.zeros(len(boxes), KINEMATICS)
+    kinematics['velocity'] = speed * np.cos(yaw), speed * np.sin(yaw), 0.0, 0.2
+    kinematics['velocity_covariance'] = np.diag([1.0, 4.0, 9.0, 0.01])
+    kinematics['acceleration'] = 0.0, 0.5, 0.0
+    kinematics['acceleration_covariance'] = np.diag([1.0, 4.0, 9.0])
+    kinematics['has_velocity'] = kinematics['has_acceleration'] = np.arange(len(boxes)) == 0
+    return replace(given, frame_id=frame_id, boxes=boxes, kinematics=kinematics)
+
+
+@pytest.mark.parametrize('type_name', [*WITH_UUID, *WITHOUT_UUID])
+def test_twist_and_acceleration_are_in_the_axes_of_the_object(type_name):
+    """Of a box with a known velocity; the other one keeps those of the message."""
+    adapter = adapter_for(type_name)
+    message = message_of(type_name, rpy=np.zeros((2, 3)))
+    boxes = turning_boxes(adapter.from_msg(message), np.pi / 2, 5.0)
+    first, second = (o.kinematics for o in adapter.to_msg(message, boxes).objects)
+    prefix = 'initial_' if hasattr(first, 'predicted_paths') else ''
+    moving = getattr(first, f'{prefix}twist_with_covariance')
+    twist = moving.twist
+    np.testing.assert_allclose(
+        [twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.z],
+        [5, 0, 0, 0.2],
+        atol=1e-9,
+    )
+    own = np.reshape(
+        getattr(message.objects[0].kinematics, f'{prefix}twist_with_covariance').covariance, (6, 6)
+    )
+    covariance = np.reshape(moving.covariance, (6, 6))
+    np.testing.assert_allclose(np.diag(covariance)[[0, 1, 2, 5]], [4, 1, 9, 0.01], atol=1e-9)
+    assert covariance[3, 3] == own[3, 3] and covariance[4, 4] == own[4, 4]
+    kept = getattr(second, f'{prefix}twist_with_covariance').twist
+    assert (kept.linear.x, kept.linear.y) == (3.0, 0.5)
+    flipped = turning_boxes(boxes, -np.pi / 2, -5.0)
+    out = adapter.to_msg(message, flipped).objects[0].kinematics
+    assert getattr(out, f'{prefix}twist_with_covariance').twist.linear.x == pytest.approx(-5)
+    if type_name in WITH_UUID:
+        accel = getattr(first, f'{prefix}acceleration_with_covariance').accel.linear
+        np.testing.assert_allclose([accel.x, accel.y], [0.5, 0.0], atol=1e-9)
+    if hasattr(first, 'has_twist'):
+        assert first.has_twist and first.has_twist_covariance
+
+
+@pytest.mark.parametrize('type_name', [OBJECTS, OBJECTS_WITH_COVARIANCE])
+def test_twist_of_an_object_array_is_in_the_axes_of_its_frame(type_name):
+    adapter = adapter_for(type_name)
+    message = message_of(type_name)
+    boxes = turning_boxes(adapter.from_msg(message), np.pi / 2, 5.0)
+    first, second = adapter.to_msg(message, boxes).objects
+    before = message.objects[1].twist
+    if type_name == OBJECTS_WITH_COVARIANCE:
+        assert np.diag(np.reshape(first.twist.covariance, (6, 6)))[1] == 4.0
+        found, kept, before = first.twist.twist, second.twist.twist, before.twist
+        assert first.accel.accel.linear.y == 0.5
+    else:
+        found, kept = first.twist, second.twist
+    assert (found.linear.x, found.linear.y) == (pytest.approx(0.0), pytest.approx(5.0))
+    assert kept == before
+
+
+def test_twist_follows_pose_reference_and_forward_axis():
+    """The rear axle of a car that turns left moves to the right of its centre."""
+    axle = Convention(pose_reference='-0.5,0,0', forward_axis='y+')
+    adapter = adapter_for(TRACKED, axle)
+    message = message_of(TRACKED, rpy=np.zeros((2, 3)))
+    boxes = turning_boxes(adapter.from_msg(message), 0.0, 5.0)
+    twist = adapter.to_msg(message, boxes).objects[0].kinematics.twist_with_covariance.twist
+    length = boxes.boxes[0, 3]
+    # y of the pose is forward, so its x points to the right.
+    np.testing.assert_allclose(
+        [twist.linear.x, twist.linear.y], [0.2 * length / 2, 5.0], atol=1e-9
+    )
+
+
+def test_kinematics_turn_with_the_frame_of_the_boxes():
+    T = np.eye(4)
+    T[:2, :2], T[:3, 3] = [[0, -1], [1, 0]], [100.0, 200.0, 0.0]
+    boxes = turning_boxes(adapter_for(TRACKED).from_msg(message_of(TRACKED)), 0.0, 5.0)
+    moved = boxes_to_frame(boxes, T, 'map')
+    np.testing.assert_allclose(moved.kinematics['velocity'][0], [0, 5, 0, 0.2], atol=1e-12)
+    covariance = moved.kinematics['velocity_covariance'][0]
+    np.testing.assert_allclose(np.diag(covariance), [4, 1, 9, 0.01], atol=1e-12)
+    np.testing.assert_allclose(moved.kinematics['acceleration'][0], [-0.5, 0, 0], atol=1e-12)
 
 
 def test_predicted_paths_are_moved_to_the_output_frame():

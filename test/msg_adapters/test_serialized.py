@@ -12,6 +12,7 @@ import time
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.live.topics import import_message
+from boxreg_ros.structures import KINEMATICS
 from msg_adapters import adapter_for, ADAPTERS, cdr
 from msg_adapters.cdr import Layout
 from msg_adapters.convention import Convention, STANDARD
@@ -56,6 +57,17 @@ def items_of(message):
     )
 
 
+def kinematics_of(n):
+    """Return velocities and accelerations of n boxes, every third one unknown."""
+    rng = np.random.default_rng(2)
+    found = np.zeros(n, KINEMATICS)
+    for name in ('velocity', 'acceleration', 'velocity_covariance', 'acceleration_covariance'):
+        found[name] = rng.normal(0, 1, found[name].shape)
+    found['has_velocity'] = np.arange(n) % 3 > 0
+    found['has_acceleration'] = np.arange(n) % 3 > 1
+    return found
+
+
 class Adapters:
     """The adapter of serialised messages of a type, and that of objects."""
 
@@ -88,11 +100,12 @@ class Adapters:
         new = replace(
             expected, boxes=boxes, frame_id=frame_id, track_ids=tuple(map(str, range(n)))
         )
-        for given in (covariances, None):
-            written = self.fast.to_msg(data, new, given, T_out_in)
+        moving = replace(new, kinematics=kinematics_of(n))
+        for wanted, given in ((moving, covariances), (new, None)):
+            written = self.fast.to_msg(data, wanted, given, T_out_in)
             if not isinstance(written, bytes):
                 written = serialize_message(written)
-            by_objects = serialize_message(self.slow.to_msg(message, new, given, T_out_in))
+            by_objects = serialize_message(self.slow.to_msg(message, wanted, given, T_out_in))
             written, by_objects = (
                 deserialize_message(data, self.kind) for data in (written, by_objects)
             )

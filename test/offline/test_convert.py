@@ -251,6 +251,7 @@ def test_convert_with_poses_and_clouds_of_a_recording(tmp_path, drive, camera):
     out = tmp_path / 'out'
     assert sorted(item.name for item in out.iterdir()) == [
         'argoverse2', 'boxes.csv', 'covariances.csv', 'kitti', 'nuscenes', 'summary.json',
+        'velocities.csv',
     ]  # fmt: skip
     assert json.loads((out / 'summary.json').read_text()) == summary
     assert (summary['frames'], summary['boxes'], summary['left_out_of_labels']) == (7, 14, {})

@@ -223,13 +223,13 @@ def test_output_folder_contents(tmp_path):
     out = tmp_path / 'out'
     assert sorted(item.name for item in out.iterdir()) == [
         'boxes.csv', 'config.yaml', 'covariances.csv', 'input_model.json', 'openlabel',
-        'review.csv', 'summary.json', 'tracks.csv',
+        'review.csv', 'summary.json', 'tracks.csv', 'velocities.csv',
     ]  # fmt: skip
     assert Config.from_yaml(out / 'config.yaml') == QUICK.updated({'solver.rounds': 2})
     content = json.loads((out / 'summary.json').read_text())
     assert content.pop('files').keys() == {
         'boxes.csv', 'config.yaml', 'covariances.csv', 'input_model.json', 'openlabel/labels.json',
-        'review.csv', 'tracks.csv',
+        'review.csv', 'tracks.csv', 'velocities.csv',
     }  # fmt: skip
     assert content == summary.as_json()
     assert Summary.from_json(content) == summary

@@ -93,7 +93,7 @@ def test_page_needs_no_other_file(street):
     out, _, page = street
     assert sorted(item.name for item in out.iterdir()) == [
         'boxes.csv', 'config.yaml', 'covariances.csv', 'input_model.json', 'report.html',
-        'review.csv', 'summary.json', 'tracks.csv',
+        'review.csv', 'summary.json', 'tracks.csv', 'velocities.csv',
     ]  # fmt: skip
     assert all(link.startswith(('#', 'data:')) for link in page.links)
     assert not set(page.tags) & {'iframe', 'object', 'img'}

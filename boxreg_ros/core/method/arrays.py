@@ -139,12 +139,15 @@ class Posterior(NamedTuple):
     face_distances : array, shape (B, N, 6)
         Signed distance of the outermost points of each face from where they are expected, by the
         estimated extents and the margins of other tracks, positive outside [m]; 0 without points.
+    kinematics : array of `KINEMATICS`, shape (B, N)
+        Velocities and accelerations.
 
     """
 
     poses: Any
     extents: Any
     face_distances: Any
+    kinematics: Any
 
 
 class Solution(NamedTuple):

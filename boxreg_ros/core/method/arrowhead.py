@@ -9,7 +9,7 @@ the matrix A. Large products are those of BLAS, since numba unrolls short loops 
 
 from math import sqrt
 
-from boxreg_ros.core.method.arrays import POSE, SHARED, SPAN
+from boxreg_ros.core.method.arrays import PIVOT, POSE, SHARED, SPAN
 from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
 
@@ -210,9 +210,12 @@ def shift_known(known, own, across):
 
 
 @kernel
-def invert_poses(U, corner_inverse, blocks, border_blocks):
+def invert_poses(U, corner_inverse, blocks, link_blocks, border_blocks):
     """
-    Write the blocks of the poses in the inverse: own, (N, 6, 6), and with the border, (N, 6, 23).
+    Write the blocks of the poses in the inverse.
+
+    Their own, (N, 6, 6), those with the two poses after, (N, 6, 12), and with the border,
+    (N, 6, 23).
 
     The blocks of the inverse Z within the pattern of U follow from the last pose backward
     (Takahashi), beginning with that of the border, `corner_inverse` (23, 23). With r the two poses
@@ -236,6 +239,20 @@ def invert_poses(U, corner_inverse, blocks, border_blocks):
         for a in range(POSE):
             for b in range(POSE):
                 blocks[pose, a, b] = (own[a, b] + own[b, a]) / 2
+            for c in range(NEXT):
+                link_blocks[pose, a, c] = -across[a, c]
             for s in range(SHARED):
                 border_blocks[pose, a, s] = -across[a, NEXT + s]
         shift_known(known, blocks[pose], across)
+
+
+@kernel
+def add_sandwich(columns, G, found):
+    """Add the variance of the gradient, seen through rows (n, 15) of the inverse curvature."""
+    for i in range(len(columns)):
+        for k in range(PIVOT):
+            through = 0.0
+            for m in range(PIVOT):
+                through += columns[i, m] * G[m, k]
+            for j in range(len(columns)):
+                found[i, j] += through * columns[j, k]

@@ -1,10 +1,12 @@
-"""Covariances of one window (M26), and the residuals of its faces: once, at its end."""
+"""What is reported of one window, once, at its end: covariances (M26), residuals of its faces."""
 
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.arrays import EXTENT, GAP, PIVOT
+from boxreg_ros.core.method.arrowhead import add_sandwich
 from boxreg_ros.core.method.compile import kernel
 from boxreg_ros.core.method.expectation import FACES, HEADING, SIZE
+from boxreg_ros.core.method.kinematics import fill_kinematics
 from boxreg_ros.core.method.rotation import fill_rotation
 from boxreg_ros.core.method.weights import face_deviation
 import numpy as np
@@ -19,14 +21,15 @@ class Inverse(NamedTuple):
 
     Attributes
     ----------
-    poses, border : array, shapes (N, 6, 6) and (N, 6, 23)
-        Of each pose: its own, and those with the shared variables.
+    poses, links, border : array, shapes (N, 6, 6), (N, 6, 12) and (N, 6, 23)
+        Of each pose: its own, those with the two poses after it, and with the shared variables.
     corner : array, shape (23, 23)
         Of the shared variables.
 
     """
 
     poses: Any
+    links: Any
     border: Any
     corner: Any
 
@@ -82,18 +85,6 @@ def fill_unclaimed(length, marginalised, terms, common, shape, constants, G):
 
 
 @kernel
-def add_sandwich(columns, G, found):
-    """Add the variance of the gradient, seen through rows (n, 15) of the inverse curvature."""
-    for i in range(len(columns)):
-        for k in range(PIVOT):
-            through = 0.0
-            for m in range(PIVOT):
-                through += columns[i, m] * G[m, k]
-            for j in range(len(columns)):
-                found[i, j] += through * columns[j, k]
-
-
-@kernel
 def fill_pose_covariances(length, times, poses, inverse, G, constants, found):
     """Write the covariances of the poses, (N, 6, 6)."""
     shift = np.zeros(3)
@@ -130,7 +121,7 @@ def fill_extent_covariance(corner, free, common, G, found):
 @kernel
 def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, constants, found):
     """
-    Write the covariances of window `b`, and the residuals of its faces.
+    Write covariances, residuals of faces, velocities and accelerations of window `b`.
 
     Parameters
     ----------
@@ -160,3 +151,6 @@ def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, cons
     fill_unclaimed(length, marginalised, terms, common, shape, constants, G)
     fill_pose_covariances(length, problem.times[b], poses, inverse, G, constants, found.poses[b])
     fill_extent_covariance(inverse.corner, free_shared, common, G, found.extents[b])
+    forward, sideways, _ = problem.of_class[b].motion
+    deviations = np.array((forward, sideways, constants.vertical))
+    fill_kinematics(length, problem.times[b], poses, deviations, inverse, G, found.kinematics[b])

@@ -186,8 +186,9 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
     oldest = np.int64(1)  # for a literal 1 all that sums residuals would be compiled once more
     at, out, gradient = empty_axes(N), empty_linearised(), np.empty(n + SHARED)
     inverse = Inverse(
-        np.empty((N, POSE, POSE)), np.empty((N, POSE, SHARED)), np.empty((SHARED, SHARED))
-    )
+        np.empty((N, POSE, POSE)), np.empty((N, POSE, 2 * POSE)), np.empty((N, POSE, SHARED)),
+        np.empty((SHARED, SHARED)),
+    )  # fmt: skip
     for row in range(first, last):
         b = rows[row]
         terms, common = sums.terms[b], sums.common[b]
@@ -205,7 +206,7 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
         )  # fmt: skip
         if not is_done[row]:
             continue
-        invert_poses(A, inverse.corner, inverse.poses, inverse.border)
+        invert_poses(A, inverse.corner, inverse.poses, inverse.links, inverse.border)
         fill_posterior(
             b, problem, found, solution.shared[b], terms, common, free[b], inverse, constants,
             solution.posterior,

@@ -1,0 +1,100 @@
+"""Velocity (M29) and acceleration (M30) of the boxes of one window, and their covariances."""
+
+from boxreg_ros.core.method.arrays import POSE, SHARED
+from boxreg_ros.core.method.arrowhead import add_sandwich
+from boxreg_ros.core.method.compile import kernel
+import numpy as np
+
+RATES = (0, 1, 2, 5)
+"""Variables of a pose whose rates are estimated: x y z and yaw."""
+MIN_GAIN = 0.5
+"""
+Least part of the variance of an acceleration that the window must remove; chosen.
+
+Measured: with less, final accelerations err by more than zero does.
+
+"""
+
+
+@kernel
+def fill_combination(first, factors, inverse, G, found):
+    """Write the covariance (6, 6) of the sum of `factors` times the poses from `first` on."""
+    border = np.zeros((POSE, SHARED))
+    found[:] = 0.0
+    for a in range(len(factors)):
+        for i in range(POSE):
+            for s in range(SHARED):
+                border[i, s] += factors[a] * inverse.border[first + a, i, s]
+        for b in range(len(factors)):
+            for i in range(POSE):
+                for j in range(POSE):
+                    if a == b:
+                        own = inverse.poses[first + a, i, j]
+                    elif a < b:
+                        own = inverse.links[first + a, i, POSE * (b - a - 1) + j]
+                    else:
+                        own = inverse.links[first + b, j, POSE * (a - b - 1) + i]
+                    found[i, j] += factors[a] * factors[b] * own
+    add_sandwich(border, G, found)
+
+
+@kernel
+def fill_kinematics(length, times, poses, deviations, inverse, G, found):
+    """
+    Write velocity and acceleration of the boxes of a window, (N,) records `KINEMATICS`.
+
+    They are those of the three poses nearest to a box: the first and second difference of (M5).
+    At the ends the velocity has changed since the middle of the three, by an acceleration whose
+    covariance is that of (M30). No box shows the acceleration of the newest: it is not known.
+
+    Parameters
+    ----------
+    length : int
+        Observations of the window; with less than three, nothing is known.
+    times, poses : array, shapes (N,) and (N, 6)
+        Of the observations [s], and their estimate [m, rad].
+    deviations : array, shape (3,)
+        Of accelerations forward, sideways and upward (M23) [m/s^2].
+    inverse : Inverse
+        Blocks of the inverse curvature.
+    G : array, shape (15, 15)
+        As of `covariance.fill_unclaimed`.
+    found : array, shape (N,)
+        Written.
+
+    """
+    C, factors = np.empty((POSE, POSE)), np.empty(3)
+    prior = (deviations**2).sum()
+    for n in range(length if length > 2 else 0):
+        own = found[n]
+        first = min(max(n - 1, 0), length - 3)
+        last = first + 2
+        before, after = times[first + 1] - times[first], times[last] - times[first + 1]
+        duration = before + after
+        elapsed = times[n] - (times[first] + times[last]) / 2
+
+        factors[0], factors[2] = 2 / (before * duration), 2 / (after * duration)
+        factors[1] = -factors[0] - factors[2]
+        fill_combination(first, factors, inverse, G, C)
+        for i in range(4):
+            for j in range(4):
+                own.velocity_covariance[i, j] = elapsed**2 * C[RATES[i], RATES[j]]
+        for i in range(3):
+            middle = poses[first + 1, i]
+            own.acceleration[i] = factors[0] * (poses[first, i] - middle)
+            own.acceleration[i] += factors[2] * (poses[last, i] - middle)
+            for j in range(3):
+                own.acceleration_covariance[i, j] = C[i, j]
+        gain = 1 - (C[0, 0] + C[1, 1] + C[2, 2]) / prior
+
+        factors[0], factors[1], factors[2] = -1 / duration, 0.0, 1 / duration
+        fill_combination(first, factors, inverse, G, C)
+        is_finite = True
+        for i in range(4):
+            rate = (poses[last, RATES[i]] - poses[first, RATES[i]]) / duration
+            own.velocity[i] = rate
+            for j in range(4):
+                own.velocity_covariance[i, j] += C[RATES[i], RATES[j]]
+            is_finite &= np.isfinite(rate) and np.isfinite(own.velocity_covariance[i, i])
+        own.has_velocity = is_finite
+        own.has_acceleration = is_finite and gain >= MIN_GAIN and n < length - 1
