@@ -38,7 +38,7 @@ PREDICTED_FIELDS = ('initial_pose_with_covariance.pose', 'predicted_paths')
 """Fields of the kinematics that are read, and those of a PredictedObject."""
 INITIAL = 'initial_'
 """Begin of the names of pose, twist and acceleration in the kinematics of a PredictedObject."""
-MOTIONS = (('twist', 'twist', 'velocity'), ('acceleration', 'accel', 'acceleration'))
+TWIST_AND_ACCEL = (('twist', 'twist', 'velocity'), ('acceleration', 'accel', 'acceleration'))
 """Names of a motion in the kinematics, of the message within, and in `KINEMATICS`."""
 
 
@@ -130,7 +130,7 @@ def _with_pose(
         is_estimated = covariance is not None and bool(np.isfinite(covariance).all())
         fields['has_position_covariance'] = is_estimated or kinematics.has_position_covariance
     if is_flipped:
-        for name, inner, _ in MOTIONS:
+        for name, inner, _ in TWIST_AND_ACCEL:
             motion = getattr(kinematics, f'{prefix}{name}_with_covariance', None)
             if motion is not None:
                 rotated = poses.rotated_motion(motion, inner, HALF_TURN)
@@ -147,7 +147,7 @@ def _with_motion(kinematics: Any, found: NDArray[np.void]) -> Any:
     """Return a copy with twist and acceleration of `found` (1,), in the axes of the object."""
     prefix = _prefix_of(kinematics)
     fields: dict[str, Any] = {}
-    for name, inner, key in MOTIONS:
+    for name, inner, key in TWIST_AND_ACCEL:
         motion = getattr(kinematics, f'{prefix}{name}_with_covariance', None)
         if motion is not None and found[f'has_{key}'][0]:
             own = poses.motion_numbers(motion, inner)[None]

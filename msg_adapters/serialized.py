@@ -266,15 +266,15 @@ def _marker_labels(fields: Fields) -> BoxLabels:
 
 # ---------------------------------------------------------------- autoware_perception_msgs
 
-KINEMATICS = 'objects.kinematics.'
+OF_OBJECTS = 'objects.kinematics.'
 FOOTPRINT = 'objects.shape.footprint.points'
-TWIST_FIELD = KINEMATICS + 'twist_with_covariance.twist.linear.x'
-ACCELERATION_FIELD = KINEMATICS + 'acceleration_with_covariance.accel.linear.x'
-HAS_COVARIANCE = KINEMATICS + 'has_position_covariance'
-HAS_TWIST = KINEMATICS + 'has_twist'
+TWIST_FIELD = OF_OBJECTS + 'twist_with_covariance.twist.linear.x'
+ACCELERATION_FIELD = OF_OBJECTS + 'acceleration_with_covariance.accel.linear.x'
+HAS_COVARIANCE = OF_OBJECTS + 'has_position_covariance'
+HAS_TWIST = OF_OBJECTS + 'has_twist'
 AUTOWARE_FIELDS = (
     'objects.existence_probability', 'objects.classification', 'objects.classification.label',
-    'objects.classification.probability', KINEMATICS + 'orientation_availability', TWIST_FIELD,
+    'objects.classification.probability', OF_OBJECTS + 'orientation_availability', TWIST_FIELD,
     'objects.shape.type', FOOTPRINT, FOOTPRINT + '.x',
 )  # fmt: skip
 
@@ -307,7 +307,7 @@ def _has_no_cylinder(fields: Fields) -> bool:
 
 def _is_oriented(fields: Fields) -> NDArray[np.bool_]:
     """Return which objects have an orientation."""
-    availability = fields.numbers(KINEMATICS + 'orientation_availability', '|u1')[:, 0]
+    availability = fields.numbers(OF_OBJECTS + 'orientation_availability', '|u1')[:, 0]
     is_oriented: NDArray[np.bool_] = availability != autoware.ORIENTATION_UNAVAILABLE
     return is_oriented
 
@@ -433,11 +433,11 @@ def _jsk_labels(fields: Fields) -> BoxLabels:
 
 DETECTED_OBJECTS = BoxFields(
     ('header.frame_id',),
-    KINEMATICS + 'pose_with_covariance.pose.position.x',
+    OF_OBJECTS + 'pose_with_covariance.pose.position.x',
     'objects.shape.dimensions.x',
     _autoware_labels,
     others=(*AUTOWARE_FIELDS, HAS_COVARIANCE, HAS_TWIST),
-    covariance=KINEMATICS + 'pose_with_covariance.covariance',
+    covariance=OF_OBJECTS + 'pose_with_covariance.covariance',
     is_ordinary=_has_no_cylinder,
     has_angles=_is_oriented,
     write=_write_detected,

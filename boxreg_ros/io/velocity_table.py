@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 VELOCITIES = 'velocities.csv'
 RATE_NAMES = ('vx', 'vy', 'vz', 'yaw_rate')
 ACCELERATION_NAMES = ('ax', 'ay', 'az')
-COLUMNS = (
+VELOCITY_COLUMNS = (
     *('stamp_ns', 'track_id'),
     *RATE_NAMES,
     *(f'{a}_{b}' for a, b in combinations_with_replacement(RATE_NAMES, 2)),
@@ -33,7 +33,7 @@ class VelocityWriter:
 
     def __init__(self, path: Path) -> None:
         self._file = path.open('w', newline='', encoding='utf-8')
-        self._file.write(','.join(COLUMNS) + '\n')
+        self._file.write(','.join(VELOCITY_COLUMNS) + '\n')
 
     def write(self, refined: RefinedBoxes) -> None:
         """Add a row for each box with a velocity; an unknown acceleration is empty cells."""
@@ -67,7 +67,7 @@ def read_velocities(path: Path) -> dict[tuple[int, str], NDArray[np.void]]:
     try:
         with path.open(newline='', encoding='utf-8-sig') as file:
             for row in csv.DictReader(file):
-                texts = [row[name] for name in COLUMNS[2:]]
+                texts = [row[name] for name in VELOCITY_COLUMNS[2:]]
                 numbers = np.array([float(text or 'nan') for text in texts])
                 key = int(row['stamp_ns']), unprotected(row['track_id'])
                 found.setdefault(key, _record(numbers))

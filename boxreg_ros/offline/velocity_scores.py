@@ -16,7 +16,7 @@ DIFFERENCE_SECONDS = 0.3
 """Time that boxes are differenced over, up to the newest [s]; chosen: four boxes at 10 Hz."""
 SMOOTHER_SECONDS = 0.5
 """The smoother uses the boxes up to this time before and after one [s]; chosen."""
-LONGEST_STEP = 0.6
+LONGEST_TRUE_STEP = 0.6
 """True boxes farther from the next one have no true velocity [s]; chosen: keyframes at 2 Hz do."""
 ROUNDING = 0.02
 """Tolerance of times, since clouds do not come at exact periods [s]; chosen."""
@@ -107,7 +107,7 @@ def _rates(boxes: BoxTable, wanted: Ints, rate: Rate) -> Floats:
 
 
 def _central(times: Floats, places: Floats, i: int) -> Floats | None:
-    if i == 0 or i + 1 == len(times) or np.diff(times[i - 1 : i + 2]).max() > LONGEST_STEP:
+    if i == 0 or i + 1 == len(times) or np.diff(times[i - 1 : i + 2]).max() > LONGEST_TRUE_STEP:
         return None
     rates: Floats = (places[i + 1] - places[i - 1]) / (times[i + 1] - times[i - 1])
     return rates
