@@ -1,4 +1,4 @@
-"""Velocity (M29) and acceleration (M30) of the boxes of one window, and their covariances."""
+"""Velocity (M26a) and acceleration (M26b) of the boxes of one window, and their covariances."""
 
 from boxreg_ros.core.method.arrays import POSE, SHARED
 from boxreg_ros.core.method.arrowhead import add_sandwich
@@ -45,7 +45,7 @@ def fill_kinematics(length, times, poses, deviations, inverse, G, found):
 
     They are those of the three poses nearest to a box: the first and second difference of (M5).
     At the ends the velocity has changed since the middle of the three, by an acceleration whose
-    covariance is that of (M30). No box shows the acceleration of the newest: it is not known.
+    covariance is that of (M26b). No box shows the acceleration of the newest: it is not known.
 
     Parameters
     ----------
