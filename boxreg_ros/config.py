@@ -28,7 +28,8 @@ YAML_ERRORS = (yaml.YAMLError, ValueError, RecursionError)
 """Of `yaml.safe_load`: malformed text, dates that do not exist, and nesting that is too deep."""
 NODE_OPTIONS = (
     *('boxes_type', 'points', 'points_type', 'time_unit', 'sensor_frames', 'points_info'),
-    *('pose_reference', 'size_order', 'forward_axis', 'associate', 'boxes_offset'),
+    *('pose_reference', 'size_order', 'forward_axis', 'orientation', 'size_scale', 'boxes_frame'),
+    *('associate', 'boxes_offset'),
     *('clock_offset', 'fixed_frame', 'output_frame'),
     *('transform_timeout', 'deadline', 'backlog', 'static_points'),
     *('static_points_wait', 'config_file', 'input_model'),

@@ -200,7 +200,8 @@ class Reason(StrEnum):
         'pose_reference',
         'message',
         'its boxes are displaced from their points; the log has the figures',
-        'set `pose_reference`, `size_order` or `forward_axis` as the log suggests',
+        'set `pose_reference`, `size_order`, `forward_axis`, `orientation`, `size_scale` or '
+        '`boxes_frame` as the log suggests',
     )
     TRACK_IDS_JUMP = (
         'track_ids_jump',

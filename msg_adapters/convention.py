@@ -8,7 +8,12 @@ from math import isfinite, pi
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.options import option
-from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
+from boxreg_ros.rotations import (
+    matrix_from_rpy,
+    quaternion_from_rpy,
+    rpy_from_matrix,
+    rpy_from_quaternion,
+)
 from boxreg_ros.structures import (
     BOX_CENTER,
     BOX_EXTENT,
@@ -43,6 +48,17 @@ The sign follows the letter: YAML reads ``y`` as a boolean, a command line ``-y`
 
 """
 
+ORIENTATIONS = ('xyzw', 'wxyz', 'clockwise', 'left_handed')
+"""
+Meanings of the orientation of a pose.
+
+As ROS defines it; a quaternion whose w comes first; a yaw that grows to the right; this, and a y
+axis of the frame that points to the right, as in Unreal and CARLA.
+
+"""
+MIRRORED = np.array([1.0, 1, 1, 1, 1, 1, -1, 1, -1])
+"""Signs of the columns of a box where y is mirrored, but for its position."""
+
 
 @dataclass(frozen=True, slots=True)
 class Convention:
@@ -64,6 +80,24 @@ class Convention:
         'axis of the box pose that points forward (default: %(default)s)',
         choices=tuple(FORWARD),
     )
+    orientation: str = option(
+        'xyzw',
+        'meaning of the orientation of a box (default: %(default)s): wxyz if w of its quaternion '
+        'comes first, clockwise if yaw grows to the right, left_handed if y points to the right, '
+        'too',
+        choices=ORIENTATIONS,
+    )
+    size_scale: float = option(
+        1.0,
+        'full lengths per given size: 2 for half extents (default: %(default)s)',
+        metavar='FACTOR',
+        parse=float,
+    )
+    boxes_frame: str = option(
+        '',
+        'frame of the boxes, where their messages name another one',
+        metavar='FRAME',
+    )
     associate: bool = option(
         False, 'replace the track ids of the input: associate boxes over time'
     )
@@ -77,11 +111,21 @@ class Convention:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name, known in (('size_order', SIZE_ORDERS), ('forward_axis', tuple(FORWARD))):
+        choices = {
+            'size_order': SIZE_ORDERS,
+            'forward_axis': tuple(FORWARD),
+            'orientation': ORIENTATIONS,
+        }
+        for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise ConfigError(
                     f'{name}: expected one of {", ".join(known)}, got {getattr(self, name)!r}'
                 )
+        if not (isfinite(self.size_scale) and self.size_scale > 0):
+            raise ConfigError(
+                f'size_scale: expected a positive factor, got {self.size_scale}; half extents '
+                f'have 2'
+            )
         if not isfinite(self.stamp_offset):
             raise ConfigError(
                 f'stamp_offset: expected seconds, got {self.stamp_offset}; leave it out for none'
@@ -110,10 +154,11 @@ class Convention:
 
     def to_centers(self, boxes: BoxArray) -> BoxArray:
         """Return boxes of this convention with the pose at their centre, as in `structures`."""
-        changed = self._rotated(boxes.boxes, FORWARD[self.forward_axis])
-        changed[:, BOX_EXTENT] = boxes.boxes[:, self._columns]
+        changed = self._rotated(self._oriented(boxes.boxes), FORWARD[self.forward_axis])
+        changed[:, BOX_EXTENT] = boxes.boxes[:, self._columns] * self.size_scale
         changed[:, BOX_CENTER] -= self._offsets(changed)
-        return self._stamped(replace(boxes, boxes=changed))
+        frame_id = self.boxes_frame or boxes.frame_id
+        return self._stamped(replace(boxes, boxes=changed, frame_id=frame_id))
 
     def _stamped(self, boxes: BoxArray) -> BoxArray:
         """Return boxes with the stamp that theirs means; an array without a stamp has none."""
@@ -125,7 +170,8 @@ class Convention:
         """Return boxes with the pose at their centre in this convention."""
         changed = self._rotated(boxes.boxes, -FORWARD[self.forward_axis])
         changed[:, BOX_CENTER] += self._offsets(boxes.boxes)
-        changed[:, self._columns] = boxes.boxes[:, BOX_EXTENT]
+        changed[:, self._columns] = boxes.boxes[:, BOX_EXTENT] / self.size_scale
+        changed = self._oriented(changed, is_inverse=True)
         return replace(boxes, boxes=changed, kinematics=self._kinematics(boxes))
 
     def covariances_from_centers(self, boxes: BoxArray, covariances: Floats) -> Floats:
@@ -138,6 +184,8 @@ class Convention:
             rotated_axes = _rotation_axes(self._rotated(boxes.boxes, -angle))
             inverse = np.linalg.pinv(np.nan_to_num(rotated_axes))
             J[:, 3:, 3:] = (axes @ inverse).swapaxes(1, 2)
+        if self._is_mirrored:
+            J = (MIRRORED * self._y_sign)[[0, 1, 2, 6, 7, 8], None] * J
         return J @ covariances @ J.swapaxes(1, 2)
 
     def _kinematics(self, boxes: BoxArray) -> NDArray[np.void] | None:
@@ -152,7 +200,37 @@ class Convention:
         found['velocity'] = (J @ found['velocity'][..., None])[..., 0]
         found['velocity_covariance'] = J @ found['velocity_covariance'] @ J.swapaxes(1, 2)
         found['acceleration'][:, :2] -= rates[:, None] ** 2 * offsets[:, :2]
+        if self._is_mirrored:
+            signs = np.array([1.0, self._y_sign[1], 1.0, -1.0])  # x y z and the rate of yaw
+            found['velocity'] *= signs
+            found['velocity_covariance'] *= signs[:, None] * signs
+            found['acceleration'] *= signs[:3]
+            found['acceleration_covariance'] *= signs[:3, None] * signs[:3]
         return found
+
+    @property
+    def _is_mirrored(self) -> bool:
+        return self.orientation in ('clockwise', 'left_handed')
+
+    @property
+    def _y_sign(self) -> Floats:
+        """Return the signs (9,) of the columns of a box that the y axis of its frame has."""
+        signs = np.ones(9)
+        signs[1] = -1.0 if self.orientation == 'left_handed' else 1.0
+        return signs
+
+    def _oriented(self, boxes: Floats, is_inverse: bool = False) -> Floats:
+        """Return boxes (n, 9) with the orientation that theirs means, or the inverse of it."""
+        if self._is_mirrored:
+            return np.asarray(boxes * MIRRORED * self._y_sign)
+        if self.orientation == 'xyzw':
+            return boxes
+        changed = boxes.copy()
+        has_angles = np.isfinite(boxes[:, ROLL:]).all(axis=1)
+        order = [3, 0, 1, 2] if is_inverse else [1, 2, 3, 0]
+        quaternions = quaternion_from_rpy(boxes[has_angles, ROLL:])[:, order]
+        changed[has_angles, ROLL:] = rpy_from_quaternion(quaternions)
+        return changed
 
     @property
     def _columns(self) -> list[int]:

@@ -22,6 +22,7 @@ from boxreg_ros.io.findings import Finding
 from boxreg_ros.io.id_assignment import IdCheck, Tracker
 from boxreg_ros.io.lidars import ignore, MergedSweep, Report, SensorPlacement, SweepMerger
 from boxreg_ros.io.motion_check import MotionCheck
+from boxreg_ros.io.place_check import PlaceCheck
 from boxreg_ros.io.pose_check import PoseCheck
 from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame, TransformTree
 from boxreg_ros.reasons import Reason
@@ -92,6 +93,7 @@ class Session:
         self._has_boxes_without_frame = False
         self._has_clouds_without_frame = False
         self._pose_check = PoseCheck(self._convention, AT_ONCE)
+        self._place_check = PlaceCheck(self._convention, AT_ONCE)
 
     @property
     def config(self) -> Config:
@@ -107,6 +109,7 @@ class Session:
     def restart(self) -> None:
         """Forget all but the transforms; ids that were assigned are not used again."""
         self._pose_check = PoseCheck(self._convention, AT_ONCE)
+        self._place_check = PlaceCheck(self._convention, AT_ONCE)
         self._motion_check.restart()
         self._axis_check.forget()
         if self._id_check is not None:
@@ -150,6 +153,7 @@ class Session:
             motion = self.tree.motion(self.fixed_frame, item.frame_id, item.stamp_ns)
             moved = boxes_to_frame(item, T_fixed_item, self.fixed_frame, motion)
         self._pose_check.add(moved)
+        self._place_check.add(moved, T_fixed_item, self._other_frames(item))
         if isinstance(moved, BoxArray):
             if self._tracker is not None:
                 moved = self._tracker.identify(moved)
@@ -157,6 +161,20 @@ class Session:
                 self._id_check.add(moved)
             self._axis_check.add(moved)
         return Admitted(moved, T_fixed_item, reason, detail)
+
+    def _other_frames(self, item: Sweep | BoxArray) -> dict[str, Floats]:
+        """Return the poses of the frames that boxes may be in, beside that of their message."""
+        found: dict[str, Floats] = {}
+        if isinstance(item, Sweep) or not self._place_check.is_open:
+            return found
+        route = self.tree.route(self.fixed_frame, self.sensor_frame or item.frame_id)
+        names = {name for edge in route for name in (edge.parent, edge.child)}
+        for name in sorted(names - {item.frame_id}):
+            try:
+                found[name] = self.tree.lookup(self.fixed_frame, name, item.stamp_ns)
+            except TransformUnavailable:
+                continue
+        return found
 
     def merged(self, sweep: Sweep, extra: object = None) -> list[MergedSweep]:
         """
@@ -230,8 +248,9 @@ class Session:
             )
             found.append(Finding(Reason.TRANSFORM_FAULT, text))
         axes = self._axis_check.finding
-        # Points show which horizontal extent is which, motion also which axis points forward.
-        poses = axes or self._pose_check.finding
+        # Points show which horizontal extent is which, motion also which axis points forward;
+        # boxes in another place show neither.
+        poses = self._place_check.finding or axes or self._pose_check.finding
         if poses:
             found.append(Finding(Reason.POSE_REFERENCE, poses))
         if self.jumping_ids:

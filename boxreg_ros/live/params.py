@@ -11,7 +11,7 @@ from boxreg_ros.config import Config, Setting, setting, settings
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lidars import Lidars
 from msg_adapters import CLOUD_TYPES, POINTS_TYPE
-from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS
+from msg_adapters.convention import Convention, FORWARD, ORIENTATIONS, REFERENCES, SIZE_ORDERS
 from msg_adapters.point_layout import AUTO, TIME_UNIT_CHOICES
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -68,6 +68,18 @@ class NodeOptions:
     )
     forward_axis: str = setting(
         'x+', 'axis of the pose that points forward', choices=tuple(FORWARD)
+    )
+    orientation: str = setting(
+        'xyzw',
+        'meaning of the orientation of a box: wxyz if w of its quaternion comes first, clockwise '
+        'if yaw grows to the right, left_handed if y points to the right, too',
+        choices=ORIENTATIONS,
+    )
+    size_scale: float = setting(
+        1.0, 'full lengths per given size: 2 for half extents', '', 0.001, 1000.0
+    )
+    boxes_frame: str = setting(
+        '', 'frame of the boxes, where their messages name another one; empty: theirs'
     )
     associate: bool = setting(False, 'assign track ids by data association, ignoring those given')
     boxes_offset: float = setting(
@@ -133,8 +145,16 @@ class NodeOptions:
     @property
     def convention(self) -> Convention:
         """Return the convention of the poses and sizes of the input boxes."""
-        own = self.pose_reference, self.size_order, self.forward_axis, self.associate
-        return Convention(*own, self.boxes_offset)
+        return Convention(
+            self.pose_reference,
+            self.size_order,
+            self.forward_axis,
+            self.orientation,
+            self.size_scale,
+            self.boxes_frame,
+            self.associate,
+            self.boxes_offset,
+        )
 
     @property
     def lidars(self) -> Lidars:

@@ -21,7 +21,8 @@ RECORDINGS = (
 """Kinds of recordings, for the help of options."""
 TOPICS = (
     *('lidars', 'boxes', 'odometry', 'tf', 'clock_offset'),
-    *('pose_reference', 'size_order', 'forward_axis', 'stamp_offset'),
+    *('pose_reference', 'size_order', 'forward_axis', 'orientation', 'size_scale', 'boxes_frame'),
+    'stamp_offset',
 )
 """Options of `Request` for the topics to read, and for the convention of the boxes."""
 

@@ -228,7 +228,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_options(
         parser, Request, 'options', 'label_frame', 'lidars', 'odometry', 'tf', 'clock_offset',
-        'fixed_frame', 'pose_reference', 'size_order', 'forward_axis', 'stamp_offset',
+        'fixed_frame', 'pose_reference', 'size_order', 'forward_axis', 'orientation',
+        'size_scale', 'boxes_frame', 'stamp_offset',
     )  # fmt: skip
 
 

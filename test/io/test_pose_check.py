@@ -1,10 +1,22 @@
 """Conventions of pose and size: conversion by hand, round trips, and the check by points."""
 
+from dataclasses import replace
+from itertools import product
+
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.place_check import PlaceCheck
 from boxreg_ros.io.pose_check import DECISIVE_BOXES, PoseCheck
-from boxreg_ros.structures import BoxArray, Sweep
+from boxreg_ros.io.transforms import boxes_to_frame, inverse
+from boxreg_ros.structures import BoxArray, KINEMATICS, Sweep
 from msg_adapters import adapter_for
-from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS, STANDARD
+from msg_adapters.convention import (
+    Convention,
+    FORWARD,
+    ORIENTATIONS,
+    REFERENCES,
+    SIZE_ORDERS,
+    STANDARD,
+)
 from msg_adapters.poses import quaternions_of
 import numpy as np
 import pytest
@@ -18,6 +30,10 @@ QUARTER = np.pi / 2
 def array_of(*boxes, stamp_ns=STAMP):
     n = len(boxes)
     return BoxArray(stamp_ns, 'map', ('1',) * n, ('car',) * n, np.ones(n), np.array(boxes, float))
+
+
+def rpy_of(*xyzw):
+    return Rotation.from_quat(xyzw).as_euler('ZYX')[::-1]
 
 
 @pytest.mark.parametrize(
@@ -43,6 +59,14 @@ def array_of(*boxes, stamp_ns=STAMP):
         # y points forward: the heading is a quarter turn further than the yaw of the pose.
         ({'forward_axis': 'y+', 'size_order': 'wlh'}, [5, 6, 1, 2, 4, 1.5, 0, 0, 0.3],
          [5, 6, 1, 4, 2, 1.5, 0, 0, 0.3 + QUARTER]),
+        ({'size_scale': 2.0}, [5, 6, 1, 2, 1, 0.75, 0, 0, 0.3], [5, 6, 1, 4, 2, 1.5, 0, 0, 0.3]),
+        ({'orientation': 'clockwise'}, [5, 6, 1, 4, 2, 1.5, 0.1, 0.2, 0.3],
+         [5, 6, 1, 4, 2, 1.5, -0.1, 0.2, -0.3]),
+        ({'orientation': 'left_handed'}, [5, 6, 1, 4, 2, 1.5, 0.1, 0.2, 0.3],
+         [5, -6, 1, 4, 2, 1.5, -0.1, 0.2, -0.3]),
+        # (0, 0, sin, cos) of a yaw, filled in as w x y z, says a half turn about x and a yaw of 0.
+        ({'orientation': 'wxyz'}, [5, 6, 1, 4, 2, 1.5, *rpy_of(np.cos(0.15), 0, 0, np.sin(0.15))],
+         [5, 6, 1, 4, 2, 1.5, 0, 0, 0.3]),
         ({'forward_axis': 'x-'}, [5, 6, 1, 4, 2, 1.5, 0, 0, -3],
          [5, 6, 1, 4, 2, 1.5, 0, 0, np.pi - 3]),
     ],
@@ -57,18 +81,19 @@ def test_conversion_by_hand(settings, raw, center):
 @pytest.mark.parametrize('forward_axis', FORWARD)
 def test_conversion_round_trips(pose_reference, forward_axis):
     boxes = array_of([5, 6, 1, 4, 2, 1.5, 0.1, -0.2, 0.3], [5, 6, 1, 4, 2, 1.5, 0, 0, np.nan])
-    for order in SIZE_ORDERS:
-        convention = Convention(pose_reference, order, forward_axis)
+    for order, orientation in product(SIZE_ORDERS, ORIENTATIONS):
+        convention = Convention(pose_reference, order, forward_axis, orientation, 2.0)
         converted = convention.from_centers(convention.to_centers(boxes)).boxes
         np.testing.assert_allclose(converted[0], boxes.boxes[0], atol=1e-12)
         np.testing.assert_allclose(converted[1, 3:6], boxes.boxes[1, 3:6])
         assert np.isnan(converted[1, 8])
 
 
+@pytest.mark.parametrize('orientation', ['xyzw', 'left_handed', 'clockwise'])
 @pytest.mark.parametrize('forward_axis', ['x+', 'x-', 'y+', 'y-'])
-def test_covariance_is_transformed_to_the_reference_point(forward_axis):
+def test_covariance_is_transformed_to_the_reference_point(forward_axis, orientation):
     """The expected covariance is that of 40,000 random boxes after conversion."""
-    convention = Convention('rear_bottom', forward_axis=forward_axis)
+    convention = Convention('rear_bottom', forward_axis=forward_axis, orientation=orientation)
     box = np.array([5, 6, 1, 4, 2, 1.5, 0.05, -0.1, 2.0])
     given = np.diag([0.1, 0.2, 0.1, 0.02, 0.03, 0.05]) ** 2
     drawn = np.tile(box, (40000, 1))
@@ -81,6 +106,17 @@ def test_covariance_is_transformed_to_the_reference_point(forward_axis):
     assert np.abs((given - seen) / scale).max() > 0.2  # the conversion changes the covariance
 
 
+@pytest.mark.parametrize(('orientation', 'side'), [('left_handed', -1), ('clockwise', 1)])
+def test_velocities_are_mirrored_with_their_boxes(orientation, side):
+    kinematics = np.zeros(1, KINEMATICS)
+    kinematics['velocity'] = 3, 2, 1, 0.5
+    kinematics['velocity_covariance'][:] = 1.0
+    boxes = replace(array_of([5, 6, 1, 4, 2, 2, 0, 0, 0.3]), kinematics=kinematics)
+    found = Convention(orientation=orientation).from_centers(boxes).kinematics
+    np.testing.assert_array_equal(found['velocity'][0], [3, 2 * side, 1, -0.5])
+    np.testing.assert_array_equal(found['velocity_covariance'][0, 0], [1, side, 1, -1])
+
+
 @pytest.mark.parametrize(
     ('settings', 'expected'),
     [
@@ -89,6 +125,8 @@ def test_covariance_is_transformed_to_the_reference_point(forward_axis):
         ({'pose_reference': '0,1,nan'}, 'pose_reference'),
         ({'size_order': 'lw'}, 'size_order.*wlh'),
         ({'forward_axis': 'z'}, 'forward_axis.*x-'),
+        ({'orientation': 'zyxw'}, 'orientation.*wxyz'),
+        ({'size_scale': 0.0}, 'size_scale.*positive'),
     ],
 )
 def test_invalid_conventions_are_refused(settings, expected):
@@ -216,3 +254,49 @@ def test_the_check_pairs_equal_stamps_and_ends_after_enough_boxes():
         check.add(Sweep(STAMP, 'map', points))
     assert not check.finding
     assert np.isnan(quaternions_of(empty)).all()
+
+
+# Check of the place ------------------------------------------------------------------------------
+
+
+def placed(meant=STANDARD, frame='lidar', taken=STANDARD):
+    """Return the finding about boxes that are written with `meant`, in a frame of a LiDAR."""
+    true, points = scene()
+    T_fixed_lidar = np.eye(4)
+    T_fixed_lidar[:3, :3] = Rotation.from_euler('z', 0.4).as_matrix()
+    T_fixed_lidar[:3, 3] = 3, -5, 0
+    check = PlaceCheck(taken, tolerance=0.02)
+    for k in range(2):
+        given = array_of(*true, stamp_ns=STAMP + k * 10**8)
+        if frame == 'lidar':
+            given = boxes_to_frame(given, inverse(T_fixed_lidar), 'lidar')
+        boxes = taken.to_centers(meant.from_centers(given))
+        check.add(Sweep(STAMP + k * 10**8, 'map', points), T_fixed_lidar)
+        moved = boxes_to_frame(boxes, T_fixed_lidar, 'map')
+        check.add(moved, T_fixed_lidar, {'map': np.eye(4)})
+    return check.finding
+
+
+@pytest.mark.parametrize(
+    ('option', 'value'),
+    [('orientation', 'wxyz'), ('orientation', 'left_handed'), ('size_scale', 2.0)],
+)
+def test_boxes_that_are_tilted_mirrored_or_of_half_the_size_are_named(option, value):
+    meant = Convention(**{option: value})
+    text = placed(meant)
+    shown = '2' if option == 'size_scale' else value
+    assert f'set {option}:={shown}' in text
+    assert f'--{option.replace("_", "-")}' in text
+    assert placed(meant, taken=meant) == ''
+
+
+def test_boxes_of_another_frame_than_their_messages_name_are_named():
+    text = placed(frame='map')
+    assert 'set boxes_frame:=map (boxreg relabel: --boxes-frame map)' in text
+    assert Convention(boxes_frame='map').to_centers(array_of([1] * 9)).frame_id == 'map'
+
+
+@pytest.mark.parametrize('reference', ['center', 'bottom', 'top', 'front', 'rear_axle_bottom'])
+def test_boxes_that_another_check_is_for_have_no_other_place(reference):
+    assert placed(Convention(reference)) == ''
+    assert placed(Convention(size_order='wlh')) == ''

@@ -1,0 +1,224 @@
+"""Check of where boxes are: in another frame, mirrored, half as large, on their backs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from boxreg_ros.io.transforms import boxes_to_frame, inverse, moved_boxes
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.structures import (
+    BOX_CENTER,
+    BOX_EXTENT,
+    BoxArray,
+    Floats,
+    is_valid_box,
+    ROLL,
+    Sweep,
+    YAW,
+)
+from msg_adapters.convention import Convention
+import numpy as np
+from numpy.typing import NDArray
+
+ENOUGH_BOXES = 12
+"""Boxes with points around them that a finding needs; chosen."""
+MAX_COMPARED = 100
+"""Boxes after which the check ends; chosen: a second of 10 boxes at 10 Hz."""
+MIN_POINTS_AROUND = 10
+"""Points around a box that it is counted from; chosen."""
+POINT_MARGIN = 0.1
+"""Points up to this distance outside of a box are of its object [m]: range noise and labels."""
+GROUND_MARGIN = 0.2
+"""Points up to this height above the bottom of a box may be of the road [m]; chosen."""
+MIN_COVERAGE = 0.5
+"""
+Part of the points around them that boxes must contain to be in the right place.
+
+Chosen: boxes of a detector contain two thirds, those at another place a fifth.
+
+"""
+MIN_RATIO_OF_COVERAGE = 1.5
+"""
+Factor by which another place must be better, in the sum over the boxes.
+
+Chosen: on the sample the right place has 4 times that of the second, and twice its size 0.75.
+
+"""
+MIN_RATIO_OF_SIZES = 3.0
+"""
+Factor by which larger boxes must be better, in the mean: more of them have points around them.
+
+Chosen: half extents contain a tenth of what the whole ones do.
+
+"""
+MIN_UPRIGHT = 0.5
+"""Cosine of the tilt below which a box is not upright; derived: 60 degrees."""
+MIN_TILTED = 0.3
+"""Part of the boxes on their sides or backs; chosen: with w first, all but oncoming ones."""
+MAX_TILTED = 0.05
+"""Part of them that may be so where w is taken to come first; chosen."""
+NO_FRAMES: Mapping[str, Floats] = {}
+
+
+@dataclass(slots=True)
+class _Place:
+    """A place and size that the boxes may have, and the option that gives it."""
+
+    option: str
+    value: str
+    coverages: list[float] = field(default_factory=list)
+
+    @property
+    def mean(self) -> float:
+        """Return the mean part of the points around the boxes that these contain."""
+        return self.sum / max(1, len(self.coverages))
+
+    @property
+    def sum(self) -> float:
+        """Return the sum of these parts: few boxes in a wrong place have points around them."""
+        return float(np.sum(self.coverages))
+
+
+class PlaceCheck:
+    """
+    Compare the first boxes with the points around them, where they are and in other places.
+
+    A box of an object contains most of the points around it, whatever its size: those above the
+    ground within twice its extents. `finding` says which setting of the `convention` would put the
+    boxes there; it is empty if none does, or they are there. Sweeps and boxes arrive in any order,
+    in one frame, at most `tolerance` [s] apart.
+
+    """
+
+    def __init__(self, convention: Convention, tolerance: float) -> None:
+        self._convention = convention
+        self._tolerance_ns = round(tolerance * 1e9)
+        scale = 2 * convention.size_scale
+        self._meant = {
+            'mirrored': replace(convention, orientation='left_handed'),
+            'doubled': replace(convention, size_scale=scale),
+        }
+        self._own = _Place('', '')
+        self._others = {
+            'mirrored': _Place('orientation', 'left_handed'),
+            'doubled': _Place('size_scale', f'{scale:g}'),
+        }
+        self._tilted: list[tuple[bool, bool]] = []  # as read, and with w first
+        self._sweep: Sweep | None = None
+        self._boxes: BoxArray | None = None
+        self._frames: dict[str, Floats] = {}
+        self.finding = ''
+
+    @property
+    def is_open(self) -> bool:
+        """Return whether more boxes are compared."""
+        return len(self._tilted) < MAX_COMPARED and not self.finding
+
+    def add(
+        self,
+        item: Sweep | BoxArray,
+        T_fixed_item: Floats,
+        frames: Mapping[str, Floats] = NO_FRAMES,
+    ) -> None:
+        """
+        Add the next sweep or boxes, and update `finding`.
+
+        Parameters
+        ----------
+        item : Sweep or BoxArray
+            In the fixed frame.
+        T_fixed_item : array, shape (4, 4)
+            Pose of the frame of its message.
+        frames : mapping of str to array (4, 4)
+            Names of other frames, and their poses in the fixed one.
+
+        """
+        if not self.is_open:
+            return
+        if isinstance(item, Sweep):
+            self._sweep = item
+        else:
+            self._boxes = boxes_to_frame(item, inverse(T_fixed_item), '')
+            self._frames = {'': T_fixed_item, **frames}
+        if self._sweep is None or self._boxes is None:
+            return
+        if abs(self._sweep.stamp_ns - self._boxes.stamp_ns) <= self._tolerance_ns:
+            self._compare(self._sweep.in_frame().points, self._boxes)
+            self._sweep = self._boxes = None
+            self.finding = self._tilt_text() or self._place_text()
+
+    def _compare(self, points: NDArray[np.floating], array: BoxArray) -> None:
+        """Add what boxes in the frame of their message contain of the points, in each place."""
+        boxes = array.boxes[is_valid_box(array.boxes)][: MAX_COMPARED - len(self._tilted)]
+        count = len(boxes)
+        kept = BoxArray(0, '', ('',) * count, ('',) * count, np.ones(count), boxes)
+        raw = self._convention.from_centers(kept)
+        wxyz = replace(self._convention, orientation='wxyz').to_centers(raw).boxes
+        tilted = np.cos([boxes[:, ROLL:YAW], wxyz[:, ROLL:YAW]]).prod(axis=2) < MIN_UPRIGHT
+        self._tilted += [(bool(own), bool(other)) for own, other in tilted.T]
+        T = self._frames.pop('')
+        _add_coverages(self._own, points, moved_boxes(boxes, T))
+        for name, convention in self._meant.items():
+            meant = convention.to_centers(raw).boxes
+            _add_coverages(self._others[name], points, moved_boxes(meant, T))
+        for name, T_fixed_frame in self._frames.items():
+            place = self._others.setdefault(f'frame {name}', _Place('boxes_frame', name))
+            _add_coverages(place, points, moved_boxes(boxes, T_fixed_frame))
+
+    def _tilt_text(self) -> str:
+        """Return that the boxes lie on their backs, unless w of their quaternions comes first."""
+        own, wxyz = np.mean(self._tilted, axis=0)
+        is_decisive = len(self._tilted) >= ENOUGH_BOXES and own >= MIN_TILTED
+        if not is_decisive or wxyz > MAX_TILTED or self._convention.orientation == 'wxyz':
+            return ''
+        return (
+            f'{own:.0%} of the boxes lie on their sides or backs: expected orientation '
+            f"'wxyz', got {self._convention.orientation!r}; set orientation:=wxyz (boxreg "
+            f'relabel: --orientation wxyz)'
+        )
+
+    def _place_text(self) -> str:
+        """Return the place that the boxes should have; empty if it is not known, or theirs."""
+        fitting = [place for place in self._others.values() if self._is_better(place)]
+        if not fitting:
+            return ''
+        best = max(fitting, key=lambda place: place.sum)
+        got = {
+            'orientation': repr(self._convention.orientation),
+            'size_scale': f'{self._convention.size_scale:g}',
+            'boxes_frame': 'that of the messages',
+        }
+        option = best.option
+        return (
+            f'boxes do not fit the points: {len(self._own.coverages)} of {len(self._tilted)} have '
+            f'points around them, and contain {self._own.mean:.0%} of these; elsewhere '
+            f'{len(best.coverages)} and {best.mean:.0%}: expected {option} {best.value}, got '
+            f'{got[option]}; set {option}:={best.value} (boxreg relabel: '
+            f'--{option.replace("_", "-")} {best.value})'
+        )
+
+    def _is_better(self, place: _Place) -> bool:
+        """Return whether the boxes belong to another place, and not where they are."""
+        own = self._own
+        if len(place.coverages) < ENOUGH_BOXES or place.mean < MIN_COVERAGE:
+            return False
+        if place.option == 'size_scale' and place.mean < MIN_RATIO_OF_SIZES * own.mean:
+            return False
+        return place.sum >= MIN_RATIO_OF_COVERAGE * own.sum
+
+
+def _add_coverages(place: _Place, points: NDArray[np.floating], boxes: Floats) -> None:
+    """Add for each of n boxes (n, 9) with enough points around it the part that it contains."""
+    for box in boxes:
+        if not np.isfinite(box).all():
+            continue
+        away = points - box[BOX_CENTER]
+        reach = 1.1 * np.linalg.norm(box[BOX_EXTENT])
+        local = away[(np.abs(away) < reach).all(axis=1)] @ matrix_from_rpy(box[ROLL:])
+        limit = box[BOX_EXTENT] / 2
+        local = local[local[:, 2] > GROUND_MARGIN - limit[2]]
+        num_around = int((np.abs(local) <= 2 * limit).all(axis=1).sum())
+        if num_around >= MIN_POINTS_AROUND:
+            num_inside = int((np.abs(local) <= limit + POINT_MARGIN).all(axis=1).sum())
+            place.coverages.append(min(1.0, num_inside / num_around))
