@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
+from collections.abc import Collection
+from functools import partial
+from itertools import pairwise
+from statistics import median
 from threading import Event, Lock
 import time
 from typing import Any, NamedTuple
@@ -12,8 +16,11 @@ BOXES_PER_CLOUD = 20
 solver time and are published in order with the others, so many more of them than of clouds may
 wait."""
 
-RECOVERY = 10
-"""Clouds in time after which an overload has ended; chosen: a second at 10 Hz."""
+RECENT_CLOUDS = 10
+"""Last clouds that show whether the node keeps up; chosen: a second at 10 Hz."""
+SLOWER = 1.05
+"""Period of clouds taken, in periods of their arrival, from which on the node does not keep up;
+chosen: a solver that is 5 % too slow fills a backlog of 0.5 s in ten seconds."""
 
 
 class Message(NamedTuple):
@@ -97,29 +104,49 @@ class CloudPatience:
     """
     Decide which clouds are dropped, because the solver is slower than the data.
 
-    A cloud may wait `backlog` [s]. Where the waits beyond the deadline became longer twice in a
-    row, the node does not catch up, and would publish all boxes late by the backlog: from then on
-    each cloud that has waited longer than the deadline gives way to a newer one, until none had
-    to for `RECOVERY` clouds. After a single delay the waits become shorter.
+    A cloud may wait `backlog` [s]. Where the clouds of a LiDAR are taken less often than they
+    arrive, by the medians of the last ones, the node does not catch up, and would publish all
+    boxes late by the backlog: meanwhile each cloud that has waited longer than the deadline gives
+    way to a newer one. Delays that end leave the medians as they are: all clouds are taken, in
+    order.
 
     """
 
     def __init__(self, backlog: float) -> None:
         self.backlog = backlog
-        self._last_wait = 0.0
-        self._num_longer = 0  # in a row
-        self._until_recovery = 0
+        self._arrived = defaultdict[str, deque[float]](partial(deque[float], maxlen=RECENT_CLOUDS))
+        self._taken = defaultdict[str, deque[float]](partial(deque[float], maxlen=RECENT_CLOUDS))
 
-    def is_overdue(self, waited: float, deadline: float, has_newer: bool) -> bool:
-        """Return whether to drop a cloud that has waited for a time; both times in [s]."""
+    def is_overdue(
+        self, cloud: Message, since: float, now: float, deadline: float, has_newer: bool
+    ) -> bool:
+        """
+        Return whether to drop a cloud; each is asked for once.
+
+        Parameters
+        ----------
+        cloud : Message
+            The oldest one that waits.
+        since, now : float
+            When it could have been taken, and the time (monotonic) [s].
+        deadline : float
+            For its boxes [s].
+        has_newer : bool
+            Whether a later cloud of the same LiDAR waits.
+
+        """
+        arrived, taken = self._arrived[cloud.lidar], self._taken[cloud.lidar]
+        arrived.append(cloud.received_ns * 1e-9)
+        waited = now - since
         if waited > self.backlog:
             return True
-        is_late = waited > deadline and has_newer
-        is_longer = is_late and waited >= self._last_wait
-        self._num_longer = self._num_longer + 1 if is_longer else 0
-        self._last_wait = waited
-        if is_late and (self._until_recovery or self._num_longer > 1):
-            self._until_recovery = RECOVERY
+        if waited > deadline and has_newer and _period(taken) > SLOWER * _period(arrived):
             return True
-        self._until_recovery = max(0, self._until_recovery - 1)
+        taken.append(now)
         return False
+
+
+def _period(times: Collection[float]) -> float:
+    """Return the median time step; 0 while less than half of `RECENT_CLOUDS` are known."""
+    steps = [after - before for before, after in pairwise(times)]
+    return median(steps) if 2 * len(steps) >= RECENT_CLOUDS else 0.0

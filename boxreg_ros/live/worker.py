@@ -209,11 +209,11 @@ class Worker:
         """Return whether a message has waited too long for the solver."""
         # What arrived while a transform was waited for may take as long again to be solved.
         since = max(message.received_ns / 1e9, self._complete_at + self._waited)
-        waited = time.monotonic() - since
+        now = time.monotonic()
         if message.topic == 'boxes':
-            return waited > BOXES_PATIENCE * self._patience.backlog
-        deadline = self._budget.seconds
-        return self._patience.is_overdue(waited, deadline, self._inbox.has_newer(message))
+            return now - since > BOXES_PATIENCE * self._patience.backlog
+        has_newer = self._inbox.has_newer(message)
+        return self._patience.is_overdue(message, since, now, self._budget.seconds, has_newer)
 
     def _decoded(self, message: Message) -> Item | None:
         """Return a message decoded; boxes that cannot be decoded pass through."""

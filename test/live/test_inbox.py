@@ -1,6 +1,6 @@
 """The queues between the threads of the node: capacity, order, and clouds that give way."""
 
-from boxreg_ros.live.inbox import BOXES_PER_CLOUD, CloudPatience, Inbox
+from boxreg_ros.live.inbox import BOXES_PER_CLOUD, CloudPatience, Inbox, Message
 import numpy as np
 import pytest
 
@@ -32,16 +32,16 @@ def test_a_newer_cloud_is_one_of_the_same_lidar():
     assert inbox.has_newer(front)
 
 
-def run_queue(backlog, took):
+def run_queue(backlog, took, patience=None):
     """Return for each cloud of 10 Hz its wait, or None if dropped; each takes a time [s]."""
-    patience = CloudPatience(backlog)
+    patience = patience or CloudPatience(backlog)
     now = 0.0
     waits = []
     for number, duration in enumerate(took):
         arrived = 0.1 * number
         now = max(now, arrived)
-        has_newer = now >= arrived + 0.1
-        if patience.is_overdue(now - arrived, 0.08, has_newer):
+        cloud = Message(number, 'points', None, round(arrived * 1e9))
+        if patience.is_overdue(cloud, arrived, now, 0.08, now >= arrived + 0.1):
             waits.append(None)
         else:
             waits.append(round(now - arrived, 3))
@@ -52,9 +52,9 @@ def run_queue(backlog, took):
 @pytest.mark.parametrize(('took', 'share'), [(0.15, 0.65), (0.25, 0.38), (0.4, 0.24)])
 def test_under_lasting_overload_the_newest_cloud_goes_first(took, share):
     waits = run_queue(0.5, [took] * 100)
-    kept = [wait for wait in waits[10:] if wait is not None]
+    kept = [wait for wait in waits[30:] if wait is not None]
     assert max(kept) <= 0.1
-    assert len(kept) / 90 == pytest.approx(share, abs=0.05)
+    assert len(kept) / 70 == pytest.approx(share, abs=0.05)
 
 
 def test_after_one_delay_the_node_catches_up_without_drops():
@@ -68,27 +68,28 @@ def test_clouds_beyond_the_backlog_are_dropped():
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize('seconds', [0.11, 0.15, 0.3])
-def test_the_newest_first_drops_no_more_clouds_than_waiting_in_order(seconds):
-    """A solver that takes longer than the period of 0.1 s, and a quarter more at random."""
+@pytest.mark.parametrize('seconds', [0.12, 0.15, 0.3])
+def test_the_newest_first_drops_as_many_clouds_as_waiting_in_order(seconds):
+    """A solver that takes longer than the period of 0.1 s, by up to a quarter more or less."""
+    took = seconds * np.random.default_rng(0).uniform(0.75, 1.25, 1000)
+    newest, in_order = run_queue(0.5, took), run_queue(0.5, took, InOrder(0.5))
+    assert newest.count(None) <= in_order.count(None) + 20
+    of_newest, of_order = (
+        np.median([wait for wait in waits if wait is not None]) for waits in (newest, in_order)
+    )
+    assert of_newest < 0.6 * of_order
 
-    class InOrder(CloudPatience):
-        def is_overdue(self, waited, deadline, has_newer):
-            return waited > self.backlog
 
-    of_newest, of_order = (overloaded(policy(0.5), seconds) for policy in (CloudPatience, InOrder))
-    assert of_newest[0] <= of_order[0] + 0.05
-    assert of_newest[1] < 0.6 * of_order[1]
+def test_delays_that_end_drop_no_more_clouds_than_waiting_in_order():
+    """One cloud in eight takes a quarter of a second longer."""
+    is_delayed = np.random.default_rng(0).random(1000) < 1 / 8
+    took = np.where(is_delayed, 0.28, 0.03)
+    newest, in_order = run_queue(0.5, took), run_queue(0.5, took, InOrder(0.5))
+    assert newest.count(None) <= in_order.count(None) + 2 < 20
 
 
-def overloaded(patience, seconds, clouds=1000):
-    """Return the share of dropped clouds, and the median of the waits of the others [s]."""
-    factors = np.random.default_rng(0).uniform(0.75, 1.25, clouds)
-    now, waits = 0.0, []
-    for turn in range(clouds):
-        arrived = 0.1 * turn
-        now = max(now, arrived)
-        if not patience.is_overdue(now - arrived, 0.08, now >= arrived + 0.1):
-            waits.append(now - arrived)
-            now += seconds * factors[turn]
-    return 1 - len(waits) / clouds, np.median(waits)
+class InOrder(CloudPatience):
+    """Clouds are taken in their order, as long as they may wait."""
+
+    def is_overdue(self, cloud, since, now, deadline, has_newer):
+        return now - since > self.backlog
