@@ -150,7 +150,7 @@ def proposals_frames(out: Path) -> Iterator[tuple[bytes, int]]:
             yield page.screenshot(), 700
             page.keyboard.press('Enter')
             page.wait_for_function(
-                f"TRACKS.length === {count} && !$('tracks').hidden && view.space", timeout=120_000
+                f"TRACKS.length === {count} && !$('tracks').hidden && view.part", timeout=120_000
             )
             page.wait_for_timeout(SETTLE)
             yield page.screenshot(), 700
@@ -160,7 +160,7 @@ def before_and_after_frames(out: Path) -> Iterator[tuple[bytes, int]]:
     """Yield screenshots of a track: its points in the input boxes and in the refined ones."""
     url = f'{(out / REPORT).as_uri()}#track={densest_vehicle(out)}'
     with opened_page(url, **FILM) as page:
-        page.wait_for_function('view.space')
+        page.wait_for_function('view.part')
         for mode in ('before', 'after') * 2:
             page.select_option('#mode', mode)
             page.wait_for_timeout(SETTLE)

@@ -353,7 +353,16 @@ def labeller(results: Any) -> Iterable[str]:
     yield (
         f'{results["actions"]} actions ({kinds_of_actions}) and {results["seconds"]:.0f} s, of '
         f'these {results["thinking"]:.0f} s of thought; {results["actions_before"]} actions '
-        f'where files are edited by hand.'
+        f'where files are edited by hand. Of {results["broken_decisions"]["boxes"]} boxes that '
+        f'decisions are about, {results["broken_decisions"]["broken"]} are not as decided in the '
+        f'labels.'
+    )
+    nothing = results['from_nothing']
+    yield (
+        f'Without boxes: {nothing["tracks"]} tracks, {nothing["whole"]} of them whole, in '
+        f'{nothing["actions"]} actions; 3D IoU {number(nothing["iou"])}, of the worst track '
+        f'{number(nothing["least_iou"])}; {nothing["broken_decisions"]["broken"]} boxes are not '
+        f'as drawn.'
     )
 
 

@@ -128,8 +128,14 @@ def follow_points(
     seeds: Sequence[BoxArray],
     config: Config,
     origins: Floats | None = None,
+    grows: bool = True,
 ) -> list[FollowedTrack]:
-    """Follow as `follow` does, without the solve; `points` are those of `ascending`."""
+    """
+    Follow as `follow` does, without the solve; `points` are those of `ascending`.
+
+    A single seed grows to the points that are seen of its object, unless `grows` is False.
+
+    """
     times = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
     limits = None if origins is None else SightLimits(points, origins)
     sweeps = Sweeps(times, points, len(times), sight_limits=limits)
@@ -144,7 +150,7 @@ def follow_points(
     found: dict[int, FollowedTrack] = {}
     counts = [0 if one is None else one.num_points for one in followers]
     for index in np.argsort(-np.array(counts, int), kind='stable').tolist():
-        track = _followed(objects[index], followers[index], stamps_ns, times)
+        track = _followed(objects[index], followers[index], stamps_ns, times, grows)
         owned.add(track.rows, track.boxes, index)
         found[index] = track
     return [found[index] for index in range(len(objects))]
@@ -206,7 +212,7 @@ def _placed(track_id: str, given: Sequence[_Seed], stamps_ns: Ints) -> _Object:
 
 
 def _followed(
-    one: _Object, follower: Follower | None, stamps_ns: Ints, times: Floats
+    one: _Object, follower: Follower | None, stamps_ns: Ints, times: Floats, grows: bool
 ) -> FollowedTrack:
     """Return the track of an object: before its first seed, between all of them, and after."""
     if follower is None:
@@ -242,7 +248,7 @@ def _followed(
         ends.append(End(int(stamps_ns[last]), reason))
     rows = np.array(sorted(poses), np.int64)
     boxes = _boxes(rows, np.array([poses[row] for row in rows.tolist()]), seeds)
-    if len(seeds.rows) == 1:
+    if grows and len(seeds.rows) == 1:
         boxes = follower.grown(rows, boxes, one.is_of_class)
     words = tuple(status[row] for row in rows.tolist())
     return FollowedTrack(

@@ -98,7 +98,8 @@ def add_objects(
     first = 0
     for index, (part, store) in enumerate(zip(parts, stores, strict=True)):
         arrays = part.completed(fixed_frame)
-        found = followed(seeds_of.get(index, []), store, config)
+        # Their size is what a person has decided.
+        found = followed(seeds_of.get(index, []), store, config, grows=False)
         plan.add(followed_plan(arrays, corrections.added(found), has_seeds=False), first)
         tracks += found
         first += len(arrays)
@@ -111,13 +112,15 @@ def _away(store: SweepStore, stamp_ns: int) -> float:
     return float(np.abs(stamps_ns - stamp_ns).min()) if len(stamps_ns) else np.inf
 
 
-def followed(arrays: Sequence[BoxArray], store: SweepStore, config: Config) -> list[FollowedTrack]:
-    """Return the tracks of keyframes, in the fixed frame."""
+def followed(
+    arrays: Sequence[BoxArray], store: SweepStore, config: Config, grows: bool = True
+) -> list[FollowedTrack]:
+    """Return the tracks of keyframes, in the fixed frame; `grows` is that of `follow_points`."""
     if not len(store) or not arrays:
         return []
     seeds = [replace(array, boxes=_from_store(array.boxes, store, -1)) for array in arrays]
     stamps_ns = np.array(store.stamps_ns, np.int64)
-    found = follow_points(stamps_ns, store, seeds, config, store.sensor_origins)
+    found = follow_points(stamps_ns, store, seeds, config, store.sensor_origins, grows)
     return [replace(track, boxes=_from_store(track.boxes, store)) for track in found]
 
 

@@ -20,7 +20,9 @@ MAX_CLICKED = 400
 """Most points of a box that the page gets; as in a report."""
 
 
-def added_track(scene: DriveScene, seeds: Sequence[BoxArray], begin_ns: int) -> dict[str, Any]:
+def added_track(
+    scene: DriveScene, seeds: Sequence[BoxArray], begin_ns: int, grows: bool = False
+) -> dict[str, Any]:
     """
     Follow an added object from its boxes; return its track as the page shows it.
 
@@ -29,7 +31,7 @@ def added_track(scene: DriveScene, seeds: Sequence[BoxArray], begin_ns: int) -> 
     RecordingError if the recording cannot be read, or no seed can be followed.
 
     """
-    track = scene.follow(seeds)
+    track = scene.follow(seeds, grows)
     points = _Near(scene, track)
     changes = _changes(track, points)
     near = points.points_of(changes)

@@ -35,6 +35,14 @@ LEAST_DISTANCE = 0.05
 """Distances to a side below this count the same [m]: range noise."""
 MISSING = np.array([0.3, 0.5, 0.7])
 """Weights of length, width and height that are not seen; chosen: the width is seen more often."""
+DRAWN_STRIP = 0.6, 1.3
+"""Points up to half a length from the line that a person draws are of the object, within these
+bounds [m]; chosen: half a pedestrian with its arms, half a truck."""
+DRAWN_QUANTILE = 0.98
+"""Of width and height; chosen: one point in fifty may be of something else."""
+DRAWN_RANGE = (0.8, 0.8), (1.3, 1.6)
+"""Least and largest width and height of an object, in parts of those usual for its class; chosen:
+a van is a car half as high again."""
 USUAL_EXTENTS = {
     'car': np.array([4.5, 1.9, 1.6]),
     'truck': np.array([8.0, 2.6, 3.2]),
@@ -100,6 +108,55 @@ def fitted(
     z = bottom + grown[2] / 2
     angle = float(np.arctan2(np.sin(yaw), np.cos(yaw)))
     return Fitted(np.array([*center, z, *grown, 0, 0, angle]), class_name, int(own.sum()))
+
+
+def drawn(
+    points: NDArray[np.floating],
+    rear: Floats,
+    front: Floats,
+    extents: Mapping[str, Floats],
+) -> Fitted:
+    """
+    Return the box that a person draws from the middle of the rear (2,) to that of the front (2,).
+
+    The class is that of `extents` whose length and height are nearest. Width and height are those
+    of the points (M, 3) inside, within `DRAWN_RANGE` of the class.
+
+    """
+    along = front - rear
+    length, yaw = float(np.linalg.norm(along)), float(np.arctan2(along[1], along[0]))
+    middle = (rear + front) / 2
+    near = points[(np.abs(points[:, :2] - middle) < FIT_REACH + length / 2).all(1)]
+    near = near.astype(np.float64)
+    road = _road_below(near)
+    local = _turned(near[:, :2] - middle, -yaw)
+    beside = np.hypot(*(np.abs(local) - [length / 2, 0]).clip(0).T)
+    bottom = float(road[beside.argmin()]) if len(near) else 0.0
+    height = near[:, 2] - road
+    is_object = (height > FIT_CLEARANCE) & (height < MAX_HEIGHT)
+    is_along = is_object & (np.abs(local[:, 0]) < length / 2)
+    strip = np.clip(length / 2, *DRAWN_STRIP)
+    top = _top_of(height[is_along & (np.abs(local[:, 1]) < strip)])
+
+    def cost(usual: Floats) -> float:
+        ratios = np.log([length / usual[0], (top or usual[2]) / usual[2]])
+        return float(np.abs(ratios).sum())
+
+    class_name, usual = min(extents.items(), key=lambda one: cost(one[1]))
+    (narrow, wide), (low, high) = (np.array(DRAWN_RANGE).T * usual[1:, None]).tolist()
+    is_inside = is_along & (np.abs(local[:, 1]) < wide / 2)
+    own = np.abs(local[is_inside, 1])
+    width = usual[1]
+    if len(own) >= MIN_POINTS:
+        width = np.clip(2 * np.quantile(own, DRAWN_QUANTILE), narrow, wide)
+    tall = min(top, high) if top > low else usual[2]  # the top of others is not seen
+    box = np.array([*middle, bottom + tall / 2, length, width, tall, 0, 0, yaw])
+    return Fitted(box, class_name, int(is_inside.sum()))
+
+
+def _top_of(heights: Floats) -> float:
+    """Return the height of an object by those of its points (M,) [m]; 0 for too few of them."""
+    return float(np.quantile(heights, DRAWN_QUANTILE)) if len(heights) >= MIN_POINTS else 0.0
 
 
 def _road_below(points: Floats) -> Floats:

@@ -82,8 +82,13 @@ class DriveScene:
             sensor = np.append(self._origins[row], self._headings[row])
             return self._store.stamps_ns[row], self._store.origin, self._store[row], sensor
 
-    def follow(self, seeds: Sequence[BoxArray]) -> FollowedTrack:
-        """Follow an object from its boxes, and solve its track; RecordingError if that fails."""
+    def follow(self, seeds: Sequence[BoxArray], grows: bool = False) -> FollowedTrack:
+        """
+        Follow an object from its boxes, and solve its track; RecordingError if that fails.
+
+        With `grows`, a single box may grow to the points of the track.
+
+        """
         with self._changed:
             self._wait(None)
         origin = self._store.origin
@@ -93,7 +98,7 @@ class DriveScene:
         stamps_ns = np.array(self._store.stamps_ns, np.int64)
         moved = [BoxArray(s.stamp_ns, s.frame_id, s.track_ids, s.class_names, s.scores,
                           s.boxes - offset) for s in seeds]  # fmt: skip
-        (track,) = follow_points(stamps_ns, self._store, moved, config)
+        (track,) = follow_points(stamps_ns, self._store, moved, config, grows=grows)
         if not len(track.rows):
             raise RecordingError('; '.join(track.problems))
         origins = np.array(self._origins) - origin

@@ -7,7 +7,7 @@ from typing import Any
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.review.added import added_track
-from boxreg_ros.review.fit import fitted, USUAL_EXTENTS
+from boxreg_ros.review.fit import drawn, fitted, USUAL_EXTENTS
 from boxreg_ros.review.payload import as_json
 from boxreg_ros.review.requests import box_of, numbers_of, posted, stamp_of, text_of
 from boxreg_ros.review.scene import DriveImages, DriveScene, DriveSource, thinned
@@ -68,16 +68,18 @@ class SceneRoutes:
         return _bytes(head + points.tobytes())
 
     def _fit(self, sent: Mapping[str, Any]) -> bytes:
-        """Return the box of the object at a place."""
-        place = numbers_of(sent.get('place'), 'place', 2)
+        """Return the box of the object at a place, or of one that is drawn from there."""
         extents = _extents_of(sent.get('extents'))
         name = text_of(sent, 'class')
         if name:
             extents = {name: extents.get(name, USUAL_EXTENTS.get(name, USUAL_EXTENTS['car']))}
         _, origin, points, sensor = self._scene.sweep(_needed_stamp(sent))
-        found = fitted(
-            points, place - origin[:2], sensor[:2] - origin[:2], float(sensor[3]), extents
-        )
+        place = numbers_of(sent.get('place'), 'place', 2) - origin[:2]
+        if 'front' in sent:  # drawn from its rear, the place
+            front = numbers_of(sent.get('front'), 'front', 2) - origin[:2]
+            found = drawn(points, place, front, extents if name else USUAL_EXTENTS | extents)
+        else:
+            found = fitted(points, place, sensor[:2] - origin[:2], float(sensor[3]), extents)
         box = found.box + np.append(origin, np.zeros(6))
         answer = {'box': box, 'class': found.class_name, 'points': found.num_points}
         return as_json(answer)
@@ -90,7 +92,8 @@ class SceneRoutes:
         for seed in _objects_of(sent.get('seeds'), 'seeds'):
             box = box_of(seed.get('box'))[None]
             seeds.append(BoxArray(_needed_stamp(seed), self._frame_id, *names, np.ones(1), box))
-        return as_json(added_track(self._scene, seeds, begin_ns))
+        grows = sent.get('grows') is True
+        return as_json(added_track(self._scene, seeds, begin_ns, grows))
 
     def _accumulated(self, sent: Mapping[str, Any]) -> Response:
         """Return the points of all sweeps in the boxes of a track."""

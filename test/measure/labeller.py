@@ -2,17 +2,22 @@
 `measure labeller`: actions of a labeller until a drive with planted errors is right.
 
 The sample street gets 20 wrong boxes, 5 ghosts, 3 broken and 2 swapped tracks, and 3 objects lose
-their boxes. `boxreg relabel` runs, and a script reviews the result in a headless Chromium, by the
-mouse and the keys of a person. It knows the true boxes, as a person sees the points. Beside its
-actions are those of the page of the first release, which could neither delete, split, join nor
-add: there, files are edited by hand.
+their boxes. `boxreg relabel --complete` runs, and a script reviews the result in a headless
+Chromium, by the mouse and the keys of a person. It knows the true boxes, as a person sees the
+points. Beside its actions are those of the page of the first release, which could neither delete,
+split, join nor add: there, files are edited by hand.
+
+Then the drive loses all boxes: the script labels whole tracks, by the objects that the run
+proposes, and by boxes that it draws.
 
 """
 
 from collections import Counter
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 import subprocess
+import sys
 from tempfile import TemporaryDirectory
 import time
 
@@ -21,6 +26,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.review_command import drive_of
+from boxreg_ros.review.decisions import DECISIONS, held, read_decisions
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, REJECTED, YAW
 from browser import end_shared_browser, opened_page, serving
@@ -41,6 +47,15 @@ SECONDS = {'key': 0.28, 'click': 1.3, 'drag': 2.5}
 """Of the keystroke-level model: a key; pointing and a click; pointing, a press, pointing [s]."""
 TIMEOUT = 120_000
 """Of the page, on a loaded machine [ms]."""
+MIN_DRAWN_POINTS = 5
+"""True boxes with fewer points need not be in a whole track."""
+WHOLE = 0.9
+"""Part of the true boxes with points that a whole track has."""
+TRACKS = 20
+"""To label in a drive without boxes."""
+OFFERED = 0.75
+"""A proposed box with a smaller 3D IoU is drawn again."""
+CLASSES = ('car', 'van', 'truck', 'cyclist', 'pedestrian')
 THINKING = 1.35
 """Of the same model, before each decision [s]."""
 BEFORE = {
@@ -95,7 +110,83 @@ def measure(folder, seed=0):
         'seconds': labeller.seconds,
         'thinking': THINKING * labeller.decided.total(),
         'script_seconds': seconds,
+        'broken_decisions': broken_decisions(out.with_name('out.corrected')),
+        'from_nothing': from_nothing(folder, truth),
     }
+
+
+def from_nothing(folder, truth):
+    """Label the drive without its boxes; return actions, and the whole tracks with their IoU."""
+    out = folder / 'nothing'
+    command = ['relabel', str(STREET / 'street.mcap'), '-o', str(out), '--report']
+    command += ['--boxes', 'none', '--proposals', '--formats', 'csv']
+    subprocess.run([*BOXREG, *command], stdout=subprocess.DEVNULL, check=True)
+    labeller = reviewed(out, truth, with_boxes=False)
+    written = out.with_name('nothing.corrected')
+    ious, whole = whole_tracks(BoxTable.read(written / 'boxes.csv'), truth)
+    return {
+        'actions': labeller.actions.total(),
+        'kinds': dict(labeller.actions),
+        'decisions': dict(labeller.decided),
+        'tracks': len(ious),
+        'whole': len(whole),
+        'iou': float(np.mean(list(ious.values()))),
+        'least_iou': min(ious.values()),
+        'broken_decisions': broken_decisions(written),
+    }
+
+
+def whole_tracks(table, truth):
+    """Return the mean 3D IoU of the boxes of each track by object, and which tracks are whole."""
+    matches = Matches(truth)
+    ids = np.array(truth.track_ids)
+    ious = {}
+    whole = set()
+    for name in set(table.track_ids):
+        rows = np.flatnonzero(np.array(table.track_ids) == name)
+        near = matches.of_track(table.stamps_ns[rows].tolist(), table.boxes[rows])
+        owner = Counter(one for one, _, _ in near).most_common(1)[0][0]
+        wanted = (ids == owner) & (truth.num_points >= MIN_DRAWN_POINTS)
+        has_box = wanted & np.isin(truth.stamps_ns, table.stamps_ns[rows])
+        if not owner:
+            continue
+        ious[owner] = float(np.mean([overlap for _, overlap, _ in near]))
+        if has_box.sum() >= WHOLE * wanted.sum():
+            whole.add(owner)
+    return ious, whole
+
+
+def broken_decisions(out):
+    """Return how many boxes of a result are not as decided, of how many that were decided."""
+    table = BoxTable.read(out / 'boxes.csv')
+    keys = zip(table.track_ids, table.stamps_ns.tolist(), strict=True)
+    row_of = {key: row for row, key in enumerate(keys)}
+    decisions = held(read_decisions(out / DECISIONS))
+    stamps = {stamp for _, stamp in row_of}
+    new_id = {
+        (one.track_id, stamp): one.value
+        for one in decisions if one.kind == 'rename'
+        for stamp in stamps if one.covers(stamp)
+    }  # fmt: skip
+    broken = total = 0
+    for one in decisions:
+        if one.box is not None:
+            key = new_id.get((one.track_id, one.stamp_ns), one.track_id), one.stamp_ns
+            row = row_of.get(key, -1)
+            total += 1
+            broken += row < 0 or not np.allclose(table.boxes[row, :6], one.box[:6], atol=1e-6)
+        for (name, stamp), row in row_of.items():
+            if name != new_id.get((one.track_id, stamp), one.track_id) or not one.covers(stamp):
+                continue
+            is_label = table.status[row] != REJECTED
+            is_broken = {
+                'delete': is_label,
+                'accept': not is_label,
+                'reclass': table.class_names[row] != one.value,
+            }
+            total += one.kind in is_broken
+            broken += is_broken.get(one.kind, False)
+    return {'broken': int(broken), 'boxes': total}
 
 
 def judged(truth):
@@ -283,6 +374,104 @@ class Labeller:
         self.key('Control+s')
         self._page.wait_for_function("$('notice').textContent.includes('boxes in')",
                                      timeout=600_000)  # fmt: skip
+
+    def label(self):
+        """Label a drive without boxes: what is proposed, then the objects with the most points."""
+        self._page.wait_for_function('scene.sweep', timeout=TIMEOUT)
+        labelled = self._take_proposals()
+        ids = np.array(self._truth.track_ids)
+        most = {name: int(self._truth.num_points[ids == name].max()) for name in set(ids)}
+        left = sorted(most.keys() - labelled, key=most.get, reverse=True)
+        for name in left[: TRACKS - len(labelled)]:
+            if self._page.evaluate('$("drive").hidden'):
+                self.key('i')
+                self._page.wait_for_function('scene.isAdding && !$("drive").hidden')
+            rows = np.flatnonzero(ids == name)
+            self._draw(self._truth.boxes[self._row_to_draw(rows)])
+            self._keep('drawn')
+        self.key('Control+s')
+        self._page.wait_for_function("$('notice').textContent.includes('boxes in')",
+                                     timeout=600_000)  # fmt: skip
+
+    def _take_proposals(self):
+        """Follow the objects that are proposed; return their names."""
+        labelled = set()
+        seen = set()
+        while self._page.evaluate('openProposals().length'):
+            self._page.evaluate('scene.fit = null')
+            self.key('p')
+            self._page.wait_for_function('scene.fit && !$("drive").hidden')
+            self._page.wait_for_timeout(300)
+            stamp, box = self._page.evaluate('[scene.fit.stamp, scene.fit.box]')
+            if (stamp, str(box)) in seen:
+                break
+            seen.add((stamp, str(box)))
+            name, overlap, true_box = self._matches.of(int(stamp), np.array(box))
+            if not name or name in labelled:
+                continue
+            if overlap < OFFERED:
+                self._draw(true_box)
+            self._keep('drawn again' if overlap < OFFERED else 'proposed')
+            labelled.add(name)
+        return labelled
+
+    def _row_to_draw(self, rows):
+        """Return the row of the truth to draw: of the sweep that is shown, if it serves."""
+        points = self._truth.num_points[rows]
+        stamps = self._page.evaluate('DATA.stamps')
+        shown = self._truth.stamps_ns[rows] == int(stamps[self._page.evaluate('scene.at')])
+        if shown.any() and points[shown][0] >= points.max() / 2:
+            return rows[shown][0]
+        row = rows[int(points.argmax())]
+        at = stamps.index(str(self._truth.stamps_ns[row]))
+        self.click_slider('#scene-time', at, len(stamps) - 1)
+        # A click on the slider may be a sweep off: that one serves as well.
+        self._page.wait_for_function('scene.sweep?.stamp === DATA.stamps[scene.at]')
+        self._page.wait_for_timeout(300)
+        shown_ns = int(self._page.evaluate('DATA.stamps[scene.at]'))
+        return rows[int(np.abs(self._truth.stamps_ns[rows] - shown_ns).argmin())]
+
+    def _draw(self, box):
+        """Draw a box from its rear to its front, where both are in view."""
+        ends = [
+            (box[:2] + sign * box[3] / 2 * np.array([np.cos(box[8]), np.sin(box[8])])).tolist()
+            for sign in (-1, 1)
+        ]
+        places = """ends => {
+          const bounds = $('scene-view').getBoundingClientRect(), { to } = sceneAxes();
+          return ends.map(end => to(end)).map(([x, y]) => [bounds.left + x, bounds.top + y,
+            x > 4 && y > 4 && x < bounds.width - 4 && y < bounds.height - 4]); }"""
+        for key in ('0', '-', '-', '-', ''):
+            found = self._page.evaluate(places, ends)
+            if all(is_in_view for *_, is_in_view in found) or not key:
+                break
+            self.key(key)
+        before = self._page.evaluate('scene.fit?.box ?? null')
+        is_adding = self._page.evaluate('scene.isAdding')
+        self.actions['drag'] += 1
+        if not is_adding:
+            self._page.keyboard.down('Control')
+        self._page.mouse.move(*found[0][:2])
+        self._page.mouse.down()
+        self._page.mouse.move(*found[1][:2], steps=4)
+        self._page.mouse.up()
+        if not is_adding:
+            self._page.keyboard.up('Control')
+        self._page.wait_for_function(
+            'before => scene.fit && String(scene.fit.box) !== String(before)', arg=before
+        )
+        self._page.wait_for_timeout(500)
+
+    def _keep(self, kind):
+        """Follow the object that is offered."""
+        self.decided[kind] += 1
+        count = self._page.evaluate('TRACKS.length')
+        self.key('Enter')
+        self._page.wait_for_function(
+            f"TRACKS.length > {count} && !$('tracks').hidden && view.part && "
+            'view.open === TRACKS.at(-1)',
+            timeout=TIMEOUT,
+        )
 
     def _look(self):
         """Decide about the open track, and go on with the next one."""
@@ -510,13 +699,18 @@ class Labeller:
         self._page.wait_for_function(until)
 
 
-def reviewed(out, truth):
+def reviewed(out, truth, with_boxes=True):
     """Review a result until it is right, write the labels, and return who did it."""
+    classes = () if with_boxes else CLASSES
     with (
-        serving(review_server([(out, drive_of(out))], 0, 'script')) as server,
+        redirect_stdout(sys.stderr),  # the measurement prints one document
+        serving(review_server([(out, drive_of(out))], 0, 'script', classes)) as server,
         opened_page(server.address, expected='409') as page,
     ):
         labeller = Labeller(page, truth)
-        labeller.review()
+        if with_boxes:
+            labeller.review()
+        else:
+            labeller.label()
     end_shared_browser()
     return labeller

@@ -258,9 +258,9 @@ def test_boxes_are_drawn_copied_and_corrected_in_the_drive(out, serve):
     assert np.cos(first.box[8] - moved[8]) == pytest.approx(1)
 
 
-LIT = """(() => {
-  const { gl } = gpu, [w, h] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
-  drawScene();
+LIT = """((name, draw) => {
+  const { gl } = gpuOf($(name)), [w, h] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+  draw();
   const pixels = new Uint8Array(4 * w * h), found = new Map();
   gl.readPixels(0, 0, w, h, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
   for (let i = 0; i < pixels.length; i += 4) {
@@ -268,27 +268,67 @@ LIT = """(() => {
     const key = pixels.slice(i, i + 3).join();
     found.set(key, (found.get(key) ?? 0) + 1);
   }
-  return [...found].sort((a, b) => b[1] - a[1]); })()"""
+  return [...found].sort((a, b) => b[1] - a[1]); })"""
 """The colours of the pixels with points, and how many have each."""
 
 
 def test_points_of_the_drive_have_colours_and_add_up(serve):
     with serve() as server, opened_page(server.address + '#drive') as page:
         page.wait_for_function('scene.sweep')
-        if not page.evaluate('Boolean(gpu.gl)'):
+        if not page.evaluate("Boolean(gpuOf($('scene-points')).gl)"):
             pytest.skip('this Chromium has no WebGL 2')
-        plain = page.evaluate(LIT)
+        plain = page.evaluate(f"{LIT}('scene-points', drawScene)")
         assert sum(count for _, count in plain) > 100
         for mode, least in (('height', 5), ('track', 2), ('status', 1)):
             page.select_option('#scene-colour', mode)
-            found = page.evaluate(LIT)
+            found = page.evaluate(f"{LIT}('scene-points', drawScene)")
             assert len(found) >= least, mode
             assert found != plain, mode
         style = 'rgbOfStyle(boxColour(scene.boxes[0])).slice(0, 3).join()'
         assert page.evaluate(style) in dict(found)
         page.select_option('#scene-sweeps', '5')
         page.wait_for_function('scene.clouds.length === 5')
-        assert sum(n for _, n in page.evaluate(LIT)) > 1.2 * sum(n for _, n in found)
+        assert sum(n for _, n in page.evaluate(f"{LIT}('scene-points', drawScene)")) > 1.2 * sum(
+            n for _, n in found
+        )
+
+
+def test_a_track_is_shown_in_3d_by_the_same_program_and_turned(serve):
+    lit = f"{LIT}('space-points', drawSpace)"
+    with serve() as server, opened_page(server.address + '#track=2') as page:
+        page.wait_for_function('view.cloud')  # with all points of the sweep
+        if not page.evaluate("Boolean(gpuOf($('space-points')).gl)"):
+            pytest.skip('no WebGL 2')
+        before = page.evaluate(lit)
+        assert {tuple(map(int, colour.split(','))) for colour, _ in before[:1]} & {
+            tuple(page.evaluate("rgbOf('points')"))
+        }
+        turn, tilt = page.evaluate('[space.turn, space.tilt]')
+        bounds = page.locator('#space-lines').bounding_box()
+        page.mouse.move(bounds['x'] + 40, bounds['y'] + 60)
+        page.mouse.down()
+        page.mouse.move(bounds['x'] + 140, bounds['y'] + 80, steps=4)
+        page.mouse.up()
+        turned = page.evaluate('[space.turn, space.tilt]')
+        assert turned == pytest.approx([turn - 0.6, tilt - 0.12])
+        assert sum(n for _, n in page.evaluate(lit)) > 0
+        # A point and a line at one place are at one pixel.
+        page.evaluate('view.local = [[1, 0.4, 0.3]], view.far = [], view.lines = []')
+        ((_, count),) = page.evaluate(lit)
+        x, y = page.evaluate('spaceAxes().to([1, 0.4, 0.3])')
+        places = np.array(
+            page.evaluate("""() => {
+          const { gl } = gpuOf($('space-points'));
+          const [w, h] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+          drawSpace();
+          const pixels = new Uint8Array(4 * w * h), at = [];
+          gl.readPixels(0, 0, w, h, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+          for (let i = 0; i < w * h; i++)
+            if (pixels[4 * i + 3]) at.push([i % w, h - 1 - (i / w | 0)]);
+          return at; }""")
+        )
+        assert len(places) == count < 16
+        np.testing.assert_allclose(places.mean(0) + 0.5, [x, y], atol=1.5)
 
 
 def test_the_track_follows_a_box_while_it_is_dragged(serve):

@@ -527,7 +527,7 @@ def test_page_waits_for_the_rest_of_what_is_half_read(result, half_read):
     place = source.index(b'</script>', source.index(f'id="{half_read}"'.encode())) - 100
     with slowly_served(source, place) as url, opened_page(f'{url}#tracks', '404') as page:
         page.evaluate('openTrack(0)')
-        page.wait_for_function('view.space && view.charts')
+        page.wait_for_function('view.part && view.charts')
 
 
 @NEEDS_BROWSER
@@ -573,7 +573,7 @@ def test_slider_keys_and_links_step_through_a_track(result):
         page.keyboard.press('Shift+ArrowRight')
         assert row() == 13
         assert page.evaluate("document.getElementById('top').toDataURL()") != before
-        page.wait_for_function("location.hash.includes('stamp=') && view.space && view.charts")
+        page.wait_for_function("location.hash.includes('stamp=') && view.part && view.charts")
         page.keyboard.press('ArrowDown')
         press(page, 'ArrowUp', 'view.part !== null')
         for mode in ('after', 'before', 'sweep'):

@@ -14,7 +14,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
-from boxreg_ros.review.fit import fitted
+from boxreg_ros.review.fit import drawn, fitted, USUAL_EXTENTS
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray
 from browser import NEEDS_BROWSER, opened_page, press, serving
@@ -252,7 +252,7 @@ def test_a_drive_without_boxes_is_labelled_from_its_recording_alone(tmp_path, pr
 
 
 @NEEDS_BROWSER
-def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, out, serve):
+def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, made, out, serve):
     with opened_page(serve(out).address) as page:
         open_scene(page, 3)
         # All points of the sweep: those of both cars, one of which has no box.
@@ -287,7 +287,7 @@ def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, out, serve):
         open_scene(page, 2)
         assert page.evaluate('document.documentElement.scrollWidth - innerWidth') <= 0
         assert page.locator('#scene-view').bounding_box()['height'] > 300
-    recording = out.with_name('drive')
+    recording = made.with_name('drive')
     recording.rename(out.with_name('moved'))
     with opened_page(serve(out).address, expected='400') as page:
         page.click('#tab-drive')
@@ -296,6 +296,7 @@ def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, out, serve):
         assert str(recording) in text and 'Put the recording back' in text
         page.click('#tab-tracks')
         press(page, 'a', 'log.count === 1')
+    out.with_name('moved').rename(recording)
 
 
 def test_a_run_follows_added_objects_beside_its_other_steps(drive, tmp_path, capsys):
@@ -353,3 +354,25 @@ def test_a_box_is_fitted_to_the_points_at_a_place():
     assert abs(math.cos(turned - yaw) + 1) < 0.01
     with pytest.raises(RecordingError, match='expected points of an object'):
         fitted(points, np.array([20.0, -10.0]), sensor, 0.0, sizes)
+
+
+def test_a_box_is_drawn_with_the_class_the_width_and_the_height_of_its_points():
+    """A van half as high again as a car, whose roof is not seen, and an object of no points."""
+    rng = np.random.default_rng(5)
+    road = np.column_stack([rng.uniform(-15, 25, (4000, 2)), rng.normal(0, 0.02, 4000)])
+    yaw, center, size = math.radians(30), np.array([12.0, 4.0]), np.array([5.2, 2.0, 2.4])
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    local = rng.uniform(-0.5, 0.5, (600, 2)) * size[:2]
+    local[:400, 1] = -size[1] / 2
+    local[400:, 0] = -size[0] / 2
+    van = np.column_stack([local @ turn.T + center, rng.uniform(0.2, size[2], 600)])
+    points = np.concatenate([road, van])
+    half = size[0] / 2 * turn[:, 0]
+    found = drawn(points, center - half, center + half, USUAL_EXTENTS)
+    truth = np.array([*center, size[2] / 2, *size, 0, 0, yaw])
+    assert iou_3d(found.box[None], truth[None])[0] > 0.9
+    assert found.class_name == 'car'
+    empty = drawn(road, np.array([-8.0, 0]), np.array([-8.0, 1.8]), USUAL_EXTENTS)
+    assert empty.class_name == 'cyclist'
+    np.testing.assert_allclose(empty.box[3:6], [1.8, 0.7, 1.7])
+    assert empty.box[2] - 0.85 == pytest.approx(0, abs=0.1)

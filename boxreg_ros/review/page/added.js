@@ -22,7 +22,7 @@ async function followAdded() {
   for (const id of ids) await followOne(id);
 }
 
-const askToFollow = (id, name, seeds) => post('follow', { id, class: name, begin_ns: DATA.begin_ns, seeds: seeds.map(row => ({ stamp: row.stamp_ns, box: row.box })) });
+const askToFollow = (id, name, seeds, grows = false) => post('follow', { id, class: name, grows, begin_ns: DATA.begin_ns, seeds: seeds.map(row => ({ stamp: row.stamp_ns, box: row.box })) });
 
 async function followOne(id) {
   const seeds = seedsOf(id), key = JSON.stringify(seeds.map(row => [row.stamp_ns, row.box, row.value]));
@@ -86,9 +86,18 @@ function nextId() {
   return String(1 + Math.max(0, ...ids.filter(id => /^\d{1,9}$/.test(id)).map(Number)));
 }
 
-// Add an object with a box at a stamp, and open its track.
-async function addObject(stamp, box, name) {
+// A box that was fitted to the points of one sweep, as large as those of all show it: it is decided about as such.
+async function grownBox(id, stamp, box, name) {
+  try {
+    const { part } = await askToFollow(id, name, [{ stamp_ns: stamp, box }], true), row = part.stamps.indexOf(stamp);
+    return row < 0 ? box : moved(part.boxes[row], part.origin, 1);
+  } catch { return box; }  // the page says it with the decision
+}
+
+// Add an object with a box at a stamp, and open its track; what a person has drawn stays as it is.
+async function addObject(stamp, box, name, isByHand = true) {
   const id = nextId();
+  if (!isByHand) box = await grownBox(id, stamp, box, name);
   const isDone = await decide([rowOf({ track_id: id, stamp_ns: stamp, end_ns: '' }, 'add', { box, value: name })]);
   const index = TRACKS.findIndex(track => track.id === id);
   if (!isDone || index < 0) return false;

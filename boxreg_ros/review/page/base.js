@@ -15,7 +15,7 @@ let TRACKS = [];                   // tracks as decided: split, joined, renamed
 // The line `track` is selected; `open` is the track whose `part` is shown.
 /** @type {any} */
 const view = { track: -1, open: null, part: null, row: 0, mark: null, sort: 'rank', descending: false, shown: [], place: 0,
-               space: false, charts: false, pending: false, edit: null, isMoved: false, playing: 0,
+               charts: false, edit: null, isMoved: false, playing: 0,
                zoom: 1, center: [0, 0, 0], around: [], solved: null, formats: [], classes: [], changed: new Set() };
 
 const isKnown = value => value !== null && value !== undefined && Number.isFinite(value);

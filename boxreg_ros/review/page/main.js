@@ -179,7 +179,7 @@ function zoomByButton(sign) {
 }
 
 function redrawAll() {
-  view.space = view.charts = false;
+  view.charts = false;
   $('map').replaceChildren();
   if (!$('overview').hidden) { drawMap(); drawOverview(); drawTimeline(); drawExample(); }
   if (view.part && !$('tracks').hidden) { drawViews(); drawCharts(); }
@@ -218,6 +218,7 @@ async function main() {
     setUpPinch($(name), (factor, event) => zoomBy(factor, $(name), event));
     setUpDragging($(name));
   }
+  setUpSpace();
   setUpSizes();
   for (const one of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll('[data-zoom]'))) one.onclick = () => zoomByButton(Number(one.dataset.zoom));
   for (const one of TABS) $('tab-' + one).onclick = () => {

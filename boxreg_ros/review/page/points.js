@@ -1,8 +1,8 @@
-// The points of sweeps, drawn by the GPU below the boxes of the scene ------------------------------
-// One program and one call for each sweep. Positions are relative to the origin of the drive, so that
+// Clouds of points, drawn by the GPU below the boxes of the drive, or of a track --------------------
+// One program a canvas, and one call for each cloud. Positions are relative to an origin nearby, so that
 // numbers of 32 bits are exact to a tenth of a millimetre, and are uploaded once.
 
-const MAX_BUFFERS = 24;            // sweeps that stay on the GPU
+const MAX_BUFFERS = 24;            // clouds that stay on the GPU
 const VERTEX = `#version 300 es
 in vec3 place; in vec4 tint; uniform vec3 center; uniform vec4 turn; uniform vec2 scale; uniform float size; out vec4 colour;
 void main() {
@@ -17,15 +17,17 @@ const FRAGMENT = `#version 300 es
 precision highp float; in vec4 colour; out vec4 shown;
 void main() { shown = vec4(colour.rgb * colour.a, colour.a); }`;
 
-/** @type {any} */
-const gpu = { buffers: new Map() };
+/** @type {Map<HTMLElement, any>} */
+const gpus = new Map();            // by canvas
 
-// The context with its program; null where there is no WebGL 2: points are drawn by the processor then.
+// The context of a canvas with its program; without `gl` where there is no WebGL 2: points are drawn by the processor then.
 function gpuOf(canvas) {
-  if (gpu.isAsked) return gpu.gl;
-  gpu.isAsked = true;
-  const gl = gpu.gl = canvas.getContext('webgl2', { antialias: false, alpha: true });
-  if (!gl) return null;
+  if (gpus.has(canvas)) return gpus.get(canvas);
+  const gl = canvas.getContext('webgl2', { antialias: false, alpha: true });
+  /** @type {any} */
+  const gpu = { gl, buffers: new Map() };
+  gpus.set(canvas, gpu);
+  if (!gl) return gpu;
   const program = gl.createProgram();
   for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
     const shader = gl.createShader(kind);
@@ -36,22 +38,28 @@ function gpuOf(canvas) {
   gl.linkProgram(program);
   gpu.program = program;
   gpu.at = Object.fromEntries(['center', 'turn', 'scale', 'size'].map(name => [name, gl.getUniformLocation(program, name)]));
-  canvas.addEventListener('webglcontextlost', event => { event.preventDefault(); gpu.buffers.clear(); });
-  canvas.addEventListener('webglcontextrestored', () => { gpu.isAsked = false; gpu.buffers.clear(); drawScene(); });
-  return gl;
+  canvas.addEventListener('webglcontextlost', event => event.preventDefault(), { once: true });
+  canvas.addEventListener('webglcontextrestored', () => { gpus.delete(canvas); redrawClouds(); }, { once: true });
+  return gpu;
 }
 
-// The buffers of a sweep: places, and colours that are uploaded again when `key` changes.
-function bufferOf(gl, sweep, key) {
+function redrawClouds() {
+  drawScene();
+  if (view.part && !$('tracks').hidden) drawSpace();
+}
+
+// The buffers of a cloud: places, and colours that are uploaded again when `key` changes.
+function bufferOf(gpu, sweep, key) {
+  const { gl } = gpu;
   let known = gpu.buffers.get(sweep);
   if (!known) {
     known = { array: gl.createVertexArray(), places: gl.createBuffer(), tints: gl.createBuffer(), key: null };
     gl.bindVertexArray(known.array);
     gl.bindBuffer(gl.ARRAY_BUFFER, known.places);
     gl.bufferData(gl.ARRAY_BUFFER, sweep.points, gl.STATIC_DRAW);
-    attribute(gl, 'place', 3, gl.FLOAT, false);
+    attribute(gpu, 'place', 3, gl.FLOAT, false);
     gl.bindBuffer(gl.ARRAY_BUFFER, known.tints);
-    attribute(gl, 'tint', 4, gl.UNSIGNED_BYTE, true);
+    attribute(gpu, 'tint', 4, gl.UNSIGNED_BYTE, true);
   }
   if (known.key !== key) {
     gl.bindBuffer(gl.ARRAY_BUFFER, known.tints);
@@ -70,30 +78,30 @@ function bufferOf(gl, sweep, key) {
   return known;
 }
 
-function attribute(gl, name, count, kind, isShare) {
-  const at = gl.getAttribLocation(gpu.program, name);
+function attribute({ gl, program }, name, count, kind, isShare) {
+  const at = gl.getAttribLocation(program, name);
   gl.enableVertexAttribArray(at);
   gl.vertexAttribPointer(at, count, kind, isShare, 0, 0);
 }
 
-// Draw sweeps; whether there is a GPU to do so.
-function drawClouds(canvas, clouds, axes, key) {
-  const gl = gpuOf(canvas);
+// Draw clouds with points of a size [px]; whether there is a GPU to do so.
+function drawClouds(canvas, clouds, axes, key, size) {
+  const gpu = gpuOf(canvas), { gl } = gpu;
   if (!gl) return false;
-  const scale = devicePixelRatio, { width, height } = axes;
-  canvas.width = Math.round(width * scale);
-  canvas.height = Math.round(height * scale);
+  const scale = devicePixelRatio, { width, height, zoom, tilt, turn } = axes;
+  const [wide, high] = [width, height].map(v => Math.round(v * scale));
+  if (canvas.width !== wide) canvas.width = wide;  // to set it again allocates it again
+  if (canvas.height !== high) canvas.height = high;
   gl.viewport(0, 0, canvas.width, canvas.height);
   gl.clearColor(0, 0, 0, 0);
   gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
   gl.enable(gl.DEPTH_TEST);  // the foremost point is seen; the page is behind pale ones
   gl.useProgram(gpu.program);
-  const { zoom, tilt, turn } = scene;
   gl.uniform4f(gpu.at.turn, Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt));
   gl.uniform2f(gpu.at.scale, 2 * zoom / width, 2 * zoom / height);
-  gl.uniform1f(gpu.at.size, scale * (zoom > CLOSE_UP ? 2.5 : 1.6));
+  gl.uniform1f(gpu.at.size, scale * size);
   for (const sweep of clouds) {
-    gl.bindVertexArray(bufferOf(gl, sweep, key).array);
+    gl.bindVertexArray(bufferOf(gpu, sweep, key).array);
     const [x, y, z] = axes.center.map((v, k) => v - sweep.origin[k]);
     gl.uniform3f(gpu.at.center, x, y, z);
     gl.drawArrays(gl.POINTS, 0, sweep.points.length / 3);
@@ -131,8 +139,12 @@ function rgbOfStyle(style) {
   return painter.getImageData(0, 0, 1, 1).data;
 }
 
-// Red, green, blue and opacity of each point of a sweep.
+// Red, green, blue and opacity of each point of a cloud: one colour that it names, or those of the drive.
 function tintsOf(sweep) {
+  if (sweep.name) {
+    const tint = [...rgbOf(sweep.name), 255 * sweep.alpha];
+    return Uint8Array.from({ length: sweep.points.length / 3 * 4 }, (_, k) => tint[k % 4]);
+  }
   const mode = $('scene-colour').value, { points } = sweep, tints = new Uint8Array(points.length / 3 * 4);
   const [road, object] = [rgbOf(LOOKS.road[0]), rgbOf(LOOKS.object[0])];
   for (let i = 0, j = 0; i < points.length; i += 3, j += 4) {

@@ -91,13 +91,17 @@ function roadOf({ points, sensor, origin }) {
 // From the fixed frame to the canvas, and from there to the road. The view is orthogonal: turned about
 // the vertical, then tilted. `depth` is larger farther away.
 function sceneAxes() {
-  const canvas = $('scene-view'), { sensor, origin } = scene.sweep, { zoom, offset, tilt, turn } = scene;
+  const { sensor, origin } = scene.sweep, { offset } = scene;
+  return axesOf($('scene-view'), [sensor[0] + offset[0], sensor[1] + offset[1], origin[2] + scene.road], scene);
+}
+
+// The same for any canvas, and the place in its middle.
+function axesOf(canvas, center, { zoom, tilt, turn }) {
   const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-  const center = [sensor[0] + offset[0], sensor[1] + offset[1], origin[2] + scene.road];
   const [c, s, flat, steep] = [Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt)];
   const turned = (x, y) => [c * (x - center[0]) + s * (y - center[1]), c * (y - center[1]) - s * (x - center[0])];
   return {
-    width, height, center,
+    width, height, center, zoom, tilt, turn,
     /** @type {(place: number[]) => [number, number]} */
     to: ([x, y, z = center[2]]) => {
       const [right, ahead] = turned(x, y);
@@ -135,7 +139,7 @@ function drawScene() {
   context.setTransform(scale, 0, 0, scale, 0, 0);
   const { points, origin, sensor } = scene.sweep, mode = $('scene-colour').value;
   const key = [mode, scene.road, colour('points'), mode === 'object' || mode === 'height' ? '' : `${scene.at} ${log.count}`].join(' ');
-  const isDrawn = drawClouds($('scene-points'), scene.clouds, axes, key);
+  const isDrawn = drawClouds($('scene-points'), scene.clouds, axes, key, scene.zoom > CLOSE_UP ? 2.5 : 1.6);
   for (const isObject of isDrawn ? [] : [false, true]) {
     const [name, alpha, size] = isObject ? LOOKS.object : LOOKS.road;
     context.fillStyle = colour(name);
@@ -185,7 +189,7 @@ function drawSceneTools() {
   $('scene-fit').hidden = !scene.fit;
   drawProposals();
   $('scene-hint').textContent = scene.fit ? `${number(scene.fit.points, 0)} points, ${scene.fit.box.slice(3, 6).map(v => number(v, 1)).join(' × ')} m. Enter follows it both ways.`
-    : scene.isAdding ? 'Click the points of the object, or drag from its rear to its front.' : 'Click a box to open its track. Drag moves, the wheel zooms, a drag with Shift turns.';
+    : scene.isAdding ? 'Click the points of the object, or drag from its rear to its front.' : 'Click a box to open its track. Drag moves, the wheel zooms, with Shift it turns, with Ctrl it draws a box.';
 }
 
 function sceneBoxAt(place) {
@@ -201,8 +205,9 @@ function startAdding(isAdding = !scene.isAdding) {
   drawScene();
 }
 
-// The median extents of each class of the drive.
-function usualExtents() {
+const MIN_TRACKS = 3;              // of a class, for its size to be used for what is drawn
+// The median extents of each class of the drive with enough tracks.
+function usualExtents(least = 1) {
   const sizes = new Map();
   for (const track of TRACKS) {
     if (!track.extents[1].every(isKnown)) continue;
@@ -210,7 +215,7 @@ function usualExtents() {
     sizes.get(track.class).push(track.extents[1]);
   }
   const median = values => values.sort((a, b) => a - b)[values.length >> 1];
-  return Object.fromEntries([...sizes].map(([one, rows]) => [one, [0, 1, 2].map(k => median(rows.map(row => row[k])))]));
+  return Object.fromEntries([...sizes].filter(([, rows]) => rows.length >= least).map(([one, rows]) => [one, [0, 1, 2].map(k => median(rows.map(row => row[k])))]));
 }
 
 // A box by hand: from its rear to its front, as wide and as high as its class.
@@ -220,6 +225,18 @@ function drawByHand([x, y], [u, v]) {
   const [, width, height] = usual[name] ?? DRAWN;
   const box = [(x + u) / 2, (y + v) / 2, scene.sweep.origin[2] + scene.road + height / 2, Math.hypot(u - x, v - y), width, height, 0, 0, Math.atan2(v - y, u - x)];
   offerFit({ box, class: name, points: numInside(scenePoints(), box), stamp: scene.sweep.stamp, place: box.slice(0, 2), isByHand: true });
+}
+
+// The box that was drawn: its class by length and height, as wide and as high as its points.
+async function completeDrawn(rear, front) {
+  const { fit } = scene;
+  let found;
+  try {
+    found = await post('fit', { stamp: fit.stamp, place: rear, front, class: '', extents: usualExtents(MIN_TRACKS) });
+  } catch (error) {
+    return fail(error.message);
+  }
+  if (scene.fit === fit) offerFit({ ...fit, ...found, place: found.box.slice(0, 2) });
 }
 
 function scenePoints() {
@@ -239,7 +256,7 @@ function editBox(track = view.open) {
 
 // What the pointer takes hold of in the box that is offered, from above.
 function sceneGrip(event) {
-  if (!scene.fit || scene.isAdding || event.shiftKey || event.button || scene.tilt) return null;
+  if (!scene.fit || scene.isAdding || event.ctrlKey || event.shiftKey || event.button || scene.tilt) return null;
   const { box } = scene.fit, at = toFrame([...sceneAxes().from(event), box[2]], box, rotation(box));
   return gripOf(at, box, GRIP / scene.zoom, [0, 1]);
 }
@@ -352,7 +369,7 @@ async function keepFit() {
   if (!fit) return;
   if (scene.isKeeping) return;
   scene.isKeeping = true;
-  const isAdded = await (fit.of ? keepCopy(fit) : addObject(fit.stamp, fit.box, $('scene-class').value));
+  const isAdded = await (fit.of ? keepCopy(fit) : addObject(fit.stamp, fit.box, $('scene-class').value, fit.isByHand));
   scene.isKeeping = false;
   if (!isAdded) return;  // it is not saved: the box stays
   scene.isAdding = false;
@@ -408,7 +425,7 @@ function setUpScene() {
   canvas.onpointerdown = event => {
     if (!scene.sweep) return;
     canvas.setPointerCapture(event.pointerId);
-    drag = { place: sceneAxes().from(event), x: event.clientX, y: event.clientY, far: 0, turns: event.shiftKey || event.button > 0, draws: scene.isAdding && !event.shiftKey && !event.button, grip: sceneGrip(event) };
+    drag = { place: sceneAxes().from(event), x: event.clientX, y: event.clientY, far: 0, turns: event.shiftKey || event.button > 0, draws: (scene.isAdding || event.ctrlKey) && !event.shiftKey && !event.button, grip: sceneGrip(event) };
   };
   canvas.onpointermove = event => {
     if (!drag) {
@@ -430,6 +447,7 @@ function setUpScene() {
   canvas.onpointerup = event => {
     const isClick = drag && drag.far < CLICK;
     const isHeld = drag?.grip;
+    if (drag?.draws && !isClick && scene.fit) completeDrawn(drag.place, sceneAxes().from(event));
     drag = null;
     if (isHeld) drawCameras();
     if (!isClick || isHeld) return;

@@ -1,11 +1,10 @@
 // The views of a box -----------------------------------------------------------------------------
 
-const FRAME = 12;                  // time for the 3D view at 60 frames per second [ms]
-const PAUSE = 120;                 // between two steps of one who stops to look [ms]
 const ZOOM_STEP = 1.25;            // of a key, or of a notch of the wheel
 const SLAB = 1.5;                  // around the object, of neighbours in the views from the side and the front [m]
+const DENSE = 1500;                // more points are drawn smaller
 const RULED = 60;                  // views that are smaller have no ruler [px]
-const CLOSE = 8;                   // of neighbours in the 3D view [m]
+const CLOSE = 8;                   // of points and neighbours in the 3D view [m]
 const ZOOM = { least: 0.1, most: 20 };
 // The axes to the right and upwards, by view, and the corners of the outline that is seen.
 /** @type {Record<string, [number, number, number[]]>} */
@@ -101,7 +100,7 @@ function drawFlat(canvas, right, up, outline) {
   context.setTransform(scale, 0, 0, scale, 0, 0);
   context.clearRect(0, 0, width, height);
   if (height > RULED) drawRuler(context, width, height, zoom, view.center[right]);
-  const isDense = view.local.length > 1500;
+  const isDense = view.local.length > DENSE;
   // Neighbours behind each other would hide the object in the views from the side and the front.
   const depth = 3 - right - up, reach = view.frame ? view.frame[3 + depth] / 2 + SLAB : 0;
   const isNear = point => depth === 2 || Math.abs(point[depth]) < reach;
@@ -198,7 +197,6 @@ function setUpSizes() {
     if (!view.part || $('tracks').hidden) return;
     drawViews();
     drawCursor();
-    if (view.space) Plotly.Plots.resize('space');
   });
   for (const name of [...Object.keys(VIEWS), 'space']) observer.observe($(name));
 }
@@ -209,53 +207,72 @@ function resetViews() {
   drawViews();
 }
 
-const EDGES = [0, 1, 2, 3, 0, 4, 5, 6, 7, 4, null, 1, 5, null, 2, 6, null, 3, 7];
+// The track in 3D, as the drive is drawn, in the frame of its box --------------------------------
 
-function spaceTraces() {
-  const every = view.local.length > 6000 ? Math.ceil(view.local.length / 6000) : 1;
-  const points = view.local.filter((_, k) => k % every === 0);
-  const columns = list => ({ x: list.map(p => p[0]), y: list.map(p => p[1]), z: list.map(p => p[2]) });
-  const cloud = (list, size, name) => ({ type: 'scatter3d', mode: 'markers', hoverinfo: 'skip', ...columns(list), marker: { size, color: colour(name) } });
-  const isClose = point => Math.hypot(...point) < CLOSE;
-  const far = (view.far ?? []).filter(isClose), some = Math.ceil(far.length / 8000);
-  /** @type {any[]} */
-  const traces = [cloud(points, every > 1 || points.length > 1500 ? 1.2 : 2.2, 'points'), cloud(far.filter((_, k) => k % some === 0), 1.2, 'around')];
-  for (const name of NAMES) {
-    const found = view.lines.filter(line => line.name === name && (name !== 'around' || line.corners.every(isClose)));
-    const gap = [null, null, null];
-    const way = found.flatMap(line => [...EDGES.map(k => (k === null ? gap : line.corners[k])), gap]);
-    traces.push({ type: 'scatter3d', mode: 'lines', hoverinfo: 'skip', ...columns(way.length ? way : [gap]),
-                  line: { color: colour(name), width: name === 'around' ? 2 : 4, dash: { input: 'dash', truth: 'dot' }[name] ?? 'solid' } });
-  }
-  return traces;
+/** @type {{ zoom: number, tilt: number, turn: number, clouds: any[], of: any[] }} */
+const space = { zoom: 1, tilt: 1.1, turn: -0.6, clouds: [], of: [] };  // seen from behind, a little from the right [rad]
+
+function spaceAxes() {
+  const canvas = $('space-lines'), [along, across, up] = view.limits, reach = Math.hypot(along, across);
+  space.zoom = view.zoom * Math.min(canvas.clientWidth / (2 * reach), canvas.clientHeight / (2 * (up + reach * Math.cos(space.tilt))));
+  return axesOf(canvas, [0, 0, 0], space);
 }
 
-// One drawing is under way at most; the newest state follows it.
-async function drawSpace() {
-  view.wanted = true;
-  if (view.pending) return;
-  view.pending = true;
-  await withPlotly();
-  while (view.wanted && view.part) {
-    view.wanted = false;
-    // Where a drawing takes longer than a frame, it waits until the stepping pauses.
-    if (view.spaceCost > FRAME) {
-      await new Promise(done => setTimeout(done, PAUSE));
-      if (view.wanted) continue;
-    }
-    const begin = performance.now();
-    const traces = spaceTraces();
-    if (!view.space) {
-      const axis = { visible: false, showspikes: false };
-      await Plotly.newPlot('space', traces, { ...LAYOUT(), margin: { l: 0, r: 0, t: 0, b: 0 }, dragmode: 'orbit',
-        scene: { aspectmode: 'data', xaxis: axis, yaxis: axis, zaxis: axis, camera: { eye: { x: -1.3, y: -1.9, z: 1.1 } } } }, CONFIG);
-      view.space = true;
-    } else {
-      const data = name => traces.map(trace => trace[name]);
-      await Plotly.restyle('space', { x: data('x'), y: data('y'), z: data('z'), 'marker.size': traces.map(t => t.marker?.size ?? null) });
-    }
-    view.spaceCost = performance.now() - begin;
-    await new Promise(requestAnimationFrame);
+// The points as clouds, made again when they are others.
+function spaceClouds() {
+  if (space.of[0] === view.local && space.of[1] === view.far) return space.clouds;
+  const cloud = (points, name, alpha) => ({ points: new Float32Array(points.flat()), origin: [0, 0, 0], name, alpha });
+  const far = (view.far ?? []).filter(point => Math.hypot(...point) < CLOSE);
+  space.of = [view.local, view.far];
+  return (space.clouds = [cloud(far, 'around', 0.6), cloud(view.local, 'points', 1)]);
+}
+
+function drawSpace() {
+  const canvas = $('space-lines'), scale = devicePixelRatio, axes = spaceAxes(), clouds = spaceClouds();
+  const isDense = view.local.length > DENSE;
+  canvas.width = Math.round(axes.width * scale);
+  canvas.height = Math.round(axes.height * scale);
+  const context = canvas.getContext('2d', { willReadFrequently: true });
+  context.setTransform(scale, 0, 0, scale, 0, 0);
+  if (!drawClouds($('space-points'), clouds, axes, colour('points'), isDense ? 1.4 : 2.4)) {
+    drawPoints(context, (view.far ?? []).filter(point => Math.hypot(...point) < CLOSE), axes.to, 1.4, 0.6, 'around');
+    drawPoints(context, view.local, axes.to, isDense ? 1.4 : 2.4, 1, 'points');
   }
-  view.pending = false;
+  for (const { name, dash, corners: c } of view.lines) {
+    if (name === 'around' && !c.every(point => Math.hypot(...point) < CLOSE)) continue;
+    context.strokeStyle = colour(name);
+    context.lineWidth = name === 'around' ? 1 : 2;
+    context.setLineDash(dash);
+    context.beginPath();
+    for (const edge of BOX_EDGES) {
+      const [a, b] = edge.map(k => axes.to(c[k]));
+      context.moveTo(...a);
+      context.lineTo(...b);
+    }
+    context.stroke();
+  }
+  context.setLineDash([]);
+}
+
+// A drag turns it; the wheel zooms all views.
+function setUpSpace() {
+  const canvas = $('space-lines');
+  let last = null;
+  setUpPinch(canvas, factor => view.part && zoomBy(factor));
+  canvas.onpointerdown = event => {
+    canvas.setPointerCapture(event.pointerId);
+    last = event;
+  };
+  canvas.onpointermove = event => {
+    if (!last || !view.part) return;
+    space.turn -= TILT.pace * (event.clientX - last.clientX);
+    space.tilt = Math.max(0, Math.min(TILT.most, space.tilt - TILT.pace * (event.clientY - last.clientY)));
+    last = event;
+    drawSpace();
+  };
+  canvas.onpointerup = canvas.onpointercancel = () => { last = null; };
+  canvas.addEventListener('wheel', event => {
+    event.preventDefault();
+    if (view.part) zoomBy(wheelFactor(event));
+  }, { passive: false });
 }
