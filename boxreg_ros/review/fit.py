@@ -126,8 +126,8 @@ def drawn(
     along = front - rear
     length, yaw = float(np.linalg.norm(along)), float(np.arctan2(along[1], along[0]))
     middle = (rear + front) / 2
-    near = points[(np.abs(points[:, :2] - middle) < FIT_REACH + length / 2).all(1)]
-    near = near.astype(np.float64)
+    is_near = (np.abs(points[:, :2] - middle) < FIT_REACH + length / 2).all(1)
+    near = points[is_near].astype(np.float64)
     road = _road_below(near)
     local = _turned(near[:, :2] - middle, -yaw)
     beside = np.hypot(*(np.abs(local) - [length / 2, 0]).clip(0).T)
