@@ -24,22 +24,16 @@ FEWEST_STEPS = 3
 
 
 class Pair(NamedTuple):
-    """A box array and its sweep, None where there is none."""
+    """A box array and its sweep, None where there is none, or it is not known yet."""
 
     boxes: BoxArray
-    sweep: Sweep | None
+    sweep: Sweep | None = None
     reason: str = ''
     """Why the boxes are kept, whether or not there is a sweep; empty for others."""
     is_dropped: bool = False
     """Whether the sweep of the boxes was dropped."""
-
-
-class _Unpaired(NamedTuple):
-    """A box array that waits for its sweep, or for the arrays before it."""
-
-    order_ns: int
-    boxes: BoxArray
-    reason: str
+    order_ns: int = 0
+    """Stamp by which the array stands among the others that wait [ns]."""
 
 
 class StampMatcher:
@@ -62,7 +56,7 @@ class StampMatcher:
         self._capacity = config.queue
         self._counts = counts
         self._sweeps: list[Sweep] = []  # ascending by stamp
-        self._unpaired: list[_Unpaired] = []  # ascending by stamp
+        self._unpaired: list[Pair] = []  # ascending by stamp
         self._newest_boxes_ns = 0
         self._used_ns: set[int] = set()  # stamps of held sweeps that were paired
         self._newest_ns = -inf  # of all sweeps added
@@ -100,7 +94,8 @@ class StampMatcher:
             order_ns = self._newest_boxes_ns
         elif not reason:
             self._newest_boxes_ns = max(self._newest_boxes_ns, order_ns)
-        insort(self._unpaired, _Unpaired(order_ns, boxes, reason), key=lambda one: one.order_ns)
+        waiting = Pair(boxes, reason=reason, order_ns=order_ns)
+        insort(self._unpaired, waiting, key=lambda one: one.order_ns)
         return self._pop_pairs()
 
     def flush(self) -> Iterator[Pair]:
@@ -117,10 +112,11 @@ class StampMatcher:
     def _pop_pairs(self, is_flush: bool = False) -> Iterator[Pair]:
         """Yield the oldest box arrays as long as no later sweep can be nearer to them."""
         while self._unpaired:
-            stamp_ns, boxes, reason = self._unpaired[0]
-            if reason:
-                yield Pair(self._unpaired.pop(0).boxes, None, reason)
+            first = self._unpaired[0]
+            if first.reason:
+                yield self._unpaired.pop(0)
                 continue
+            stamp_ns = first.boxes.stamp_ns
             sweep = min(self._sweeps, key=lambda s: abs(s.stamp_ns - stamp_ns), default=None)
             offset_ns = self._reach_ns + 1
             if sweep is not None:
@@ -137,8 +133,8 @@ class StampMatcher:
             if is_dropped:
                 sweep = None
             if sweep is not None:
-                _check_frames(sweep, boxes)
-            yield Pair(self._unpaired.pop(0).boxes, sweep, is_dropped=is_dropped)
+                _check_frames(sweep, first.boxes)
+            yield self._unpaired.pop(0)._replace(sweep=sweep, is_dropped=is_dropped)
             # Boxes of another clock may be far ahead of all sweeps.
             self._discard_before(min(stamp_ns, self._newest_ns) - self._reach_ns)
 

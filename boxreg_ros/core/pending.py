@@ -8,9 +8,9 @@ They refer to each other: an estimate of a track is written to the box arrays of
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from math import dist, inf
-from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.motion import motion_at
@@ -47,15 +47,6 @@ Derived: within the 0.2 s of two observations no road user changes its velocity 
 is 50 m/s^2.
 
 """
-
-
-class BoxToObserve(NamedTuple):
-    """A box that is to be observed: in a row of its array, predicted, or followed."""
-
-    track: ObservedTrack
-    box: Floats
-    row: int = -1
-    is_followed: bool = False
 
 
 class PendingArray:
@@ -119,41 +110,37 @@ class PendingArray:
             if is_valid[row]:
                 known.add(track_id)
 
-    def add_observations(
-        self, seen: Sequence[Observation], rows: Sequence[int]
-    ) -> list[PendingBox]:
-        """Add observations of the boxes in `rows`, which then wait for their estimates."""
-        if not seen:
-            return []
+    def observe(self, boxes: Sequence[PendingBox], seen: Sequence[Observation]) -> None:
+        """Give boxes of the array their observations; they then wait for their estimates."""
+        self.num_unsettled += len(boxes)
+        if not boxes:
+            return
         table = seen[0].table
-        stamp_ns = self.input.stamp_ns
-        self.num_points[rows] = table.num_points
-        self.num_unsettled += len(rows)
-        entries = []
+        self.num_points[[one.row for one in boxes]] = table.num_points
         places = table.boxes[:, : LENGTH + 1].tolist()
-        for observation, row, place in zip(seen, rows, places, strict=True):
-            self.reasons[row] = Reason.SHORT_TRACK  # until there is an estimate
-            entries.append(PendingBox(observation, InputPlace(stamp_ns, *place), self, row))
-        return entries
+        for one, observation, place in zip(boxes, seen, places, strict=True):
+            self.reasons[one.row] = Reason.SHORT_TRACK  # until there is an estimate
+            one.array = self
+            one.observation = observation
+            one.place = place
 
-    def add_predicted(self, item: BoxToObserve) -> int:
-        """Add the predicted box of a track; return its row."""
+    def add_predicted(self, track: ObservedTrack, one: PendingBox) -> None:
+        """Add the predicted box of a track as a row."""
         given = self.input
         self.input = replace(
             given,
-            track_ids=(*given.track_ids, item.track.track_id),
-            class_names=(*given.class_names, item.track.class_name),
+            track_ids=(*given.track_ids, track.track_id),
+            class_names=(*given.class_names, track.class_name),
             scores=np.append(given.scores, 0.0),
-            boxes=np.vstack([given.boxes, item.box]),
+            boxes=np.vstack([given.boxes, one.box]),
             pinned=None if given.pinned is None else np.append(given.pinned, False),
         )
         self.reasons.append('')
         self.num_points = np.append(self.num_points, 0)
         self.estimates.append(None)
-        row = len(self.estimates) - 1
-        if item.is_followed:
-            self.followed.append(row)
-        return row
+        one.row = len(self.estimates) - 1
+        if one.is_followed:
+            self.followed.append(one.row)
 
     def result(self, is_final: bool) -> RefinedBoxes:
         """
@@ -196,31 +183,23 @@ class PendingArray:
         return whole if is_returned.all() else whole.take(np.flatnonzero(is_returned).tolist())
 
 
-class InputPlace(NamedTuple):
-    """Centre and length of an input box [m] as plain numbers, of which motion is computed."""
+@dataclass(slots=True, eq=False)
+class PendingBox:
+    """A box of a track: to be observed, then waiting for its estimate."""
 
     stamp_ns: int
-    x: float
-    y: float
-    z: float
-    length: float
-
-
-@dataclass(slots=True)
-class PendingBox:
-    """
-    An observation of a track, and the row of the box array its estimate is written to.
-
-    `estimate` is a row of a table with `boxes`, which the next window starts from.
-
-    """
-
-    observation: Observation
-    place: InputPlace
-    array: PendingArray
-    row: int
+    box: Floats
+    """(9,), of the input, or predicted."""
+    row: int = -1
+    """In its array, which the estimate is written to; -1 while a predicted box has none."""
     is_predicted: bool = False
+    is_followed: bool = False
+    array: PendingArray = field(init=False)
+    observation: Observation = field(init=False)
+    place: list[float] = field(init=False)
+    """x y z length of the box as plain numbers, of which motion is computed [m]."""
     estimate: tuple[Estimates | Observations, int] | None = None
+    """Row of a table with `boxes`, which the next window starts from."""
     is_settled: bool = False
 
     def settle(self) -> None:
@@ -250,7 +229,7 @@ class ObservedTrack:
     @property
     def newest_ns(self) -> int:
         """Stamp of the newest observation [ns]."""
-        return self.entries[-1].place.stamp_ns
+        return self.entries[-1].stamp_ns
 
     def is_in(self, array: PendingArray) -> bool:
         """Return whether the newest observation is of `array`."""
@@ -300,17 +279,21 @@ class ObservedTrack:
         recent = self.entries[-ID_SWITCH_OBSERVATIONS:]
         if len(recent) < ID_SWITCH_OBSERVATIONS - 1:
             return None
-        first, latest = recent[0].place, recent[-3].place
+        first, latest = recent[0], recent[-3]
         duration_ns = latest.stamp_ns - first.stamp_ns
-        for place in (recent[-1].place, recent[-2].place):
-            elapsed_ns = place.stamp_ns - latest.stamp_ns
+        first_x, first_y, *_ = first.place
+        latest_x, latest_y, _, length = latest.place
+        for entry in (recent[-1], recent[-2]):
+            elapsed_ns = entry.stamp_ns - latest.stamp_ns
             part = elapsed_ns / duration_ns
-            x = latest.x + part * (latest.x - first.x)
-            y = latest.y + part * (latest.y - first.y)
-            gate = latest.length / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9
-            if dist((place.x, place.y), (x, y)) < gate:
+            x = latest_x + part * (latest_x - first_x)
+            y = latest_y + part * (latest_y - first_y)
+            gate = length / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9
+            if dist(entry.place[:2], (x, y)) < gate:
                 return None
-        moved = [replace(entry, estimate=None) for entry in self.entries[-2:]]
+        moved = [copy(entry) for entry in self.entries[-2:]]
+        for entry in moved:
+            entry.estimate = None
         del self.entries[-2:]
         return ObservedTrack(self.track_id, self.class_name, moved, detected_ns=self.detected_ns)
 

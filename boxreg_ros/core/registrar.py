@@ -19,7 +19,7 @@ from boxreg_ros.core.latency import Latency, LatencyCorrection
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.observation import Observation, Observations, observe
-from boxreg_ros.core.pending import BoxToObserve, ObservedTrack, PendingArray, PendingBox
+from boxreg_ros.core.pending import ObservedTrack, PendingArray, PendingBox
 from boxreg_ros.core.problem import SETTINGS_OF
 from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import column, joined
@@ -46,6 +46,8 @@ VELOCITY_OBSERVATIONS = 4
 """Observations that the input velocity is estimated from; chosen: 0.3 s at 10 Hz."""
 UNKNOWN_COVARIANCE = np.full((6, 6), inf)
 """Covariance of a track without an estimate."""
+_OfTrack = tuple[ObservedTrack, PendingBox]
+"""A box and its track; boxes do not refer to tracks: cycles would wait for garbage collection."""
 
 
 class BoxRegistrar:
@@ -353,7 +355,8 @@ class BoxRegistrar:
             if not array.reasons[row]:
                 if track_id not in self._tracks:
                     self._tracks[track_id] = ObservedTrack(track_id, boxes.class_names[row])
-                given.append(BoxToObserve(self._tracks[track_id], boxes.boxes[row], row))
+                one = PendingBox(boxes.stamp_ns, boxes.boxes[row], row)
+                given.append((self._tracks[track_id], one))
         coasting = [*self._followed(array, sweep), *self._coasting(array)]
         if not (given or coasting):
             return
@@ -364,22 +367,20 @@ class BoxRegistrar:
             self.counts[Reason.COAST_UNCONFIRMED] += len(coasting) - len(confirmed)
             seen, velocities = self._seen([*given, *confirmed], boxes, sweep)
         self.box_time.add(seen[: len(given)], velocities[: len(given)])
-        rows = [item.row for item in given]
-        rows += [array.add_predicted(item) for item in confirmed]
-        entries = array.add_observations(seen, rows)
-        for item, entry in zip(given, entries, strict=False):
-            track = item.track
-            track.entries.append(entry)
+        for track, one in confirmed:
+            array.add_predicted(track, one)
+        array.observe([one for _, one in (*given, *confirmed)], seen)
+        for track, one in given:
+            track.entries.append(one)
             track.detected_ns = boxes.stamp_ns
             successor = track.split_at_id_switch()
             if successor is not None:
                 self._end([track.track_id])
                 self._tracks[track.track_id] = successor
-        for item, entry in zip(confirmed, entries[len(given) :], strict=True):
-            entry.is_predicted = True
-            item.track.entries.append(entry)
+        for track, one in confirmed:
+            track.entries.append(one)
 
-    def _followed(self, array: PendingArray, sweep: Sweep) -> list[BoxToObserve]:
+    def _followed(self, array: PendingArray, sweep: Sweep) -> list[_OfTrack]:
         """Return the boxes of followed objects that have none in `array`."""
         if not array.is_observed:
             return []
@@ -396,10 +397,11 @@ class BoxRegistrar:
             track = self._tracks.setdefault(
                 one.track_id, ObservedTrack(one.track_id, one.class_name)
             )
-            found.append(BoxToObserve(track, one.box, is_followed=True))
+            box = PendingBox(boxes.stamp_ns, one.box, is_predicted=True, is_followed=True)
+            found.append((track, box))
         return found
 
-    def _coasting(self, array: PendingArray) -> list[BoxToObserve]:
+    def _coasting(self, array: PendingArray) -> list[_OfTrack]:
         """Return the predicted boxes of the tracks that have no box in `array`."""
         if not (self.config.coasts and array.is_observed):
             return []
@@ -415,15 +417,15 @@ class BoxRegistrar:
                 self.counts[Reason.COAST_UNCONFIRMED] += 1
                 continue
             others = np.vstack([others, box])
-            found.append(BoxToObserve(track, box))
+            found.append((track, PendingBox(boxes.stamp_ns, box, is_predicted=True)))
         return found
 
     def _seen(
-        self, to_observe: list[BoxToObserve], given: BoxArray, sweep: Sweep
+        self, to_observe: list[_OfTrack], given: BoxArray, sweep: Sweep
     ) -> tuple[list[Observation], Floats]:
         """Return the observation of each box at the stamp of `given`, and their velocities."""
         stamp_ns = given.stamp_ns
-        boxes = np.array([item.box for item in to_observe])
+        boxes = np.array([one.box for _, one in to_observe])
         at_sweep = boxes.copy()
         offset = (sweep.stamp_ns - stamp_ns) * 1e-9  # [s]
         velocities = np.zeros((len(boxes), 3))
@@ -438,7 +440,7 @@ class BoxRegistrar:
         if offset or motion.any():
             table = table.relative_to(boxes, motion / 2)
         if given.pinned is not None:
-            pinned = [item.row >= 0 and given.pinned[item.row] for item in to_observe]
+            pinned = [one.row >= 0 and given.pinned[one.row] for _, one in to_observe]
             table = table._replace(is_pinned=np.array(pinned))
         return [Observation(table, row) for row in range(len(boxes))], velocities
 
@@ -580,25 +582,25 @@ def _by_urgency(tracks: list[ObservedTrack]) -> list[ObservedTrack]:
     return [tracks[i] for i in np.lexsort((distances, -variances, -carried)).tolist()]
 
 
-def _input_velocities(to_observe: list[BoxToObserve], boxes: Floats, stamp_ns: int) -> Floats:
+def _input_velocities(to_observe: list[_OfTrack], boxes: Floats, stamp_ns: int) -> Floats:
     """Return the mean velocities (n, 3) of the input centres up to the new `boxes` [m/s]."""
     velocities = np.zeros((len(boxes), 3))
-    known = [row for row, item in enumerate(to_observe) if item.track.entries]
+    known = [row for row, (track, _) in enumerate(to_observe) if track.entries]
     if known:
-        before = [to_observe[row].track.entries[-VELOCITY_OBSERVATIONS:][0].place for row in known]
-        elapsed = stamp_ns - np.array([place.stamp_ns for place in before])
-        centers = np.array([(place.x, place.y, place.z) for place in before])
+        before = [to_observe[row][0].entries[-VELOCITY_OBSERVATIONS:][0] for row in known]
+        elapsed = stamp_ns - np.array([one.stamp_ns for one in before])
+        centers = np.array([one.place[:3] for one in before])
         velocities[known] = (boxes[known, X : Z + 1] - centers) / elapsed[:, None] * 1e9
     return velocities
 
 
-def _confirmed(coasting: list[BoxToObserve], seen: list[Observation]) -> list[BoxToObserve]:
+def _confirmed(coasting: list[_OfTrack], seen: list[Observation]) -> list[_OfTrack]:
     """Return those of the predicted boxes that have enough points."""
     inside = points_inside(seen)
     return [
-        item
-        for item, count in zip(coasting, inside.tolist(), strict=True)
-        if item.is_followed or count >= item.track.least_points
+        (track, one)
+        for (track, one), count in zip(coasting, inside.tolist(), strict=True)
+        if one.is_followed or count >= track.least_points
     ]
 
 

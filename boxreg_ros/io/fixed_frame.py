@@ -10,7 +10,7 @@ The clouds and boxes of a recording in the fixed frame: the one way to read a re
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import cast, NamedTuple
@@ -19,41 +19,13 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.items import Item, ItemSource, not_measured, Stage, Wanted
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MISSING, MergedSweep
-from boxreg_ros.io.session import Admitted, is_placeholder, Session
+from boxreg_ros.io.session import is_placeholder, Session
 from boxreg_ros.io.time_jumps import Confirmed, JumpConfirmation
 from boxreg_ros.io.transforms import inverse, sweep_to_frame
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
-
-
-class MovedItem(NamedTuple):
-    """A cloud or boxes of a recording, and the same in the fixed frame."""
-
-    items: tuple[Item, ...]
-    """As recorded: one, or the clouds of several LiDARs that were merged."""
-    moved: Sweep | BoxArray | None
-    """Boxes with their ids; None where no transform is known."""
-    restarts: bool
-    """Whether time went back before it."""
-    reason: str = ''
-    """Why `moved` is None, if not for want of a transform."""
-
-    @property
-    def T_fixed_item(self) -> Floats | None:
-        """Return the pose of the frame of a single item; None if unknown, and of merged clouds."""
-        return self.items[0].T_fixed_item if len(self.items) == 1 else None
-
-    @property
-    def given(self) -> Sweep | BoxArray:
-        """Return the content as recorded; of merged clouds the first."""
-        return self.items[0].content
-
-    @property
-    def received_ns(self) -> int:
-        """Return when it was complete [ns]."""
-        return self.items[-1].received_ns
 
 
 class StoredCloud(NamedTuple):
@@ -70,10 +42,10 @@ class FixedFrameItems:
 
     It is the one that `source` chooses unless `fixed_frame` names another. Of `config`, `max_gap`
     and `merge_span` are used; `convention` also says whether ids are assigned; `stage` measures
-    ``read``, ``decode`` and ``transform``. `counts` has sweeps, box arrays, time jumps, clouds
-    without a transform or whose LiDARs are not all known, and what has no stamp or one ahead;
-    `missing_transforms` both clouds and box arrays. `first_missing_transform` and `first_unplaced`
-    are the errors of the first ones.
+    ``read``, ``decode`` and ``transform``; `ticket` makes that of each box array. `counts` has
+    sweeps, box arrays, time jumps, clouds without a transform or whose LiDARs are not all known,
+    and what has no stamp or one ahead; `missing_transforms` both clouds and box arrays.
+    `first_missing_transform` and `first_unplaced` are the errors of the first ones.
 
     Raises RecordingError if no motion of the sensor is known, or no transforms lead to
     `fixed_frame`.
@@ -87,9 +59,11 @@ class FixedFrameItems:
         convention: Convention = STANDARD,
         fixed_frame: str | None = None,
         stage: Stage = not_measured,
+        ticket: Callable[[], object] = lambda: None,
     ) -> None:
         self._source = source
         self._stage = stage
+        self._ticket = ticket
         self._is_merging = len(source.placement.lidars.topics) > 1
         self._jumps = JumpConfirmation[Item]()
         self._restarts = False
@@ -105,9 +79,7 @@ class FixedFrameItems:
         self.first_unplaced = ''
         self.first_ahead = ''
 
-    def read(
-        self, *, with_clouds: bool = True, with_intensities: bool = False
-    ) -> Iterator[MovedItem]:
+    def read(self, *, with_clouds: bool = True, with_intensities: bool = False) -> Iterator[Item]:
         """Yield clouds and boxes in the order they were received; see `Recording.items`."""
         wanted = Wanted(with_clouds, with_intensities, self._stage)
         for item in self._source.items(self.tree, wanted):
@@ -116,7 +88,7 @@ class FixedFrameItems:
                 confirmed = self._jumps.add(item, item.content, item.received_ns)
             for ahead in confirmed.ahead:
                 self._count_ahead(ahead)
-                yield self._item((ahead,), None)._replace(reason=Reason.STAMP_AHEAD)
+                yield self._restarting(ahead._replace(reason=Reason.STAMP_AHEAD))
             if confirmed.has_jumped:
                 yield from map(self._merged, self.session.unmerged())
                 # The tree, which is ahead of the items, has detected the jump itself.
@@ -136,22 +108,22 @@ class FixedFrameItems:
         except TransformUnavailable:
             return None
 
-    def stored_cloud(self, item: MovedItem, frame_id: str) -> StoredCloud:
+    def stored_cloud(self, item: Item, frame_id: str) -> StoredCloud:
         """Return a cloud for label files, a merged one in `frame_id`, with its times as moved."""
         moved = item.moved
-        given = item.given
+        given = item.content
         assert isinstance(given, Sweep)
         if not isinstance(moved, Sweep):
-            return StoredCloud(given, None, item.items[0].intensities)
-        if len(item.items) == 1:
+            return StoredCloud(given, None, item.intensities)
+        if len(item.parts) < 2:
             given = replace(given, times=moved.times)
-            return StoredCloud(given, item.T_fixed_item, item.items[0].intensities)
+            return StoredCloud(given, item.T_fixed_item, item.intensities)
         T_fixed_frame = self.pose_of(frame_id, moved.stamp_ns)
         if T_fixed_frame is not None:
             moved = sweep_to_frame(moved, inverse(T_fixed_frame), frame_id).in_frame()
-        intensities = [part.intensities for part in item.items]
+        intensities = [part.intensities for part in item.parts]
         known = [values for values in intensities if values is not None]
-        whole = np.concatenate(known) if len(known) == len(item.items) else None
+        whole = np.concatenate(known) if len(known) == len(item.parts) else None
         return StoredCloud(moved, T_fixed_frame, whole)
 
     def left_out(self) -> str:
@@ -195,44 +167,51 @@ class FixedFrameItems:
         name = 'clouds' if isinstance(item.content, Sweep) else 'boxes'
         self.first_ahead = self.first_ahead or f'{name} at {item.content.stamp_ns} ns'
 
-    def _moved(self, item: Item) -> Iterator[MovedItem]:
+    def _moved(self, item: Item) -> Iterator[Item]:
         """Yield an item in the fixed frame, or the sweeps that are complete with its cloud."""
         with self._stage('transform'):
-            admitted = self.session.admit(item.content, item.received_ns)
-        self._count(item.content, admitted)
-        item = item._replace(T_fixed_item=admitted.T_fixed_item)
+            item = self.session.admit(item, self._ticket())
+        self._count(item)
         if not self._is_merging or not isinstance(item.content, Sweep):
-            yield self._item((item,), admitted.moved)
-        elif isinstance(admitted.moved, Sweep):  # otherwise the other LiDARs go on
+            yield self._restarting(item)
+        elif isinstance(item.moved, Sweep):  # otherwise the other LiDARs go on
             with self._stage('transform'):
-                complete = self.session.merged(admitted.moved, item)
+                complete = self.session.merged(item.moved, item)
             yield from map(self._merged, complete)
 
-    def _merged(self, merged: MergedSweep) -> MovedItem:
+    def _merged(self, merged: MergedSweep) -> Item:
         """Return a sweep of several LiDARs."""
         self.counts['sweeps'] += 1
-        return self._item(cast(tuple[Item, ...], merged.extras), merged.sweep)
+        parts = cast(tuple[Item, ...], merged.extras)
+        whole = parts[0]._replace(
+            received_ns=parts[-1].received_ns, moved=merged.sweep, parts=parts
+        )
+        if len(parts) > 1:
+            whole = whole._replace(T_fixed_item=None)
+        return self._restarting(whole)
 
-    def _item(self, items: tuple[Item, ...], moved: Sweep | BoxArray | None) -> MovedItem:
+    def _restarting(self, item: Item) -> Item:
+        """Return the next item, with whether time went back before it."""
         restarts = self._restarts
         self._restarts = False
-        return MovedItem(items, moved, restarts)
+        return item._replace(restarts=restarts)
 
-    def _count(self, given: Sweep | BoxArray, admitted: Admitted) -> None:
+    def _count(self, item: Item) -> None:
+        given = item.content
         kind = 'sweeps' if isinstance(given, Sweep) else 'box_arrays'
         if not (self._is_merging and isinstance(given, Sweep)):  # those are counted merged
             self.counts[kind] += 1
         if given.stamp_ns <= 0 and not is_placeholder(given):
             self.counts[f'{kind}_without_stamp'] += 1
-        if not admitted.reason:
+        if not item.reason:
             return
         if isinstance(given, Sweep):
-            self.counts[admitted.reason] += 1
-        if admitted.moved is None:
+            self.counts[item.reason] += 1
+        if item.moved is None:
             self.missing_transforms += 1
-            self.first_missing_transform = self.first_missing_transform or admitted.detail
+            self.first_missing_transform = self.first_missing_transform or item.detail
         else:
-            self.first_unplaced = self.first_unplaced or admitted.detail
+            self.first_unplaced = self.first_unplaced or item.detail
 
 
 def input_boxes(

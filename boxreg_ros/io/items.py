@@ -11,6 +11,7 @@ from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.lidars import SensorPlacement
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 
 LOOKAHEAD_NS = 2 * 10**9
@@ -18,10 +19,15 @@ LOOKAHEAD_NS = 2 * 10**9
 
 
 class Item(NamedTuple):
-    """A decoded cloud or box array, on its way from a recording or a topic to the registrar."""
+    """
+    A decoded cloud or box array, on its way from a recording or a topic to the registrar.
+
+    `Session` completes it; that of merged clouds has the content of the first.
+
+    """
 
     received_ns: int
-    """When it was received [ns]; live by a clock that never jumps."""
+    """When it was received, or complete [ns]; live by a clock that never jumps."""
     content: Sweep | BoxArray
     """In the frame of its message."""
     intensities: Floats | None = None
@@ -30,8 +36,20 @@ class Item(NamedTuple):
     """Status and covariances of boxes that come from label files."""
     message: Any = None
     """As it was received, live."""
+    moved: Sweep | BoxArray | None = None
+    """In the fixed frame, boxes with their ids; None before, and where no transform is known."""
     T_fixed_item: Floats | None = None
-    """Maps the frame of its message to the fixed frame; None where it is not known yet."""
+    """Maps the frame of its message to the fixed frame; None likewise, and of merged clouds."""
+    reason: Reason | None = None
+    """Why `moved` is None, or why not all LiDARs of a cloud are known."""
+    detail: str = ''
+    """The transform or message that is missing."""
+    parts: tuple[Item, ...] = ()
+    """Those of the clouds of several LiDARs that were merged."""
+    restarts: bool = False
+    """Whether time went back before it."""
+    T_fixed_sensor: Floats | None = None
+    """Pose of the sensor frame of label files; None if unknown, and live."""
 
     @property
     def received(self) -> float:

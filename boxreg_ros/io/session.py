@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from typing import NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.matching import AT_ONCE
@@ -20,6 +20,7 @@ from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.axis_check import AxisCheck
 from boxreg_ros.io.findings import Finding
 from boxreg_ros.io.id_assignment import IdCheck, Tracker
+from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import ignore, MergedSweep, Report, SensorPlacement, SweepMerger
 from boxreg_ros.io.motion_check import MotionCheck
 from boxreg_ros.io.place_check import PlaceCheck
@@ -38,19 +39,6 @@ CLOUDS_WITHOUT_FRAME = (
     "sensor_frames:=['FRAME'] (boxreg relabel: --sensor-frame FRAME), or set it in the driver"
 )
 """What to do about clouds without a frame."""
-
-
-class Admitted(NamedTuple):
-    """A sweep or boxes on the way to the registrar."""
-
-    moved: Sweep | BoxArray | None
-    """In the fixed frame, boxes with their ids; None where no transform is known."""
-    T_fixed_item: Floats | None
-    """Maps the frame of the item to the fixed frame."""
-    reason: Reason | None = None
-    """Why `moved` is None, or why not all LiDARs of a cloud are known."""
-    detail: str = ''
-    """The transform or message that is missing."""
 
 
 class Session:
@@ -119,39 +107,40 @@ class Session:
         if self._tracker is not None:
             self._tracker.forget()
 
-    def admit(self, item: Sweep | BoxArray, received_ns: int | None = None) -> Admitted:
+    def admit(self, item: Item, ticket: object = None) -> Item:
         """
-        Return a sweep or boxes in the fixed frame, with ids.
+        Return an item with its sweep or boxes in the fixed frame, boxes with ids.
 
         Parameters
         ----------
-        item : Sweep or BoxArray
-            In the frame of its message.
-        received_ns : int or None
-            When it was received [ns], by the clock of the transforms in `tree`.
+        item : Item
+            Received by the clock of the transforms in `tree`.
+        ticket : object
+            Of the boxes in the fixed frame.
 
         """
-        if is_placeholder(item):
-            return Admitted(None, None)
-        if isinstance(item, BoxArray) and not item.frame_id and self.sensor_frame:
-            item = replace(item, frame_id=self.sensor_frame)
+        given = item.content
+        if is_placeholder(given):
+            return item
+        if isinstance(given, BoxArray) and not given.frame_id and self.sensor_frame:
+            given = replace(given, frame_id=self.sensor_frame)
             self._has_boxes_without_frame = True
         try:
-            fixed_frame = self.require_fixed_frame(item)
-            self._motion_check.add(item, fixed_frame, received_ns)
-            T_fixed_item = self.tree.lookup(fixed_frame, item.frame_id, item.stamp_ns)
+            fixed_frame = self.require_fixed_frame(given)
+            self._motion_check.add(given, fixed_frame, item.received_ns)
+            T_fixed_item = self.tree.lookup(fixed_frame, given.frame_id, given.stamp_ns)
         except TransformUnavailable as error:
-            is_sweep = isinstance(item, Sweep)
+            is_sweep = isinstance(given, Sweep)
             missing = Reason.SWEEP_WITHOUT_TRANSFORM if is_sweep else Reason.NO_TRANSFORM
-            return Admitted(None, None, missing, str(error))
+            return item._replace(reason=missing, detail=str(error))
         reason, detail = None, ''
         moved: Sweep | BoxArray
-        if isinstance(item, Sweep):
-            moved = sweep_to_frame(item, T_fixed_item, self.fixed_frame)
+        if isinstance(given, Sweep):
+            moved = sweep_to_frame(given, T_fixed_item, self.fixed_frame)
             moved, reason, detail = self.placement.placed(moved, self.tree)
         else:
-            motion = self.tree.motion(self.fixed_frame, item.frame_id, item.stamp_ns)
-            moved = boxes_to_frame(item, T_fixed_item, self.fixed_frame, motion)
+            motion = self.tree.motion(self.fixed_frame, given.frame_id, given.stamp_ns)
+            moved = boxes_to_frame(given, T_fixed_item, self.fixed_frame, motion, ticket)
         self._pose_check.add(moved)
         self._place_check.add(moved, T_fixed_item, self._other_frames(item))
         if isinstance(moved, BoxArray):
@@ -160,7 +149,7 @@ class Session:
             if self._id_check is not None:
                 self._id_check.add(moved)
             self._axis_check.add(moved)
-        return Admitted(moved, T_fixed_item, reason, detail)
+        return item._replace(moved=moved, T_fixed_item=T_fixed_item, reason=reason, detail=detail)
 
     def _other_frames(self, item: Sweep | BoxArray) -> dict[str, Floats]:
         """Return the poses of the frames that boxes may be in, beside that of their message."""
@@ -280,7 +269,7 @@ def hand_to_registrar(
     registrar: BoxRegistrar, moved: Sweep | BoxArray | None, restarts: bool, reason: str = ''
 ) -> list[RefinedBoxes]:
     """
-    Hand an item, moved as of `Admitted`, to the registrar; return results that are ready now.
+    Hand a sweep or boxes in the fixed frame to the registrar; return results that are ready now.
 
     If time went back before it, tracks are flushed and the registrar is reset first. With a
     `reason` boxes are kept.

@@ -814,19 +814,33 @@ def move_to_frame(item: Sweep | BoxArray, T_frame_item: Floats, frame_id: str) -
 
 
 def boxes_to_frame(
-    boxes: BoxArray, T_frame_boxes: Floats, frame_id: str, motion: FrameMotion | None = None
+    boxes: BoxArray,
+    T_frame_boxes: Floats,
+    frame_id: str,
+    motion: FrameMotion | None = None,
+    ticket: object = None,
 ) -> BoxArray:
     """
-    Return the boxes in another frame, with the `motion` of their own; NaN stays NaN.
+    Return the boxes in another frame, with the `motion` of their own, and a ticket.
 
-    Their kinematics are in its axes, but over ground: a moving frame takes nothing off.
+    NaN stays NaN. In the same frame the numbers are the same: to convert angles changes their
+    last digits. Their kinematics are in its axes, but over ground: a moving frame takes nothing
+    off.
 
     """
-    moved = moved_boxes(boxes.boxes, T_frame_boxes)
-    kinematics = boxes.kinematics
-    if kinematics is not None:
-        kinematics = rotated_kinematics(kinematics, T_frame_boxes[:3, :3])
-    return replace(boxes, frame_id=frame_id, boxes=moved, motion=motion, kinematics=kinematics)
+    moved, kinematics = boxes.boxes, boxes.kinematics
+    if frame_id != boxes.frame_id:
+        moved = moved_boxes(moved, T_frame_boxes)
+        if kinematics is not None:
+            kinematics = rotated_kinematics(kinematics, T_frame_boxes[:3, :3])
+    return replace(
+        boxes,
+        frame_id=frame_id,
+        boxes=moved,
+        motion=motion,
+        ticket=boxes.ticket if ticket is None else ticket,
+        kinematics=kinematics,
+    )
 
 
 def moved_boxes(boxes: Floats, T_frame_boxes: Floats) -> Floats:

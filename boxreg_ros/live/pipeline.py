@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from math import inf
 from typing import Any
 
@@ -10,30 +10,23 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.input_statistics import Drives
 from boxreg_ros.core.matching import Pair
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import MergedSweep
-from boxreg_ros.io.session import Admitted, is_placeholder, Session
-from boxreg_ros.io.time_jumps import Held, JumpConfirmation
-from boxreg_ros.io.transforms import boxes_to_frame, inverse
+from boxreg_ros.io.session import is_placeholder, Session
+from boxreg_ros.io.time_jumps import Confirmed
+from boxreg_ros.live.arrivals import Arrivals
 from boxreg_ros.live.budget import TickBudget
-from boxreg_ros.live.bursts import Bursts
 from boxreg_ros.live.following import Following
 from boxreg_ros.live.outgoing import Outgoing, OutgoingQueue
 from boxreg_ros.live.silence import Silence
 from boxreg_ros.live.static_points import StaticPoints
-from boxreg_ros.live.tickets import OutputFrame, passing, ticket_of, Tickets
+from boxreg_ros.live.tickets import passing, Ticket, ticket_of, Tickets
 from boxreg_ros.live.transform_wait import TransformWait
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 from msg_adapters import Adapter
 import numpy as np
 
-CONFIRMATION_TIME = 0.5
-"""A message waits this long for the one that confirms a time jump [s]: five sweeps at 10 Hz."""
-AHEAD_TIME = 3.0
-"""The same of one that is ahead of all others [s]; chosen: boxes of the slowest detectors, 1 Hz,
-have come three times."""
 PASSED = 'passed'
 """Reason of messages that pass through; they have no boxes that it could be counted for."""
 
@@ -42,10 +35,8 @@ class MessagePipeline:
     """
     Take messages as they arrive, and return the messages to publish.
 
-        message --> confirm --> session --+-- cloud --> merged --+--> registrar --> messages
-                                          +-- boxes --> ticket --+
-
-    Messages of boxes of one stamp are joined before `confirm` takes them.
+        message --> arrivals --> session --+-- cloud --> merged --+--> registrar --> messages
+                                           +-- boxes --> ticket --+
 
     The registrar has the order of the boxes; what is published for them is in their ticket. Not
     thread-safe.
@@ -71,7 +62,7 @@ class MessagePipeline:
     ----------
     adapter : Adapter or None
         Of the boxes; to be set before the first ones.
-    registrar, following, static_points, silence
+    arrivals, registrar, following, static_points, silence
         The parts that the worker asks.
 
     """
@@ -97,20 +88,9 @@ class MessagePipeline:
         if static_patience is not None:
             self.static_points = StaticPoints(static_patience, self.registrar)
         self.silence = Silence(self.registrar)
-        self._jumps = JumpConfirmation[Item]()
-        self._bursts = Bursts()
-        self._tickets = Tickets()
+        self.arrivals = Arrivals()
+        self._tickets = Tickets(session, wait)
         self._queue = OutgoingQueue(self.following, self.static_points)
-
-    @property
-    def config(self) -> Config:
-        """Return the settings of the core; see `BoxRegistrar` for those that may change."""
-        return self.registrar.config
-
-    @config.setter
-    def config(self, config: Config) -> None:
-        self.registrar.config = config
-        self.session.config = config
 
     @property
     def facts(self) -> dict[str, object]:
@@ -121,12 +101,7 @@ class MessagePipeline:
     @property
     def is_holding(self) -> bool:
         """Return whether messages wait for a cloud, further observations or confirmation."""
-        return self.registrar.num_held > 0 or bool(self._jumps.held) or self.is_joining
-
-    @property
-    def is_joining(self) -> bool:
-        """Return whether a message of boxes waits for others of its stamp."""
-        return self._bursts.held is not None
+        return self.registrar.num_held > 0 or self.arrivals.is_holding
 
     # ------------------------------------------------------------ one message
 
@@ -137,75 +112,30 @@ class MessagePipeline:
         Also return all that was held where time went back: tracks and transforms start anew.
 
         """
-        if is_placeholder(item.content):
-            return [item], []
-        if isinstance(item.content, Sweep):
-            return self._confirmed(item)
-        return self._all_confirmed(self._bursts.add(item))
-
-    def _all_confirmed(self, whole: list[Item]) -> tuple[list[Item], list[Outgoing]]:
-        """Return the messages to process next, and what to publish before, of several ones."""
-        items: list[Item] = []
-        ready: list[Outgoing] = []
-        for item in whole:
-            confirmed, released = self._confirmed(item)
-            items += confirmed
-            ready += released
-        return items, ready
-
-    def _confirmed(self, item: Item) -> tuple[list[Item], list[Outgoing]]:
-        """Return as `confirm`, for a cloud or for all boxes of a stamp."""
-        confirmed = self._jumps.add(item, item.content, item.received_ns)
-        ready = self._not_used(confirmed.ahead)
-        if not confirmed.has_jumped:
-            return confirmed.items, ready
-        stamp_ns = confirmed.items[0].content.stamp_ns
-        self._report(
-            Reason.TIME_JUMP,
-            f'expected stamps of one clock, got some that went back to {stamp_ns} ns; tracks '
-            f'start anew: unless a recording is played in a loop, let one clock set all stamps',
-            1,
-        )
-        ready += self._start_anew()
-        self.session.tree.rewind(stamp_ns)
-        return confirmed.items, ready
+        return self._confirmed(self.arrivals.add(item))
 
     def release(
         self, now: float = inf, more_boxes: bool = False
     ) -> tuple[list[Item], list[Outgoing]]:
-        """
-        Return what no other message has confirmed in time: late ones, and those not used.
-
-        While there are `more_boxes`, those that wait for others of their stamp wait on.
-
-        """
-        whole = [] if more_boxes else self._bursts.release(now)
-        late, ready = self._all_confirmed(whole)
-        ahead: list[Item] = []
-        for held in self._jumps.held:
-            if now >= held.item.received + _patience(held):
-                (ahead if held.is_ahead else late).extend(self._jumps.release(held))
-        return late, ready + self._not_used(ahead)
+        """Return what no other message has confirmed in time, see `Arrivals`."""
+        return self._confirmed(self.arrivals.release(now, more_boxes))
 
     def process(self, item: Item) -> list[Outgoing]:
         """Take a message to the registrar; return the messages that are ready to be published."""
         if is_placeholder(item.content):
             return self.pass_through(item.message)
         self.following.start(item.received)
-        admitted = self.session.admit(item.content, item.received_ns)
-        if admitted.reason:
-            self._report_missing_transform(item, admitted.reason, admitted.detail)
+        item = self.session.admit(item, Ticket(item.message, received=item.received))
         if isinstance(item.content, Sweep):
-            return self._process_cloud(item, item.content, admitted)
-        return self._process_boxes(item, item.content, admitted)
+            return self._process_cloud(item)
+        return self._process_boxes(item)
 
-    def pass_through(self, message: Any) -> list[Outgoing]:
+    def pass_through(
+        self, message: Any, stamp_ns: int = 0, is_early_out: bool = False
+    ) -> list[Outgoing]:
         """Return an input message as early boxes and, once those before it are, as final."""
-        return [Outgoing(message, False), *self.pass_through_as_final(message)]
-
-    def pass_through_as_final(self, message: Any) -> list[Outgoing]:
-        """Return an input message as final boxes once those before it are."""
-        return self._messages(self.registrar.add_kept(passing(message), PASSED))
+        early = [] if is_early_out else [Outgoing(message, False)]
+        return early + self._messages(self.registrar.add_kept(passing(message, stamp_ns), PASSED))
 
     # ------------------------------------------------------------ messages that do not arrive
 
@@ -238,10 +168,9 @@ class MessagePipeline:
     def reset(self) -> list[Outgoing]:
         """Forget everything but the transforms; return everything that is held."""
         ready = self._start_anew()
-        for item in (*self._jumps.release(), *self._bursts.release()):
+        for item in self.arrivals.reset():
             if not isinstance(item.content, Sweep):
                 ready += self.pass_through(item.message)
-        self._jumps.restart()
         return ready
 
     def abandon(self, item: Item | None) -> list[Outgoing]:
@@ -268,62 +197,67 @@ class MessagePipeline:
         self._restart()
         return ready
 
-    def _not_used(self, ahead: list[Item]) -> list[Outgoing]:
-        """Report messages that are ahead of all others; return boxes, which pass through."""
+    def _confirmed(
+        self, confirmed: Iterable[Confirmed[Item]]
+    ) -> tuple[list[Item], list[Outgoing]]:
+        """Return the messages to process next, and what to publish before."""
+        items: list[Item] = []
         ready: list[Outgoing] = []
-        for item in ahead:
-            is_cloud = isinstance(item.content, Sweep)
-            self._report(
-                Reason.STAMP_AHEAD,
-                f'{"points" if is_cloud else "boxes"}: the stamp {item.content.stamp_ns} ns is in '
-                f'the future of those before and after it; {Reason.STAMP_AHEAD.remedy}',
-                1,
-            )
-            if not is_cloud:
-                ready += self.pass_through(item.message)
+        for one in confirmed:
+            for ahead in one.ahead:
+                ready += self._not_used(ahead)
+            if one.has_jumped:
+                ready += self._gone_back(one.items[0].content.stamp_ns)
+            items += one.items
+        return items, ready
+
+    def _gone_back(self, stamp_ns: int) -> list[Outgoing]:
+        """Start anew where time went back; return everything that was held."""
+        self._report(
+            Reason.TIME_JUMP,
+            f'expected stamps of one clock, got some that went back to {stamp_ns} ns; tracks '
+            f'start anew: unless a recording is played in a loop, let one clock set all stamps',
+            1,
+        )
+        ready = self._start_anew()
+        self.session.tree.rewind(stamp_ns)
         return ready
 
-    def _process_cloud(self, item: Item, cloud: Sweep, admitted: Admitted) -> list[Outgoing]:
-        """Add a cloud to the registrar, with those of the other LiDARs."""
-        if admitted.moved is None:
-            self.wait.give_up(cloud)
-            return []
-        assert isinstance(admitted.moved, Sweep)
-        return self._add_sweeps(self.session.merged(admitted.moved, item))
+    def _not_used(self, item: Item) -> list[Outgoing]:
+        """Report a message that is ahead of all others; return boxes, which pass through."""
+        is_cloud = isinstance(item.content, Sweep)
+        self._report(
+            Reason.STAMP_AHEAD,
+            f'{"points" if is_cloud else "boxes"}: the stamp {item.content.stamp_ns} ns is in '
+            f'the future of those before and after it; {Reason.STAMP_AHEAD.remedy}',
+            1,
+        )
+        return [] if is_cloud else self.pass_through(item.message)
 
-    def _process_boxes(self, item: Item, given: BoxArray, admitted: Admitted) -> list[Outgoing]:
-        """Add boxes to the registrar, with their ticket; pass them through without transforms."""
+    def _process_cloud(self, item: Item) -> list[Outgoing]:
+        """Add a cloud to the registrar, with those of the other LiDARs."""
+        assert isinstance(item.content, Sweep)
+        if item.reason:
+            self._report(item.reason, item.detail, 1)
+        if item.moved is None:
+            self.wait.give_up(item.content)
+            return []
+        assert isinstance(item.moved, Sweep)
+        return self._add_sweeps(self.session.merged(item.moved, item))
+
+    def _process_boxes(self, item: Item) -> list[Outgoing]:
+        """Add boxes to the registrar; pass them through without transforms."""
         for found in self.session.findings:
             self._report(found.reason, found.text, 1)
-        placed = self._in_output_frame(item, given, admitted)
-        if placed is None:
-            return self.pass_through(item.message)
-        shown, frame = placed
-        assert isinstance(admitted.moved, BoxArray)
+        if isinstance(item.moved, BoxArray):
+            item = self._tickets.completed(item, self.registrar.config)
+        if not isinstance(item.moved, BoxArray):
+            assert isinstance(item.content, BoxArray) and item.reason is not None
+            if item.content.track_ids:
+                self._report(item.reason, item.detail, len(item.content.track_ids))
+            return self.pass_through(item.message, item.content.stamp_ns)
         self.silence.boxes_received = item.received
-        boxes = self._tickets.issue(item, shown, admitted.moved, frame, self.config)
-        return self._messages(self.registrar.add_boxes(boxes))
-
-    def _in_output_frame(
-        self, item: Item, given: BoxArray, admitted: Admitted
-    ) -> tuple[BoxArray, OutputFrame] | None:
-        """Return boxes in the output frame, and that frame; None if it is not reached."""
-        T_fixed_item = admitted.T_fixed_item
-        if T_fixed_item is None:
-            return None
-        if not self.wait.changes_frame(given):
-            return given, OutputFrame(inverse(T_fixed_item), None)
-        output_frame = self.wait.output_frame
-        try:
-            T_output_fixed = self.session.tree.lookup(
-                output_frame, self.session.fixed_frame, given.stamp_ns
-            )
-        except TransformUnavailable as error:
-            self._report_missing_transform(item, Reason.NO_TRANSFORM, str(error))
-            return None
-        T_output_item = T_output_fixed @ T_fixed_item
-        shown = boxes_to_frame(given, T_output_item, output_frame)
-        return shown, OutputFrame(T_output_fixed, T_output_item)
+        return self._messages(self.registrar.add_boxes(item.moved))
 
     def _add_sweeps(self, complete: list[MergedSweep]) -> list[Outgoing]:
         """Add sweeps to the registrar; return the messages that are ready to be published."""
@@ -347,13 +281,6 @@ class MessagePipeline:
         self._tickets.restart()
         self.following.restart()
 
-    def _report_missing_transform(self, item: Item, reason: Reason, detail: str) -> None:
-        """Report a sweep, or the boxes of an array, that no transform is known for."""
-        content = item.content
-        count = 1 if isinstance(content, Sweep) else len(content.track_ids)
-        if count:
-            self._report(reason, detail, count)
-
     def _note_latency(self, pair: Pair) -> BoxArray:
         """Report boxes that were late, and return them."""
         latency = self.registrar.latency
@@ -361,8 +288,3 @@ class MessagePipeline:
         if latency.warning:
             self._report(Reason.LATENCY, latency.warning, 1)
         return pair.boxes
-
-
-def _patience(held: Held[Item]) -> float:
-    """Return how long a message waits for the next of its stream [s]."""
-    return AHEAD_TIME if held.is_ahead else CONFIRMATION_TIME

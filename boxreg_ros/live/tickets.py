@@ -8,12 +8,17 @@ from math import inf
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.items import Item
+from boxreg_ros.io.session import Session
+from boxreg_ros.io.transforms import boxes_to_frame, inverse
+from boxreg_ros.live.transform_wait import TransformWait
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats
 import numpy as np
 
 PASSING = BoxArray(0, '', (), (), np.zeros(0), np.zeros((0, 9)))
-"""In the place of a message that passes through: it stands behind the newest boxes."""
+"""In the place of a message that passes through."""
 
 
 class Detection(NamedTuple):
@@ -51,48 +56,53 @@ class Ticket:
 
 class Tickets:
     """
-    Give box arrays their tickets.
+    Complete the tickets of box arrays.
 
     State: the last detection of each track, for boxes of tracks that miss one. Not thread-safe.
 
     """
 
-    def __init__(self) -> None:
+    def __init__(self, session: Session, wait: TransformWait) -> None:
+        self._session = session
+        self._wait = wait
         self._last: dict[str, Detection] = {}
 
     def restart(self) -> None:
         """Forget the detections: tracks start anew."""
         self._last = {}
 
-    def issue(
-        self, item: Item, shown: BoxArray, moved: BoxArray, frame: OutputFrame, config: Config
-    ) -> BoxArray:
+    def completed(self, item: Item, config: Config) -> Item:
         """
-        Return boxes with their ticket.
+        Return boxes in the fixed frame with all that their ticket holds.
 
-        Parameters
-        ----------
-        item : Item
-            The input message.
-        shown, moved : BoxArray
-            Its boxes in the output frame, and in the fixed frame with their ids.
-        frame : OutputFrame
-            Of the output.
-        config : Config
-            `coast` and `max_gap` are used.
+        Where the output frame is not reached, they are not `moved`. Of `config`, `coast` and
+        `max_gap` are used.
 
         """
-        assert isinstance(item.content, BoxArray)
-        has_new_ids = moved.track_ids != item.content.track_ids
-        ticket = Ticket(
-            item.message,
-            replace(shown, track_ids=moved.track_ids) if has_new_ids else shown,
-            item.received,
-            frame,
-            has_new_ids,
-            self._earlier(item.message, moved, config),
-        )
-        return replace(moved, ticket=ticket)
+        given, moved = item.content, item.moved
+        assert isinstance(given, BoxArray) and isinstance(moved, BoxArray)
+        ticket = ticket_of(moved)
+        try:
+            ticket.boxes, ticket.frame = self._in_output_frame(item, given)
+        except TransformUnavailable as error:
+            return item._replace(moved=None, reason=Reason.NO_TRANSFORM, detail=str(error))
+        ticket.has_new_ids = moved.track_ids != given.track_ids
+        if ticket.has_new_ids:
+            ticket.boxes = replace(ticket.boxes, track_ids=moved.track_ids)
+        ticket.earlier = self._earlier(item.message, moved, config)
+        return item
+
+    def _in_output_frame(self, item: Item, given: BoxArray) -> tuple[BoxArray, OutputFrame]:
+        """Return boxes in the output frame, and that frame."""
+        assert item.T_fixed_item is not None  # the boxes are in the fixed frame
+        if not self._wait.changes_frame(given):
+            return given, OutputFrame(inverse(item.T_fixed_item), None)
+        frame = self._wait.output_frame
+        session = self._session
+        T_output_fixed = session.tree.lookup(frame, session.fixed_frame, given.stamp_ns)
+        T_output_item = T_output_fixed @ item.T_fixed_item
+        shown = boxes_to_frame(given, T_output_item, frame)
+        return shown, OutputFrame(T_output_fixed, T_output_item)
 
     def _earlier(self, message: Any, boxes: BoxArray, config: Config) -> dict[str, Detection]:
         """Return the detections of tracks that have none in `boxes`; note those of `boxes`."""
@@ -111,9 +121,15 @@ class Tickets:
         return earlier
 
 
-def passing(message: Any) -> BoxArray:
-    """Return an array with a ticket for a message that passes through: its early copy is out."""
-    return replace(PASSING, ticket=Ticket(message, received=inf, is_early_out=True))
+def passing(message: Any, stamp_ns: int = 0) -> BoxArray:
+    """
+    Return an array with a ticket for a message that passes through: its early copy is out.
+
+    Without its stamp [ns] it stands behind the newest boxes.
+
+    """
+    ticket = Ticket(message, received=inf, is_early_out=True)
+    return replace(PASSING, stamp_ns=stamp_ns, ticket=ticket)
 
 
 def ticket_of(boxes: BoxArray) -> Ticket:

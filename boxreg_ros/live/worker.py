@@ -191,7 +191,7 @@ class Worker:
         if message is None:
             return
         if message.topic == 'passing':
-            self._publish(self._live.pass_through_as_final(message.content))
+            self._publish(self._live.pass_through(message.content, is_early_out=True))
         elif self._is_overdue(message):
             self.drop(message)
         else:
@@ -258,7 +258,7 @@ class Worker:
             self._catch_up(spare)
             return
         period = HELD_PERIOD if self._live.is_holding else IDLE_PERIOD
-        if self._live.is_joining:
+        if self._live.arrivals.is_joining:
             period = JOIN_TIME
         if self._live.static_points is not None:
             period = min(period, self._live.static_points.due(now))
@@ -304,7 +304,8 @@ class Worker:
             case 'reset':
                 self._publish(self._guarded(self._live.reset))
             case 'settings':
-                self._live.config, options = content
+                config, options = content
+                self._live.registrar.config = self._live.session.config = config
                 self._live.wait.output_frame = options.output_frame.lstrip('/')
                 self._live.wait.timeout = options.transform_timeout
                 self._budget.deadline = options.deadline
@@ -323,7 +324,7 @@ class Worker:
             refined = labels_passed_through(out.message, self._live.adapter, self._live.session)
         if refined is not None:
             fixed_frame = self._live.session.fixed_frame
-            content = LabelMessage(refined, fixed_frame, self._live.config.digest)
+            content = LabelMessage(refined, fixed_frame, self._live.registrar.config.digest)
             publisher.publish(String(data=to_text(content)))
 
     def _follow(self, message: Any) -> None:
@@ -436,20 +437,20 @@ class Worker:
                 self._health.report(reason, f'{reason.meaning}; {reason.remedy}')
 
     def _finish(self, item: Item | None) -> None:
-        """Publish held boxes, and pass waiting messages through unsolved."""
+        """Publish held boxes, and pass messages that are not decoded yet through unsolved."""
         self._take_events()
-        self._publish(self._guarded(self._live.flush))
         late, ready = self._live.release()
         self._publish(ready)
         for waiting in (item, *self._confirmed, *late):
-            if waiting is not None and not isinstance(waiting.content, Sweep):
-                self._publish(self._live.pass_through(waiting.message))
+            if waiting is not None:  # its transforms will not come
+                self._process(waiting)
+        self._publish(self._guarded(self._live.flush))
         message = self._inbox.take()
         while message is not None:
             if message.topic == 'boxes':
                 self._publish(self._live.pass_through(message.content))
             elif message.topic == 'passing':
-                self._publish(self._live.pass_through_as_final(message.content))
+                self._publish(self._live.pass_through(message.content, is_early_out=True))
             message = self._inbox.take()
         self._save_model()
         self._publish_static()

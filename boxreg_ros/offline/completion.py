@@ -13,8 +13,9 @@ from boxreg_ros.core.latency import Latency
 from boxreg_ros.core.matching import Pair
 from boxreg_ros.core.observation import crop
 from boxreg_ros.core.registrar import BoxRegistrar, Submit
+from boxreg_ros.io.items import Item
 from boxreg_ros.io.session import hand_to_registrar
-from boxreg_ros.offline.reader import ReadItem
+from boxreg_ros.offline.reader import ArrayPlace
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
     BoxArray,
@@ -112,21 +113,20 @@ def _oldest_to_come(arrays: Sequence[BoxArray]) -> list[float]:
     return oldest[::-1]
 
 
-def with_boxes_in_time(
-    items: Iterable[ReadItem], in_time: Sequence[BoxArray]
-) -> Iterator[ReadItem]:
+def with_boxes_in_time(items: Iterable[Item], in_time: Sequence[BoxArray]) -> Iterator[Item]:
     """Yield the items of a recording with the boxes that a `FirstPass` has brought in time."""
     arrays = iter(in_time)
     for item in items:
         if isinstance(item.moved, BoxArray):  # the first pass does without attributes
-            boxes = replace(next(arrays), ticket=None, attributes=item.moved.attributes)
+            given = item.moved
+            boxes = replace(next(arrays), ticket=given.ticket, attributes=given.attributes)
             item = item._replace(moved=boxes)
         yield item
 
 
 def with_empty_arrays(
-    items: Iterable[ReadItem], parts: Sequence[Arrivals], frame_id: str
-) -> Iterator[ReadItem]:
+    items: Iterable[Item], parts: Sequence[Arrivals], frame_id: str
+) -> Iterator[Item]:
     """Yield the items of a recording, and an empty array for each sweep without one."""
     inserter = Inserter(parts)
     poses: dict[int, Floats | None] = {}
@@ -139,8 +139,12 @@ def with_empty_arrays(
         if is_sweep:
             poses[moved.stamp_ns] = item.T_fixed_sensor
         for stamp_ns in inserter.after(moved.stamp_ns if is_sweep else None, item.restarts):
-            empty, pose = empty_array(stamp_ns, frame_id), poses.pop(stamp_ns)
-            yield ReadItem(item.seconds, False, empty, empty, np.eye(4), pose, None)
+            empty = empty_array(stamp_ns, frame_id)
+            moved = replace(empty, ticket=ArrayPlace())
+            pose = poses.pop(stamp_ns)
+            yield Item(
+                item.received_ns, empty, moved=moved, T_fixed_item=np.eye(4), T_fixed_sensor=pose
+            )
 
 
 ROAD_CLEARANCE = 0.3

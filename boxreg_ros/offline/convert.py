@@ -164,16 +164,15 @@ def _read_with_recording(
         fixed_frame = items.fixed_frame
         sensor_frame = label_frame_of(recording, items.tree, fixed_frame, request.label_frame)
         for item in items.read(with_clouds=spool is not None, with_intensities=True):
-            if isinstance(item.given, Sweep):
+            if isinstance(item.content, Sweep):
                 if spool is not None:
                     yield from _with_clouds(waiting, items.stored_cloud(item, sensor_frame), spool)
                 continue
-            refined = item.items[0].refined
+            refined = item.refined
             assert refined is not None  # boxes of label files have it
-            # To move boxes within the fixed frame would change their last digits.
-            if isinstance(item.moved, BoxArray) and item.given.frame_id != fixed_frame:
+            if isinstance(item.moved, BoxArray):
                 refined = replace(refined, boxes=item.moved)
-            T_fixed_sensor = items.pose_of(sensor_frame, item.given.stamp_ns)
+            T_fixed_sensor = items.pose_of(sensor_frame, item.content.stamp_ns)
             frame = LabelFrame(refined, fixed_frame, sensor_frame, T_fixed_sensor)
             if spool is None:
                 yield frame

@@ -242,9 +242,9 @@ def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
         if count >= SAMPLE_ITEMS or item.received_ns > begin_ns + SAMPLE_SECONDS * 1e9:
             break
         sample.add(item)
-        admitted = session.admit(item.content, item.received_ns)
-        if admitted.detail:
-            sample.without_transform.append(admitted.detail)
+        detail = session.admit(item).detail
+        if detail:
+            sample.without_transform.append(detail)
     recording.check_readable()
     return {
         'points_topic': recording.points_topic,

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
+from boxreg_ros.io.items import Item
 from boxreg_ros.labels import LabelFrame, LabelOutput, Provenance
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline.progress import Stopwatch
-from boxreg_ros.offline.reader import ReadItem, Source, uses_one_core
+from boxreg_ros.offline.reader import ArrayPlace, Source, uses_one_core
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.sources import writer_options
 from boxreg_ros.offline.workers import Background
 from boxreg_ros.reasons import Reason
 from boxreg_ros.review.corrections import Corrections
-from boxreg_ros.structures import BoxArray, Floats, REFINED, RefinedBoxes, Sweep, YAW
+from boxreg_ros.structures import BoxArray, REFINED, RefinedBoxes, Sweep, YAW
 import numpy as np
 
 ARRAYS_AHEAD = 256
@@ -24,24 +25,11 @@ ARRAYS_AHEAD = 256
 returns the results of as many stamps at once."""
 
 
-@dataclass(eq=False, slots=True)
-class ArrayPlace:
-    """What label files need of a box array beside its result: its ticket at the registrar."""
-
-    boxes: BoxArray
-    """Of the input, in time, in the fixed frame where a transform to it is known."""
-    T_fixed_sensor: Floats | None
-    T_fixed_boxes: Floats | None
-    """Pose of the frame of the input message; None where unknown, as that of the sensor."""
-    early: RefinedBoxes | None = None
-    is_written: bool = False
-
-
 class Sink:
     """
     Write the result of each box array once, in the order of the registrar.
 
-    Every box array gets an `ArrayPlace` as its ticket on its way to the registrar. Files are
+    The ticket of every box array is an `ArrayPlace`. Files are
     written in a thread, while the registrar goes on; attributes are those of all results after
     the end of the block only. The time spent on files is added to the stage ``write`` of the
     clock.
@@ -91,22 +79,24 @@ class Sink:
         self.heading_flips = 0
         self.without_cloud = 0
 
-    def expect(self, item: ReadItem) -> tuple[Sweep | BoxArray | None, str]:
+    def expect(self, item: Item) -> tuple[Sweep | BoxArray | None, str]:
         """
         Return what the registrar is given for an item, and why boxes are kept; empty if not.
 
-        A cloud is stored if files need it; boxes get a `ArrayPlace` as their ticket.
+        A cloud is stored if files need it; the `ArrayPlace` of boxes is completed.
 
         """
         if self.points is not None and item.moved is not None:
             with self._clock('report'):
                 self.points.note(item.moved)
-        self._note_time(item.given or item.moved)
-        if isinstance(item.given, BoxArray):
-            return self._with_place(item, item.given)
-        if self._spool and item.given is not None and item.T_fixed_given is not None:
+        if isinstance(item.content, BoxArray):
+            self._note_time(item.content)
+            return self._with_place(item, item.content)
+        if item.moved is not None or self._spool:
+            self._note_time(item.content)
+        if self._spool and item.T_fixed_item is not None:
             with self._clock('write'):
-                self._spool.add(item.given, item.T_fixed_given, item.intensities)
+                self._spool.add(item.content, item.T_fixed_item, item.intensities)
         return item.moved, ''
 
     def to_register(self, boxes: BoxArray, sweep: Sweep | None) -> BoxArray:
@@ -129,6 +119,7 @@ class Sink:
             assert isinstance(place, ArrayPlace)
             if place.is_written:
                 continue
+            assert place.boxes is not None
             result = self.corrections.apply(place.boxes, refined)
             if refined.is_final or self._writes_early:
                 place.is_written = True
@@ -155,16 +146,14 @@ class Sink:
         """Return the number of input boxes that have not been written."""
         return self.boxes_in - (self.boxes_out - self._boxes_added)
 
-    def _note_time(self, content: Sweep | BoxArray | None) -> None:
+    def _note_time(self, content: Sweep | BoxArray) -> None:
         """Widen the time range of clouds or boxes by a message; empty box arrays count."""
-        if content is None:
-            return
         name = 'boxes' if isinstance(content, BoxArray) else 'clouds'
         stamp_ns = content.stamp_ns
         first, last = self.time_ranges.get(name, (stamp_ns, stamp_ns))
         self.time_ranges[name] = min(first, stamp_ns), max(last, stamp_ns)
 
-    def _with_place(self, item: ReadItem, given: BoxArray) -> tuple[BoxArray | None, str]:
+    def _with_place(self, item: Item, given: BoxArray) -> tuple[BoxArray | None, str]:
         """Return boxes with their place, and why they are kept, if they are."""
         count = len(given.track_ids)
         self.boxes_in += count
@@ -177,17 +166,20 @@ class Sink:
         if isinstance(moved, BoxArray):
             if self._has_keyframes:  # soft: evidence may move those that files call pinned
                 moved = replace(moved, pinned=None)
-            return replace(
-                moved, ticket=ArrayPlace(moved, item.T_fixed_sensor, item.T_fixed_given)
-            ), ''
+            place = moved.ticket
+            assert isinstance(place, ArrayPlace)
+            place.boxes = moved
+            place.T_fixed_sensor, place.T_fixed_boxes = item.T_fixed_sensor, item.T_fixed_item
+            return moved, ''
         if not count:
             return None, ''
-        place = ArrayPlace(given, item.T_fixed_sensor, item.T_fixed_given)
         as_kept = self.corrections.to_register(given, with_pins=False)
+        place = ArrayPlace(given, item.T_fixed_sensor, item.T_fixed_item)
         return replace(as_kept, ticket=place), item.reason or Reason.NO_TRANSFORM
 
     def _put(self, refined: RefinedBoxes, place: ArrayPlace) -> None:
         """Count the boxes of one array and write them in all formats; in the thread."""
+        assert place.boxes is not None
         refined = self.corrections.with_attributes(place.boxes, refined)
         count = len(place.boxes.track_ids)
         self.boxes_out += len(refined.status)

@@ -11,22 +11,23 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
-from boxreg_ros.io.items import ItemSource
+from boxreg_ros.io.fixed_frame import FixedFrameItems
+from boxreg_ros.io.items import Item, ItemSource
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.offline.sources import label_frame_of, scene_address
 from boxreg_ros.offline.stored_sweeps import StoredPlace, StoredSweeps
 from boxreg_ros.offline.workers import Background, Receive, run_in_worker, Send
-from boxreg_ros.structures import BoxArray, Floats, Sweep
+from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 from msg_adapters.clouds import POINTS_TYPE
+import numpy as np
 
 MESSAGES_AHEAD = 4
 """Messages that are read before the receiver has taken those before them: two clouds, their boxes.
@@ -40,17 +41,17 @@ class JumpingIds(RecordingError):
     """The ids of a topic of boxes do not identify objects over time."""
 
 
-class ReadItem(NamedTuple):
-    """A cloud or boxes for the registrar, with the poses (4, 4) that label files need."""
+@dataclass(eq=False, slots=True)
+class ArrayPlace:
+    """What label files need of a box array beside its result: its ticket at the registrar."""
 
-    seconds: float  # since the start of the part that is read
-    restarts: bool  # time went back before this item
-    given: Sweep | BoxArray | None  # in its own frame; None for a cloud that is not written
-    moved: Sweep | BoxArray | None  # in the fixed frame; None where no transform is known
-    T_fixed_given: Floats | None  # None where unknown, and for a cloud that is not written
-    T_fixed_sensor: Floats | None  # pose of the sensor frame of label files
-    intensities: Floats | None  # (M,) of a cloud that is written
-    reason: str = ''  # why `moved` is None, if not for want of a transform
+    boxes: BoxArray | None = None
+    """Of the input, in time, in the fixed frame where a transform to it is known."""
+    T_fixed_sensor: Floats | None = None
+    T_fixed_boxes: Floats | None = None
+    """Pose of the frame of the input message; None where unknown, as that of the sensor."""
+    early: RefinedBoxes | None = None
+    is_written: bool = False
 
 
 class Source(NamedTuple):
@@ -59,7 +60,8 @@ class Source(NamedTuple):
     topics: dict[str, str | None]  # of points, boxes and odometry; None where there is none
     fixed_frame: str  # to refine in
     sensor_frame: str  # of label files
-    seconds: float  # duration of the part that is read
+    start_ns: int  # of the part that is read, in receive time [ns]
+    seconds: float  # its duration
 
 
 class Findings(NamedTuple):
@@ -104,7 +106,7 @@ class RecordingReader:
         if request.jumping_ids:
             convention = replace(convention, associate=True)
         self._items = FixedFrameItems(
-            recording, request.config, convention, request.fixed_frame, clock
+            recording, request.config, convention, request.fixed_frame, clock, ArrayPlace
         )
         with clock('read'):
             sensor_frame = label_frame_of(
@@ -116,9 +118,11 @@ class RecordingReader:
             'odometry': recording.odometry_topic,
         }
         seconds = (recording.end_ns - recording.start_ns) * 1e-9
-        self.source = Source(topics, self._items.fixed_frame, sensor_frame, seconds)
+        self.source = Source(
+            topics, self._items.fixed_frame, sensor_frame, recording.start_ns, seconds
+        )
 
-    def __iter__(self) -> Iterator[ReadItem]:
+    def __iter__(self) -> Iterator[Item]:
         """
         Yield clouds and boxes in the order they were received.
 
@@ -130,18 +134,19 @@ class RecordingReader:
         self._check_ids()
         self._recording.check_readable()
 
-    def _read(self) -> Iterator[ReadItem]:
+    def _read(self) -> Iterator[Item]:
         """Yield clouds and boxes, as they are."""
         sweeps = self._sweeps
+        checked_ns = self._recording.start_ns + round(IDS_SECONDS * 1e9)
         are_written = self._with_points or (sweeps is not None and sweeps.with_clouds)
         for item in self._items.read(with_intensities=are_written):
-            if sweeps is not None and isinstance(item.given, Sweep):
+            if sweeps is not None and isinstance(item.content, Sweep):
                 with self._clock('points'):
                     sweeps.add(item, self._items, self.source.sensor_frame)
             with self._clock('transform'):
-                read_item = self._trimmed(item)
-            yield read_item
-            if isinstance(item.given, BoxArray) and read_item.seconds >= IDS_SECONDS:
+                trimmed = self._trimmed(item)
+            yield trimmed
+            if isinstance(item.content, BoxArray) and item.received_ns >= checked_ns:
                 self._check_ids()
 
     def _check_ids(self) -> None:
@@ -189,26 +194,27 @@ class RecordingReader:
             self._clock.stages(),
         )
 
-    def _trimmed(self, item: MovedItem) -> ReadItem:
-        """Return an item without the parts that are not read: it is copied to a process."""
+    def _trimmed(self, item: Item) -> Item:
+        """Return an item without what nobody reads: it is copied to a process."""
+        pose = self._items.pose_of(self.source.sensor_frame, item.content.stamp_ns)
+        trimmed = item._replace(refined=None, parts=(), T_fixed_sensor=pose)
+        if isinstance(item.content, BoxArray):
+            return trimmed
         moved = item.moved
         if isinstance(moved, Sweep) and not self._with_times:
             moved = replace(moved, times=None)
-        seconds = (item.received_ns - self._recording.start_ns) * 1e-9
-        given, T_fixed_given, intensities = item.given, item.T_fixed_item, None
-        if isinstance(given, Sweep):
-            if not self._with_points:
-                pose = None
-                if moved is not None:
-                    pose = self._items.pose_of(self.source.sensor_frame, given.stamp_ns)
-                return ReadItem(seconds, item.restarts, None, moved, None, pose, None)
-            cloud = self._items.stored_cloud(item, self.source.sensor_frame)
-            given, T_fixed_given, intensities = cloud
-        T_fixed_sensor = self._items.pose_of(self.source.sensor_frame, given.stamp_ns)
-        return ReadItem(
-            seconds, item.restarts, given, moved, T_fixed_given, T_fixed_sensor, intensities,
-            item.reason,
-        )  # fmt: skip
+        if not self._with_points:
+            content = moved or Sweep(item.content.stamp_ns, '', np.zeros((0, 3)))
+            return trimmed._replace(
+                content=content, moved=moved, T_fixed_item=None, intensities=None
+            )
+        cloud = self._items.stored_cloud(item, self.source.sensor_frame)
+        return trimmed._replace(
+            content=cloud.sweep,
+            moved=moved,
+            T_fixed_item=cloud.T_fixed_sweep,
+            intensities=cloud.intensities,
+        )
 
 
 def _may_associate(request: Request) -> bool:
@@ -255,7 +261,7 @@ class ReadAhead:
         self.source: Source = receive()
         self.findings: Findings
 
-    def __iter__(self) -> Iterator[ReadItem]:
+    def __iter__(self) -> Iterator[Item]:
         """Yield clouds and boxes; an error of the process is raised at its place."""
         while True:
             received = self._receive()
@@ -266,7 +272,7 @@ class ReadAhead:
 
 
 def _read(
-    messages: Callable[[], Iterator[Source | ReadItem | Findings]], _: Receive, send: Send
+    messages: Callable[[], Iterator[Source | Item | Findings]], _: Receive, send: Send
 ) -> None:
     """Send the messages, in a thread that waits for the receiver while others are read."""
     background = Background(MESSAGES_AHEAD)
@@ -279,7 +285,7 @@ def _read(
 
 def _messages(
     request: Request, sweeps: StoredSweeps | None
-) -> Generator[Source | ReadItem | Findings]:
+) -> Generator[Source | Item | Findings]:
     """Yield the source of a recording, all its items, and the findings."""
     with request.recording() as recording:
         _check_copies(request, recording)

@@ -178,7 +178,7 @@ def true_boxes(path: Path) -> BoxTable:
         for item in FixedFrameItems(scene, Config()).read(with_clouds=False):
             if not isinstance(item.moved, BoxArray):
                 continue  # without a pose
-            annotations = item.items[0].refined
+            annotations = item.refined
             assert annotations is not None
             arrays.append(item.moved)
             num_points.append(annotations.num_points)

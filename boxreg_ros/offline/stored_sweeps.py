@@ -9,7 +9,8 @@ import pickle
 from tempfile import TemporaryFile
 from typing import NamedTuple
 
-from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem, StoredCloud
+from boxreg_ros.io.fixed_frame import FixedFrameItems, StoredCloud
+from boxreg_ros.io.items import Item
 from boxreg_ros.structures import Floats, Sweep
 import numpy as np
 
@@ -56,7 +57,7 @@ class StoredSweeps:
         self.with_clouds = with_clouds
         self.places: list[StoredPlace] = []
 
-    def add(self, item: MovedItem, items: FixedFrameItems, sensor_frame: str) -> None:
+    def add(self, item: Item, items: FixedFrameItems, sensor_frame: str) -> None:
         """Store a sweep of `items`; label files have merged ones in `sensor_frame`."""
         cloud = items.stored_cloud(item, sensor_frame) if self.with_clouds else None
         moved = item.moved if isinstance(item.moved, Sweep) else None
@@ -92,15 +93,15 @@ class StoredSweeps:
         return stored
 
 
-def _parts(item: MovedItem, items: FixedFrameItems) -> Iterator[MergedCloud]:
+def _parts(item: Item, items: FixedFrameItems) -> Iterator[MergedCloud]:
     """Yield the clouds that an item was merged from."""
     first = 0
-    for part in item.items:
+    for part in item.parts or (item,):
         cloud = part.content
         assert isinstance(cloud, Sweep)
         rows = slice(first, first + len(cloud.points))
         first = rows.stop
         T = item.T_fixed_item
-        if len(item.items) > 1:
+        if len(item.parts) > 1:
             T = items.pose_of(cloud.frame_id, cloud.stamp_ns)
         yield MergedCloud(cloud.topic, cloud.stamp_ns, rows, np.eye(3) if T is None else T[:3, :3])

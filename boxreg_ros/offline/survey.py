@@ -7,8 +7,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any, TYPE_CHECKING
 
+from boxreg_ros.io.items import Item
 from boxreg_ros.offline.progress import Progress, Stopwatch
-from boxreg_ros.offline.reader import ReadAhead, reader, ReadItem
+from boxreg_ros.offline.reader import ReadAhead, reader
 from boxreg_ros.structures import BoxArray
 
 if TYPE_CHECKING:
@@ -31,11 +32,13 @@ class Passes:
         self._passes = passes
         self._done = 0
 
-    def each(self, recording: ReadAhead) -> Iterator[ReadItem]:
+    def each(self, recording: ReadAhead) -> Iterator[Item]:
         """Yield the items of one pass, and show the time that has been read [s]."""
-        seconds = recording.source.seconds
+        source = recording.source
         for item in recording:
-            self.progress.show(self._done * seconds + item.seconds, self._passes * seconds)
+            seconds = (item.received_ns - source.start_ns) * 1e-9
+            done = self._done * source.seconds + seconds
+            self.progress.show(done, self._passes * source.seconds)
             yield item
         self._done += 1
 
@@ -56,7 +59,7 @@ class Survey:
     latency: Latency | None = None
     """By which they were corrected."""
 
-    def completed(self, items: Iterable[ReadItem], fixed_frame: str) -> Iterator[ReadItem]:
+    def completed(self, items: Iterable[Item], fixed_frame: str) -> Iterator[Item]:
         """Yield the items of the second pass: boxes in time, and an array for each sweep."""
         from boxreg_ros.offline.completion import with_boxes_in_time, with_empty_arrays
 

@@ -13,9 +13,9 @@ from typing import Any
 from boxreg_ros.config import Config
 from boxreg_ros.core.follow import follow_points, FollowedTrack, solved
 from boxreg_ros.errors import BoxregError, RecordingError, remedy_of
-from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
+from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.images import Image, ImageCamera, RecordedImages
-from boxreg_ros.io.items import ItemSource
+from boxreg_ros.io.items import Item, ItemSource
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.sweep_store import SweepStore
 from boxreg_ros.io.transforms import inverse
@@ -197,7 +197,7 @@ class DriveScene:
                 self._is_done = True
                 self._changed.notify_all()
 
-    def _add(self, sweep: Sweep, item: MovedItem, items: FixedFrameItems) -> None:
+    def _add(self, sweep: Sweep, item: Item, items: FixedFrameItems) -> None:
         heading = self._headings[-1] if self._headings else 0.0
         if item.T_fixed_item is not None:
             heading = float(np.arctan2(item.T_fixed_item[1, 0], item.T_fixed_item[0, 0]))

@@ -212,7 +212,7 @@ def test_boxes_from_the_future_have_another_clock(tmp_path, seconds):
     path = write_recording(tmp_path / 'corrected', drive.items, messages=drive.messages)
     with Recording([path], convention=convention) as recording:
         items = FixedFrameItems(recording, Config(), convention)
-        stamps = [item.given.stamp_ns for item in items.read()]
+        stamps = [item.content.stamp_ns for item in items.read()]
         assert sorted(stamps) == sorted(2 * list(true_origins(30)))
         assert not items.session.finding
 
@@ -253,7 +253,7 @@ def test_boxes_with_stamps_of_earlier_clouds_are_those_of_a_slow_detector(tmp_pa
     path = write_recording(tmp_path / 'drive', drive.items, messages=drive.messages)
     with Recording([path]) as recording:
         items = FixedFrameItems(recording, Config())
-        given = [item.given for item in items.read()]
+        given = [item.content for item in items.read()]
         assert not items.session.finding
         assert 'those of a slow detector' in recording.finding
         assert '--boxes-offset=1.50' in recording.finding
@@ -487,7 +487,7 @@ def test_an_array_stamped_0_has_the_stamp_of_its_boxes(tmp_path):
     path = write_recording(tmp_path / 'drive', drive.items, messages=drive.messages)
     with Recording([path]) as recording:
         items = FixedFrameItems(recording, Config())
-        given = [item.given for item in items.read(with_clouds=False)]
+        given = [item.content for item in items.read(with_clouds=False)]
     assert [boxes.stamp_ns for boxes in given] == drive.stamps
 
 

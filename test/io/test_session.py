@@ -5,6 +5,7 @@ from dataclasses import replace
 from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.io.items import Item
 from boxreg_ros.io.session import hand_to_registrar, is_placeholder, Session
 from boxreg_ros.io.time_jumps import Confirmed, JumpConfirmation
 from boxreg_ros.offline.progress import Stopwatch
@@ -48,7 +49,7 @@ def test_items_are_moved_into_the_fixed_frame_with_their_transform():
     for transform in transforms:
         session.tree.add_transforms(*transform)
     for item in items:
-        admitted = session.admit(item)
+        admitted = session.admit(Item(0, item))
         T = session.tree.lookup('odom', 'lidar', item.stamp_ns)
         np.testing.assert_array_equal(admitted.T_fixed_item, T)
         assert admitted.moved.frame_id == 'odom'
@@ -60,11 +61,21 @@ def test_items_are_moved_into_the_fixed_frame_with_their_transform():
             np.testing.assert_allclose(admitted.moved.boxes[:, :3], expected)
 
 
+def test_boxes_in_the_fixed_frame_keep_their_numbers_and_get_the_ticket():
+    boxes = array_of(START)
+    boxes.boxes[0, 6:] = 0.1, -0.2, 2.9
+    session = Session(STANDARD, Config(), 'map')
+    ticket = object()
+    moved = session.admit(Item(0, boxes), ticket).moved
+    np.testing.assert_array_equal(moved.boxes, boxes.boxes)
+    assert moved.ticket is ticket
+
+
 def test_items_without_transform_have_a_reason():
     drive = Drive(sweeps=1, motion='none')
     items, _ = contents(drive)
     session = Session(STANDARD, Config(), 'odom')
-    admitted = [session.admit(item) for item in items]
+    admitted = [session.admit(Item(0, item)) for item in items]
     assert [a.reason for a in admitted] == ['sweep_without_transform', 'no_transform']
     assert all(a.moved is None and "'odom'" in a.detail for a in admitted)
 
@@ -86,23 +97,23 @@ def test_fixed_frame_is_chosen_when_the_motion_of_the_clouds_is_known():
 def test_ids_are_assigned_only_if_asked_for():
     boxes = array_of(START)
     session = Session(STANDARD, Config(), 'map')
-    assert session.admit(boxes).moved.track_ids == ('?',)
+    assert session.admit(Item(0, boxes)).moved.track_ids == ('?',)
     assert session.facts == {'ids': 'of the input'}
     session = Session(ASSOCIATE, Config(), 'map')
-    assert session.admit(boxes).moved.track_ids == ('1',)
+    assert session.admit(Item(0, boxes)).moved.track_ids == ('1',)
     assert session.facts == {'ids': 'by association', 'associated_tracks': 1}
 
 
 def test_a_restart_assigns_new_ids_and_max_gap_may_change():
     session = Session(ASSOCIATE, Config(max_gap=0.5), 'map')
     first, later = array_of(START), array_of(START + 8 * SECOND // 10)
-    assert session.admit(first).moved.track_ids == ('1',)
+    assert session.admit(Item(0, first)).moved.track_ids == ('1',)
     session.config = Config(max_gap=1.0)
-    assert session.admit(later).moved.track_ids == ('1',)
+    assert session.admit(Item(0, later)).moved.track_ids == ('1',)
     session.config = Config(max_gap=0.5)
     session.restart()
-    assert session.admit(first).moved.track_ids == ('2',)
-    assert session.admit(later).moved.track_ids == ('3',)
+    assert session.admit(Item(0, first)).moved.track_ids == ('2',)
+    assert session.admit(Item(0, later)).moved.track_ids == ('3',)
 
 
 def sweep_at(seconds):
@@ -204,7 +215,8 @@ def test_an_array_without_boxes_stamp_and_frame_is_a_placeholder():
     placeholder = BoxArray(0, '', (), (), np.zeros(0), empty)
     assert is_placeholder(placeholder)
     for _ in range(3):
-        assert session.admit(placeholder) == (None, None, None, '')
+        item = Item(0, placeholder)
+        assert session.admit(item) is item
     assert not is_placeholder(replace(placeholder, stamp_ns=START, frame_id='map'))
 
 
@@ -236,7 +248,7 @@ def test_boxes_of_a_recording_stamped_in_the_future_are_kept_and_said(tmp_path):
         warning = reading.findings().warning
     unused = [item for item in items if item.reason]
     assert [(item.moved, item.reason) for item in unused] == [(None, 'stamp_ahead')]
-    assert unused[0].given.stamp_ns == drive.stamps[5] + 3600 * SECOND
+    assert unused[0].content.stamp_ns == drive.stamps[5] + 3600 * SECOND
     assert sum(isinstance(item.moved, BoxArray) for item in items) == 11
     assert 'stamp_ahead (1 messages, first: boxes at' in warning
 

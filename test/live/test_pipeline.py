@@ -50,7 +50,8 @@ class Live(MessagePipeline):
             else:
                 item = received(topic, message, now, self.adapter)
                 confirmed, ready = self.confirm(item)
-                if self.is_joining and not self.joins:  # no other message of its stamp comes
+                # No other message of its stamp comes.
+                if self.arrivals.is_joining and not self.joins:
                     late, more = self.release(now + JOIN_TIME)
                     confirmed, ready = confirmed + late, ready + more
                 out += ready

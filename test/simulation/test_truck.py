@@ -28,7 +28,7 @@ def merged_sweeps(path, lidars):
         found = []
         for item in recording.items(session.tree):
             if isinstance(item.content, Sweep):
-                found += session.merged(session.admit(item.content).moved)
+                found += session.merged(session.admit(item).moved)
     return [part.sweep.in_frame() for part in found]
 
 
