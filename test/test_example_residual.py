@@ -64,9 +64,7 @@ def insert(path, before, text):
 
 CHECK = """
 from boxreg_ros import Config
-from boxreg_ros.core.method.assemble import (
-    accumulate, empty_axes, no_matrix, weigh_each
-)
+from boxreg_ros.core.method.assemble import accumulate, empty_axes, no_matrix, number_of
 from boxreg_ros.core.method.arrays import COMMON
 from boxreg_ros.core.method.constants import CONSTANTS, RESIDUAL_NAMES
 from boxreg_ros.core.method.residuals import empty_linearised, RESIDUALS, TERMS
@@ -80,28 +78,29 @@ POSES = np.zeros((2, 6))
 POSES[1, :3] = 1.0, 2.0, 0.1  # 0.1 m up in 0.2 s: r = 0.5 m/s
 
 
-def terms_of(config):
-    # Weights of a window of two boxes of a car, as at the start of a round.
-    terms = np.zeros(2, TERMS)
-    terms['time'], terms['axes'] = [0.0, 0.2], np.eye(3)
+def constants_of(config):
+    return CONSTANTS.with_settings(config).in_round(False, False).record()
+
+
+def weight(config):
+    # Of the row of the table, for a car. All weights together take 8 s to compile.
     ones = np.ones(6)
     window = Weighing(2, ones, ones, np.zeros(2, bool), ones, np.zeros(2, bool),
                       settings_of_kinds(config)[0])
-    constants = CONSTANTS.with_settings(config).in_round(False, False).record()
-    weigh_each(POSES, np.zeros(23), terms, window, constants, empty_axes(2), empty_linearised())
-    return terms
+    w = np.zeros(6)
+    RESIDUALS[I].weight(0, np.array([0.5]), window, constants_of(config), w)
+    return w[0]
 
 
 def test_the_setting_is_the_weight():
     assert Config().vehicle.rise == 1.0
-    config = Config().updated({'vehicle.rise': 0.5})
-    assert terms_of(config)['W'][0, I, 0] == 4.0
-    assert not terms_of(config)['W'][1, I].any()  # no box follows the last one
+    assert weight(Config().updated({'vehicle.rise': 0.5})) == 4.0
 
 
 def test_the_ablation_leaves_it_out():
-    config = Config().updated(merged([INGREDIENTS['rise'].settings]))
-    assert not terms_of(config)['W'][:, I].any()
+    without = Config().updated(merged([INGREDIENTS['rise'].settings]))
+    counts = [number_of(2, 2, constants_of(c).residuals[I]) for c in (Config(), without)]
+    assert counts == [1, 0]  # no box follows the last one
 
 
 def test_value_and_gradient_by_hand():

@@ -35,6 +35,8 @@ GROUND_CLEARANCE = 0.2
 UNKNOWN_TOP = 1e3
 """Height of the ring above an object in the highest one [m]. Derived: any that gives its top no
 weight."""
+LEAST_UP = 0.1
+"""Least vertical part of the z axis of a box; chosen: a box that lies on its side has no road."""
 MIN_SENSOR_PART = 0.1
 """Least part of the points of an object by a sensor that sees it; chosen: fewer are stray."""
 FACE_TOLERANCE = 0.2
@@ -220,7 +222,7 @@ def observe(
         delays = sweep.times[rows].astype(np.float32)
         sights = _medians(delays, counts)
     up = np.cos(boxes[:, ROLL:YAW]).prod(1)  # of the z axis of each box, in the fixed frame
-    ground = (own.road - boxes[:, 5] / 2) / up.clip(0.1)  # along z of the fixed frame
+    ground = (own.road - boxes[:, 5] / 2) / up.clip(LEAST_UP)  # along z of the fixed frame
     origins = _origins(sweep, rows, owner, centers)
     heights = ring_heights(points, counts, origins)
     if view is not None:

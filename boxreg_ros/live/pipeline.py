@@ -14,9 +14,9 @@ from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import MergedSweep
 from boxreg_ros.io.session import is_placeholder, Session
 from boxreg_ros.io.time_jumps import Confirmed
-from boxreg_ros.live.arrivals import Arrivals
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.following import Following
+from boxreg_ros.live.incoming import Incoming
 from boxreg_ros.live.outgoing import Outgoing, OutgoingQueue
 from boxreg_ros.live.silence import Silence
 from boxreg_ros.live.static_points import StaticPoints
@@ -35,7 +35,7 @@ class MessagePipeline:
     """
     Take messages as they arrive, and return the messages to publish.
 
-        message --> arrivals --> session --+-- cloud --> merged --+--> registrar --> messages
+        message --> incoming --> session --+-- cloud --> merged --+--> registrar --> messages
                                            +-- boxes --> ticket --+
 
     The registrar has the order of the boxes; what is published for them is in their ticket. Not
@@ -62,7 +62,7 @@ class MessagePipeline:
     ----------
     adapter : Adapter or None
         Of the boxes; to be set before the first ones.
-    arrivals, registrar, following, static_points, silence
+    incoming, registrar, following, static_points, silence
         The parts that the worker asks.
 
     """
@@ -88,7 +88,7 @@ class MessagePipeline:
         if static_patience is not None:
             self.static_points = StaticPoints(static_patience, self.registrar)
         self.silence = Silence(self.registrar)
-        self.arrivals = Arrivals()
+        self.incoming = Incoming()
         self._tickets = Tickets(session, wait)
         self._queue = OutgoingQueue(self.following, self.static_points)
 
@@ -101,7 +101,7 @@ class MessagePipeline:
     @property
     def is_holding(self) -> bool:
         """Return whether messages wait for a cloud, further observations or confirmation."""
-        return self.registrar.num_held > 0 or self.arrivals.is_holding
+        return self.registrar.num_held > 0 or self.incoming.is_holding
 
     # ------------------------------------------------------------ one message
 
@@ -112,13 +112,13 @@ class MessagePipeline:
         Also return all that was held where time went back: tracks and transforms start anew.
 
         """
-        return self._confirmed(self.arrivals.add(item))
+        return self._confirmed(self.incoming.add(item))
 
     def release(
         self, now: float = inf, more_boxes: bool = False
     ) -> tuple[list[Item], list[Outgoing]]:
-        """Return what no other message has confirmed in time, see `Arrivals`."""
-        return self._confirmed(self.arrivals.release(now, more_boxes))
+        """Return what no other message has confirmed in time, see `Incoming`."""
+        return self._confirmed(self.incoming.release(now, more_boxes))
 
     def process(self, item: Item) -> list[Outgoing]:
         """Take a message to the registrar; return the messages that are ready to be published."""
@@ -168,7 +168,7 @@ class MessagePipeline:
     def reset(self) -> list[Outgoing]:
         """Forget everything but the transforms; return everything that is held."""
         ready = self._start_anew()
-        for item in self.arrivals.reset():
+        for item in self.incoming.reset():
             if not isinstance(item.content, Sweep):
                 ready += self.pass_through(item.message)
         return ready

@@ -258,7 +258,7 @@ class Worker:
             self._catch_up(spare)
             return
         period = HELD_PERIOD if self._live.is_holding else IDLE_PERIOD
-        if self._live.arrivals.is_joining:
+        if self._live.incoming.is_joining:
             period = JOIN_TIME
         if self._live.static_points is not None:
             period = min(period, self._live.static_points.due(now))

@@ -51,7 +51,7 @@ class Live(MessagePipeline):
                 item = received(topic, message, now, self.adapter)
                 confirmed, ready = self.confirm(item)
                 # No other message of its stamp comes.
-                if self.arrivals.is_joining and not self.joins:
+                if self.incoming.is_joining and not self.joins:
                     late, more = self.release(now + JOIN_TIME)
                     confirmed, ready = confirmed + late, ready + more
                 out += ready

@@ -21,6 +21,8 @@ POSITION, ANGLE = 0.03, np.radians(1.0)
 """Deviations of a box that a person has drawn: centre and extents [m], angles [rad]. Measured."""
 DEVIATIONS = np.repeat([POSITION, POSITION, ANGLE], 3)
 """Of the columns of a box [m, rad]."""
+LARGEST_PART = 0.9
+"""Most that a fit has of the variance of its keyframe; chosen: the rest is that of the others."""
 GROUPS = (([0, 1, 2],) * 2, ([3, 4, 5],) * 2, ([8], [6, 7, 8]))
 """Columns of a box that show one deviation, and those it is of: position, extents, angles."""
 
@@ -79,7 +81,7 @@ def _residuals(keyframes: Floats, fits: Floats) -> Floats:
 
 def _variances_of_others(variances: Floats, usual: Floats) -> Floats:
     """Return p^2 of `shown`, (n, 9)."""
-    of_fit = np.minimum(variances, 0.9 * usual**2)
+    of_fit = np.minimum(variances, LARGEST_PART * usual**2)
     found: Floats = 1 / (1 / of_fit - usual**-2)
     return found
 

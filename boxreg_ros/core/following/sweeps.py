@@ -9,6 +9,9 @@ from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from numpy.typing import NDArray
 
+USUAL_PERIOD_NS = 1e8
+"""Period of a single sweep [ns]; that of most LiDARs."""
+
 
 class Points(Protocol):
     """The points (M, 3) of each sweep, ascending by x."""
@@ -78,4 +81,4 @@ def nearest(stamps_ns: Ints, stamp_ns: int) -> tuple[int, int, float]:
     away = np.abs(stamps_ns - stamp_ns)
     row = int(away.argmin())
     steps = np.diff(stamps_ns[max(0, row - 1) : row + 2])
-    return row, int(away[row]), float(steps.max(initial=0)) or 1e8
+    return row, int(away[row]), float(steps.max(initial=0)) or USUAL_PERIOD_NS

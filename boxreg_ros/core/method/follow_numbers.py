@@ -41,6 +41,12 @@ class FollowNumbers(NamedTuple):
     """Distance at which the weight of a point is 1/4 [m]; nearer points fit the surface."""
     effective_points: float = 30.0
     """Evidence of one sweep: more points of one surface are not independent."""
+    max_steps: int = 12
+    """Most Gauss-Newton steps from one start."""
+    settled: float = 1e-3
+    """A step ends the search where it moves the pose less [m]. Derived: far below `deviation`."""
+    settled_yaw: float = 5e-4
+    """And turns it less [rad]. Derived: 1 mm at 2 m."""
     road_deviation: float = 0.07
     """Of the height of the road beside a box [m]. Swept: 0.05 and 0.1 are as good, 0.2 drifts."""
 

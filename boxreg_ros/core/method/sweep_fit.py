@@ -90,7 +90,7 @@ def find(points, expected, target):
         weight = FOLLOW.road_deviation**-2
         prior[2] += height * weight / (information[2, 2] + weight)
         information[2, 2] += weight
-    best = registered(own, prior, prior, information, target, 12)
+    best = registered(own, prior, prior, information, target, FOLLOW.max_steps)
     is_lost = expected.reach > 0
     slips = best.fit.inside > FOLLOW.effective_points
     slips = slips and best.fit.score < FOLLOW.search_below * expected.usual
@@ -108,7 +108,7 @@ def find(points, expected, target):
             own = around(points, start, target.half, FOLLOW.around)
             if (n == 0 and is_lost) or len(own) < FOLLOW.min_points:
                 continue
-            other = registered(own, start, prior, information, target, 12)
+            other = registered(own, start, prior, information, target, FOLLOW.max_steps)
             if rank(other) > rank(best) + FOLLOW.jump_cost:
                 best = other
     if is_lost and best.reason == ACCEPTED:
@@ -145,7 +145,7 @@ def registered(points, start, prior, information, target, iterations):
         size = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
         step *= min(1.0, 2 * FOLLOW.cell / max(size, 1e-9))
         pose = pose - step
-        if size < 1e-3 and abs(step[3]) < 5e-4:
+        if size < FOLLOW.settled and abs(step[3]) < FOLLOW.settled_yaw:
             break
     found = fit(points, pose, target)
     covariance = np.linalg.inv(total)

@@ -18,7 +18,7 @@ AHEAD_TIME = 3.0
 have come three times."""
 
 
-class Arrivals:
+class Incoming:
     """
     Decide which messages are processed next.
 
