@@ -99,7 +99,7 @@ def test_the_setting_is_the_weight():
 
 def test_the_ablation_leaves_it_out():
     without = Config().updated(merged([INGREDIENTS['rise'].settings]))
-    counts = [number_of(2, 2, constants_of(c).residuals[I]) for c in (Config(), without)]
+    counts = [number_of(2, 2, constants_of(c)['residuals'][I]) for c in (Config(), without)]
     assert counts == [1, 0]  # no box follows the last one
 
 
