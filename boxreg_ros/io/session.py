@@ -142,7 +142,7 @@ class Session:
             motion = self.tree.motion(self.fixed_frame, given.frame_id, given.stamp_ns)
             moved = boxes_to_frame(given, T_fixed_item, self.fixed_frame, motion, ticket)
         self._pose_check.add(moved)
-        self._place_check.add(moved, T_fixed_item, self._other_frames(item))
+        self._place_check.add(moved, T_fixed_item, self._other_frames(given))
         if isinstance(moved, BoxArray):
             if self._tracker is not None:
                 moved = self._tracker.identify(moved)
