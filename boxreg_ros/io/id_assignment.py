@@ -34,8 +34,7 @@ Share of the boxes at which ids jump.
 Measured on the simulated street, highway, articulated and parked drives, whole and with broken
 tracks and ghosts: ids of a tracker jump at none; where two neighbours swap theirs at 1 % of the
 boxes, at .004 to .036; where the three nearest objects have their row, at .076 to .17, where all
-have, at .16 to .48. Between .04 and .07 nothing changes; below it, a tracker that swaps so often
-is worse than association, too.
+have, at .16 to .48.
 
 """
 

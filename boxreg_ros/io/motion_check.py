@@ -20,6 +20,7 @@ from boxreg_ros.io.clocks import (
     COPY_NS,
     likely_offset,
     MIN_CLOCK_OFFSET,
+    MIN_PAIRS,
     ReceiveTimes,
     seconds_text,
 )
@@ -53,6 +54,8 @@ LOOK_PERIOD = 10
 """Clouds between two looks at what changes slowly; chosen: 1 s at 10 Hz."""
 SETTLED_CLOUDS = 15
 """Clouds by which an offset of clocks that was found at the first look is confirmed; chosen."""
+SHORT_PERIOD = 0.9
+"""Period of clouds that do not all come at the begin of a second [s]; chosen: some may at 1 Hz."""
 FIRST_LOOK = 5
 """Cloud of the first look, for short recordings."""
 LIDAR_WORDS = (
@@ -185,6 +188,7 @@ class MotionCheck:
         self._cloud_stamps = deque[int](maxlen=CAPACITY)
         self._copied: list[bool] = []
         self._count = 0
+        self._first_milliseconds = 0
 
     def add(self, item: Sweep | BoxArray, fixed_frame: str, received_ns: int | None) -> None:
         """
@@ -210,6 +214,7 @@ class MotionCheck:
                 self._copied.append(nearest <= COPY_NS)
             return
         self._cloud_stamps.append(item.stamp_ns)
+        self._first_milliseconds += item.stamp_ns % 10**9 < 10**6
         self._count += 1
         if self._count == FIRST_LOOK or self._count % LOOK_PERIOD == 0:
             self._look(fixed_frame, item.frame_id)
@@ -225,6 +230,7 @@ class MotionCheck:
             'publishers': self._publisher_text() or _contradiction_text(route),
             'clock': self._clock_text(moving),
             'boxes_clock': self._boxes_clock_text(),
+            'microseconds': self._microseconds_text(),
             'sensor': '' if self._named_sensors else registered_text(tree, fixed_frame, frame),
             'sparse': _sparse_text(moving),
             'parents': _parents_text(tree, route),
@@ -274,6 +280,20 @@ class MotionCheck:
             f'{edge.parent} -> {edge.child} received at the same time{of_whom}: each cloud is '
             f'placed by the pose of another moment; correct the motion with '
             f'--clock-offset={total} (node: clock_offset:={total})'
+        )
+
+    def _microseconds_text(self) -> str:
+        """Return that all stamps of the clouds lie at the begins of seconds."""
+        if self._first_milliseconds < max(MIN_PAIRS, self._count):
+            return ''
+        received = self._clouds.received_ns
+        if len(received) < MIN_PAIRS or np.median(np.diff(received)) > SHORT_PERIOD * 1e9:
+            return ''
+        return (
+            f'stamps: expected those of clouds {np.median(np.diff(received)) * 1e-9:.2g} s apart, '
+            f'got all of {self._count} in the first millisecond of a second: the driver writes '
+            f'microseconds into nanosec; multiply nanosec by 1000 in the headers of clouds and '
+            f'boxes'
         )
 
     def _boxes_clock_text(self) -> str:
@@ -400,6 +420,7 @@ REASONS_OF = {
     'publishers': Reason.TRANSFORM_FAULT,
     'clock': Reason.CLOCK_OFFSET,
     'boxes_clock': Reason.CLOCK_OFFSET,
+    'microseconds': Reason.CLOCK_OFFSET,
     'sensor': Reason.SENSOR_POSITION,
     'sparse': Reason.TRANSFORM_FAULT,
     'parents': Reason.TRANSFORM_FAULT,

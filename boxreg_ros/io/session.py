@@ -40,6 +40,9 @@ CLOUDS_WITHOUT_FRAME = (
 )
 """What to do about clouds without a frame."""
 
+MAX_ROUNDING = 0.02
+"""Step between coordinates from which they are named as coarse [m]; chosen: the range noise."""
+
 
 class Session:
     """
@@ -80,6 +83,7 @@ class Session:
         self._axis_check = AxisCheck(convention, config.drives)
         self._has_boxes_without_frame = False
         self._has_clouds_without_frame = False
+        self._coarse = ''
         self._pose_check = PoseCheck(self._convention, AT_ONCE)
         self._place_check = PlaceCheck(self._convention, AT_ONCE)
 
@@ -136,6 +140,7 @@ class Session:
         reason, detail = None, ''
         moved: Sweep | BoxArray
         if isinstance(given, Sweep):
+            self._coarse = self._coarse or coarse_text(given)
             moved = sweep_to_frame(given, T_fixed_item, self.fixed_frame)
             moved, reason, detail = self.placement.placed(moved, self.tree)
         else:
@@ -230,6 +235,8 @@ class Session:
                 f'{pairs}; each pair is taken for one frame, since nothing else connects them'
             )
             found.append(Finding(Reason.TRANSFORM_FAULT, text))
+        if self._coarse:
+            found.append(Finding(Reason.SENSOR_POSITION, self._coarse))
         if self._has_boxes_without_frame:
             text = (
                 f'boxes have an empty frame_id: expected the name of their frame; they are taken '
@@ -286,6 +293,21 @@ def hand_to_registrar(
     elif moved is not None:
         ready += registrar.add_boxes(moved)
     return ready
+
+
+def coarse_text(sweep: Sweep) -> str:
+    """Return that the coordinates of a cloud are rounded to centimetres; empty if they are not."""
+    if sweep.points.dtype != np.float32 or not len(sweep.points):
+        return ''
+    largest = np.abs(sweep.points).max()
+    step = float(np.spacing(largest))
+    if not MAX_ROUNDING <= step < np.inf:
+        return ''
+    return (
+        f'clouds in {sweep.frame_id!r} have coordinates of up to {largest:.7g} m as float32, '
+        f'which are {step:.2g} m apart there: points and boxes are as coarse; take the clouds '
+        f'before their registration, in the frame of the LiDAR, or of a map with a near origin'
+    )
 
 
 def is_placeholder(item: Sweep | BoxArray) -> bool:

@@ -7,6 +7,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.session import coarse_text
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
@@ -148,6 +149,27 @@ def test_odometry_without_a_child_frame_is_that_of_the_vehicle(tmp_path):
     assert_true(origins, 8)
     assert '/odom: expected the frame of the vehicle in child_frame_id, got none' in found
     assert "'base'" in found
+
+
+def test_microseconds_in_nanosec_are_named(tmp_path):
+    drive = Drive(sweeps=12)
+    for topic, _, message in drive.items:
+        if topic in ('/points', '/boxes'):
+            for one in (message, *getattr(message, 'detections', [])):
+                one.header.stamp.nanosec //= 1000
+    found = read(drive, tmp_path)[2]
+    assert 'got all of 10 in the first millisecond of a second' in found
+    assert 'multiply nanosec by 1000' in found
+    assert 'nanosec' not in read(Drive(sweeps=12), tmp_path / 'right')[2]
+
+
+def test_coordinates_that_float32_rounds_to_centimetres_are_named():
+    points = np.array([[500_000.0, 4_600_000.0, 3.0]], np.float32)
+    text = coarse_text(Sweep(START, 'utm', points))
+    assert "clouds in 'utm'" in text
+    assert '0.5 m apart' in text
+    for near in (points.astype(np.float64), points - points, points[:0]):
+        assert coarse_text(Sweep(START, 'utm', near)) == ''
 
 
 def test_odometry_is_that_of_the_namespace_of_the_clouds(tmp_path):
