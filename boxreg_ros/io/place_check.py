@@ -168,9 +168,10 @@ class PlaceCheck:
 
     def _tilt_text(self) -> str:
         """Return that the boxes lie on their backs, unless w of their quaternions comes first."""
+        if len(self._tilted) < ENOUGH_BOXES or self._convention.orientation == 'wxyz':
+            return ''
         own, wxyz = np.mean(self._tilted, axis=0)
-        is_decisive = len(self._tilted) >= ENOUGH_BOXES and own >= MIN_TILTED
-        if not is_decisive or wxyz > MAX_TILTED or self._convention.orientation == 'wxyz':
+        if own < MIN_TILTED or wxyz > MAX_TILTED:
             return ''
         return (
             f'{own:.0%} of the boxes lie on their sides or backs: expected orientation '

@@ -296,6 +296,16 @@ def test_boxes_of_another_frame_than_their_messages_name_are_named():
     assert Convention(boxes_frame='map').to_centers(array_of([1] * 9)).frame_id == 'map'
 
 
+def test_arrays_without_valid_boxes_have_no_place():
+    check = PlaceCheck(STANDARD, tolerance=0.02)
+    for boxes in ([], [[np.nan] * 9]):
+        check.add(Sweep(STAMP, 'map', np.zeros((3, 3))), np.eye(4))
+        given = np.reshape(boxes, (-1, 9))
+        ids = ('1',) * len(given)
+        check.add(BoxArray(STAMP, 'map', ids, ids, np.ones(len(given)), given), np.eye(4))
+        assert (check.finding, check.is_open) == ('', True)
+
+
 @pytest.mark.parametrize('reference', ['center', 'bottom', 'top', 'front', 'rear_axle_bottom'])
 def test_boxes_that_another_check_is_for_have_no_other_place(reference):
     assert placed(Convention(reference)) == ''
