@@ -270,6 +270,7 @@ def placed(meant=STANDARD, frame='lidar', taken=STANDARD):
         given = array_of(*true, stamp_ns=STAMP + k * 10**8)
         if frame == 'lidar':
             given = boxes_to_frame(given, inverse(T_fixed_lidar), 'lidar')
+        given = replace(given, frame_id='lidar')  # as the message says, even where it is wrong
         boxes = taken.to_centers(meant.from_centers(given))
         check.add(Sweep(STAMP + k * 10**8, 'map', points), T_fixed_lidar)
         moved = boxes_to_frame(boxes, T_fixed_lidar, 'map')
