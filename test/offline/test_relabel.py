@@ -100,6 +100,26 @@ def test_boxes_whose_ids_identify_nothing_are_associated(tmp_path, kind):
     assert kept.status['kept'] == 16
 
 
+@pytest.mark.parametrize('estimate', ['track', 'final', 'early'])
+def test_boxes_do_not_depend_on_the_order_of_messages_received_at_once(tmp_path, estimate):
+    drive = Drive(sweeps=20)
+    rng = np.random.default_rng(0)
+    static, *items = drive.items
+    at_once = {received_ns: [] for _, received_ns, _ in items}
+    for item in items:
+        at_once[item[1]].append(item)
+    shuffled = [static]
+    for group in at_once.values():
+        shuffled += [group[i] for i in rng.permutation(len(group))]
+    assert [item[0] for item in shuffled] != [item[0] for item in drive.items]
+    (tmp_path / 'out').mkdir()
+    for name, ordered in (('a', drive.items), ('b', shuffled)):
+        path = write_recording(tmp_path / name, ordered, messages=drive.messages)
+        run(path, tmp_path / 'out' / name, settings={'estimate': estimate})
+    boxes = [(tmp_path / 'out' / name / 'boxes.csv').read_bytes() for name in 'ab']
+    assert boxes[0] == boxes[1]
+
+
 def rename(message, *names):
     """Set the ids of detections."""
     for detection, name in zip(message.detections, names, strict=True):

@@ -1,5 +1,5 @@
 """
-Every number of the method: value, unit, origin.
+Every number of the objective and of its weights: value, unit, origin.
 
 *Derived* numbers follow from a formula, those of the *literature* from a citation, *measured* ones
 from data; all others are *chosen*, and `make results` halves and doubles each of them.
