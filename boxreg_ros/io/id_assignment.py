@@ -272,7 +272,7 @@ class Tracker:
 
 class IdCheck:
     """
-    Detect ids that do not identify objects over time: rows of a message, new ones, or none.
+    Detect ids that do not identify objects: rows of a message, new ones, equal ones, or none.
 
     Where a box does not fit the track that had its id before, boxes are also associated by their
     motion alone: the id jumps if that gives the box to another object. `finding` says so once
@@ -287,6 +287,7 @@ class IdCheck:
         self.new = 0
         self.compared = 0
         self.nameless = 0
+        self.twice = 0
         self.count = 0
         self.forget()
 
@@ -309,6 +310,7 @@ class IdCheck:
         if '' in boxes.track_ids:
             self.nameless += boxes.track_ids.count('')
             boxes = boxes.take([row for row, name in enumerate(boxes.track_ids) if name])
+        self.twice += len(boxes.track_ids) - len(set(boxes.track_ids))
         associated = self._tracker.keep(boxes, self._track_of)
         if associated is None:
             associated = self._tracker.identify(boxes)
@@ -346,6 +348,11 @@ class IdCheck:
             return (
                 f'track ids are new at {self.new} of {self.compared} boxes: expected one id for '
                 f'each object over time, got one for each box'
+            )
+        if self.twice >= max(MIN_JUMPS, MIN_JUMP_SHARE * self.count):
+            return (
+                f'{self.twice} of {self.count} boxes have the track id of another box of their '
+                f'message, as of trackers for one class each: expected one id for each object'
             )
         if self.jumps < MIN_JUMPS or self.jumps < MIN_JUMP_SHARE * self.boxes:
             return ''

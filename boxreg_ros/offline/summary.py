@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 
 UNUSED_PREFIXES = ('sweep_', 'boxes_')
 """Counters of the registrar with these prefixes count unused messages and not kept boxes."""
-NO_BOXES = 'no boxes in the input, or in its part by --start and --end: nothing was refined'
+NO_BOXES = (
+    'no boxes in the input, or in its part by --start and --end: nothing was refined (of a '
+    'MarkerArray, markers of the type CUBE are boxes)'
+)
 
 
 @dataclass(slots=True)

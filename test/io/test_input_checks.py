@@ -124,6 +124,14 @@ def test_ids_that_are_new_or_missing_are_found_and_others_are_not():
     assert id_finding(rare).finding == ''
 
 
+def test_ids_that_each_class_has_are_found():
+    def arrays():
+        for stamp, ids, boxes in street():
+            yield array(stamp, [name if name < '6' else str(int(name) - 6) for name in ids], boxes)
+
+    assert id_finding(arrays()).finding.startswith('60 of 240 boxes have the track id of another')
+
+
 def axes_of(frames, convention, checked=STANDARD, name='car'):
     """Return the check of boxes that a publisher states in a convention."""
     check = AxisCheck(checked, Config().drives)
