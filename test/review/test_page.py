@@ -331,6 +331,25 @@ def test_a_track_is_shown_in_3d_by_the_same_program_and_turned(serve):
         np.testing.assert_allclose(places.mean(0) + 0.5, [x, y], atol=1.5)
 
 
+def test_fewer_points_are_drawn_while_a_slow_view_moves_and_all_when_it_rests(serve):
+    lit = f"{LIT}('scene-points', drawScene).reduce((sum, [, n]) => sum + n, 0)"
+    moving = f'(() => {{ gpu.last = performance.now() - 600; return {lit}; }})()'
+    with serve() as server, opened_page(server.address + '#drive') as page:
+        page.wait_for_function('scene.sweep')
+        if not page.evaluate("Boolean(gpuOf($('scene-points')).gl)"):
+            pytest.skip('no WebGL 2')
+        page.evaluate("window.gpu = gpuOf($('scene-points')), gpu.last = undefined")
+        resting = page.evaluate(lit)
+        assert page.evaluate(moving) < resting / 2
+        # It draws itself again once it rests.
+        page.evaluate(
+            'window.drawn = 0, window.draw = drawScene, drawScene = () => { drawn++; draw(); }'
+        )
+        page.wait_for_function('drawn > 0')
+        page.evaluate('gpu.last = undefined')
+        assert page.evaluate(lit) == resting
+
+
 def test_the_track_follows_a_box_while_it_is_dragged(serve):
     with serve() as server, opened_page(server.address + '#track=2') as page:
         page.evaluate('step(5)')

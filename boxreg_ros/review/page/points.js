@@ -3,6 +3,10 @@
 // numbers of 32 bits are exact to a tenth of a millimetre, and are uploaded once.
 
 const MAX_BUFFERS = 24;            // clouds that stay on the GPU
+// While the view moves, every `every`-th point is drawn, so that a frame takes less than SLOW; all of them when it rests.
+const SLOW = 66, QUICK = 33;       // frames that take longer get fewer points, quicker ones more [ms]: 15 and 30 a second
+const REST = 1000;                 // after the last frame [ms]
+const MAX_EVERY = 21;              // WebGL steps over at most 255 bytes
 const VERTEX = `#version 300 es
 in vec3 place; in vec4 tint; uniform vec3 center; uniform vec4 turn; uniform vec2 scale; uniform float size; out vec4 colour;
 void main() {
@@ -57,9 +61,6 @@ function bufferOf(gpu, sweep, key) {
     gl.bindVertexArray(known.array);
     gl.bindBuffer(gl.ARRAY_BUFFER, known.places);
     gl.bufferData(gl.ARRAY_BUFFER, sweep.points, gl.STATIC_DRAW);
-    attribute(gpu, 'place', 3, gl.FLOAT, false);
-    gl.bindBuffer(gl.ARRAY_BUFFER, known.tints);
-    attribute(gpu, 'tint', 4, gl.UNSIGNED_BYTE, true);
   }
   if (known.key !== key) {
     gl.bindBuffer(gl.ARRAY_BUFFER, known.tints);
@@ -78,10 +79,31 @@ function bufferOf(gpu, sweep, key) {
   return known;
 }
 
-function attribute({ gl, program }, name, count, kind, isShare) {
-  const at = gl.getAttribLocation(program, name);
-  gl.enableVertexAttribArray(at);
-  gl.vertexAttribPointer(at, count, kind, isShare, 0, 0);
+// The attributes of the bound array: places and tints of every `every`-th point.
+function setStep({ gl, program }, known, every) {
+  if (known.every === every) return;
+  known.every = every;
+  /** @type {[string, WebGLBuffer, number, number, number][]} */
+  const columns = [['place', known.places, 3, gl.FLOAT, 12], ['tint', known.tints, 4, gl.UNSIGNED_BYTE, 4]];
+  for (const [name, buffer, count, kind, size] of columns) {
+    const at = gl.getAttribLocation(program, name);
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    gl.enableVertexAttribArray(at);
+    gl.vertexAttribPointer(at, count, kind, kind !== gl.FLOAT, every * size, 0);
+  }
+}
+
+// Of how many points one is drawn: after the time since the frame before.
+function everyOf(gpu) {
+  const now = performance.now(), gap = now - (gpu.last ?? -Infinity);
+  gpu.last = now;
+  clearTimeout(gpu.resting);
+  if (gap > REST) return 1;
+  gpu.every ??= 1;
+  if (gap > SLOW) gpu.every = Math.min(MAX_EVERY, Math.ceil(gpu.every * gap / SLOW));
+  else if (gap < QUICK) gpu.every = Math.max(1, gpu.every - 1);
+  if (gpu.every > 1) gpu.resting = setTimeout(redrawClouds, REST + 1);
+  return gpu.every;
 }
 
 // Draw clouds with points of a size [px]; whether there is a GPU to do so.
@@ -100,11 +122,14 @@ function drawClouds(canvas, clouds, axes, key, size) {
   gl.uniform4f(gpu.at.turn, Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt));
   gl.uniform2f(gpu.at.scale, 2 * zoom / width, 2 * zoom / height);
   gl.uniform1f(gpu.at.size, scale * size);
+  const every = everyOf(gpu);
   for (const sweep of clouds) {
-    gl.bindVertexArray(bufferOf(gpu, sweep, key).array);
+    const known = bufferOf(gpu, sweep, key);
+    gl.bindVertexArray(known.array);
+    setStep(gpu, known, every);
     const [x, y, z] = axes.center.map((v, k) => v - sweep.origin[k]);
     gl.uniform3f(gpu.at.center, x, y, z);
-    gl.drawArrays(gl.POINTS, 0, sweep.points.length / 3);
+    gl.drawArrays(gl.POINTS, 0, Math.ceil(sweep.points.length / 3 / every));
   }
   gl.bindVertexArray(null);
   return true;

@@ -189,7 +189,8 @@ function drawSceneTools() {
   $('scene-fit').hidden = !scene.fit;
   drawProposals();
   $('scene-hint').textContent = scene.fit ? `${number(scene.fit.points, 0)} points, ${scene.fit.box.slice(3, 6).map(v => number(v, 1)).join(' × ')} m. Enter follows it both ways.`
-    : scene.isAdding ? 'Click the points of the object, or drag from its rear to its front.' : 'Click a box to open its track. Drag moves, the wheel zooms, with Shift it turns, with Ctrl it draws a box.';
+    : scene.isAdding ? 'Click the points of the object, or drag from its rear to its front.' : 'Click opens a track. Drag moves, with Shift turns, with Ctrl draws a box; the wheel zooms.';
+  $('scene-hint').title = $('scene-hint').textContent;
 }
 
 function sceneBoxAt(place) {

@@ -224,7 +224,7 @@ function spaceClouds() {
   const cloud = (points, name, alpha) => ({ points: new Float32Array(points.flat()), origin: [0, 0, 0], name, alpha });
   const far = (view.far ?? []).filter(point => Math.hypot(...point) < CLOSE);
   space.of = [view.local, view.far];
-  return (space.clouds = [cloud(far, 'around', 0.6), cloud(view.local, 'points', 1)]);
+  return (space.clouds = [cloud(view.local, 'points', 1), cloud(far, 'around', 0.6)]);  // of two at one place the first is seen
 }
 
 function drawSpace() {
