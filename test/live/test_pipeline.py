@@ -13,6 +13,7 @@ from boxreg_ros.structures import BoxArray, COASTED, KEPT, REFINED, RefinedBoxes
 from lidar_drives import LidarDrive
 from msg_adapters import adapter_for, pointcloud, vision
 from msg_adapters.convention import Convention, STANDARD
+from msg_adapters.poses import kinematics_of_axes
 import numpy as np
 import pytest
 from ros_messages import DETECTIONS, Drive, MARKERS, SECOND, START, TRACKED
@@ -178,7 +179,10 @@ def test_associated_ids_are_the_same_in_markers_and_messages():
 
 
 def test_heading_signs_are_resolved_per_track_and_stay_marked_as_unknown():
-    """One of five headings of each object is flipped, and its twist must be as well."""
+    """One of five headings of each object is flipped, and its twist must be as well.
+
+    That of a box with a velocity is its own, in the axes of the object.
+    """
     drive = Drive(sweeps=5, boxes=TRACKED)
     for item in items_of(drive, '/boxes')[1].objects:
         turn = item.kinematics.pose_with_covariance.pose.orientation
@@ -192,13 +196,17 @@ def test_heading_signs_are_resolved_per_track_and_stay_marked_as_unknown():
     assert len(finals) == 5
     for k, item in enumerate(finals):
         assert np.abs(item.refined.boxes.boxes[:, 8]).max() < 0.4
-        for given, written in zip(
-            items_of(drive, '/boxes')[k].objects, item.message.objects, strict=True
+        known = kinematics_of_axes(item.refined.boxes)
+        assert known['has_velocity'].all() == (item.refined.status == (REFINED,) * len(known))
+        for given, written, own in zip(
+            items_of(drive, '/boxes')[k].objects, item.message.objects, known, strict=True
         ):
             assert written.kinematics.orientation_availability == 1
             sign = -1 if k == 1 else 1
-            speed = given.kinematics.twist_with_covariance.twist.linear.x
-            assert written.kinematics.twist_with_covariance.twist.linear.x == sign * speed
+            speed = sign * given.kinematics.twist_with_covariance.twist.linear.x
+            expected = own['velocity'][0] if own['has_velocity'] else speed
+            found = written.kinematics.twist_with_covariance.twist.linear.x
+            assert found == pytest.approx(expected, abs=1e-9)
 
 
 def test_messages_wait_for_their_transforms_until_the_timeout():
