@@ -49,7 +49,7 @@ POINT_CLOUD_MEDIA = 6
 IMAGE_FOLDER = 'images/default'
 OWN_ATTRIBUTE = 'extent_covariance'
 """Attribute of the boxes that we write, and no other program."""
-NO_ATTRIBUTES = (
+ANNOTATION_FIELDS = (
     'track_id', 'track', OCCLUDED, 'outside', 'keyframe', 'score',
     'status', 'reason', 'num_points', 'covariance', 'extent_covariance',
 )  # fmt: skip
@@ -239,7 +239,7 @@ def _cuboid(annotation: dict[str, Any], labels: list[str], is_swapped: bool) -> 
     if OWN_ATTRIBUTE in attributes:  # those of others may have another meaning
         evidence = dict(attributes)
         track = attributes.get('track', track)
-    evidence['attributes'] = attributes_from(attributes, NO_ATTRIBUTES)
+    evidence['attributes'] = attributes_from(attributes, ANNOTATION_FIELDS)
     if _is_set(attributes.get(OCCLUDED)):  # CVAT states the other value of every box
         evidence['attributes'][OCCLUDED] = TRUE
     return ReadBox('' if track is None else str(track), class_name, box, evidence)

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels.attributes import FALSE, is_set, OCCLUDED, PARTLY, TRUE
-from boxreg_ros.labels.attributes import TRUNCATED as TRUNCATED_NAME
+from boxreg_ros.labels.attributes import FALSE, is_set, OCCLUDED, PARTLY, TRUE, TRUNCATED
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, following, read_provenance, require_single
@@ -52,7 +51,7 @@ FORMAT = Format(
     reads='17 or 18 columns of one sequence, of labels or of a tracker',
 )
 SEQUENCE = '0000'
-INSIDE_IMAGE, TRUNCATED, OUTSIDE_IMAGE = 0, 1, 2
+INSIDE_IMAGE, CUT_OFF, OUTSIDE_IMAGE = 0, 1, 2
 """Values of truncation."""
 UNKNOWN_OCCLUSION = 3
 OCCLUSION = {FALSE: 0, PARTLY: 1, TRUE: 2}
@@ -130,9 +129,9 @@ def occlusion_of(attributes: Mapping[str, str], unknown: int = UNKNOWN_OCCLUSION
 
 def truncation_of(attributes: Mapping[str, str], seen: int) -> int:
     """Return the truncation of a box: the attribute, else that of its rectangle, `seen`."""
-    if seen == OUTSIDE_IMAGE or TRUNCATED_NAME not in attributes:
+    if seen == OUTSIDE_IMAGE or TRUNCATED not in attributes:
         return seen
-    return TRUNCATED if is_set(attributes[TRUNCATED_NAME]) else INSIDE_IMAGE
+    return CUT_OFF if is_set(attributes[TRUNCATED]) else INSIDE_IMAGE
 
 
 def attributes_of(truncation: str, occlusion: str) -> dict[str, str]:
@@ -141,7 +140,7 @@ def attributes_of(truncation: str, occlusion: str) -> dict[str, str]:
     found = {OCCLUDED: names[occlusion]} if occlusion in names else {}
     part = float(truncation)
     if 0 <= part <= 1:
-        found[TRUNCATED_NAME] = TRUE if part == 1 else truncation if part else FALSE
+        found[TRUNCATED] = TRUE if part == 1 else truncation if part else FALSE
     return found
 
 
@@ -159,7 +158,7 @@ def columns_of(camera: Camera, boxes: Floats) -> tuple[Ints, Floats]:
     Returns
     -------
     truncation : array, shape (n,)
-        `INSIDE_IMAGE`, `TRUNCATED` or `OUTSIDE_IMAGE`.
+        `INSIDE_IMAGE`, `CUT_OFF` or `OUTSIDE_IMAGE`.
     columns : array, shape (n, 12)
         alpha [rad]; left, top, right, bottom [px], -1 outside of the image; height, width, length
         and the centre of the bottom face in the rectified camera frame [m]; rotation_y [rad].
@@ -169,7 +168,7 @@ def columns_of(camera: Camera, boxes: Floats) -> tuple[Ints, Floats]:
     rectangles, is_inside = camera.project(boxes)
     is_outside = np.isnan(rectangles).any(axis=1)
     rectangles[is_outside] = -1.0
-    truncation = np.where(is_inside, INSIDE_IMAGE, TRUNCATED)
+    truncation = np.where(is_inside, INSIDE_IMAGE, CUT_OFF)
     truncation[is_outside] = OUTSIDE_IMAGE
     alpha = wrap_angle(rotations_y - np.arctan2(centres[:, 0], centres[:, 2]))
     sizes = boxes[:, [HEIGHT, WIDTH, LENGTH]]

@@ -14,19 +14,19 @@ from contextlib import suppress
 from pathlib import Path
 
 from boxreg_ros.errors import RecordingError, unreadable
-from boxreg_ros.labels.attributes import TRUNCATED as TRUNCATED_NAME
+from boxreg_ros.labels.attributes import TRUNCATED
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.cameras import black_png, LabelCamera
 from boxreg_ros.labels.kitti import (
     attributes_of,
     boxes_of,
     columns_of,
+    CUT_OFF,
     decimals,
     IGNORED_CLASS,
     INSIDE_IMAGE,
     occlusion_of,
     OUTSIDE_IMAGE,
-    TRUNCATED,
     truncation_of,
     write_calibration,
 )
@@ -53,7 +53,7 @@ FORMAT = Format(
 LABEL_FOLDER = 'label_2'
 KITTI_IMAGES = 'image_2'
 OBJECT_COLUMNS = (15, 16)
-TRUNCATION = {INSIDE_IMAGE: '0.00', TRUNCATED: '-1.00', OUTSIDE_IMAGE: '1.00'}
+TRUNCATION = {INSIDE_IMAGE: '0.00', CUT_OFF: '-1.00', OUTSIDE_IMAGE: '1.00'}
 """Text of the values of KITTI tracking; the part outside of the image is not known."""
 CALIBRATION_NAMES = ('R0_rect', 'Tr_velo_to_cam', 'Tr_imu_to_velo')
 
@@ -99,7 +99,7 @@ class Writer(PerFrameWriter):
             attributes = array.attributes_of(row)
             cut = TRUNCATION[truncation_of(attributes, int(truncation[i]))]
             with suppress(ValueError):  # the part that is stated
-                cut = f'{float(attributes.get(TRUNCATED_NAME, "")):.2f}'
+                cut = f'{float(attributes.get(TRUNCATED, "")):.2f}'
             numbers = decimals(columns[i], array.scores[row])
             yield f'{name} {cut} {occlusion_of(attributes)} {numbers}'
 

@@ -67,7 +67,7 @@ OBJECT_DATA_POINTER: dict[str, Any] = {
     },
 }
 
-NO_ATTRIBUTES = (
+CUBOID_FIELDS = (
     *OBJECT_DATA_POINTER['attribute_pointers'], 'confidence', 'interpolated', 'keyframe',
 )  # fmt: skip
 """Names among the attributes of a cuboid that are none of the object."""
@@ -355,7 +355,7 @@ class _Objects:
         class_name = self._classes.get(uid, '')
         values = _attributes(cuboid)
         evidence = dict(values) if self._are_own else _of_others(values)
-        evidence['attributes'] = attributes_from(values, NO_ATTRIBUTES)
+        evidence['attributes'] = attributes_from(values, CUBOID_FIELDS)
         return ReadBox(track_id, class_name, _box(cuboid['val']), evidence)
 
     def require_frames(self, count: int) -> None:

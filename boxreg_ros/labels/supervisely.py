@@ -39,7 +39,7 @@ FORMAT = cuboids.cuboid_format(
 ANNOTATION_FILE = 'annotation.json'
 CUBOID = 'cuboid_3d'
 TAGS = ('track_id', 'status')
-NO_ATTRIBUTES = (*TAGS, 'keyframe')
+FIGURE_FIELDS = (*TAGS, 'keyframe')
 
 
 class Writer(cuboids.CuboidWriter):
@@ -211,7 +211,7 @@ def _cuboid(figure: dict[str, Any], parent: dict[str, Any], key: Any, index: int
     ]
     geometry = figure['geometry']
     box = cuboids.box_from_xyz(geometry['position'], geometry['rotation'], geometry['dimensions'])
-    attributes = attributes_from(dict(given), NO_ATTRIBUTES)
+    attributes = attributes_from(dict(given), FIGURE_FIELDS)
     evidence = {'status': _status(figure, tags), 'attributes': attributes}
     evidence |= figure.get(cuboids.EVIDENCE_KEY, {})
     track_id = evidence.get('track_id', tags.get('track_id', key))
