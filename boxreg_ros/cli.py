@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from io import TextIOWrapper
@@ -12,7 +12,6 @@ import os
 import re
 import signal
 import sys
-from threading import current_thread, main_thread
 from types import FrameType, ModuleType
 from typing import Any, NamedTuple, NoReturn
 
@@ -63,11 +62,18 @@ ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 
 def command() -> NoReturn:
     """Run a subcommand and end the process with its exit status."""
+    if sys.argv[1:2] != ['node']:  # the node handles signals itself
+        for number in ENDING_SIGNALS:
+            if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
+                signal.signal(number, _end)
     sys.exit(main())
 
 
-class _EndedBySignal(BaseException):
-    """One of `ENDING_SIGNALS` was received; its argument is the number."""
+def _end(number: int, _: FrameType | None) -> NoReturn:
+    """End as an error does, so that files are removed, which a second signal does not stop."""
+    for one in ENDING_SIGNALS:
+        signal.signal(one, signal.SIG_IGN)
+    sys.exit(_fail(_ended_by(number, sys.argv[1:]), SIGNALLED + number))
 
 
 class _Parser(argparse.ArgumentParser):
@@ -110,8 +116,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, TextIOWrapper):  # file names may have characters it cannot encode
             stream.reconfigure(errors='backslashreplace')
     try:
-        with _ended_by_signals(arguments):
-            status = _run(arguments)
+        status = _run(arguments)
         sys.stdout.flush()
         return status
     except BrokenPipeError:
@@ -120,37 +125,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return DONE
     except KeyboardInterrupt:
         return _fail(_ended_by(signal.SIGINT, arguments), SIGNALLED + signal.SIGINT)
-    except _EndedBySignal as end:
-        number = end.args[0]
-        return _fail(_ended_by(number, arguments), SIGNALLED + number)
     except Exception as error:
         if is_debug:
             raise
         status = WRONG_USAGE if isinstance(error, ConfigError) else FAILED
         return _fail(description_of(error), status)
-
-
-@contextmanager
-def _ended_by_signals(arguments: list[str]) -> Iterator[None]:
-    """Raise `_EndedBySignal` on `ENDING_SIGNALS` inside the block, so that files are removed."""
-
-    def end(number: int, _: FrameType | None) -> None:
-        for one in handled:  # a second signal must not interrupt the clean-up
-            signal.signal(one, signal.SIG_IGN)
-        raise _EndedBySignal(number)
-
-    handled: list[int] = []
-    # The node handles signals itself; only the main thread may set handlers.
-    if arguments[:1] != ['node'] and current_thread() is main_thread():
-        # A signal that is ignored stays so: nohup ignores SIGHUP.
-        handled = [one for one in ENDING_SIGNALS if signal.getsignal(one) is signal.SIG_DFL]
-    try:
-        for one in handled:
-            signal.signal(one, end)
-        yield
-    finally:
-        for one in handled:
-            signal.signal(one, signal.SIG_DFL)
 
 
 def _ended_by(number: int, arguments: list[str]) -> str:
