@@ -173,16 +173,19 @@ def interpolate_rotation(first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: f
     return matrix_from_quaternion(interpolate_quaternion(first_xyzw, second_xyzw, share))
 
 
-def interpolate_quaternion(first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: float) -> Floats:
-    """Return the same rotation as `interpolate_rotation` as a quaternion (4,), x y z w."""
-    first, second = _unit(np.stack([first_xyzw, second_xyzw]))
-    if first @ second < 0:
-        second = -second  # the same rotation, on the shortest path
-    angle = 2 * np.arctan2(np.linalg.norm(second - first), np.linalg.norm(second + first))
+def interpolate_quaternion(
+    first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: ArrayLike
+) -> Floats:
+    """Return the same rotations as `interpolate_rotation` as quaternions (..., 4), x y z w."""
+    first, second = _unit(first_xyzw), _unit(second_xyzw)
+    is_opposite = (first * second).sum(-1, keepdims=True) < 0
+    second = np.where(is_opposite, -second, second)  # the same rotation, on the shortest path
+    distances = (np.linalg.norm(one, axis=-1) for one in (second - first, second + first))
+    angle = 2 * np.arctan2(*distances)
     # sin(part * angle) / sin(angle), with its limit for equal rotations
-    parts = np.array([1 - share, share])
-    weights = parts * np.sinc(parts * angle / np.pi) / np.sinc(angle / np.pi)
-    interpolated: Floats = weights @ np.stack([first, second])
+    parts = np.stack([1 - np.asarray(share), np.asarray(share)])
+    weights = (parts * np.sinc(parts * angle / np.pi) / np.sinc(angle / np.pi))[..., None]
+    interpolated: Floats = weights[0] * first + weights[1] * second
     return interpolated
 
 

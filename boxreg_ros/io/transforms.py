@@ -225,18 +225,24 @@ class TransformTree:
         transforms between both frames are static.
 
         """
-        if all(edge.is_static for edge, _ in self._route(target, source)):
+        route = self._route(target, source)
+        if all(edge.is_static for edge, _ in route):
             return None
-        stamps_ns = [stamp_ns]
-        poses = [self.lookup(target, source, stamp_ns)]
         period_ns = round(POSES_PERIOD * 1e9)
-        for step in range(1, round(POSES_SECONDS / POSES_PERIOD) + 1):
-            at_ns = stamp_ns - step * period_ns
-            if not self.covers(target, source, at_ns):
-                break
-            stamps_ns.insert(0, at_ns)
-            poses.insert(0, self.lookup(target, source, at_ns))
-        return FrameMotion(np.array(stamps_ns), np.array(poses))
+        stamps_ns = [
+            stamp_ns - step * period_ns
+            for step in range(round(POSES_SECONDS / POSES_PERIOD), 0, -1)
+        ]
+        while stamps_ns and not self.covers(target, source, stamps_ns[0]):
+            del stamps_ns[0]
+        if stamps_ns and not self.covers(target, source, stamps_ns[-1]):
+            stamps_ns = []
+        T_target_source = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
+        for edge, is_upward in route if stamps_ns else ():
+            T = edge.at_each(stamps_ns, self._is_once(edge))
+            T_target_source = (T if is_upward else inverse(T)) @ T_target_source
+        last = self.lookup(target, source, stamp_ns)
+        return FrameMotion(np.array([*stamps_ns, stamp_ns]), np.array([*T_target_source, last]))
 
     def connects(self, target: str, source: str) -> bool:
         """Return whether transforms connect `source` with `target`, at any stamp."""
@@ -711,6 +717,24 @@ class Edge:
             )
         return 'check that its stamps use the clock of the point cloud'
 
+    def at_each(self, stamps_ns: Sequence[int], is_constant: bool) -> Floats:
+        """Return ``T_parent_child`` (n, 4, 4) at stamps that `covers` is true for."""
+        if self.is_static or is_constant:
+            return matrix(np.array([self.poses[0]] * len(stamps_ns)))
+        known = self.stamps
+        after = [min(max(bisect_left(known, one), 1), len(known) - 1) for one in stamps_ns]
+        gaps_ns = [known[row] - known[row - 1] for row in after]
+        if len(known) < 2 or max(gaps_ns) > MAX_LINEAR_GAP * 1e9:
+            return np.array([self._at(one, 0) for one in stamps_ns])
+        shares = np.array(
+            [
+                (one - known[row - 1]) / gap
+                for one, row, gap in zip(stamps_ns, after, gaps_ns, strict=True)
+            ]
+        )
+        first = np.array([self.poses[row - 1] for row in after])
+        return matrix(_between(first, np.array([self.poses[row] for row in after]), shares))
+
     def _nodes(self, after: int) -> list[int]:
         """
         Return the rows of the samples to interpolate the gap before row `after` by.
@@ -736,18 +760,21 @@ class Edge:
 
 
 def matrix(pose: Floats) -> Floats:
-    """Return T (4, 4) of x y z qx qy qz qw."""
-    T = np.eye(4)
-    T[:3, :3] = matrix_from_quaternion(pose[3:])
-    T[:3, 3] = pose[:3]
+    """Return T (..., 4, 4) of x y z qx qy qz qw (..., 7)."""
+    T = np.zeros((*pose.shape[:-1], 4, 4))
+    T[..., :3, :3] = matrix_from_quaternion(pose[..., 3:])
+    T[..., :3, 3] = pose[..., :3]
+    T[..., 3, 3] = 1.0
     return T
 
 
 def inverse(T: Floats) -> Floats:
-    """Return the inverse of a rigid T (4, 4)."""
-    inverted = np.eye(4)
-    inverted[:3, :3] = T[:3, :3].T
-    inverted[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    """Return the inverse of rigid transforms T (..., 4, 4)."""
+    inverted = np.zeros_like(T)
+    R = np.swapaxes(T[..., :3, :3], -1, -2)
+    inverted[..., :3, :3] = R
+    inverted[..., :3, 3] = -(R @ T[..., :3, 3, None])[..., 0]
+    inverted[..., 3, 3] = 1.0
     return inverted
 
 
@@ -786,10 +813,12 @@ def interpolated(stamps_ns: Sequence[int], poses: Sequence[Floats], stamp_ns: in
     return matrix(values[0])
 
 
-def _between(first: Floats, second: Floats, share: float) -> Floats:
-    """Return the pose (7,) between two poses: `share` 0 is the first, 1 the second."""
-    position = first[:3] + share * (second[:3] - first[:3])
-    return np.concatenate([position, interpolate_quaternion(first[3:], second[3:], share)])
+def _between(first: Floats, second: Floats, share: float | Floats) -> Floats:
+    """Return the poses (..., 7) between two poses: `share` (...) 0 is the first, 1 the second."""
+    part = np.asarray(share)[..., None]
+    position = first[..., :3] + part * (second[..., :3] - first[..., :3])
+    turn = interpolate_quaternion(first[..., 3:], second[..., 3:], share)
+    return np.concatenate([position, turn], axis=-1)
 
 
 def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:

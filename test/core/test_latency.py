@@ -9,7 +9,7 @@ from boxreg_ros.core.latency import Latency, LatencyCorrection, NOTABLE, OBJECTS
 from boxreg_ros.core.matching import Pair
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import boxes_to_frame, inverse
+from boxreg_ros.io.transforms import inverse, moved_boxes
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.scenarios import highway
 from boxreg_ros.structures import BoxArray, FrameMotion
@@ -169,7 +169,8 @@ def test_late_boxes_in_a_frame_that_turns_and_drives_are_put_where_they_were_mea
         at = 0.1 * k + latency
         stamp_ns = START_NS + round(at * 1e9)
         (given,) = boxes_of([parked], [stamp_ns])
-        given = boxes_to_frame(given, pose(at) @ inverse(pose(at - latency)), 'odom')
+        T_late = pose(at) @ inverse(pose(at - latency))
+        given = replace(given, boxes=moved_boxes(given.boxes, T_late))
         times = at - 0.1 * np.arange(10, -1, -1)
         motion = FrameMotion(
             START_NS + np.round(times * 1e9).astype(np.int64), np.array([*map(pose, times)])
