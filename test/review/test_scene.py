@@ -102,7 +102,7 @@ def ious_with_truth(table, drive, track_id):
 
 
 @NEEDS_BROWSER
-def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serve):
+def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serve, quick_python):
     server = serve(out)
     with opened_page(server.address) as page:
         add_car(page, drive)
