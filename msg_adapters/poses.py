@@ -74,26 +74,27 @@ def common_header(kind: str, header: Any, items: Sequence[Any]) -> Any:
     kind : str
         Type of the message, for errors.
     header : std_msgs/Header
-        Of the array. Where it has no frame that of the first item counts; where its stamp is 0,
-        that of the items, if they have the same.
+        Of the array. Where the items name a frame, theirs counts: their poses are in it. Where its
+        stamp is 0 that of the items counts, if they have the same.
     items : sequence
         Boxes with a header of their own.
 
     Raises
     ------
     UnsupportedMessage
-        If an item is in another frame.
+        If they are in several frames.
 
     """
     own = header
-    header = header if header.frame_id or not items else items[0].header
-    for item in items:
-        frame = item.header.frame_id
-        if frame and frame != header.frame_id:
-            raise UnsupportedMessage(
-                f'{kind}: expected all boxes in the frame of the array {header.frame_id!r}, got '
-                f'one in {frame!r}; publish one array per frame'
-            )
+    frames = {item.header.frame_id or header.frame_id for item in items} - {''}
+    if len(frames) > 1:
+        raise UnsupportedMessage(
+            f'{kind}: expected all boxes of a message in one frame, got '
+            f'{" and ".join(map(repr, sorted(frames)))}; split the array by frame, or transform '
+            f'its boxes into one, where they are published, or in a copy of the recording'
+        )
+    if frames - {header.frame_id}:
+        header = replaced(header, frame_id=frames.pop())
     if stamp_ns(own) == 0 and len({stamp_ns(item.header) for item in items}) == 1:
         return replaced(header, stamp=items[0].header.stamp)
     return header

@@ -30,10 +30,18 @@ MAX_DIRECTIONS = 500
 """After so many directions the check ends; chosen."""
 MIN_SHARE = 0.8
 """Share of the directions that must agree; chosen: about half of unresolved headings do."""
+MAX_SHARE_OF_NOISE = 0.5
+"""Share of the directions near x or -x by which yaw is not of the boxes; a third are by chance."""
+MIN_TRACKS_OF_NOISE = 3
+"""Tracks that show it; chosen: the directions of one that turns or slides depend on each other."""
+MIN_DIRECTIONS_OF_NOISE = 20
+"""Directions that show it; chosen: by chance, 15 of them are near x with a share of 1 in 50."""
+MIRRORED_OF = {'xyzw': 'clockwise', 'clockwise': 'xyzw'}
+"""Orientation -> that in which yaw grows the other way."""
 MIN_RATIO = 1.15
 """Ratio of length and width of a vehicle from which they can be told apart; chosen."""
 SWAPPED = str.maketrans('lw', 'wl')
-OPTIONS = ('forward_axis', 'size_order')
+OPTIONS = ('orientation', 'forward_axis', 'size_order')
 """Of a `Convention`, which the motion can show."""
 AXIS_WORDS = {
     'x+': 'x axis',
@@ -51,6 +59,7 @@ class _Way:
 
     stamp_ns: int
     box: Floats
+    frame_yaw: float
     axes: Counter[str] = field(default_factory=Counter)
 
 
@@ -70,6 +79,7 @@ class AxisCheck:
         self._ratios: list[float] = []
         self._axes: Counter[str] = Counter()
         self._tracks: Counter[str] = Counter()  # by the axis along which they moved first
+        self._mirrored: Counter[bool] = Counter()  # where one sense of yaw fits alone: the other?
         self.finding = ''
         self.forget()
 
@@ -77,7 +87,7 @@ class AxisCheck:
         """Forget where the tracks are, after a time jump; directions stay."""
         self._ways: dict[str, _Way] = {}
 
-    def add(self, boxes: BoxArray) -> None:
+    def add(self, boxes: BoxArray, frame_yaw: float = 0.0) -> None:
         """
         Add the next boxes, and update `finding`.
 
@@ -85,6 +95,8 @@ class AxisCheck:
         ----------
         boxes : BoxArray
             In a fixed frame, with ids; read by the convention that is checked.
+        frame_yaw : float
+            Yaw of the frame of their message in the fixed frame [rad]: a yaw is mirrored in it.
 
         """
         known = len(self._ratios)
@@ -95,32 +107,40 @@ class AxisCheck:
         is_valid = is_valid_box(boxes.boxes).tolist()
         for row, track_id in enumerate(boxes.track_ids):
             if track_id and is_valid[row] and self._is_checked(boxes.class_names[row]):
-                self._add(track_id, boxes.stamp_ns, boxes.boxes[row])
+                self._add(track_id, boxes.stamp_ns, boxes.boxes[row], frame_yaw)
         if len(self._ratios) > known:
             self.finding = self._text()
 
-    def _add(self, track_id: str, stamp_ns: int, box: Floats) -> None:
+    def _add(self, track_id: str, stamp_ns: int, box: Floats, frame_yaw: float) -> None:
         way = self._ways.get(track_id)
         if way is None:
-            self._ways[track_id] = _Way(stamp_ns, box)
+            self._ways[track_id] = _Way(stamp_ns, box, frame_yaw)
             return
         step = (box[:2] - way.box[:2]).tolist()
         moved = hypot(*step)
         if moved < MIN_WAY:
             return
         if moved <= MAX_OBJECT_SPEED * (stamp_ns - way.stamp_ns) * 1e-9:
-            yaws = np.exp(1j * np.array([way.box[YAW], box[YAW]]))
-            axis = _axis_of(atan2(step[1], step[0]) - float(np.angle(yaws.sum())))
+            heading = atan2(step[1], step[0])
+            yaws = np.array([way.box[YAW], box[YAW]])
+            axis = _axis_of(heading - _mean_angle(yaws))
+            mirrored = 2 * np.array([way.frame_yaw, frame_yaw]) - yaws
+            fits_mirrored = _axis_of(heading - _mean_angle(mirrored)) == 'x+'
+            if fits_mirrored != (axis == 'x+'):
+                self._mirrored[fits_mirrored] += 1
             self._tracks[axis] += not way.axes[axis]
             self._axes[axis] += 1
             self._ratios.append(float(box[LENGTH] / box[WIDTH]))
             way.axes[axis] += 1
         way.stamp_ns = stamp_ns
         way.box = box
+        way.frame_yaw = frame_yaw
 
     @property
     def wanted(self) -> Convention:
         """Return the convention of the motion: the one that is checked, if nothing else fits."""
+        if self._is_mirrored:
+            return replace(self._convention, orientation=MIRRORED_OF[self._convention.orientation])
         axis = self._axis()
         if axis is None:
             return self._convention
@@ -138,7 +158,7 @@ class AxisCheck:
         wanted, own = self.wanted, self._convention
         names = [name for name in OPTIONS if getattr(wanted, name) != getattr(own, name)]
         if not names:
-            return ''
+            return self._noise_text()
         tracks = self._tracks.total()
         expected = ' and '.join(f'{name} {getattr(wanted, name)!r}' for name in names)
         got = ' and '.join(repr(getattr(own, name)) for name in names)
@@ -147,9 +167,38 @@ class AxisCheck:
         how = 'are wider than long along their way'
         if wanted.forward_axis != own.forward_axis:
             how = f'move along their {AXIS_WORDS[self._axis() or "x+"]}'
+        if wanted.orientation != own.orientation:
+            how = 'turn against their way, as if yaw grew to the other side'
         return (
             f'boxes of vehicles {how} (seen of {tracks} moving tracks): expected {expected}, got '
             f'{got}; set {node} (boxreg relabel and convert: {flags})'
+        )
+
+    @property
+    def _is_mirrored(self) -> bool:
+        """Return whether the directions that show the sense of yaw say that it is the other."""
+        if self._convention.orientation not in MIRRORED_OF:
+            return False
+        total = self._mirrored
+        if total[True] < max(MIN_DIRECTIONS, MIN_SHARE * total.total()):
+            return False
+        # A box that is turned by a quarter or a half seems mirrored where its way crosses an axis.
+        fitting = self._axes['x+'] + total[True] - total[False]
+        return fitting >= MIN_SHARE * self._axes.total()
+
+    def _noise_text(self) -> str:
+        """Return that yaw has nothing to do with the way, as degrees taken for radians have."""
+        total, along = self._axes.total(), self._axes['x+'] + self._axes['x-']
+        is_enough = total >= MIN_DIRECTIONS_OF_NOISE
+        is_of_many = self._tracks.total() >= MIN_TRACKS_OF_NOISE
+        across = max(self._axes['y+'], self._axes['y-'])
+        if not (is_enough and is_of_many) or max(along, across) > MAX_SHARE_OF_NOISE * total:
+            return ''
+        return (
+            f'yaw of the boxes of vehicles does not follow their way: expected nearly all of '
+            f'{total} directions along a box, got {along}; it may be degrees written as radians, '
+            f'which no option can undo in a quaternion: convert yaw to radians where the boxes '
+            f'are made, or see whether another topic has them'
         )
 
     def _axis(self) -> str | None:
@@ -165,6 +214,11 @@ class AxisCheck:
         if tracks < MIN_MOVING_TRACKS and count < MIN_DIRECTIONS:
             return None
         return axis
+
+
+def _mean_angle(angles: Floats) -> float:
+    """Return the direction of the sum of unit vectors at angles [rad]."""
+    return float(np.angle(np.exp(1j * angles).sum()))
 
 
 def _axis_of(angle: float) -> str:

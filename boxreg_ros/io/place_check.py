@@ -191,12 +191,19 @@ class PlaceCheck:
             'boxes_frame': 'that of the messages',
         }
         option = best.option
+        instead = ''
+        if best.value == 'left_handed':
+            instead = (
+                '; if the boxes are right, it is the clouds whose y points to the right, which no '
+                'option undoes: negate y of their points, in the driver or in a copy of the '
+                'recording'
+            )
         return (
             f'boxes do not fit the points: {len(self._own.coverages)} of {len(self._tilted)} have '
             f'points around them, and contain {self._own.mean:.0%} of these; elsewhere '
             f'{len(best.coverages)} and {best.mean:.0%}: expected {option} {best.value}, got '
             f'{got[option]}; set {option}:={best.value} (boxreg relabel: '
-            f'--{option.replace("_", "-")} {best.value})'
+            f'--{option.replace("_", "-")} {best.value}){instead}'
         )
 
     def _is_better(self, place: _Place) -> bool:

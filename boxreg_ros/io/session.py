@@ -44,6 +44,12 @@ MAX_ROUNDING = 0.02
 """Step between coordinates from which they are named as coarse [m]; chosen: the range noise."""
 
 
+UNIT_POINTS = 100
+"""Points of a cloud that its unit is looked up by; chosen."""
+MAX_MEDIAN_DISTANCE = 1000.0
+"""Median distance of points from their middle that no LiDAR on the ground has [m]; chosen."""
+
+
 class Session:
     """
     Prepare sweeps and boxes for the registrar.
@@ -140,7 +146,7 @@ class Session:
         reason, detail = None, ''
         moved: Sweep | BoxArray
         if isinstance(given, Sweep):
-            self._coarse = self._coarse or coarse_text(given)
+            self._coarse = self._coarse or unit_text(given) or coarse_text(given)
             moved = sweep_to_frame(given, T_fixed_item, self.fixed_frame)
             moved, reason, detail = self.placement.placed(moved, self.tree)
         else:
@@ -153,7 +159,8 @@ class Session:
                 moved = self._tracker.identify(moved)
             if self._id_check is not None:
                 self._id_check.add(moved)
-            self._axis_check.add(moved)
+            frame_yaw = float(np.arctan2(T_fixed_item[1, 0], T_fixed_item[0, 0]))
+            self._axis_check.add(moved, frame_yaw)
         return item._replace(moved=moved, T_fixed_item=T_fixed_item, reason=reason, detail=detail)
 
     def _other_frames(self, item: Sweep | BoxArray) -> dict[str, Floats]:
@@ -307,6 +314,22 @@ def coarse_text(sweep: Sweep) -> str:
         f'clouds in {sweep.frame_id!r} have coordinates of up to {largest:.7g} m as float32, '
         f'which are {step:.2g} m apart there: points and boxes are as coarse; take the clouds '
         f'before their registration, in the frame of the LiDAR, or of a map with a near origin'
+    )
+
+
+def unit_text(sweep: Sweep) -> str:
+    """Return that the points of a cloud lie too far from each other to be in metres, or ''."""
+    points = sweep.points[:: max(1, len(sweep.points) // UNIT_POINTS)]
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < UNIT_POINTS:
+        return ''
+    distance = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
+    if distance < MAX_MEDIAN_DISTANCE:
+        return ''
+    return (
+        f'clouds in {sweep.frame_id!r}: expected metres, got points of which half are more than '
+        f'{distance:.0f} from their middle: they are in millimetres, or scaled otherwise; divide '
+        f'x, y and z by 1000, in the driver or in a copy of the recording'
     )
 
 

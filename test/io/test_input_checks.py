@@ -183,6 +183,28 @@ def test_unresolved_headings_are_no_finding():
     assert axes_of(frames(), STANDARD).finding == ''
 
 
+def street_of(yaw_of, frame_yaw=0.0):
+    """Return the check of a street with other yaws, in a frame of the boxes that is turned."""
+    check = AxisCheck(STANDARD, Config().drives)
+    for stamp, ids, boxes in street(moving=4):
+        boxes[:, 8] = yaw_of(boxes[:, 8])
+        check.add(array(stamp, ids, boxes), frame_yaw)
+    return check
+
+
+@pytest.mark.parametrize('frame_yaw', [0.0, 0.7])
+def test_a_clockwise_yaw_is_named_with_its_option(frame_yaw):
+    check = street_of(lambda yaw: 2 * frame_yaw - yaw, frame_yaw)
+    assert check.wanted == Convention(orientation='clockwise')
+    assert '--orientation clockwise' in check.finding
+
+
+def test_a_yaw_in_degrees_is_named():
+    rng = np.random.default_rng(1)
+    finding = street_of(lambda yaw: np.degrees(yaw + rng.normal(0, 0.1, len(yaw)))).finding
+    assert 'degrees written as radians' in finding
+
+
 def test_label_files_with_other_axes_are_named_and_read_by_the_options(tmp_path, capsys):
     """The table of a drive along its x axis, written with y forward and width, length, height."""
     convention = Convention(forward_axis='y+', size_order='wlh')

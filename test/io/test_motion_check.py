@@ -7,7 +7,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.session import coarse_text
+from boxreg_ros.io.session import coarse_text, unit_text
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
@@ -170,6 +170,12 @@ def test_coordinates_that_float32_rounds_to_centimetres_are_named():
     assert '0.5 m apart' in text
     for near in (points.astype(np.float64), points - points, points[:0]):
         assert coarse_text(Sweep(START, 'utm', near)) == ''
+
+
+def test_points_in_millimetres_are_named():
+    points = np.random.default_rng(0).uniform(-80, 80, (1000, 3))
+    assert unit_text(Sweep(START, 'lidar', points + 5e6)) == ''
+    assert 'they are in millimetres' in unit_text(Sweep(START, 'lidar', 1000 * points))
 
 
 def test_odometry_is_that_of_the_namespace_of_the_clouds(tmp_path):
@@ -354,7 +360,8 @@ def test_clouds_registered_into_the_fixed_frame_need_the_frame_of_their_lidar(tm
     drive = Drive(sweeps=12)
     for topic, _, message in drive.items:
         if topic in ('/points', '/boxes'):
-            message.header.frame_id = 'odom'
+            for one in (message, *getattr(message, 'detections', [])):
+                one.header.frame_id = 'odom'
     origins, frame, found = read(drive, tmp_path)
     assert frame == 'odom'
     assert '--sensor-frame lidar' in found

@@ -288,6 +288,7 @@ def test_boxes_that_are_tilted_mirrored_or_of_half_the_size_are_named(option, va
     shown = '2' if option == 'size_scale' else value
     assert f'set {option}:={shown}' in text
     assert f'--{option.replace("_", "-")}' in text
+    assert ('it is the clouds whose y' in text) == (value == 'left_handed')
     assert placed(meant, taken=meant) == ''
 
 

@@ -323,8 +323,15 @@ def test_contradicting_headers_are_refused():
         markers.from_msg(message)
     message = vision_msg()
     message.detections[1].header = M.header(STAMP, 'map')
-    with pytest.raises(UnsupportedMessage, match=r"'lidar', got one in 'map'"):
+    with pytest.raises(UnsupportedMessage, match=r"one frame, got 'lidar' and 'map'"):
         vision.from_msg(message)
+
+
+def test_the_frame_of_all_detections_comes_before_that_of_the_array():
+    message = vision_msg()
+    message.header = M.header(STAMP, 'map')
+    boxes = vision.from_msg(message)
+    assert (boxes.frame_id, boxes.stamp_ns) == ('lidar', STAMP)
 
 
 def test_fields_of_no_release_of_vision_msgs_are_refused():
