@@ -52,6 +52,17 @@ Factor by which larger boxes must be better, in the mean: more of them have poin
 Chosen: half extents contain a tenth of what the whole ones do.
 
 """
+MAX_FILLED = 0.7
+"""Part of the extents up to which the points of twice too large boxes reach; derived: 0.5."""
+MIN_SHARE_WITHIN = 0.7
+"""
+Share of the points in the upper half of a box within this part of it: that of a small object.
+
+Chosen: in the median of the sample 0.13, with extents twice as large 0.88; by chance 0.34.
+
+"""
+MAX_ZERO = 1e-6
+"""Height that is taken for 0 [m]; derived: rounding of the transforms that it went through."""
 MIN_UPRIGHT = 0.5
 """Cosine of the tilt below which a box is not upright; derived: 60 degrees."""
 MIN_TILTED = 0.3
@@ -105,6 +116,8 @@ class PlaceCheck:
             'doubled': _Place('size_scale', f'{scale:g}'),
         }
         self._tilted: list[tuple[bool, bool]] = []  # as read, and with w first
+        self._within: list[float] = []
+        self._heights: list[float] = []  # in the frame of the messages
         self._sweep: Sweep | None = None
         self._boxes: BoxArray | None = None
         self._frames: dict[str, Floats] = {}
@@ -146,7 +159,7 @@ class PlaceCheck:
         if abs(self._sweep.stamp_ns - self._boxes.stamp_ns) <= self._tolerance_ns:
             self._compare(self._sweep.in_frame().points, self._boxes)
             self._sweep = self._boxes = None
-            self.finding = self._tilt_text() or self._place_text()
+            self.finding = self._tilt_text() or self._place_text() or self._size_text()
 
     def _compare(self, points: NDArray[np.floating], array: BoxArray) -> None:
         """Add what boxes in the frame of their message contain of the points, in each place."""
@@ -158,7 +171,10 @@ class PlaceCheck:
         tilted = np.cos([boxes[:, ROLL:YAW], wxyz[:, ROLL:YAW]]).prod(axis=2) < MIN_UPRIGHT
         self._tilted += [(bool(own), bool(other)) for own, other in tilted.T]
         T = self._frames.pop('')
-        _add_coverages(self._own, points, moved_boxes(boxes, T))
+        own = moved_boxes(boxes, T)
+        _add_coverages(self._own, points, own)
+        self._within += [share for box in own if (share := _share_within(points, box)) is not None]
+        self._heights += raw.boxes[:, BOX_CENTER][:, 2].tolist()
         for name, convention in self._meant.items():
             meant = convention.to_centers(raw).boxes
             _add_coverages(self._others[name], points, moved_boxes(meant, T))
@@ -177,6 +193,35 @@ class PlaceCheck:
             f'{own:.0%} of the boxes lie on their sides or backs: expected orientation '
             f"'wxyz', got {self._convention.orientation!r}; set orientation:=wxyz (boxreg "
             f'relabel: --orientation wxyz)'
+        )
+
+    @property
+    def flat(self) -> str:
+        """Return that all boxes have z of 0, as a detector in the plane writes it; else ''."""
+        if len(self._heights) < MAX_COMPARED or self._convention.pose_reference != 'center':
+            return ''
+        if np.abs(self._heights).max() > MAX_ZERO:
+            return ''
+        return (
+            f'all of {len(self._heights)} boxes have z of 0: expected the heights of their '
+            f'objects, got those of a detector in the plane; x, y and yaw are refined, z is right '
+            f'only where 0 is the height of their centres: if the ground is at 0, set '
+            f'pose_reference:=bottom (boxreg relabel: --pose-reference bottom); a pose at another '
+            f'height is a fraction of that of the box, as in --pose-reference=0,0,0.5'
+        )
+
+    def _size_text(self) -> str:
+        """Return that boxes are twice as large as what they contain; empty if they are not."""
+        enough = len(self._within) >= ENOUGH_BOXES
+        if not enough or np.median(self._within) < MIN_SHARE_WITHIN:
+            return ''
+        scale = f'{self._convention.size_scale / 2:g}'
+        return (
+            f'boxes are about twice as large as the objects in them: in half of '
+            f'{len(self._within)}, {np.median(self._within):.0%} of the points or more lie within '
+            f'{MAX_FILLED:g} of the extents: expected size_scale {scale}, got '
+            f'{self._convention.size_scale:g}; set size_scale:={scale} (boxreg relabel: '
+            f'--size-scale {scale})'
         )
 
     def _place_text(self) -> str:
@@ -214,6 +259,18 @@ class PlaceCheck:
         if place.option == 'size_scale' and place.mean < MIN_RATIO_OF_SIZES * own.mean:
             return False
         return place.sum >= MIN_RATIO_OF_COVERAGE * own.sum
+
+
+def _share_within(points: NDArray[np.floating], box: Floats) -> float | None:
+    """Return the share of the points in the upper half of a box that its inner part contains."""
+    if not np.isfinite(box).all():
+        return None
+    away = points - box[BOX_CENTER]
+    limit = box[BOX_EXTENT] / 2
+    local = away[(np.abs(away) < np.linalg.norm(limit)).all(axis=1)] @ matrix_from_rpy(box[ROLL:])
+    parts = np.abs(local / limit).max(axis=1)[local[:, 2] > 0]
+    parts = parts[parts <= 1]
+    return float(np.mean(parts <= MAX_FILLED)) if len(parts) >= MIN_POINTS_AROUND else None
 
 
 def _add_coverages(place: _Place, points: NDArray[np.floating], boxes: Floats) -> None:

@@ -11,6 +11,7 @@ transforms and publishing; `boxreg relabel` adds reading and writing.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -30,6 +31,7 @@ from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # it imports torch, which a process that only reads does not need
     from boxreg_ros.core.registrar import BoxRegistrar
@@ -48,6 +50,14 @@ UNIT_POINTS = 100
 """Points of a cloud that its unit is looked up by; chosen."""
 MAX_MEDIAN_DISTANCE = 1000.0
 """Median distance of points from their middle that no LiDAR on the ground has [m]; chosen."""
+
+
+SECTORS = 72
+"""Parts of the azimuth that a cloud may cover; chosen: 5 degrees."""
+PACKET_CLOUDS = 30
+"""Clouds by which it is seen whether each is a whole sweep; chosen: packets are 10 or more."""
+MIN_PACKETS = 3
+"""Clouds that a revolution is split into, at least; chosen: two LiDARs may share a frame."""
 
 
 class Session:
@@ -90,6 +100,7 @@ class Session:
         self._has_boxes_without_frame = False
         self._has_clouds_without_frame = False
         self._coarse = ''
+        self._sectors: list[NDArray[np.bool_]] = []
         self._pose_check = PoseCheck(self._convention, AT_ONCE)
         self._place_check = PlaceCheck(self._convention, AT_ONCE)
 
@@ -146,6 +157,8 @@ class Session:
         reason, detail = None, ''
         moved: Sweep | BoxArray
         if isinstance(given, Sweep):
+            if self._merger is None and len(self._sectors) < PACKET_CLOUDS:
+                self._sectors.append(sectors(given))
             self._coarse = self._coarse or unit_text(given) or coarse_text(given)
             moved = sweep_to_frame(given, T_fixed_item, self.fixed_frame)
             moved, reason, detail = self.placement.placed(moved, self.tree)
@@ -242,6 +255,8 @@ class Session:
                 f'{pairs}; each pair is taken for one frame, since nothing else connects them'
             )
             found.append(Finding(Reason.TRANSFORM_FAULT, text))
+        if len(self._sectors) == PACKET_CLOUDS and (text := packets_text(self._sectors)):
+            found.append(Finding(Reason.SENSOR_POSITION, text))
         if self._coarse:
             found.append(Finding(Reason.SENSOR_POSITION, self._coarse))
         if self._has_boxes_without_frame:
@@ -253,7 +268,8 @@ class Session:
         axes = self._axis_check.finding
         # Points show which horizontal extent is which, motion also which axis points forward;
         # boxes in another place show neither.
-        poses = self._place_check.finding or axes or self._pose_check.finding
+        place = self._place_check
+        poses = place.finding or axes or self._pose_check.finding or place.flat
         if poses:
             found.append(Finding(Reason.POSE_REFERENCE, poses))
         if self.jumping_ids:
@@ -331,6 +347,37 @@ def unit_text(sweep: Sweep) -> str:
         f'{distance:.0f} from their middle: they are in millimetres, or scaled otherwise; divide '
         f'x, y and z by 1000, in the driver or in a copy of the recording'
     )
+
+
+def sectors(sweep: Sweep) -> NDArray[np.bool_]:
+    """Return in which of `SECTORS` of azimuth about the LiDAR a cloud in its frame has points."""
+    angles = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
+    places = ((angles / (2 * np.pi) + 0.5) * SECTORS)[np.isfinite(angles)].astype(int)
+    return np.bincount(places.clip(0, SECTORS - 1), minlength=SECTORS) > 0
+
+
+def packets_text(seen: Sequence[NDArray[np.bool_]]) -> str:
+    """Return that each of some clouds has a part of a revolution; '' if each covers the same."""
+    each = float(np.median([_extent(one) for one in seen]))
+    together = _extent(np.any(seen, axis=0))
+    if not 0 < each * MIN_PACKETS <= together:
+        return ''
+    degrees = 360 / SECTORS
+    return (
+        f'clouds: expected a whole sweep in each, got parts of it: each covers about '
+        f'{each * degrees:.0f} degrees of azimuth, and {len(seen)} together '
+        f'{together * degrees:.0f}: most boxes have no points in the cloud of their time; join '
+        f'the clouds of each revolution, by the setting of the driver, or in a copy of the '
+        f'recording, with the times of the points'
+    )
+
+
+def _extent(occupied: NDArray[np.bool_]) -> int:
+    """Return the number of sectors from the first to the last occupied one, around the circle."""
+    rows = np.flatnonzero(occupied)
+    if not len(rows):
+        return 0
+    return SECTORS + 1 - int(np.diff(rows, append=rows[0] + SECTORS).max())
 
 
 def is_placeholder(item: Sweep | BoxArray) -> bool:

@@ -39,6 +39,8 @@ carried on for that long is off by 2 cm.
 """
 SAME_POSITION = 0.01
 """Positions of one frame at one stamp differ by less [m]; chosen: one centimetre of rounding."""
+END_NS = 10**9
+"""Time without transforms that is not the fault of a clock [ns]; chosen: detectors are as late."""
 MAX_LINEAR_GAP = 0.25
 """
 Longest gap between two samples of a moving frame that is interpolated linearly, as tf2 does [s].
@@ -714,6 +716,11 @@ class Edge:
                 f'it comes every {period_ns * 1e-9:.2g} s, too rarely to carry the motion on for '
                 f'{outside_ns * 1e-9:.2g} s; use a faster source of motion, if there is one: '
                 f'--odometry TOPIC comes before TF'
+            )
+        if outside_ns < END_NS:
+            return (
+                'nothing to do where the recording begins or ends; elsewhere transforms are '
+                'missing, or the stamp is late'
             )
         return 'check that its stamps use the clock of the point cloud'
 

@@ -292,6 +292,24 @@ def test_boxes_that_are_tilted_mirrored_or_of_half_the_size_are_named(option, va
     assert placed(meant, taken=meant) == ''
 
 
+def test_boxes_twice_as_large_as_their_objects_are_named():
+    meant = Convention(size_scale=0.5)
+    assert 'set size_scale:=0.5 (boxreg relabel: --size-scale 0.5)' in placed(meant)
+    assert placed(meant, taken=meant) == ''
+
+
+def test_boxes_without_heights_are_named():
+    boxes = np.tile([5.0, 0, 0, 4, 2, 1.5, 0, 0, 0], (100, 1))
+    T_map_lidar = np.eye(4)
+    T_map_lidar[:3, :3] = Rotation.from_euler('z', 0.4).as_matrix()
+    for z, is_named in ((0.0, True), (0.1, False)):
+        boxes[-1, 2] = z
+        check = PlaceCheck(STANDARD, tolerance=0.02)
+        check.add(Sweep(STAMP, 'map', np.zeros((3, 3))), T_map_lidar)
+        check.add(boxes_to_frame(array_of(*boxes), T_map_lidar, 'map'), T_map_lidar)
+        assert ('all of 100 boxes have z of 0' in check.flat) == is_named
+
+
 def test_boxes_of_another_frame_than_their_messages_name_are_named():
     text = placed(frame='map')
     assert 'set boxes_frame:=map (boxreg relabel: --boxes-frame map)' in text
