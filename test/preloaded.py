@@ -77,7 +77,8 @@ class PreloadedProcess:
         return self._process.exitcode
 
     def send_signal(self, number):
-        os.kill(self.pid, number)
+        if self.poll() is None:  # as of `subprocess.Popen`
+            os.kill(self.pid, number)
 
     def kill(self):
         self._process.kill()

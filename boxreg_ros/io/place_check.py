@@ -83,10 +83,10 @@ class _Place:
     @property
     def mean(self) -> float:
         """Return the mean part of the points around the boxes that these contain."""
-        return self.sum / max(1, len(self.coverages))
+        return self.total / max(1, len(self.coverages))
 
     @property
-    def sum(self) -> float:
+    def total(self) -> float:
         """Return the sum of these parts: few boxes in a wrong place have points around them."""
         return float(np.sum(self.coverages))
 
@@ -229,7 +229,7 @@ class PlaceCheck:
         fitting = [place for place in self._others.values() if self._is_better(place)]
         if not fitting:
             return ''
-        best = max(fitting, key=lambda place: place.sum)
+        best = max(fitting, key=lambda place: place.total)
         got = {
             'orientation': repr(self._convention.orientation),
             'size_scale': f'{self._convention.size_scale:g}',
@@ -258,7 +258,7 @@ class PlaceCheck:
             return False
         if place.option == 'size_scale' and place.mean < MIN_RATIO_OF_SIZES * own.mean:
             return False
-        return place.sum >= MIN_RATIO_OF_COVERAGE * own.sum
+        return place.total >= MIN_RATIO_OF_COVERAGE * own.total
 
 
 def _share_within(points: NDArray[np.floating], box: Floats) -> float | None:

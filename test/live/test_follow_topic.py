@@ -48,7 +48,7 @@ def test_one_box_is_followed_until_its_points_are_gone(graph: Graph, tmp_path):
     truth = scene.truth.rows(np.array(scene.truth.track_ids) == name)
     given = truth.boxes[truth.stamps_ns == scene.sweeps[BOX_AT].stamp_ns]
     del message.detections[1:]
-    box = replace(vision.from_msg(message), boxes=given)
+    box = replace(vision.from_msg(message), boxes=given, frame_id='odom')
     at = boxes_to_frame(box, inverse(scene.T_fixed_sensor[BOX_AT]), 'lidar')
     message = vision.to_msg(message, at)
     message.detections[0].id = name

@@ -33,7 +33,7 @@ def test_every_measurement_declares_options(name):
     measure.add_arguments(parser, import_module(f'measure.{name}').ARGUMENTS)
     is_simulated = name in (
         'paper', 'speed', 'highway', 'lidars', 'load', 'node', 'report', 'kinds', 'points',
-        'labeller',
+        'labeller', 'robot',
     )  # fmt: skip
     parser.parse_args([] if is_simulated else ['folder'])
 

@@ -7,7 +7,7 @@ const SHOWN = 90;                  // of the drive around the sensor [m]
 const DRAWN = [4.5, 1.9, 1.6];     // length, width and height of a box by hand where the drive has none of its class [m]
 const PICKED = 6;                  // a click is on a point this near [px]
 const TILT = { usual: 1, most: 1.3, pace: 0.006 };  // of the view in 3D, from above [rad], and of a drag [rad/px]
-/** @type {{ [name: string]: any, sweep: Sweep, boxes: SceneBox[], fit: Fit, slim: Map<number, SlimPart> }} */
+/** @type {{ [name: string]: any, zoom: number, tilt: number, turn: number, sweep: Sweep, boxes: SceneBox[], fit: Fit, slim: Map<number, SlimPart> }} */
 const scene = { at: 0, zoom: 0, offset: [0, 0], tilt: 0, turn: 0, sweep: null, boxes: [], clouds: [], isAdding: false, fit: null, proposals: [], proposal: -1, playing: 0, slim: new Map() };
 /** @type {Record<string, [string, number, number]>} */
 const LOOKS = { road: ['around', 0.45, 1], object: ['points', 0.9, 1.6] };  // colour, opacity, size [px]
