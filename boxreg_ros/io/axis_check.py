@@ -35,7 +35,7 @@ MAX_SHARE_OF_NOISE = 0.5
 MIN_TRACKS_OF_NOISE = 3
 """Tracks that show it; chosen: the directions of one that turns or slides depend on each other."""
 MIN_DIRECTIONS_OF_NOISE = 20
-"""Directions that show it; chosen: by chance, 15 of them are near x with a share of 1 in 50."""
+"""Directions that show it; chosen: by chance, more than half lie along x in 1 of 26 cases."""
 MIRRORED_OF = {'xyzw': 'clockwise', 'clockwise': 'xyzw'}
 """Orientation -> that in which yaw grows the other way."""
 MIN_RATIO = 1.15
@@ -159,7 +159,7 @@ class AxisCheck:
         names = [name for name in OPTIONS if getattr(wanted, name) != getattr(own, name)]
         if not names:
             return self._noise_text()
-        tracks = self._tracks.total()
+        ways = len(self._ratios)
         expected = ' and '.join(f'{name} {getattr(wanted, name)!r}' for name in names)
         got = ' and '.join(repr(getattr(own, name)) for name in names)
         node = ' '.join(f'{name}:={getattr(wanted, name)}' for name in names)
@@ -170,8 +170,8 @@ class AxisCheck:
         if wanted.orientation != own.orientation:
             how = 'turn against their way, as if yaw grew to the other side'
         return (
-            f'boxes of vehicles {how} (seen of {tracks} moving tracks): expected {expected}, got '
-            f'{got}; set {node} (boxreg relabel and convert: {flags})'
+            f'boxes of vehicles {how} (by {ways} directions of moving ones): expected {expected}, '
+            f'got {got}; set {node} (boxreg relabel and convert: {flags})'
         )
 
     @property
