@@ -232,6 +232,13 @@ class Reason(StrEnum):
         'LiDAR',
         'set `sensor_frames` as the log suggests',
     )
+    CLOUD_FAULT = (
+        'cloud_fault',
+        'message',
+        'its clouds are parts of sweeps, in millimetres, or too far from their origin for '
+        'float32; the log says which',
+        'mend them in the driver of the LiDAR, or in a node before this one, as the log says',
+    )
     TRANSFORM_FAULT = (
         'transform_fault',
         'message',

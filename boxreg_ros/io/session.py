@@ -256,9 +256,9 @@ class Session:
             )
             found.append(Finding(Reason.TRANSFORM_FAULT, text))
         if len(self._sectors) == PACKET_CLOUDS and (text := packets_text(self._sectors)):
-            found.append(Finding(Reason.SENSOR_POSITION, text))
+            found.append(Finding(Reason.CLOUD_FAULT, text))
         if self._coarse:
-            found.append(Finding(Reason.SENSOR_POSITION, self._coarse))
+            found.append(Finding(Reason.CLOUD_FAULT, self._coarse))
         if self._has_boxes_without_frame:
             text = (
                 f'boxes have an empty frame_id: expected the name of their frame; they are taken '
