@@ -88,7 +88,7 @@ def _newest(out: Path) -> Path:
         print(
             f'{out}: goes on in {newest}, which was written from it with all of its decisions; '
             f'to open {out.name} itself, rename {newest.name}',
-            flush=True,
+            file=sys.stderr,  # the first line of the output is the address
         )
     return newest
 
