@@ -142,3 +142,18 @@ def test_ids_of_a_real_drive():
             given.setdefault(int(track), set()).add(track_id)
     assert all(len(ids) == 1 for ids in given.values()), given
     assert len(set.union(*given.values())) == len(given) == 15
+
+
+def test_boxes_that_do_not_keep_their_tracks_are_still_the_newest_of_these():
+    def array(seconds, *ids):
+        boxes = array_of(round(seconds * 1e9), (10 * seconds, 0, CAR), (30 + 10 * seconds, 0, CAR))
+        return BoxArray(boxes.stamp_ns, 'map', ids, ('car',) * 2, np.ones(2), boxes.boxes)
+
+    tracker = Tracker(max_gap=0.5)
+    given = tracker.identify(array(0.0, 'a', 'b')).track_ids
+    own = dict(zip('ab', given, strict=True))
+    assert tracker.keep(array(0.1, 'b', 'a'), own) is None
+    assert tracker.identify(array(0.1, 'b', 'a')).track_ids == given
+    # Tracks that had no box since the first array have ended by now.
+    kept = tracker.keep(array(0.55, 'a', 'b'), own)
+    assert kept is not None and kept.track_ids == given
