@@ -11,7 +11,6 @@ transforms and publishing; `boxreg relabel` adds reading and writing.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -19,6 +18,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.matching import AT_ONCE
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.axis_check import AxisCheck
+from boxreg_ros.io.cloud_check import CloudCheck
 from boxreg_ros.io.findings import Finding
 from boxreg_ros.io.id_assignment import IdCheck, Tracker
 from boxreg_ros.io.items import Item
@@ -31,7 +31,6 @@ from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention
 import numpy as np
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # it imports torch, which a process that only reads does not need
     from boxreg_ros.core.registrar import BoxRegistrar
@@ -41,23 +40,6 @@ CLOUDS_WITHOUT_FRAME = (
     "sensor_frames:=['FRAME'] (boxreg relabel: --sensor-frame FRAME), or set it in the driver"
 )
 """What to do about clouds without a frame."""
-
-MAX_ROUNDING = 0.02
-"""Step between coordinates from which they are named as coarse [m]; chosen: the range noise."""
-
-
-UNIT_POINTS = 100
-"""Points of a cloud that its unit is looked up by; chosen."""
-MAX_MEDIAN_DISTANCE = 1000.0
-"""Median distance of points from their middle that no LiDAR on the ground has [m]; chosen."""
-
-
-SECTORS = 72
-"""Parts of the azimuth that a cloud may cover; chosen: 5 degrees."""
-PACKET_CLOUDS = 30
-"""Clouds by which it is seen whether each is a whole sweep; chosen: packets are 10 or more."""
-MIN_PACKETS = 3
-"""Clouds that a revolution is split into, at least; chosen: two LiDARs may share a frame."""
 
 
 class Session:
@@ -99,8 +81,7 @@ class Session:
         self._axis_check = AxisCheck(convention, config.drives)
         self._has_boxes_without_frame = False
         self._has_clouds_without_frame = False
-        self._coarse = ''
-        self._sectors: list[NDArray[np.bool_]] = []
+        self._cloud_check = CloudCheck(is_merged=self._merger is not None)
         self._pose_check = PoseCheck(self._convention, AT_ONCE)
         self._place_check = PlaceCheck(self._convention, AT_ONCE)
 
@@ -157,9 +138,7 @@ class Session:
         reason, detail = None, ''
         moved: Sweep | BoxArray
         if isinstance(given, Sweep):
-            if self._merger is None and len(self._sectors) < PACKET_CLOUDS:
-                self._sectors.append(sectors(given))
-            self._coarse = self._coarse or unit_text(given) or coarse_text(given)
+            self._cloud_check.add(given)
             moved = sweep_to_frame(given, T_fixed_item, self.fixed_frame)
             moved, reason, detail = self.placement.placed(moved, self.tree)
         else:
@@ -255,10 +234,7 @@ class Session:
                 f'{pairs}; each pair is taken for one frame, since nothing else connects them'
             )
             found.append(Finding(Reason.TRANSFORM_FAULT, text))
-        if len(self._sectors) == PACKET_CLOUDS and (text := packets_text(self._sectors)):
-            found.append(Finding(Reason.CLOUD_FAULT, text))
-        if self._coarse:
-            found.append(Finding(Reason.CLOUD_FAULT, self._coarse))
+        found += self._cloud_check.findings
         if self._has_boxes_without_frame:
             text = (
                 f'boxes have an empty frame_id: expected the name of their frame; they are taken '
@@ -316,68 +292,6 @@ def hand_to_registrar(
     elif moved is not None:
         ready += registrar.add_boxes(moved)
     return ready
-
-
-def coarse_text(sweep: Sweep) -> str:
-    """Return that the coordinates of a cloud are rounded to centimetres; empty if they are not."""
-    if sweep.points.dtype != np.float32 or not len(sweep.points):
-        return ''
-    largest = np.abs(sweep.points[::100]).max()  # a far origin is that of all
-    step = float(np.spacing(largest))
-    if not MAX_ROUNDING <= step < np.inf:
-        return ''
-    return (
-        f'clouds in {sweep.frame_id!r} have coordinates of up to {largest:.7g} m as float32, '
-        f'which are {step:.2g} m apart there: points and boxes are as coarse; take the clouds '
-        f'before their registration, in the frame of the LiDAR, or of a map with a near origin'
-    )
-
-
-def unit_text(sweep: Sweep) -> str:
-    """Return that the points of a cloud lie too far from each other to be in metres, or ''."""
-    points = sweep.points[:: max(1, len(sweep.points) // UNIT_POINTS)]
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) < UNIT_POINTS:
-        return ''
-    distance = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
-    if distance < MAX_MEDIAN_DISTANCE:
-        return ''
-    return (
-        f'clouds in {sweep.frame_id!r}: expected metres, got points of which half are more than '
-        f'{distance:.0f} from their middle: they are in millimetres, or scaled otherwise; divide '
-        f'x, y and z by 1000, in the driver or in a copy of the recording'
-    )
-
-
-def sectors(sweep: Sweep) -> NDArray[np.bool_]:
-    """Return in which of `SECTORS` of azimuth about the LiDAR a cloud in its frame has points."""
-    angles = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
-    places = ((angles / (2 * np.pi) + 0.5) * SECTORS)[np.isfinite(angles)].astype(int)
-    return np.bincount(places.clip(0, SECTORS - 1), minlength=SECTORS) > 0
-
-
-def packets_text(seen: Sequence[NDArray[np.bool_]]) -> str:
-    """Return that each of some clouds has a part of a revolution; '' if each covers the same."""
-    each = float(np.median([_extent(one) for one in seen]))
-    together = _extent(np.any(seen, axis=0))
-    if not 0 < each * MIN_PACKETS <= together:
-        return ''
-    degrees = 360 / SECTORS
-    return (
-        f'clouds: expected a whole sweep in each, got parts of it: each covers about '
-        f'{each * degrees:.0f} degrees of azimuth, and {len(seen)} together '
-        f'{together * degrees:.0f}: most boxes have no points in the cloud of their time; join '
-        f'the clouds of each revolution, by the setting of the driver, or in a copy of the '
-        f'recording, with the times of the points'
-    )
-
-
-def _extent(occupied: NDArray[np.bool_]) -> int:
-    """Return the number of sectors from the first to the last occupied one, around the circle."""
-    rows = np.flatnonzero(occupied)
-    if not len(rows):
-        return 0
-    return SECTORS + 1 - int(np.diff(rows, append=rows[0] + SECTORS).max())
 
 
 def is_placeholder(item: Sweep | BoxArray) -> bool:

@@ -7,7 +7,6 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.session import coarse_text, packets_text, sectors, unit_text
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
@@ -161,32 +160,6 @@ def test_microseconds_in_nanosec_are_named(tmp_path):
     assert 'got all of 10 in the first millisecond of a second' in found
     assert 'multiply nanosec by 1000' in found
     assert 'nanosec' not in read(Drive(sweeps=12), tmp_path / 'right')[2]
-
-
-def test_coordinates_that_float32_rounds_to_centimetres_are_named():
-    points = np.array([[500_000.0, 4_600_000.0, 3.0]], np.float32)
-    text = coarse_text(Sweep(START, 'utm', points))
-    assert "clouds in 'utm'" in text
-    assert '0.5 m apart' in text
-    for near in (points.astype(np.float64), points - points, points[:0]):
-        assert coarse_text(Sweep(START, 'utm', near)) == ''
-
-
-@pytest.mark.parametrize('parts', [1, 10])
-def test_clouds_that_are_parts_of_a_sweep_are_named(parts):
-    seen = []
-    for k in range(30):
-        angles = 2 * np.pi * (np.linspace(0, 1, 500, endpoint=False) + k) / parts
-        points = 9 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
-        seen.append(sectors(Sweep(START + k, 'lidar', points)))
-    named = 'each covers about 40 degrees of azimuth, and 30 together 360'
-    assert (named in packets_text(seen)) == (parts == 10)
-
-
-def test_points_in_millimetres_are_named():
-    points = np.random.default_rng(0).uniform(-80, 80, (1000, 3))
-    assert unit_text(Sweep(START, 'lidar', points + 5e6)) == ''
-    assert 'they are in millimetres' in unit_text(Sweep(START, 'lidar', 1000 * points))
 
 
 def test_odometry_is_that_of_the_namespace_of_the_clouds(tmp_path):

@@ -1,0 +1,113 @@
+"""Check of clouds as they are given: unit, rounding, and whether each is a whole sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from boxreg_ros.io.findings import Finding
+from boxreg_ros.reasons import Reason
+from boxreg_ros.structures import Sweep
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_ROUNDING = 0.02
+"""Step between coordinates from which they are named as coarse [m]; chosen: the range noise."""
+UNIT_POINTS = 100
+"""Points of a cloud that its unit is looked up by; chosen."""
+MAX_MEDIAN_DISTANCE = 1000.0
+"""Median distance of points from their middle that no LiDAR on the ground has [m]; chosen."""
+SECTORS = 72
+"""Parts of the azimuth that a cloud may cover; chosen: 5 degrees."""
+PACKET_CLOUDS = 30
+"""Clouds by which it is seen whether each is a whole sweep; chosen: packets are 10 or more."""
+MIN_PACKETS = 3
+"""Clouds that a revolution is split into, at least; chosen: two LiDARs may share a frame."""
+
+
+class CloudCheck:
+    """
+    Collect what is wrong with the clouds of a recording or stream, in the frame of their message.
+
+    With `is_merged` the clouds of several LiDARs are joined, each of which may see a sector only.
+
+    """
+
+    def __init__(self, is_merged: bool) -> None:
+        self._is_merged = is_merged
+        self._coordinates = ''
+        self._sectors: list[NDArray[np.bool_]] = []
+
+    def add(self, sweep: Sweep) -> None:
+        """Add a cloud in its own frame."""
+        if not self._is_merged and len(self._sectors) < PACKET_CLOUDS:
+            self._sectors.append(_sectors(sweep))
+        self._coordinates = self._coordinates or _unit_text(sweep) or _coarse_text(sweep)
+
+    @property
+    def findings(self) -> list[Finding]:
+        """Return what was found so far."""
+        packets = _packets_text(self._sectors) if len(self._sectors) == PACKET_CLOUDS else ''
+        texts = (packets, self._coordinates)
+        return [Finding(Reason.CLOUD_FAULT, text) for text in texts if text]
+
+
+def _coarse_text(sweep: Sweep) -> str:
+    """Return that the coordinates of a cloud are rounded to centimetres; empty if they are not."""
+    if sweep.points.dtype != np.float32 or not len(sweep.points):
+        return ''
+    largest = np.abs(sweep.points[::100]).max()  # a far origin is that of all
+    step = float(np.spacing(largest))
+    if not MAX_ROUNDING <= step < np.inf:
+        return ''
+    return (
+        f'clouds in {sweep.frame_id!r} have coordinates of up to {largest:.7g} m as float32, '
+        f'which are {step:.2g} m apart there: points and boxes are as coarse; take the clouds '
+        f'before their registration, in the frame of the LiDAR, or of a map with a near origin'
+    )
+
+
+def _unit_text(sweep: Sweep) -> str:
+    """Return that the points of a cloud lie too far from each other to be in metres, or ''."""
+    points = sweep.points[:: max(1, len(sweep.points) // UNIT_POINTS)]
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < UNIT_POINTS:
+        return ''
+    distance = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
+    if distance < MAX_MEDIAN_DISTANCE:
+        return ''
+    return (
+        f'clouds in {sweep.frame_id!r}: expected metres, got points of which half are more than '
+        f'{distance:.0f} from their middle: they are in millimetres, or scaled otherwise; divide '
+        f'x, y and z by 1000, in the driver or in a copy of the recording'
+    )
+
+
+def _sectors(sweep: Sweep) -> NDArray[np.bool_]:
+    """Return in which of `SECTORS` of azimuth about the LiDAR a cloud in its frame has points."""
+    angles = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
+    places = ((angles / (2 * np.pi) + 0.5) * SECTORS)[np.isfinite(angles)].astype(int)
+    return np.bincount(places.clip(0, SECTORS - 1), minlength=SECTORS) > 0
+
+
+def _packets_text(seen: Sequence[NDArray[np.bool_]]) -> str:
+    """Return that each of some clouds has a part of a revolution; '' if each covers the same."""
+    each = float(np.median([_extent(one) for one in seen]))
+    together = _extent(np.any(seen, axis=0))
+    if not 0 < each * MIN_PACKETS <= together:
+        return ''
+    degrees = 360 / SECTORS
+    return (
+        f'clouds: expected a whole sweep in each, got parts of it: each covers about '
+        f'{each * degrees:.0f} degrees of azimuth, and {len(seen)} together '
+        f'{together * degrees:.0f}: most boxes have no points in the cloud of their time; join '
+        f'the clouds of each revolution, by the setting of the driver, or in a copy of the '
+        f'recording, with the times of the points'
+    )
+
+
+def _extent(occupied: NDArray[np.bool_]) -> int:
+    """Return the number of sectors from the first to the last occupied one, around the circle."""
+    rows = np.flatnonzero(occupied)
+    if not len(rows):
+        return 0
+    return SECTORS + 1 - int(np.diff(rows, append=rows[0] + SECTORS).max())
