@@ -246,13 +246,20 @@ def invert_poses(U, corner_inverse, blocks, link_blocks, border_blocks):
         shift_known(known, blocks[pose], across)
 
 
-@kernel
+@loop
 def add_sandwich(columns, G, found):
-    """Add the variance of the gradient, seen through rows (n, 15) of the inverse curvature."""
+    """
+    Add the variance of the gradient, seen through rows (n, 15) of the inverse curvature.
+
+    Of `G` (15, 15) the diagonal and the places beside it are read: the others are zero.
+
+    """
     for i in range(len(columns)):
         for k in range(PIVOT):
-            through = 0.0
-            for m in range(PIVOT):
-                through += columns[i, m] * G[m, k]
+            through = columns[i, k] * G[k, k]
+            if k > 0:
+                through += columns[i, k - 1] * G[k - 1, k]
+            if k + 1 < PIVOT:
+                through += columns[i, k + 1] * G[k + 1, k]
             for j in range(len(columns)):
                 found[i, j] += through * columns[j, k]

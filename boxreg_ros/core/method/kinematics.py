@@ -1,8 +1,8 @@
 """Velocity (M26a) and acceleration (M26b) of the boxes of one window, and their covariances."""
 
-from boxreg_ros.core.method.arrays import POSE, SHARED
+from boxreg_ros.core.method.arrays import PIVOT, POSE
 from boxreg_ros.core.method.arrowhead import add_sandwich
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
 
 RATES = (0, 1, 2, 5)
@@ -16,25 +16,30 @@ Measured: with less, final accelerations err by more than zero does.
 """
 
 
-@kernel
-def fill_combination(first, factors, inverse, G, found):
-    """Write the covariance (6, 6) of the sum of `factors` times the poses from `first` on."""
-    border = np.zeros((POSE, SHARED))
-    found[:] = 0.0
-    for a in range(len(factors)):
-        for i in range(POSE):
-            for s in range(SHARED):
-                border[i, s] += factors[a] * inverse.border[first + a, i, s]
-        for b in range(len(factors)):
-            for i in range(POSE):
-                for j in range(POSE):
-                    if a == b:
-                        own = inverse.poses[first + a, i, j]
-                    elif a < b:
-                        own = inverse.links[first + a, i, POSE * (b - a - 1) + j]
-                    else:
-                        own = inverse.links[first + b, j, POSE * (a - b - 1) + i]
-                    found[i, j] += factors[a] * factors[b] * own
+@loop
+def fill_combination(first, factors, inverse, G, border, found):
+    """
+    Write the covariance (4, 4) of the sum of `factors` times three poses, from `first` on.
+
+    Of their variables `RATES`. `border` (4, 15) is to work in.
+
+    """
+    for i in range(len(RATES)):
+        k = RATES[i]
+        for s in range(PIVOT):
+            border[i, s] = 0.0
+            for a in range(3):
+                border[i, s] += factors[a] * inverse.border[first + a, k, s]
+        for j in range(len(RATES)):
+            m = RATES[j]
+            found[i, j] = 0.0
+            for a in range(3):
+                found[i, j] += factors[a] ** 2 * inverse.poses[first + a, k, m]
+                links = inverse.links[first + a]
+                for b in range(a + 1, 3):
+                    of_other = POSE * (b - a - 1)
+                    both = links[k, of_other + m] + links[m, of_other + k]
+                    found[i, j] += factors[a] * factors[b] * both
     add_sandwich(border, G, found)
 
 
@@ -63,7 +68,7 @@ def fill_kinematics(length, times, poses, deviations, inverse, G, found):
         Written.
 
     """
-    C, factors = np.empty((POSE, POSE)), np.empty(3)
+    C, factors, border = np.empty((4, 4)), np.empty(3), np.empty((4, PIVOT))
     prior = (deviations**2).sum()
     for n in range(length if length > 2 else 0):
         own = found[n]
@@ -75,10 +80,10 @@ def fill_kinematics(length, times, poses, deviations, inverse, G, found):
 
         factors[0], factors[2] = 2 / (before * duration), 2 / (after * duration)
         factors[1] = -factors[0] - factors[2]
-        fill_combination(first, factors, inverse, G, C)
+        fill_combination(first, factors, inverse, G, border, C)
         for i in range(4):
             for j in range(4):
-                own.velocity_covariance[i, j] = elapsed**2 * C[RATES[i], RATES[j]]
+                own.velocity_covariance[i, j] = elapsed**2 * C[i, j]
         for i in range(3):
             middle = poses[first + 1, i]
             own.acceleration[i] = factors[0] * (poses[first, i] - middle)
@@ -88,13 +93,13 @@ def fill_kinematics(length, times, poses, deviations, inverse, G, found):
         gain = 1 - (C[0, 0] + C[1, 1] + C[2, 2]) / prior
 
         factors[0], factors[1], factors[2] = -1 / duration, 0.0, 1 / duration
-        fill_combination(first, factors, inverse, G, C)
+        fill_combination(first, factors, inverse, G, border, C)
         is_finite = True
         for i in range(4):
             rate = (poses[last, RATES[i]] - poses[first, RATES[i]]) / duration
             own.velocity[i] = rate
             for j in range(4):
-                own.velocity_covariance[i, j] += C[RATES[i], RATES[j]]
+                own.velocity_covariance[i, j] += C[i, j]
             is_finite &= np.isfinite(rate) and np.isfinite(own.velocity_covariance[i, i])
         own.has_velocity = is_finite
         own.has_acceleration = is_finite and gain >= MIN_GAIN and n < length - 1
