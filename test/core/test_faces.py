@@ -155,6 +155,14 @@ def test_outermost_points_of_each_strip_by_hand():
     assert found['visibility'][0, 0, 0] == 1
 
 
+def test_the_seen_half_of_a_round_roof_does_not_roll_the_body():
+    # The roof falls by 0.15 m from its ridge to its right edge, which the sensor is beside.
+    x, y = (part.ravel() for part in np.meshgrid(np.linspace(-1.9, 1.9, 41), -np.arange(10) / 10))
+    found = supported(seen_from([0.0, -30.0, 2.0], np.c_[x, y, 0.95 - 0.15 * y**2]))
+    side = found['W_faces'][0, 0, 4][1, 3]  # mean y
+    assert side == pytest.approx(0.0, abs=1e-6)
+
+
 @pytest.mark.parametrize(('behind', 'used'), [(0.15, 9), (0.25, 6)])
 def test_a_strip_far_behind_the_others_is_left_out(behind, used):
     # The left strip of the front is 0.15 or 0.25 m behind the other two; 0.2 m is the limit.

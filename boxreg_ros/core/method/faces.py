@@ -15,8 +15,14 @@ import numpy as np
 
 FACES = 5
 """Front, back, left, right, top: the bottom is observed by the road."""
-STRIP_AXIS = (1, 1, 0, 0, 1)
-"""Box axis along which the strips of each of these lie side by side."""
+STRIP_AXIS = (1, 1, 0, 0, 0)
+"""
+Box axis along which the strips of each of these lie side by side.
+
+Those of the roof lie behind each other: bodies are round across, and one side of the roof is seen.
+Strips beside each other would have its edge, which is lower, as outermost points.
+
+"""
 NOWHERE = 1e9
 """Depth of points that are not on a face [m]."""
 ALWAYS_VISIBLE = 9.0
@@ -351,8 +357,8 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
     The paper takes the K points closest to a face that is visible by the points' centre of mass
     [Eq. 4]. Here the outermost ones are taken: the closest points of a face that is given too far
     inside may lie anywhere. On a face with a wrong yaw the outermost points are all at one end:
-    each strip has its own, so that the face is turned as well. Points far behind the outermost
-    one belong to another surface.
+    each strip has its own, so that the face is turned as well; a roof by its pitch alone. Points
+    far behind the outermost one belong to another surface.
 
     """
     R = np.empty((3, 3))
