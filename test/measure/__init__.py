@@ -20,6 +20,7 @@ MEASUREMENTS = {
     'speed': 'time per tick, per box and per window, and of relabel',
     'pair': 'CPU seconds of this checkout beside those of another, by turns',
     'kinds': 'gain of each class of objects, with standard errors',
+    'detector': 'average precision of a detector by the labels that it is trained on',
     'proposals': 'objects without boxes that are proposed, and false alarms',
     'tracks': 'broken tracks before and after each completing step',
     'sensitivity': 'accuracy with each setting halved and doubled',

@@ -1,0 +1,192 @@
+"""Labels of drives: from boxes of a detector, through the product, to boxes to train on."""
+
+from __future__ import annotations
+
+from contextlib import redirect_stdout
+from dataclasses import replace
+from pathlib import Path
+import shutil
+import sys
+
+from boxreg_ros import cli
+from boxreg_ros.core.refine import Track
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.box_scores import by_overlap, match, summarise
+from boxreg_ros.structures import BoxArray, REJECTED
+from measure.detector.frames import Frame, num_points, REACH
+from measure.detector.network import CLASSES, detections, Detector, Labels
+from measure.methods import smoothed
+import numpy as np
+
+SCORE = 0.3
+"""Least score of a detection that becomes a label; chosen."""
+MIN_LABEL_POINTS = 3
+"""Labels with fewer points above the ground are left out of the training, as of any source."""
+MIN_TRUE_POINTS = 5
+"""True boxes with fewer points are not in scope of any score."""
+ERRORS = ('along', 'across', 'up', 'yaw', 'length', 'width', 'height')
+"""Of boxes in the axes of the true ones [m], of yaw in degrees."""
+MIN_TRACK_BOXES = 10
+"""Fewest boxes of a track whose mean and deviations count."""
+MAD_TO_DEVIATION = 1.4826
+"""Standard deviation of a normal variable over its median absolute deviation."""
+OPTIONS = {
+    'early': ('--set', 'estimate=early'),
+    'track': (),
+    'track, complete': ('--complete',),
+}
+"""Options of `boxreg relabel` of the labels that it makes."""
+
+
+def detected(model: Detector, frames: list[Frame], frame_id: str) -> BoxTable:
+    """Return the boxes of a detector with at least `SCORE`, in the fixed frame, without ids."""
+    arrays = []
+    for frame in frames:
+        labels, scores = detections(model, frame)
+        count = int((scores >= SCORE).sum())  # the best are first
+        names = tuple(CLASSES[kind] for kind in labels.classes[:count])
+        boxes = frame.fixed(labels.boxes[:count])
+        ids = ('',) * count
+        arrays.append(BoxArray(frame.stamp_ns, frame_id, ids, names, scores[:count], boxes))
+    return BoxTable.from_arrays(arrays)
+
+
+def relabelled(recording: Path, boxes: BoxTable, folder: Path) -> dict[str, BoxTable]:
+    """
+    Return the labels of each source but the true ones, made of boxes without ids.
+
+    `boxreg relabel --associate` runs in this process; raw and smoothed boxes have its ids.
+    Raises RecordingError if it fails.
+
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    boxes.write(folder / 'boxes.csv')
+    found = {}
+    for source, options in OPTIONS.items():
+        out = folder / source.replace(', ', '_')
+        words = [
+            'relabel', str(recording), '-o', str(out), '--labels', f'csv:{folder / "boxes.csv"}',
+            '--associate', '--formats', 'csv', '--workers', '1', *options,
+        ]  # fmt: skip
+        with redirect_stdout(sys.stderr):
+            if cli.main(words):
+                raise RecordingError(f'{recording}: boxreg {" ".join(words)} failed')
+        table = BoxTable.read(out / 'boxes.csv')
+        shutil.rmtree(out)
+        found[source] = table.rows(np.array([word != REJECTED for word in table.status], bool))
+    raw = with_ids(boxes, found['track'])
+    return {'raw': raw, 'smoothed': smoothed_table(raw)} | found
+
+
+def with_ids(boxes: BoxTable, tracked: BoxTable) -> BoxTable:
+    """Return boxes with the ids of those of the same stamp and score in another table."""
+    id_of: dict[tuple[int, float], str] = {}
+    for track_id, key in zip(tracked.track_ids, _keys(tracked), strict=True):
+        id_of[key] = '' if key in id_of else track_id
+    return replace(boxes, track_ids=tuple(id_of.get(key, '') for key in _keys(boxes)))
+
+
+def _keys(table: BoxTable) -> list[tuple[int, float]]:
+    return list(zip(table.stamps_ns.tolist(), table.scores.round(8).tolist(), strict=True))
+
+
+def smoothed_table(table: BoxTable) -> BoxTable:
+    """Return the boxes of tracks by the smoother of `measure real`; those without id unchanged."""
+    boxes = table.boxes.copy()
+    ids = np.array(table.track_ids, str)
+    for track_id in np.unique(ids[ids != '']):
+        rows = np.flatnonzero(ids == track_id)
+        rows = rows[np.argsort(table.stamps_ns[rows], kind='stable')]
+        points = [np.zeros((0, 3))] * len(rows)
+        stamps = table.stamps_ns[rows]
+        track = Track(track_id, table.class_names[rows[0]], stamps, boxes[rows], points, None)
+        boxes[rows] = smoothed(track)
+    return replace(table, boxes=boxes)
+
+
+def labels_of(table: BoxTable, frame: Frame) -> Labels:
+    """Return the labels of a frame with enough points, within reach."""
+    rows = np.flatnonzero(table.stamps_ns == frame.stamp_ns)
+    boxes = frame.local(table.boxes[rows])
+    kinds = np.array([CLASSES.index(table.class_names[row].lower()) for row in rows], np.int64)
+    within = np.abs(boxes[:, :2]).max(axis=1, initial=0) < REACH
+    kept = within & (num_points(frame.points, boxes) >= MIN_LABEL_POINTS)
+    return Labels(boxes[kept], kinds[kept])
+
+
+def with_points(truth: BoxTable, frames: list[Frame]) -> BoxTable:
+    """Return the true boxes of frames within reach, with their points above the ground."""
+    counts = np.full(len(truth.boxes), -1)
+    for frame in frames:
+        rows = np.flatnonzero(truth.stamps_ns == frame.stamp_ns)
+        boxes = frame.local(truth.boxes[rows])
+        within = np.abs(boxes[:, :2]).max(axis=1, initial=0) < REACH
+        counts[rows[within]] = num_points(frame.points, boxes[within])
+    return replace(truth, num_points=counts).rows(counts >= 0)
+
+
+def errors_of(tables: list[BoxTable], truths: list[BoxTable], class_name: str) -> dict[str, float]:
+    """
+    Return how labels of several drives differ from the true boxes of a class, '' for all.
+
+    Recall, false labels for each true box, IoU and its recalls over matched boxes, flips; and of
+    the errors along, across, up, of yaw and of extents the robust standard deviation, that of the
+    means of tracks, that within a track, and the autocorrelation of the latter after one sweep.
+
+    """
+    words = [class_name] if class_name else []
+    pairs = [
+        (match(table, truth, MIN_TRUE_POINTS, words, by_overlap), truth)
+        for table, truth in zip(tables, truths, strict=True)
+    ]
+    is_found = np.concatenate([found.is_matched for found, _ in pairs])
+    columns = {'bev': 'iou_bev', '3d': 'iou_3d'}
+    iou = {key: np.concatenate([getattr(m, name) for m, _ in pairs])[is_found]
+           for key, name in columns.items()}  # fmt: skip
+    flips = np.concatenate([found.is_flipped for found, _ in pairs])[is_found]
+    result = {
+        'boxes': len(is_found),
+        'recall': float(is_found.mean()),
+        'false': sum(summarise(found).unmatched for found, _ in pairs) / len(is_found),
+        'iou_bev': float(iou['bev'].mean()),
+        'iou_3d': float(iou['3d'].mean()),
+        'over_0.7': float((iou['3d'] >= 0.7).sum() / len(is_found)),
+        'flips': float(flips.mean()),
+    }
+    errors, tracks = [], []
+    for drive, (found, truth) in enumerate(pairs):
+        rows = np.flatnonzero(found.is_matched)
+        yaw = found.rotation[rows, 2]
+        yaw = np.degrees((yaw + np.pi / 2) % np.pi - np.pi / 2)  # without flips
+        errors.append(np.column_stack([found.translation[rows], yaw, found.extent[rows]]))
+        tracks += [f'{drive}/{truth.track_ids[found.rows[row]]}' for row in rows]
+    return result | _spreads(np.concatenate(errors), np.array(tracks, str))
+
+
+def _spreads(errors: np.ndarray, tracks: np.ndarray) -> dict[str, float]:
+    """Return the deviations of errors (n, 7) of tracks (n,), in time order within a track."""
+    _, codes, counts = np.unique(tracks, return_inverse=True, return_counts=True)
+    is_long = counts >= MIN_TRACK_BOXES
+    long = is_long[codes]
+    order = np.argsort(codes, kind='stable')
+    order = order[long[order]]
+    is_next = np.diff(codes[order]) == 0
+    found = {}
+    for name, values in zip(ERRORS, errors.T, strict=True):
+        median = np.median(values)
+        found |= {
+            f'{name} mean': float(values.mean()),
+            f'{name} robust': float(MAD_TO_DEVIATION * np.median(np.abs(values - median))),
+        }
+        if is_next.any():
+            means = np.bincount(codes, values) / counts
+            rest = values - means[codes]
+            before, after = rest[order][:-1][is_next], rest[order][1:][is_next]
+            variance = np.square(rest[long]).mean()
+            found |= {
+                f'{name} between': float(means[is_long].std()),
+                f'{name} within': float(np.sqrt(variance)),
+                f'{name} correlation': float((before * after).mean() / variance),
+            }
+    return found
