@@ -39,12 +39,13 @@ MISSED = (1, 2, 5)
 COMPLETED = 'track, complete'
 SAMPLES = 200
 """Bootstrap samples of drives and of seeds."""
+MANY = {'nargs': '*', 'default': []}
 ARGUMENTS = {
     'out': (Path, 'folder for drives, labels and scores; goes on with those in it'),
-    '--others': ([], 'recordings with truth.csv, labelled as well', {'nargs': '*', 'type': Path}),
-    '--test': ([], 'recordings with truth.csv to test on as well', {'nargs': '*', 'type': Path}),
+    '--others': (Path, 'recordings with truth.csv, labelled as well', MANY),
+    '--test': (Path, 'recordings with truth.csv, to test on as well', MANY),
     '--seeds': (3, 'trainings on the labels of each source'),
-    '--steps': (1000, 'of the optimiser in each training'),
+    '--steps': (1200, 'of the optimiser in each training'),
     '--stored': (False, 'train nothing: the scores of the trainings that are stored'),
 }
 

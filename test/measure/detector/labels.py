@@ -13,6 +13,7 @@ from boxreg_ros.core.refine import Track
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import by_overlap, match, summarise
+from boxreg_ros.offline.track_scores import track_scores
 from boxreg_ros.structures import BoxArray, REJECTED
 from measure.detector.frames import Frame, num_points, REACH
 from measure.detector.network import CLASSES, detections, Detector, Labels
@@ -130,9 +131,10 @@ def errors_of(tables: list[BoxTable], truths: list[BoxTable], class_name: str) -
     """
     Return how labels of several drives differ from the true boxes of a class, '' for all.
 
-    Recall, false labels for each true box, IoU and its recalls over matched boxes, flips; and of
-    the errors along, across, up, of yaw and of extents the robust standard deviation, that of the
-    means of tracks, that within a track, and the autocorrelation of the latter after one sweep.
+    Recall, IoU and flips of matched boxes; of all classes also false labels for each true box and
+    the scores of tracks; and of the errors along, across, up, of yaw and of extents the mean, the
+    robust standard deviation, that of the means of tracks, that within a track, and the
+    autocorrelation of the latter after one sweep.
 
     """
     words = [class_name] if class_name else []
@@ -148,12 +150,14 @@ def errors_of(tables: list[BoxTable], truths: list[BoxTable], class_name: str) -
     result = {
         'boxes': len(is_found),
         'recall': float(is_found.mean()),
-        'false': sum(summarise(found).unmatched for found, _ in pairs) / len(is_found),
         'iou_bev': float(iou['bev'].mean()),
         'iou_3d': float(iou['3d'].mean()),
         'over_0.7': float((iou['3d'] >= 0.7).sum() / len(is_found)),
         'flips': float(flips.mean()),
     }
+    if not class_name:
+        result |= _of_tracks(tables, truths)
+        result['false'] = sum(summarise(found).unmatched for found, _ in pairs) / len(is_found)
     errors, tracks = [], []
     for drive, (found, truth) in enumerate(pairs):
         rows = np.flatnonzero(found.is_matched)
@@ -162,6 +166,18 @@ def errors_of(tables: list[BoxTable], truths: list[BoxTable], class_name: str) -
         errors.append(np.column_stack([found.translation[rows], yaw, found.extent[rows]]))
         tracks += [f'{drive}/{truth.track_ids[found.rows[row]]}' for row in rows]
     return result | _spreads(np.concatenate(errors), np.array(tracks, str))
+
+
+def _of_tracks(tables: list[BoxTable], truths: list[BoxTable]) -> dict[str, float]:
+    """Return ids per object and HOTA, means over the drives."""
+    found = [
+        track_scores(table, truth, np.flatnonzero(truth.num_points >= MIN_TRUE_POINTS))
+        for table, truth in zip(tables, truths, strict=True)
+    ]
+    return {
+        'ids_per_object': float(np.mean([scores.ids_per_object for scores in found])),
+        'hota': float(np.mean([scores.hota for scores in found])),
+    }
 
 
 def _spreads(errors: np.ndarray, tracks: np.ndarray) -> dict[str, float]:
