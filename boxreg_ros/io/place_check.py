@@ -157,11 +157,11 @@ class PlaceCheck:
         if self._sweep is None or self._boxes is None:
             return
         if abs(self._sweep.stamp_ns - self._boxes.stamp_ns) <= self._tolerance_ns:
-            self._compare(self._sweep.in_frame().points, self._boxes)
+            self._compare(_Points(self._sweep.in_frame().points), self._boxes)
             self._sweep = self._boxes = None
             self.finding = self._tilt_text() or self._place_text() or self._size_text()
 
-    def _compare(self, points: NDArray[np.floating], array: BoxArray) -> None:
+    def _compare(self, points: _Points, array: BoxArray) -> None:
         """Add what boxes in the frame of their message contain of the points, in each place."""
         boxes = array.boxes[is_valid_box(array.boxes)][: MAX_COMPARED - len(self._tilted)]
         count = len(boxes)
@@ -261,26 +261,39 @@ class PlaceCheck:
         return place.total >= MIN_RATIO_OF_COVERAGE * own.total
 
 
-def _share_within(points: NDArray[np.floating], box: Floats) -> float | None:
+class _Points:
+    """Points (N, 3) in the order of x, of which those around a place are found without the rest."""
+
+    def __init__(self, points: NDArray[np.floating]) -> None:
+        self._points = points[np.argsort(points[:, 0])]
+
+    def around(self, center: Floats, reach: float) -> Floats:
+        """Return the points (n, 3) nearer than `reach` along each axis, relative to `center`."""
+        ends = np.searchsorted(self._points[:, 0], (center[0] - reach, center[0] + reach))
+        away = self._points[slice(*ends)] - center
+        found: Floats = away[(np.abs(away) < reach).all(axis=1)]
+        return found
+
+
+def _share_within(points: _Points, box: Floats) -> float | None:
     """Return the share of the points in the upper half of a box that its inner part contains."""
     if not np.isfinite(box).all():
         return None
-    away = points - box[BOX_CENTER]
     limit = box[BOX_EXTENT] / 2
-    local = away[(np.abs(away) < np.linalg.norm(limit)).all(axis=1)] @ matrix_from_rpy(box[ROLL:])
+    away = points.around(box[BOX_CENTER], float(np.linalg.norm(limit)))
+    local = away @ matrix_from_rpy(box[ROLL:])
     parts = np.abs(local / limit).max(axis=1)[local[:, 2] > 0]
     parts = parts[parts <= 1]
     return float(np.mean(parts <= MAX_FILLED)) if len(parts) >= MIN_POINTS_AROUND else None
 
 
-def _add_coverages(place: _Place, points: NDArray[np.floating], boxes: Floats) -> None:
+def _add_coverages(place: _Place, points: _Points, boxes: Floats) -> None:
     """Add for each of n boxes (n, 9) with enough points around it the part that it contains."""
     for box in boxes:
         if not np.isfinite(box).all():
             continue
-        away = points - box[BOX_CENTER]
-        reach = 1.1 * np.linalg.norm(box[BOX_EXTENT])
-        local = away[(np.abs(away) < reach).all(axis=1)] @ matrix_from_rpy(box[ROLL:])
+        away = points.around(box[BOX_CENTER], 1.1 * float(np.linalg.norm(box[BOX_EXTENT])))
+        local = away @ matrix_from_rpy(box[ROLL:])
         limit = box[BOX_EXTENT] / 2
         local = local[local[:, 2] > GROUND_MARGIN - limit[2]]
         num_around = int((np.abs(local) <= 2 * limit).all(axis=1).sum())
