@@ -219,17 +219,19 @@ class LatencyEvidence:
     def _compare(self, sweep: Sweep, tracks: MeasuredTracks) -> None:
         """Compare the points of a sweep with the boxes of objects that move in their frame."""
         times_ns = sweep.stamp_ns + np.round(CANDIDATES * 1e9).astype(np.int64)
-        covering = [name for name, track in tracks.by_id.items() if track.covers(times_ns)]
-        if not covering:
-            return
-        shifts = _shift(tracks.smoothed_centers(covering, times_ns[ENDS], ENDS))
-        is_moving = np.linalg.norm(shifts, axis=1) > MIN_SPEED
         compared = Counter(sample.track_id for sample in self._samples)
-        moving = sorted(np.array(covering)[is_moving].tolist(), key=compared.__getitem__)
+        moving = [
+            name
+            for name, track in tracks.by_id.items()
+            if track.covers(times_ns)
+            and np.linalg.norm(_shift(track.nearest_centers(times_ns[ENDS], ENDS))) > MIN_SPEED
+        ]
+        moving.sort(key=compared.__getitem__)
         found = 0
         for first in range(0, len(moving), OBJECTS_COMPARED):
             some = moving[first : first + OBJECTS_COMPARED]
             paths = [_Path(name, *tracks.by_id[name].smoothed(times_ns, ALL)) for name in some]
+            paths = [path for path in paths if path.speed > MIN_SPEED]
             for path, points in zip(paths, _points_near(sweep, paths), strict=True):
                 costs = _costs(path, *points)
                 if costs is None or found == OBJECTS_COMPARED:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import pairwise
 
 from boxreg_ros.config import Config
@@ -112,10 +111,6 @@ class MeasuredTrack:
             old += 1
         del self._arrays[:old], self._boxes[:old]
 
-    def items(self) -> Iterator[tuple[MeasuredArray, Floats]]:
-        """Return the boxes (9,), each with the array that it is of."""
-        return zip(self._arrays, self._boxes, strict=True)
-
     def covers(self, times_ns: Ints) -> bool:
         """Return whether all times are within those of the boxes."""
         first_ns = self._arrays[0].stamp_ns
@@ -172,10 +167,28 @@ class MeasuredTrack:
         """
         boxes = self._of_candidates(candidates)
         seconds = (self._stamps_ns()[:, None] - times_ns) * 1e-9
-        present = np.ones((len(boxes), 1))
-        found, slope = (one[:, 0] for one in _on_lines(seconds, present, boxes[:, :, None]))
+        found, slope = _on_lines(seconds, boxes)
         found[:, BOX_EXTENT] = np.median(boxes[:, 0, BOX_EXTENT], axis=0)
         return found, slope[:, : Z + 1]
+
+    def nearest_centers(self, times_ns: Ints, candidates: Ints) -> Floats:
+        """Return the centres (C, 3) of the boxes nearest to some times, as of `smoothed`."""
+        found = np.zeros((len(times_ns), 3))
+        for k, row in enumerate(self._nearest(times_ns)):
+            center, T = self._boxes[row][: Z + 1], self._arrays[row].of_candidates
+            if T is not None:
+                moved = T[candidates[k]]
+                center = moved[:3, :3] @ center + moved[:3, 3]
+            found[k] = center
+        return found
+
+    def _nearest(self, times_ns: Ints) -> list[int]:
+        """Return the rows of the boxes nearest to some times within those of the track."""
+        stamps_ns = self._stamps_ns()
+        after = np.searchsorted(stamps_ns, times_ns).clip(1, len(stamps_ns) - 1)
+        is_before = 2 * times_ns < stamps_ns[after - 1] + stamps_ns[after]
+        nearest: list[int] = (after - is_before).tolist()
+        return nearest
 
     def _stamps_ns(self) -> Ints:
         return np.array([array.stamp_ns for array in self._arrays])
@@ -200,36 +213,31 @@ class MeasuredTrack:
         return boxes
 
 
-def _on_lines(
-    seconds: NDArray[np.floating], present: Floats, values: Floats
-) -> tuple[Floats, Floats]:
+def _on_lines(seconds: NDArray[np.floating], values: Floats) -> tuple[Floats, Floats]:
     """
-    Return values and slopes of K tracks at C times, on local lines through n samples.
+    Return values and slopes of a track at C times, on local lines through n samples.
 
     Parameters
     ----------
     seconds : array, shape (n, C)
         Times of the samples, relative to those that are asked for [s].
-    present : array, shape (n, K)
-        1 where a track has a sample, else 0.
-    values : array, shape (n, C, K, d)
+    values : array, shape (n, C, d)
         The samples.
 
     Returns
     -------
-    values, slopes : array, shape (C, K, d)
+    values, slopes : array, shape (C, d)
         The slopes are for each second.
 
     """
-    seconds = seconds[:, :, None]
-    weights = np.clip(SMOOTHING - np.abs(seconds), 1e-6, None) * present[:, None]
+    weights = np.clip(SMOOTHING - np.abs(seconds), 1e-6, None)
     weights = weights / weights.sum(0)
     mean = (weights * seconds).sum(0)
     offsets = seconds - mean
     spread = (weights * offsets**2).sum(0)
-    middle = np.einsum('nck,nckd->ckd', weights, values)
-    slope = np.einsum('nck,nckd->ckd', weights * offsets, values) / spread[:, :, None]
-    return middle - mean[:, :, None] * slope, slope
+    middle = np.einsum('nc,ncd->cd', weights, values)
+    slope = np.einsum('nc,ncd->cd', weights * offsets, values) / spread[:, None]
+    return middle - mean[:, None] * slope, slope
 
 
 class MeasuredTracks:
@@ -252,26 +260,6 @@ class MeasuredTracks:
             del self.by_id[name]
         for track in self.by_id.values():
             track.forget_before(oldest_ns)
-
-    def smoothed_centers(self, track_ids: list[str], times_ns: Ints, candidates: Ints) -> Floats:
-        """Return the centres (C, K, 3) of the boxes that `smoothed` returns, of several tracks."""
-        row_of: dict[MeasuredArray, int] = {}
-        cells = []
-        for column, track_id in enumerate(track_ids):
-            for array, box in self.by_id[track_id].items():
-                cells.append((row_of.setdefault(array, len(row_of)), column, box[: Z + 1]))
-        rows, columns, centers = zip(*cells, strict=True)
-        values = np.zeros((len(row_of), len(candidates), len(track_ids), 3))
-        present = np.zeros((len(row_of), len(track_ids)))
-        present[rows, columns] = 1.0
-        values[rows, :, columns] = np.array(centers)[:, None]
-        for array, row in row_of.items():
-            if array.of_candidates is not None:
-                T = array.of_candidates[candidates]
-                values[row] = values[row] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
-        stamps_ns = np.array([array.stamp_ns for array in row_of])
-        seconds = (stamps_ns[:, None] - times_ns) * 1e-9
-        return _on_lines(seconds, present, values)[0]
 
     def at_stamp(self, boxes: BoxArray, latency: float) -> Floats:
         """Return the boxes (n, 9) of an array where their objects are at its stamp."""

@@ -262,7 +262,7 @@ class PlaceCheck:
 
 
 class _Points:
-    """Points (N, 3) in the order of x, of which those around a place are found without the rest."""
+    """Points (N, 3) in the order of x: those around a place are found without the others."""
 
     def __init__(self, points: NDArray[np.floating]) -> None:
         self._points = points[np.argsort(points[:, 0])]
