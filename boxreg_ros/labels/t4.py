@@ -3,7 +3,9 @@ T4, the data set format of TIER IV: nuScenes with other folder and channel names
 
 Its devkit refuses columns that it does not know, since version 0.8. So status, reason, covariance
 and the stamp in nanoseconds are in ``boxreg_values.json``, by the token of their row. Its own
-columns have the velocity, and whether a program made the box, with its name and the score.
+columns have velocity and acceleration, those that were refined where they are known and else the
+velocity between the boxes before and after, and whether a program made the box, with its name and
+the score.
 
 """
 
@@ -19,7 +21,7 @@ from boxreg_ros.labels.attributes import to_nuscenes
 from boxreg_ros.labels.files import JsonList
 from boxreg_ros.labels.nuscenes import OWN_VALUES, read, read_scene
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
-from boxreg_ros.structures import HUMAN
+from boxreg_ros.structures import HUMAN, RefinedBoxes
 import numpy as np
 
 __all__ = ['FORMAT', 'read', 'read_scene', 'Writer']
@@ -31,6 +33,8 @@ FORMAT = replace(
     files='annotation/, data/LIDAR_CONCAT/, maps/',
     read_back='t4-devkit 0.1.0; 0.8.0 by hand',
 )
+MOTION = ('velocity', 'acceleration')
+"""Columns with the motion of a box over ground, of x y z in the frame of the map [m/s, m/s^2]."""
 LONGEST_STEP = 1.5
 """No velocity is stated across longer gaps [s]; that of the devkit of nuScenes."""
 
@@ -52,6 +56,7 @@ class Writer(nuscenes.Writer):
         self._stamp_ns = 0
         # Stamp [ns] and centre of the last two boxes, by instance key
         self._places: dict[str, list[tuple[int, list[float]]]] = {}
+        self._are_refined: dict[str, bool] = {}  # the velocity of the last box, by instance key
 
     def add(self, frame: LabelFrame) -> None:
         """Add a sample with its annotations."""
@@ -72,15 +77,25 @@ class Writer(nuscenes.Writer):
         if instance:
             places = self._places.setdefault(instance, [])
             places.append((self._stamp_ns, row['translation']))
-            row['velocity'] = _velocity(places[-2:])  # until the next one is known
             held = self._held_annotations.get(instance)
-            if held is not None:
+            if held is not None and not self._are_refined[instance]:
                 held['velocity'] = _velocity(places[-3:]) or held['velocity']
+            self._are_refined[instance] = row['velocity'] is not None
+            row['velocity'] = row['velocity'] or _velocity(places[-2:])  # until the next is known
             del places[:-2]
         super()._link(table, row, instance, camera)
 
+    def _evidence(self, refined: RefinedBoxes, row: int) -> dict[str, Any]:
+        """Return what an annotation states beside the columns of nuScenes."""
+        motion = refined.boxes.known_kinematics[row]
+        known = {
+            name: motion[name][:3].tolist() if motion[f'has_{name}'] else None for name in MOTION
+        }
+        return super()._evidence(refined, row) | known
+
     def _own_columns(self, token: str, values: dict[str, Any]) -> dict[str, Any]:
         """Write values beside the tables; return those that T4 has columns for."""
+        motion = {name: values.pop(name, None) for name in MOTION}
         self._own_values.append({'token': token, **values})
         if 'status' not in values:  # of a sweep
             return {}
@@ -90,7 +105,7 @@ class Writer(nuscenes.Writer):
         certainty = 1.0 if score is None else float(np.clip(score, 0.0, 1.0))
         model = {'name': self._model, 'score': certainty, 'uncertainty': None}
         return {
-            'velocity': None,
+            **motion,
             'automatic_annotation': is_automatic,
             'autolabel_metadata': [model] if is_automatic else None,
         }

@@ -44,7 +44,7 @@ from boxreg_ros.labels import (
     writer_for,
 )
 from boxreg_ros.labels.camera import Camera
-from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
+from boxreg_ros.structures import BoxArray, KINEMATICS, RefinedBoxes, Sweep
 from consumers import consumer
 import numpy as np
 import pytest
@@ -302,6 +302,23 @@ def test_t4_has_no_columns_that_its_devkit_refuses(tmp_path):
     assert rows[1]['autolabel_metadata'] is None
     (again, *_) = frames_of('t4', folder)
     assert (again.refined.boxes.stamp_ns, again.refined.reasons) == (STAMP, ('',))
+
+
+def test_t4_has_the_refined_motion_where_it_is_known(tmp_path):
+    frames = [
+        frame_of([[13.0 + 0.5 * i, *IN_FIXED[1:]]], stamp_ns=STAMP + i * 5 * 10**8)
+        for i in range(3)
+    ]
+    motion = np.zeros(1, KINEMATICS)
+    motion['velocity'], motion['acceleration'] = (1.2, 0.1, 0.0, 0.3), (0.5, 0.0, 0.0)
+    motion['has_velocity'] = motion['has_acceleration'] = True
+    boxes = replace(frames[1].refined.boxes, kinematics=motion)
+    frames[1] = replace(frames[1], refined=replace(frames[1].refined, boxes=boxes))
+    _, folder = written('t4', tmp_path, frames)
+    rows = json.loads((folder / 'annotation/sample_annotation.json').read_text())
+    rows.sort(key=lambda row: row['translation'][0])
+    assert [row['velocity'] for row in rows] == [[1, 0, 0], [1.2, 0.1, 0], [1, 0, 0]]
+    assert [row['acceleration'] for row in rows] == [None, [0.5, 0, 0], None]
 
 
 OFFICIAL_CLASSES = {
