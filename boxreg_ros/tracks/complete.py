@@ -36,7 +36,7 @@ from boxreg_ros.tracks.extend import extend, num_free, num_supported, points_at_
 from boxreg_ros.tracks.fill import fill
 from boxreg_ros.tracks.prune import duplicates, ghosts
 from boxreg_ros.tracks.static import join_static
-from boxreg_ros.tracks.stitch import stitch
+from boxreg_ros.tracks.stitch import join_turns, stitch
 from boxreg_ros.tracks.tracklet import AddedBoxes, Tracklet, tracklets_of
 import numpy as np
 from numpy.typing import NDArray
@@ -224,6 +224,9 @@ def complete(
         tracks = _rejected(tracks, found, Reason.DUPLICATE, plan)
     ambiguous: list[tuple[str, str]] = []
     if steps.stitch:
+        tracks, left = join_turns(tracks, config, decided)
+        found = _doubted(left, {one.track_id for one in left}, given, decided)
+        _rejected(left, found, Reason.DUPLICATE, plan)
         tracks, ambiguous = stitch(tracks, config, decided)
     if steps.static:
         tracks = join_static(tracks, config, decided)

@@ -9,6 +9,8 @@ confirmed it again and again.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.observation import GOOD_POINTS
@@ -47,6 +49,11 @@ def evidence(tracklet: Tracklet) -> int:
     return int((tracklet.num_points >= GOOD_POINTS).sum())
 
 
+def by_evidence(tracklets: Sequence[Tracklet]) -> list[Tracklet]:
+    """Return tracklets with the most evidence first, of equal ones the longest."""
+    return sorted(tracklets, key=lambda t: (evidence(t), len(t.stamps_ns)), reverse=True)
+
+
 def _is_ghost(tracklet: Tracklet) -> bool:
     """Return whether a short track lacks consistent points or consistent motion."""
     n = len(tracklet.stamps_ns)
@@ -72,10 +79,9 @@ def duplicates(tracklets: list[Tracklet], config: Config) -> set[str]:
     Only tracks of one kind of object: a rider and a bicycle are no duplicates.
 
     """
-    ranked = sorted(tracklets, key=lambda t: (evidence(t), len(t.stamps_ns)), reverse=True)
     rejected: set[str] = set()
     rows: dict[int, list[tuple[Tracklet, int]]] = {}  # boxes of better tracks, by stamp
-    for tracklet in ranked:
+    for tracklet in by_evidence(tracklets):
         kind = tracklet.model(config)
         inside = 0
         for row, stamp_ns in enumerate(tracklet.stamps_ns.tolist()):

@@ -3,21 +3,25 @@ Stitch: fragments of one object become one track.
 
 A fragment continues another one if motion and extents of both agree. Boxes are compared after
 registration, so position and extents are those of the points. Where two continuations are nearly
-as good, none is made.
+as good, none is made. Fragments that take turns have their boxes in the gaps of each other.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.motion import EndMotion
+from boxreg_ros.core.support import is_owned
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import BOX_EXTENT, Floats, X, Y, YAW, Z
+from boxreg_ros.structures import BOX_EXTENT, Floats, LENGTH, X, Y, YAW, Z
 from boxreg_ros.tracks.decided import Decided, NOTHING
+from boxreg_ros.tracks.fill import fill
+from boxreg_ros.tracks.prune import by_evidence
 from boxreg_ros.tracks.tracklet import end_motion, joined_tracklets, Tracklet
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -170,3 +174,73 @@ def _position_cost(known: EndMotion, other: EndMotion) -> tuple[float, float]:
     covariance = known.covariance(other.stamp_ns)
     distance = float(offset @ np.linalg.solve(covariance, offset))
     return distance, float(np.linalg.slogdet(covariance)[1])
+
+
+TURNS_PART = 0.5
+"""Part of the boxes of two tracks that are at one place, for both to be one object; chosen: the
+majority."""
+
+
+def join_turns(
+    tracklets: list[Tracklet], config: Config, decided: Decided = NOTHING
+) -> tuple[list[Tracklet], list[Tracklet]]:
+    """
+    Join tracklets that take turns at one place.
+
+    A detector that loses an object and finds it again under a new id, then under the old one,
+    leaves tracks of which each would be filled over the boxes of the other. Also return what is
+    left over: of the boxes at one stamp those of the track with less evidence, under the id that
+    the joined track does not have.
+
+    """
+    whole: list[Tracklet] = []
+    left: list[Tracklet] = []
+    for tracklet in by_evidence(tracklets):
+        for index, other in enumerate(whole):
+            pair = [other, tracklet]
+            if allowed([other, tracklet], [(0, 1)], decided) and _take_turns(
+                other, tracklet, config
+            ):
+                is_common = np.isin(tracklet.stamps_ns, other.stamps_ns)
+                parts = [other, tracklet.take(~is_common)] if not is_common.all() else [other]
+                whole[index] = joined_tracklets(parts, decided.names)
+                (free,) = {one.track_id for one in pair} - {whole[index].track_id}
+                if is_common.any():
+                    left.append(replace(tracklet.take(is_common), track_id=free))
+                break
+        else:
+            whole.append(tracklet)
+    return sorted(whole, key=lambda one: one.first_ns), left
+
+
+def _take_turns(first: Tracklet, second: Tracklet, config: Config) -> bool:
+    """
+    Return whether two tracks are one object that has a box of either at most stamps.
+
+    Boxes at one stamp overlap, and boxes in a gap of the other track are where it is filled.
+
+    """
+    is_apart = second.last_ns < first.first_ns or first.last_ns < second.first_ns
+    if is_apart or first.model(config) is not second.model(config):
+        return False
+    centers = [np.interp(second.stamps_ns, first.stamps_ns, first.boxes[:, i]) for i in (X, Y)]
+    away = np.linalg.norm(second.boxes[:, X : Y + 1] - np.stack(centers, axis=1), axis=1)
+    if away.min() > max(first.boxes[0, LENGTH], second.boxes[0, LENGTH]):
+        return False
+    _, rows, others = np.intersect1d(first.stamps_ns, second.stamps_ns, return_indices=True)
+    turns = _owned_turns(first, second, config) + _owned_turns(second, first, config)
+    votes = turns + [
+        is_owned(first.boxes[row], second.boxes[other][None])
+        for row, other in zip(rows, others, strict=True)
+    ]
+    return any(turns) and float(np.mean(votes)) >= TURNS_PART
+
+
+def _owned_turns(tracklet: Tracklet, other: Tracklet, config: Config) -> list[bool]:
+    """Return for each box of another track in a gap whether it is where one would be filled in."""
+    box_at = dict(zip(other.stamps_ns.tolist(), other.boxes, strict=True))
+    return [
+        is_owned(box, box_at[stamp_ns][None])
+        for gap in fill(tracklet, other.stamps_ns, config)
+        for stamp_ns, box in zip(gap.stamps_ns.tolist(), gap.boxes, strict=True)
+    ]

@@ -27,6 +27,7 @@ from boxreg_ros.structures import (
     YAW,
 )
 import numpy as np
+from numpy.typing import NDArray
 
 SWITCH_SPEED = 10.0
 """Deviation from constant velocity beyond half a length that is another object [m/s]. Derived: as
@@ -65,6 +66,19 @@ class Tracklet:
     def last_ns(self) -> int:
         """Return the stamp of the last box [ns]."""
         return int(self.stamps_ns[-1])
+
+    def take(self, chosen: NDArray[np.bool_]) -> Tracklet:
+        """Return the boxes where `chosen` (n,) is True as a tracklet."""
+        rows = np.flatnonzero(chosen)
+        return replace(
+            self,
+            places=tuple(self.places[row] for row in rows),
+            stamps_ns=self.stamps_ns[rows],
+            boxes=self.boxes[rows],
+            covariances=self.covariances[rows],
+            scores=self.scores[rows],
+            num_points=self.num_points[rows],
+        )
 
     def model(self, config: Config) -> ClassConfig:
         """Return the settings of its kind of object."""

@@ -2,12 +2,13 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.motion import motion_at
-from boxreg_ros.structures import kept
+from boxreg_ros.structures import BoxArray, kept
+from boxreg_ros.tracks.complete import complete
 from boxreg_ros.tracks.extend import extend, MOVING_REACH, num_free, num_supported
 from boxreg_ros.tracks.fill import fill
 from boxreg_ros.tracks.prune import duplicates, ghosts
 from boxreg_ros.tracks.static import join_static
-from boxreg_ros.tracks.stitch import best_links, stitch
+from boxreg_ros.tracks.stitch import best_links, join_turns, stitch
 from boxreg_ros.tracks.tracklet import (
     between,
     is_parked,
@@ -286,3 +287,46 @@ def test_joined_tracks_have_the_majority_class_and_the_longest_id():
     assert (np.diff(whole.stamps_ns) > 0).all()
     taken = {'7', '7_2'}
     assert (unused_id('7', taken), unused_id('7', taken)) == ('7_3', '7_4')
+
+
+def test_tracks_that_take_turns_are_one():
+    car = path((0, 0), (8, 0), 40)
+    steps = np.arange(40)
+    of_a, of_b = steps[steps % 10 < 4], steps[(steps % 10 >= 5) & (steps % 10 < 8)]
+    first, second = tracklet('a', car[of_a], steps=of_a), tracklet('b', car[of_b], steps=of_b)
+    (whole,), left = join_turns([first, second], CONFIG)
+    assert whole.track_id == 'a'
+    assert whole.stamps_ns.tolist() == STAMPS[np.sort([*of_a, *of_b])].tolist()
+    assert left == []
+    beside = tracklet('b', car[of_b] + 2.5 * np.eye(9)[1], steps=of_b)
+    rider = tracklet('b', car[of_b], steps=of_b, class_name='cyclist')
+    ahead = tracklet('b', car[:38] + 5.0 * np.eye(9)[0], steps=steps[:38])
+    for other in (beside, rider, ahead):
+        assert set(ids(join_turns([first, other], CONFIG)[0])) == {'a', 'b'}
+
+
+def test_of_two_boxes_at_one_stamp_a_joined_track_has_one():
+    car = path((0, 0), (8, 0), 40)
+    of_a, of_b = np.array([*range(10), *range(15, 30)]), np.arange(8, 16)
+    first, second = tracklet('a', car[of_a], steps=of_a), tracklet('b', car[of_b], steps=of_b)
+    (whole,), (left,) = join_turns([first, second], CONFIG)
+    assert (whole.track_id, left.track_id) == ('a', 'b')
+    assert whole.stamps_ns.tolist() == STAMPS[:30].tolist()
+    assert left.stamps_ns.tolist() == STAMPS[[8, 9, 15]].tolist()
+
+
+def test_tracks_that_take_turns_are_not_filled_over_each_other():
+    car = path((0, 0), (8, 0), 39)
+    id_at = {step: 'ab'[step // 5 % 2] for step in range(39) if step % 10 != 9}
+    given = []
+    for step, stamp_ns in enumerate(STAMPS[:39].tolist()):
+        rows = [(id_at[step], 'car', car[step])] if step in id_at else []
+        names, classes, boxes = zip(*rows, strict=True) if rows else ((), (), np.zeros((0, 9)))
+        scores = np.ones(len(names))
+        given.append(BoxArray(stamp_ns, 'odom', names, classes, scores, np.array(boxes)))
+    config = CONFIG.updated({'complete.stitch': True, 'complete.fill': True})
+    points = [np.full(len(array.track_ids), 50) for array in given]
+    plan = complete(given, [kept(array, '') for array in given], points, 'odom', config)
+    for step, array in enumerate(plan.arrays):
+        names = [*array.track_ids, *(box.track_id for box in array.added)]
+        assert names == ['a'], f'step {step}'
