@@ -99,6 +99,9 @@ def test_hits_of_a_frame_by_hand():
     assert hits.count == 2
     assert hits.scores.tolist() == [0.9, 0.8, 0.7]
     assert hits.is_true.tolist() == [True, False, False]
+    nothing = hits_of(found, scores, truth[:0], np.zeros(0, bool))['BEV 0.5']
+    assert nothing.count == 0
+    assert nothing.is_true.tolist() == [False] * 4
     assert without_overlaps(found).tolist() == [0, 2, 3]
 
 

@@ -2,8 +2,8 @@
 `measure detector`: does a detector get better by refined labels? One round of auto-labelling.
 
 A small detector is trained on the true boxes of a tenth of the drives. Its boxes on the other
-drives are tracked and refined by `boxreg relabel --associate`; the same network is trained from
-scratch on the labels of each source, and tested on drives that nobody has trained on. OUT keeps
+drives are tracked and refined by `boxreg relabel --associate`; the training goes on with the
+labels of each source, and its detector is tested on drives that nobody has trained on. OUT keeps
 drives, labels and scores: a run that has ended goes on where it was.
 
 """
@@ -23,6 +23,7 @@ from measure.detector.labels import (
     errors_of,
     labels_of,
     MIN_TRUE_POINTS,
+    OPTIONS,
     relabelled,
 )
 from measure.detector.network import CLASSES, detections, Detector, trained
@@ -81,15 +82,21 @@ def run(args):
     }
 
 
+TEACHER = Training('tenth', 'true', 0)
+SCRATCH = 'own, scratch'
+"""Own boxes, for a detector that does not begin as the one of the tenth."""
+
+
 def wanted(seeds: int) -> Iterator[Training]:
     """Yield the trainings in the order of what they say."""
-    yield Training('tenth', 'true', 0)
+    yield TEACHER
+    for source in ('raw', 'true'):
+        yield Training(SCRATCH, source, 0)
     for seed in range(seeds):
-        for source in ('raw', COMPLETED, 'true', 'smoothed', 'early'):
+        for source in ('raw', 'true', COMPLETED, 'smoothed', 'early'):
             yield Training('own', source, seed)
-        if seed == 0:
-            yield Training('second', COMPLETED, 0)
-            yield Training('own', 'track', 0)
+    yield Training('own', 'track', 0)
+    yield Training('second', COMPLETED, 0)
     for missed in MISSED:
         for source in ('raw', COMPLETED):
             yield Training(f'published, {missed} in ten missing', source, 0)
@@ -152,11 +159,14 @@ class Experiment:
         for drive in self._parts['tenth' if training.detector == 'tenth' else 'others']:
             table = drive.truth
             if training.source != 'true':
-                table = self._labels(training.detector, drive)[training.source]
+                detector = 'own' if training.detector == SCRATCH else training.detector
+                table = self._labels(detector, drive)[training.source]
             chosen = drive.frames[::TRAINING_STEP]
             frames += chosen
             labels += [labels_of(table, frame) for frame in chosen]
-        return trained(frames, labels, self._steps, training.seed)
+        is_first = training == TEACHER or training.detector == SCRATCH
+        start = None if is_first else self._model(TEACHER)
+        return trained(frames, labels, self._steps, training.seed, start)
 
     def _labels(self, detector: str, drive: StoredDrive) -> dict[str, BoxTable]:
         """Return the labels of each source of a drive, of the boxes of a detector."""
@@ -164,7 +174,8 @@ class Experiment:
 
         def make() -> dict[str, BoxTable]:
             boxes = self._boxes(detector, drive)
-            return relabelled(drive.recording, boxes, folder / drive.name)
+            sources = OPTIONS if detector == 'own' else [COMPLETED]
+            return relabelled(drive.recording, boxes, folder / drive.name, sources)
 
         return stored(folder / f'{drive.name}.pickle', make)
 
@@ -174,9 +185,7 @@ class Experiment:
             missed = int(detector.split()[1]) / 10
             rng = np.random.default_rng(0)
             return drive.published.rows(rng.random(len(drive.published.boxes)) >= missed)
-        teacher = Training('tenth', 'true', 0)
-        if detector == 'second':
-            teacher = Training('own', COMPLETED, 0)
+        teacher = Training('own', COMPLETED, 0) if detector == 'second' else TEACHER
         return detected(self._model(teacher), drive.frames, drive.truth.frame_id)
 
     def _tested(self, model: Detector) -> Scores:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
-import shutil
 import sys
 
 from boxreg_ros import cli
@@ -34,8 +34,8 @@ MAD_TO_DEVIATION = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
 OPTIONS = {
     'early': ('--set', 'estimate=early'),
-    'track': (),
     'track, complete': ('--complete',),
+    'track': (),
 }
 """Options of `boxreg relabel` of the labels that it makes."""
 
@@ -53,30 +53,33 @@ def detected(model: Detector, frames: list[Frame], frame_id: str) -> BoxTable:
     return BoxTable.from_arrays(arrays)
 
 
-def relabelled(recording: Path, boxes: BoxTable, folder: Path) -> dict[str, BoxTable]:
+def relabelled(
+    recording: Path, boxes: BoxTable, folder: Path, sources: Iterable[str]
+) -> dict[str, BoxTable]:
     """
-    Return the labels of each source but the true ones, made of boxes without ids.
+    Return the raw and smoothed labels, and those of each of `sources`, of boxes without ids.
 
-    `boxreg relabel --associate` runs in this process; raw and smoothed boxes have its ids.
-    Raises RecordingError if it fails.
+    `boxreg relabel --associate` runs in this process; raw and smoothed boxes have the ids of its
+    last run. Raises RecordingError if it fails.
 
     """
     folder.mkdir(parents=True, exist_ok=True)
     boxes.write(folder / 'boxes.csv')
     found = {}
-    for source, options in OPTIONS.items():
+    tracked = boxes
+    for source in sources:
         out = folder / source.replace(', ', '_')
         words = [
             'relabel', str(recording), '-o', str(out), '--labels', f'csv:{folder / "boxes.csv"}',
-            '--associate', '--formats', 'csv', '--workers', '1', *options,
+            '--associate', '--formats', 'csv', '--workers', '1', *OPTIONS[source],
         ]  # fmt: skip
         with redirect_stdout(sys.stderr):
             if cli.main(words):
                 raise RecordingError(f'{recording}: boxreg {" ".join(words)} failed')
-        table = BoxTable.read(out / 'boxes.csv')
-        shutil.rmtree(out)
-        found[source] = table.rows(np.array([word != REJECTED for word in table.status], bool))
-    raw = with_ids(boxes, found['track'])
+        tracked = BoxTable.read(out / 'boxes.csv')
+        is_label = np.array([word != REJECTED for word in tracked.status], bool)
+        found[source] = tracked.rows(is_label)
+    raw = with_ids(boxes, tracked)
     return {'raw': raw, 'smoothed': smoothed_table(raw)} | found
 
 

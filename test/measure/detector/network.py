@@ -148,11 +148,20 @@ def loss_of(output: Tensor, heat: Tensor, values: Tensor, mask: Tensor) -> Tenso
     return of_heat + VALUES_WEIGHT * away / NUM_VALUES * 4
 
 
-def trained(frames: Sequence[Frame], labels: Sequence[Labels], steps: int, seed: int) -> Detector:
-    """Return a detector trained on labels of frames, one each."""
+def trained(
+    frames: Sequence[Frame],
+    labels: Sequence[Labels],
+    steps: int,
+    seed: int,
+    start: Detector | None = None,
+) -> Detector:
+    """Return a detector trained on labels of frames, one each; it begins as `start`."""
     rng = np.random.default_rng(seed)
     torch.manual_seed(seed)
-    model = Detector().to(memory_format=torch.channels_last)
+    model = Detector()
+    if start is not None:
+        model.load_state_dict(start.state_dict())
+    model = model.to(memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(model.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, steps)
     for _ in range(steps):

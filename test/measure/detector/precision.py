@@ -45,9 +45,10 @@ def hits_of(
         is_free = np.ones(len(truth), bool)
         kept, is_true = [], []
         for row, iou in zip(order, ious[kind], strict=True):
-            best = int(np.argmax(np.where(is_free, iou, -1))) if len(truth) else -1
-            is_hit = best >= 0 and is_free[best] and iou[best] >= float(level)
-            is_free[best] &= not is_hit
+            free = np.where(is_free, iou, 0.0)
+            is_hit = free.max(initial=0.0) >= float(level)
+            best = int(np.argmax(free)) if is_hit else 0
+            is_free[best : best + 1] &= not is_hit
             if is_hit and not in_scope[best]:
                 continue
             if not is_hit and iou[~in_scope].max(initial=0) > 0:
