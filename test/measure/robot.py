@@ -2,7 +2,8 @@
 `measure robot`: the live node at the rates of a robot, as a table.
 
 Each row is a run of `measure node`; with both cores taken, as many processes as there are cores
-compute beside it. The machine has to be quiet: run it alone.
+compute beside it, without a priority. With `--real-time` all others have that of `chrt -r 1`, as
+drivers of robots do, which needs the right to it. The machine has to be quiet: run it alone.
 
 """
 
@@ -24,11 +25,16 @@ ROWS = {
 }
 """Tracks, points, rates of TF with odometry and of /clock [Hz], and whether cores are taken."""
 COLUMNS = ('p50 [ms]', 'p99 [ms]', 'early refined [%]', 'clouds dropped', 'cores', 'load')
-ARGUMENTS = {'--seconds': (25.0, 'seconds of data of each row')}
+ARGUMENTS = {
+    '--seconds': (25.0, 'seconds of data of each row'),
+    '--real-time': (False, 'with real-time priority'),
+}
 
 
 def run(args):
     """Print the table, a row when it is measured; return the values."""
+    if args.real_time:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))  # inherited by processes
     print('| 10 Hz | ' + ' | '.join(COLUMNS) + ' |\n|---' + '|---:' * len(COLUMNS) + '|')
     found = {}
     for name, row in ROWS.items():
@@ -49,6 +55,7 @@ def _measured(args, tracks, points, motion, clock, is_busy):
         if is_busy:
             for _ in range(os.cpu_count() or 1):
                 other = subprocess.Popen([sys.executable, '-c', 'while True: pass'])
+                os.sched_setscheduler(other.pid, os.SCHED_OTHER, os.sched_param(0))
                 stack.callback(other.wait)
                 stack.callback(other.kill)
         report = measure(scope)
