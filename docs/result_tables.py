@@ -522,6 +522,18 @@ def load(results: Any) -> Iterable[str]:
         yield grid(f'{policy}: tracks', tuple(next(iter(rows.values()))), rows)
 
 
+def robot(results: Any) -> Iterable[str]:
+    """Yield latency and what was refined in time, by what the robot sends."""
+    digits = {
+        'p50 [ms]': 0, 'p99 [ms]': 0, 'early refined [%]': 0, 'clouds dropped [%]': 1, 'cores': 2,
+    }  # fmt: skip
+    rows = [
+        [name, *(number(row[key], places) for key, places in digits.items())]
+        for name, row in results.items()
+    ]
+    yield table(['10 Hz', *digits], rows)
+
+
 def flat(results: Any) -> Iterable[list[str]]:
     """Yield names and values; those of the start, the middle and the end of a run in one row."""
     rows: dict[str, list[str]] = {}

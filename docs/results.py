@@ -520,6 +520,7 @@ KINDS = {
     'load': Kind('node', result_tables.load, _load),
     'scale': Kind('speed', result_tables.scale, _scale),
     'node': Kind('node', result_tables.figures, _node),
+    'robot': Kind('node', result_tables.robot, None),
 }
 SHARED = {
     name for name, count in Counter(kind.page for kind in KINDS.values()).items() if count > 1

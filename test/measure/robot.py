@@ -24,7 +24,6 @@ ROWS = {
     'all cores taken, 17 boxes': (17, 100_000, 0.0, 0.0, True),
 }
 """Tracks, points, rates of TF with odometry and of /clock [Hz], and whether cores are taken."""
-COLUMNS = ('p50 [ms]', 'p99 [ms]', 'early refined [%]', 'clouds dropped', 'cores', 'load')
 ARGUMENTS = {
     '--seconds': (25.0, 'seconds of data of each row'),
     '--real-time': (False, 'with real-time priority'),
@@ -32,20 +31,18 @@ ARGUMENTS = {
 
 
 def run(args):
-    """Print the table, a row when it is measured; return the values."""
+    """Return the figures of each row."""
     if args.real_time:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))  # inherited by processes
-    print('| 10 Hz | ' + ' | '.join(COLUMNS) + ' |\n|---' + '|---:' * len(COLUMNS) + '|')
     found = {}
     for name, row in ROWS.items():
+        print(name, file=sys.stderr)
         found[name] = _measured(args, *row)
-        cells = ' | '.join(found[name][column] for column in COLUMNS)
-        print(f'| {name} | {cells} |', flush=True)
     return found
 
 
 def _measured(args, tracks, points, motion, clock, is_busy):
-    """Return the cells of a row."""
+    """Return the figures of a row."""
     settings = ['use_sim_time:=true'] if clock else []
     scope = argparse.Namespace(
         tracks=tracks, points=points, rate=10.0, seconds=args.seconds, delay=0.05,
@@ -63,10 +60,10 @@ def _measured(args, tracks, points, motion, clock, is_busy):
     early = sum(counts.get(f'early_{name}', 0) for name in ('refined', 'budget', 'kept'))
     nan = float('nan')
     return {
-        'p50 [ms]': f'{report.get("latency p50 [ms]", nan):.0f}',
-        'p99 [ms]': f'{report.get("latency p99 [ms]", nan):.0f}',
-        'early refined [%]': f'{100 * counts.get("early_refined", 0) / max(1, early):.0f}',
-        'clouds dropped': f'{counts.get("points_queue_full", 0)} of {args.seconds * 10:.0f}',
-        'cores': f'{report["cores used"]:.2f}',
+        'p50 [ms]': report.get('latency p50 [ms]', nan),
+        'p99 [ms]': report.get('latency p99 [ms]', nan),
+        'early refined [%]': 100 * counts.get('early_refined', 0) / max(1, early),
+        'clouds dropped [%]': 10 * counts.get('points_queue_full', 0) / args.seconds,
+        'cores': report['cores used'],
         'load': report['load before, during'],
     }
