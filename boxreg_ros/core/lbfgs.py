@@ -113,7 +113,7 @@ def minimize(
     """
     rows = torch.arange(len(start), device=start.device)
     value, gradient = function(start, rows) if first is None else first
-    is_finite = value.isfinite() & gradient.isfinite().all(1)
+    is_finite = _are_finite(value, gradient)
     status = torch.where(is_finite, 0, int(Status.FAILED))
     best = Minimum(start.clone(), value.clone(), status, torch.zeros_like(rows))
     gradient = torch.where(is_finite[:, None], gradient, 0.0)
@@ -143,12 +143,15 @@ def _with_new_directions(
 
     """
     moved = search.has_moved.nonzero()[:, 0]
+    if not len(moved):
+        return search._replace(tries=search.tries + 1)
     rows, _, value, gradient, *_, pairs = _select(search, moved)
     direction = -_two_loop(gradient, pairs, rows, metric)
     slope = (gradient * direction).sum(1)
     is_uphill = ~(slope < 0)
-    direction = torch.where(is_uphill[:, None], -gradient, direction)
-    slope = torch.where(is_uphill, -gradient.square().sum(1), slope)
+    if is_uphill.any():
+        direction = torch.where(is_uphill[:, None], -gradient, direction)
+        slope = torch.where(is_uphill, -gradient.square().sum(1), slope)
     if metric is None and not pairs:  # the scale is unknown: a step of length 1 at most
         size = gradient.abs().sum(1).clamp(min=1.0)
         direction = direction / size[:, None]
@@ -175,31 +178,42 @@ def _after_trial(search: _Search, best: Minimum, function: Function, history: in
     rows, value, slope, step = search.rows, search.value, search.slope, search.step
     trial, trial_gradient = function(search.x + step[:, None] * search.direction, rows)
     has_decreased = trial <= value + SUFFICIENT_DECREASE * step * slope
-    is_good = trial_gradient.isfinite().all(1) & has_decreased
-    is_stuck = ~is_good & (search.tries == MAX_BACKTRACKS)
-    best.status[rows] += int(Status.STUCK) * is_stuck
+    is_good = _are_finite(trial, trial_gradient) & has_decreased
+    if not is_good.all():
+        is_stuck = ~is_good & (search.tries == MAX_BACKTRACKS)
+        best.status[rows] += int(Status.STUCK) * is_stuck
+        step = _shorter(step, slope, trial - value)
 
-    s = torch.where(is_good, step, 0.0)[:, None] * search.direction
+    s = torch.where(is_good, search.step, 0.0)[:, None] * search.direction
     y = torch.where(is_good[:, None], trial_gradient - search.gradient, 0.0)
     s_y = (s * y).sum(1)
     is_curved = s_y > MIN_CURVATURE * s.norm(dim=1) * y.norm(dim=1)
     pair = s, y, torch.where(is_curved, 1 / s_y, 0.0)
 
-    # The minimum of the parabola through value, slope and trial.
-    parabola = -slope * step.square() / (2 * (trial - value - slope * step))
-    least, most = STEP_BOUNDS
-    shorter = torch.where(parabola.isfinite(), parabola, least * step)
     search = search._replace(
         x=search.x + s,
         value=torch.where(is_good, trial, value),
         gradient=search.gradient + y,
-        step=shorter.clamp(least * step, most * step),
+        step=step,
         has_moved=is_good,
         pairs=[*search.pairs, pair][-history:],
     )
     best.x[rows] = search.x  # by Armijo's condition never worse than before
     best.value[rows] = search.value
     return search
+
+
+def _are_finite(value: Tensor, gradient: Tensor) -> Tensor:
+    """Return which values (b,) and gradients (b, D) are finite; a sum of finite numbers is."""
+    return (value + gradient.sum(1)).isfinite()
+
+
+def _shorter(step: Tensor, slope: Tensor, rise: Tensor) -> Tensor:
+    """Return shorter steps (b,), by the parabola through the slope and the `rise` at `step`."""
+    parabola = -slope * step.square() / (2 * (rise - slope * step))
+    least, most = STEP_BOUNDS
+    shorter = torch.where(parabola.isfinite(), parabola, least * step)
+    return shorter.clamp(least * step, most * step)
 
 
 def _two_loop(
