@@ -7,7 +7,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.field_of_view import FieldOfView
 from boxreg_ros.core.method import crop as crop_kernels
 from boxreg_ros.core.method.rings import ring_heights
-from boxreg_ros.core.tables import column
+from boxreg_ros.core.tables import by_table, column
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, Ints, ROLL, Sweep, YAW
 import numpy as np
@@ -103,6 +103,27 @@ class Observations(NamedTuple):
                 table._replace(origins=_repeat_last(table.origins, most)) for table in tables
             ]
         return cls(*(column(tables, name) for name in cls._fields))
+
+    @classmethod
+    def gathered(cls, items: Sequence[tuple['Observations', int]]) -> tuple['Observations', Ints]:
+        """
+        Return one table with some rows of some tables, and where each of them is in it (n,).
+
+        A table that is used by half is not copied row by row: it has further rows.
+
+        """
+        tables = []
+        rows = np.empty(len(items), int)
+        length = 0
+        for table, places, own in by_table(items):
+            if 2 * len(own) < len(table.boxes):
+                tables.append(table.take(np.array(own)))
+                rows[places] = np.arange(length, length + len(own))
+            else:
+                tables.append(table)
+                rows[places] = np.array(own) + length
+            length += len(tables[-1].boxes)
+        return cls.concatenated(tables), rows
 
     def take(self, rows: Ints) -> 'Observations':
         """Return some of the rows (n,), in their order."""

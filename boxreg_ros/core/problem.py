@@ -14,7 +14,6 @@ from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, GAP, PIVOT, POSE, PRIOR, SHARED
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.observation import Observations
-from boxreg_ros.core.tables import joined
 from boxreg_ros.core.window import MarginalisationPrior, Window
 from boxreg_ros.structures import Floats, Ints, ROLL, YAW
 import numpy as np
@@ -268,10 +267,7 @@ def stack_windows(
     """
     lengths = np.array([len(window.observations) for window in windows])
     valid = np.arange(lengths.max()) < lengths[:, None]  # (B, N)
-    tables, rows = joined([item for window in windows for item in window.observations])
-    seen = Observations.concatenated(tables)
-    if 2 * len(rows) < len(seen.boxes):  # of another group: their points are not held twice
-        seen, rows = seen.take(rows), np.arange(len(rows))
+    seen, rows = Observations.gathered([item for w in windows for item in w.observations])
     boxes, times, origins, ground, ring_heights = _stack_observations(seen, rows, valid)
     priors = [w.prior or _no_prior(w.observations[0].box[:3]) for w in windows]
     base, state, step, information, extents, _ = (
