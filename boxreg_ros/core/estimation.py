@@ -52,17 +52,21 @@ def estimate_windows(
     """
     estimates: dict[int, Estimate] = {}
     groups = group_windows(windows, config)
+    if not groups:
+        return [None] * len(windows)
     parts = [[windows[i] for i in rows] for rows in groups]
     decay = model.constants.prior_decay
     stacked = [stack_windows(part, config, decay) for part in parts]
     with shared_between(config.solver.threads):
         for part, (problem, _) in zip(parts, stacked, strict=True):
             _update_margins(model, part, problem, config)
+        # Whole tracks show their own noise.
+        inputs = model.inputs(config, with_noise=config.estimate != 'track')
         for rows, part, (problem, base) in zip(groups, parts, stacked, strict=True):
             if config.objective == 'paper':
                 solution = solve_paper(problem, config)
             else:
-                solution = solve(problem, config, model, part[0].is_warm)
+                solution = solve(problem, config, model, inputs, part[0].is_warm)
                 _update_noise(model, part, problem, solution, config)
             found = _accepted(part, problem, base, solution, config, model.constants.max_lost_part)
             estimates.update(zip(rows, found, strict=True))

@@ -115,6 +115,9 @@ class InputModel:
     ----------
     constants : Constants
         The numbers of the method, for all that use the model.
+    latest : array of `INPUTS`, shape (K,), or None
+        What the batch before was solved with: new boxes are observed with it. None before the
+        first one.
 
     """
 
@@ -125,6 +128,7 @@ class InputModel:
         numbers: constants.Constants | None = None,
     ) -> None:
         self.constants = numbers or constants.CONSTANTS
+        self.latest: Inputs | None = None
         self._estimates_margins = config.learn
         self._occlusion_insets = np.array([config.inset_ends, config.inset_sides, 0.0, 0.0])
         # Of each track of each kind: what it shows, and its last input residuals.
@@ -159,7 +163,9 @@ class InputModel:
             Settings.
 
         """
-        inputs = self.inputs(config, with_noise=False)
+        inputs = self.latest
+        if inputs is None:
+            inputs = self.inputs(config, with_noise=False)
         terms = np.zeros(problem.counts.shape, TERMS)
         run(
             observe_faces, len(poses), problem, np.ascontiguousarray(poses),

@@ -80,12 +80,15 @@ class Batch(NamedTuple):
     """Where the round begins; the round writes its end."""
 
 
-def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) -> Solution:
+def solve(
+    problem: Problem, config: Config, model: InputModel, inputs: Inputs, is_warm: bool
+) -> Solution:
     """
     Minimise the robust objective (M1) of a batch: rounds until every window is settled.
 
     The B windows are all warm, with all boxes but the newest starting from an earlier fit, or all
-    cold. `model` has labelling margins and noise of the input, and the constants of the method.
+    cold. `model` has the constants of the method, and what it estimates of the errors of the
+    `inputs`.
     Returned are poses, shared variables and covariances; for sliding windows also the prior of the
     next ones.
 
@@ -95,7 +98,6 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     """
     constants = model.constants.with_settings(config)
     plan = SolverPlan.choose(config, is_warm)
-    inputs = model.inputs(config, with_noise=not plan.estimates_noise)
     batch = start(problem, config, plan, inputs)
     rows, turn = np.arange(len(batch.free)), 0
     with shared_between(config.solver.threads):
@@ -112,6 +114,7 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
                 inputs = model.inputs(
                     config, fits=(residuals, batch.solution.evidence, problem.kind)
                 )
+    model.latest = inputs
     return batch.solution
 
 

@@ -62,9 +62,9 @@ def empty_sums(B: int, N: int, prior_mean: Any, prior_information: Any) -> Sums:
     common = np.zeros(B, COMMON)
     common['prior_mean'] = prior_mean
     common['W_prior'] = prior_information
-    factor = Arrowhead(
-        np.zeros((B, N + 2, POSE, SPAN)), np.zeros((B, N + 2, POSE, SHARED)),
-        np.zeros((B, SHARED, SHARED)),
+    factor = Arrowhead(  # written before it is read
+        np.empty((B, N + 2, POSE, SPAN)), np.empty((B, N + 2, POSE, SHARED)),
+        np.empty((B, SHARED, SHARED)),
     )  # fmt: skip
     return Sums(np.zeros((B, N), TERMS), common, factor)
 

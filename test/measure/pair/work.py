@@ -28,8 +28,11 @@ def main(case: str, path: Path, folder: Path) -> dict[str, float]:
     """Return the figures of a case."""
     if case in ('relabel', 'compile'):
         return _command(case, path, folder)
+    from boxreg_ros.allocation import collect_rarely, keep_freed_memory
     import torch
 
+    collect_rarely()  # as the commands and the node do
+    keep_freed_memory()
     torch.set_num_threads(1)
     with np.load(path) as arrays:
         work = {'tick': _tick, 'refine': _refine, 'follow': _follow}[case.partition(' ')[0]]

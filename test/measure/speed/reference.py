@@ -51,13 +51,17 @@ def compare(config: Config, count: int, references: int) -> dict[str, float]:
     windows, truth = make_windows(count, config.window, 128, config)
     problem, base = stack_windows(windows, config, CONSTANTS.prior_decay)
 
+    def solved(problem: Problem, is_warm: bool) -> Solution:
+        model = InputModel(config.faces)
+        return solve(problem, config, model, model.inputs(config), is_warm)
+
     def cold() -> Solution:
-        return solve(problem, config, InputModel(config.faces), is_warm=False)
+        return solved(problem, is_warm=False)
 
     warm_problem = _warm(problem, cold())
 
     def warm() -> Solution:
-        return solve(warm_problem, config, InputModel(config.faces), is_warm=True)
+        return solved(warm_problem, is_warm=True)
 
     tracks = [_track(window) for window in windows]
     once = replace(config, estimate='track')

@@ -139,7 +139,8 @@ def _milliseconds(count: int, length: int, points: int, config: Config) -> float
     problem, _ = stack_windows(windows, config, CONSTANTS.prior_decay)
 
     def once() -> object:
-        return solve(problem, config, InputModel(config.faces), is_warm=False)
+        model = InputModel(config.faces)
+        return solve(problem, config, model, model.inputs(config), is_warm=False)
 
     return 1e3 * shortest(once)
 
