@@ -5,6 +5,7 @@ from boxreg_ros.core.method.arrays import BOX_POSE
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.faces import fill_insets, fill_visibility, observe_faces
 from boxreg_ros.core.method.residuals import TERMS
+from boxreg_ros.rotations import matrix_from_rpy
 import numpy as np
 import pytest
 from scenes import no_inputs, problem_of, shared_of
@@ -118,12 +119,13 @@ def on_faces(inside, n=40, faces=(0, 2, 4)):
     return np.concatenate(points)
 
 
-def supported(problem, gap=0.0, outermost=0.05, depths=0.0, distant=0.0):
+def supported(problem, gap=0.0, outermost=0.05, depths=0.0, distant=0.0, poses=None):
     constants = CONSTANTS._replace(outermost=outermost)
     terms = np.zeros(problem.counts.shape, TERMS)
     B = len(problem.boxes)
     observe_faces(
-        0, B, problem, np.ascontiguousarray(problem.boxes[..., BOX_POSE]),
+        0, B, problem,
+        np.ascontiguousarray(problem.boxes[..., BOX_POSE]) if poses is None else poses,
         shared_of(B=B, GAP=[gap] * 6), no_inputs(occlusion_inset=depths, range_inset=distant),
         constants.record(), terms,
     )  # fmt: skip
@@ -155,12 +157,24 @@ def test_outermost_points_of_each_strip_by_hand():
     assert found['visibility'][0, 0, 0] == 1
 
 
-def test_the_seen_half_of_a_round_roof_does_not_roll_the_body():
-    # The roof falls by 0.15 m from its ridge to its right edge, which the sensor is beside.
-    x, y = (part.ravel() for part in np.meshgrid(np.linspace(-1.9, 1.9, 41), -np.arange(10) / 10))
-    found = supported(seen_from([0.0, -30.0, 2.0], np.c_[x, y, 0.95 - 0.15 * y**2]))
-    side = found['W_faces'][0, 0, 4][1, 3]  # mean y
-    assert side == pytest.approx(0.0, abs=1e-6)
+def test_the_seen_half_of_a_roof_does_not_roll_the_body():
+    # Twelve points of the roof, right of the middle of a box with roll, pitch and yaw, and off the
+    # centre of its input: as if each were in the middle, at its height above the box.
+    rng = np.random.default_rng(6)
+    points = np.c_[rng.uniform(-1.9, 1.9, 60), rng.uniform(-0.9, 0.0, 60), rng.uniform(0.8, 1, 60)]
+    shift, angles = np.array([0.1, -0.05, 0.02]), np.array([0.05, -0.1, 0.4])
+    R = matrix_from_rpy(angles)
+    problem = seen_from([0.0, -30.0, 2.0], points @ R.T + shift)
+    found = supported(problem, poses=np.concatenate([shift, angles])[None, None])
+    order = np.argsort(-points[:, 2])
+    strip = np.floor((points[:, 1] + 1) * 1.5)
+    outer = np.concatenate([order[strip[order] == k][:3] for k in range(3)])
+    middle = (points[outer] * [1, 0, 1]) @ R.T + shift
+    homogeneous = np.c_[middle, np.ones(len(outer))]
+    np.testing.assert_allclose(
+        found['W_faces'][0, 0, 4], homogeneous.T @ homogeneous / len(outer), atol=1e-6
+    )
+    assert found['distance'][0, 0, 4] == pytest.approx(points[outer, 2].mean() - 1, abs=1e-6)
 
 
 @pytest.mark.parametrize(('behind', 'used'), [(0.15, 9), (0.25, 6)])

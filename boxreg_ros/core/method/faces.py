@@ -15,14 +15,8 @@ import numpy as np
 
 FACES = 5
 """Front, back, left, right, top: the bottom is observed by the road."""
-STRIP_AXIS = (1, 1, 0, 0, 0)
-"""
-Box axis along which the strips of each of these lie side by side.
-
-Those of the roof lie behind each other: bodies are round across, and one side of the roof is seen.
-Strips beside each other would have its edge, which is lower, as outermost points.
-
-"""
+STRIP_AXIS = (1, 1, 0, 0, 1)
+"""Box axis along which the strips of each of these lie side by side."""
 NOWHERE = 1e9
 """Depth of points that are not on a face [m]."""
 ALWAYS_VISIBLE = 9.0
@@ -144,6 +138,32 @@ def outermost_points(m, wanted, constants, work, moments):
             moment[3, 3] = 1.0
         work.number[face] = number
         work.mean_depth[face] = total / max(number, 1)
+
+
+@loop
+def to_middle(R, shift, lever, moment):
+    """
+    Move the second moments (4, 4) of points of the roof to the middle of the box across.
+
+    Of q + u u'(shift - q), as high above the box as q, with its y axis u. `lever` (3,) is to work
+    in.
+
+    """
+    middle, mean, variance = 0.0, 0.0, 0.0
+    for i in range(3):
+        middle += R[i, 1] * shift[i]
+        mean += R[i, 1] * moment[i, 3]
+    for i in range(3):
+        lever[i] = middle * moment[i, 3]
+        for j in range(3):
+            lever[i] -= moment[i, j] * R[j, 1]
+        variance -= R[i, 1] * lever[i]
+    variance += middle * (middle - mean)
+    for i in range(3):
+        for j in range(3):
+            moment[i, j] += lever[i] * R[j, 1] + R[i, 1] * (lever[j] + variance * R[j, 1])
+        moment[i, 3] += R[i, 1] * (middle - mean)
+        moment[3, i] = moment[i, 3]
 
 
 @kernel
@@ -357,8 +377,11 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
     The paper takes the K points closest to a face that is visible by the points' centre of mass
     [Eq. 4]. Here the outermost ones are taken: the closest points of a face that is given too far
     inside may lie anywhere. On a face with a wrong yaw the outermost points are all at one end:
-    each strip has its own, so that the face is turned as well; a roof by its pitch alone. Points
-    far behind the outermost one belong to another surface.
+    each strip has its own, so that the face is turned as well. Points far behind the outermost
+    one belong to another surface.
+
+    Bodies are round across, and one side of the roof is seen: its points show its height and its
+    pitch, but would roll the body toward the sensor.
 
     """
     R = np.empty((3, 3))
@@ -366,6 +389,7 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
     shift = np.empty(3)
     level = np.empty(6)
     toward = np.empty(3)
+    lever = np.empty(3)
     tangent = np.empty(6)
     velocity = np.zeros(3)
     length = problem.lengths[b]
@@ -397,6 +421,7 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
         share = constants.outermost / constants.strips
         wanted = ceil(max(constants.min_face_points, share * near))
         outermost_points(m, wanted, constants, work, term.W_faces)
+        to_middle(R, shift, lever, term.W_faces[TOP])
         for face in range(FACES):
             distance[face] = -work.mean_depth[face]
             if work.number[face] < constants.min_face_points:
