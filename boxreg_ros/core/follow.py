@@ -10,6 +10,7 @@ from typing import NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core.following import person
 from boxreg_ros.core.following.between import between
+from boxreg_ros.core.following.exact import between_exact, Keyframes
 from boxreg_ros.core.following.object_points import Owned
 from boxreg_ros.core.following.start_speed import POSE4, Seeds
 from boxreg_ros.core.following.sweeps import ascending, nearest, Points, SightLimits, Sweeps
@@ -340,13 +341,22 @@ def solved(
     usual = keyframe_deviations(tracks, points, config, origins)
     given = [_track(track, points, origins) for track in tracks if len(track.rows)]
     found = refined_tracks(given, config, person.numbers(usual))
-    steps = person.corrections(*_fits(given, found), usual)
+    fits = _fits(given, found)
+    steps = person.corrections(*fits, usual)
+    are_exact = person.are_exact(*fits, usual)
     boxes = {}
     first = 0
     for track, refined in zip(given, found, strict=True):
-        at_ns = track.stamps_ns[_is_fit(track, refined)]
+        is_fit = _is_fit(track, refined)
+        at_ns = track.stamps_ns[is_fit]
         own = steps[first : first + len(at_ns)]
-        boxes[track.track_id] = person.moved(track.stamps_ns, refined.boxes, at_ns, own)
+        moved = person.moved(track.stamps_ns, refined.boxes, at_ns, own)
+        if are_exact:
+            residuals = person.residuals(track.boxes, refined.boxes)
+            residuals[~is_fit] = np.nan
+            keyframes = Keyframes(track.stamps_ns, track.boxes, residuals).take(track.pinned)
+            moved = between_exact(track.stamps_ns, moved, keyframes)
+        boxes[track.track_id] = moved
         first += len(at_ns)
     return [replace(track, boxes=boxes.get(track.track_id, track.boxes)) for track in tracks]
 

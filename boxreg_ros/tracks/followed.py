@@ -6,7 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from boxreg_ros.core.follow import FollowedTrack
-from boxreg_ros.core.following.person import corrections, diagonals, moved
+from boxreg_ros.core.following.exact import between_exact, Keyframes
+from boxreg_ros.core.following.person import (
+    are_exact,
+    corrections,
+    diagonals,
+    moved,
+    residuals,
+)
 from boxreg_ros.structures import BoxArray, Floats, HUMAN, REFINED, RefinedBoxes
 from boxreg_ros.tracks.complete import AddedBox, CompletionPlan, TrackSteps, unchanged_plan
 from boxreg_ros.tracks.decided import Decided, DecidedTrack, NOTHING
@@ -57,24 +64,30 @@ def with_evidence(
     """
     Return results that are nearer to the keyframes if these show it, see `person.corrections`.
 
-    Boxes between keyframes are moved by the steps of these, interpolated in time. `given` has
+    Boxes between keyframes are moved by the steps of these, interpolated in time; between exact
+    ones, a line or spline takes their place where it errs less, see `between_exact`. `given` has
     the keyframes as they were registered with `deviations` (9,); `results` have added boxes
     behind them.
 
     """
     keyframes = [
         (array.track_ids[row], array.stamp_ns, array.boxes[row], result.boxes.boxes[row],
-         diagonals(result.covariances[row], result.extent_covariances[row]))
+         diagonals(result.covariances[row], result.extent_covariances[row]),
+         result.status[row] == REFINED)
         for array, result in zip(given, results, strict=True)
         for row in range(len(array.track_ids))
-        if result.status[row] == REFINED
     ]  # fmt: skip
-    if not keyframes:
+    if not any(keyframe[-1] for keyframe in keyframes):
         return list(results)
-    names, stamps_ns, boxes, fits, spread = zip(*keyframes, strict=True)
-    steps = corrections(np.array(boxes), np.array(fits), np.array(spread), deviations)
+    names, *columns = zip(*keyframes, strict=True)
+    stamps_ns, boxes, fits, spread, is_fit = map(np.array, columns)
+    shown = boxes[is_fit], fits[is_fit], spread[is_fit], deviations
+    steps = np.zeros_like(boxes)
+    steps[is_fit] = corrections(*shown)
     if not steps.any():
         return list(results)
+    exact, away = are_exact(*shown), residuals(boxes, fits)
+    away[~is_fit] = np.nan
     rows_of: dict[str, list[int]] = {}
     for row, name in enumerate(names):
         rows_of.setdefault(name, []).append(row)
@@ -87,7 +100,11 @@ def with_evidence(
     for name, rows in rows_of.items():
         at = np.array([results[index].boxes.stamp_ns for index, _ in places[name]], np.int64)
         own = np.array([found[index][row] for index, row in places[name]])
-        own = moved(at, own, np.array(stamps_ns, np.int64)[rows], steps[rows])
+        fit_rows = [row for row in rows if is_fit[row]]
+        if fit_rows:
+            own = moved(at, own, stamps_ns[fit_rows], steps[fit_rows])
+        if exact:
+            own = between_exact(at, own, Keyframes(stamps_ns[rows], boxes[rows], away[rows]))
         for (index, row), box in zip(places[name], own, strict=True):
             found[index][row] = box
     return [

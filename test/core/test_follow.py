@@ -5,6 +5,7 @@ from dataclasses import replace
 from boxreg_ros import follow, ShapeError
 from boxreg_ros.core.following import person
 from boxreg_ros.core.following.between import closed
+from boxreg_ros.core.following.exact import between_exact, Keyframes
 from boxreg_ros.core.following.motion_kinds import MOTIONS, steering
 from boxreg_ros.core.following.person import corrections, DEVIATIONS
 from boxreg_ros.core.following.tracker import Way
@@ -14,6 +15,7 @@ from boxreg_ros.structures import BoxArray, HUMAN, INTERPOLATED
 import numpy as np
 import pytest
 from scenes import drive, returns, stamps
+from scipy.interpolate import CubicSpline
 
 N = 30
 ORIGIN = (0.0, 0.0, 1.5)
@@ -131,6 +133,55 @@ def test_keyframes_are_soft_by_the_error_that_they_show():
     assert all(track.status[row] == HUMAN for track in soft for row in rows)
     assert iou_3d(found, true).mean() > iou_3d(given, true).mean() + 0.01
     assert np.abs(found[:, :3] - given[:, :3]).mean() < 0.03
+
+
+def test_no_box_between_exact_keyframes_is_below_line_and_spline():
+    # The objects turn evenly, so that the spline errs by less than a millimetre.
+    truths, tracks, _ = keyframes_of_a_drive(0.0, 0.0, 0.0)
+    rows, at = np.arange(0, N, 5), stamps(N) - stamps(N)[0]
+    between = np.setdiff1d(np.arange(rows[-1]), rows)
+    for track, truth in zip(tracks, truths, strict=True):
+        spline = CubicSpline(at[rows], truth[rows])(at[between])
+        line = np.stack([np.interp(at[between], at[rows], one) for one in truth[rows].T], axis=1)
+        best = np.maximum(*(iou_3d(boxes, truth[between]) for boxes in (line, spline)))
+        assert (iou_3d(track.boxes[between], truth[between]) >= best - 1e-9).all()
+
+
+def curve_of(motion, fits=0.0, at=range(6)):
+    """Return what is between exact keyframes `at` times [s] of a motion along x, every 0.1 s."""
+    times = np.arange(51) / 10
+    boxes, keys = np.zeros((51, 9)), np.zeros((len(at), 9))
+    boxes[:, 0], keys[:, 0] = 100.0, motion(np.array(at))
+    boxes[:, 3:6] = keys[:, 3:6] = 4, 2, 2
+    residuals = np.zeros_like(keys)
+    residuals[:, 0] = fits
+    stamps_ns = (times * 1e9).astype(np.int64)
+    keyframes = Keyframes((np.array(at) * 1e9).astype(np.int64), keys, residuals)
+    return times, between_exact(stamps_ns, boxes, keyframes)[:, 0]
+
+
+def test_a_line_a_spline_or_the_fits_are_between_exact_keyframes():
+    wavy = [0.0, 0.1, 0.0, 0.1, 0.0, 0.1]  # fits err by .1 m from one keyframe to the next
+    is_between = np.arange(51) % 10 > 0
+    times, found = curve_of(lambda t: t**3, wavy)
+    np.testing.assert_allclose(found[is_between], (times**3)[is_between])  # a spline
+    times, found = curve_of(lambda t: np.abs(t - 2), wavy)
+    # Splines overshoot; beside the kink, which a line without that keyframe misses, fits stay.
+    for rows in (slice(1, 10), slice(31, 40), slice(41, 50)):
+        np.testing.assert_allclose(found[rows], np.abs(times - 2)[rows])
+    assert (found[11:20] == 100).all() and (found[21:30] == 100).all()
+    _, found = curve_of(lambda t: 0 * t, 0.0)
+    assert (found[is_between] == 0).all()  # at rest: as good as the fits
+    _, found = curve_of(lambda t: (-1.0) ** t, wavy)
+    assert (found == 100).all()  # the fits
+    assert (curve_of(lambda t: t**3, [0.0, 0.1], [0, 5])[1] == 100).all()  # two show nothing
+
+
+def test_a_long_gap_between_keyframes_is_judged_by_its_length():
+    # Without the keyframe at 3.9 s a line errs by .1 m there, for the next one is near, but by
+    # 3.9^2 / (4 * 3.9 * .1) times as much in the long gap.
+    _, found = curve_of(lambda t: 0.1 * (t == 3.9), [0.0, 0.3, 0.0, 0.3], [0, 3.9, 4, 5])
+    assert (found[1:39] == 100).all()
 
 
 def test_bad_keyframes_are_given_less_weight(monkeypatch):

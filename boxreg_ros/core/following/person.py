@@ -54,7 +54,7 @@ def shown(keyframes: Floats, fits: Floats, variances: Floats, usual: Floats) -> 
     if len(keyframes) < FOLLOW.min_keyframes:
         return found
     others = _variances_of_others(variances, usual)
-    errors = _residuals(keyframes, fits) * (1 + others / usual**2)
+    errors = residuals(keyframes, fits) * (1 + others / usual**2)
     for columns, of_group in GROUPS:
         variance = MAD_TO_DEVIATION**2 * np.median(errors[:, columns] ** 2)
         variance -= np.median(others[:, columns])
@@ -64,19 +64,26 @@ def shown(keyframes: Floats, fits: Floats, variances: Floats, usual: Floats) -> 
     return found
 
 
+def are_exact(keyframes: Floats, fits: Floats, variances: Floats, usual: Floats) -> bool:
+    """Return whether keyframes show smaller deviations of position and angles than the usual."""
+    deviations = shown(keyframes, fits, variances, usual)
+    return bool((deviations < usual)[list(BOX_POSE)].all())
+
+
 def corrections(keyframes: Floats, fits: Floats, variances: Floats, usual: Floats) -> Floats:
     """Return the steps (n, 9) from fits to those with smaller deviations, if `shown`."""
     smaller = np.minimum(shown(keyframes, fits, variances, usual), usual)
     others = _variances_of_others(variances, usual)
     weight = others / (usual**2 + others)  # of the keyframe in the fit
     better = others / (smaller**2 + others)
-    return _residuals(keyframes, fits) * (better - weight) / (1 - weight)
+    return residuals(keyframes, fits) * (better - weight) / (1 - weight)
 
 
-def _residuals(keyframes: Floats, fits: Floats) -> Floats:
-    residuals: Floats = keyframes - fits
-    residuals[:, ROLL:] = wrap_angle(residuals[:, ROLL:])
-    return residuals
+def residuals(keyframes: Floats, fits: Floats) -> Floats:
+    """Return keyframes less their fits, (n, 9) [m, rad]."""
+    found: Floats = keyframes - fits
+    found[:, ROLL:] = wrap_angle(found[:, ROLL:])
+    return found
 
 
 def _variances_of_others(variances: Floats, usual: Floats) -> Floats:
