@@ -13,6 +13,7 @@ has the published objective to the letter. docs/method.md has the formulas.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import repeat
 
 from boxreg_ros.config import Config
@@ -66,7 +67,8 @@ def estimate_windows(
             if config.objective == 'paper':
                 solution = solve_paper(problem, config)
             else:
-                solution = solve(problem, config, model, inputs, part[0].is_warm)
+                observe = partial(_update_margins, model, part, problem, config)
+                solution = solve(problem, config, model, inputs, part[0].is_warm, observe)
                 _update_noise(model, part, problem, solution, config)
             found = _accepted(part, problem, base, solution, config, model.constants.max_lost_part)
             estimates.update(zip(rows, found, strict=True))
@@ -74,22 +76,32 @@ def estimate_windows(
 
 
 def _update_margins(
-    model: InputModel, windows: Sequence[Window], problem: Problem, config: Config
+    model: InputModel,
+    windows: Sequence[Window],
+    problem: Problem,
+    config: Config,
+    poses: Floats | None = None,
 ) -> None:
     """
     Update the labelling margins with the faces of new observations at their input boxes.
 
-    `problem` has the `windows`. The angles are those of the start, as far as there is an earlier
-    estimate: the outermost points of a box with a wrong yaw are its corners, further outside.
+    `problem` has the `windows`. The angles are those of `poses` (B, N, 6), or of the start, as far
+    as there is an earlier estimate: the outermost points of a box with a wrong yaw are its
+    corners, further outside. Whole tracks have none: those of the input are replaced later.
 
     """
     columns = [window.margin_columns() for window in windows]
     new = [row for row, part in enumerate(columns) if part]
     if not new:
         return
+    is_input = poses is None and config.estimate == 'track'
+    if poses is not None:
+        start = np.concatenate([problem.start[..., :ROLL], poses[..., 3:]], axis=-1)
+        problem = problem._replace(start=start)
     problem = problem.part(new, [columns[row] for row in new])
-    poses = np.concatenate([problem.boxes[..., :3], problem.start[..., ROLL:]], axis=-1)
-    model.observe_margins([windows[row].track_id for row in new], problem, poses, config)
+    at = np.concatenate([problem.boxes[..., :3], problem.start[..., ROLL:]], axis=-1)
+    track_ids = [windows[row].track_id for row in new]
+    model.observe_margins(track_ids, problem, at, config, is_input)
 
 
 def _update_noise(

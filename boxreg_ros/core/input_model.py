@@ -146,10 +146,17 @@ class InputModel:
         )
 
     def observe_margins(
-        self, track_ids: Sequence[str], problem: Problem, poses: Floats, config: Config
+        self,
+        track_ids: Sequence[str],
+        problem: Problem,
+        poses: Floats,
+        config: Config,
+        is_input: bool = False,
     ) -> None:
         """
         Add the face observations of some windows at their input boxes.
+
+        Those at the angles of the input are replaced by the next ones of their tracks.
 
         Parameters
         ----------
@@ -161,6 +168,8 @@ class InputModel:
             Boxes at which faces are observed [m, rad].
         config : Config
             Settings.
+        is_input : bool
+            Whether the angles of `poses` are those of the input.
 
         """
         inputs = self.latest
@@ -172,10 +181,15 @@ class InputModel:
             problem.expected_shared(inputs), inputs,
             self.constants.with_settings(config).record(), terms,
         )  # fmt: skip
-        self._add(track_ids, problem, terms, inputs)
+        self._add(track_ids, problem, terms, inputs, is_input)
 
     def _add(
-        self, track_ids: Sequence[str], problem: Problem, terms: NDArray[np.void], inputs: Inputs
+        self,
+        track_ids: Sequence[str],
+        problem: Problem,
+        terms: NDArray[np.void],
+        inputs: Inputs,
+        is_input: bool,
     ) -> None:
         """Add face observations, of records `TERMS` (B, N), that were made with `inputs`."""
         kinds = problem.kind
@@ -207,8 +221,10 @@ class InputModel:
         logarithms = np.log(problem.mean_extents())
         for k in set(kinds.tolist()):
             rows, kept = _kept(self._tracks[k], track_ids, kinds == k)
-            self._tracks[k].arrays['sums'][kept] += sums[rows]
-            self._tracks[k].arrays['evidence'][kept, 0] = logarithms[rows]
+            known = self._tracks[k].arrays
+            known['at_input'][kept] = sums[rows] if is_input else 0.0
+            known['sums'][kept] += 0.0 if is_input else sums[rows]
+            known['evidence'][kept, 0] = logarithms[rows]
 
     def add_fits(
         self, track_ids: Sequence[str], kinds: Ints, residuals: Floats, evidence: Floats
@@ -272,7 +288,7 @@ class InputModel:
         settings = settings_of_kinds(config)
         of_faces = self.constants.with_settings(config).face_deviations
         for k in range(len(KINDS)):
-            tracks = np.concatenate([self._past[k], self._tracks[k].in_order])
+            tracks = np.concatenate([self._past[k], _shown(self._tracks[k])])
             evidence = np.concatenate([tracks['evidence'], more[of_fits == k]])
             if config.ingredients.population_extents and len(evidence):
                 found = population_slopes(evidence, self.constants)
@@ -327,7 +343,7 @@ class InputModel:
             noise = self._noise[k]
             if not noise['boxes']:
                 noise = noise_of(self._residuals[k].in_order, self.constants)
-            kinds.append(KindStatistics(self._tracks[k].in_order, noise))
+            kinds.append(KindStatistics(_shown(self._tracks[k]), noise))
         return drive_of(kinds, name)
 
     def gaps_of_tracks(self, faces: Sequence[int]) -> list[Floats]:
@@ -341,11 +357,19 @@ class InputModel:
     def _means_of_tracks(self, quantity: int, faces: Sequence[int]) -> list[Floats]:
         means = []
         for tracks in self._tracks:
-            for total, count, share in tracks.in_order['sums'][:, quantity][..., faces]:
+            for total, count, share in _shown(tracks)['sums'][:, quantity][..., faces]:
                 is_known = count >= MIN_HITS
                 if is_known.any():
                     means.append(total[is_known] / share[is_known])
         return means
+
+
+def _shown(tracks: TrackRows) -> NDArray[np.void]:
+    """Return what tracks show, with the face observations at the angles of their input."""
+    found = tracks.in_order
+    found['sums'] += found['at_input']
+    found['at_input'] = 0.0
+    return found
 
 
 def _means(sums: Floats) -> Floats:

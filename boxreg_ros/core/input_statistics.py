@@ -25,7 +25,9 @@ MAX_NOISE = 1e3
 """Deviations of an input over those of the settings are smaller. Chosen."""
 MAX_METRES = 1e3
 """Extents and gaps of objects are smaller [m]. Chosen."""
-TRACK = np.dtype([('sums', float, (3, 3, 6)), ('evidence', float, (3, 3))])
+TRACK = np.dtype(
+    [('sums', float, (3, 3, 6)), ('evidence', float, (3, 3)), ('at_input', float, (3, 3, 6))]
+)
 """
 Of one track.
 
@@ -34,6 +36,8 @@ sums
     [m], number of observations and share.
 evidence
     Of its points about the extents, see `population_slopes`.
+at_input
+    As `sums`, of observations at the angles of the input, until a fit replaces them.
 """
 NOISE = np.dtype([('deviation', float, 9), ('correlation', float, 9), ('boxes', float)])
 """

@@ -6,6 +6,7 @@ minimised. How many rounds there are, and what they use, is a `SolverPlan`, chos
 
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -81,14 +82,19 @@ class Batch(NamedTuple):
 
 
 def solve(
-    problem: Problem, config: Config, model: InputModel, inputs: Inputs, is_warm: bool
+    problem: Problem,
+    config: Config,
+    model: InputModel,
+    inputs: Inputs,
+    is_warm: bool,
+    observe_margins: Callable[[Floats], None] | None = None,
 ) -> Solution:
     """
     Minimise the robust objective (M1) of a batch: rounds until every window is settled.
 
     The B windows are all warm, with all boxes but the newest starting from an earlier fit, or all
     cold. `model` has the constants of the method, and what it estimates of the errors of the
-    `inputs`.
+    `inputs`. Of whole tracks `observe_margins` adds what their first round (B, N, 6) shows.
     Returned are poses, shared variables and covariances; for sliding windows also the prior of the
     next ones.
 
@@ -106,6 +112,8 @@ def solve(
             rows = rows[~is_done]
             turn += 1
             if plan.estimates_noise:
+                if turn == 1 and observe_margins:
+                    observe_margins(batch.solution.poses)
                 if turn <= NOISE_ROUNDS:
                     extents = batch.solution.shared[:, EXTENT:BIAS]
                     residuals = normalised_residuals(problem, batch.solution.poses, extents)

@@ -476,7 +476,8 @@ def show_faces(
     terms['visibility'], terms['num_points'] = float(seen), count
     terms['inset_shares'] = np.array([hidden, distant])[:, None]
     kind = np.full(b, KINDS.index(of_kind))
-    model._add(names, problem_of(np.zeros((b, n, 9)), kind=kind), terms, inputs)
+    problem = problem_of(np.zeros((b, n, 9)), kind=kind)
+    model._add(names, problem, terms, inputs, is_input=False)
 
 
 def test_margins_of_one_kind_do_not_change_those_of_others():
@@ -701,3 +702,24 @@ def test_labelling_margins_are_estimated_from_face_observations():
     share = (found[:5] - expected) / (0.11 - expected)
     assert ((share > 0.7) & (share < 1)).all()
     assert offsets_of(model)['margin'][5] == 0
+
+
+def test_observations_at_the_angles_of_the_input_are_replaced():
+    """Those of a fit count once; until there is one, those of the input do."""
+    x, z = (part.ravel() for part in np.meshgrid(np.linspace(-1.9, 1.9, 20), [-0.5, 0.0, 0.5]))
+    side = np.c_[x, 0 * x + 0.9, z]  # 0.1 m inside of the left side of a box of 4 x 2 x 2 m
+    problem = problem_of(
+        np.tile([0, 0, 0, 4.0, 2, 2, 0, 0, 0], (4, 6, 1)), points=np.tile(side, (4, 6, 1, 1)),
+        origins=np.tile([0.0, 30.0, 2.0], (4, 6, 1)), of_class=settings_of(Config().vehicle),
+    )  # fmt: skip
+    names = ['a', 'b', 'c', 'd']
+    fits = problem.boxes[..., BOX_POSE].copy()
+    turned = fits.copy()
+    turned[..., 5] = 0.1
+    once, again = (InputModel(FaceConfig()) for _ in range(2))
+    once.observe_margins(names, problem, fits, Config())
+    again.observe_margins(names, problem, turned, Config(), is_input=True)
+    of_input = again.gaps_of_tracks([2])
+    again.observe_margins(names, problem, fits, Config())
+    np.testing.assert_array_equal(again.gaps_of_tracks([2]), once.gaps_of_tracks([2]))
+    assert np.abs(np.subtract(of_input, once.gaps_of_tracks([2]))).min() > 0.02

@@ -480,9 +480,9 @@ def test_live_windows_are_warm_after_the_first_one(monkeypatch):
     """Three observations make the first window; later ones start from its estimates."""
     asked = []
 
-    def note(problem, config, model, inputs, is_warm):
+    def note(problem, config, model, inputs, is_warm, observe_margins):
         asked.append((problem.boxes.shape[1], is_warm))
-        return solve(problem, config, model, inputs, is_warm)
+        return solve(problem, config, model, inputs, is_warm, observe_margins)
 
     monkeypatch.setattr(estimation, 'solve', note)
     config = config_with()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 import math
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             results[mode].add(drive, methods, mode)
             if 'ours' in args.methods:
                 results[mode].add(drive, _with_held_extents(drive, mode), mode)
+                results[mode].add(drive, _of_short_tracks(drive, mode), mode)
             if seed == 0:
                 draw_figures(args.output, mode, methods, drive.truth)
     return {mode: _report(mode, result) for mode, result in results.items()}
@@ -110,6 +112,22 @@ def _with_held_extents(drive: Drive, mode: str) -> Methods:
         config = Config(estimate=run, mode=mode, extent='fixed')
         for estimate, boxes in drive.registered(config).items():
             methods[f'held extents, {estimate}'] = boxes
+    return methods
+
+
+def _of_short_tracks(drive: Drive, mode: str) -> Methods:
+    """Return our estimates of tracks as long as a window, into which the drive is cut."""
+    length = Config().window
+    arrays = [
+        replace(array, track_ids=tuple(f'{name}/{row // length}' for name in array.track_ids))
+        for row, array in enumerate(drive.boxes)
+    ]
+    short = replace(drive, boxes=tuple(arrays))
+    methods: Methods = {}
+    for name, extent in (('short tracks', 'track'), ('held extents, short tracks', 'fixed')):
+        boxes = short.registered(Config(mode=mode, extent=extent))['track']
+        ids = tuple(track_id.partition('/')[0] for track_id in boxes.track_ids)
+        methods[name] = replace(boxes, track_ids=ids)
     return methods
 
 
