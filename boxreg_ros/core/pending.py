@@ -217,8 +217,6 @@ class ObservedTrack:
     class_name: str
     entries: list[PendingBox] = field(default_factory=list)
     prior: MarginalisationPrior | None = None
-    covariance: Floats | None = None
-    """(6, 6), of the newest estimate."""
     num_carried: int = 0
     """Newest observations that were in no window yet, because the budget was used up."""
     detected_ns: int = 0
@@ -300,7 +298,6 @@ class ObservedTrack:
     def write(self, estimate: Estimate, entries: list[PendingBox]) -> None:
         """Pass the estimate of the window of `entries` to the box arrays that are not settled."""
         self.prior = estimate.prior
-        self.covariance = estimate.covariances[-1]
         self.num_carried = 0
         for row, entry in enumerate(entries, estimate.begin):
             entry.estimate = found = estimate.table, row

@@ -18,11 +18,11 @@ from boxreg_ros.core.input_statistics import Drives
 from boxreg_ros.core.latency import Latency, LatencyCorrection
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.method.constants import Constants
-from boxreg_ros.core.observation import Observation, Observations, observe
+from boxreg_ros.core.observation import Observation, observe
 from boxreg_ros.core.pending import ObservedTrack, PendingArray, PendingBox
 from boxreg_ros.core.problem import SETTINGS_OF
 from boxreg_ros.core.support import is_owned, points_inside
-from boxreg_ros.core.tables import column, joined
+from boxreg_ros.core.tables import by_table, column, joined
 from boxreg_ros.core.window import Estimate, PRIOR_POSES, Window
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, RefinedBoxes, Sweep, X, Z
@@ -44,8 +44,9 @@ Its argument is the number that refines every final box: one of each track in `l
 
 VELOCITY_OBSERVATIONS = 4
 """Observations that the input velocity is estimated from; chosen: 0.3 s at 10 Hz."""
-UNKNOWN_COVARIANCE = np.full((6, 6), inf)
-"""Covariance of a track without an estimate."""
+REACTION_TIME = 2.0
+"""Of tracks that cannot all be solved, those that are nearest after this time come first [s].
+Literature: the time headway that drivers are told to keep."""
 _OfTrack = tuple[ObservedTrack, PendingBox]
 """A box and its track; boxes do not refer to tracks: cycles would wait for garbage collection."""
 
@@ -132,10 +133,11 @@ class BoxRegistrar:
     points support it, refined or not.
 
     With a **budget**, waiting tracks that have no box here are solved first, since their boxes
-    become final before they end; then those that have waited longest, then those whose newest
-    estimate is least certain, then the nearest. The boxes of the others are kept for now,
-    with the reason ``budget``; their observations join the next window that is solved. After the
-    early boxes are published, `catch_up` solves tracks that wait, for their final boxes.
+    become final before they end; then as many of those that have waited longest as let every
+    track be solved before its boxes are final; then those that come nearest to a sensor within
+    `REACTION_TIME`. The boxes of the others are kept for now, with the reason ``budget``; their
+    observations join the next window that is solved. While there is time, `catch_up` solves
+    tracks that wait, for their final boxes.
 
     """
 
@@ -252,7 +254,7 @@ class BoxRegistrar:
         """
         waiting = [track for track in self._tracks.values() if track.num_carried]
         if waiting:
-            self._solve(_by_urgency(waiting)[:limit])
+            self._solve(_by_urgency(waiting, limit)[:limit])
         return self._returned()
 
     @property
@@ -487,14 +489,15 @@ class BoxRegistrar:
         # A track that has waited keeps two observations of its prior beside the new ones.
         longest_wait = min(self._lag + 1, self.config.window - PRIOR_POSES)
         num_last = num_ended + len(silent)
-        limit = self._budget(num_last + ceil(len(ready) / longest_wait))
+        num_rotating = ceil(len(ready) / longest_wait)
+        limit = self._budget(num_last + num_rotating)
         self._settle_ended_tracks_beyond(max(limit - len(ready), min(limit, num_ended)))
         limit = max(0, limit - len(self._ended_tracks))
         silent = silent[:limit]
         limit -= len(silent)
         if len(ready) <= limit:
             return silent + tracks
-        ready = _by_urgency(ready)
+        ready = _by_urgency(ready, num_rotating)
         for track in ready[limit:]:
             track.carry(self._num_overlapping)
         return silent + ready[:limit]
@@ -570,16 +573,36 @@ def _windows(tracks: Sequence[ObservedTrack]) -> list[Window]:
     return windows
 
 
-def _by_urgency(tracks: list[ObservedTrack]) -> list[ObservedTrack]:
-    """Return tracks ordered by the gain of solving them, highest gain first."""
+def _by_urgency(tracks: list[ObservedTrack], num_rotating: int) -> list[ObservedTrack]:
+    """
+    Return tracks in the order in which they are solved.
+
+    First `num_rotating` of those that have waited longest, then those that are nearest to a sensor
+    after `REACTION_TIME` if they approach it as they did.
+
+    """
     carried = np.array([track.num_carried for track in tracks])
-    known = [track.covariance for track in tracks]
-    covariances = np.array([UNKNOWN_COVARIANCE if c is None else c for c in known])  # (n, 6, 6)
-    variances = covariances[:, :3, :3].trace(axis1=1, axis2=2)  # of the position [m^2]
-    tables, rows = joined([track.entries[-1].observation for track in tracks])
-    sensors = Observations.concatenated(tables).origins[rows]
-    distances = np.linalg.norm(sensors, axis=2).min(1)  # (n,) [m]; NaN, the last, if unknown
-    return [tracks[i] for i in np.lexsort((distances, -variances, -carried)).tolist()]
+    before = [track.entries[-VELOCITY_OBSERVATIONS:][0] for track in tracks]
+    newest = [track.entries[-1] for track in tracks]
+    elapsed = 1e-9 * np.array(
+        [b.stamp_ns - a.stamp_ns for a, b in zip(before, newest, strict=True)]
+    )
+    ranges = _ranges([one.observation for one in newest])
+    approached = _ranges([one.observation for one in before]) - ranges
+    speed = np.divide(approached, elapsed, out=np.zeros(len(tracks)), where=elapsed > 0)
+    expected = ranges - REACTION_TIME * speed  # (n,) [m]; NaN, the last, if unknown
+    order = np.lexsort((expected, -carried))
+    rest = order[num_rotating:]
+    order[num_rotating:] = rest[np.argsort(expected[rest], kind='stable')]
+    return [tracks[i] for i in order.tolist()]
+
+
+def _ranges(seen: Sequence[Observation]) -> Floats:
+    """Return the distance of each box from the nearest sensor that sees it, (n,) [m]."""
+    ranges = np.empty(len(seen))
+    for table, places, rows in by_table(seen):
+        ranges[places] = np.linalg.norm(table.origins[rows], axis=2).min(1)
+    return ranges
 
 
 def _input_velocities(to_observe: list[_OfTrack], boxes: Floats, stamp_ns: int) -> Floats:

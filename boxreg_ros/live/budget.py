@@ -48,9 +48,9 @@ class TickBudget:
     those that no reserve would hold. So interruptions of the process cost the boxes of their own
     ticks, and none after them.
 
-    Final boxes are given up last. In a tick that is late with any plan, and after the early
-    boxes of any other, the windows that they need are solved, as long as these take no longer
-    than what a batch costs in any case (`BATCH_OVERHEAD`): else clouds would be dropped.
+    Final boxes are given up last: the windows that they need are solved in any case, as long as
+    these take no longer than what a batch costs (`BATCH_OVERHEAD`). A batch of their own, after
+    the early boxes, would take twice as long, and clouds would be dropped.
 
     `deadline`, which may change, is the maximum time from complete data to published early boxes
     [s]; negative: `PART_OF_PERIOD` of the measured period of the boxes. `solve` does the same as
@@ -73,7 +73,6 @@ class TickBudget:
         self._publishing_times = deque[float](maxlen=RECENT)  # [s]
         self._overruns = deque[tuple[float, float]]()  # when, and by how much [s]
         self._times = deque[float](maxlen=RECENT)  # per window [s]
-        self.owed = 0  # windows to solve once the early boxes are published
         self._arrivals = deque[float](maxlen=RECENT)
 
     def add_arrival(self, received: float) -> None:
@@ -87,7 +86,6 @@ class TickBudget:
         self._since = since
         self._solved_at = 0.0
         self._planned_end = inf
-        self.owed = 0
 
     def end(self) -> float | None:
         """
@@ -111,19 +109,15 @@ class TickBudget:
         `needed` is the number of windows per box array that refine every final box.
 
         """
-        self.owed = min(needed, BATCH_OVERHEAD)
         number = 0
         if self._times:
             planned_end = self._since + self.seconds - self._reserve
             time_left = planned_end - _median(self._publishing_times) - self._clock()
             number = int(time_left / _median(self._times)) - BATCH_OVERHEAD
-        if number > 0:
+        least = max(1, min(needed, BATCH_OVERHEAD))
+        if number >= least:  # the tick can be in time
             self._planned_end = planned_end
-            limit = number
-        else:  # the tick is late with any plan, or the first
-            limit = max(1, self.owed)
-        self.owed = max(0, self.owed - limit)
-        return limit
+        return max(number, least)
 
     def spare_windows(self) -> int:
         """Return how many windows fit into the part of the period that no deadline covers."""

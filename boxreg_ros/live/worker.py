@@ -347,16 +347,14 @@ class Worker:
             self.fixed_frame = self._live.session.fixed_frame
             self._logger.info(f'fixed frame is {self.fixed_frame!r}')
         self._publish(ready)
-        self._catch_up(self._budget.owed)
         if is_placeholder(item.content) and self._board.is_showing:
             self._markers.publish(self._board.clear())
         if isinstance(item.content, BoxArray):
             self._collect_garbage()
 
     def _catch_up(self, limit: int) -> None:
-        """Solve up to `limit` tracks that wait, after the early boxes are published."""
-        if limit > 0:
-            self._publish(self._guarded(partial(self._live.catch_up, limit)))
+        """Solve up to `limit` tracks that wait."""
+        self._publish(self._guarded(partial(self._live.catch_up, limit)))
 
     def _collect_garbage(self) -> None:
         """Free objects in cycles after a tick, so that no collection interrupts the next one."""

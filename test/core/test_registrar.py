@@ -1,7 +1,6 @@
 """Each box is returned once, in order, with its status; the same calls return the same boxes."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 from boxreg_ros import Config, refine
 from boxreg_ros.config import Ingredients
@@ -506,15 +505,15 @@ def test_an_ample_budget_changes_nothing(stream):
     assert_equal(fed(registrar, stream) + registrar.flush(), known)
 
 
-def test_tracks_beyond_the_budget_are_kept_and_solved_first_in_the_next_tick():
+def test_tracks_beyond_the_budget_are_kept_and_solved_in_turn():
     rng = np.random.default_rng(0)
     cars = [track_of(drive(12, start=(5.0, 8.0 * i, 0.0)), rng, str(i)) for i in range(4)]
     results, _ = fed_within(lambda _: 2, cars)
     early = [result for result in results if not result.is_final]
     solved = [{i for i, word in enumerate(r.status) if word == 'refined'} for r in early[2:]]
-    for one, next_one in pairwise(solved):
-        assert len(one) == 2
-        assert one | next_one == {0, 1, 2, 3}
+    assert {len(one) for one in solved} == {2}  # one in turn, and the nearest of the others
+    for i in range(len(solved) - 2):
+        assert set.union(*solved[i : i + 3]) == {0, 1, 2, 3}
     for result in early[2:]:
         for i, word in enumerate(result.status):
             if word == 'kept':
@@ -578,17 +577,27 @@ def test_waiting_tracks_catch_up_before_their_boxes_are_final():
     assert registrar.counts['budget'] == 0
 
 
-def test_the_least_certain_track_is_solved_first_then_the_nearest():
+def test_early_boxes_of_the_nearest_and_of_those_that_approach_are_refined():
+    # Six cars 8 m apart ahead of the sensor; a seventh, farther than half of them, comes nearer.
     rng = np.random.default_rng(0)
-    far = track_of(drive(8, start=(30.0, 4.0, 0.0)), rng, 'far')
-    near = track_of(drive(8, start=(8.0, 4.0, 0.0)), rng, 'near')
-    budgets = iter([2, 2, 1, 2, 2, 2, 1, 2])  # the third stamp has the first windows
-    results, _ = fed_within(lambda _: next(budgets), [far, near])
-    early = [result for result in results if not result.is_final]
-    assert early[2].status == ('kept', 'refined')
-    variance = np.trace(early[5].covariances[:, :3, :3], axis1=1, axis2=2)
-    assert early[6].status[variance.argmax()] == 'refined'
-    assert early[6].reasons[variance.argmin()] == 'budget'
+    cars = [track_of(drive(30, start=(10.0, 8.0 * i, 0.0)), rng, str(i)) for i in range(6)]
+    truth = drive(30, start=(10.0, 0.0, 0.0))
+    truth[:, 0] += 40.0 - 10.0 * 0.1 * np.arange(30)
+    cars.append(track_of(truth, rng, 'oncoming'))
+    asked = []
+
+    def half(needed):
+        asked.append(needed)
+        return 4
+
+    results, _ = fed_within(half, cars, window=10, lag=9)
+    early = [result for result in results if not result.is_final][15:]
+    share = np.mean([[word == 'refined' for word in r.status] for r in early], axis=0)
+    assert max(asked) == 1  # of each tick, for the final boxes
+    assert share[[0, 1]].min() > 0.9
+    assert share[6] > 0.5
+    assert share[[3, 4, 5]].max() < 0.5
+    assert {word for r in finals(results)[2:-10] for word in r.status} == {'refined'}
 
 
 def test_ended_tracks_beyond_the_budget_release_their_boxes():
