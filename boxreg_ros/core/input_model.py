@@ -288,15 +288,33 @@ class InputModel:
         settings = settings_of_kinds(config)
         of_faces = self.constants.with_settings(config).face_deviations
         for k in range(len(KINDS)):
-            tracks = np.concatenate([self._past[k], _shown(self._tracks[k])])
-            evidence = np.concatenate([tracks['evidence'], more[of_fits == k]])
-            if config.ingredients.population_extents and len(evidence):
-                found = population_slopes(evidence, self.constants)
-                inputs['median'][k], inputs['slopes'][k] = found
+            tracks = self._tracks_of(k)
             if len(tracks):
                 deviations = GAP_DEVIATIONS[KINDS[k]]
                 self._set_margins(inputs[k], tracks, settings[k], deviations, of_faces)
+        self.set_population(inputs, config, more, of_fits)
         return inputs
+
+    def set_population(
+        self, inputs: Inputs, config: Config, evidence: Floats, kinds: Ints
+    ) -> None:
+        """
+        Set the population of extents in records `INPUTS` (K,) (M18).
+
+        By the tracks of the model and further `evidence` (B, 3, 3) of tracks of `kinds` (B,).
+
+        """
+        if not config.ingredients.population_extents:
+            return
+        for k in range(len(KINDS)):
+            known = np.concatenate([self._tracks_of(k)['evidence'], evidence[kinds == k]])
+            if len(known):
+                found = population_slopes(known, self.constants)
+                inputs['median'][k], inputs['slopes'][k] = found
+
+    def _tracks_of(self, k: int) -> NDArray[np.void]:
+        """Return the tracks of one kind, with those of other drives, records `TRACK` (n,)."""
+        return np.concatenate([self._past[k], _shown(self._tracks[k])])
 
     def _set_margins(
         self,

@@ -112,16 +112,17 @@ def solve(
             rows = rows[~is_done]
             turn += 1
             if plan.estimates_noise:
+                evidence, kind = batch.solution.evidence, problem.kind
+                if turn > NOISE_ROUNDS:
+                    model.set_population(inputs, config, evidence, kind)
+                    continue
                 if turn == 1 and observe_margins:
                     observe_margins(batch.solution.poses)
-                if turn <= NOISE_ROUNDS:
-                    extents = batch.solution.shared[:, EXTENT:BIAS]
-                    residuals = normalised_residuals(problem, batch.solution.poses, extents)
+                extents = batch.solution.shared[:, EXTENT:BIAS]
+                residuals = normalised_residuals(problem, batch.solution.poses, extents)
                 if turn == NOISE_ROUNDS:
-                    model.add_noise(residuals, problem.kind)
-                inputs = model.inputs(
-                    config, fits=(residuals, batch.solution.evidence, problem.kind)
-                )
+                    model.add_noise(residuals, kind)
+                inputs = model.inputs(config, fits=(residuals, evidence, kind))
     model.latest = inputs
     return batch.solution
 
