@@ -189,6 +189,11 @@ class Tracker:
         """Return the ids of the tracks that may go on."""
         return self._tracks.ids
 
+    def known_velocities(self, max_deviation: float) -> Floats:
+        """Return the velocities (K, 3) of the tracks that err by less than this [m/s]."""
+        tracks = self._tracks
+        return tracks.velocities[tracks.covariances[:, 2] < max_deviation**2]
+
     def identify(self, boxes: BoxArray) -> BoxArray:
         """
         Return boxes in a fixed frame with ids; invalid boxes get the id ``''``.
@@ -276,12 +281,12 @@ class IdCheck:
 
     Where a box does not fit the track that had its id before, boxes are also associated by their
     motion alone: the id jumps if that gives the box to another object. `finding` says so once
-    enough have; it is empty before.
+    enough have; it is empty before. `tracker` has the objects, associated by motion alone.
 
     """
 
     def __init__(self, max_gap: float) -> None:
-        self._tracker = Tracker(max_gap)
+        self.tracker = Tracker(max_gap)
         self.jumps = 0
         self.boxes = 0
         self.new = 0
@@ -293,7 +298,7 @@ class IdCheck:
 
     def forget(self) -> None:
         """Forget all tracks, after a time jump; counts stay."""
-        self._tracker.forget()
+        self.tracker.forget()
         self._track_of: dict[str, str] = {}  # of the association, by the id of the input
 
     def add(self, boxes: BoxArray) -> None:
@@ -311,26 +316,26 @@ class IdCheck:
             self.nameless += boxes.track_ids.count('')
             boxes = boxes.take([row for row, name in enumerate(boxes.track_ids) if name])
         self.twice += len(boxes.track_ids) - len(set(boxes.track_ids))
-        associated = self._tracker.keep(boxes, self._track_of)
+        associated = self.tracker.keep(boxes, self._track_of)
         if associated is None:
-            associated = self._tracker.identify(boxes)
+            associated = self.tracker.identify(boxes)
             self.jumps += self._jumps(boxes, associated)
         known = sum(track_id in self._track_of for track_id in boxes.track_ids)
         self.boxes += known
-        if not set(self._tracker.track_ids).isdisjoint(self._track_of.values()):
+        if not set(self.tracker.track_ids).isdisjoint(self._track_of.values()):
             self.compared += len(boxes.track_ids)
             self.new += len(boxes.track_ids) - known
         pairs = zip(boxes.track_ids, associated.track_ids, strict=True)
         given = {track_id: name for track_id, name in pairs if name}
         # A track has the id that came with it last; where boxes lie on one another, another
         # track has it for a moment.
-        others = set(self._tracker.track_ids) - set(given.values())
+        others = set(self.tracker.track_ids) - set(given.values())
         kept = {track_id: name for track_id, name in self._track_of.items() if name in others}
         self._track_of = kept | given
 
     def _jumps(self, boxes: BoxArray, associated: BoxArray) -> int:
         """Count the boxes that are far from the track of their id, and on that of another."""
-        costs = self._tracker.costs
+        costs = self.tracker.costs
         column_of = {name: column for column, name in enumerate(costs.track_ids)}
         count = 0
         for row, cost in zip(costs.rows.tolist(), costs.values, strict=True):

@@ -19,6 +19,7 @@ from boxreg_ros.core.matching import AT_ONCE
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.axis_check import AxisCheck
 from boxreg_ros.io.cloud_check import CloudCheck
+from boxreg_ros.io.common_motion import CommonMotionCheck
 from boxreg_ros.io.findings import Finding
 from boxreg_ros.io.id_assignment import IdCheck, Tracker
 from boxreg_ros.io.items import Item
@@ -79,6 +80,7 @@ class Session:
         self._motion_check = MotionCheck(self.tree, bool(lidars.frames or lidars.info))
         self._id_check = None if convention.associate else IdCheck(config.max_gap)
         self._axis_check = AxisCheck(convention, config.drives)
+        self._common_motion = CommonMotionCheck()
         self._has_boxes_without_frame = False
         self._has_clouds_without_frame = False
         self._cloud_check = CloudCheck(is_merged=self._merger is not None)
@@ -102,6 +104,7 @@ class Session:
         self._place_check = PlaceCheck(self._convention, AT_ONCE)
         self._motion_check.restart()
         self._axis_check.forget()
+        self._common_motion.forget()
         if self._id_check is not None:
             self._id_check.forget()
         if self._merger is not None:
@@ -151,6 +154,10 @@ class Session:
                 moved = self._tracker.identify(moved)
             if self._id_check is not None:
                 self._id_check.add(moved)
+            tracker = self._tracker if self._id_check is None else self._id_check.tracker
+            if tracker is not None and self.sensor_frame:
+                route = self.tree.route(self.fixed_frame, self.sensor_frame)
+                self._common_motion.add(moved.stamp_ns, tracker, route)
             frame_yaw = float(np.arctan2(T_fixed_item[1, 0], T_fixed_item[0, 0]))
             self._axis_check.add(moved, frame_yaw)
         return item._replace(moved=moved, T_fixed_item=T_fixed_item, reason=reason, detail=detail)
@@ -235,6 +242,8 @@ class Session:
             )
             found.append(Finding(Reason.TRANSFORM_FAULT, text))
         found += self._cloud_check.findings
+        if self._common_motion.finding:
+            found.append(Finding(Reason.TRANSFORM_FAULT, self._common_motion.finding))
         if self._has_boxes_without_frame:
             text = (
                 f'boxes have an empty frame_id: expected the name of their frame; they are taken '
