@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 import csv
 from dataclasses import dataclass
 from functools import lru_cache
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.rotations import quaternion_from_rpy, rpy_from_quaternion
@@ -23,6 +23,7 @@ COLUMNS = (
 )  # fmt: skip
 FORMULA_STARTS = ('=', '+', '-', '@', '\t', '\r', "'")
 """Spreadsheets run cells that begin so as formulas, or hide the first character."""
+_T = TypeVar('_T')
 csv.field_size_limit(2**31 - 1)  # ids may be as long as messages
 
 
@@ -176,6 +177,28 @@ class BoxTable:
                     *map(protected, (self.frame_id, self.track_ids[i], self.class_names[i])),
                     *(f'{number:.9f}' for number in numbers), self.status[i], self.num_points[i],
                 ]))  # fmt: skip
+
+
+def read_by_box(path: Path, parsed: Callable[[dict[str, str]], _T]) -> dict[tuple[int, str], _T]:
+    """
+    Return what is `parsed` of each row of a table beside ``boxes.csv``, by stamp [ns] and id.
+
+    Of several rows of one box the first counts. Raises RecordingError if the table is damaged.
+
+    """
+    found: dict[tuple[int, str], _T] = {}
+    try:
+        with path.open(newline='', encoding='utf-8-sig') as file:
+            for row in csv.DictReader(file):
+                found.setdefault((int(row['stamp_ns']), unprotected(row['track_id'])), parsed(row))
+    except OSError as error:
+        raise RecordingError(unreadable(path, error)) from None
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
+        raise RecordingError(
+            f'{path}: expected the columns of {path.name} with a number in each cell, got '
+            f'{error}; relabel again, or delete the file'
+        ) from None
+    return found
 
 
 def csv_row(cells: Iterable[object]) -> str:

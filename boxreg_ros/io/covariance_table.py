@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-import csv
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import NamedTuple
 
-from boxreg_ros.errors import RecordingError, unreadable
-from boxreg_ros.io.box_table import cell, unprotected
+from boxreg_ros.io.box_table import cell, read_by_box
 from boxreg_ros.structures import Floats, KEPT, RefinedBoxes, X, Y
 import numpy as np
 
@@ -75,29 +72,15 @@ class CovarianceWriter:
 
 def read_covariances(path: Path) -> dict[tuple[int, str], BoxCovariance]:
     """Read a table of covariances, the first row of a stamp and id; RecordingError if damaged."""
-    try:
-        with path.open(newline='', encoding='utf-8-sig') as file:
-            found: dict[tuple[int, str], BoxCovariance] = {}
-            for key, covariance in _rows(csv.DictReader(file)):
-                found.setdefault(key, covariance)
-            return found
-    except OSError as error:
-        raise RecordingError(unreadable(path, error)) from None
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
-        raise RecordingError(
-            f'{path}: expected the columns of covariances.csv with a number in each cell, got '
-            f'{error}; relabel again, or delete the file'
-        ) from None
+    return read_by_box(path, _covariance)
 
 
-def _rows(reader: csv.DictReader[str]) -> Iterator[tuple[tuple[int, str], BoxCovariance]]:
-    """Yield stamp and track id, and the covariances, of each row."""
-    for row in reader:
-        numbers = np.array([float(row[name]) for name in COVARIANCE_NUMBERS])
-        pose = _symmetric(numbers[:NUM_POSE], 6)
-        extent = _symmetric(numbers[NUM_POSE:], 3)
-        key = int(row['stamp_ns']), unprotected(row['track_id'])
-        yield key, BoxCovariance(float(row['range'] or 'nan'), pose, extent)
+def _covariance(row: dict[str, str]) -> BoxCovariance:
+    """Return the covariances of a row."""
+    numbers = np.array([float(row[name]) for name in COVARIANCE_NUMBERS])
+    pose = _symmetric(numbers[:NUM_POSE], 6)
+    extent = _symmetric(numbers[NUM_POSE:], 3)
+    return BoxCovariance(float(row['range'] or 'nan'), pose, extent)
 
 
 def _symmetric(upper: Floats, size: int) -> Floats:

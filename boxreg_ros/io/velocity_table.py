@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 from itertools import combinations_with_replacement
 from pathlib import Path
 
-from boxreg_ros.errors import RecordingError, unreadable
-from boxreg_ros.io.box_table import cell, unprotected
+from boxreg_ros.io.box_table import cell, read_by_box
 from boxreg_ros.structures import KINEMATICS, RefinedBoxes
 import numpy as np
 from numpy.typing import NDArray
@@ -63,26 +61,12 @@ def read_velocities(path: Path) -> dict[tuple[int, str], NDArray[np.void]]:
     Raises RecordingError if the table is damaged.
 
     """
-    found: dict[tuple[int, str], NDArray[np.void]] = {}
-    try:
-        with path.open(newline='', encoding='utf-8-sig') as file:
-            for row in csv.DictReader(file):
-                texts = [row[name] for name in VELOCITY_COLUMNS[2:]]
-                numbers = np.array([float(text or 'nan') for text in texts])
-                key = int(row['stamp_ns']), unprotected(row['track_id'])
-                found.setdefault(key, _record(numbers))
-    except OSError as error:
-        raise RecordingError(unreadable(path, error)) from None
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
-        raise RecordingError(
-            f'{path}: expected the columns of velocities.csv with a number in each cell, got '
-            f'{error}; relabel again, or delete the file'
-        ) from None
-    return found
+    return read_by_box(path, _record)
 
 
-def _record(numbers: NDArray[np.float64]) -> NDArray[np.void]:
-    """Return the record of a row (23,) without its keys."""
+def _record(row: dict[str, str]) -> NDArray[np.void]:
+    """Return the record of a row."""
+    numbers = np.array([float(row[name] or 'nan') for name in VELOCITY_COLUMNS[2:]])
     record = np.zeros((), KINEMATICS)
     for name, size, begin in (('velocity', 4, 0), ('acceleration', 3, 14)):
         if not np.isfinite(numbers[begin]):
