@@ -3,7 +3,7 @@
 
 An ingredient is switched off by settings, or by one of `config.Ingredients`: each of the
 residuals of `core.method.residuals` by its name. Both estimates are measured, since some
-ingredients are part of one only.
+ingredients are part of one only. Losses have standard errors over tracks and draws.
 
 """
 
@@ -11,17 +11,19 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.method.constants import RESIDUAL_NAMES
+from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.offline.box_scores import Scores, summarise
+from boxreg_ros.structures import Floats
 from measure import RECORDINGS
 from measure.common import in_scope, SCOPE
 from measure.drives import Drive
 import numpy as np
+from numpy.typing import NDArray
 
 WHOLE = 'nothing'
 ABLATED_ESTIMATES = ('final', 'track')
@@ -102,86 +104,65 @@ ARGUMENTS = {
         'early (newest box), final (fixed lag), track (full sequence)',
         {'nargs': '+', 'choices': ('early', *ABLATED_ESTIMATES)},
     ),
-    '--greedy': (
-        float,
-        'also leave out the ingredient that costs least on average, then the next one beside it, '
-        'as long as the mean 3D IoU of an estimate falls by less than this',
-        {'metavar': 'LOSS'},
-    ),
+    '--draws': (1, 'draws of the errors of the input: those of the recording, and simulated ones'),
 }
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the scores without each ingredient, of each estimate on each recording."""
-    drives = {str(folder): Drive.read(folder) for folder in args.data}
-    report = {
-        folder: {
-            estimate: {
-                name: _scores(INGREDIENTS[name].settings, drive, estimate, args)
-                for name in (WHOLE, *args.without)
-            }
-            for estimate in args.estimate
+    """Return the losses without each ingredient, of each estimate on each recording."""
+    if args.draws < 1:
+        raise ConfigError(f'--draws: expected 1 or more, got {args.draws}')
+    report: dict[str, Any] = {}
+    for folder in args.data:
+        drive = Drive.read(folder)
+        drives = [drive, *(drive.redrawn(seed) for seed in range(1, args.draws))]
+        report[str(folder)] = {
+            estimate: _losses(drives, estimate, args) for estimate in args.estimate
         }
-        for folder, drive in drives.items()
-    }
-    plain: dict[str, Any] = {
-        folder: {
-            estimate: {name: asdict(scores) for name, scores in rows.items()}
-            for estimate, rows in found.items()
+    return report
+
+
+def _losses(
+    drives: Sequence[Drive], estimate: str, args: argparse.Namespace
+) -> dict[str, dict[str, float]]:
+    """Return 3D IoU, its loss and the error of that without each ingredient, over some draws."""
+
+    def ious(settings: Mapping[str, Any]) -> Floats:
+        return np.array([
+            in_scope(without(settings, drive, estimate), drive.truth, args).iou_3d
+            for drive in drives
+        ])  # fmt: skip
+
+    truth = drives[0].truth
+    tracks = np.array(truth.track_ids)[in_scope(truth, truth, args).rows]
+    whole = ious({})
+    rows = {}
+    for name in (WHOLE, *args.without):
+        found = whole if name == WHOLE else ious(INGREDIENTS[name].settings)
+        rows[name] = {
+            'iou_3d': float(found.mean()),
+            'loss': float((whole - found).mean()),
+            'loss_error': standard_error(whole - found, tracks),
         }
-        for folder, found in report.items()
-    }
-    if args.greedy is not None:
-        plain['greedy'] = greedy(drives, report, args)
-    return plain
+    return rows
 
 
-def _scores(
-    settings: Mapping[str, Any], drive: Drive, estimate: str, args: argparse.Namespace
-) -> Scores:
-    """Return the scores of an estimate with settings that switch ingredients off."""
-    return summarise(in_scope(without(settings, drive, estimate), drive.truth, args))
+def standard_error(values: Floats, tracks: NDArray[np.str_]) -> float:
+    """
+    Return the standard error of the mean of `values` (D, n) of D draws and n boxes of `tracks`.
 
+    The boxes of a track are no independent evidence, nor are those of a draw, which share what is
+    estimated of the input: clusters cross (Cameron, Gelbach & Miller, Journal of Business &
+    Economic Statistics 29, 2011). With one draw tracks alone count.
 
-def greedy(
-    drives: Mapping[str, Drive],
-    report: Mapping[str, Mapping[str, Mapping[str, Scores]]],
-    args: argparse.Namespace,
-) -> list[tuple[str, float]]:
-    """Leave the cheapest ingredient out, again and again; return names so far and their loss."""
-    whole = {
-        estimate: np.mean([found[estimate][WHOLE].iou_3d for found in report.values()])
-        for estimate in args.estimate
-    }
-
-    def loss(names: Sequence[str]) -> float:
-        settings = merged([INGREDIENTS[name].settings for name in names])
-        losses = []
-        for estimate in args.estimate:
-            scores = [_scores(settings, drive, estimate, args).iou_3d for drive in drives.values()]
-            losses.append(whole[estimate] - np.mean(scores))
-        return float(max(losses))
-
-    left, out = [*args.without], list[str]()
-    order = []
-    while left:
-        costs = {name: loss([*out, name]) for name in left}
-        cheapest = min(costs, key=lambda name: costs[name])
-        if costs[cheapest] > args.greedy:
-            break
-        left.remove(cheapest)
-        out.append(cheapest)
-        order.append((', '.join(out), costs[cheapest]))
-    return order
-
-
-def merged(settings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the settings that switch several ingredients off; residuals add up."""
-    found: dict[str, Any] = {}
-    for one in settings:
-        for name, value in one.items():
-            found[name] = (*found.get(name, ()), *value) if isinstance(value, tuple) else value
-    return found
+    """
+    off = values - values.mean()
+    names, track = np.unique(tracks, return_inverse=True)
+    cells = np.array([np.bincount(track, row, len(names)) for row in off])  # (D, tracks)
+    by_track = np.square(cells.sum(0)).sum()
+    crossed = by_track + np.square(cells.sum(1)).sum() - np.square(cells).sum()
+    few = len(names) / max(len(names) - 1, 1)
+    return float(np.sqrt(few * max(by_track, crossed)) / values.size)
 
 
 def without(settings: Mapping[str, Any], drive: Drive, estimate: str = 'track') -> BoxTable:

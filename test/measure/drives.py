@@ -16,6 +16,7 @@ from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.io.transforms import sweep_to_frame
 from boxreg_ros.offline import drive
 from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.simulation.noise import detector_noise
 from boxreg_ros.simulation.scene import SimulatedScene
 from boxreg_ros.structures import (
     BOX_EXTENT,
@@ -57,6 +58,24 @@ class Drive(drive.Drive):
         if len(found) != 1:
             raise RecordingError(f'{folder}: expected one recording in it, got {len(found)}')
         return cls.of(Recording(found, lidars), truth)
+
+    def redrawn(self, seed: int) -> Drive:
+        """Return the drive with the simulated errors of a detector, another draw for each seed."""
+        truth, rng = self.truth, np.random.default_rng(seed)
+        boxes, ids = truth.boxes.copy(), np.array(truth.track_ids)
+        for name in dict.fromkeys(truth.track_ids):
+            rows = np.flatnonzero(ids == name)
+            rows = rows[np.argsort(truth.stamps_ns[rows], kind='stable')]
+            sweeps = self.sweeps_at(truth.stamps_ns[rows])
+            origins = np.array([sweep.origin for sweep in sweeps])
+            boxes[rows] = detector_noise(truth.boxes[rows], origins, rng)
+        arrays = []
+        for stamp_ns in np.unique(truth.stamps_ns).tolist():
+            at = np.flatnonzero(truth.stamps_ns == stamp_ns)
+            names = tuple(truth.class_names[row] for row in at)
+            columns = tuple(ids[at].tolist()), names, np.ones(len(at)), boxes[at]
+            arrays.append(BoxArray(stamp_ns, truth.frame_id, *columns))
+        return replace(self, boxes=tuple(arrays))
 
     def registered(self, config: Config) -> dict[str, BoxTable]:
         """Return refined boxes by estimate: 'early' and that of `config`, from one run."""
