@@ -189,7 +189,7 @@ class InputModel:
         problem: Problem,
         terms: NDArray[np.void],
         inputs: Inputs,
-        is_input: bool,
+        is_input: bool = False,
     ) -> None:
         """Add face observations, of records `TERMS` (B, N), that were made with `inputs`."""
         kinds = problem.kind

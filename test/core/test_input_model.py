@@ -476,8 +476,7 @@ def show_faces(
     terms['visibility'], terms['num_points'] = float(seen), count
     terms['inset_shares'] = np.array([hidden, distant])[:, None]
     kind = np.full(b, KINDS.index(of_kind))
-    problem = problem_of(np.zeros((b, n, 9)), kind=kind)
-    model._add(names, problem, terms, inputs, is_input=False)
+    model._add(names, problem_of(np.zeros((b, n, 9)), kind=kind), terms, inputs)
 
 
 def test_margins_of_one_kind_do_not_change_those_of_others():
