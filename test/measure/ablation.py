@@ -159,10 +159,13 @@ def standard_error(values: Floats, tracks: NDArray[np.str_]) -> float:
     off = values - values.mean()
     names, track = np.unique(tracks, return_inverse=True)
     cells = np.array([np.bincount(track, row, len(names)) for row in off])  # (D, tracks)
-    by_track = np.square(cells.sum(0)).sum()
-    crossed = by_track + np.square(cells.sum(1)).sum() - np.square(cells).sum()
-    few = len(names) / max(len(names) - 1, 1)
-    return float(np.sqrt(few * max(by_track, crossed)) / values.size)
+    by_track, by_draw, by_both = map(_sum_of_squares, (cells.sum(0), cells.sum(1), cells.ravel()))
+    return float(np.sqrt(max(by_track, by_track + by_draw - by_both)) / values.size)
+
+
+def _sum_of_squares(sums: Floats) -> float:
+    """Return the sum of squares of the sums of n clusters, as of a variance."""
+    return float(np.square(sums).sum() * len(sums) / max(len(sums) - 1, 1))
 
 
 def without(settings: Mapping[str, Any], drive: Drive, estimate: str = 'track') -> BoxTable:

@@ -60,7 +60,7 @@ class Drive(drive.Drive):
         return cls.of(Recording(found, lidars), truth)
 
     def redrawn(self, seed: int) -> Drive:
-        """Return the drive with the simulated errors of a detector, another draw for each seed."""
+        """Return the drive with true boxes with the simulated errors of a detector, by a seed."""
         truth, rng = self.truth, np.random.default_rng(seed)
         boxes, ids = truth.boxes.copy(), np.array(truth.track_ids)
         for name in dict.fromkeys(truth.track_ids):

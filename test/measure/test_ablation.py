@@ -4,9 +4,11 @@ from dataclasses import fields
 import json
 
 from boxreg_ros.config import Ingredients, settings
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.box_scores import match
 from boxreg_ros.simulation.simulate import simulate
 from measure import main
-from measure.ablation import INGREDIENTS, merged, WHOLE, without
+from measure.ablation import INGREDIENTS, standard_error, WHOLE, without
 from measure.drives import Drive
 import numpy as np
 import pytest
@@ -72,16 +74,29 @@ def test_losses_are_printed(tmp_path, scene, capsys):
     for rows in found.values():
         assert set(rows) == {WHOLE, 'one extent'}
         assert 0.5 < rows[WHOLE]['iou_3d'] < 1
+        assert rows['one extent']['loss'] > 2 * rows['one extent']['loss_error'] > 0
+    assert main([*options, '--draws', '0']) == 1
+    assert '--draws: expected 1 or more, got 0' in capsys.readouterr().err
 
 
-def test_ingredients_are_left_out_one_after_the_other():
-    settings = [INGREDIENTS[name].settings for name in ('rigid shape', 'road', 'slip')]
-    known = {'ingredients.without': ('rigid shape', 'slip'), 'ingredients.road': False}
-    assert merged(settings) == known
+def test_standard_errors_are_those_of_tracks_and_of_draws():
+    tracks = np.array(['a', 'a', 'b', 'b'])
+    of_tracks = np.array([[1.0, 1.0, -1.0, -1.0]])  # two means of 1 and -1
+    assert standard_error(of_tracks, tracks) == pytest.approx(1.0)
+    assert standard_error(np.repeat(of_tracks, 5, axis=0), tracks) == pytest.approx(1.0)
+    of_draws = np.array([[1.0] * 4, [-1.0] * 4])  # tracks agree, draws do not
+    assert standard_error(of_draws, tracks) > 0.5
+    assert standard_error(0 * of_draws, tracks) == 0
 
 
-def test_estimates_differ(drive, whole):
-    newest, final = (without({}, drive, name) for name in ('early', 'final'))
-    for one, other in ((newest, final), (final, whole), (newest, whole)):
-        assert len(one.boxes) == len(other.boxes)
-        assert np.abs(one.boxes - other.boxes).max() > 1e-3
+def test_draws_have_the_errors_of_a_detector(drive):
+    once, again, other = (drive.redrawn(seed).boxes for seed in (1, 1, 2))
+    for draws in zip(once, again, other, drive.boxes, strict=True):
+        own, same, new, recorded = draws
+        assert own.stamp_ns == recorded.stamp_ns
+        assert set(own.track_ids) >= set(recorded.track_ids)
+        np.testing.assert_array_equal(own.boxes, same.boxes)
+        assert (own.boxes != new.boxes).any(1).all()
+    found = match(BoxTable.from_arrays(once), drive.truth)
+    assert found.is_matched.all()
+    assert 0.6 < found.iou_3d.mean() < 0.9
