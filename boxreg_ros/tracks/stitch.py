@@ -177,8 +177,8 @@ def _position_cost(known: EndMotion, other: EndMotion) -> tuple[float, float]:
 
 
 TURNS_PART = 0.5
-"""Part of the boxes of two tracks that are at one place, for both to be one object; chosen: the
-majority."""
+"""Part of the boxes of a track that are where gaps of another one with more evidence are filled,
+for both to be one object; chosen: the majority."""
 
 
 def join_turns(
@@ -215,9 +215,9 @@ def join_turns(
 
 def _take_turns(first: Tracklet, second: Tracklet, config: Config) -> bool:
     """
-    Return whether two tracks are one object that has a box of either at most stamps.
+    Return whether most boxes of the second track are where gaps of the first are filled.
 
-    Boxes at one stamp overlap, and boxes in a gap of the other track are where it is filled.
+    Boxes at a stamp of the first one do not count: two objects that overlap have many of them.
 
     """
     is_apart = second.last_ns < first.first_ns or first.last_ns < second.first_ns
@@ -227,20 +227,10 @@ def _take_turns(first: Tracklet, second: Tracklet, config: Config) -> bool:
     away = np.linalg.norm(second.boxes[:, X : Y + 1] - np.stack(centers, axis=1), axis=1)
     if away.min() > max(first.boxes[0, LENGTH], second.boxes[0, LENGTH]):
         return False
-    _, rows, others = np.intersect1d(first.stamps_ns, second.stamps_ns, return_indices=True)
-    turns = _owned_turns(first, second, config) + _owned_turns(second, first, config)
-    votes = turns + [
-        is_owned(first.boxes[row], second.boxes[other][None])
-        for row, other in zip(rows, others, strict=True)
-    ]
-    return any(turns) and float(np.mean(votes)) >= TURNS_PART
-
-
-def _owned_turns(tracklet: Tracklet, other: Tracklet, config: Config) -> list[bool]:
-    """Return for each box of another track in a gap whether it is where one would be filled in."""
-    box_at = dict(zip(other.stamps_ns.tolist(), other.boxes, strict=True))
-    return [
+    box_at = dict(zip(second.stamps_ns.tolist(), second.boxes, strict=True))
+    turns = sum(
         is_owned(box, box_at[stamp_ns][None])
-        for gap in fill(tracklet, other.stamps_ns, config)
+        for gap in fill(first, second.stamps_ns, config)
         for stamp_ns, box in zip(gap.stamps_ns.tolist(), gap.boxes, strict=True)
-    ]
+    )
+    return turns >= TURNS_PART * len(second.stamps_ns)

@@ -301,7 +301,8 @@ def test_tracks_that_take_turns_are_one():
     beside = tracklet('b', car[of_b] + 2.5 * np.eye(9)[1], steps=of_b)
     rider = tracklet('b', car[of_b], steps=of_b, class_name='cyclist')
     ahead = tracklet('b', car[:38] + 5.0 * np.eye(9)[0], steps=steps[:38])
-    for other in (beside, rider, ahead):
+    over = tracklet('b', car[:38] + 1.0 * np.eye(9)[1], steps=steps[:38], points=1)
+    for other in (beside, rider, ahead, over):
         assert set(ids(join_turns([first, other], CONFIG)[0])) == {'a', 'b'}
 
 
