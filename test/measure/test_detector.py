@@ -126,7 +126,11 @@ def test_errors_of_labels_by_hand(drive):
     turned_boxes[:, YAW] = wrap_angle(turned_boxes[:, YAW] + np.pi)
     first = np.arange(len(scoped.boxes)) > 0
     table = replace(scoped, boxes=turned_boxes, frame_id=truth.frame_id).rows(first)
-    errors = errors_of([table], [truth], '')
+    found = errors_of({'raw': [scoped], 'turned': [table]}, [truth])
+    assert found['raw']['']['recall'] == 1
+    errors = found['turned']['']
+    assert errors['gain'] == pytest.approx(0, abs=1e-9)
+    assert found['turned']['car']['boxes'] < errors['boxes']
     assert errors['boxes'] == len(first)
     assert errors['recall'] == pytest.approx(first.mean())
     assert errors['false'] == 0

@@ -11,6 +11,7 @@ drives, labels and scores: a run that has ended goes on where it was.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 import sys
 from typing import NamedTuple
@@ -21,6 +22,7 @@ from measure.detector.drives import recorded, stored, StoredDrive, street
 from measure.detector.labels import (
     detected,
     errors_of,
+    in_reach,
     labels_of,
     MIN_TRUE_POINTS,
     OPTIONS,
@@ -93,10 +95,15 @@ def wanted(seeds: int) -> Iterator[Training]:
     for source in ('raw', 'true'):
         yield Training(SCRATCH, source, 0)
     for seed in range(seeds):
-        for source in ('raw', 'true', COMPLETED, 'smoothed', 'early'):
+        for source in ('raw', 'true', 'track', COMPLETED):
             yield Training('own', source, seed)
-    yield Training('own', 'track', 0)
-    yield Training('second', COMPLETED, 0)
+        if seed == 0:
+            for source in ('smoothed', 'early'):
+                yield Training('own', source, 0)
+    for seed in range(1, seeds):
+        for source in ('smoothed', 'early'):
+            yield Training('own', source, seed)
+    yield Training('second', 'track', 0)
     for missed in MISSED:
         for source in ('raw', COMPLETED):
             yield Training(f'published, {missed} in ten missing', source, 0)
@@ -133,18 +140,24 @@ class Experiment:
     def label_errors(self) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
         """Return the errors of stored labels by detector, source and class; '' for all classes."""
         found = {}
-        truths = [drive.truth for drive in self._parts['others']]
+        drives = self._parts['others']
+        truths = [
+            replace(
+                drive.truth,
+                num_points=drive.truth.num_points * in_reach(drive.truth, drive.frames),
+            )
+            for drive in drives
+        ]
         for folder in sorted((self._out / 'labels').iterdir()):
-            paths = [folder / f'{drive.name}.pickle' for drive in self._parts['others']]
-            if all(path.is_file() for path in paths):
-                of_drives = [stored(path, dict) for path in paths]
-                found[folder.name] = {
-                    source: {
-                        kind: errors_of([labels[source] for labels in of_drives], truths, kind)
-                        for kind in ('', *CLASSES)
-                    }
-                    for source in of_drives[0]
-                }
+            paths = [folder / f'{drive.name}.pickle' for drive in drives]
+            if not all(path.is_file() for path in paths):
+                continue
+            labels: dict[str, list[BoxTable]] = {}
+            for path, drive in zip(paths, drives, strict=True):
+                for source, table in stored(path, dict).items():
+                    within = table.rows(in_reach(table, drive.frames))
+                    labels.setdefault(source, []).append(within)
+            found[folder.name] = errors_of(labels, truths)
         return found
 
     def _model(self, training: Training) -> Detector:
@@ -174,7 +187,7 @@ class Experiment:
 
         def make() -> dict[str, BoxTable]:
             boxes = self._boxes(detector, drive)
-            sources = OPTIONS if detector == 'own' else [COMPLETED]
+            sources = OPTIONS if detector in ('own', 'second') else [COMPLETED]
             return relabelled(drive.recording, boxes, folder / drive.name, sources)
 
         return stored(folder / f'{drive.name}.pickle', make)
@@ -185,7 +198,7 @@ class Experiment:
             missed = int(detector.split()[1]) / 10
             rng = np.random.default_rng(0)
             return drive.published.rows(rng.random(len(drive.published.boxes)) >= missed)
-        teacher = Training('own', COMPLETED, 0) if detector == 'second' else TEACHER
+        teacher = Training('own', 'track', 0) if detector == 'second' else TEACHER
         return detected(self._model(teacher), drive.frames, drive.truth.frame_id)
 
     def _tested(self, model: Detector) -> Scores:

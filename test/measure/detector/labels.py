@@ -12,18 +12,21 @@ from boxreg_ros import cli
 from boxreg_ros.core.refine import Track
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.offline.box_scores import by_overlap, match, summarise
+from boxreg_ros.offline.box_scores import by_overlap, match, Matches
 from boxreg_ros.offline.track_scores import track_scores
 from boxreg_ros.structures import BoxArray, REJECTED
 from measure.detector.frames import Frame, num_points, REACH
 from measure.detector.network import CLASSES, detections, Detector, Labels
 from measure.methods import smoothed
+from measure.real import paired, PairedBoxes
 import numpy as np
 
 SCORE = 0.3
 """Least score of a detection that becomes a label; chosen."""
 MIN_LABEL_POINTS = 3
 """Labels with fewer points above the ground are left out of the training, as of any source."""
+EDGE = 2.0
+"""Labels and true boxes so close to the end of the reach have no score as labels [m]."""
 MIN_TRUE_POINTS = 5
 """True boxes with fewer points are not in scope of any score."""
 ERRORS = ('along', 'across', 'up', 'yaw', 'length', 'width', 'height')
@@ -130,45 +133,83 @@ def with_points(truth: BoxTable, frames: list[Frame]) -> BoxTable:
     return replace(truth, num_points=counts).rows(counts >= 0)
 
 
-def errors_of(tables: list[BoxTable], truths: list[BoxTable], class_name: str) -> dict[str, float]:
-    """
-    Return how labels of several drives differ from the true boxes of a class, '' for all.
+def in_reach(table: BoxTable, frames: list[Frame]) -> np.ndarray:
+    """Return which boxes (n,) of a table are clearly within reach of the sensor."""
+    found = np.zeros(len(table.boxes), bool)
+    for frame in frames:
+        rows = np.flatnonzero(table.stamps_ns == frame.stamp_ns)
+        found[rows] = np.abs(frame.local(table.boxes[rows])[:, :2]).max(axis=1) < REACH - EDGE
+    return found
 
-    Recall, IoU and flips of matched boxes; of all classes also false labels for each true box and
-    the scores of tracks; and of the errors along, across, up, of yaw and of extents the mean, the
-    robust standard deviation, that of the means of tracks, that within a track, and the
-    autocorrelation of the latter after one sweep.
+
+def errors_of(
+    labels: dict[str, list[BoxTable]], truths: list[BoxTable], first: str = 'raw'
+) -> dict[str, dict[str, dict[str, float]]]:
+    """
+    Return how labels of several drives differ from the true boxes, by source and class.
+
+    Of all classes (''), false labels for each true box and the scores of tracks; and of each
+    class recall, IoU and flips of matched boxes, the gain of IoU over those of the `first` source
+    with its standard error over tracks, and of the errors along, across, up, of yaw and of
+    extents the mean, the robust standard deviation, the deviation of the means of tracks, that
+    within a track, and the autocorrelation of the latter after one sweep.
 
     """
-    words = [class_name] if class_name else []
-    pairs = [
-        (match(table, truth, MIN_TRUE_POINTS, words, by_overlap), truth)
-        for table, truth in zip(tables, truths, strict=True)
-    ]
-    is_found = np.concatenate([found.is_matched for found, _ in pairs])
-    columns = {'bev': 'iou_bev', '3d': 'iou_3d'}
-    iou = {key: np.concatenate([getattr(m, name) for m, _ in pairs])[is_found]
-           for key, name in columns.items()}  # fmt: skip
-    flips = np.concatenate([found.is_flipped for found, _ in pairs])[is_found]
-    result = {
+    matches = {
+        source: [
+            match(table, truth, MIN_TRUE_POINTS, (), by_overlap)
+            for table, truth in zip(tables, truths, strict=True)
+        ]
+        for source, tables in labels.items()
+    }
+    result: dict[str, dict[str, dict[str, float]]] = {}
+    for source, found in matches.items():
+        of_source = result.setdefault(source, {})
+        for kind in ('', *CLASSES):
+            masks = [
+                np.array([not kind or name.lower() == kind for name in one.class_names], bool)
+                for one in found
+            ]
+            if any(mask.any() for mask in masks):
+                of_source[kind] = _errors(found, matches[first], truths, masks)
+        of_source[''] |= _of_tracks(labels[source], truths)
+        unmatched = sum(one.unmatched for one in found)
+        of_source['']['false'] = unmatched / of_source['']['boxes']
+    return result
+
+
+def _errors(
+    matches: list[Matches], firsts: list[Matches], truths: list[BoxTable], masks: list[np.ndarray]
+) -> dict[str, float]:
+    """Return the errors of the true boxes of each drive where its mask (n,) is True."""
+    drives = list(zip(matches, truths, masks, strict=True))
+    is_found = np.concatenate([one.is_matched[mask] for one, _, mask in drives])
+    bev, whole, flips = (
+        np.concatenate([getattr(one, name)[mask] for one, _, mask in drives])[is_found]
+        for name in ('iou_bev', 'iou_3d', 'is_flipped')
+    )
+    parts = {
+        str(drive): paired(one, firsts[drive], truth, mask)
+        for drive, (one, truth, mask) in enumerate(drives)
+    }
+    gain = PairedBoxes.pooled(parts).difference()
+    errors, tracks = [], []
+    for drive, (one, truth, mask) in enumerate(drives):
+        rows = np.flatnonzero(one.is_matched & mask)
+        yaw = one.rotation[rows, 2]
+        yaw = np.degrees((yaw + np.pi / 2) % np.pi - np.pi / 2)  # without flips
+        errors.append(np.column_stack([one.translation[rows], yaw, one.extent[rows]]))
+        tracks += [f'{drive}/{truth.track_ids[one.rows[row]]}' for row in rows]
+    return {
         'boxes': len(is_found),
         'recall': float(is_found.mean()),
-        'iou_bev': float(iou['bev'].mean()),
-        'iou_3d': float(iou['3d'].mean()),
-        'over_0.7': float((iou['3d'] >= 0.7).sum() / len(is_found)),
+        'iou_bev': float(bev.mean()),
+        'iou_3d': float(whole.mean()),
+        'over_0.7': float((whole >= 0.7).sum() / len(is_found)),
         'flips': float(flips.mean()),
-    }
-    if not class_name:
-        result |= _of_tracks(tables, truths)
-        result['false'] = sum(summarise(found).unmatched for found, _ in pairs) / len(is_found)
-    errors, tracks = [], []
-    for drive, (found, truth) in enumerate(pairs):
-        rows = np.flatnonzero(found.is_matched)
-        yaw = found.rotation[rows, 2]
-        yaw = np.degrees((yaw + np.pi / 2) % np.pi - np.pi / 2)  # without flips
-        errors.append(np.column_stack([found.translation[rows], yaw, found.extent[rows]]))
-        tracks += [f'{drive}/{truth.track_ids[found.rows[row]]}' for row in rows]
-    return result | _spreads(np.concatenate(errors), np.array(tracks, str))
+        'gain': gain.iou_3d,
+        'gain_error': gain.iou_3d_error,
+    } | _spreads(np.concatenate(errors), np.array(tracks, str))
 
 
 def _of_tracks(tables: list[BoxTable], truths: list[BoxTable]) -> dict[str, float]:
