@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.linalg import vector_norm
 
 SUFFICIENT_DECREASE = 1e-4
 """Part of the predicted decrease that a step must reach: c1 of Armijo's condition. Literature:
@@ -176,23 +177,24 @@ def _after_trial(search: _Search, best: Minimum, function: Function, history: in
 
     """
     rows, value, slope, step = search.rows, search.value, search.slope, search.step
-    trial, trial_gradient = function(search.x + step[:, None] * search.direction, rows)
+    s = step[:, None] * search.direction
+    trial, trial_gradient = function(search.x + s, rows)
     has_decreased = trial <= value + SUFFICIENT_DECREASE * step * slope
     is_good = _are_finite(trial, trial_gradient) & has_decreased
+    y = trial_gradient - search.gradient
     if not is_good.all():
         is_stuck = ~is_good & (search.tries == MAX_BACKTRACKS)
         best.status[rows] += int(Status.STUCK) * is_stuck
         step = _shorter(step, slope, trial - value)
-
-    s = torch.where(is_good, search.step, 0.0)[:, None] * search.direction
-    y = torch.where(is_good[:, None], trial_gradient - search.gradient, 0.0)
+        s, y = (torch.where(is_good[:, None], change, 0.0) for change in (s, y))
+        trial = torch.where(is_good, trial, value)
     s_y = (s * y).sum(1)
-    is_curved = s_y > MIN_CURVATURE * s.norm(dim=1) * y.norm(dim=1)
+    is_curved = s_y > MIN_CURVATURE * vector_norm(s, dim=1) * vector_norm(y, dim=1)
     pair = s, y, torch.where(is_curved, 1 / s_y, 0.0)
 
     search = search._replace(
         x=search.x + s,
-        value=torch.where(is_good, trial, value),
+        value=trial,
         gradient=search.gradient + y,
         step=step,
         has_moved=is_good,
