@@ -137,19 +137,26 @@ def substitute_forward(U, x, count):
 
 
 @loop
+def solve_corner(U, x):
+    """Replace a right side `x` (m,) by the solution of U' U x = b, for an upper triangle U."""
+    size = len(x)
+    for s in range(size):
+        x[s] /= U[s, s]
+        for t in range(s + 1, size):
+            x[t] -= U[s, t] * x[s]
+    for s in range(size - 1, -1, -1):
+        for t in range(s + 1, size):
+            x[s] -= U[s, t] * x[t]
+        x[s] /= U[s, s]
+
+
+@loop
 def solve(U, x):
     """Replace a right side `x` (6 N + 23,) by the solution of U' U x = b."""
     links, border, corner = U
     n = len(x) - SHARED
     substitute_forward(U, x, n)
-    for s in range(SHARED):
-        x[n + s] /= corner[s, s]
-        for t in range(s + 1, SHARED):
-            x[n + t] -= corner[s, t] * x[n + s]
-    for s in range(SHARED - 1, -1, -1):
-        for t in range(s + 1, SHARED):
-            x[n + s] -= corner[s, t] * x[n + t]
-        x[n + s] /= corner[s, s]
+    solve_corner(corner, x[n:])
     for i in range(n - 1, -1, -1):
         pose, a = i // POSE, i % POSE
         first = POSE * pose

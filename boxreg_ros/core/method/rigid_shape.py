@@ -11,7 +11,9 @@ in point-to-plane ICP.
 from math import sqrt
 from typing import Any, NamedTuple
 
+from boxreg_ros.core.method.arrowhead import factorise_corner, solve_corner
 from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.eigen import eigenvalues, eigenvector
 from boxreg_ros.core.method.faces import fill_moved, fill_velocity, to_box_axes
 from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
@@ -46,14 +48,15 @@ def fill_planes(sums, roughness, constants, planes, thickness):
             continue
         mean = sums[cell, :3, 3] / number
         covariance = sums[cell, :3, :3] / number - mean * mean.reshape(3, 1)
-        power, axes = np.linalg.eigh(covariance)
+        power = eigenvalues(covariance)
         thick = max(power[0], 0.0) + roughness**2
         if power[1] > constants.min_flatness * thick:
             thickness[cell] = thick
+            normal = eigenvector(covariance, power[0])
             planes[cell, 3] = 0.0
             for k in range(3):
-                planes[cell, k] = axes[k, 0]
-                planes[cell, 3] -= axes[k, 0] * mean[k]
+                planes[cell, k] = normal[k]
+                planes[cell, 3] -= normal[k] * mean[k]
 
 
 class ShapeWork(NamedTuple):
@@ -139,16 +142,21 @@ def fill_agreement(m, local, half, constants, work, total, wanted):
         lever[4] = z * a - x * d
         lever[5] = x * c - y * a
         for j in range(6):
-            pull[j] += weight * lever[j] * off
-            for k in range(6):
-                total[j, k] += weight * lever[j] * lever[k]
+            weighted = weight * lever[j]
+            pull[j] += weighted * off
+            for k in range(j, 6):
+                total[j, k] += weighted * lever[k]
     # So many points of one observation err on their own.
     scale = constants.effective_points / max(float(used), constants.effective_points)
     for j in range(6):
         pull[j] *= scale
-        for k in range(6):
+        for k in range(j, 6):
             total[j, k] *= scale
-    wanted[:] = np.linalg.solve(total + STEP_RIDGE * np.eye(6), pull)
+            total[k, j] = total[j, k]
+    factor = total + STEP_RIDGE * np.eye(6)
+    factorise_corner(factor)
+    wanted[:] = pull
+    solve_corner(factor, wanted)
 
 
 @loop
