@@ -218,19 +218,12 @@ def _times(store: Path) -> Iterable[str]:
             f'{relabel["memory, shared once"]:.0f}',
             f'at most {WANTED["relabel: memory, shared once"]:g}',
         ],
-        *(
-            [
-                f'one sweep of {n} tracks [ms]',
-                f'{ticks[n]:.1f}',
-                f'at most {WANTED[f"ticks: {n}"]:g}',
-            ]
-            for n in ('8', '64', '512')
-        ),
+        *([f'one sweep of {n} tracks [ms]', f'{ticks[n]:.1f}', ''] for n in ('8', '64', '512')),
         ['tracks held at 10 Hz', str(found['held tracks']), f'at least {WANTED["held tracks"]:g}'],
         [
             f'`refine`, per window [ms] (`torch.optim.LBFGS`: {solver["reference"]:.0f})',
             f'{solver["refine, track"]:.2f}, {times:.0f} times faster',
-            f'at least {WANTED["solver: times faster"]:g} times',
+            '',
         ],
         [
             f'crop of a sweep [ms] (numpy, box by box: {crop["numpy, box by box"]:.0f})',

@@ -12,8 +12,7 @@ from measure.speed.reference import compare
 from measure.speed.scaling import cores, crop, held_tracks, scaling, tick
 
 WANTED = {
-    'ticks: 8': 2.0, 'ticks: 64': 8.0, 'ticks: 512': 50.0, 'held tracks': 400.0,
-    'solver: times faster': 150.0, 'relabel: faster, long': 15.0, 'relabel: start': 1.5,
+    'held tracks': 400.0, 'relabel: faster, long': 15.0, 'relabel: start': 1.5,
     'relabel: help': 0.5, 'relabel: memory, shared once': 700.0,
 }  # fmt: skip
 """Aims by the name of the number. Chosen."""
