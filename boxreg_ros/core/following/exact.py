@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, ROLL, YAW
 import numpy as np
 from scipy.interpolate import CubicSpline
-
-Curve = Callable[[Floats, Floats, Floats], Floats]
-"""Values (m, 9) at times (m,) [s] through values (n, 9) at times (n,) [s]."""
 
 
 class Keyframes(NamedTuple):
@@ -46,12 +42,22 @@ def between_exact(stamps_ns: Ints, boxes: Floats, keyframes: Keyframes) -> Float
     start_ns = keyframes.stamps_ns[0]
     at = (keyframes.stamps_ns - start_ns) * 1e-9
     times = (stamps_ns - start_ns) * 1e-9
+    is_between = (times > at[0]) & (times < at[-1]) & ~np.isin(times, at)
+    if not is_between.any():
+        return found
     keys = keyframes.boxes.copy()
     keys[:, ROLL:] = np.unwrap(keys[:, ROLL:], axis=0)
     half_length = keys[1:-1, LENGTH, None] / 2
     residuals = keyframes.residuals
-    errors = np.array([_left_out(at, keys, curve, half_length) for curve in (_line, _spline)])
-    of_fits = _left_out(at, residuals, _line, half_length)  # (n - 2,)
+    errors = np.array(
+        [
+            _sizes(keys[1:-1] - _line_without(at, keys), half_length),
+            _sizes(keys[1:-1] - _spline_without(at, keys), half_length),
+        ]
+    )
+    of_fits = _sizes(residuals[1:-1] - _line_without(at, residuals), half_length)  # (n - 2,)
+    curves = np.array([_line(at, keys, times), _spline(at, keys, times)])  # (2, N, 9)
+    curves[:, :, BOX_EXTENT] = curves[0, :, BOX_EXTENT]
     before, after = at[1:-1] - at[:-2], at[2:] - at[1:-1]
     for first in range(len(at) - 1):
         judges = np.unique(np.clip([first - 1, first], 0, len(at) - 3))  # keyframes at its ends
@@ -61,10 +67,8 @@ def between_exact(stamps_ns: Ints, boxes: Floats, keyframes: Keyframes) -> Float
         rows = np.flatnonzero((times > at[first]) & (times < at[first + 1]))
         if expected[best] > np.linalg.norm(of_fits[judges]):
             continue
-        boxes_between = (_line, _spline)[best](at, keys, times[rows])
-        boxes_between[:, BOX_EXTENT] = _line(at, keys[:, BOX_EXTENT], times[rows])
-        boxes_between[:, ROLL:] = wrap_angle(boxes_between[:, ROLL:])
-        found[rows] = boxes_between
+        found[rows] = curves[best, rows]
+        found[rows, ROLL:] = wrap_angle(found[rows, ROLL:])
     return found
 
 
@@ -77,13 +81,24 @@ def _spline(at: Floats, values: Floats, times: Floats) -> Floats:
     return found
 
 
-def _left_out(at: Floats, values: Floats, curve: Curve, half_length: Floats) -> Floats:
-    """Return how far a curve without each inner value (n, 9) is from it, at most in a box [m]."""
-    away = [
-        values[k] - curve(np.delete(at, k), np.delete(values, k, axis=0), at[k : k + 1])[0]
+def _line_without(at: Floats, values: Floats) -> Floats:
+    """Return the line at each inner one of values (n, 9), between those before and after it."""
+    share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
+    found: Floats = values[:-2] + share[:, None] * (values[2:] - values[:-2])
+    return found
+
+
+def _spline_without(at: Floats, values: Floats) -> Floats:
+    """Return the spline at each inner one of values (n, 9) through all others."""
+    without = [
+        _spline(np.delete(at, k), np.delete(values, k, axis=0), at[k : k + 1])[0]
         for k in range(1, len(at) - 1)
     ]
-    offsets = np.array(away)
+    return np.array(without)
+
+
+def _sizes(offsets: Floats, half_length: Floats) -> Floats:
+    """Return how far offsets (n, 9) move a box, at most in it (n,) [m]."""
     turned = half_length * offsets[:, [YAW]]
     distances: Floats = np.linalg.norm(np.hstack([offsets[:, :3], turned]), axis=1)
     return distances
