@@ -224,31 +224,20 @@ def ingredients() -> str:
 
 def ablation(results: Any) -> Iterable[str]:
     """Yield for each recording the losses without an ingredient, the largest first."""
-    order = results.pop('greedy', [])
     for found in results.values():
-        parts = ('3D', 'loss', 'R@0.8 loss')
-        titles = [f'{estimate}: {part}' for estimate in found for part in parts]
-        best = {estimate: rows['nothing'] for estimate, rows in found.items()}
+        titles = [f'{estimate}: {part}' for estimate in found for part in ('3D', 'loss')]
         names = sorted(
             next(iter(found.values())),
-            key=lambda name: min(
-                rows[name]['iou_3d'] - best[e]['iou_3d'] for e, rows in found.items()
-            ),
+            key=lambda name: -max(rows[name]['loss'] for rows in found.values()),
         )
         rows = []
-        for name in ['nothing', *(name for name in names if name != 'nothing')]:
+        for name in [WHOLE, *(name for name in names if name != WHOLE)]:
             cells = []
-            for estimate, of in found.items():
-                own, whole = of[name], best[estimate]
-                cells += [
-                    number(own['iou_3d']),
-                    signed(whole['iou_3d'] - own['iou_3d'], 4),
-                    signed(whole['recall_3d'][-1] - own['recall_3d'][-1], 3),
-                ]
+            for of in found.values():
+                own = of[name]
+                cells += [number(own['iou_3d']), with_error(own, 'loss')]
             rows.append([name, *cells])
         yield table(['without', *titles], rows)
-    if order:
-        yield table(['without all of', 'largest loss'], [[a, signed(b, 4)] for a, b in order])
 
 
 def sensitivity(results: Any) -> Iterable[str]:

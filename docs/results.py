@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 import sys
 from typing import Any, NamedTuple
@@ -321,22 +322,47 @@ def _paper(documents: Documents) -> Iterable[str]:
 
 
 def _ablation(documents: Documents) -> Iterable[str]:
-    """Yield the losses of 3D IoU without each ingredient on all recordings, the largest first."""
-    losses: dict[str, list[list[float]]] = {}
+    """
+    Yield the losses of 3D IoU without each ingredient on all recordings, the largest first.
+
+    Those within two standard errors of zero on all of them are named only.
+
+    """
+    losses: dict[str, list[list[dict[str, float]]]] = {}
     titles = []
     for data, document in documents:
         estimates = document['results'][data].values()
         titles.append(result_tables.title_of(data))
         for name in INGREDIENTS:
-            pairs = [(rows[WHOLE], rows[name]) for rows in estimates if name in rows]
-            if pairs and name != WHOLE:
-                found = [whole['iou_3d'] - without['iou_3d'] for whole, without in pairs]
+            found = [rows[name] for rows in estimates if name in rows]
+            if found and name != WHOLE:
                 losses.setdefault(name, []).append(found)
+    shown = {name: pairs for name, pairs in losses.items() if any(map(_differs, chain(*pairs)))}
     rows = [
-        [f'{name}: {INGREDIENTS[name].meaning}', *(' / '.join(map(_loss, pair)) for pair in found)]
-        for name, found in sorted(losses.items(), key=lambda item: -max(map(max, item[1])))
+        [
+            f'{name}: {INGREDIENTS[name].meaning}',
+            *(' / '.join(map(_loss_with_error, pair)) for pair in pairs),
+        ]
+        for name, pairs in sorted(shown.items(), key=lambda item: -_largest(item[1]))
     ]
     yield table(['without', *titles], rows)
+    others = ', '.join(name for name in losses if name not in shown)
+    if others:
+        yield f'Within two standard errors of zero everywhere: {others}.'
+
+
+def _differs(row: dict[str, float]) -> bool:
+    """Return whether a loss is more than two standard errors from zero."""
+    return abs(row['loss']) > 2 * row['loss_error']
+
+
+def _largest(pairs: list[list[dict[str, float]]]) -> float:
+    return max(row['loss'] for row in chain(*pairs))
+
+
+def _loss_with_error(row: dict[str, float]) -> str:
+    """Return a loss of IoU in thousandths, with its standard error."""
+    return f'{_loss(row["loss"])}±{1000 * row["loss_error"]:.0f}'
 
 
 def _loss(value: float) -> str:
