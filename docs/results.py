@@ -317,6 +317,7 @@ def _paper(documents: Documents) -> Iterable[str]:
         names = (
             'initial, published', 'refined, published', 'input', 'smoothing only',
             'paper, track', 'ours, final', 'ours, track', 'held extents, final',
+            'held extents, short tracks',
         )  # fmt: skip
         yield grid(f'mode: {mode}', columns, {name: methods[name] for name in names})
 
