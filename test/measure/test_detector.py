@@ -107,10 +107,10 @@ def test_hits_of_a_frame_by_hand():
 
 def test_smoother_and_ids_of_detections(drive):
     boxes = BoxTable.from_arrays(drive.boxes)
-    boxes = replace(boxes, scores=np.linspace(0.3, 0.9, len(boxes.boxes)))
-    unnamed = replace(boxes, track_ids=('',) * len(boxes.boxes))
-    order = np.random.default_rng(0).permutation(len(boxes.boxes))
-    tracked = replace(boxes.rows(np.ones(len(order), bool)), scores=boxes.scores)
+    scores = np.random.default_rng(0).random(len(boxes.boxes))
+    boxes = replace(boxes, scores=scores)
+    unnamed = replace(boxes, track_ids=('',) * len(scores))
+    tracked = replace(boxes, scores=scores.round(9))  # as in boxes.csv
     assert with_ids(unnamed, tracked).track_ids == boxes.track_ids
     smoothed = smoothed_table(boxes)
     lengths = {}

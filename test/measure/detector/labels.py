@@ -87,7 +87,7 @@ def relabelled(
 
 
 def with_ids(boxes: BoxTable, tracked: BoxTable) -> BoxTable:
-    """Return boxes with the ids of those of the same stamp and score in another table."""
+    """Return boxes with the ids of those of the same stamp and score, as in a file of boxes."""
     id_of: dict[tuple[int, float], str] = {}
     for track_id, key in zip(tracked.track_ids, _keys(tracked), strict=True):
         id_of[key] = '' if key in id_of else track_id
@@ -95,7 +95,7 @@ def with_ids(boxes: BoxTable, tracked: BoxTable) -> BoxTable:
 
 
 def _keys(table: BoxTable) -> list[tuple[int, float]]:
-    return list(zip(table.stamps_ns.tolist(), table.scores.round(8).tolist(), strict=True))
+    return list(zip(table.stamps_ns.tolist(), table.scores.round(9).tolist(), strict=True))
 
 
 def smoothed_table(table: BoxTable) -> BoxTable:
