@@ -31,6 +31,8 @@ DATA = {
 }
 """Title and content of each recording, in the order of the tables."""
 PART_OF_RUN = re.compile(' (?:at the start|in the middle|at the end)')
+SURE = 2.0
+"""Standard errors of a gap that is divided by; of a smaller one no part can be said."""
 SHOWN_LOSS = 0.001
 """Smaller changes of mean IoU are within the scatter of noise seeds."""
 
@@ -540,3 +542,90 @@ def _named(results: Any, prefix: str = '') -> Iterable[tuple[str, str]]:
             yield f'{prefix}{name}', plain(value)
         else:
             yield f'{prefix}{name}', str(value)
+
+
+MAIN_PRECISIONS = (
+    ('car', 'BEV 0.7'), ('car', '3D 0.7'), ('truck', 'BEV 0.7'), ('truck', '3D 0.7'),
+    ('pedestrian', '3D 0.5'), ('cyclist', '3D 0.5'),
+)  # fmt: skip
+"""Class and metric of the main tables; literature: KITTI has .7 for cars and .5 for people."""
+
+
+def detector(results: Any) -> Iterable[str]:
+    """Yield precision by the labels of the training, and the errors of these labels."""
+    metrics = ('BEV 0.5', 'BEV 0.7', '3D 0.5', '3D 0.7')
+    for drives, by_detector in results['precision'].items():
+        for kind in by_detector['own']['true']:
+            yield precision_by_labels(results, drives, [(kind, metric) for metric in metrics])
+    yield quality_of_labels(results)
+    yield errors_of_detectors(results)
+
+
+def precision_by_labels(results: Any, drives: str, columns: Sequence[tuple[str, str]]) -> str:
+    """Return the table of average precision on some drives, by detector and source of labels."""
+    by_detector = results['precision'][drives]
+    known = [column for column in columns if column[0] in by_detector['own']['true']]
+    rows = []
+    for name, sources in by_detector.items():
+        for source, kinds in sources.items():
+            cells = [kinds[kind][metric] for kind, metric in known]
+            found = [_part(cell, 'ap', 3) for cell in cells]
+            rows.append([f'{name}: {source} ({cells[0]["seeds"]})', *found])
+    header = [f'{kind}, {metric}' for kind, metric in known]
+    return table([f'AP on {drives}: boxes of, labels (trainings)', *header], rows)
+
+
+def gaps_closed(results: Any, drives: str) -> Iterable[str]:
+    """Yield the table of the parts of gaps from raw to true labels that are closed, if any is."""
+    own = results['precision'][drives]['own']
+    columns = [
+        (kind, metric)
+        for kind, metric in MAIN_PRECISIONS
+        if kind in own['true']
+        and own['true'][kind][metric]['gain']
+        > SURE * (own['true'][kind][metric]['gain_error'] or math.inf)
+    ]
+    rows = [
+        [source, *(_part(kinds[kind][metric], 'closed', 2) for kind, metric in columns)]
+        for source, kinds in own.items()
+        if source not in ('raw', 'true')
+    ]
+    header = [f'{kind}, {metric}' for kind, metric in columns]
+    if columns:
+        yield table([f'part of the gap closed on {drives}', *header], rows)
+
+
+def _part(found: Any, key: str, digits: int) -> str:
+    """Return a part of 1 with its standard error, where that is known."""
+    error = found[f'{key}_error']
+    return number(found[key], digits) + ('' if error is None else f'±{number(error, digits)}')
+
+
+def quality_of_labels(results: Any) -> str:
+    """Return the table of scores of the labels by detector and source, and the gain of cars."""
+    columns = ('recall', 'false', 'iou_bev', 'iou_3d', 'over_0.7', 'flips', 'ids_per_object')
+    rows = []
+    for name, sources in results['labels'].items():
+        for source, kinds in sources.items():
+            cells = [number(kinds[''][key]) for key in columns]
+            gains = [with_error(kinds[kind], 'gain') for kind in kinds if kind]
+            rows.append([f'{name}: {source}', *cells, *gains])
+    header = ['recall', 'false per true', 'BEV', '3D', 'R@0.7', 'flips', 'ids per object']
+    header += [f'{kind}, 3D - raw' for kind in kinds if kind]
+    return table(['labels', *header], rows)
+
+
+def errors_of_detectors(results: Any) -> str:
+    """Return the table of errors of cars by detector: raw boxes, and those refined as tracks."""
+    names = ('along', 'across', 'up', 'yaw', 'length', 'width', 'height')
+    parts = ('robust', 'between', 'within', 'correlation')
+    rows = []
+    for name, sources in results['labels'].items():
+        for source in ('raw', 'track'):
+            errors = sources[source]['car']
+            cells = (
+                ' / '.join(number(errors.get(f'{key} {part}'), 2) for part in parts)
+                for key in names
+            )
+            rows.append([f'{name}: {source}', *cells])
+    return table([f'errors of cars: {" / ".join(parts)}', *names], rows)

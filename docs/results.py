@@ -499,6 +499,18 @@ def _load(documents: Documents) -> Iterable[str]:
     yield from result_tables.load({'deadline': document['results']['deadline']})
 
 
+def _detector(documents: Documents) -> Iterable[str]:
+    """Yield the main precisions by the labels, the gaps closed, and the errors of the labels."""
+    ((_, document),) = documents
+    results = document['results']
+    for drives in results['precision']:
+        columns = result_tables.MAIN_PRECISIONS
+        yield result_tables.precision_by_labels(results, drives, columns)
+        yield from result_tables.gaps_closed(results, drives)
+    yield result_tables.quality_of_labels(results)
+    yield result_tables.errors_of_detectors(results)
+
+
 OVERVIEW_SECTIONS = {
     'recordings': _recordings,
     'accuracy': _mean_ious,
@@ -525,6 +537,7 @@ class Kind(NamedTuple):
 KINDS = {
     'real': Kind('real', result_tables.accuracy, _accuracy),
     'kinds': Kind('scenes', result_tables.kinds_of_objects, _kinds_of_objects),
+    'detector': Kind('detector', result_tables.detector, _detector),
     'tracks': Kind('tracks', result_tables.tracks, _tracks),
     'paper': Kind('scenes', result_tables.paper, _paper),
     'ablation': Kind('ablation', result_tables.ablation, _ablation),
