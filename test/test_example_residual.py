@@ -70,7 +70,7 @@ from boxreg_ros.core.method.constants import CONSTANTS, RESIDUAL_NAMES
 from boxreg_ros.core.method.residuals import empty_linearised, RESIDUALS, TERMS
 from boxreg_ros.core.method.weights import Weighing
 from boxreg_ros.core.problem import settings_of_kinds
-from measure.ablation import INGREDIENTS, merged
+from measure.ablation import INGREDIENTS
 import numpy as np
 
 I = RESIDUAL_NAMES.index('rise')
@@ -98,7 +98,7 @@ def test_the_setting_is_the_weight():
 
 
 def test_the_ablation_leaves_it_out():
-    without = Config().updated(merged([INGREDIENTS['rise'].settings]))
+    without = Config().updated(INGREDIENTS['rise'].settings)
     counts = [number_of(2, 2, constants_of(c)['residuals'][I]) for c in (Config(), without)]
     assert counts == [1, 0]  # no box follows the last one
 

@@ -16,15 +16,15 @@ MIN_LOOKS = 4
 """Looks in a row that a finding needs, 2 s: cars that start at a light differ by more."""
 STILL_NS = 10**9
 """Time in which a frame that moves has moved [ns]."""
-MIN_WAY = 0.01
+STILL_WAY = 0.01
 """Way of a frame that moves [m]: odometry of a wheel that stands still has none."""
 MIN_SPEED = 2.0
 """Slower objects may be parked [m/s]: the velocity of a track errs by half of it."""
 MAX_DIFFERENCE = 1.0
 """Largest difference of velocities that are alike [m/s]: their errors."""
-MIN_TRACKS = 4
+FEWEST_ALIKE = 4
 """Objects that move alike."""
-MIN_SHARE = 0.5
+COMMON_SHARE = 0.5
 """Part of all objects that move alike: of the traffic past a sensor at the roadside it is less."""
 
 
@@ -66,7 +66,7 @@ class CommonMotionCheck:
             return
         self._looked_ns = stamp_ns
         moving = [edge for edge in route if not edge.is_static]
-        if not moving or any(_way(edge, stamp_ns - STILL_NS) > MIN_WAY for edge in moving):
+        if not moving or any(_way(edge, stamp_ns - STILL_NS) > STILL_WAY for edge in moving):
             self._looks = 0
             return
         velocities = tracker.known_velocities(MIN_SPEED / 2)
@@ -94,10 +94,10 @@ def _way(edge: Edge, since_ns: int) -> float:
 
 def _alike(velocities: Floats) -> tuple[int, float]:
     """Return how many of the velocities (K, 3) are alike and their speed [m/s]; 0 if few are."""
-    if len(velocities) < MIN_TRACKS:
+    if len(velocities) < FEWEST_ALIKE:
         return 0, 0.0
     middle = np.median(velocities, axis=0)
     count = int((np.linalg.norm(velocities - middle, axis=1) < MAX_DIFFERENCE).sum())
     speed = float(np.linalg.norm(middle))
-    is_common = speed > MIN_SPEED and count >= max(MIN_TRACKS, MIN_SHARE * len(velocities))
+    is_common = speed > MIN_SPEED and count >= max(FEWEST_ALIKE, COMMON_SHARE * len(velocities))
     return (count, speed) if is_common else (0, speed)

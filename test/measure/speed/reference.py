@@ -79,7 +79,8 @@ def compare(config: Config, count: int, references: int) -> dict[str, float]:
     fits = [reference_fit(problem, config) for problem in single]
     result['reference'] = 1e3 * (process_time() - begin) / references
     result['times faster'] = result['reference'] / result['refine, track']
-    ours = [solve(one, config, InputModel(config.faces), is_warm=False) for one in single]
+    model = InputModel(config.faces)
+    ours = [solve(one, config, model, model.inputs(config), is_warm=False) for one in single]
     starts = [_Fit(one, config).batch.solution for one in single]
     iou = {}
     for name, found in (('input', starts), ('reference', fits), ('ours', ours)):
