@@ -78,8 +78,8 @@ class CommonMotionCheck:
                 f'{alike} of {len(velocities)} objects move alike, at {speed:.1f} m/s, while '
                 f'{names} stands still: expected the motion of the LiDAR in it, got that of '
                 f'objects that are parked; boxes are as wrong as this motion: name another source '
-                f'of it, --odometry TOPIC or --fixed-frame FRAME (node: odometry_topic, '
-                f'fixed_frame), or publish it again'
+                f'of it, --odometry TOPIC or --fixed-frame FRAME (node: fixed_frame:=FRAME), or '
+                f'mend its publisher'
             )
 
 
