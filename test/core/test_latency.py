@@ -102,6 +102,43 @@ def test_boxes_of_either_time_of_a_sweep_are_not_late(at_sight):
     assert found.seconds == pytest.approx(0.2, abs=0.02)
 
 
+def parabolas(minima, depths=(1.0, 1.0), tracks=16):
+    """Return samples of tracks whose costs are least at `minima` [s], as seen and at the stamp."""
+    samples = []
+    for track in range(tracks):
+        shift = 0.004 * (-1) ** track
+        costs = [
+            np.minimum(np.square(latency.CANDIDATES - least - shift) / 0.04, 1) * depth - depth
+            for least, depth in zip(minima, depths, strict=True)
+        ]
+        samples += [latency._Sample(START_NS, str(track), 10.0, np.array(costs))] * 5
+    return samples
+
+
+def test_boxes_that_are_in_time_in_one_way_are_in_time():
+    # They fit better at the stamp, by 4 deviations: by chance, if they were made where points are.
+    found = latency._estimated(parabolas([-0.01, 0.06], [1.0, 1.1]))
+    assert found.seconds == 0
+    assert found.estimated == pytest.approx(-0.01, abs=0.005)
+    found = latency._estimated(parabolas([0.07, 0.12], [1.0, 1.1]))
+    assert found.seconds == pytest.approx(0.12, abs=0.005)
+    found = latency._estimated(parabolas([0.07, 0.12], [1.1, 1.0]))
+    assert found.seconds == pytest.approx(0.07, abs=0.005)
+
+
+def test_tracks_that_do_not_agree_correct_nothing():
+    samples = [
+        sample._replace(track_id=name)
+        for name, least in zip('abcde', [0.65, 0.65, 0.65, 0.4, 0.4], strict=True)
+        for sample in parabolas([least, least], tracks=1)
+    ]
+    found = latency._estimated(samples)
+    assert abs(found.estimated) > latency.SIGNIFICANCE * found.deviation
+    assert found.deviation > latency.USABLE_DEVIATION
+    assert found.seconds == 0
+    assert 'not known' in found.finding
+
+
 def test_weak_evidence_corrects_nothing(sample_drive):
     first = replace(sample_drive.boxes[0], motion=None)
     parked = [replace(first, stamp_ns=array.stamp_ns) for array in sample_drive.boxes]
