@@ -1,4 +1,4 @@
-"""Boxes between exact keyframes: a line or a spline in time, where it errs less than the fits."""
+"""Boxes between exact keyframes: a spline in time, or a line or fits where they err less."""
 
 from __future__ import annotations
 
@@ -8,6 +8,12 @@ from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, ROLL, YAW
 import numpy as np
 from scipy.interpolate import CubicSpline
+
+SCATTER = 2.0
+"""
+Factor by which errors judged at one or two keyframes scatter; chosen. A spline is what a body with
+a steady force does: the line or the fits have to err by so much less.
+"""
 
 
 class Keyframes(NamedTuple):
@@ -27,7 +33,7 @@ class Keyframes(NamedTuple):
 
 def between_exact(stamps_ns: Ints, boxes: Floats, keyframes: Keyframes) -> Floats:
     """
-    Return `boxes` (N, 9) with a line or spline between keyframes where it errs less.
+    Return `boxes` (N, 9) with a spline or line between keyframes, but where the fits err less.
 
     Each is judged at the keyframes, without the one that it is compared with. An interpolation
     between keyframes errs by at most a h^2 / 8 with the acceleration a and the time h between
@@ -51,22 +57,23 @@ def between_exact(stamps_ns: Ints, boxes: Floats, keyframes: Keyframes) -> Float
     residuals = keyframes.residuals
     errors = np.array(
         [
-            _sizes(keys[1:-1] - _line_without(at, keys), half_length),
             _sizes(keys[1:-1] - _spline_without(at, keys), half_length),
+            _sizes(keys[1:-1] - _line_without(at, keys), half_length),
         ]
     )
     of_fits = _sizes(residuals[1:-1] - _line_without(at, residuals), half_length)  # (n - 2,)
-    curves = np.array([_line(at, keys, times), _spline(at, keys, times)])  # (2, N, 9)
-    curves[:, :, BOX_EXTENT] = curves[0, :, BOX_EXTENT]
+    curves = np.array([_spline(at, keys, times), _line(at, keys, times)])  # (2, N, 9)
+    curves[:, :, BOX_EXTENT] = curves[1, :, BOX_EXTENT]
     before, after = at[1:-1] - at[:-2], at[2:] - at[1:-1]
     for first in range(len(at) - 1):
         judges = np.unique(np.clip([first - 1, first], 0, len(at) - 3))  # keyframes at its ends
         ratio = (at[first + 1] - at[first]) ** 2 / (4 * before * after)[judges]
-        expected = np.linalg.norm(errors[:, judges] * ratio, axis=1)
-        best = int(expected.argmin())
-        rows = np.flatnonzero((times > at[first]) & (times < at[first + 1]))
-        if expected[best] > np.linalg.norm(of_fits[judges]):
+        spline, line = np.linalg.norm(errors[:, judges] * ratio, axis=1)
+        of_fit = np.linalg.norm(of_fits[judges])
+        best = int(np.argmin([spline, SCATTER * line, SCATTER * of_fit]))
+        if best == len(curves):
             continue
+        rows = np.flatnonzero((times > at[first]) & (times < at[first + 1]))
         found[rows] = curves[best, rows]
         found[rows, ROLL:] = wrap_angle(found[rows, ROLL:])
     return found
