@@ -39,7 +39,6 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 PROPOSALS = 'proposals.csv'
 BOXES = 'boxes.csv'
@@ -47,8 +46,6 @@ MAX_ROWS = 10_000
 """Most decisions of a request: a track that is made of as many parts; chosen."""
 OPEN_SECONDS = 600.0
 """A track is open to one person for so long; chosen: then the person has left."""
-REQUEST_SECONDS = 20.0
-"""A request, its body included, is received within this time; chosen."""
 POLL_SECONDS = 0.25
 """Another program may append to the file: the time until its decisions are seen; chosen."""
 MARK = f'<html lang="en" data-page="{PAGE_VERSION}"'.encode()
@@ -490,32 +487,3 @@ def _proposals_of(out: Path) -> list[dict[str, Any]]:
         {'stamp': str(stamp), 'class': name, 'box': box.tolist(), 'points': int(points)}
         for stamp, name, box, points in zip(*columns, strict=True)
     ]
-
-
-class TimedProtocol(H11Protocol):
-    """Close a connection on which no whole request arrives within `REQUEST_SECONDS`."""
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait for the first request."""
-        super().connection_made(transport)
-        self._answered: Any = None
-        self._expire_later()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Stop waiting."""
-        self._timer.cancel()
-        super().connection_lost(exc)
-
-    def _expire_later(self) -> None:
-        self._timer = self.loop.call_later(REQUEST_SECONDS, self._expire)
-
-    def _expire(self) -> None:
-        """Close the connection unless a request has been received since the last time."""
-        cycle = self.cycle
-        is_received = cycle is not None and not cycle.more_body
-        is_new = cycle is not self._answered or (cycle is not None and not cycle.response_complete)
-        if not (is_received and is_new):
-            self.transport.close()
-            return
-        self._answered = cycle
-        self._expire_later()

@@ -19,6 +19,7 @@ from starlette.responses import Response
 MAX_BODY = 2**23
 """Longest request [bytes]: one decision about a track whose id has 1 MB, several times over."""
 BODY_SECONDS = 20.0
+"""The body of a request is received within this time; chosen."""
 STAMP = re.compile(r'-?[0-9]{1,19}')
 
 

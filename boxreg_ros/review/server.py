@@ -98,7 +98,7 @@ class ReviewServer:
     def __init__(
         self, results: Results, bound: socket.socket, who: str, classes: Sequence[str]
     ) -> None:
-        from boxreg_ros.review.application import review_application, TimedProtocol
+        from boxreg_ros.review.application import review_application
         from uvicorn import Config, Server
 
         self._socket = bound
@@ -107,7 +107,7 @@ class ReviewServer:
         self._reviews = found.reviews
         self.address = f'http://{HOST}:{self.server_port}/?token={found.token}'
         config = Config(
-            found.application, http=TimedProtocol, ws='none', lifespan='off', log_config=None,
+            found.application, http='h11', ws='none', lifespan='off', log_config=None,
             log_level='critical', server_header=False, date_header=False,
             timeout_graceful_shutdown=SHUTDOWN_SECONDS,
         )  # fmt: skip
