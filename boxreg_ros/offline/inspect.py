@@ -31,8 +31,6 @@ from boxreg_ros.offline.arguments import (
 )
 from boxreg_ros.offline.notes import sparse_boxes
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import spare_file
-from boxreg_ros.offline.timeline import check_plotly, merged_spans, write_timeline
 
 if TYPE_CHECKING:
     from boxreg_ros.datasets.registry import Address
@@ -51,6 +49,8 @@ DEFAULTS = Config()
 """Settings of the proposed command."""
 GAP_PERIODS = 3.0
 """A pause longer than this many median periods is a gap."""
+MAX_PARTS = 500
+"""Parts of a recording that `presence_s` tells apart; chosen: what a picture can show."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,10 +58,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_recordings(parser, 'several are merged by time; a data set without a scene is listed')
     add_options(parser, Request, *TOPICS)
     parser.add_argument('--json', action='store_true', help='print JSON')
-    parser.add_argument(
-        '--html', type=Path, metavar='FILE',
-        help='also write a page with a picture of the timeline: messages, gaps and damages',
-    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -74,14 +70,8 @@ def run(args: argparse.Namespace) -> int:
     if len(scenes) > 1:  # none of several is named
         print(json.dumps(scenes) if args.json else '\n'.join(scenes))
         return DONE
-    if args.html is not None:
-        check_plotly()
-        spare_file(args.html, args.recordings)
     facts = inspect(args, address)
-    lines = list(_lines(facts))
-    if args.html is not None:
-        write_timeline(args.html, facts, lines)
-    print(json.dumps(facts, indent=2) if args.json else '\n'.join(lines))
+    print(json.dumps(facts, indent=2) if args.json else '\n'.join(_lines(facts)))
     return DONE if facts['command'] else FAILED
 
 
@@ -122,7 +112,7 @@ def _contents(paths: list[Path]) -> dict[str, Any]:
             'type': kind,
             'messages': count,
             'rate': _rate(count, seconds),
-            'presence_s': merged_spans(presence[topic], begin_ns, seconds),
+            'presence_s': _merged_spans(presence[topic], begin_ns, seconds),
             'gaps_s': _pauses(presence[topic], begin_ns, _rate(count, seconds)),
         }
         for (topic, kind), count in sorted(counts.items())
@@ -180,6 +170,22 @@ def _scene_contents(address: Address) -> dict[str, Any]:
 def _rate(count: int, seconds: float) -> float:
     """Return the mean rate of messages [Hz]; 0 for a single one."""
     return (count - 1) / seconds if count > 1 and seconds > 0 else 0.0
+
+
+def _merged_spans(
+    spans: Sequence[tuple[int, int]], begin_ns: int, seconds: float
+) -> list[list[float]]:
+    """Return ascending spans [ns] as [s] from the begin; those too close to be seen are joined."""
+    nearest = seconds / MAX_PARTS
+    merged: list[list[float]] = []
+    for first_ns, last_ns in spans:
+        first = (first_ns - begin_ns) * 1e-9
+        last = (last_ns - begin_ns) * 1e-9
+        if merged and first - merged[-1][1] <= nearest:
+            merged[-1][1] = max(merged[-1][1], last)
+        else:
+            merged.append([first, last])
+    return merged
 
 
 def _pauses(parts: list[tuple[int, int]], begin_ns: int, rate: float) -> list[list[float]]:
