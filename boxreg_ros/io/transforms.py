@@ -127,7 +127,7 @@ class TransformTree:
     `buffer_duration` [s]. After a time jump of a pair, new samples replace the old ones. Between
     samples, positions are interpolated linearly and orientations along the shortest rotation, as
     tf2 does; over gaps longer than `MAX_LINEAR_GAP` by the polynomial through up to two samples
-    on each side. Up to `max_extrapolation` [s] outside of them the motion is extrapolated. A
+    on each side. Up to `MAX_EXTRAPOLATION` outside of them the motion is extrapolated. A
     moving frame with one sample only counts as static once others are newer. Of a frame that has
     two parents at once, the transforms to both are kept. Where nothing else connects two frames,
     those whose names differ by one and the same prefix, as ``r1/lidar`` and ``lidar``, are taken
@@ -140,15 +140,9 @@ class TransformTree:
 
     """
 
-    def __init__(
-        self,
-        max_extrapolation: float = MAX_EXTRAPOLATION,
-        buffer_duration: float = BUFFER_DURATION,
-        clock_offset: float = 0.0,
-    ) -> None:
-        self._max_extrapolation_ns = round(max_extrapolation * 1e9)
+    def __init__(self, buffer_duration: float = BUFFER_DURATION) -> None:
         self._buffer_ns = round(buffer_duration * 1e9)
-        self.clock_offset = clock_offset
+        self.clock_offset = 0.0
         self.prefers_odometry = False
         self.odometry_child = ''
         self.clear()
@@ -214,7 +208,7 @@ class TransformTree:
         """Return ``T_target_source`` (4, 4) at a stamp, or raise TransformUnavailable."""
         T_target_source = np.eye(4)
         for edge, is_upward in self._route(target, source):
-            T = edge.at(stamp_ns, self._max_extrapolation_ns, self._is_once(edge, stamp_ns))
+            T = edge.at(stamp_ns, self._is_once(edge, stamp_ns))
             T_target_source = (T if is_upward else inverse(T)) @ T_target_source
         return T_target_source
 
@@ -674,16 +668,16 @@ class Edge:
             return bool(self.stamps)
         return bool(self.stamps) and self.stamps[0] <= stamp_ns <= self.stamps[-1]
 
-    def at(self, stamp_ns: int, max_extrapolation_ns: int, is_constant: bool = False) -> Floats:
+    def at(self, stamp_ns: int, is_constant: bool = False) -> Floats:
         """Return ``T_parent_child`` at a stamp; at any if its only sample is `is_constant`."""
         self._confirm(stamp_ns)
         if is_constant:
             return matrix(self.poses[0])
         if self._last_found is None or self._last_found[0] != stamp_ns:
-            self._last_found = stamp_ns, self._at(stamp_ns, max_extrapolation_ns)
+            self._last_found = stamp_ns, self._at(stamp_ns)
         return self._last_found[1]
 
-    def _at(self, stamp_ns: int, max_extrapolation_ns: int) -> Floats:
+    def _at(self, stamp_ns: int) -> Floats:
         stamps = self.stamps
         if not stamps:
             cause = 'all poses are NaN or have no orientation; check its publisher'
@@ -692,11 +686,11 @@ class Edge:
             raise TransformUnavailable(f'transform {self.parent} -> {self.child}: {cause}')
         outside = max(stamps[0] - stamp_ns, stamp_ns - stamps[-1])
         # Extrapolation needs two samples; a single one has no velocity.
-        if not self.is_static and outside > max_extrapolation_ns * (len(stamps) > 1):
+        if not self.is_static and outside > MAX_EXTRAPOLATION * 1e9 * (len(stamps) > 1):
             raise TransformUnavailable(
                 f'transform {self.parent} -> {self.child} is known from {stamps[0]} to '
                 f'{stamps[-1]} ns: expected to cover {stamp_ns} ns within '
-                f'{max_extrapolation_ns * 1e-9:g} s; {self._remedy(outside)}'
+                f'{MAX_EXTRAPOLATION:g} s; {self._remedy(outside)}'
             )
         if self.is_static or len(stamps) == 1:
             return matrix(self.poses[0])
@@ -732,7 +726,7 @@ class Edge:
         after = [min(max(bisect_left(known, one), 1), len(known) - 1) for one in stamps_ns]
         gaps_ns = [known[row] - known[row - 1] for row in after]
         if len(known) < 2 or max(gaps_ns) > MAX_LINEAR_GAP * 1e9:
-            return np.array([self._at(one, 0) for one in stamps_ns])
+            return np.array([self._at(one) for one in stamps_ns])
         shares = np.array(
             [
                 (one - known[row - 1]) / gap
@@ -840,13 +834,6 @@ def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
         origins=None if sweep.origins is None else sweep.origins @ R.T + t,
         T_frame_points=T_frame_sweep if known is None else T_frame_sweep @ known,
     )
-
-
-def move_to_frame(item: Sweep | BoxArray, T_frame_item: Floats, frame_id: str) -> Sweep | BoxArray:
-    """Return a sweep or boxes in another frame."""
-    if isinstance(item, Sweep):
-        return sweep_to_frame(item, T_frame_item, frame_id)
-    return boxes_to_frame(item, T_frame_item, frame_id)
 
 
 def boxes_to_frame(

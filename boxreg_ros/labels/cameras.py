@@ -140,11 +140,11 @@ class LabelCameras:
         return found
 
 
-def cameras_of(recording: Recording | None, needed_by: str) -> LabelCameras:
+def cameras_of(recording: Recording | None) -> LabelCameras:
     """Return the cameras of a recording; ConfigError where the labels have none."""
     if recording is None:
         raise ConfigError(
-            f'{needed_by}: expected a recording with camera images and a CameraInfo, got none'
+            '--with-images: expected a recording with camera images and a CameraInfo, got none'
         )
     return LabelCameras(recording)
 

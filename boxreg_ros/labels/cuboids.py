@@ -164,7 +164,6 @@ def read_files(
     names: Iterable[str],
     what: str,
     cuboids_of: Callable[[Any], FrameBoxes],
-    suffix: str = '.json',
 ) -> Iterator[LabelFrame]:
     """
     Yield the frames of a folder with sidecar files and a file of labels per frame.
@@ -181,8 +180,6 @@ def read_files(
         Content of the files, for errors.
     cuboids_of : callable
         Returns the boxes of the content of a file.
-    suffix : str
-        Of the files, after the name of a frame.
 
     Raises
     ------
@@ -192,7 +189,7 @@ def read_files(
     """
 
     def cuboids_by_name(name: str) -> FrameBoxes:
-        file = labels / f'{name}{suffix}'
+        file = labels / f'{name}.json'
         if not file.exists():
             return NO_FRAME_BOXES
         content = from_json(file)

@@ -54,21 +54,20 @@ def from_json(path: Path, parse_float: Callable[[str], Any] = float) -> Any:
         raise RecordingError(f'{path}: not JSON: {error}; write it again') from None
 
 
-def json_items(path: Path, prefix: str = 'item') -> Iterator[Any]:
+def json_items(path: Path) -> Iterator[Any]:
     """
     Yield the items of a list in a JSON file one by one, without holding the list.
 
-    `prefix` is their place in the words of ijson; by default the file is one list. Raises
-    RecordingError if the file cannot be read or is not JSON.
+    Raises RecordingError if the file cannot be read or is not JSON.
 
     """
     import ijson
 
-    yield from _streamed(path, lambda file: ijson.items(file, prefix, use_float=True))
+    yield from _streamed(path, lambda file: ijson.items(file, 'item', use_float=True))
 
 
 def json_members(path: Path, prefix: str) -> Iterator[tuple[str, Any]]:
-    """Yield the names and values of an object in a JSON file; as `json_items`."""
+    """Yield the names and values of an object at a place in a JSON file; as `json_items`."""
     import ijson
 
     yield from _streamed(path, lambda file: ijson.kvitems(file, prefix, use_float=True))

@@ -70,7 +70,7 @@ class FolderWriter:
         self.class_names = ClassNames(self.form, options.class_map if self.form else None)
         self.cameras: LabelCameras | None = None
         if options.with_images and self.image_file:
-            self.cameras = cameras_of(options.recording, '--with-images')
+            self.cameras = cameras_of(options.recording)
             self.files.callback(self.cameras.close)
         self._with_points = options.with_points and self.cloud_file != ''
         for name in self.folders:

@@ -12,7 +12,7 @@ from boxreg_ros.datasets.registry import address_of
 from boxreg_ros.datasets.scene_recording import SceneRecording
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.items import EVERYTHING, ItemSource, Wanted
-from boxreg_ros.io.transforms import move_to_frame, TransformTree
+from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame, TransformTree
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.structures import Sweep
 import layouts
@@ -123,7 +123,8 @@ def read(source, wanted=EVERYTHING):
         for item in source.items(tree, wanted):
             content = item.content
             T_fixed_item = tree.lookup(fixed_frame, content.frame_id, content.stamp_ns)
-            moved = move_to_frame(content, T_fixed_item, fixed_frame)
+            move = sweep_to_frame if isinstance(content, Sweep) else boxes_to_frame
+            moved = move(content, T_fixed_item, fixed_frame)
             if isinstance(moved, Sweep):
                 sweeps.append(moved.in_frame())
             else:

@@ -3,7 +3,7 @@
 from boxreg_ros.cli import main
 from boxreg_ros.io.items import ItemSource, Wanted
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import move_to_frame, TransformTree
+from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame, TransformTree
 from boxreg_ros.offline.sources import LabelledRecording
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import STANDARD
@@ -44,7 +44,8 @@ def read(source):
         for item in source.items(tree):
             content = item.content
             T_fixed_item = tree.lookup(fixed_frame, content.frame_id, content.stamp_ns)
-            moved = move_to_frame(content, T_fixed_item, fixed_frame)
+            move = sweep_to_frame if isinstance(content, Sweep) else boxes_to_frame
+            moved = move(content, T_fixed_item, fixed_frame)
             kinds.append((type(moved), moved.stamp_ns))
             if isinstance(moved, Sweep):
                 points.append(moved.points)
