@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 if TYPE_CHECKING:
     from torch import Tensor
 
+MIN_QUATERNION_NORM = 1e-6
+"""A shorter quaternion states no orientation."""
 GIMBAL_LOCK = 1e-9
 """
 Cosine of the pitch below which roll and yaw rotate about one axis; roll is then defined as zero.
@@ -136,6 +138,35 @@ def quaternion_from_matrix(R: ArrayLike) -> Floats:
 def rpy_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:
     """Return roll, pitch and yaw (..., 3) of quaternions (..., 4) [rad]."""
     return rpy_from_matrix(matrix_from_quaternion(quaternion_xyzw))
+
+
+def boxes_from_quaternions(
+    centres: ArrayLike, extents: ArrayLike, quaternions_xyzw: ArrayLike
+) -> Floats:
+    """
+    Return boxes (n, 9) from rows, or from one; the angles of no valid quaternion are NaN.
+
+    Parameters
+    ----------
+    centres, extents : array_like, shape (n, 3) or (3,)
+        In meters.
+    quaternions_xyzw : array_like, shape (n, 4) or (4,)
+        Of any length; one of zero, NaN or infinity is not valid.
+
+    Returns
+    -------
+    boxes : array, shape (n, 9)
+        Centre, extent, and roll, pitch, yaw [m, rad].
+
+    """
+    parts = [np.asarray(part, np.float64) for part in (centres, extents, quaternions_xyzw)]
+    centre, extent, quaternion = (part.reshape(-1, part.shape[-1]) for part in parts)
+    angles = np.full((len(centre), 3), np.nan)
+    norms = np.linalg.norm(quaternion, axis=1)
+    is_rotation = (norms > MIN_QUATERNION_NORM) & np.isfinite(norms)
+    if is_rotation.any():
+        angles[is_rotation] = rpy_from_quaternion(quaternion[is_rotation])
+    return np.hstack([centre, extent, angles])
 
 
 def quaternion_from_rpy(rpy: ArrayLike) -> Floats:

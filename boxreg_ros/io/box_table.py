@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from boxreg_ros.errors import RecordingError, unreadable
-from boxreg_ros.rotations import quaternion_from_rpy, rpy_from_quaternion
+from boxreg_ros.rotations import boxes_from_quaternions, quaternion_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, Ints, ROLL
 import numpy as np
 from numpy.typing import NDArray
@@ -133,20 +133,13 @@ class BoxTable:
         stamps = np.array(column('stamp_ns', int), np.int64)
         num_points = np.array(column('num_points', int), np.int64)
         numbers = np.array([column(name, float, 'nan') for name in COLUMNS[4:15]]).T
-        boxes = np.full((len(rows), 9), np.nan)
-        boxes[:, :3], boxes[:, BOX_EXTENT] = numbers[:, 1:4], numbers[:, 8:11]
-        turned = (np.linalg.norm(numbers[:, 4:8], axis=1) > 1e-6) & np.isfinite(
-            numbers[:, 4:8]
-        ).all(axis=1)
-        if turned.any():
-            boxes[turned, ROLL:] = rpy_from_quaternion(numbers[turned, 4:8])
         return cls(
             stamps,
             frame_id,
             tuple(unprotected(row['track_id']) for row in rows),
             tuple(unprotected(row['class_name']) for row in rows),
             numbers[:, 0],
-            boxes,
+            boxes_from_quaternions(numbers[:, 1:4], numbers[:, 8:], numbers[:, 4:8]),
             tuple(row['status'] for row in rows),
             num_points,
         )

@@ -78,13 +78,13 @@ def read_covariances(path: Path) -> dict[tuple[int, str], BoxCovariance]:
 def _covariance(row: dict[str, str]) -> BoxCovariance:
     """Return the covariances of a row."""
     numbers = np.array([float(row[name]) for name in COVARIANCE_NUMBERS])
-    pose = _symmetric(numbers[:NUM_POSE], 6)
-    extent = _symmetric(numbers[NUM_POSE:], 3)
+    pose = symmetric(numbers[:NUM_POSE], 6)
+    extent = symmetric(numbers[NUM_POSE:], 3)
     return BoxCovariance(float(row['range'] or 'nan'), pose, extent)
 
 
-def _symmetric(upper: Floats, size: int) -> Floats:
-    """Return the symmetric matrix of an upper triangle."""
+def symmetric(upper: Floats, size: int) -> Floats:
+    """Return the symmetric matrix (size, size) of its upper triangle, row by row."""
     matrix = np.zeros((size, size))
     matrix[np.triu_indices(size)] = upper
     return matrix + np.triu(matrix, 1).T

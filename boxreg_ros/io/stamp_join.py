@@ -70,8 +70,8 @@ def joined_stamps(stamps_ns: Ints, others_ns: Ints) -> JoinedStamps:
     others = np.unique(others_ns)
     if not len(own) or not len(others):
         return JoinedStamps(stamps_ns, len(own), 0, 0, 0, None)
-    nearest = _nearest(own, others)
-    is_mutual = _nearest(others, own)[nearest] == np.arange(len(own))
+    nearest = nearest_rows(own, others)
+    is_mutual = nearest_rows(others, own)[nearest] == np.arange(len(own))
     offsets = np.abs(others[nearest] - own)
     is_common = is_mutual & (offsets <= LARGEST_OFFSET_NS)
     joined = np.where(is_common, others[nearest], own)
@@ -86,7 +86,7 @@ def joined_stamps(stamps_ns: Ints, others_ns: Ints) -> JoinedStamps:
     )
 
 
-def _nearest(stamps_ns: Ints, among_ns: Ints) -> Ints:
+def nearest_rows(stamps_ns: Ints, among_ns: Ints) -> Ints:
     """Return the row of the nearest of ascending stamps (m,) to each stamp (n,)."""
     after = np.searchsorted(among_ns, stamps_ns).clip(0, len(among_ns) - 1)
     before = (after - 1).clip(0)

@@ -6,6 +6,7 @@ from itertools import combinations_with_replacement
 from pathlib import Path
 
 from boxreg_ros.io.box_table import cell, read_by_box
+from boxreg_ros.io.covariance_table import symmetric
 from boxreg_ros.structures import KINEMATICS, RefinedBoxes
 import numpy as np
 from numpy.typing import NDArray
@@ -72,9 +73,8 @@ def _record(row: dict[str, str]) -> NDArray[np.void]:
         if not np.isfinite(numbers[begin]):
             continue
         middle = begin + size
-        upper = np.zeros((size, size))
-        upper[np.triu_indices(size)] = numbers[middle : middle + size * (size + 1) // 2]
+        upper = numbers[middle : middle + size * (size + 1) // 2]
         record[name] = numbers[begin:middle]
-        record[f'{name}_covariance'] = upper + np.triu(upper, 1).T
+        record[f'{name}_covariance'] = symmetric(upper, size)
         record[f'has_{name}'] = True
     return record

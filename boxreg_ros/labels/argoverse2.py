@@ -21,13 +21,8 @@ from boxreg_ros.labels.arrow import read_rows, read_table
 from boxreg_ros.labels.files import frame_names, to_json
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance, SceneFrames
-from boxreg_ros.labels.records import (
-    boxes_from_quaternions,
-    EVIDENCE_COLUMNS,
-    evidence_of,
-    refined_boxes,
-)
-from boxreg_ros.rotations import quaternion_from_matrix
+from boxreg_ros.labels.records import EVIDENCE_COLUMNS, evidence_of, refined_boxes
+from boxreg_ros.rotations import boxes_from_quaternions, quaternion_from_matrix
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, RefinedBoxes, Sweep
 from msg_adapters.poses import quaternions_of
 import numpy as np

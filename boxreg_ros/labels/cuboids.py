@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.covariance_table import POSE_TRIANGLE
 from boxreg_ros.labels.files import following, from_json, require_single
 from boxreg_ros.labels.folder import FolderWriter, frame_name
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame
-from boxreg_ros.labels.records import evidence_of, ReadBox, UPPER_TRIANGLE
+from boxreg_ros.labels.records import evidence_of, ReadBox
 from boxreg_ros.labels.sidecar import read_sidecar, STAMPS_FILE
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, ROLL
@@ -133,7 +134,7 @@ class CuboidWriter(FolderWriter):
                     'reason': evidence['reason'],
                     'num_points': int(frame.refined.num_points[row]),
                     'score': evidence['score'],
-                    'covariance': frame.refined.covariances[row][UPPER_TRIANGLE].tolist(),
+                    'covariance': frame.refined.covariances[row][POSE_TRIANGLE].tolist(),
                     'extent_covariance': evidence['extent_covariance'],
                     **({'attributes': dict(attributes)} if attributes else {}),
                 },

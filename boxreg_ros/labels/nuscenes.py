@@ -32,8 +32,8 @@ from boxreg_ros.labels.protocol import (
     Provenance,
     SceneFrames,
 )
-from boxreg_ros.labels.records import boxes_from_quaternions, evidence_of, refined_boxes
-from boxreg_ros.rotations import quaternion_from_matrix
+from boxreg_ros.labels.records import evidence_of, refined_boxes
+from boxreg_ros.rotations import boxes_from_quaternions, quaternion_from_matrix
 from boxreg_ros.structures import BOX_CENTER, Floats, HEIGHT, LENGTH, RefinedBoxes, WIDTH
 from msg_adapters.poses import quaternions_of
 import numpy as np

@@ -21,12 +21,8 @@ from boxreg_ros.io.box_table import COLUMNS
 from boxreg_ros.labels.arrow import read_table, Table
 from boxreg_ros.labels.files import to_json
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.records import (
-    boxes_from_quaternions,
-    finite_or_none,
-    numbers_of,
-    refined_boxes,
-)
+from boxreg_ros.labels.records import finite_or_none, numbers_of, refined_boxes
+from boxreg_ros.rotations import boxes_from_quaternions
 import numpy as np
 
 FORMAT = Format(

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from itertools import count
 from typing import Any, NamedTuple
 
+from boxreg_ros.io.covariance_table import symmetric
 from boxreg_ros.labels.protocol import INPUT_STATUS
-from boxreg_ros.rotations import rpy_from_quaternion
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, Floats, RefinedBoxes
 from msg_adapters.poses import quaternions_of
 import numpy as np
@@ -17,9 +17,6 @@ FIRST_ASSIGNED_NUMBER = 10**6
 """Track numbers below keep their value; assigned numbers start here (see `TrackNumbers`)."""
 LARGEST_ANGLE = 4 * np.pi
 """Angles up to two turns are radians [rad]; chosen: most degrees of a drive have larger ones."""
-MIN_QUATERNION_NORM = 1e-6
-"""A shorter quaternion states no orientation."""
-UPPER_TRIANGLE = np.triu_indices(6)
 
 
 class ReadBox(NamedTuple):
@@ -88,22 +85,7 @@ def _covariance(values: ArrayLike | None) -> Floats:
         return np.eye(6)
     if np.size(values) == 36:
         return np.reshape(np.asarray(values, np.float64), (6, 6))
-    matrix = np.zeros((6, 6))
-    matrix[UPPER_TRIANGLE] = values
-    return matrix + np.triu(matrix, 1).T
-
-
-def boxes_from_quaternions(
-    centres: ArrayLike, extents: ArrayLike, quaternions_xyzw: ArrayLike
-) -> Floats:
-    """Return boxes (n, 9) from rows; the angles are NaN where a quaternion is zero or NaN."""
-    parts = [np.asarray(part, np.float64) for part in (centres, extents, quaternions_xyzw)]
-    centre, extent, quaternion = (part.reshape(-1, part.shape[-1]) for part in parts)
-    angles = np.full((len(centre), 3), np.nan)
-    is_rotation = np.linalg.norm(quaternion, axis=1) > MIN_QUATERNION_NORM  # False for NaN
-    if is_rotation.any():
-        angles[is_rotation] = rpy_from_quaternion(quaternion[is_rotation])
-    return np.hstack([centre, extent, angles])
+    return symmetric(np.asarray(values, np.float64), 6)
 
 
 def require_radians(angles: ArrayLike) -> Floats:

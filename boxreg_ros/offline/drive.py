@@ -11,7 +11,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.stamp_join import joined_stamps
+from boxreg_ros.io.stamp_join import joined_stamps, nearest_rows
 from boxreg_ros.structures import BoxArray, Ints, Sweep
 import numpy as np
 
@@ -79,7 +79,4 @@ class Drive:
     def sweeps_at(self, stamps_ns: Ints) -> list[Sweep]:
         """Return the sweep nearest in time to each stamp."""
         own = np.array([sweep.stamp_ns for sweep in self.sweeps])
-        after = np.searchsorted(own, stamps_ns).clip(0, len(own) - 1)
-        before = (after - 1).clip(0)
-        rows = np.where(stamps_ns - own[before] < own[after] - stamps_ns, before, after)
-        return [self.sweeps[row] for row in rows]
+        return [self.sweeps[row] for row in nearest_rows(stamps_ns, own)]

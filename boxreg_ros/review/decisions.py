@@ -22,10 +22,9 @@ from typing import Any
 from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.io.box_table import csv_row, protected, unprotected
 from boxreg_ros.io.whole_files import written_whole
-from boxreg_ros.rotations import quaternion_from_rpy, rpy_from_quaternion
+from boxreg_ros.rotations import boxes_from_quaternions, quaternion_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, Floats, is_valid_box, ROLL, Z
 import numpy as np
-from numpy.typing import NDArray
 
 DECISIONS = 'decisions.csv'
 VERSION = 2
@@ -353,7 +352,7 @@ def _parsed(row: dict[str, str], version: int) -> Decision:
     box = None
     if any(row[name] for name in PINNED_BOX_COLUMNS):
         numbers = np.array([float(row[name] or 'nan') for name in PINNED_BOX_COLUMNS])
-        box = _box_of(numbers)
+        (box,) = boxes_from_quaternions(numbers[:3], numbers[7:], numbers[3:7])
     stamp_ns = int(row['stamp_ns']) if row['stamp_ns'] else None
     if version == 1:
         names = row['track_id'], stamp_ns, row['decision'], row['comment'], row['frame_id']
@@ -370,13 +369,3 @@ def _parsed(row: dict[str, str], version: int) -> Decision:
         unprotected(row['who']),
         row['when'],
     )
-
-
-def _box_of(numbers: NDArray[np.float64]) -> Floats:
-    """Return a box (9,) of `PINNED_BOX_COLUMNS` (10,), NaN angles without a valid quaternion."""
-    quaternion = numbers[3:7]
-    norm = np.linalg.norm(quaternion)
-    angles = np.full(3, np.nan)
-    if np.isfinite(norm) and norm > 0:
-        angles = rpy_from_quaternion(quaternion[None])[0]
-    return np.concatenate([numbers[:3], numbers[7:], angles])

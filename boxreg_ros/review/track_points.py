@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.observation import crop
+from boxreg_ros.io.stamp_join import nearest_rows
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, ROLL, Sweep, X, Z
@@ -94,10 +95,7 @@ class PointCollector:
         if not self._origins:
             return np.full((len(stamps_ns), 3), np.nan)
         known = np.array(sorted(self._origins))
-        after = np.searchsorted(known, stamps_ns).clip(0, len(known) - 1)
-        before = (after - 1).clip(0)
-        is_before = stamps_ns - known[before] < known[after] - stamps_ns
-        return self.origins[np.where(is_before, before, after)]
+        return self.origins[nearest_rows(stamps_ns, known)]
 
     def gather(self, boxes: BoxArray, sweep: Sweep | None) -> None:
         """Gather the points of a sweep around its boxes, both in the fixed frame."""
