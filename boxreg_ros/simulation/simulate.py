@@ -19,7 +19,6 @@ from boxreg_ros.simulation.breaks import break_tracks
 from boxreg_ros.simulation.raycast import ROAD
 from boxreg_ros.simulation.scenarios import SCENARIOS
 from boxreg_ros.simulation.scene import FIXED_FRAME, SENSOR_FRAME, SimulatedScene
-from boxreg_ros.simulation.truck import truck_scene, TRUCK_SENSORS, write_truck
 from boxreg_ros.simulation.writer import write_recording
 from boxreg_ros.structures import Ints
 import numpy as np
@@ -74,11 +73,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--sweeps', type=int, metavar='N', help='number of sweeps (default: that of the scenario)'
     )
     parser.add_argument(
-        '--sensors', choices=TRUCK_SENSORS,
-        help='a truck drives through the street, with LiDARs at its corners: a topic each, '
-        'concatenated with info, or concatenated alone; or with one on its roof',
-    )  # fmt: skip
-    parser.add_argument(
         '--break', action='store_true', dest='breaks',
         help='break the tracks: 8 %% of the boxes missing, gaps of 3 to 8 sweeps, new ids after '
         'half of them; the truth stays',
@@ -99,8 +93,6 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.ghosts and not args.breaks:
         raise ConfigError(f'--ghosts {args.ghosts:g}: expected with --break only; add --break')
-    if args.sensors:
-        return _simulate_truck(args, truth)
     scene = simulate(args.scenario, args.seed, args.sweeps)
     if args.breaks:
         scene = broken(scene, args.seed, args.ghosts)
@@ -119,21 +111,6 @@ def run(args: argparse.Namespace) -> int:
         f'{sum(len(sweep.points) for sweep in scene.sweeps)} points, '
         f'{sum(len(boxes.track_ids) for boxes in scene.detections)} boxes of '
         f'{len(scene.actors)} objects; {len(scene.truth.boxes)} true boxes in {truth}'
-    )
-    return 0
-
-
-def _simulate_truck(args: argparse.Namespace, truth: Path) -> int:
-    """Write the recording of a truck and its truth, and print a summary."""
-    if args.breaks or args.scenario != 'street':
-        raise ConfigError('--sensors: expected without --break and --scenario; leave these out')
-    scene = truck_scene(args.seed, args.sweeps)
-    write_truck(args.output, scene, args.sensors)
-    scene.truth.write(truth)
-    print(
-        f'{args.output}: {len(scene.detections)} sweeps of a truck, LiDARs {args.sensors}, '
-        f'{sum(len(boxes.track_ids) for boxes in scene.detections)} boxes; '
-        f'{len(scene.truth.boxes)} true boxes in {truth}'
     )
     return 0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 import tempfile
 from typing import Any
@@ -137,36 +137,6 @@ class LidarMessages:
             transform=transform,
         )
         return self.make('tf2_msgs/TFMessage', transforms=[stamped])
-
-    def static_transforms(self, stamp_ns: int, parent: str, children: Mapping[str, Floats]) -> Any:
-        """Return a TFMessage with T_parent_child (4, 4) of several children."""
-        messages = [self.transform(stamp_ns, parent, name, T) for name, T in children.items()]
-        every = [message.transforms[0] for message in messages]
-        return self.make('tf2_msgs/TFMessage', transforms=every)
-
-    def info(self, whole: Sweep, parts: Sequence[Sweep]) -> Any:
-        """Return the info on a cloud that is concatenated from `parts`."""
-        begin = 0
-        sources = []
-        for part in parts:
-            source = self.make(
-                'autoware_sensing_msgs/SourcePointCloudInfo',
-                header=self.header(part.stamp_ns, part.frame_id),
-                topic=f'/points/{part.frame_id}',
-                status=0,
-                idx_begin=begin,
-                length=len(part.points),
-            )
-            sources.append(source)
-            begin += len(part.points)
-        return self.make(
-            'autoware_sensing_msgs/ConcatenatedPointCloudInfo',
-            header=self.header(whole.stamp_ns, whole.frame_id),
-            concatenation_success=True,
-            matching_strategy=0,
-            matching_strategy_config=np.zeros(0, np.uint8),
-            source_info=sources,
-        )
 
     def odometry(self, stamp_ns: int, parent: str, child: str, T: Floats) -> Any:
         """Return an Odometry of T_parent_child (4, 4)."""

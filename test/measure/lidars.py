@@ -18,7 +18,7 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
-from boxreg_ros.simulation.truck import CORNER_LIDARS, truck_scene, write_truck
+from measure.truck import CORNER_LIDARS, truck_scene, write_truck
 import numpy as np
 
 CLASSES = ('car', 'van', 'truck')
@@ -35,6 +35,7 @@ MIN_POINTS = 100
 ARGUMENTS = {
     '--seeds': (3, 'number of drives'),
     '--sweeps': (int, 'sweeps of a drive'),
+    '--keep': (Path, 'folder that keeps the recordings and the true boxes of each seed'),
 }
 
 
@@ -42,7 +43,7 @@ def run(args):
     """Return the mean IoU of the input and of each way to record the LiDARs."""
     rows = {name: [] for name in ('input', *WAYS)}
     for seed in range(args.seeds):
-        for name, ious in measured(seed, args.sweeps).items():
+        for name, ious in measured(seed, args.sweeps, args.keep).items():
             rows[name].append(ious)
     return {
         name: dict(zip(('bev', '3d'), np.mean(ious, axis=0).tolist(), strict=True))
@@ -50,13 +51,16 @@ def run(args):
     }
 
 
-def measured(seed, sweeps):
+def measured(seed, sweeps, keep=None):
     """Return mean BEV and 3D IoU of the input and of each way for one drive."""
     scene = truck_scene(seed, sweeps)
     found = {}
     with tempfile.TemporaryDirectory() as folder:
+        recordings = Path(folder if keep is None else keep) / str(seed)
+        recordings.mkdir(parents=True, exist_ok=True)
+        scene.truth.write(recordings / 'truth.csv')
         for name, (layout, lidars) in WAYS.items():
-            path = Path(folder) / f'{layout}.mcap'
+            path = recordings / f'{layout}.mcap'
             out = Path(folder) / name
             write_truck(path, scene, layout)
             if not found:

@@ -9,7 +9,7 @@ frame ``base``, at the stamp of the first LiDAR.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,6 +43,40 @@ ROOF_STREAM = 2
 TRUCK_SENSORS = ('corners', 'concatenated', 'concatenated-alone', 'roof')
 """What is recorded: a topic per corner, one concatenated cloud with or without info, or the
 roof."""
+
+
+class TruckMessages(LidarMessages):
+    """Makes the messages of a recording with several LiDARs."""
+
+    def static_transforms(self, stamp_ns: int, parent: str, children: Mapping[str, Floats]) -> Any:
+        """Return a TFMessage with T_parent_child (4, 4) of several children."""
+        messages = [self.transform(stamp_ns, parent, name, T) for name, T in children.items()]
+        every = [message.transforms[0] for message in messages]
+        return self.make('tf2_msgs/TFMessage', transforms=every)
+
+    def info(self, whole: Sweep, parts: Sequence[Sweep]) -> Any:
+        """Return the info on a cloud that is concatenated from `parts`."""
+        begin = 0
+        sources = []
+        for part in parts:
+            source = self.make(
+                'autoware_sensing_msgs/SourcePointCloudInfo',
+                header=self.header(part.stamp_ns, part.frame_id),
+                topic=f'/points/{part.frame_id}',
+                status=0,
+                idx_begin=begin,
+                length=len(part.points),
+            )
+            sources.append(source)
+            begin += len(part.points)
+        return self.make(
+            'autoware_sensing_msgs/ConcatenatedPointCloudInfo',
+            header=self.header(whole.stamp_ns, whole.frame_id),
+            concatenation_success=True,
+            matching_strategy=0,
+            matching_strategy_config=np.zeros(0, np.uint8),
+            source_info=sources,
+        )
 
 
 class TruckScene(NamedTuple):
@@ -84,7 +118,7 @@ def write_truck(path: Path, scene: TruckScene, layout: str) -> None:
 
 def _messages(scene: TruckScene, layout: str) -> Iterator[tuple[str, Any, int]]:
     """Yield topic, message and receive time [ns]."""
-    make = LidarMessages()
+    make = TruckMessages()
     mounts = ROOF_LIDAR if layout == 'roof' else CORNER_LIDARS
     clouds = {name: scene.clouds[name] for name in mounts}
     first_ns = scene.detections[0].stamp_ns

@@ -1,13 +1,12 @@
-"""The truck of `boxreg simulate --sensors`."""
+"""The truck of `measure lidars`."""
 
-from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.session import Session
 from boxreg_ros.io.transforms import TransformTree
-from boxreg_ros.simulation.truck import CORNER_LIDARS, truck_scene, TRUCK_SENSORS, write_truck
 from boxreg_ros.structures import Sweep
+from measure.truck import CORNER_LIDARS, truck_scene, TRUCK_SENSORS, write_truck
 from msg_adapters.convention import STANDARD
 import numpy as np
 import pytest
@@ -59,16 +58,8 @@ def test_each_lidar_sees_its_side_only(scene):
 
 
 @pytest.mark.parametrize('layout', TRUCK_SENSORS)
-def test_the_command_writes_a_recording(layout, tmp_path, capsys):
+def test_recording_has_the_topics_of_its_layout(scene, layout, tmp_path):
     path = tmp_path / 'truck.mcap'
-    assert main(['simulate', '-o', str(path), '--sensors', layout, '--sweeps', '1']) == 0
-    assert f'LiDARs {layout}' in capsys.readouterr().out
-    assert (tmp_path / 'truck_truth.csv').exists()
+    write_truck(path, scene, layout)
     with Recording([path], Lidars(TOPICS if layout == 'corners' else ())) as recording:
         assert ('/points_info' in recording.topics) == (layout == 'concatenated')
-
-
-def test_other_scenarios_have_no_truck(tmp_path, capsys):
-    command = ['simulate', '-o', str(tmp_path / 'a.mcap'), '--sensors', 'roof']
-    assert main([*command, '--scenario', 'highway']) == 2
-    assert '--sensors: expected without' in capsys.readouterr().err
