@@ -7,12 +7,16 @@ from pathlib import Path
 import re
 
 from boxreg_ros.config import KINDS, settings
+from boxreg_ros.datasets.registry import DATASETS, module_of
+from boxreg_ros.labels import import_format
+from boxreg_ros.labels.registry import BUILT_IN
 from boxreg_ros.offline import formats
 from boxreg_ros.reasons import Reason
 from msg_adapters import registry
 
 DOCS = Path(__file__).resolve().parent
 COMMAND = 'python docs/generate.py'
+READING_COLUMNS = ('name', 'what is read', 'what is left out', 'read back by')
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -47,12 +51,23 @@ def parameters() -> str:
     )
 
 
+def reading_rows() -> list[tuple[str, ...]]:
+    """Return what is read of each format and data set that states it, in `READING_COLUMNS`."""
+    found: list[tuple[str, ...]] = []
+    for form in (import_format(name).FORMAT for name in BUILT_IN):
+        found.append((form.name, form.reads, form.leaves_out, form.read_back))
+    for name in DATASETS:
+        dataset = module_of(name).DATASET
+        found.append((f'{name}:', dataset.reads, dataset.leaves_out, dataset.read_back))
+    return [row for row in found if any(row[1:])]
+
+
 TABLES = {
     'parameters.md': {'': parameters},
     'formats.md': {
         'messages': lambda: table(registry.MESSAGE_COLUMNS, registry.rows()),
         'labels': lambda: table(formats.FORMAT_COLUMNS, formats.rows()),
-        'reading': lambda: table(formats.READING_COLUMNS, formats.reading_rows()),
+        'reading': lambda: table(READING_COLUMNS, reading_rows()),
         'datasets': lambda: table(formats.DATASET_COLUMNS, formats.dataset_rows()),
     },
     'troubleshooting.md': {

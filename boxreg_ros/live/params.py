@@ -250,53 +250,6 @@ def parameters_yaml(config: Config, options: NodeOptions | None = None) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def parameters_schema() -> dict[str, Any]:
-    """Return the JSON schema of a ROS parameter file of the node, such as `params.yaml`."""
-    values: dict[str, Any] = {'use_sim_time': {'type': 'boolean'}, 'qos_overrides': {}}
-    for item in (*NODE_SETTINGS, *settings()):
-        group, _, name = item.name.rpartition('.')
-        target = values
-        if group:
-            target = values.setdefault(group, _object_schema({}))['properties']
-        target[name] = _schema_of(item)
-    parameters = _object_schema({'ros__parameters': _object_schema(values)})
-    return {
-        '$schema': 'http://json-schema.org/draft-07/schema#',
-        'title': 'Parameters of boxreg_node',
-        'type': 'object',
-        'additionalProperties': parameters,  # by the name of the node, or /** for any
-    }
-
-
-def _object_schema(properties: dict[str, Any]) -> dict[str, Any]:
-    return {'type': 'object', 'properties': properties, 'additionalProperties': False}
-
-
-def _schema_of(item: Setting) -> dict[str, Any]:
-    """Return the JSON schema of one setting: type, default, meaning and bounds."""
-    names = {bool: 'boolean', int: 'integer', float: 'number', str: 'string', tuple: 'array'}
-    unit = f' [{item.unit}]' if item.unit else ''
-    schema = {
-        'type': names[type(item.default)],
-        'default': _plain(item.default),
-        'description': f'{item.meaning}{unit}',
-    }
-    if isinstance(item.default, tuple):
-        schema['items'] = {'type': 'string'}
-    if item.choices:
-        schema['enum'] = list(item.choices)
-    if item.low is not None:
-        schema |= {'minimum': item.low, 'maximum': item.high}
-    if item.choices and item.low is not None:  # a number, or a text with one
-        schema['type'] = ['string', 'number']
-        schema['anyOf'] = [
-            {'enum': schema.pop('enum')},
-            {'type': 'number'},
-            {'pattern': '^[-0-9]'},
-        ]
-    return schema
-
-
 def describe(item: Setting) -> ParameterDescriptor:
     """Return the descriptor of a parameter: meaning, unit, bounds and whether it may change."""
     unit = f' [{item.unit}]' if item.unit else ''

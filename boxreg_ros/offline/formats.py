@@ -8,7 +8,6 @@ from boxreg_ros.datasets.registry import DATASETS
 from boxreg_ros.datasets.registry import module_of as dataset_module
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.labels import can_read, FORMATS, import_format
-from boxreg_ros.labels.registry import BUILT_IN
 
 FORMAT_COLUMNS = (
     'name',
@@ -21,23 +20,7 @@ FORMAT_COLUMNS = (
     'files',
     'needs',
 )
-
-
 DATASET_COLUMNS = ('address', 'data set', 'in the folder', '`--labels`', 'needs')
-
-
-READING_COLUMNS = ('name', 'what is read', 'what is left out', 'read back by')
-
-
-def reading_rows() -> list[tuple[str, ...]]:
-    """Return what is read of each format and data set that states it, in `READING_COLUMNS`."""
-    table: list[tuple[str, ...]] = []
-    for form in (import_format(name).FORMAT for name in BUILT_IN):
-        table.append((form.name, form.reads, form.leaves_out, form.read_back))
-    for name in DATASETS:
-        dataset = dataset_module(name).DATASET
-        table.append((f'{name}:', dataset.reads, dataset.leaves_out, dataset.read_back))
-    return [row for row in table if any(row[1:])]
 
 
 def dataset_rows() -> list[tuple[str, ...]]:

@@ -4,13 +4,12 @@ import json
 import re
 from xml.etree import ElementTree
 
-from boxreg_ros.config import Config
+from boxreg_ros.config import Config, settings
 from boxreg_ros.io.markers import NAMESPACES
 from boxreg_ros.live.params import (
     declare,
     NODE_SETTINGS,
     NodeOptions,
-    parameters_schema,
     parameters_yaml,
 )
 from measure.node import PROFILE
@@ -47,6 +46,54 @@ def test_parameter_file_holds_the_defaults_for_any_node(name):
         node.destroy_node()
     finally:
         rclpy.shutdown(context=context)
+
+
+def parameters_schema():
+    """Return the JSON schema of a ROS parameter file of the node, such as `params.yaml`."""
+    values = {'use_sim_time': {'type': 'boolean'}, 'qos_overrides': {}}
+    for item in (*NODE_SETTINGS, *settings()):
+        group, _, name = item.name.rpartition('.')
+        target = values
+        if group:
+            target = values.setdefault(group, object_schema({}))['properties']
+        target[name] = schema_of(item)
+    parameters = object_schema({'ros__parameters': object_schema(values)})
+    return {
+        '$schema': 'http://json-schema.org/draft-07/schema#',
+        'title': 'Parameters of boxreg_node',
+        'type': 'object',
+        'additionalProperties': parameters,  # by the name of the node, or /** for any
+    }
+
+
+def object_schema(properties):
+    return {'type': 'object', 'properties': properties, 'additionalProperties': False}
+
+
+def schema_of(item):
+    """Return the JSON schema of one setting: type, default, meaning and bounds."""
+    names = {bool: 'boolean', int: 'integer', float: 'number', str: 'string', tuple: 'array'}
+    unit = f' [{item.unit}]' if item.unit else ''
+    plain = (list(item.default) or ['']) if isinstance(item.default, tuple) else item.default
+    schema = {
+        'type': names[type(item.default)],
+        'default': plain,
+        'description': f'{item.meaning}{unit}',
+    }
+    if isinstance(item.default, tuple):
+        schema['items'] = {'type': 'string'}
+    if item.choices:
+        schema['enum'] = list(item.choices)
+    if item.low is not None:
+        schema |= {'minimum': item.low, 'maximum': item.high}
+    if item.choices and item.low is not None:  # a number, or a text with one
+        schema['type'] = ['string', 'number']
+        schema['anyOf'] = [
+            {'enum': schema.pop('enum')},
+            {'type': 'number'},
+            {'pattern': '^[-0-9]'},
+        ]
+    return schema
 
 
 def schema_text():
