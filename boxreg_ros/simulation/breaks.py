@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, Floats, ROLL, X, Y, YAW
 import numpy as np
+from numpy.typing import NDArray
 
 BREAK_MISS_PROBABILITY = 0.08
 """Part of the boxes that are missing beside the gaps; literature: PointRCNN misses 6.8 %."""
-MISS_SWEEPS = 3.0
-"""Mean length of a run of misses that depend on the distance; chosen: such misses repeat."""
-MAX_MISS_PROBABILITY = 0.5
-"""Greatest part of missing boxes at any distance; chosen: a detector that misses more has none."""
 SWEEPS_PER_GAP = 60
 """A track has one gap in so many sweeps on average; chosen."""
 GAP_SWEEPS = (3, 8)
@@ -33,6 +30,16 @@ DUPLICATE_PROBABILITY = 0.2
 """Part of the ghosts that are a second box of an object; chosen."""
 GHOST_JITTER = 0.15
 """Standard deviation of the steps of a ghost, and of a second box from the first [m]; chosen."""
+
+Misses = Callable[[str, Sequence[int], np.random.Generator], NDArray[np.bool_]]
+"""Takes a track and the rows of its n arrays; says in which of them it is missed, (n,)."""
+
+
+def independent_misses(
+    _: str, arrays: Sequence[int], rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """Return misses of a track that do not depend on each other, nor on where it is."""
+    return rng.random(len(arrays)) < BREAK_MISS_PROBABILITY
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,34 +59,29 @@ def break_tracks(
     rng: np.random.Generator,
     ghosts: float = 0.0,
     origins: Floats | None = None,
-    far_misses: bool = False,
+    misses: Misses = independent_misses,
 ) -> list[BoxArray]:
     """
     Return box arrays with missed boxes, gaps, changed ids and ghosts.
 
     The arrays are one per sweep, in the order of stamps, in one fixed frame. `ghosts` is the
     mean number of boxes per sweep that belong to no object. `origins` (n, 3) are the positions
-    of the sensor, for ghosts and far misses. Far misses come in runs, as likely as the square of
-    the distance, like those of a detector that has too few points; other misses are independent.
-    The boxes that are left have exactly the input poses and extents. Raises ConfigError if
-    `ghosts` is negative, or something needs `origins` that are not given.
+    of the sensor, for ghosts. The boxes that are left have exactly the input poses and extents.
+    Raises ConfigError if `ghosts` is negative, or needs `origins` that are not given.
 
     """
-    if ghosts < 0 or ((ghosts or far_misses) and origins is None):
+    if ghosts < 0 or (ghosts and origins is None):
         raise ConfigError(f'ghosts: expected 0 or more, and origins, got {ghosts:g}')
-    probabilities = _miss_probabilities(arrays, origins, far_misses)
-    sweeps_of: dict[str, list[tuple[int, float]]] = {}  # with the probability of a miss
+    sweeps_of: dict[str, list[int]] = {}
     for sweep, array in enumerate(arrays):
-        for track_id, probability in zip(array.track_ids, probabilities[sweep], strict=True):
-            sweeps_of.setdefault(track_id, []).append((sweep, probability))
+        for track_id in array.track_ids:
+            sweeps_of.setdefault(track_id, []).append(sweep)
     new_id: dict[tuple[int, str], str] = {}  # of the boxes that are left, by sweep and old id
     for track_id, sweeps in sweeps_of.items():
         names = _broken_names(track_id, len(sweeps), rng)
-        numbers = rng.random(len(sweeps))
-        if far_misses:
-            numbers = _repeated(numbers, rng)
-        for (sweep, probability), name, number in zip(sweeps, names, numbers, strict=True):
-            if name and number >= probability:
+        is_missed = misses(track_id, sweeps, rng)
+        for sweep, name, is_gone in zip(sweeps, names, is_missed, strict=True):
+            if name and not is_gone:
                 new_id[sweep, track_id] = name
     broken = [_renamed(array, sweep, new_id) for sweep, array in enumerate(arrays)]
     if ghosts and origins is not None:
@@ -102,27 +104,6 @@ def _broken_names(track_id: str, count: int, rng: np.random.Generator) -> list[s
         names[end:] = [track_id + suffix] * (count - end)
         box = end + 1 + round(rng.exponential(SWEEPS_PER_GAP))
     return names
-
-
-def _miss_probabilities(
-    arrays: Sequence[BoxArray], origins: Floats | None, far_misses: bool
-) -> list[Floats]:
-    """Return the probability (b,) that each box is missed, of each array with b boxes."""
-    if not far_misses or origins is None:
-        return [np.full(len(array.track_ids), BREAK_MISS_PROBABILITY) for array in arrays]
-    squares = [
-        np.square(array.boxes[:, X : Y + 1] - origin[:2]).sum(1)
-        for array, origin in zip(arrays, origins, strict=True)
-    ]
-    part = BREAK_MISS_PROBABILITY / np.concatenate(squares).mean()
-    return [np.minimum(MAX_MISS_PROBABILITY, part * square) for square in squares]
-
-
-def _repeated(numbers: Floats, rng: np.random.Generator) -> Floats:
-    """Return random numbers (n,) that repeat in runs of `MISS_SWEEPS` on average."""
-    is_new = rng.random(len(numbers)) < 1 / MISS_SWEEPS
-    is_new[:1] = True
-    return np.asarray(numbers[is_new][np.cumsum(is_new) - 1])
 
 
 def _renamed(array: BoxArray, sweep: int, new_id: dict[tuple[int, str], str]) -> BoxArray:

@@ -21,7 +21,12 @@ from boxreg_ros.offline.box_scores import overlaps
 from boxreg_ros.offline.completion import Completion, first_pass
 from boxreg_ros.offline.track_scores import track_scores, TrackScores
 from boxreg_ros.review.rules import DUPLICATE_IOU
-from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
+from boxreg_ros.simulation.breaks import (
+    BREAK_MISS_PROBABILITY,
+    break_tracks,
+    GHOST_PREFIX,
+    independent_misses,
+)
 from boxreg_ros.structures import BoxArray, REJECTED
 from measure.drives import Drive
 import numpy as np
@@ -41,6 +46,10 @@ class Row(NamedTuple):
     by_kind: dict  # scores of each kind of object, and of objects with `ONE_LABEL`
 
 
+MISS_SWEEPS = 3.0
+"""Mean length of a run of misses that depend on the distance; chosen: such misses repeat."""
+MAX_MISS_PROBABILITY = 0.5
+"""Greatest part of missing boxes at any distance; chosen: a detector that misses more has none."""
 ARGUMENTS = {
     'data': (Path, 'folder with one recording and truth.csv, as boxes.csv', {'nargs': '+'}),
     '--ghosts': (0.0, 'mean number of boxes per sweep that belong to no object'),
@@ -73,8 +82,39 @@ def broken(drive, seed, ghosts, far_misses=False):
     stamps = np.array([array.stamp_ns for array in drive.boxes])
     origins = np.array([sweep.origin for sweep in drive.sweeps_at(stamps)])
     rng = np.random.default_rng(seed)
-    arrays = break_tracks(drive.boxes, rng, ghosts, origins, far_misses)
+    misses = FarMisses(drive.boxes, origins) if far_misses else independent_misses
+    arrays = break_tracks(drive.boxes, rng, ghosts, origins, misses)
     return replace(drive, boxes=tuple(arrays))
+
+
+class FarMisses:
+    """
+    Misses that come in runs, as likely as the square of the distance to the sensor.
+
+    They are like those of a detector that has too few points. The arrays are one per sweep, in
+    one frame with the positions of the sensor (n, 3).
+
+    """
+
+    def __init__(self, arrays, origins):
+        squares = [
+            np.square(array.boxes[:, :2] - origin[:2]).sum(1)
+            for array, origin in zip(arrays, origins, strict=True)
+        ]
+        part = BREAK_MISS_PROBABILITY / np.concatenate(squares).mean()
+        probabilities = [(part * square).clip(max=MAX_MISS_PROBABILITY) for square in squares]
+        self._probabilities = [
+            dict(zip(array.track_ids, likely, strict=True))
+            for array, likely in zip(arrays, probabilities, strict=True)
+        ]
+
+    def __call__(self, track_id, arrays, rng):
+        """Return in which of its arrays a track is missed, as `breaks.Misses`."""
+        numbers = rng.random(len(arrays))
+        is_new = rng.random(len(arrays)) < 1 / MISS_SWEEPS
+        is_new[:1] = True
+        repeated = numbers[is_new][np.cumsum(is_new) - 1]
+        return repeated < [self._probabilities[row][track_id] for row in arrays]
 
 
 def _rows(whole, drive, coast):

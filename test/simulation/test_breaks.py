@@ -8,6 +8,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.simulation.breaks import break_tracks
 from boxreg_ros.simulation.simulate import broken, simulate
 from boxreg_ros.structures import BoxArray
+from measure.tracks import FarMisses
 import numpy as np
 import pytest
 
@@ -53,8 +54,8 @@ def test_part_of_the_boxes_is_missing_and_ids_change():
 
 def test_far_boxes_are_missed_more_often_and_in_runs():
     """The distance of track k is 100 k m: its square is 1 / 1200 k^2 of the mean square."""
-    origins = np.zeros((SWEEPS, 3))
-    found = break_tracks(arrays(), np.random.default_rng(1), 0.0, origins, far_misses=True)
+    far = FarMisses(arrays(), np.zeros((SWEEPS, 3)))
+    found = break_tracks(arrays(), np.random.default_rng(1), misses=far)
     left = np.zeros(TRACKS)
     for array in found:
         for name in array.track_ids:
@@ -82,7 +83,7 @@ def test_ghosts_have_their_rate_and_short_lives():
     with pytest.raises(ConfigError, match='ghosts: expected 0 or more'):
         break_tracks(arrays(), np.random.default_rng(3), -1.0, origins)
     with pytest.raises(ConfigError, match='origins'):
-        break_tracks(arrays(), np.random.default_rng(3), far_misses=True)
+        break_tracks(arrays(), np.random.default_rng(3), 1.5)
 
 
 def test_same_seed_breaks_alike_and_keeps_the_truth():
