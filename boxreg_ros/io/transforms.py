@@ -84,32 +84,6 @@ A vehicle has tens of frames; trackers that publish a frame per object add some 
 """
 
 
-class TimeJumpDetector:
-    """
-    Detect that the stamps of a stream start again: a recording in a loop, a simulation reset.
-
-    One message that is much older than the newest is an outlier; two in a row are a jump.
-
-    """
-
-    def __init__(self) -> None:
-        self._newest_ns: int | None = None
-        self._was_back = False
-
-    def has_jumped(self, stamp_ns: int) -> bool:
-        """Add the next stamp [ns]; return whether time went back before it."""
-        if self._newest_ns is None:
-            self._newest_ns = stamp_ns
-        is_back = stamp_ns < self._newest_ns - round(TIME_JUMP * 1e9)
-        if is_back and self._was_back:
-            self._newest_ns = stamp_ns
-            self._was_back = False
-            return True
-        self._newest_ns = max(self._newest_ns, stamp_ns)
-        self._was_back = is_back
-        return False
-
-
 class Link(NamedTuple):
     """A pair of parent and child frame; `stamps_ns` ascend, and are one for a static pair."""
 
@@ -563,7 +537,7 @@ class Edge:
         self.arrivals = ReceiveTimes()
         self.contradictions = 0
         self.num_ahead = 0
-        self._jump_detector = TimeJumpDetector()
+        self._was_old = False  # whether the last sample was: one far behind the newest
         self._clock = StreamClock()
         self._ahead: tuple[int, tuple[float, ...], int | None] | None = None
         self._was_forgotten = False
@@ -616,9 +590,12 @@ class Edge:
             return  # no pose; the error of a lookup has the stamps that are known
         self._last_added = stamp_ns, values
         self._last_found = None
-        if self._jump_detector.has_jumped(stamp_ns):
+        is_old = bool(self.stamps) and stamp_ns < self.stamps[-1] - round(TIME_JUMP * 1e9)
+        has_jumped = is_old and self._was_old  # a single old one is an outlier
+        if has_jumped:
             self._forget()
             self._was_forgotten = True
+        self._was_old = is_old and not has_jumped
         if self.is_static:
             first, end = 0, len(self.stamps)
         else:
@@ -641,7 +618,6 @@ class Edge:
             return
         self._forget()
         self._was_forgotten = stamp_ns > 0  # 0: the recording is read again, no time jump
-        self._jump_detector = TimeJumpDetector()
         last_added = self._last_added
         if last_added is not None and last_added[0] <= newest_ns:
             self.add(last_added[0], tuple(last_added[1]))  # it arrived after time went back
@@ -650,6 +626,7 @@ class Edge:
         self.stamps.clear()
         self.poses.clear()
         self._clock = StreamClock()
+        self._was_old = False
         self._last_found = None
 
     @property
