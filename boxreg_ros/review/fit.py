@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from boxreg_ros.core.l_shape import closest_heading
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.structures import Floats
 import numpy as np
@@ -31,8 +32,6 @@ MIN_POINTS = 5
 """Fewer points do not show the shape of an object."""
 ANGLES = np.radians(np.arange(0, 90, 1.5))
 """Headings that are tried [rad]."""
-LEAST_DISTANCE = 0.05
-"""Distances to a side below this count the same [m]: range noise."""
 MISSING = np.array([0.3, 0.5, 0.7])
 """Weights of length, width and height that are not seen; chosen: the width is seen more often."""
 DRAWN_STRIP = 0.6, 1.3
@@ -206,16 +205,6 @@ def _touching(points: Floats, place: Floats) -> NDArray[np.bool_]:
     return np.asarray((label == label[nearest]) & (away[nearest] < MAX_AWAY))
 
 
-def _heading(points: Floats) -> float:
-    """Return the heading whose box has its sides nearest to the points (M, 2)."""
-    scores = []
-    for yaw in ANGLES:
-        local = _turned(points, -yaw)
-        to_sides = np.minimum(local - local.min(0), local.max(0) - local).min(1)
-        scores.append((1 / to_sides.clip(LEAST_DISTANCE)).sum())
-    return float(ANGLES[int(np.argmax(scores))])
-
-
 def _span(points: Floats, yaw: float) -> tuple[Floats, Floats]:
     """Return the least and the largest coordinates (2,) along the axes of a heading."""
     local = _turned(points, -yaw)
@@ -238,7 +227,7 @@ def _shape(
 
     """
     found = []
-    first = _heading(cluster[:, :2])
+    first = closest_heading(cluster[:, :2], ANGLES)
     for yaw in (first, first + np.pi / 2):
         low, high = _span(cluster[:, :2], yaw)
         size = np.append(high - low, cluster[:, 2].max() - bottom)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from boxreg_ros.core.l_shape import closest_heading
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, ROLL, WIDTH, YAW
 import numpy as np
@@ -38,6 +39,10 @@ MIN_OPEN = 2
 """So many of them have points of it."""
 OPEN_PART = 0.6
 """Part of the cells around a cluster, of those with points, that are open road."""
+YAWS = np.radians(np.arange(0, 90, 3))
+"""Headings that are tried [rad]."""
+MANY_POINTS = 200
+"""Of more points of a cluster about so many are tried."""
 BOX_MARGIN = 0.4
 """Points so far outside of a box are of its object [m]."""
 MIN_SWEEPS = 8
@@ -240,22 +245,15 @@ def _stands_free(cells: Ints, is_open: NDArray[np.bool_], seen: NDArray[np.bool_
 
 def _rectangle(points: Floats) -> tuple[float, Floats, Floats]:
     """Return yaw and limits (2,), (2,) of the rectangle whose sides are nearest to points."""
-    thinned = points[:: 1 + len(points) // 200]
-    yaws = np.radians(np.arange(0, 90, 3))
-    axes = np.stack([np.cos(yaws), np.sin(yaws)], 1)  # (A, 2)
-    normals = np.stack([-np.sin(yaws), np.cos(yaws)], 1)
-    along, across = thinned @ axes.T, thinned @ normals.T  # (M, A)
-    to_side = np.minimum.reduce(
-        [
-            along - along.min(0),
-            along.max(0) - along,
-            across - across.min(0),
-            across.max(0) - across,
-        ]
-    )
-    best = int((1 / np.maximum(to_side, 0.05)).sum(0).argmax())
-    turned = points @ np.stack([axes[best], normals[best]], 1)
-    return float(yaws[best]), turned.min(0), turned.max(0)
+    yaw = closest_heading(points[:: 1 + len(points) // MANY_POINTS], YAWS)
+    turned = points @ _axes(yaw)
+    return yaw, turned.min(0), turned.max(0)
+
+
+def _axes(yaw: float) -> Floats:
+    """Return the axes of a box from above, the columns of (2, 2)."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s], [s, c]])
 
 
 def _turned(place: Floats, yaw: float) -> Floats:
@@ -329,8 +327,7 @@ def _box(cluster: _Cluster, class_name: str, heading: float | None) -> Floats:
         yaw = heading
     elif (high - low)[1] > (high - low)[0]:
         yaw += np.pi / 2
-    c, s = np.cos(yaw), np.sin(yaw)
-    axes = np.array([[c, -s], [s, c]])
+    axes = _axes(yaw)
     turned = cluster.points[:, :2] @ axes
     low, high = turned.min(0), turned.max(0)
     usual = np.array(USUAL[class_name])

@@ -1,0 +1,43 @@
+"""
+The heading of an object by its points, which lie on two of its sides.
+
+Zhang et al., Efficient L-Shape Fitting for Vehicle Detection Using Laser Scanners, IV 2017: the
+rectangle whose sides are nearest to the points (closeness criterion).
+
+"""
+
+from boxreg_ros.structures import Floats
+import numpy as np
+
+LEAST_DISTANCE = 0.05
+"""Distances to a side below this count the same [m]: range noise."""
+
+
+def closest_heading(points: Floats, yaws: Floats) -> float:
+    """
+    Return the heading whose rectangle has its sides nearest to the points.
+
+    Parameters
+    ----------
+    points : array, shape (M, 2)
+        At least one, from above [m].
+    yaws : array, shape (n,)
+        Headings that are tried, of a quarter turn [rad].
+
+    Returns
+    -------
+    yaw : float
+        One of them.
+
+    """
+    cos, sin = np.cos(yaws), np.sin(yaws)
+    along, across = points @ np.stack([cos, sin]), points @ np.stack([-sin, cos])  # (M, n)
+    to_sides = np.minimum.reduce(
+        [
+            along - along.min(0),
+            along.max(0) - along,
+            across - across.min(0),
+            across.max(0) - across,
+        ]
+    )
+    return float(yaws[(1 / np.maximum(to_sides, LEAST_DISTANCE)).sum(0).argmax()])
