@@ -7,7 +7,7 @@ Command line options, stated once: in the dataclass whose field has the value.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import field
 from typing import Any, NamedTuple
 
@@ -19,7 +19,8 @@ class Option(NamedTuple):
     Attributes
     ----------
     meaning : str
-        For help texts; ``%(default)s`` is the default as users write it.
+        For help texts, to which the unit is added, and a default that is not empty unless it is
+        stated here.
     flag : str
         Empty for the name of the field, with ``--`` before it.
     metavar : str or None
@@ -28,10 +29,14 @@ class Option(NamedTuple):
         Returns the value of a text, or raises `argparse.ArgumentTypeError` with what is expected.
     text : callable
         Returns the text of a value: the inverse of `parse`.
-    choices : collection of str
+    choices : tuple of str
         Allowed values; empty for any.
     is_repeated : bool
         True if the field is a tuple, with one parsed value for each time the option is given.
+    unit : str
+        Of a number; empty for none.
+    low, high : float or None
+        Bounds of a number where it is a parameter of the node.
 
     """
 
@@ -40,8 +45,11 @@ class Option(NamedTuple):
     metavar: str | None = None
     parse: Callable[[str], Any] = str
     text: Callable[[Any], str] = str
-    choices: Collection[str] = ()
+    choices: tuple[str, ...] = ()
     is_repeated: bool = False
+    unit: str = ''
+    low: float | None = None
+    high: float | None = None
 
 
 def option(default: Any, meaning: str, **facts: Any) -> Any:

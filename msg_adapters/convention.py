@@ -67,46 +67,49 @@ class Convention:
     pose_reference: str = option(
         'center',
         f'point of the box at its pose: {", ".join(REFERENCES)}, or X,Y,Z as fractions of length, '
-        f'width and height (default: %(default)s)',
+        f'width and height',
         metavar='POINT',
     )
     size_order: str = option(
         'lwh',
-        'meaning of x, y and z of a size (default: %(default)s: length, width, height)',
+        'order of length, width and height in x, y and z of a size',
         choices=SIZE_ORDERS,
     )
     forward_axis: str = option(
         'x+',
-        'axis of the box pose that points forward (default: %(default)s)',
+        'axis of the box pose that points forward',
         choices=tuple(FORWARD),
     )
     orientation: str = option(
         'xyzw',
-        'meaning of the orientation of a box (default: %(default)s): wxyz if w of its quaternion '
-        'comes first, clockwise if yaw grows to the right, left_handed if y points to the right, '
-        'too',
+        'meaning of the orientation of a box: wxyz if w of its quaternion comes first, clockwise '
+        'if yaw grows to the right, left_handed if y points to the right, too',
         choices=ORIENTATIONS,
     )
     size_scale: float = option(
         1.0,
-        'full lengths per given size: 2 for half extents (default: %(default)s)',
+        'full lengths per given size: 2 for half extents',
         metavar='FACTOR',
         parse=float,
+        low=0.001,
+        high=1000.0,
     )
     boxes_frame: str = option(
         '',
-        'frame of the boxes, where their messages name another one',
+        'frame of the boxes, where their messages name another one; empty: theirs',
         metavar='FRAME',
     )
     associate: bool = option(
         False, 'replace the track ids of the input: associate boxes over time'
     )
-    stamp_offset: float = option(
+    boxes_offset: float = option(
         0.0,
-        'added to the stamps of the boxes, where their clock is behind that of the clouds [s]',
-        flag='--boxes-offset',
+        'added to the stamps of the boxes, where their clock is behind that of the clouds',
         metavar='S',
         parse=float,
+        unit='s',
+        low=-1e10,
+        high=1e10,
     )
 
     def __post_init__(self) -> None:
@@ -126,9 +129,9 @@ class Convention:
                 f'size_scale: expected a positive factor, got {self.size_scale}; half extents '
                 f'have 2'
             )
-        if not isfinite(self.stamp_offset):
+        if not isfinite(self.boxes_offset):
             raise ConfigError(
-                f'stamp_offset: expected seconds, got {self.stamp_offset}; leave it out for none'
+                f'boxes_offset: expected seconds, got {self.boxes_offset}; leave it out for none'
             )
         _ = self.reference
 
@@ -162,9 +165,9 @@ class Convention:
 
     def _stamped(self, boxes: BoxArray) -> BoxArray:
         """Return boxes with the stamp that theirs means; an array without a stamp has none."""
-        if not self.stamp_offset or boxes.stamp_ns <= 0:
+        if not self.boxes_offset or boxes.stamp_ns <= 0:
             return boxes
-        return replace(boxes, stamp_ns=boxes.stamp_ns + round(self.stamp_offset * 1e9))
+        return replace(boxes, stamp_ns=boxes.stamp_ns + round(self.boxes_offset * 1e9))
 
     def from_centers(self, boxes: BoxArray) -> BoxArray:
         """Return boxes with the pose at their centre in this convention."""

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, Field, fields, replace
 import json
-from typing import Any
+from typing import Any, cast
 
 from boxreg_ros.config import Config, Setting, setting, settings
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lidars import Lidars
 from msg_adapters import CLOUD_TYPES, POINTS_TYPE
-from msg_adapters.convention import Convention, FORWARD, ORIENTATIONS, REFERENCES, SIZE_ORDERS
+from msg_adapters.convention import Convention, STANDARD
 from msg_adapters.point_layout import AUTO, TIME_UNIT_CHOICES
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -58,37 +58,7 @@ class NodeOptions:
         'topic of ConcatenatedPointCloudInfo, which divides a concatenated cloud among its '
         'LiDARs; empty: none',
     )
-    pose_reference: str = setting(
-        'center',
-        f'point of the box that the pose refers to: {", ".join(REFERENCES)}, or x,y,z as '
-        f'fractions of length, width and height',
-    )
-    size_order: str = setting(
-        'lwh', 'order of length, width and height in size x, y, z', choices=SIZE_ORDERS
-    )
-    forward_axis: str = setting(
-        'x+', 'axis of the pose that points forward', choices=tuple(FORWARD)
-    )
-    orientation: str = setting(
-        'xyzw',
-        'meaning of the orientation of a box: wxyz if w of its quaternion comes first, clockwise '
-        'if yaw grows to the right, left_handed if y points to the right, too',
-        choices=ORIENTATIONS,
-    )
-    size_scale: float = setting(
-        1.0, 'full lengths per given size: 2 for half extents', '', 0.001, 1000.0
-    )
-    boxes_frame: str = setting(
-        '', 'frame of the boxes, where their messages name another one; empty: theirs'
-    )
-    associate: bool = setting(False, 'assign track ids by data association, ignoring those given')
-    boxes_offset: float = setting(
-        0.0,
-        'added to the stamps of the boxes, where their clock is behind that of the clouds',
-        's',
-        -1e10,
-        1e10,
-    )
+    convention: Convention = STANDARD
     clock_offset: float = setting(
         0.0,
         'added to the stamps of TF and odometry, where their clock is behind that of the clouds',
@@ -143,26 +113,33 @@ class NodeOptions:
     )
 
     @property
-    def convention(self) -> Convention:
-        """Return the convention of the poses and sizes of the input boxes."""
-        return Convention(
-            self.pose_reference,
-            self.size_order,
-            self.forward_axis,
-            self.orientation,
-            self.size_scale,
-            self.boxes_frame,
-            self.associate,
-            self.boxes_offset,
-        )
-
-    @property
     def lidars(self) -> Lidars:
         """Return the topics of the clouds and the frames of the LiDARs."""
         return Lidars(self.points, self.sensor_frames, self.points_info, self.time_unit)
 
+    def items(self) -> Iterator[tuple[Setting, Any]]:
+        """Yield each of `NODE_SETTINGS` with its value."""
+        for item in NODE_SETTINGS:
+            owner = self.convention if item in CONVENTION_SETTINGS else self
+            yield item, getattr(owner, item.name)
 
-NODE_SETTINGS = tuple(one.metadata['of']._replace(name=one.name) for one in fields(NodeOptions))
+
+def _setting_of(one: Field[Any]) -> Setting:
+    """Return the parameter that a field states, as one or as an option of the command line."""
+    if 'of' in one.metadata:
+        known: Setting = one.metadata['of']
+        return known._replace(name=one.name)
+    facts, default = one.metadata['option'], cast('Any', one.default)
+    bounds = facts.unit, facts.low, facts.high, facts.choices
+    return Setting(one.name, default, facts.meaning, *bounds)
+
+
+CONVENTION_SETTINGS = tuple(map(_setting_of, fields(Convention)))
+NODE_SETTINGS = tuple(
+    item
+    for one in fields(NodeOptions)
+    for item in (CONVENTION_SETTINGS if one.name == 'convention' else [_setting_of(one)])
+)
 
 
 def declare(node: Node) -> tuple[Config, NodeOptions]:
@@ -191,7 +168,7 @@ def declare(node: Node) -> tuple[Config, NodeOptions]:
             f'detections set coast'
         )
     config = replace(config, estimate='final', complete=Config().complete)
-    values = [*config.items(), *((s, getattr(options, s.name)) for s in NODE_SETTINGS)]
+    values = [*config.items(), *options.items()]
     for item, value in values:
         if item.name in given:
             node.undeclare_parameter(item.name)
@@ -237,8 +214,8 @@ def parameters_yaml(config: Config, options: NodeOptions | None = None) -> str:
     """
     options = options or NodeOptions()
     lines = ['/**:', '  ros__parameters:']
-    for item in NODE_SETTINGS:
-        lines.append(_yaml_line(item, '    ', item.name, getattr(options, item.name)))
+    for item, value in options.items():
+        lines.append(_yaml_line(item, '    ', item.name, value))
     current_group = ''
     for item, value in config.items():
         group, _, name = item.name.rpartition('.')
@@ -278,7 +255,8 @@ def _updated(
     """Return the settings with the given values, by name, set; other names are ignored."""
     config = config.updated({s.name: given[s.name] for s in settings() if s.name in given})
     own = {s.name: _checked(s, given[s.name]) for s in NODE_SETTINGS if s.name in given}
-    return config, replace(options, **own)
+    convention = {s.name: own.pop(s.name) for s in CONVENTION_SETTINGS if s.name in own}
+    return config, replace(options, convention=replace(options.convention, **convention), **own)
 
 
 def _yaml_line(item: Setting, indent: str, name: str, value: Any) -> str:

@@ -22,7 +22,7 @@ RECORDINGS = (
 TOPICS = (
     *('lidars', 'boxes', 'odometry', 'tf', 'clock_offset'),
     *('pose_reference', 'size_order', 'forward_axis', 'orientation', 'size_scale', 'boxes_frame'),
-    'stamp_offset',
+    'boxes_offset',
 )
 """Options of `Request` for the topics to read, and for the convention of the boxes."""
 
@@ -49,9 +49,11 @@ def add_options(
     """
     for one, facts in _options(owner, names):
         default = defaults.get(one.name, one.default)
-        shown = ','.join(default) if isinstance(default, tuple) else default
         more: dict[str, Any] = {'dest': one.name, 'default': default}
-        more['help'] = facts.meaning.replace('%(default)s', str(shown))
+        more['help'] = f'{facts.meaning} [{facts.unit}]' if facts.unit else facts.meaning
+        if default and '(default: ' not in facts.meaning:
+            shown = ','.join(default) if isinstance(default, tuple) else default
+            more['help'] += f' (default: {shown})'
         if default is False:
             parser.add_argument(_flag(one, facts), action='store_true', **more)
             continue

@@ -228,7 +228,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_options(
         parser, Request, 'options', 'label_frame', 'lidars', 'odometry', 'tf', 'clock_offset',
         'fixed_frame', 'pose_reference', 'size_order', 'forward_axis', 'orientation',
-        'size_scale', 'boxes_frame', 'stamp_offset',
+        'size_scale', 'boxes_frame', 'boxes_offset',
     )  # fmt: skip
 
 

@@ -128,8 +128,7 @@ class Request:
     )
     formats: tuple[str, ...] = option(
         ('csv', 'openlabel'),
-        'label formats to write, see `boxreg formats`; csv is always written (default: '
-        '%(default)s)',
+        'label formats to write, see `boxreg formats`; csv is always written',
         metavar='NAME,...',
         parse=_names,
         text=','.join,

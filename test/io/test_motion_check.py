@@ -220,7 +220,7 @@ def test_boxes_from_the_future_have_another_clock(tmp_path, seconds):
     found = read(drive, tmp_path)[2]
     assert f'stamps of the boxes {seconds:g} s ahead of those of the clouds' in found
     assert f'--boxes-offset={-seconds:g}' in found
-    convention = Convention(stamp_offset=-seconds)
+    convention = Convention(boxes_offset=-seconds)
     path = write_recording(tmp_path / 'corrected', drive.items, messages=drive.messages)
     with Recording([path], convention=convention) as recording:
         items = FixedFrameItems(recording, Config(), convention)
