@@ -22,14 +22,15 @@ from boxreg_ros.core.measured_tracks import MeasuredTracks
 from boxreg_ros.core.observation import crop
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, LENGTH, Sweep, X, Y, YAW, Z
 import numpy as np
+from numpy.typing import NDArray
 
 # All of these are chosen, except where an origin stands beside them.
 NOTABLE = 0.05
 """Less is neither corrected nor a warning [s]: without latency, estimates err by up to 0.04 s."""
 CANDIDATES = np.arange(-0.2, 0.801, 0.05)
 """Latencies that are compared [s]; negative ones are of boxes that are predicted too far."""
-ALL, ENDS = np.arange(len(CANDIDATES)), np.array([0, len(CANDIDATES) - 1])
-"""Rows of all candidates, and of the two that show whether an object moves."""
+ENDS = np.array([0, len(CANDIDATES) - 1])
+"""Rows of the two candidates that show whether an object moves."""
 SAMPLE_PERIOD = 0.3
 """Least time between sweeps whose points are compared with boxes [s]."""
 MIN_SPEED = 2.0
@@ -38,8 +39,8 @@ FEWEST_POINTS, POINTS_COMPARED = 10, 128
 """Points of an object that provide evidence, and those that are used of more."""
 CONSTANT_ERROR = 0.2
 """Deviation of the mean error of a track along its path [m]; measured: 0.07 to 0.16 m."""
-USABLE_DEVIATION = 0.03
-"""An estimate with a larger deviation is not used [s]."""
+USABLE_DEVIATION, USABLE_PART = 0.03, 0.2
+"""An estimate with a larger deviation [s], and a larger one for its size, is not used."""
 GAIN = 2.0
 """Deviations by which tracks must fit better at a latency than in time, for it to be corrected."""
 SIGNIFICANCE = 3.0
@@ -158,8 +159,8 @@ class _Path(NamedTuple):
 
 
 def _shift(centers: Floats) -> Floats:
-    """Return how centres (C, ..., 3), one for each candidate, move by latency, (..., 3) [m/s]."""
-    shift: Floats = (centers[-1] - centers[0]) / (CANDIDATES[-1] - CANDIDATES[0])
+    """Return how centres (..., C, 3), one for each candidate, move by latency, (..., 3) [m/s]."""
+    shift: Floats = (centers[..., -1, :] - centers[..., 0, :]) / (CANDIDATES[-1] - CANDIDATES[0])
     return shift
 
 
@@ -220,17 +221,16 @@ class LatencyEvidence:
         """Compare the points of a sweep with the boxes of objects that move in their frame."""
         times_ns = sweep.stamp_ns + np.round(CANDIDATES * 1e9).astype(np.int64)
         compared = Counter(sample.track_id for sample in self._samples)
-        moving = [
-            name
-            for name, track in tracks.by_id.items()
-            if track.covers(times_ns)
-            and np.linalg.norm(_shift(track.nearest_centers(times_ns[ENDS], ENDS))) > MIN_SPEED
-        ]
+        names = [name for name, track in tracks.by_id.items() if track.covers(times_ns)]
+        centers = tracks.nearest_centers(names, times_ns[ENDS], ENDS)
+        speeds = np.linalg.norm(_shift(centers), axis=-1).tolist()
+        moving = [name for name, speed in zip(names, speeds, strict=True) if speed > MIN_SPEED]
         moving.sort(key=compared.__getitem__)
         found = 0
         for first in range(0, len(moving), OBJECTS_COMPARED):
             some = moving[first : first + OBJECTS_COMPARED]
-            paths = [_Path(name, *tracks.by_id[name].smoothed(times_ns, ALL)) for name in some]
+            smoothed = tracks.smoothed(some, times_ns)
+            paths = [_Path(*path) for path in zip(some, *smoothed, strict=True)]
             paths = [path for path in paths if path.speed > MIN_SPEED]
             for path, points in zip(paths, _points_near(sweep, paths), strict=True):
                 costs = _costs(path, *points)
@@ -364,22 +364,19 @@ def _costs(path: _Path, points: Floats, times: Floats) -> Floats | None:
     boxes = path.boxes
     if len(points) < FEWEST_POINTS:
         return None
-    costs = np.zeros((2, len(boxes)))
-    moved = points - times[:, None] * path.velocities.mean(0)
+    at_stamp = points - times[:, None] * path.velocities.mean(0)
+    x, y = (np.stack([points[:, k], at_stamp[:, k]])[..., None] - boxes[:, k] for k in (X, Y))
     cos, sin = np.cos(boxes[:, YAW]), np.sin(boxes[:, YAW])
-    for row, at_stamp in enumerate((points, moved)):
-        x = at_stamp[:, None, X] - boxes[:, X]  # (M, C)
-        y = at_stamp[:, None, Y] - boxes[:, Y]
-        along = np.abs(cos * x + sin * y) - boxes[:, LENGTH] / 2
-        across = np.abs(cos * y - sin * x) - boxes[:, LENGTH + 1] / 2
-        outside = np.maximum(along, across)
-        is_of_path = (outside < PATH_REACH).any(1)
-        if is_of_path.sum() < FEWEST_POINTS:
-            return None
-        outside = outside[is_of_path]
-        inside = (outside < PATH_REACH / 2).sum(0)
-        depth = np.abs(outside).clip(max=FACE_DEPTH).mean(0)
-        costs[row] = 1.5 * depth / FACE_DEPTH - inside / max(inside.max(), FEWEST_POINTS)
+    along = np.abs(cos * x + sin * y) - boxes[:, LENGTH] / 2  # (2, M, C)
+    across = np.abs(cos * y - sin * x) - boxes[:, LENGTH + 1] / 2
+    outside = np.maximum(along, across)
+    is_of_path: NDArray[np.bool_] = np.any(outside < PATH_REACH, axis=2)
+    if is_of_path.sum(1).min() < FEWEST_POINTS:
+        return None
+    inside = ((outside < PATH_REACH / 2) & is_of_path[..., None]).sum(1)
+    depth = np.abs(outside).clip(max=FACE_DEPTH).mean(1, where=is_of_path[..., None])
+    most = inside.max(1, keepdims=True).clip(min=FEWEST_POINTS)
+    costs: Floats = 1.5 * depth / FACE_DEPTH - inside / most
     return costs
 
 
@@ -387,7 +384,7 @@ def _points_near(sweep: Sweep, paths: Sequence[_Path]) -> list[tuple[Floats, Flo
     """Return points (M, 3) around the boxes of each path, above the road, and their times (M,)."""
     if not paths:
         return []
-    around = np.array([_box_around(path) for path in paths])
+    around = _boxes_around(np.array([path.boxes for path in paths]))
     near = crop(sweep, around, 0.0)
     ends = np.searchsorted(near.owner, np.arange(len(paths) + 1)).tolist()
     found = []
@@ -401,18 +398,22 @@ def _points_near(sweep: Sweep, paths: Sequence[_Path]) -> list[tuple[Floats, Flo
     return found
 
 
-def _box_around(path: _Path) -> Floats:
-    """Return the box (9,) that holds the boxes of a path, less the road below it."""
-    boxes = path.boxes
-    middle = boxes[:, : Z + 1].mean(0)
-    length, width, height = boxes[0, BOX_EXTENT]
-    heading = np.arctan2(path.shift[Y], path.shift[X])
-    ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
-    beside = np.array([-ahead[Y], ahead[X], 0.0])
-    reach = np.abs((boxes[:, : Z + 1] - middle) @ np.stack([ahead, beside], 1)).max(0)
-    reach += np.array([length, width]) / 2 + PATH_REACH
-    middle[Z] += ROAD_CLEARANCE
-    return np.array([*middle, *(2 * reach), height, 0.0, 0.0, heading])
+def _boxes_around(boxes: Floats) -> Floats:
+    """Return boxes (K, 9) that each hold the boxes (K, C, 9) of a path, less the road below."""
+    centers = boxes[..., : Z + 1]
+    found = np.zeros((len(boxes), boxes.shape[2]))
+    found[:, : Z + 1] = centers.mean(1)
+    shift = _shift(centers)
+    heading = np.arctan2(shift[:, Y], shift[:, X])
+    x, y, _ = (centers - found[:, None, : Z + 1]).transpose(2, 1, 0)  # (C, K) each
+    cos, sin = np.cos(heading), np.sin(heading)
+    along, across = np.abs(cos * x + sin * y).max(0), np.abs(cos * y - sin * x).max(0)
+    found[:, BOX_EXTENT] = boxes[:, 0, BOX_EXTENT]
+    found[:, LENGTH] += 2 * (along + PATH_REACH)
+    found[:, LENGTH + 1] += 2 * (across + PATH_REACH)
+    found[:, Z] += ROAD_CLEARANCE
+    found[:, YAW] = heading
+    return found
 
 
 def _estimated(samples: Sequence[_Sample]) -> Latency:
@@ -426,7 +427,7 @@ def _estimated(samples: Sequence[_Sample]) -> Latency:
     costs = np.zeros((len(track_ids), 2, len(CANDIDATES)))
     np.add.at(costs, rows, np.array([sample.costs for sample in samples]))
     # The mean of each track, less for one that was compared a few times only.
-    costs *= np.minimum(1.0, counts / FULL_WEIGHT) / counts
+    costs /= np.maximum(counts, FULL_WEIGHT)
     n = len(costs)
     speed = np.mean([sample.speed for sample in samples])
     constant = CONSTANT_ERROR / speed / np.sqrt(n)
@@ -437,8 +438,8 @@ def _estimated(samples: Sequence[_Sample]) -> Latency:
     found = Latency(0.0, '', estimated, deviation, n)
     is_significant = abs(estimated) >= max(NOTABLE, SIGNIFICANCE * deviation)
     is_inside = CANDIDATES[0] < estimated < CANDIDATES[-1]  # at the ends it is no minimum
-    is_usable = is_inside and deviation <= USABLE_DEVIATION
-    if is_significant and is_usable and _fits_better(costs[:, way]):
+    is_usable = deviation <= max(USABLE_DEVIATION, USABLE_PART * abs(estimated))
+    if is_significant and is_inside and is_usable and _fits_better(costs[:, way]):
         found = found._replace(seconds=estimated)
     elif deviation > USABLE_DEVIATION or is_significant:
         found = found._replace(
@@ -481,16 +482,20 @@ def _minimum_and_jackknife(costs: Floats) -> tuple[float, float]:
     """Return the candidate of least cost of all tracks, (n, C), and its deviation [s]."""
     n = len(costs)
     total = costs.sum(0)
-    others = np.array([_minimum(total - one) for one in costs]) if n > 1 else np.zeros(1)
+    others = _minima(total - costs)
     spread = (n - 1) / n * np.square(others - others.mean()).sum()
-    return _minimum(total), float(np.sqrt(spread))
+    return float(_minima(total[None])[0]), float(np.sqrt(spread))
 
 
-def _minimum(costs: Floats) -> float:
-    """Return the candidate of least cost, by a parabola through it and its neighbours [s]."""
-    row = int(costs.argmin())
-    if row in (0, len(costs) - 1):
-        return float(CANDIDATES[row])
-    before, least, after = costs[row - 1 : row + 2]
-    shift = (before - after) / (before - 2 * least + after) / 2
-    return float(CANDIDATES[row] + shift * (CANDIDATES[1] - CANDIDATES[0]))
+def _minima(costs: Floats) -> Floats:
+    """Return the candidates of least cost (n, C), by a parabola through them and the next ones."""
+    least = costs.argmin(1)
+    middle = least.clip(1, costs.shape[1] - 2)
+    rows = np.arange(len(costs))
+    before, at, after = (costs[rows, middle + k] for k in (-1, 0, 1))
+    curvature = before - 2 * at + after
+    is_minimum = (least == middle) & (curvature > 0)
+    shift = np.where(is_minimum, before - after, 0.0) / np.where(is_minimum, 2 * curvature, 1.0)
+    step = CANDIDATES[1] - CANDIDATES[0]
+    found: Floats = CANDIDATES[least] + step * shift
+    return found

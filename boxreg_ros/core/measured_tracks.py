@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections.abc import Sequence
 from itertools import pairwise
+from operator import attrgetter
 
 from boxreg_ros.config import Config
 from boxreg_ros.rotations import (
@@ -74,8 +77,10 @@ class MeasuredArray:
     def __init__(self, boxes: BoxArray, candidates: Floats) -> None:
         self.stamp_ns = boxes.stamp_ns
         self._motion = boxes.motion
-        self.of_candidates: Floats | None = None  # (C, 4, 4); None: the frame does not move
-        if boxes.motion is not None:
+        self.of_candidates: Floats  # (C, 4, 4)
+        if boxes.motion is None:  # the frame does not move
+            self.of_candidates = np.broadcast_to(np.eye(4), (len(candidates), 4, 4))
+        else:
             self.of_candidates = displacements(boxes.motion, candidates)
         self._known = (0.0, np.eye(4))
 
@@ -90,30 +95,30 @@ class MeasuredTrack:
     """The boxes of a track in the last seconds, as they were given, oldest first."""
 
     def __init__(self) -> None:
-        self._arrays: list[MeasuredArray] = []
-        self._boxes: list[Floats] = []
+        self.arrays: list[MeasuredArray] = []
+        self.boxes: list[Floats] = []
 
     @property
     def newest_ns(self) -> int:
         """Stamp of the newest box [ns]."""
-        return self._arrays[-1].stamp_ns
+        return self.arrays[-1].stamp_ns
 
     def add(self, array: MeasuredArray, box: Floats) -> None:
         """Add a box; one that is not newer than the others is left out."""
-        if not self._arrays or array.stamp_ns > self.newest_ns:
-            self._arrays.append(array)
-            self._boxes.append(box)
+        if not self.arrays or array.stamp_ns > self.newest_ns:
+            self.arrays.append(array)
+            self.boxes.append(box)
 
     def forget_before(self, oldest_ns: float) -> None:
         """Remove the boxes with older stamps, but for the newest."""
         old = 0
-        while old < len(self._arrays) - 1 and self._arrays[old].stamp_ns < oldest_ns:
+        while old < len(self.arrays) - 1 and self.arrays[old].stamp_ns < oldest_ns:
             old += 1
-        del self._arrays[:old], self._boxes[:old]
+        del self.arrays[:old], self.boxes[:old]
 
     def covers(self, times_ns: Ints) -> bool:
         """Return whether all times are within those of the boxes."""
-        first_ns = self._arrays[0].stamp_ns
+        first_ns = self.arrays[0].stamp_ns
         return bool(first_ns <= times_ns[0] and times_ns[-1] <= self.newest_ns)
 
     def at(self, stamp_ns: int, latency: float, box: Floats) -> Floats:
@@ -144,100 +149,80 @@ class MeasuredTrack:
         found[YAW] = wrap_angle(found[YAW])
         return found
 
-    def smoothed(self, times_ns: Ints, candidates: Ints) -> tuple[Floats, Floats]:
-        """
-        Return boxes at some times, each for its own candidate of the latency.
-
-        They are on local lines through the boxes as the frame measured them so long before.
-
-        Parameters
-        ----------
-        times_ns : array, shape (C,)
-            Times in the stamps of the boxes, one for each candidate [ns].
-        candidates : array, shape (C,)
-            Their rows among those that the tracks are made with.
-
-        Returns
-        -------
-        boxes : array, shape (C, 9)
-            In the fixed frame.
-        velocities : array, shape (C, 3)
-            Slopes of the lines through the centres [m/s].
-
-        """
-        boxes = self._of_candidates(candidates)
-        seconds = (self._stamps_ns()[:, None] - times_ns) * 1e-9
-        found, slope = _on_lines(seconds, boxes)
-        found[:, BOX_EXTENT] = np.median(boxes[:, 0, BOX_EXTENT], axis=0)
-        return found, slope[:, : Z + 1]
-
-    def nearest_centers(self, times_ns: Ints, candidates: Ints) -> Floats:
-        """Return the centres (C, 3) of the boxes nearest to some times, as of `smoothed`."""
-        found = np.zeros((len(times_ns), 3))
-        for k, row in enumerate(self._nearest(times_ns)):
-            center, T = self._boxes[row][: Z + 1], self._arrays[row].of_candidates
-            if T is not None:
-                moved = T[candidates[k]]
-                center = moved[:3, :3] @ center + moved[:3, 3]
-            found[k] = center
-        return found
-
-    def _nearest(self, times_ns: Ints) -> list[int]:
-        """Return the rows of the boxes nearest to some times within those of the track."""
-        stamps_ns = self._stamps_ns()
-        after = np.searchsorted(stamps_ns, times_ns).clip(1, len(stamps_ns) - 1)
-        is_before = 2 * times_ns < stamps_ns[after - 1] + stamps_ns[after]
-        nearest: list[int] = (after - is_before).tolist()
-        return nearest
+    def nearest(self, time_ns: int) -> int:
+        """Return the row of the box nearest to a time within those of the track [ns]."""
+        after = bisect_left(self.arrays, time_ns, 1, len(self.arrays) - 1, key=_stamp)
+        middle = self.arrays[after - 1].stamp_ns + self.arrays[after].stamp_ns
+        return after - (2 * time_ns < middle)
 
     def _stamps_ns(self) -> Ints:
-        return np.array([array.stamp_ns for array in self._arrays])
+        return np.array([array.stamp_ns for array in self.arrays])
 
     def _measured(self, begin: int, end: int, latency: float) -> Floats:
         """Return some boxes (n, 9) where they were measured."""
-        boxes = np.array(self._boxes[begin:end])
-        T = np.array([array.displacement(latency) for array in self._arrays[begin:end]])
+        boxes = np.array(self.boxes[begin:end])
+        T = np.array([array.displacement(latency) for array in self.arrays[begin:end]])
         return displaced(boxes, T)
 
-    def _of_candidates(self, candidates: Ints) -> Floats:
-        """Return all boxes where they were measured by some candidates, (n, C, 9)."""
-        boxes = np.repeat(np.array(self._boxes)[:, None], len(candidates), axis=1)
-        known = [array.of_candidates for array in self._arrays]
-        moving = [row for row, T in enumerate(known) if T is not None]
-        if moving:
-            T = np.array([known[row] for row in moving])[:, candidates]  # (n, C, 4, 4)
-            centers = np.einsum('ncij,ncj->nci', T[..., :3, :3], boxes[moving, :, : Z + 1])
-            boxes[moving, :, : Z + 1] = centers + T[..., :3, 3]
-            boxes[moving, :, YAW] += np.arctan2(T[..., 1, 0], T[..., 0, 0])
-        boxes[..., YAW] = np.unwrap(boxes[..., YAW], period=np.pi, axis=0)
-        return boxes
+
+_stamp = attrgetter('stamp_ns')
 
 
-def _on_lines(seconds: NDArray[np.floating], values: Floats) -> tuple[Floats, Floats]:
+def _moved(T: Floats, points: Floats) -> Floats:
+    """Return points (..., 3), each moved by its T (..., 4, 4)."""
+    moved: Floats = (T[..., :3, :3] @ points[..., None])[..., 0] + T[..., :3, 3]
+    return moved
+
+
+def _unwrapped(yaw: Floats, is_known: NDArray[np.bool_]) -> Floats:
+    """Return the yaw (A, K, C) of boxes without half turns between the known ones (A, K)."""
+    rows = np.where(is_known, np.arange(len(yaw))[:, None], is_known.argmax(0))
+    known_rows = np.maximum.accumulate(rows, axis=0)  # of each box, or of the one before it
+    return np.unwrap(np.take_along_axis(yaw, known_rows[..., None], 0), period=np.pi, axis=0)
+
+
+def _median(values: Floats, is_known: NDArray[np.bool_]) -> Floats:
+    """Return the medians (K, d) of the known ones (A, K) of values (A, K, d)."""
+    ascending = np.sort(np.where(is_known[..., None], values, np.inf), axis=0)
+    count = is_known.sum(0)[None, :, None]
+    lower, upper = (
+        np.take_along_axis(ascending, row, 0)[0] for row in ((count - 1) // 2, count // 2)
+    )
+    middle: Floats = (lower + upper) / 2
+    return middle
+
+
+def _on_lines(
+    seconds: NDArray[np.floating], values: Floats, is_known: NDArray[np.bool_]
+) -> tuple[Floats, Floats]:
     """
-    Return values and slopes of a track at C times, on local lines through n samples.
+    Return values and slopes of K tracks at C times, on local lines through their samples.
 
     Parameters
     ----------
-    seconds : array, shape (n, C)
+    seconds : array, shape (A, C)
         Times of the samples, relative to those that are asked for [s].
-    values : array, shape (n, C, d)
+    values : array, shape (A, K, C, d)
         The samples.
+    is_known : array, shape (A, K)
+        Which of them there are.
 
     Returns
     -------
-    values, slopes : array, shape (C, d)
+    values, slopes : array, shape (K, C, d)
         The slopes are for each second.
 
     """
-    weights = np.clip(SMOOTHING - np.abs(seconds), 1e-6, None)
-    weights = weights / weights.sum(0)
-    mean = (weights * seconds).sum(0)
-    offsets = seconds - mean
-    spread = (weights * offsets**2).sum(0)
-    middle = np.einsum('nc,ncd->cd', weights, values)
-    slope = np.einsum('nc,ncd->cd', weights * offsets, values) / spread[:, None]
-    return middle - mean[:, None] * slope, slope
+    near = np.clip(SMOOTHING - np.abs(seconds), 1e-6, None)
+    weights = np.where(is_known[..., None], near[:, None], 0.0)  # (A, K, C)
+    weights /= weights.sum(0)
+    mean = np.einsum('akc,ac->kc', weights, seconds)
+    offsets = seconds[:, None] - mean
+    of_slope = weights * offsets
+    spread = (of_slope * offsets).sum(0)
+    middle = np.einsum('akc,akcd->kcd', weights, values)
+    slope = np.einsum('akc,akcd->kcd', of_slope, values) / spread[..., None]
+    return middle - mean[..., None] * slope, slope
 
 
 class MeasuredTracks:
@@ -260,6 +245,66 @@ class MeasuredTracks:
             del self.by_id[name]
         for track in self.by_id.values():
             track.forget_before(oldest_ns)
+
+    def nearest_centers(self, names: Sequence[str], times_ns: Ints, candidates: Ints) -> Floats:
+        """
+        Return the centres of the boxes of tracks that are nearest to some times, (K, C, 3).
+
+        Each of the C times has its own candidate of the latency, as in `smoothed`.
+
+        """
+        centers, T = [], []
+        for name in names:
+            track = self.by_id[name]
+            for time_ns, candidate in zip(times_ns.tolist(), candidates.tolist(), strict=True):
+                row = track.nearest(time_ns)
+                centers.append(track.boxes[row][: Z + 1])
+                T.append(track.arrays[row].of_candidates[candidate])
+        found = _moved(np.array(T).reshape(-1, 4, 4), np.array(centers).reshape(-1, 3))
+        return found.reshape(len(names), len(times_ns), 3)
+
+    def smoothed(self, names: Sequence[str], times_ns: Ints) -> tuple[Floats, Floats]:
+        """
+        Return the boxes of tracks at some times, each for its own candidate of the latency.
+
+        They are on local lines through the boxes as the frame measured them so long before.
+
+        Parameters
+        ----------
+        names : sequence of K
+            Ids of tracks.
+        times_ns : array, shape (C,)
+            Times in the stamps of the boxes, one for each candidate [ns].
+
+        Returns
+        -------
+        boxes : array, shape (K, C, 9)
+            In the fixed frame, upright.
+        velocities : array, shape (K, C, 3)
+            Slopes of the lines through the centres [m/s].
+
+        """
+        tracks = [self.by_id[name] for name in names]
+        arrays = list({id(array): array for track in tracks for array in track.arrays}.values())
+        arrays.sort(key=_stamp)
+        row_of = {id(array): row for row, array in enumerate(arrays)}
+        boxes = np.zeros((len(arrays), len(tracks), 9))
+        is_known = np.zeros(boxes.shape[:2], bool)
+        for column, track in enumerate(tracks):
+            rows = [row_of[id(array)] for array in track.arrays]
+            boxes[rows, column] = track.boxes
+            is_known[rows, column] = True
+        T = np.array([array.of_candidates for array in arrays])  # (A, C, 4, 4)
+        poses = np.zeros((*boxes.shape[:2], len(times_ns), 4))  # centre and yaw
+        poses[..., : Z + 1] = _moved(T[:, None], boxes[:, :, None, : Z + 1])
+        yaw = boxes[:, :, None, YAW] + np.arctan2(T[:, None, :, 1, 0], T[:, None, :, 0, 0])
+        poses[..., Z + 1] = _unwrapped(yaw, is_known)
+        seconds = (np.array([array.stamp_ns for array in arrays])[:, None] - times_ns) * 1e-9
+        middle, slope = _on_lines(seconds, poses, is_known)
+        found = np.zeros((*middle.shape[:2], 9))
+        found[..., : Z + 1], found[..., YAW] = middle[..., : Z + 1], middle[..., Z + 1]
+        found[..., BOX_EXTENT] = _median(boxes[..., BOX_EXTENT], is_known)[:, None]
+        return found, slope[..., : Z + 1]
 
     def at_stamp(self, boxes: BoxArray, latency: float) -> Floats:
         """Return the boxes (n, 9) of an array where their objects are at its stamp."""

@@ -134,7 +134,7 @@ def test_tracks_that_do_not_agree_correct_nothing():
     ]
     found = latency._estimated(samples)
     assert abs(found.estimated) > latency.SIGNIFICANCE * found.deviation
-    assert found.deviation > latency.USABLE_DEVIATION
+    assert found.deviation > latency.USABLE_PART * found.estimated
     assert found.seconds == 0
     assert 'not known' in found.finding
 
