@@ -556,7 +556,9 @@ def detector(results: Any) -> Iterable[str]:
     metrics = ('BEV 0.5', 'BEV 0.7', '3D 0.5', '3D 0.7')
     for drives, by_detector in results['precision'].items():
         for kind in by_detector['own']['true']:
-            yield precision_by_labels(results, drives, [(kind, metric) for metric in metrics])
+            columns = [(kind, metric) for metric in metrics]
+            yield precision_by_labels(results, drives, columns)
+            yield gains_of_precision(results, drives, columns)
     yield quality_of_labels(results)
     yield errors_of_detectors(results)
 
@@ -575,23 +577,47 @@ def precision_by_labels(results: Any, drives: str, columns: Sequence[tuple[str, 
     return table([f'AP on {drives}: boxes of, labels (trainings)', *header], rows)
 
 
+def gains_of_precision(results: Any, drives: str, columns: Sequence[tuple[str, str]]) -> str:
+    """Return the table of gains over raw labels of the same boxes, and of the second round."""
+    by_detector = results['precision'][drives]
+    known = [column for column in columns if column[0] in by_detector['own']['true']]
+    rows = []
+    for name, sources in by_detector.items():
+        if 'raw' in sources:
+            for source, kinds in sources.items():
+                cells = [_part(kinds[kind][metric], 'gain', 3) for kind, metric in known]
+                if source != 'raw':
+                    rows.append([f'{name}: {source} - {name}: raw', *cells])
+    for name, sources in by_detector.items():
+        for source, kinds in sources.items():
+            cells = [kinds[kind][metric] for kind, metric in known]
+            if 'round' in cells[0]:
+                differences = [_part(cell, 'round', 3) for cell in cells]
+                rows.append([f'{name}: {source} - own: {source}', *differences])
+    header = [f'{kind}, {metric}' for kind, metric in known]
+    return table([f'difference of AP on {drives}', *header], rows)
+
+
 def gaps_closed(results: Any, drives: str) -> Iterable[str]:
     """Yield the table of the parts of gaps from raw to true labels that are closed, if any is."""
-    own = results['precision'][drives]['own']
-    columns = [
-        (kind, metric)
-        for kind, metric in MAIN_PRECISIONS
-        if kind in own['true']
-        and own['true'][kind][metric]['gain']
-        > SURE * (own['true'][kind][metric]['gain_error'] or math.inf)
-    ]
-    rows = [
-        [source, *(_part(kinds[kind][metric], 'closed', 2) for kind, metric in columns)]
-        for source, kinds in own.items()
-        if source not in ('raw', 'true')
-    ]
+    by_detector = results['precision'][drives]
+    columns = [column for column in MAIN_PRECISIONS if column[0] in by_detector['own']['true']]
+    rows = []
+    for name, sources in by_detector.items():
+        for source, kinds in sources.items():
+            cells = [kinds[kind][metric] for kind, metric in columns]
+            if source in ('raw', 'true') or 'gap' not in cells[0]:
+                continue
+            parts = [
+                _part(cell, 'closed', 2)
+                if cell['gap'] > SURE * (cell['gap_error'] or math.inf)
+                else '-'
+                for cell in cells
+            ]
+            if set(parts) != {'-'}:
+                rows.append([f'{name}: {source}', *parts])
     header = [f'{kind}, {metric}' for kind, metric in columns]
-    if columns:
+    if rows:
         yield table([f'part of the gap closed on {drives}', *header], rows)
 
 

@@ -506,6 +506,7 @@ def _detector(documents: Documents) -> Iterable[str]:
     for drives in results['precision']:
         columns = result_tables.MAIN_PRECISIONS
         yield result_tables.precision_by_labels(results, drives, columns)
+        yield result_tables.gains_of_precision(results, drives, columns)
         yield from result_tables.gaps_closed(results, drives)
     yield result_tables.quality_of_labels(results)
     yield result_tables.errors_of_detectors(results)

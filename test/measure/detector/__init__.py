@@ -18,7 +18,7 @@ import sys
 from typing import NamedTuple
 
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.structures import Floats
+from boxreg_ros.structures import Floats, REJECTED
 from measure.detector.drives import recorded, stored, StoredDrive, street
 from measure.detector.labels import (
     detected,
@@ -27,7 +27,10 @@ from measure.detector.labels import (
     labels_of,
     MIN_TRUE_POINTS,
     OPTIONS,
-    relabelled,
+    refined,
+    smoothed_table,
+    UNREFINED,
+    with_ids,
 )
 from measure.detector.network import CLASSES, detections, Detector, trained
 from measure.detector.precision import average_precision, Hits, hits_of, joined, METRICS
@@ -88,26 +91,30 @@ def run(args):
 TEACHER = Training('tenth', 'true', 0)
 SCRATCH = 'own, scratch'
 """Own boxes, for a detector that does not begin as the one of the tenth."""
+SECOND = 'second'
+"""Boxes of a detector that was trained on own ones, refined as whole tracks."""
 
 
 def wanted(seeds: int) -> Iterator[Training]:
     """Yield the trainings in the order of what they say."""
     yield TEACHER
-    for source in ('raw', 'true'):
-        yield Training(SCRATCH, source, 0)
-    for seed in range(seeds):
-        for source in ('raw', 'true', 'track', COMPLETED):
-            yield Training('own', source, seed)
-        if seed == 0:
-            for source in ('smoothed', 'early'):
-                yield Training('own', source, 0)
-    for seed in range(1, seeds):
-        for source in ('smoothed', 'early'):
-            yield Training('own', source, seed)
-    yield Training('second', 'track', 0)
+    for source in ('raw', 'true', 'track'):
+        yield Training('own', source, 0)
+    for source in ('raw', 'track'):
+        yield Training(SECOND, source, 0)
     for missed in MISSED:
         for source in ('raw', 'track'):
             yield Training(f'published, {missed} in ten missing', source, 0)
+    for source in (COMPLETED, 'smoothed', 'early'):
+        yield Training('own', source, 0)
+    for seed in range(1, seeds):
+        for source in ('raw', 'true', 'track'):
+            yield Training('own', source, seed)
+    for seed in range(1, seeds):
+        for source in (COMPLETED, 'smoothed', 'early'):
+            yield Training('own', source, seed)
+    for source in ('raw', 'true'):
+        yield Training(SCRATCH, source, 0)
 
 
 class Experiment:
@@ -150,14 +157,18 @@ class Experiment:
             for drive in drives
         ]
         for folder in sorted((self._out / 'labels').iterdir()):
-            paths = [folder / f'{drive.name}.pickle' for drive in drives]
-            if not all(path.is_file() for path in paths):
-                continue
+            known = [source for source in OPTIONS if all(
+                (folder / source / f'{drive.name}.pickle').is_file() for drive in drives
+            )]  # fmt: skip
+            if 'track' not in known:
+                continue  # the others have its ids
             labels: dict[str, list[BoxTable]] = {}
-            for path, drive in zip(paths, drives, strict=True):
-                for source, table in stored(path, dict).items():
-                    within = table.rows(in_reach(table, drive.frames))
-                    labels.setdefault(source, []).append(within)
+            for source in (*UNREFINED, *known):
+                tables = [self._labels(folder.name, source, drive) for drive in drives]
+                labels[source] = [
+                    table.rows(in_reach(table, drive.frames))
+                    for table, drive in zip(tables, drives, strict=True)
+                ]
             found[folder.name] = errors_of(labels, truths)
         return found
 
@@ -174,7 +185,7 @@ class Experiment:
             table = drive.truth
             if training.source != 'true':
                 detector = 'own' if training.detector == SCRATCH else training.detector
-                table = self._labels(detector, drive)[training.source]
+                table = self._labels(detector, training.source, drive)
             chosen = drive.frames[::TRAINING_STEP]
             frames += chosen
             labels += [labels_of(table, frame) for frame in chosen]
@@ -182,14 +193,22 @@ class Experiment:
         start = None if is_first else self._model(TEACHER)
         return trained(frames, labels, self._steps, training.seed, start)
 
-    def _labels(self, detector: str, drive: StoredDrive) -> dict[str, BoxTable]:
-        """Return the labels of each source of a drive, of the boxes of a detector."""
-        folder = self._out / 'labels' / detector
-
-        def make() -> dict[str, BoxTable]:
+    def _labels(self, detector: str, source: str, drive: StoredDrive) -> BoxTable:
+        """Return the labels of a drive by one of their sources, of the boxes of a detector."""
+        if source in UNREFINED:
             boxes = self._boxes(detector, drive)
-            sources = OPTIONS if detector == 'own' else ['track']
-            return relabelled(drive.recording, boxes, folder / drive.name, sources)
+            raw = with_ids(boxes, self._refined(detector, 'track', drive))
+            return smoothed_table(raw) if source == 'smoothed' else raw
+        table = self._refined(detector, source, drive)
+        return table.rows(np.array([word != REJECTED for word in table.status], bool))
+
+    def _refined(self, detector: str, source: str, drive: StoredDrive) -> BoxTable:
+        """Return all boxes that `boxreg relabel` returns for those of a detector."""
+        folder = self._out / 'labels' / detector / source
+
+        def make() -> BoxTable:
+            boxes = self._boxes(detector, drive)
+            return refined(drive.recording, boxes, folder / drive.name, OPTIONS[source])
 
         return stored(folder / f'{drive.name}.pickle', make)
 
@@ -201,8 +220,11 @@ class Experiment:
             boxes = drive.published.rows(rng.random(len(drive.published.boxes)) >= missed)
             # By its score each box is found again in the labels.
             return replace(boxes, scores=rng.permutation(len(boxes.boxes)) / len(boxes.boxes))
-        teacher = Training('own', 'track', 0) if detector == 'second' else TEACHER
-        return detected(self._model(teacher), drive.frames, drive.truth.frame_id)
+        teacher = Training('own', 'track', 0) if detector == SECOND else TEACHER
+        return stored(
+            self._out / 'boxes' / detector / f'{drive.name}.pickle',
+            lambda: detected(self._model(teacher), drive.frames, drive.truth.frame_id),
+        )
 
     def _tested(self, model: Detector) -> Scores:
         return {drive.name: _hits(model, drive) for drive in self._parts['test']}
@@ -233,7 +255,8 @@ def precision(scores: dict[Training, Scores]) -> dict[str, dict[str, dict[str, d
     Return the average precision by kind of drives, detector, source, class and metric.
 
     Each is the mean over the seeds, with its standard error by a bootstrap of drives and of
-    seeds, and the part of the gap from raw to true labels of the same drives that it closes.
+    seeds; the gain over raw labels of the same boxes, their gap to true labels, and the part of
+    it that is closed; and of the second round, the difference to the first one.
 
     """
     drives = next(iter(scores.values()))
@@ -259,18 +282,24 @@ def _precision(scores: dict[Training, Scores], drives: Sequence[str]) -> dict:
             with_truth = [values for values in with_truth if np.isfinite(values[0])]
             of_kinds['mean', metric] = np.mean(with_truth, axis=0)
         found[labels] = of_kinds
-    raw, true = (found.get(('own', source), {}) for source in ('raw', 'true'))
+    best = found.get(('own', 'true'))
     report: dict = {}
     for (detector, source), of_kinds in found.items():
+        base = found.get((detector, 'raw'))
+        first = found.get(('own', source)) if detector == SECOND else None
         for (kind, metric), values in of_kinds.items():
             if np.isfinite(values[0]):
                 cell = _with_error('ap', values, len(drives)) | {
                     'seeds': len(by_labels[detector, source])
                 }
-                if raw and true:
-                    base, best = raw[kind, metric], true[kind, metric]
-                    cell |= _with_error('gain', values - base, len(drives))
-                    cell |= _with_error('closed', (values - base) / (best - base), len(drives))
+                if base and best:
+                    gain = values - base[kind, metric]
+                    gap = best[kind, metric] - base[kind, metric]
+                    cell |= _with_error('gain', gain, len(drives))
+                    cell |= _with_error('gap', gap, len(drives))
+                    cell |= _with_error('closed', gain / gap, len(drives))
+                if first:
+                    cell |= _with_error('round', values - first[kind, metric], len(drives))
                 of_source = report.setdefault(detector, {}).setdefault(source, {})
                 of_source.setdefault(kind, {})[metric] = cell
     return report

@@ -14,7 +14,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import by_overlap, match, Matches
 from boxreg_ros.offline.track_scores import track_scores
-from boxreg_ros.structures import BoxArray, REJECTED
+from boxreg_ros.structures import BoxArray
 from measure.detector.frames import Frame, num_points, REACH
 from measure.detector.network import CLASSES, detections, Detector, Labels
 from measure.methods import smoothed
@@ -37,10 +37,12 @@ MAD_TO_DEVIATION = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
 OPTIONS = {
     'early': ('--set', 'estimate=early'),
-    'track, complete': ('--complete',),
     'track': (),
+    'track, complete': ('--complete',),
 }
 """Options of `boxreg relabel` of the labels that it makes."""
+UNREFINED = ('raw', 'smoothed')
+"""Sources of labels that it does not make; they have the ids of 'track'."""
 
 
 def detected(model: Detector, frames: list[Frame], frame_id: str) -> BoxTable:
@@ -56,34 +58,23 @@ def detected(model: Detector, frames: list[Frame], frame_id: str) -> BoxTable:
     return BoxTable.from_arrays(arrays)
 
 
-def relabelled(
-    recording: Path, boxes: BoxTable, folder: Path, sources: Iterable[str]
-) -> dict[str, BoxTable]:
+def refined(recording: Path, boxes: BoxTable, folder: Path, options: Iterable[str]) -> BoxTable:
     """
-    Return the raw and smoothed labels, and those of each of `sources`, of boxes without ids.
+    Return the boxes of `boxreg relabel --associate`, with options, for boxes without ids.
 
-    `boxreg relabel --associate` runs in this process; raw and smoothed boxes have the ids of its
-    last run. Raises RecordingError if it fails.
+    It runs in this process. Raises RecordingError if it fails.
 
     """
     folder.mkdir(parents=True, exist_ok=True)
     boxes.write(folder / 'boxes.csv')
-    found = {}
-    tracked = boxes
-    for source in sources:
-        out = folder / source.replace(', ', '_')
-        words = [
-            'relabel', str(recording), '-o', str(out), '--labels', f'csv:{folder / "boxes.csv"}',
-            '--associate', '--formats', 'csv', '--workers', '1', *OPTIONS[source],
-        ]  # fmt: skip
-        with redirect_stdout(sys.stderr):
-            if cli.main(words):
-                raise RecordingError(f'{recording}: boxreg {" ".join(words)} failed')
-        tracked = BoxTable.read(out / 'boxes.csv')
-        is_label = np.array([word != REJECTED for word in tracked.status], bool)
-        found[source] = tracked.rows(is_label)
-    raw = with_ids(boxes, tracked)
-    return {'raw': raw, 'smoothed': smoothed_table(raw)} | found
+    words = [
+        'relabel', str(recording), '-o', str(folder / 'out'), '--associate', '--formats', 'csv',
+        '--labels', f'csv:{folder / "boxes.csv"}', '--workers', '1', *options,
+    ]  # fmt: skip
+    with redirect_stdout(sys.stderr):
+        if cli.main(words):
+            raise RecordingError(f'{recording}: boxreg {" ".join(words)} failed')
+    return BoxTable.read(folder / 'out' / 'boxes.csv')
 
 
 def with_ids(boxes: BoxTable, tracked: BoxTable) -> BoxTable:
