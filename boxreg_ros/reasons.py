@@ -341,6 +341,13 @@ class Reason(StrEnum):
     )
     GHOST = ('ghost', 'box', 'rejected: its track is short, without consistent points or motion')
     DUPLICATE = ('duplicate', 'box', 'rejected: overlaps the boxes of a track with more evidence')
+    RARELY_DETECTED = (
+        'rarely_detected',
+        'missing box',
+        'not added in the gaps of a track that has a box less than half as often as usual in the '
+        'drive: it may be no object',
+        'accept the track in `boxreg review`, and it is filled',
+    )
     NOT_A_KEYFRAME = (
         'not_a_keyframe',
         'box of label files',

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from boxreg_ros.tracks.proposals import Proposal
 
 PROPOSALS = 'proposals.csv'
-STEP_COLUMNS = ('fragments', 'filled', 'extended', 'rejected', 'reclassified', 'ambiguous')
+STEP_COLUMNS = (
+    'fragments', 'filled', 'extended', 'rejected', 'reclassified', 'ambiguous', 'unfilled',
+)  # fmt: skip
 
 
 def completed_counts(plan: CompletionPlan | None) -> dict[str, int]:
@@ -45,6 +47,7 @@ def completed_counts(plan: CompletionPlan | None) -> dict[str, int]:
         'filled': sum(track.filled for track in tracks),
         'extended': sum(track.extended for track in tracks),
         'reclassified': sum(track.reclassified for track in tracks),
+        'unfilled': sum(track.unfilled for track in tracks),
     }
 
 
@@ -146,6 +149,7 @@ def _step_cells(tracks: Sequence[TrackSteps]) -> dict[str, list[int | str]]:
             track.rejected,
             track.reclassified,
             ' '.join(track.ambiguous),
+            track.unfilled,
         ]
         for track in tracks
     }

@@ -33,7 +33,7 @@ from boxreg_ros.structures import (
 )
 from boxreg_ros.tracks.decided import Decided, DecidedTrack, NOTHING
 from boxreg_ros.tracks.extend import extend, num_free, num_supported, points_at_end
-from boxreg_ros.tracks.fill import fill
+from boxreg_ros.tracks.fill import fill, rarely_detected
 from boxreg_ros.tracks.prune import duplicates, ghosts
 from boxreg_ros.tracks.static import join_static
 from boxreg_ros.tracks.stitch import join_turns, stitch
@@ -50,6 +50,7 @@ class TrackSteps:
     class_name: str  # of all its boxes: the most frequent one of the input
     fragments: int = 1  # parts that were joined
     filled: int = 0  # added in gaps
+    unfilled: int = 0  # not added there: the track is `rarely_detected`
     extended: int = 0  # added at the ends
     rejected: int = 0
     reclassified: int = 0  # of another class before
@@ -239,10 +240,10 @@ def complete(
     array_of = _array_of_stamp(given, fixed_frame)
     stamps_ns = np.array(sorted(array_of), np.int64)
     if steps.fill:
-        for track in tracks:
-            for gap in fill(track, stamps_ns, config):
-                own = of_track[track.track_id]
-                _add(own.left(gap, is_extension=False), track, plan, array_of, own)
+        detected = [one for one in given if one.frame_id == fixed_frame and len(one.boxes)]
+        detected_ns = np.unique(np.array([one.stamp_ns for one in detected], np.int64))
+        rare = _doubted(tracks, rarely_detected(tracks, detected_ns, config), given, decided)
+        _fill(tracks, rare, stamps_ns, plan, array_of, config, of_track)
     if steps.extend:
         _extend(tracks, stamps_ns, plan, array_of, config, of_track)
     _note_ambiguous(plan, ambiguous)
@@ -278,12 +279,20 @@ def _exchanged(
 def _doubted(
     tracks: Sequence[Tracklet], names: set[str], given: Sequence[BoxArray], decided: Decided
 ) -> set[str]:
-    """Return those of `names` whose track no person has accepted."""
+    """Return those of `names` whose track no person has accepted, or given a box in the input."""
     return {
         track.track_id
         for track in tracks
-        if track.track_id in names and not DecidedTrack.of(track, given, decided).is_accepted()
+        if track.track_id in names
+        and not DecidedTrack.of(track, given, decided).is_accepted()
+        and not _is_pinned(track, given)
     }
+
+
+def _is_pinned(track: Tracklet, given: Sequence[BoxArray]) -> bool:
+    """Return whether a box of a track is held as it is in the input."""
+    pinned = [(given[index].pinned, row) for index, row in track.places]
+    return any(held is not None and bool(held[row]) for held, row in pinned)
 
 
 def _rejected(
@@ -353,6 +362,28 @@ def _add(
                 extension if pin is None else -1,
             )
         )
+
+
+def _fill(
+    tracks: Sequence[Tracklet],
+    rare: set[str],
+    stamps_ns: Ints,
+    plan: CompletionPlan,
+    array_of: dict[int, int],
+    config: Config,
+    of_track: Mapping[str, DecidedTrack],
+) -> None:
+    """Add the missing boxes of tracks, but of `rare` ones only where a person has set one."""
+    steps = {one.track_id: one for one in plan.tracks}
+    for track in tracks:
+        own = of_track[track.track_id]
+        gaps = [own.left(gap, is_extension=False) for gap in fill(track, stamps_ns, config)]
+        missing_ns = [stamp_ns for gap in gaps for stamp_ns in gap.stamps_ns.tolist()]
+        if track.track_id in rare and not own.is_accepted(missing_ns):
+            steps[track.track_id].unfilled = len(missing_ns)
+            continue
+        for gap in gaps:
+            _add(gap, track, plan, array_of, own)
 
 
 def _extend(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -122,11 +122,11 @@ class DecidedTrack:
         """Return the box that a person has set at a stamp; None for none."""
         return self.decided.pin(self.input_id(stamp_ns), stamp_ns)
 
-    def is_accepted(self) -> bool:
-        """Return whether a person has accepted, pinned or named one of the boxes."""
+    def is_accepted(self, added_ns: Iterable[int] = ()) -> bool:
+        """Return whether a person has accepted, pinned or named a box, of the input or added."""
         return self.track_id in self.decided.names or any(
-            self.decided.is_accepted(input_id, stamp_ns)
-            for input_id, stamp_ns in zip(self.input_ids, self.stamps_ns, strict=True)
+            self.decided.is_accepted(self.input_id(stamp_ns), stamp_ns)
+            for stamp_ns in (*self.stamps_ns, *added_ns)
         )
 
     def is_deleted(self, stamp_ns: int) -> bool:

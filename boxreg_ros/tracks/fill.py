@@ -3,17 +3,56 @@ Fill: missing boxes between two boxes of a track are put on the motion model.
 
 They are then registered to their points like the boxes of the input. Where there are no points,
 the box on the motion model stays, with a covariance that grows with the distance to both ends.
+Tracks that are detected rarely are not filled.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.motion import motion_at
 from boxreg_ros.structures import Floats, INTERPOLATED, Ints
+from boxreg_ros.tracks.prune import CONFIRMED_BOXES
 from boxreg_ros.tracks.tracklet import AddedBoxes, between, is_parked, Tracklet
 import numpy as np
+
+RARE = 0.5
+"""Part of the usual rate of detection of a drive below which a track is not filled; chosen: less
+than half as often."""
+
+
+def rarely_detected(tracklets: Sequence[Tracklet], detected_ns: Ints, config: Config) -> set[str]:
+    """
+    Return the ids of tracks that have a box far less often than usual, see `_rate`.
+
+    A bush is detected now and then, an object about as often as other objects: boxes between
+    those of a bush would be as false as these. How often an object is detected depends on the
+    detector, and is the median over the tracks of `CONFIRMED_BOXES` or more; without such tracks
+    it is not known, and no track is rarely detected. `detected_ns` (a,) are the stamps of arrays
+    with boxes, ascending: detectors may be slower than the LiDAR.
+
+    """
+    rates = {one.track_id: _rate(one, detected_ns, config) for one in tracklets}
+    usual = [rates[one.track_id] for one in tracklets if len(one.stamps_ns) >= CONFIRMED_BOXES]
+    if not usual:
+        return set()
+    least = RARE * float(np.median(usual))
+    return {track_id for track_id, rate in rates.items() if rate < least}
+
+
+def _rate(tracklet: Tracklet, detected_ns: Ints, config: Config) -> float:
+    """
+    Return the part of the stamps behind its first box at which a track has one; 1 for one box.
+
+    Pauses longer than `complete.fill_gap` do not count: a parked object may be out of sight.
+
+    """
+    steps = np.diff(np.searchsorted(detected_ns, tracklet.stamps_ns))
+    steps = steps[np.diff(tracklet.stamps_ns) <= config.complete.fill_gap * 1e9]
+    return len(steps) / int(steps.sum()) if len(steps) else 1.0
 
 
 def fill(tracklet: Tracklet, array_stamps_ns: Ints, config: Config) -> list[AddedBoxes]:

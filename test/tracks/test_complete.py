@@ -15,7 +15,8 @@ from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.track_scores import track_scores
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import ADDED, Sweep
-from drives import ALL_STEPS, complete, drive, only, path, steps_of
+from boxreg_ros.tracks.decided import NOTHING, Nothing
+from drives import ALL_STEPS, complete, drive, only, path, STEP_NS, steps_of
 from measure.drives import Drive
 from measure.tracks import broken, completed, table_of
 import numpy as np
@@ -134,6 +135,45 @@ def test_filled_boxes_are_registered_to_their_points():
     assert tracks['a'].filled == 10
     errors = [np.linalg.norm((row[4] - boxes[row[0]])[:2]) for row in rows]
     assert max(errors) < 0.15
+
+
+class OnePerson(Nothing):
+    """A person who has accepted the box of the track `b` at one step."""
+
+    def __init__(self, step):
+        self.stamp_ns = step * STEP_NS
+
+    def is_accepted(self, track_id, stamp_ns):
+        return (track_id, stamp_ns) == ('b', self.stamp_ns)
+
+
+@pytest.mark.parametrize(
+    ('decided', 'is_pinned', 'is_filled'),
+    [
+        (NOTHING, False, False),
+        (OnePerson(7), False, True),
+        (OnePerson(8), False, True),  # a box that is missing, in the report of an earlier run
+        (NOTHING, True, True),
+    ],
+)
+def test_what_is_seen_now_and_then_is_filled_by_a_person_alone(decided, is_pinned, is_filled):
+    car, bush = path((5, 6), (8, 0), 24), path((10, -6), (0, 0), 24)
+    seen = (2, 7, 11, 16, 21)
+    given = [[('a', car[k])] * (k != 9) + [('b', bush[k])] * (k in seen) for k in range(24)]
+    items = drive([[*boxes] for boxes in zip(car, bush, strict=True)], given)
+    if is_pinned:
+        has_both = [len(getattr(item, 'track_ids', ())) == 2 for item in items]
+        items = [
+            replace(item, pinned=[False, True]) if both else item
+            for item, both in zip(items, has_both, strict=True)
+        ]
+    config = only('fill')
+    plan = first_pass([(item, False) for item in items], config).plan('odom', config, decided)
+    tracks = {one.track_id: one for one in plan.tracks}
+    missing = 15  # between the first and the last of its five boxes
+    assert (tracks['a'].unfilled, tracks['b'].unfilled) == (0, 0 if is_filled else missing)
+    added = Counter(one.track_id for array in plan.arrays for one in array.added)
+    assert (added['a'], added['b']) == (1, missing if is_filled else 0)
 
 
 def test_boxes_without_points_have_a_growing_covariance():

@@ -5,7 +5,7 @@ from boxreg_ros.core.motion import motion_at
 from boxreg_ros.structures import BoxArray, kept
 from boxreg_ros.tracks.complete import complete
 from boxreg_ros.tracks.extend import extend, MOVING_REACH, num_free, num_supported
-from boxreg_ros.tracks.fill import fill
+from boxreg_ros.tracks.fill import fill, rarely_detected
 from boxreg_ros.tracks.prune import duplicates, ghosts
 from boxreg_ros.tracks.static import join_static
 from boxreg_ros.tracks.stitch import best_links, join_turns, stitch
@@ -218,6 +218,29 @@ def test_long_gaps_are_filled_for_parked_objects_only():
     steps = [*range(5), *range(60, 65)]
     # A stamp at which the input has no boxes of any object is no gap.
     assert fill(parked, STAMPS[steps], CONFIG) == []
+
+
+def test_tracks_are_compared_with_the_usual_rate_of_detection():
+    def some(track_id, steps):
+        return tracklet(track_id, path((0, 0), (0, 0), len(steps)), steps=steps)
+
+    def rare(tracks, stamps_ns=STAMPS[:80]):
+        return rarely_detected(tracks, stamps_ns, CONFIG)
+
+    bush, brief = some('bush', [3, 8, 15, 22, 30]), some('brief', [3, 4, 7, 8])
+    often = some('bush for long', range(3, 80, 7))
+    always, half = some('always', range(40)), some('half', range(0, 80, 2))
+    assert rare([bush, brief, often, always, always]) == {'bush', 'bush for long'}
+    assert rare([half, always, always]) == set()  # not less than half as often
+    assert rare([bush, brief]) == set()  # how often is usual is not known
+    # A detector that misses six of seven boxes of an object does so with each.
+    assert rare([bush, often]) == set()
+    # One that is slower than the LiDAR misses nothing between its own boxes.
+    assert (
+        rare([some('of slow', [5, 15, 20]), some('slow', range(0, 40, 5))], STAMPS[:40:5]) == set()
+    )
+    # An object that is out of sight for more than `fill_gap` is not missed.
+    assert rare([some('parked', [0, 1, 2, 70, 72, 73]), always, always]) == set()
 
 
 def test_extension_follows_the_motion_from_the_track_outwards():
