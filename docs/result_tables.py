@@ -560,6 +560,7 @@ def detector(results: Any) -> Iterable[str]:
             yield precision_by_labels(results, drives, columns)
             yield gains_of_precision(results, drives, columns)
     yield quality_of_labels(results)
+    yield true_parts_of_labels(results)
     yield errors_of_detectors(results)
 
 
@@ -638,6 +639,19 @@ def quality_of_labels(results: Any) -> str:
             rows.append([f'{name}: {source}', *cells, *gains])
     header = ['recall', 'false per true', 'BEV', '3D', 'R@0.7', 'flips', 'ids per object']
     header += [f'{kind}, 3D - raw' for kind in kinds if kind]
+    return table(['labels', *header], rows)
+
+
+def true_parts_of_labels(results: Any) -> str:
+    """Return the table of recall, and of 3D IoU with the true value of each part of a box."""
+    keys = ('recall', 'over_0.7', 'iou_3d', 'true centre', 'true yaw', 'true extents')
+    rows = []
+    for name, sources in results['labels'].items():
+        for source in ('raw', 'track'):
+            for kind, found in sources[source].items():
+                if kind:
+                    rows.append([f'{name}: {source}, {kind}', *(number(found[k]) for k in keys)])
+    header = ('recall', 'R@0.7', '3D', 'true centre', 'true yaw', 'true extents')
     return table(['labels', *header], rows)
 
 

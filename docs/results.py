@@ -509,6 +509,7 @@ def _detector(documents: Documents) -> Iterable[str]:
         yield result_tables.gains_of_precision(results, drives, columns)
         yield from result_tables.gaps_closed(results, drives)
     yield result_tables.quality_of_labels(results)
+    yield result_tables.true_parts_of_labels(results)
     yield result_tables.errors_of_detectors(results)
 
 

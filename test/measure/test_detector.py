@@ -139,6 +139,17 @@ def test_errors_of_labels_by_hand(drive):
     assert errors['yaw robust'] == pytest.approx(0, abs=1e-6)
 
 
+def test_parts_of_labels_are_replaced_by_true_ones(drive):
+    truth = with_points(drive.truth, frames_of(drive.sweeps))
+    boxes = truth.boxes.copy()
+    boxes[:, 2] += boxes[:, 5] / 4  # a quarter of the height: IoU 3/5
+    boxes[:, 3] *= 1.25  # and of the extents alone 4/5
+    found = errors_of({'raw': [replace(truth, boxes=boxes)]}, [truth])['raw']['']
+    assert found['true extents'] == pytest.approx(0.6)
+    assert found['true centre'] == pytest.approx(0.8)
+    assert found['true yaw'] == pytest.approx(found['iou_3d'])
+
+
 def test_streets_differ_and_have_unlabelled_objects(drive):
     scene = random_street(5, 1)
     assert len(scene.truth.boxes) != len(drive.truth.boxes) / 3

@@ -9,12 +9,13 @@ from pathlib import Path
 import sys
 
 from boxreg_ros import cli
+from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.refine import Track
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import by_overlap, match, Matches
 from boxreg_ros.offline.track_scores import track_scores
-from boxreg_ros.structures import BoxArray
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, YAW
 from measure.detector.frames import Frame, num_points, REACH
 from measure.detector.network import CLASSES, detections, Detector, Labels
 from measure.methods import smoothed
@@ -29,6 +30,8 @@ EDGE = 2.0
 """Labels and true boxes so close to the end of the reach have no score as labels [m]."""
 MIN_TRUE_POINTS = 5
 """True boxes with fewer points are not in scope of any score."""
+PARTS = {'centre': BOX_CENTER, 'yaw': YAW, 'extents': BOX_EXTENT}
+"""Columns of boxes whose errors are taken out one by one."""
 ERRORS = ('along', 'across', 'up', 'yaw', 'length', 'width', 'height')
 """Of boxes in the axes of the true ones [m], of yaw in degrees."""
 MIN_TRACK_BOXES = 10
@@ -141,7 +144,8 @@ def errors_of(
 
     Of all classes (''), false labels for each true box and the scores of tracks; and of each
     class recall, IoU and flips of matched boxes, the gain of IoU over those of the `first` source
-    with its standard error over tracks, and of the errors along, across, up, of yaw and of
+    with its standard error over tracks, IoU with the true value of each of the `PARTS` in its
+    place, and of the errors along, across, up, of yaw and of
     extents the mean, the robust standard deviation, the deviation of the means of tracks, that
     within a track, and the autocorrelation of the latter after one sweep.
 
@@ -163,6 +167,7 @@ def errors_of(
             ]
             if any(mask.any() for mask in masks):
                 of_source[kind] = _errors(found, matches[first], truths, masks)
+                of_source[kind] |= _with_true_parts(found, labels[source], truths, masks)
         of_source[''] |= _of_tracks(labels[source], truths)
         unmatched = sum(one.unmatched for one in found)
         of_source['']['false'] = unmatched / of_source['']['boxes']
@@ -201,6 +206,27 @@ def _errors(
         'gain': gain.iou_3d,
         'gain_error': gain.iou_3d_error,
     } | _spreads(np.concatenate(errors), np.array(tracks, str))
+
+
+def _with_true_parts(
+    matches: list[Matches],
+    tables: list[BoxTable],
+    truths: list[BoxTable],
+    masks: list[np.ndarray],
+) -> dict[str, float]:
+    """Return the mean 3D IoU of matched boxes with the true value of each of the `PARTS`."""
+    boxes, true = [], []
+    for one, table, truth, mask in zip(matches, tables, truths, masks, strict=True):
+        rows = np.flatnonzero(one.is_matched & mask)
+        boxes.append(table.boxes[one.predicted_rows[rows]])
+        true.append(truth.boxes[one.rows[rows]])
+    given, wanted = np.concatenate(boxes), np.concatenate(true)
+    found = {}
+    for name, columns in PARTS.items():
+        changed = given.copy()
+        changed[:, columns] = wanted[:, columns]
+        found[f'true {name}'] = float(iou_3d(changed, wanted).mean())
+    return found
 
 
 def _of_tracks(tables: list[BoxTable], truths: list[BoxTable]) -> dict[str, float]:
