@@ -46,6 +46,8 @@ MISSED = (0, 1, 2, 5)
 COMPLETED = 'track, complete'
 SAMPLES = 200
 """Bootstrap samples of drives and of seeds."""
+DEVIATION = (0.16, 0.84)
+"""Quantiles of a normal variable at one deviation below and above its mean."""
 MANY = {'nargs': '*', 'default': []}
 ARGUMENTS = {
     'out': (Path, 'folder for drives, labels and scores; goes on with those in it'),
@@ -103,7 +105,7 @@ def wanted(seeds: int) -> Iterator[Training]:
     for source in ('raw', 'track'):
         yield Training(SECOND, source, 0)
     for missed in MISSED:
-        for source in ('raw', 'track'):
+        for source in ('raw', 'track', *[COMPLETED] * (missed > 0)):
             yield Training(f'published, {missed} in ten missing', source, 0)
     for source in (COMPLETED, 'smoothed', 'early'):
         yield Training('own', source, 0)
@@ -324,6 +326,9 @@ def _drawn(
 
 
 def _with_error(name: str, values: Floats, num_drives: int) -> dict[str, float]:
-    """Return a value and the deviation of its bootstrap samples, the values after it."""
-    deviation = float(np.nanstd(values[1:])) if num_drives > 1 else math.nan
-    return {name: float(values[0]), f'{name}_error': deviation}
+    """Return a value and half of the middle 68 % of its bootstrap samples, those after it."""
+    error = math.nan
+    if num_drives > 1:  # parts of small gaps have samples far out
+        low, high = np.nanquantile(values[1:], DEVIATION)
+        error = float(high - low) / 2
+    return {name: float(values[0]), f'{name}_error': error}
