@@ -190,7 +190,7 @@ def walker() -> Callable[..., int] | None:
     """
     Return `walk` compiled, or loaded from disk; None where numba does not work.
 
-    A warning names the reason, unless numba is missing: the solver warns of that.
+    A warning names the reason.
 
     """
     try:
@@ -200,8 +200,6 @@ def walker() -> Callable[..., int] | None:
         nothing = np.zeros(0, np.int64)
         bytes_, steps = np.zeros(0, np.uint8), np.zeros((0, 4), np.int64)
         compiled(bytes_, 0, steps, nothing, np.zeros((0, 0, 2), np.int64))
-    except ImportError:
-        return None
     except Exception as error:  # whatever a damaged cache or an unsupported processor raises
         reason = ' '.join(f'{type(error).__name__}: {error}'.split())
         warn(

@@ -22,12 +22,9 @@ class Compilation:
 @contextmanager
 def announced_compilation(announce: Callable[[str], None]) -> Iterator[Compilation]:
     """Call `announce` with `COMPILING`, then with the progress, if numba compiles in the block."""
+    from numba.core import event  # it takes half a second
+
     done = Compilation()
-    try:
-        from numba.core import event
-    except Exception:  # whatever an incomplete installation raises; the solver warns of it
-        yield done
-        return
 
     class Notice(event.Listener):
         """Announce compilations; kernels that are loaded from files cause no event."""
