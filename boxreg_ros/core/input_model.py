@@ -6,7 +6,7 @@ docs/method.md, section Input model, has the formulas.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from itertools import pairwise
 
 from boxreg_ros.config import Config, FaceConfig, KINDS
 from boxreg_ros.core.input_noise import noise_of, set_noise
@@ -20,12 +20,11 @@ from boxreg_ros.core.input_statistics import (
 )
 from boxreg_ros.core.method import constants
 from boxreg_ros.core.method.arrays import INPUTS
-from boxreg_ros.core.method.expectation import constant_part, SIZE
 from boxreg_ros.core.method.faces import observe_faces
+from boxreg_ros.core.method.margins import fill_margins, FIRST_FACE, MIN_HITS
+from boxreg_ros.core.method.population import population_slopes
 from boxreg_ros.core.method.residuals import TERMS
-from boxreg_ros.core.population import population_slopes
 from boxreg_ros.core.problem import Problem, settings_of_kinds
-from boxreg_ros.core.support import MIN_HITS
 from boxreg_ros.core.threads import run
 from boxreg_ros.core.track_rows import TrackRows
 from boxreg_ros.structures import Floats, Ints
@@ -33,61 +32,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 Inputs = NDArray[np.void]
-FACE_GROUPS = ([0, 1], [2, 3], [4], [5])
+FACE_GROUPS = [list(range(*ends)) for ends in pairwise(FIRST_FACE)]
 """Faces with one labelling margin: ends, sides, top, bottom."""
-FIRST_FACES = np.array([faces[0] for faces in FACE_GROUPS])
-"""The first face of each group."""
 GROUP_OF_FACE = np.repeat(np.arange(len(FACE_GROUPS)), [len(faces) for faces in FACE_GROUPS])
 """The group of each face."""
-QUARTILES_TO_DEVIATION = 0.74
-"""Standard deviation over interquartile range. Derived: 1 / 1.349 for a Gaussian."""
-MIDMEAN_FACTOR = 1.2
-"""Variance of the mean of the middle half over that of the mean. Derived: for a Gaussian."""
 GAP_DEVIATIONS = {
-    'vehicle': (0.05, 0.05, 0.05, 0.15),
-    'cyclist': (0.15, 0.15, 0.15, 0.15),
-    'pedestrian': (0.15, 0.15, 0.15, 0.15),
+    'vehicle': np.array([0.05, 0.05, 0.05, 0.15]),
+    'cyclist': np.full(4, 0.15),
+    'pedestrian': np.full(4, 0.15),
 }
 """Prior deviation of each margin from the one of the settings of its kind [m]. Chosen."""
-
-
-class Pooled(NamedTuple):
-    """
-    Quantities that differ from track to track: normal-inverse-chi-squared distributions (M15).
-
-    Attributes
-    ----------
-    mean, variance : array, shape (m,)
-        Of the means over all tracks [m], and the variances of these estimates [m^2].
-    between : array, shape (m,)
-        Variances between tracks [m^2].
-
-    """
-
-    mean: Floats
-    variance: Floats
-    between: Floats
-
-    def given(self, values: Floats, prior_tracks: float) -> 'Pooled':
-        """
-        Return the posterior, by the values (n, m) of n tracks, robustly; NaN is left out.
-
-        The variance of the prior counts as that of `prior_tracks`.
-
-        """
-        values = np.sort(values, axis=0)  # NaN comes last
-        n = np.isfinite(values).sum(0)
-        quarter, rank, face = n // 4, np.arange(len(values))[:, None], np.arange(len(n))
-        first, last = values[quarter, face], values[n - 1 - quarter, face]
-        between = prior_tracks * self.between + n * (QUARTILES_TO_DEVIATION * (last - first)) ** 2
-        between /= prior_tracks + n
-        information = n / (MIDMEAN_FACTOR * between)
-        variance = 1 / (1 / self.variance + information)
-        is_middle = (quarter <= rank) & (rank < n - quarter)
-        middle = np.where(is_middle, values, 0.0).sum(0) / (n - 2 * quarter).clip(1)
-        mean = variance * (self.mean / self.variance + information * middle)
-        is_known = n >= MIN_HITS
-        return Pooled(*np.where(is_known, (mean, variance, between), self))
 
 
 class InputModel:
@@ -275,23 +229,25 @@ class InputModel:
 
         """
         inputs = np.zeros(len(KINDS), INPUTS)
-        residuals, kinds = _of_all_kinds(self._residuals)
+        residuals = [known.arrays for known in self._residuals]
         more, of_fits = np.zeros((0, 3, 3)), np.zeros(0, int)
         if fits:
-            residuals, more, of_fits = fits
-            kinds = of_fits
+            of_tracks, more, of_fits = fits
+            residuals = [of_tracks[of_fits == k] for k in range(len(KINDS))]
         if not (with_noise and config.ingredients.noise_estimation):
-            residuals, kinds = residuals[:0], kinds[:0]
-        set_noise(inputs, residuals, kinds, self._past_noise, self.constants)
+            residuals = [part[:0] for part in residuals]
+        set_noise(inputs, residuals, self._past_noise, self.constants)
         inputs['spread'] = 1.0
         inputs['occlusion_inset'] = self._occlusion_insets[GROUP_OF_FACE]
         settings = settings_of_kinds(config)
-        of_faces = self.constants.with_settings(config).face_deviations
-        for k in range(len(KINDS)):
+        record = self.constants.with_settings(config).record()
+        for k, kind in enumerate(KINDS):
             tracks = self._tracks_of(k)
             if len(tracks):
-                deviations = GAP_DEVIATIONS[KINDS[k]]
-                self._set_margins(inputs[k], tracks, settings[k], deviations, of_faces)
+                fill_margins(
+                    tracks, settings[k], GAP_DEVIATIONS[kind], self._occlusion_insets,
+                    self._estimates_margins, record, inputs[k],
+                )  # fmt: skip
         self.set_population(inputs, config, more, of_fits)
         return inputs
 
@@ -306,47 +262,16 @@ class InputModel:
         """
         if not config.ingredients.population_extents:
             return
+        record = self.constants.record()
         for k in range(len(KINDS)):
             known = np.concatenate([self._tracks_of(k)['evidence'], evidence[kinds == k]])
             if len(known):
-                found = population_slopes(known, self.constants)
-                inputs['median'][k], inputs['slopes'][k] = found
+                population_slopes(known, record, inputs['median'][k], inputs['slopes'][k])
 
     def _tracks_of(self, k: int) -> NDArray[np.void]:
         """Return the tracks of one kind, with those of other drives, records `TRACK` (n,)."""
-        return np.concatenate([self._past[k], _shown(self._tracks[k])])
-
-    def _set_margins(
-        self,
-        inputs: Any,
-        tracks: NDArray[np.void],
-        settings: Any,
-        deviations: Sequence[float],
-        face_deviations: Sequence[float],
-    ) -> None:
-        """Set margins and insets of one kind, by its `tracks`, noise and settings (M15)."""
-        extents = np.exp(np.median(tracks['evidence'][:, 0], axis=0))
-        parts = np.array([constant_part(c, 1.0) for c in inputs['correlation'].tolist()])
-        bias = settings['pose'][:SIZE] * inputs['deviation'][:SIZE] * parts[:SIZE]
-        half_extent = settings['extent'] * inputs['extent_error'] * parts[-SIZE:] * extents / 2
-        along_axes = bias**2 + half_extent**2
-        spread = np.array([*[settings['gap_spread']] * 3, self.constants.road_spread])
-        of_face = np.maximum(face_deviations, settings['roughness'])[FIRST_FACES]
-        between = spread**2 + along_axes[FIRST_FACES // 2] + of_face**2
-        prior = Pooled(np.zeros(len(between)), np.square(deviations), between)
-        # Of each track, quantity and group of faces: the sums of value, count and share.
-        sums = np.add.reduceat(tracks['sums'], FIRST_FACES, axis=-1)
-        strength = self.constants.half_weight
-        gaps = prior.given(_means(sums[:, 0]), strength)
-        sums[:, 2, 0] -= gaps.mean * sums[:, 2, 1]
-        inputs['range_inset'] = prior.given(_means(sums[:, 2]), strength).mean[GROUP_OF_FACE]
-        if self._estimates_margins:
-            inputs['margin'] = gaps.mean[GROUP_OF_FACE]
-            inputs['margin_variance'] = gaps.variance[GROUP_OF_FACE]
-            inputs['spread'] = np.sqrt(gaps.between / between)[GROUP_OF_FACE]
-            of_insets = prior._replace(mean=self._occlusion_insets)
-            insets = of_insets.given(_means(sums[:, 1]), strength).mean
-            inputs['occlusion_inset'] = insets[GROUP_OF_FACE]
+        own = self._tracks[k].arrays
+        return np.concatenate([self._past[k], own]) if len(self._past[k]) else own
 
     def add_noise(self, residuals: Floats, kind: Ints) -> None:
         """Add the noise of whole tracks, by their residuals (B, N, 9) (M16)."""
@@ -388,20 +313,6 @@ def _shown(tracks: TrackRows) -> NDArray[np.void]:
     found['sums'] += found['at_input']
     found['at_input'] = 0.0
     return found
-
-
-def _means(sums: Floats) -> Floats:
-    """Return the mean of a quantity, of each track and group of faces; NaN where it is unknown."""
-    total, count, share = np.moveaxis(sums, 1, 0)
-    means = np.full(count.shape, np.nan)
-    np.divide(total, share, out=means, where=count >= MIN_HITS)
-    return means
-
-
-def _of_all_kinds(known: Sequence[TrackRows]) -> tuple[Floats, Ints]:
-    """Return the arrays of the tracks of all kinds, (n, ...), and their kinds (n,)."""
-    parts = [tracks.in_order for tracks in known]
-    return np.concatenate(parts), np.repeat(np.arange(len(known)), list(map(len, parts)))
 
 
 def _kept(

@@ -5,8 +5,9 @@ docs/method.md, section Input model, has the formulas.
 
 """
 
-from boxreg_ros.config import KINDS
-from boxreg_ros.core.input_statistics import NOISE, pooled_noise
+from collections.abc import Sequence
+
+from boxreg_ros.core.input_statistics import NOISE
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.method.expectation import SIZE
 from boxreg_ros.core.method.noise import estimate
@@ -29,33 +30,36 @@ LEAST_RATIO = 0.02
 
 def set_noise(
     inputs: NDArray[np.void],
-    residuals: Floats,
-    kind: Ints,
+    residuals: Sequence[Floats],
     past: NDArray[np.void],
     constants: Constants,
 ) -> None:
     """
     Set the errors of each of `KINDS` in records `INPUTS` (K,) (M16), (M17).
 
-    Of `normalised_residuals` of tracks (B, N, 9) of a `kind` (B,), NaN is left out, and of other
+    Of `normalised_residuals` of the tracks of each kind (B, N, 9), NaN is left out, and of other
     drives, records `NOISE` (K,). The settings are the prior of all kinds together, and these of
     each: a kind that was seen in few boxes errs as the others do, in proportion to its settings.
 
     """
-    own = [
-        pooled_noise([past[k], noise_of(residuals[kind == k], constants)])
-        for k in range(len(KINDS))
-    ]
-    for k in range(len(KINDS)):
-        variance, correlation = np.ones(9), np.full(9, constants.typical_correlation)
-        for known in (pooled_noise(own[:k] + own[k + 1 :]), own[k]):
-            share = known['boxes'] / (known['boxes'] + constants.half_weight)
-            variance += share * (known['deviation'] ** 2 - variance)
-            correlation += share * (known['correlation'] - correlation)
-        correlation[DETECTED] = correlation[DETECTED].mean()
-        deviation = np.sqrt(variance).clip(LEAST_RATIO)
-        inputs['deviation'][k], inputs['correlation'][k] = deviation, correlation
-    of_centres = np.exp(np.log(inputs['deviation'][:, :SIZE]).mean(1))
+    found = np.array([noise_of(of_kind, constants) for of_kind in residuals])
+    boxes = np.stack([past['boxes'], found['boxes']])  # (2, K)
+    variances = np.stack([past['deviation'], found['deviation']]) ** 2  # (2, K, 9)
+    correlations = np.stack([past['correlation'], found['correlation']])
+    variance = np.ones((len(inputs), 9))
+    correlation = np.full((len(inputs), 9), constants.typical_correlation)
+    is_own = np.eye(len(inputs))
+    for taken in (1.0 - is_own, is_own):
+        weights = taken[:, None] * boxes  # (K, 2, K): of each part of each kind, for a kind
+        count = weights.sum((1, 2))[:, None]
+        share = count / (count + constants.half_weight)
+        weights /= np.maximum(count, 1.0)[..., None]
+        variance += share * (np.tensordot(weights, variances, 2) - variance)
+        correlation += share * (np.tensordot(weights, correlations, 2) - correlation)
+    correlation[:, DETECTED] = correlation[:, DETECTED].mean(1, keepdims=True)
+    deviation = np.sqrt(variance).clip(LEAST_RATIO)
+    inputs['deviation'], inputs['correlation'] = deviation, correlation
+    of_centres = np.exp(np.log(deviation[:, :SIZE]).mean(1))
     inputs['low_noise'] = (of_centres / constants.low_noise).clip(max=1.0)
     # Trackers may hold the extents: no residual shows their errors. Those of the centre do.
     inputs['extent_error'] = EXTENT_ERRORS * inputs['low_noise'][:, None]
@@ -64,10 +68,11 @@ def set_noise(
 def noise_of(residuals: Floats, constants: Constants) -> NDArray[np.void]:
     """Estimate the noise of tracks (B, N, 9) of one kind (M16), a record `NOISE`."""
     found = np.zeros((), NOISE)
-    found['boxes'] = estimate(
-        np.ascontiguousarray(residuals), constants.record(), found['deviation'],
-        found['correlation'],
-    )  # fmt: skip
+    if len(residuals):
+        found['boxes'] = estimate(
+            np.ascontiguousarray(residuals), constants.record(), found['deviation'],
+            found['correlation'],
+        )  # fmt: skip
     return found
 
 

@@ -13,9 +13,10 @@ from dataclasses import dataclass, field, replace
 from math import dist, inf
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.method.margins import MIN_HITS
 from boxreg_ros.core.motion import motion_at
 from boxreg_ros.core.observation import Observation, Observations
-from boxreg_ros.core.support import MIN_HITS, points_to_confirm
+from boxreg_ros.core.support import points_to_confirm
 from boxreg_ros.core.tables import by_table, column, joined
 from boxreg_ros.core.window import Estimate, Estimates, MarginalisationPrior, PRIOR_POSES
 from boxreg_ros.reasons import Reason

@@ -7,6 +7,7 @@ numbers each and the shared variables s of `method.arrays`, the same for all obs
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import chain
 from typing import NamedTuple
 
@@ -406,6 +407,7 @@ def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, 
     return minimum, np.asarray((half_turns % 2 == 0).all(1))
 
 
+@lru_cache(maxsize=4)
 def settings_of_kinds(config: Config) -> NDArray[np.void]:
     """Return the settings of each of `KINDS`, records `CLASS_SETTINGS` (K,)."""
     kinds = [getattr(config, name) for name in KINDS]

@@ -3,15 +3,13 @@
 from collections.abc import Sequence
 
 from boxreg_ros.core.method.constants import CONSTANTS
+from boxreg_ros.core.method.margins import MIN_HITS
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.observation import FACE_TOLERANCE, GOOD_POINTS, Observation
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, ROLL
 import numpy as np
 
-MIN_HITS = 3
-"""Detections that confirm a track, and its face observations, and tracks, that a margin needs;
-literature: SORT."""
 SUPPORT_PART = 0.3
 """
 Least part of the points that the end of the track has, in a supported box.

@@ -10,7 +10,7 @@ from pathlib import Path
 from boxreg_ros.config import KINDS
 from boxreg_ros.core.input_model import FACE_GROUPS
 from boxreg_ros.core.input_statistics import Drives, from_text, joined
-from boxreg_ros.core.support import MIN_HITS
+from boxreg_ros.core.method.margins import MIN_HITS
 from boxreg_ros.errors import ConfigError, unreadable
 from boxreg_ros.io.storage.urls import read_text
 from boxreg_ros.structures import Floats

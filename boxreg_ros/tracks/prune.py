@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.method.margins import MIN_HITS
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.observation import GOOD_POINTS
-from boxreg_ros.core.support import MIN_HITS
 from boxreg_ros.structures import BOX_EXTENT, Floats, X, Y
 from boxreg_ros.tracks.tracklet import Tracklet
 import numpy as np

@@ -2,15 +2,16 @@
 
 from boxreg_ros.config import Config, FaceConfig, KINDS
 from boxreg_ros.core.following import person
-from boxreg_ros.core.input_model import GAP_DEVIATIONS, InputModel, Pooled
+from boxreg_ros.core.input_model import GAP_DEVIATIONS, InputModel
 from boxreg_ros.core.input_noise import EXTENT_ERRORS, normalised_residuals, set_noise
 from boxreg_ros.core.input_noise import noise_of as estimate
 from boxreg_ros.core.input_statistics import NOISE
 from boxreg_ros.core.method.arrays import BOX_POSE, COMMON
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.expectation import fill_evidence, population_factor
+from boxreg_ros.core.method.margins import pooled
+from boxreg_ros.core.method.population import population_slopes
 from boxreg_ros.core.method.residuals import TERMS
-from boxreg_ros.core.population import population_slopes
 import numpy as np
 import pytest
 from scenes import no_inputs, problem_of, returns_of, settings_of, shared_of
@@ -120,7 +121,7 @@ def noise_by_kind(values, kind, past=None, constants=CONSTANTS):
     """Return the records `INPUTS` (K,) with the noise of tracks (B, N, 9) of a kind (B,)."""
     inputs = no_inputs()
     past = np.zeros(len(KINDS), NOISE) if past is None else past
-    set_noise(inputs, values, np.asarray(kind), past, constants)
+    set_noise(inputs, [values[np.asarray(kind) == k] for k in range(len(KINDS))], past, constants)
     return inputs
 
 
@@ -359,9 +360,16 @@ def evidence_of(true, given, error=0.05, weight=0.8):
     return np.stack([given, found, np.full_like(given, weight * error**2)], 1)
 
 
+def slopes_of(evidence):
+    """Return medians (3,) and slopes (3, 3) of the population with some `evidence` (n, 3, 3)."""
+    median, slopes = np.empty(3), np.empty((3, 3))
+    population_slopes(np.array(evidence, float), CONSTANTS.record(), median, slopes)
+    return median, slopes
+
+
 def corrections(evidence, given, error):
     """Return the logarithms of the factors (B, 3) on extents whose logarithms are `given`."""
-    median, slopes = population_slopes(np.array(evidence, float), CONSTANTS)
+    median, slopes = slopes_of(evidence)
     radius = CONSTANTS.population_radius
     return np.log(
         [
@@ -432,7 +440,7 @@ def test_population_of_one_kind_does_not_correct_others():
     kinds = np.zeros(101, int)
     model.add_fits([str(i) for i in range(101)], kinds, np.full((101, 9), np.nan), evidence)
     inputs = model.inputs(Config())
-    median, slopes = population_slopes(evidence, CONSTANTS)
+    median, slopes = slopes_of(evidence)
     np.testing.assert_array_equal(inputs['median'][0], median)
     np.testing.assert_array_equal(inputs['slopes'][0], slopes)
     assert np.abs(slopes).max() > 1
@@ -491,56 +499,51 @@ def test_margins_of_one_kind_do_not_change_those_of_others():
     np.testing.assert_allclose(offsets_of(model, 'pedestrian')['margin'], -0.1, atol=0.02)
 
 
-def pooled(*of_face):
-    """Return the distribution of the gaps of one face: mean, its variance, that of tracks."""
-    return Pooled(*np.array(of_face)[:, None])
+def posterior_of_gaps(gaps, *prior):
+    """Return mean, its variance and that of tracks of the `gaps` of a face, given a `prior`."""
+    return pooled(np.array(gaps, float), *prior, HALF_WEIGHT)
 
 
 def test_gaps_of_many_tracks_give_margin_and_scatter():
     # 800 tracks with margins of 0.04 m scatter by 0.078 m, as is expected: they show the mean to
     # 1.1 * 0.078 / sqrt(800) m. Twice the scatter is found as well.
     gaps = np.random.default_rng(0).normal(0.04, 0.078, 800)
-    found = pooled(0.0, 0.05**2, 0.078**2).given(gaps[:, None], HALF_WEIGHT)
-    np.testing.assert_allclose(found.mean, 0.04, atol=3 * found.variance.item() ** 0.5)
-    np.testing.assert_allclose(found.variance**0.5, 1.1 * 0.078 / 800**0.5, rtol=0.1)
-    np.testing.assert_allclose(found.between**0.5, 0.078, rtol=0.1)
-    twice = pooled(0.0, 0.05**2, 0.078**2).given(2 * gaps[:, None], HALF_WEIGHT)
-    np.testing.assert_allclose(twice.between**0.5, 0.156, rtol=0.1)
+    mean, variance, between = posterior_of_gaps(gaps, 0.0, 0.05**2, 0.078**2)
+    np.testing.assert_allclose(mean, 0.04, atol=3 * variance**0.5)
+    np.testing.assert_allclose(variance**0.5, 1.1 * 0.078 / 800**0.5, rtol=0.1)
+    np.testing.assert_allclose(between**0.5, 0.078, rtol=0.1)
+    _, _, between = posterior_of_gaps(2 * gaps, 0.0, 0.05**2, 0.078**2)
+    np.testing.assert_allclose(between**0.5, 0.156, rtol=0.1)
 
 
 def test_the_posterior_of_gaps_by_hand():
     # Quartiles of 0 and 0.2 m: a deviation of 0.148 m. The prior counts for 14 tracks, these for
     # 8. The mean has precisions of 1 / .05^2 before and of 8 tracks after.
-    gaps = np.repeat([[0.0], [0.2]], 4, axis=0)
-    found = pooled(0.02, 0.05**2, 0.1**2).given(gaps, HALF_WEIGHT)
+    prior = (0.02, 0.05**2, 0.1**2)
+    mean, variance, found = posterior_of_gaps([0.0, 0.2] * 4, *prior)
     between = (14 * 0.1**2 + 8 * 0.148**2) / 22
     weight = 8 / 1.2 / between
-    np.testing.assert_allclose(found.between, between)
-    np.testing.assert_allclose(found.variance, 1 / (400 + weight))
-    np.testing.assert_allclose(found.mean, (400 * 0.02 + weight * 0.1) / (400 + weight))
-    prior = pooled(0.02, 0.05**2, 0.1**2)
-    assert prior.given(np.zeros((2, 1)), HALF_WEIGHT) == prior
+    np.testing.assert_allclose(found, between)
+    np.testing.assert_allclose(variance, 1 / (400 + weight))
+    np.testing.assert_allclose(mean, (400 * 0.02 + weight * 0.1) / (400 + weight))
+    assert posterior_of_gaps(np.zeros(2), *prior) == prior
 
 
-def test_faces_are_shown_by_different_tracks():
-    # The second face is known of 9 of 20 tracks: as if there were only these.
-    gaps = np.random.default_rng(2).normal(0.0, 0.078, (20, 2))
-    gaps[np.arange(20) % 2 == 0, 1] = gaps[1, 1] = np.nan
-    prior = Pooled(*np.tile([[0.02], [0.05**2], [0.1**2]], 2))
-    alone = pooled(0.02, 0.05**2, 0.1**2)
-    for found, seen in zip(np.transpose(prior.given(gaps, HALF_WEIGHT)), gaps.T, strict=True):
-        known = seen[np.isfinite(seen), None]
-        np.testing.assert_allclose(found, np.ravel(alone.given(known, HALF_WEIGHT)))
+def test_the_middle_half_of_the_gaps_gives_the_mean():
+    # Of nine, two on each side are left out, in whatever order they are.
+    gaps = np.array([9.0, 0.1, -5.0, 0.2, 0.3, 7.0, 0.4, -8.0, 0.5])
+    mean, _, _ = posterior_of_gaps(gaps, 0.0, 1e6, 1.0)
+    np.testing.assert_allclose(mean, 0.3, rtol=1e-5)
 
 
 def test_a_bad_track_costs_little():
     gaps = np.random.default_rng(1).normal(0.0, 0.078, 30)
-    prior = pooled(0.0, 0.05**2, 0.078**2)
-    known = prior.given(gaps[:, None], HALF_WEIGHT)
+    prior = (0.0, 0.05**2, 0.078**2)
+    mean, _, between = posterior_of_gaps(gaps, *prior)
     gaps[0] = 0.5
-    spoilt = prior.given(gaps[:, None], HALF_WEIGHT)
-    assert abs(spoilt.mean - known.mean) < 0.008
-    assert abs(spoilt.between / known.between - 1) < 0.2
+    spoilt, _, spread = posterior_of_gaps(gaps, *prior)
+    assert abs(spoilt - mean) < 0.008
+    assert abs(spread / between - 1) < 0.2
 
 
 def test_insets_are_expected_from_the_settings():
