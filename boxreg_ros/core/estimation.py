@@ -167,7 +167,8 @@ def _accepted(
         found, status, reasons, covariances, extent_covariances, distances, near_points,
         kinematics,
     )  # fmt: skip
-    table = Estimates(*(part[valid] for part in columns))
+    flat = (part.reshape(-1, *part.shape[2:]) for part in columns)
+    table = Estimates(*(flat if valid.all() else (part[valid.ravel()] for part in flat)))
     ends = np.cumsum(problem.lengths).tolist()
     return list(map(Estimate, repeat(table), [0, *ends], ends, priors))
 

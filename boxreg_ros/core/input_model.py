@@ -21,7 +21,7 @@ from boxreg_ros.core.input_statistics import (
 from boxreg_ros.core.method import constants
 from boxreg_ros.core.method.arrays import INPUTS
 from boxreg_ros.core.method.faces import observe_faces
-from boxreg_ros.core.method.margins import fill_margins, FIRST_FACE, MIN_HITS
+from boxreg_ros.core.method.margins import fill_margins, FIRST_FACE, MIN_HITS, sum_faces
 from boxreg_ros.core.method.population import population_slopes
 from boxreg_ros.core.method.residuals import TERMS
 from boxreg_ros.core.problem import Problem, settings_of_kinds
@@ -147,32 +147,8 @@ class InputModel:
     ) -> None:
         """Add face observations, of records `TERMS` (B, N), that were made with `inputs`."""
         kinds = problem.kind
-        numbers = self.constants
-        distance, weight = terms['distance'], terms['visibility']
-        occluded, distant = np.moveaxis(terms['inset_shares'], 2, 0)
-        margin, occlusion_inset, range_inset = (
-            inputs[name][kinds][:, None] for name in ('margin', 'occlusion_inset', 'range_inset')
-        )
-        occluded = occluded * (occlusion_inset > 0)  # the bottom is observed by the road
-        is_visible = occluded < numbers.min_share / 2
-        is_distant = distant > numbers.min_share
-        has_points = (terms['num_points'] >= numbers.min_box_points)[..., None]
-        # Three quantities: gap, occlusion inset, range inset; all (3, B, N, 6).
-        counts = np.stack([
-            has_points & is_visible & ~is_distant,
-            has_points & (occluded > numbers.min_share),
-            is_visible & is_distant,
-        ])  # fmt: skip
-        counts &= (weight > 0) & (np.abs(distance) < numbers.max_gap)
-        counts &= problem.valid[..., None]
-        values = np.stack([
-            0 * occluded, occluded * occlusion_inset, distant * range_inset
-        ]) - distance  # fmt: skip
-        values[::2] += margin  # an occlusion inset is counted from the present gap
-        shares = np.stack([np.ones_like(distance), occluded, distant])
-        # (B, 3 quantities, 3 sums: value, count, share; 6 faces)
-        sums = np.moveaxis(np.stack([values * counts, counts, shares * counts], 1).sum(3), 2, 0)
-        logarithms = np.log(problem.mean_extents())
+        sums, logarithms = np.empty((len(kinds), 3, 3, 6)), np.empty((len(kinds), 3))
+        sum_faces(problem, terms, inputs, self.constants.record(), sums, logarithms)
         for k in set(kinds.tolist()):
             rows, kept = _kept(self._tracks[k], track_ids, kinds == k)
             known = self._tracks[k].arrays

@@ -117,15 +117,15 @@ def minimize(
     is_finite = _are_finite(value, gradient)
     status = torch.where(is_finite, 0, int(Status.FAILED))
     best = Minimum(start.clone(), value.clone(), status, torch.zeros_like(rows))
-    gradient = torch.where(is_finite[:, None], gradient, 0.0)
     zeros = torch.zeros_like(rows)
     search = _Search(
         rows, start, value, gradient, start, value, value, is_finite, zeros, list[CurvaturePair]()
     )
-    for _ in range(iterations * MAX_BACKTRACKS):
-        is_running = best.status[search.rows] == Status.RUNNING
-        is_over = search.has_moved & (best.iterations[search.rows] == iterations)
-        search = _select(search, (is_running & ~is_over).nonzero()[:, 0])
+    search = _select(search, is_finite.nonzero()[:, 0])
+    for turn in range(iterations * MAX_BACKTRACKS):
+        if turn >= iterations:
+            goes_on = best.iterations[search.rows] < iterations
+            search = _select(search, (goes_on | ~search.has_moved).nonzero()[:, 0])
         if len(search.rows):
             search = _with_new_directions(search, best, metric, tolerance)
         if not len(search.rows):
@@ -158,15 +158,19 @@ def _with_new_directions(
         direction = direction / size[:, None]
         slope = slope / size
     has_converged = -slope <= tolerance * (1 + value.abs())
-    best.status[rows] = int(Status.CONVERGED) * has_converged
     best.iterations[rows] += ~has_converged
-    search = search._replace(
-        direction=search.direction.index_copy(0, moved, direction),
-        slope=search.slope.index_copy(0, moved, slope),
-        step=torch.where(search.has_moved, 1.0, search.step),
-        tries=torch.where(search.has_moved, 0, search.tries) + 1,
-    )
-    return _select(search, (best.status[search.rows] == Status.RUNNING).nonzero()[:, 0])
+    if len(moved) == len(search.rows):
+        step, tries = torch.ones_like(slope), torch.ones_like(rows)
+    else:
+        direction = search.direction.index_copy(0, moved, direction)
+        slope = search.slope.index_copy(0, moved, slope)
+        step = torch.where(search.has_moved, 1.0, search.step)
+        tries = torch.where(search.has_moved, 0, search.tries) + 1
+    search = search._replace(direction=direction, slope=slope, step=step, tries=tries)
+    if not has_converged.any():
+        return search
+    best.status[rows[has_converged]] = int(Status.CONVERGED)
+    return _running(search, best)
 
 
 def _after_trial(search: _Search, best: Minimum, function: Function, history: int) -> _Search:
@@ -182,7 +186,8 @@ def _after_trial(search: _Search, best: Minimum, function: Function, history: in
     has_decreased = trial <= value + SUFFICIENT_DECREASE * step * slope
     is_good = _are_finite(trial, trial_gradient) & has_decreased
     y = trial_gradient - search.gradient
-    if not is_good.all():
+    all_good = bool(is_good.all())
+    if not all_good:
         is_stuck = ~is_good & (search.tries == MAX_BACKTRACKS)
         best.status[rows] += int(Status.STUCK) * is_stuck
         step = _shorter(step, slope, trial - value)
@@ -202,7 +207,7 @@ def _after_trial(search: _Search, best: Minimum, function: Function, history: in
     )
     best.x[rows] = search.x  # by Armijo's condition never worse than before
     best.value[rows] = search.value
-    return search
+    return search if all_good else _running(search, best)
 
 
 def _are_finite(value: Tensor, gradient: Tensor) -> Tensor:
@@ -237,6 +242,11 @@ def _two_loop(
     for (s, y, rho), alpha in zip(pairs, reversed(alphas), strict=True):
         q = q + s * (alpha - rho * (y * q).sum(1))[:, None]
     return q
+
+
+def _running(search: _Search, best: Minimum) -> _Search:
+    """Return the rows of a search that have not ended."""
+    return _select(search, (best.status[search.rows] == Status.RUNNING).nonzero()[:, 0])
 
 
 def _select(search: _Search, rows: Tensor) -> _Search:

@@ -117,11 +117,11 @@ class Observations(NamedTuple):
         length = 0
         for table, places, own in by_table(items):
             if 2 * len(own) < len(table.boxes):
-                tables.append(table.take(np.array(own)))
+                tables.append(table.take(own))
                 rows[places] = np.arange(length, length + len(own))
             else:
                 tables.append(table)
-                rows[places] = np.array(own) + length
+                rows[places] = own + length
             length += len(tables[-1].boxes)
         return cls.concatenated(tables), rows
 

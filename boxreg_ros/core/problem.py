@@ -14,6 +14,7 @@ from typing import NamedTuple
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, GAP, PIVOT, POSE, PRIOR, SHARED
 from boxreg_ros.core.method.constants import CONSTANTS
+from boxreg_ros.core.method.headings import resolve_headings
 from boxreg_ros.core.observation import Observations
 from boxreg_ros.core.window import MarginalisationPrior, Window
 from boxreg_ros.structures import Floats, Ints, ROLL, YAW
@@ -22,15 +23,6 @@ from numpy.typing import NDArray
 
 PADDING_PERIOD = 0.1
 """Time step of padding observations [s]. Derived: any positive number keeps times increasing."""
-MAX_REVERSE_SPEED = 6.0
-"""A faster object moves forward [m/s]; chosen: no road vehicle reverses at 22 km/h."""
-KNOWN_FLIP_SHARE = 0.75
-"""
-Share of contrary headings above which a known heading sign is changed; chosen.
-
-Without a known sign the majority decides: a share of 0.5.
-
-"""
 MAX_BATCH_VALUES = 3e7
 """Most point coordinates, or entries of the Hessian, in a batch; derived: 240 MB as float64."""
 VALUES_PER_POINT = 18
@@ -277,7 +269,7 @@ def stack_windows(
     pinned = np.zeros(valid.shape, bool)
     pinned[valid] = seen.is_pinned[rows]
     if config.ingredients.heading_sign:
-        boxes[..., ROLL:] = _resolved_angles(boxes, times, valid, pinned, state[:, 5])
+        boxes[..., ROLL:] = _resolved_angles(boxes, times, lengths, pinned, state[:, 5].copy())
     else:
         boxes[..., YAW] = np.unwrap(boxes[..., YAW])
     start = _starting_boxes(windows, boxes)
@@ -360,7 +352,7 @@ def _delays(seen: Observations, config: Config) -> NDArray[np.float32]:
 def _resolved_angles(
     boxes: Floats,
     times: Floats,
-    valid: NDArray[np.bool_],
+    lengths: Ints,
     pinned: NDArray[np.bool_],
     known_yaw: Floats,
 ) -> Floats:
@@ -370,7 +362,8 @@ def _resolved_angles(
     A pinned box decides on the heading of its window.
 
     """
-    yaw = resolve_headings(boxes, times, valid, known_yaw)
+    yaw = np.empty(times.shape)
+    resolve_headings(boxes, times, lengths, known_yaw, yaw)
     is_contrary = np.any(pinned & (np.cos(yaw - boxes[..., YAW]) < 0), axis=1, keepdims=True)
     yaw = np.where(is_contrary, yaw + np.pi, yaw)
     # A half turn about the z axis of the box changes the signs of roll and pitch.
@@ -423,44 +416,3 @@ def _of_classes(windows: Sequence[Window], config: Config) -> tuple[Ints, NDArra
     kinds = {name: config.kind(name) for name in {window.class_name for window in windows}}
     kind = np.array([KINDS.index(kinds[window.class_name]) for window in windows])
     return kind, settings_of_kinds(config)[kind]
-
-
-def resolve_headings(
-    boxes: Floats, times: Floats, valid: NDArray[np.bool_], known_yaw: Floats
-) -> Floats:
-    """
-    Return unwrapped yaw angles with one heading sign per window, 180° flips corrected, (B, N).
-
-    The majority of a window decides on the sign; against a known sign, `known_yaw` (B,) of the
-    first box as estimated before [rad] (NaN where unknown), three quarters. An object faster than
-    `MAX_REVERSE_SPEED` heads where it moves. A single heading that is off by a quarter turn does
-    not affect those after it. `boxes` (B, N, 9) [m, rad] have increasing `times` (B, N) [s];
-    `valid` is False for padding. Each angle is within a whole number of half turns of the input.
-
-    """
-    input_yaw = boxes[..., YAW]
-    chain = input_yaw.copy()
-    if chain.shape[1] == 1:
-        return chain  # nothing contradicts a single heading
-    trend = boxes[:, 0, YAW]
-    for column in range(1, chain.shape[1]):
-        change = (chain[:, column] - trend + np.pi / 2) % np.pi - np.pi / 2
-        chain[:, column] = trend + change
-        trend = trend + change * 2 / 3  # an outlier of a quarter turn moves it by 60° only
-    is_contrary = (np.cos(input_yaw - chain) < 0) & valid
-    share = is_contrary.sum(1) / valid.sum(1)
-    limit = np.where(np.isnan(known_yaw), 0.5, KNOWN_FLIP_SHARE)
-    limit = np.where(np.cos(known_yaw - chain[:, 0]) < 0, 1 - KNOWN_FLIP_SHARE, limit)
-    speed = _median_forward_speed(boxes, times, valid, chain)
-    is_flipped = np.where(np.abs(speed) > MAX_REVERSE_SPEED, speed < 0, share > limit)
-    return np.where(is_flipped[:, None], chain + np.pi, chain)
-
-
-def _median_forward_speed(
-    boxes: Floats, times: Floats, valid: NDArray[np.bool_], yaw: Floats
-) -> Floats:
-    """Return the median speed of the centres along `yaw` (B, N), shape (B,) [m/s]."""
-    dx, dy = np.moveaxis(np.diff(boxes[..., :2], axis=1, prepend=boxes[:, :1, :2]), 2, 0)
-    along = (dx * np.cos(yaw) + dy * np.sin(yaw)) / np.diff(times, prepend=-1.0)
-    ascending = np.sort(np.where(valid, along, np.inf))
-    return np.asarray(ascending[np.arange(len(boxes)), (valid.sum(1) - 1) // 2])

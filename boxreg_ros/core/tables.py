@@ -30,14 +30,16 @@ def joined(items: Sequence[tuple[Any, int]]) -> tuple[list[Any], Ints]:
     return list(of_id.values()), before + np.array(rows, int)
 
 
-def by_table(items: Sequence[tuple[Any, int]]) -> list[tuple[Any, list[int], list[int]]]:
+def by_table(items: Sequence[tuple[Any, int]]) -> list[tuple[Any, Ints, Ints]]:
     """Return each table of some items, the places of its items among them, and their rows."""
-    found: dict[int, tuple[Any, list[int], list[int]]] = {}
-    for place, (table, row) in enumerate(items):
-        _, places, rows = found.setdefault(id(table), (table, [], []))
-        places.append(place)
-        rows.append(row)
-    return list(found.values())
+    owners, rows = zip(*items, strict=True) if items else ((), ())
+    ids = list(map(id, owners))
+    of_id = dict(zip(ids, owners, strict=True))
+    numbers = dict(zip(of_id, range(len(of_id)), strict=True))
+    number, row = np.array([numbers[i] for i in ids], int), np.array(rows, int)
+    order = np.argsort(number, kind='stable')
+    parts = np.split(order, np.cumsum(np.bincount(number, minlength=len(of_id)))[:-1])
+    return [(table, part, row[part]) for table, part in zip(of_id.values(), parts, strict=False)]
 
 
 def column(tables: Sequence[Any], name: str) -> Any:

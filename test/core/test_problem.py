@@ -1,9 +1,10 @@
 """Windows of observations, and batches of windows as padded arrays."""
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.method import headings
 from boxreg_ros.core.method.arrays import PRIOR as PRIOR_SIZE
 from boxreg_ros.core.method.constants import CONSTANTS
-from boxreg_ros.core.problem import group_windows, NO_RANGE, Problem, resolve_headings
+from boxreg_ros.core.problem import group_windows, NO_RANGE, Problem
 from boxreg_ros.core.problem import stack_windows as stack
 from boxreg_ros.core.window import MarginalisationPrior
 from boxreg_ros.structures import POSE, ROLL, YAW
@@ -48,6 +49,13 @@ def flipped(window):
     boxes = [o.box + np.pi * np.eye(9)[8] for o in window.observations]
     pairs = zip(window.observations, boxes, strict=True)
     return window._replace(observations=[changed(o, boxes=box) for o, box in pairs])
+
+
+def resolve_headings(boxes, times, valid, known_yaw):
+    """Return the resolved headings (B, N) of windows."""
+    yaw = np.empty(valid.shape)
+    headings.resolve_headings(boxes, times, valid.sum(1), known_yaw, yaw)
+    return yaw
 
 
 def test_windows_are_padded():

@@ -254,19 +254,24 @@ def invert_poses(U, corner_inverse, blocks, link_blocks, border_blocks):
 
 
 @loop
-def add_sandwich(columns, G, found):
+def add_sandwich(columns, G, through, found):
     """
     Add the variance of the gradient, seen through rows (n, 15) of the inverse curvature.
 
-    Of `G` (15, 15) the diagonal and the places beside it are read: the others are zero.
+    Of `G` (15, 15), symmetric, the diagonal and the places beside it are read: the others are
+    zero. `through` (15,) is to work in.
 
     """
     for i in range(len(columns)):
         for k in range(PIVOT):
-            through = columns[i, k] * G[k, k]
-            if k > 0:
-                through += columns[i, k - 1] * G[k - 1, k]
-            if k + 1 < PIVOT:
-                through += columns[i, k + 1] * G[k + 1, k]
-            for j in range(len(columns)):
-                found[i, j] += through * columns[j, k]
+            through[k] = columns[i, k] * G[k, k]
+        for k in range(PIVOT - 1):
+            through[k] += columns[i, k + 1] * G[k + 1, k]
+            through[k + 1] += columns[i, k] * G[k, k + 1]
+        for j in range(i, len(columns)):
+            total = 0.0
+            for k in range(PIVOT):
+                total += through[k] * columns[j, k]
+            found[i, j] += total
+            if j > i:
+                found[j, i] += total

@@ -87,10 +87,10 @@ def fill_unclaimed(length, marginalised, terms, common, shape, constants, G):
 @kernel
 def fill_pose_covariances(length, times, poses, inverse, G, constants, found):
     """Write the covariances of the poses, (N, 6, 6)."""
-    shift = np.zeros(3)
+    shift, through = np.zeros(3), np.empty(PIVOT)
     for n in range(len(poses)):
         found[n] = inverse.poses[n]
-        add_sandwich(inverse.border[n], G, found[n])
+        add_sandwich(inverse.border[n], G, through, found[n])
         found[n, HEADING, HEADING] += constants.heading_deviation**2
         if n >= length:
             continue
@@ -110,7 +110,7 @@ def fill_extent_covariance(corner, free, common, G, found):
     """Write the covariance of the extents, (3, 3); held ones have the errors of the input."""
     rows = corner[EXTENT : EXTENT + SIZE]
     found[:] = rows[:, EXTENT : EXTENT + SIZE]
-    add_sandwich(rows, G, found)
+    add_sandwich(rows, G, np.empty(PIVOT), found)
     for i in range(SIZE):
         for j in range(SIZE):
             found[i, j] *= free[EXTENT + i] * free[EXTENT + j]

@@ -105,15 +105,15 @@ def outermost_points(m, wanted, constants, work, moments):
         best_depth[:, :wanted] = NOWHERE
         for candidate in range(count):
             i = candidates[candidate]
-            d, s = depth[i], own_strip[i]
-            place = wanted - 1
-            if d < best_depth[s, place]:
-                while place > 0 and d < best_depth[s, place - 1]:
-                    best_depth[s, place] = best_depth[s, place - 1]
-                    best_index[s, place] = best_index[s, place - 1]
-                    place -= 1
-                best_depth[s, place] = d
-                best_index[s, place] = i
+            s = own_strip[i]
+            d, next_depth, next_index = depth[i], depth[i], np.int64(i)
+            for place in range(wanted):  # without a branch: half would be predicted wrong
+                here, here_index = best_depth[s, place], best_index[s, place]
+                is_behind = d < here
+                best_depth[s, place] = next_depth if is_behind else here
+                best_index[s, place] = next_index if is_behind else here_index
+                next_depth = here if is_behind else next_depth
+                next_index = here_index if is_behind else next_index
         number = 0
         total = 0.0
         moment = moments[face]

@@ -17,30 +17,33 @@ Measured: with less, final accelerations err by more than zero does.
 
 
 @loop
-def fill_combination(first, factors, inverse, G, border, found):
+def fill_combination(first, factors, inverse, G, border, through, found):
     """
     Write the covariance (4, 4) of the sum of `factors` times three poses, from `first` on.
 
-    Of their variables `RATES`. `border` (4, 15) is to work in.
+    Of their variables `RATES`. `border` (4, 15) and `through` (15,) are to work in.
 
     """
     for i in range(len(RATES)):
         k = RATES[i]
         for s in range(PIVOT):
-            border[i, s] = 0.0
-            for a in range(3):
-                border[i, s] += factors[a] * inverse.border[first + a, k, s]
-        for j in range(len(RATES)):
+            border[i, s] = (
+                factors[0] * inverse.border[first, k, s]
+                + factors[1] * inverse.border[first + 1, k, s]
+                + factors[2] * inverse.border[first + 2, k, s]
+            )
+        for j in range(i, len(RATES)):
             m = RATES[j]
-            found[i, j] = 0.0
+            total = 0.0
             for a in range(3):
-                found[i, j] += factors[a] ** 2 * inverse.poses[first + a, k, m]
+                total += factors[a] ** 2 * inverse.poses[first + a, k, m]
                 links = inverse.links[first + a]
                 for b in range(a + 1, 3):
                     of_other = POSE * (b - a - 1)
                     both = links[k, of_other + m] + links[m, of_other + k]
-                    found[i, j] += factors[a] * factors[b] * both
-    add_sandwich(border, G, found)
+                    total += factors[a] * factors[b] * both
+            found[i, j] = found[j, i] = total
+    add_sandwich(border, G, through, found)
 
 
 @kernel
@@ -69,6 +72,7 @@ def fill_kinematics(length, times, poses, deviations, inverse, G, found):
 
     """
     C, factors, border = np.empty((4, 4)), np.empty(3), np.empty((4, PIVOT))
+    through = np.empty(PIVOT)
     prior = (deviations**2).sum()
     for n in range(length if length > 2 else 0):
         own = found[n]
@@ -80,7 +84,7 @@ def fill_kinematics(length, times, poses, deviations, inverse, G, found):
 
         factors[0], factors[2] = 2 / (before * duration), 2 / (after * duration)
         factors[1] = -factors[0] - factors[2]
-        fill_combination(first, factors, inverse, G, border, C)
+        fill_combination(first, factors, inverse, G, border, through, C)
         for i in range(4):
             for j in range(4):
                 own.velocity_covariance[i, j] = elapsed**2 * C[i, j]
@@ -93,7 +97,7 @@ def fill_kinematics(length, times, poses, deviations, inverse, G, found):
         gain = 1 - (C[0, 0] + C[1, 1] + C[2, 2]) / prior
 
         factors[0], factors[1], factors[2] = -1 / duration, 0.0, 1 / duration
-        fill_combination(first, factors, inverse, G, border, C)
+        fill_combination(first, factors, inverse, G, border, through, C)
         is_finite = True
         for i in range(4):
             rate = (poses[last, RATES[i]] - poses[first, RATES[i]]) / duration

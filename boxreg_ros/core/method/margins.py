@@ -1,9 +1,9 @@
 """Labelling margins and insets of one kind of objects, by what its tracks show (M15)."""
 
-from math import exp
+from math import exp, log
 
 from boxreg_ros.core.method.compile import kernel
-from boxreg_ros.core.method.expectation import constant_part, SIZE
+from boxreg_ros.core.method.expectation import constant_part, FACES, fill_mean_extents, SIZE
 from boxreg_ros.core.method.selection import nth
 import numpy as np
 
@@ -19,6 +19,64 @@ MIDMEAN_FACTOR = 1.2
 """Variance of the mean of the middle half over that of the mean. Derived: for a Gaussian."""
 GAP, OCCLUSION, RANGE = 0, 1, 2
 """Quantities that the faces of a track show."""
+
+
+@kernel
+def add_value(quantity, face, value, share, sums):
+    """Add one value of a quantity of a face to the sums of its track, (3, 3, 6)."""
+    sums[quantity, 0, face] += value
+    sums[quantity, 1, face] += 1.0
+    sums[quantity, 2, face] += share
+
+
+@kernel
+def sum_faces(problem, terms, inputs, constants, sums, logarithms):
+    """
+    Sum what the faces of each window show of its track.
+
+    Parameters
+    ----------
+    problem : Problem
+        The windows; all their observations count.
+    terms : array of `TERMS`, shape (B, N)
+        Their face observations.
+    inputs : array of `INPUTS`, shape (K,)
+        What these were made with, by kind.
+    constants : record of `Constants`
+        Of the method.
+    sums, logarithms : array, shapes (B, 3, 3, 6) and (B, 3)
+        Written: see `TRACK`, and of the mean input extents.
+
+    """
+    mean = np.empty(SIZE)
+    sums[:] = 0.0
+    for b in range(len(terms)):
+        known = inputs[problem.kind[b]]
+        fill_mean_extents(b, problem, mean)
+        for k in range(SIZE):
+            logarithms[b, k] = log(mean[k])
+        for n in range(problem.lengths[b]):
+            term = terms[b, n]
+            has_points = term.num_points >= constants.min_box_points
+            for face in range(FACES):
+                distance, margin = term.distance[face], known.margin[face]
+                if not (term.visibility[face] > 0 and abs(distance) < constants.max_gap):
+                    continue
+                occlusion_inset = known.occlusion_inset[face]
+                occluded, distant = term.inset_shares[0, face], term.inset_shares[1, face]
+                if not occlusion_inset > 0:
+                    occluded = 0.0  # the bottom is observed by the road
+                is_visible = occluded < constants.min_share / 2
+                is_distant = distant > constants.min_share
+                if has_points and is_visible and not is_distant:
+                    add_value(GAP, face, margin - distance, 1.0, sums[b])
+                if has_points and occluded > constants.min_share:
+                    # Counted from the present gap.
+                    inset = occluded * occlusion_inset - distance
+                    add_value(OCCLUSION, face, inset, occluded, sums[b])
+                if is_visible and is_distant:
+                    inset = distant * known.range_inset[face] - distance + margin
+                    add_value(RANGE, face, inset, distant, sums[b])
 
 
 @kernel
