@@ -87,6 +87,8 @@ def add(n, poses, rows, columns, W, out, gradient, A):
                 border[out.columns[s]] += weighted * S[s]
         for s in range(columns):
             weighted = W[row] * S[s]
+            if weighted == 0.0:
+                continue
             for t in range(s, columns):
                 A.corner[out.columns[s], out.columns[t]] += weighted * S[t]
     return value
