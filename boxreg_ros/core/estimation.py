@@ -19,7 +19,7 @@ from itertools import repeat
 from boxreg_ros.config import Config
 from boxreg_ros.core.articulation import changes_shape, extent_ranges
 from boxreg_ros.core.input_model import InputModel
-from boxreg_ros.core.input_noise import residuals_at
+from boxreg_ros.core.input_noise import normalised_residuals
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, Solution
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.faces import count_held
@@ -115,7 +115,8 @@ def _update_noise(
     lag = min(config.lag, config.window - 1)
     best = problem.lengths - 1 - lag
     extents = solution.shared[:, EXTENT:BIAS]
-    residuals = residuals_at(problem, solution.poses, extents, best.clip(0))
+    every = normalised_residuals(problem, solution.poses, extents)
+    residuals = every[np.arange(len(best)), best.clip(0)]
     # Each box counts once. The first one stays the best of its window as long as this grows.
     residuals[best < 0] = np.nan
     track_ids = [window.track_id for window in windows]

@@ -10,15 +10,12 @@ from collections.abc import Sequence
 from boxreg_ros.core.input_statistics import NOISE
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.method.expectation import SIZE
-from boxreg_ros.core.method.noise import estimate
+from boxreg_ros.core.method.noise import estimate, fill_residuals
 from boxreg_ros.core.problem import Problem
-from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, POSE
+from boxreg_ros.structures import Floats
 import numpy as np
 from numpy.typing import NDArray
 
-REPEATED_BOX_TOLERANCE = 1e-3
-"""A box that differs from the one before by less repeats it [m, rad]. Chosen."""
 EXTENT_ERRORS = ((0.9, 0.9, 0.9), (0.8, 1.6, 0.65), (2.7, 1.6, 0.65))
 """Error of extents that is constant along a track, over the one of the settings, of vehicles,
 cyclists and pedestrians. Measured of PointRCNN on KITTI, widths of the latter two on PandaSet."""
@@ -77,40 +74,7 @@ def noise_of(residuals: Floats, constants: Constants) -> NDArray[np.void]:
 
 
 def normalised_residuals(problem: Problem, poses: Floats, extents: Floats) -> Floats:
-    """
-    Return input minus fit over the deviations of the settings, shape (B, N, 9).
-
-    Along the axes of the boxes at `poses` (B, N, 6) of `extents` (B, 3), in the order of
-    `NOISE`. NaN for boxes that repeat the one before, since boxes that a tracker holds have
-    no new error, and for those without points, since their fit follows the input.
-
-    """
-    # The first box is compared with the last one: a track that is held throughout is left out.
-    before = np.roll(problem.boxes, 1, axis=1)
-    has_points = problem.counts > 0
-    residuals = _residuals(problem.boxes, before, poses, extents[:, None], has_points)
-    return residuals / problem.errors[:, None]
-
-
-def residuals_at(problem: Problem, poses: Floats, extents: Floats, columns: Ints) -> Floats:
-    """Return `normalised_residuals` (B, 9) of one observation of each window, in `columns`."""
-    rows = np.arange(len(problem.boxes))
-    boxes, before = problem.boxes[rows, columns], problem.boxes[rows, columns - 1]
-    has_points = problem.counts[rows, columns] > 0
-    residuals = _residuals(boxes, before, poses[rows, columns], extents, has_points)
-    return residuals / problem.errors
-
-
-def _residuals(
-    boxes: Floats, before: Floats, pose: Floats, extent: Floats, has_points: NDArray[np.bool_]
-) -> Floats:
-    """Return input minus fit (..., 9), NaN for boxes without points or as the one `before`."""
-    difference = boxes[..., POSE] - pose
-    to_box = np.swapaxes(matrix_from_rpy(pose[..., 3:]), -1, -2)
-    along = (to_box @ difference[..., :3, None])[..., 0]
-    residuals = np.concatenate(
-        [along, difference[..., 3:], boxes[..., BOX_EXTENT] / extent - 1], axis=-1
-    )
-    is_repeated = np.abs(boxes - before).max(-1) < REPEATED_BOX_TOLERANCE
-    residuals[~has_points | is_repeated] = np.nan
+    """Return the residuals (B, N, 9) of `noise.fill_residuals`, in the order of `NOISE`."""
+    residuals = np.empty((*problem.counts.shape, 9))
+    fill_residuals(problem, np.ascontiguousarray(poses), np.ascontiguousarray(extents), residuals)
     return residuals

@@ -3,9 +3,13 @@
 from math import sqrt
 
 from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.expectation import SIZE
+from boxreg_ros.core.method.rotation import fill_rotation
 from boxreg_ros.core.method.selection import lower_median
 import numpy as np
 
+REPEATED_BOX_TOLERANCE = 1e-3
+"""A box that differs from the one before by less repeats it [m, rad]. Chosen."""
 MIN_POWER = 1e-12
 """Errors with a smaller variance do not change along a track [m^2, rad^2]. Derived: rounding."""
 MAD_TO_DEVIATION = 1.48
@@ -13,6 +17,39 @@ MAD_TO_DEVIATION = 1.48
 CORRELATION_ITERATIONS = 5
 """Alternating evaluations of the correlation and of the variance that track means remove.
 Derived: they change by less than 0.1 % then."""
+
+
+@kernel
+def fill_residuals(problem, poses, extents, residuals):
+    """
+    Write input minus fit over the deviations of the settings, (B, N, 9).
+
+    Along the axes of the boxes at `poses` (B, N, 6) of `extents` (B, 3). NaN for boxes that repeat
+    the one before, since boxes that a tracker holds have no new error, and for those without
+    points, since their fit follows the input. The first box is compared with the last one: a track
+    that is held throughout is left out.
+
+    """
+    R = np.empty((3, 3))
+    for b in range(len(poses)):
+        of_class = problem.of_class[b]
+        for n in range(poses.shape[1]):
+            box, before, pose = problem.boxes[b, n], problem.boxes[b, n - 1], poses[b, n]
+            own = residuals[b, n]
+            change = 0.0
+            for k in range(len(box)):
+                change = max(change, abs(box[k] - before[k]))
+            if problem.counts[b, n] == 0 or change < REPEATED_BOX_TOLERANCE:
+                own[:] = np.nan
+                continue
+            fill_rotation(pose[3], pose[4], pose[5], R)
+            for k in range(SIZE):
+                along = 0.0
+                for j in range(SIZE):
+                    along += R[j, k] * (box[j] - pose[j])
+                own[k] = along / of_class.pose[k]
+                own[3 + k] = (box[6 + k] - pose[3 + k]) / of_class.pose[3 + k]
+                own[6 + k] = (box[3 + k] / extents[b, k] - 1) / of_class.extent
 
 
 @kernel
