@@ -7,7 +7,7 @@ of a table and a row in it: many small arrays take longer to stack than a few la
 """
 
 from collections.abc import Sequence
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Any
 
 from boxreg_ros.structures import Ints
@@ -38,8 +38,9 @@ def by_table(items: Sequence[tuple[Any, int]]) -> list[tuple[Any, Ints, Ints]]:
     numbers = dict(zip(of_id, range(len(of_id)), strict=True))
     number, row = np.array([numbers[i] for i in ids], int), np.array(rows, int)
     order = np.argsort(number, kind='stable')
-    parts = np.split(order, np.cumsum(np.bincount(number, minlength=len(of_id)))[:-1])
-    return [(table, part, row[part]) for table, part in zip(of_id.values(), parts, strict=False)]
+    ends = np.cumsum(np.bincount(number, minlength=len(of_id))).tolist()
+    parts = [order[begin:end] for begin, end in pairwise([0, *ends])]
+    return [(table, part, row[part]) for table, part in zip(of_id.values(), parts, strict=True)]
 
 
 def column(tables: Sequence[Any], name: str) -> Any:

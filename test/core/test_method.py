@@ -129,8 +129,8 @@ def test_the_factor_solves_and_inverts(is_held):
         np.testing.assert_allclose(links[n], after, rtol=1e-6, atol=1e-9)
     # The covariance of a sum of three poses, with that of the gradient by shared variables.
     factors, G = np.array([2.0, -3.0, 0.5]), np.diag(np.linspace(0.1, 1.0, PIVOT))
-    found, room = np.empty((4, 4)), np.empty((4, PIVOT))
-    fill_combination(2, factors, Inverse(blocks, links, border, corner), G, room, found)
+    found, rooms = np.empty((4, 4)), (np.empty((4, PIVOT)), np.empty(PIVOT))
+    fill_combination(2, factors, Inverse(blocks, links, border, corner), G, *rooms, found)
     J = np.hstack([factor * np.eye(6) for factor in factors])
     rows = slice(12, 30)
     through = (J @ inverse[rows, 6 * N :])[:, :PIVOT]
