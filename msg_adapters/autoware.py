@@ -148,12 +148,10 @@ def _with_motion(kinematics: Any, found: NDArray[np.void]) -> Any:
     prefix = _prefix_of(kinematics)
     fields: dict[str, Any] = {}
     for name, inner, key in TWIST_AND_ACCEL:
-        motion = getattr(kinematics, f'{prefix}{name}_with_covariance', None)
-        if motion is not None and found[f'has_{key}'][0]:
-            own = poses.motion_numbers(motion, inner)[None]
-            numbers = poses.with_kinematics(own, found, key)[0]
-            written = poses.with_motion_numbers(motion, inner, numbers)
-            fields[f'{prefix}{name}_with_covariance'] = written
+        field = f'{prefix}{name}_with_covariance'
+        motion = getattr(kinematics, field, None)
+        if motion is not None:
+            fields[field] = poses.with_motion(motion, inner, found, key)
     if hasattr(kinematics, 'has_twist') and found['has_velocity'][0]:
         fields |= {'has_twist': True, 'has_twist_covariance': True}
     return poses.replaced(kinematics, **fields)

@@ -15,7 +15,6 @@ from typing import Any
 from boxreg_ros.structures import BoxArray, Floats
 from msg_adapters import poses
 import numpy as np
-from numpy.typing import NDArray
 
 BOX = 1
 CLASS_NAMES = (
@@ -81,8 +80,8 @@ def to_msg(
             covariance = None if covariances is None else covariances[i]
             if kinematics is not None:
                 own = kinematics[i : i + 1]
-                twist = _with_motion(twist, 'twist', own, 'velocity')
-                accel = _with_motion(accel, 'accel', own, 'acceleration')
+                twist = poses.with_motion(twist, 'twist', own, 'velocity')
+                accel = poses.with_motion(accel, 'accel', own, 'acceleration')
             i += 1
         if hasattr(o.pose, 'covariance'):
             pose = poses.with_covariance(o.pose, pose, covariance, T_out_in)
@@ -100,14 +99,6 @@ def to_msg(
     return poses.replaced(
         msg, header=poses.with_frame(msg.header, boxes.frame_id), objects=objects
     )
-
-
-def _with_motion(motion: Any, name: str, found: NDArray[np.void], key: str) -> Any:
-    """Return a twist or an accel with the one `found` (1,), where it is known."""
-    if not found[f'has_{key}'][0]:
-        return motion
-    own = poses.motion_numbers(motion, name)[None]
-    return poses.with_motion_numbers(motion, name, poses.with_kinematics(own, found, key)[0])
 
 
 def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:

@@ -343,7 +343,29 @@ def rotated_motion(motion: Any, name: str, T_out_in: Floats | None) -> Any:
     return replaced(motion, **{name: inner, 'covariance': covariance})
 
 
-def motion_numbers(motion: Any, name: str) -> Floats:
+def with_motion(motion: Any, name: str, found: NDArray[np.void], key: str) -> Any:
+    """
+    Return a twist or an accel with the one that was found, where it is known.
+
+    Parameters
+    ----------
+    motion : message
+        As in `rotated_motion`, in the axes that `found` is in.
+    name : str
+        As there.
+    found : array, shape (1,)
+        Record `KINEMATICS`.
+    key : str
+        ``velocity`` or ``acceleration``.
+
+    """
+    if not found[f'has_{key}'][0]:
+        return motion
+    own = _motion_numbers(motion, name)[None]
+    return _with_motion_numbers(motion, name, with_kinematics(own, found, key)[0])
+
+
+def _motion_numbers(motion: Any, name: str) -> Floats:
     """
     Return the numbers of a twist or an accel in the order of the message: 6, or 42.
 
@@ -355,10 +377,10 @@ def motion_numbers(motion: Any, name: str) -> Floats:
     return np.concatenate([own, getattr(motion, 'covariance', [])]).astype(np.float64)
 
 
-def with_motion_numbers(motion: Any, name: str, numbers: Floats) -> Any:
-    """Return a copy of a twist or an accel with the numbers of `motion_numbers`."""
+def _with_motion_numbers(motion: Any, name: str, numbers: Floats) -> Any:
+    """Return a copy of a twist or an accel with the numbers of `_motion_numbers`."""
     if hasattr(motion, 'covariance'):
-        inner = with_motion_numbers(getattr(motion, name), name, numbers[:6])
+        inner = _with_motion_numbers(getattr(motion, name), name, numbers[:6])
         return replaced(motion, **{name: inner, 'covariance': numbers[6:]})
     parts = {}
     for part, values in (('linear', numbers[:3]), ('angular', numbers[3:])):
@@ -374,7 +396,7 @@ def with_kinematics(own: Floats, kinematics: NDArray[np.void] | None, name: str)
     Parameters
     ----------
     own : array, shape (n, 6) or (n, 42)
-        Of the message, as of `motion_numbers`.
+        Of the message, as of `_motion_numbers`.
     kinematics : array, shape (n,), or None
         Records `KINEMATICS` in the axes of the message.
     name : str
