@@ -23,6 +23,7 @@ from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 from consumers import consumer
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from measure.truck import truck_scene, write_truck
 import numpy as np
 import pytest
 from relabel_results import QUICK
@@ -267,7 +268,7 @@ def test_boxes_that_no_point_confirms_are_uncertain_and_rejected_ones_no_objects
 
 def test_clouds_of_several_lidars_are_copied_each_on_its_topic(tmp_path):
     path, out = tmp_path / 'truck.mcap', tmp_path / 'out'
-    assert cli.main(['simulate', '-o', str(path), '--sensors=corners', '--sweeps=5']) == 0
+    write_truck(path, truck_scene(0, 5), 'corners')
     with closing(AnyReader([path])) as reader:
         reader.open()
         kind = 'sensor_msgs/msg/PointCloud2'
