@@ -344,8 +344,8 @@ class Reason(StrEnum):
     RARELY_DETECTED = (
         'rarely_detected',
         'missing box',
-        'not added in the gaps of a track that has a box less than half as often as usual in the '
-        'drive: it may be no object',
+        'not added in a track with several gaps that has a box less than half as often as usual '
+        'in the drive: it may be no object',
         'accept the track in `boxreg review`, and it is filled',
     )
     NOT_A_KEYFRAME = (

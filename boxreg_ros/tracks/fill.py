@@ -45,14 +45,15 @@ def rarely_detected(tracklets: Sequence[Tracklet], detected_ns: Ints, config: Co
 
 def _rate(tracklet: Tracklet, detected_ns: Ints, config: Config) -> float:
     """
-    Return the part of the stamps behind its first box at which a track has one; 1 for one box.
+    Return the part of the stamps behind its first box at which a track has one.
 
-    Pauses longer than `complete.fill_gap` do not count: a parked object may be out of sight.
+    Pauses longer than `complete.fill_gap` do not count, nor does a single gap, as if there were
+    none: the object may have been out of sight.
 
     """
     steps = np.diff(np.searchsorted(detected_ns, tracklet.stamps_ns))
     steps = steps[np.diff(tracklet.stamps_ns) <= config.complete.fill_gap * 1e9]
-    return len(steps) / int(steps.sum()) if len(steps) else 1.0
+    return len(steps) / int(steps.sum()) if (steps > 1).sum() > 1 else 1.0
 
 
 def fill(tracklet: Tracklet, array_stamps_ns: Ints, config: Config) -> list[AddedBoxes]:
