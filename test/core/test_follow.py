@@ -179,6 +179,14 @@ def test_a_line_a_spline_or_the_fits_are_between_exact_keyframes():
     assert (curve_of(lambda t: t**3, [0.0, 0.1], [0, 5])[1] == 100).all()  # two show nothing
 
 
+def test_fits_of_unknown_error_are_not_between_exact_keyframes():
+    # Without a fit of the keyframe at 1 s, those at 1 and 2 s do not say by how much fits err.
+    _, found = curve_of(lambda t: (-1.0) ** t, [0.0, np.nan, 0.0, 0.0, 0.0, 0.0])
+    is_between = np.arange(51) % 10 > 0
+    assert (found[:30][is_between[:30]] != 100).all()
+    assert (found[30:][is_between[30:]] == 100).all()
+
+
 def test_a_long_gap_between_keyframes_is_judged_by_its_length():
     # Without the keyframe at 3.9 s a line errs by .1 m there, for the next one is near, but by
     # 3.9^2 / (4 * 3.9 * .1) times as much in the long gap.

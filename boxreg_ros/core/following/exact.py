@@ -38,8 +38,9 @@ def between_exact(stamps_ns: Ints, boxes: Floats, keyframes: Keyframes) -> Float
     Each is judged at the keyframes, without the one that it is compared with. An interpolation
     between keyframes errs by at most a h^2 / 8 with the acceleration a and the time h between
     them, and by a s t / 2 at one that is left out, s after the last and t before the next. Fits,
-    from which the residuals of these neighbours are removed, err as between them. Two keyframes
-    show nothing.
+    from which the residuals of these neighbours are removed, err as between them; where one of
+    them has no fit, it is not known by how much, and they are not taken. Two keyframes show
+    nothing.
 
     """
     found = boxes.copy()
@@ -70,7 +71,7 @@ def between_exact(stamps_ns: Ints, boxes: Floats, keyframes: Keyframes) -> Float
         ratio = (at[first + 1] - at[first]) ** 2 / (4 * before * after)[judges]
         spline, line = np.linalg.norm(errors[:, judges] * ratio, axis=1)
         of_fit = np.linalg.norm(of_fits[judges])
-        best = int(np.argmin([spline, SCATTER * line, SCATTER * of_fit]))
+        best = int(np.nanargmin([spline, SCATTER * line, SCATTER * of_fit]))
         if best == len(curves):
             continue
         rows = np.flatnonzero((times > at[first]) & (times < at[first + 1]))
