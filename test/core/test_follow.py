@@ -187,6 +187,14 @@ def test_fits_of_unknown_error_are_not_between_exact_keyframes():
     assert (found[30:][is_between[30:]] == 100).all()
 
 
+def test_errors_of_close_keyframes_do_not_bend_a_spline_in_a_long_gap():
+    # Three within .2 s are 1 cm off a line: an acceleration of 2 m/s^2, and a gap of 4.8 s.
+    at, x = [0.0, 0.1, 0.2, 5.0], np.array([0.0, 0.01, 0.04, 0.0])
+    times, found = curve_of(lambda _: x, [0.0, 0.3, 0.0, 0.3], at)
+    assert np.abs(CubicSpline(at, x)(times)).max() > 3
+    assert (found[3:50] == 100).all()  # the fits
+
+
 def test_a_long_gap_between_keyframes_is_judged_by_its_length():
     # Without the keyframe at 3.9 s a line errs by .1 m there, for the next one is near, but by
     # 3.9^2 / (4 * 3.9 * .1) times as much in the long gap.

@@ -14,6 +14,8 @@ SCATTER = 2.0
 Factor by which errors judged at one or two keyframes scatter; chosen. A spline is what a body with
 a steady force does: the line or the fits have to err by so much less.
 """
+EVEN = 0.25
+"""Ratio of squared times, see `between_exact`, of evenly spaced keyframes. Derived."""
 
 
 class Keyframes(NamedTuple):
@@ -37,7 +39,9 @@ def between_exact(stamps_ns: Ints, boxes: Floats, keyframes: Keyframes) -> Float
 
     Each is judged at the keyframes, without the one that it is compared with. An interpolation
     between keyframes errs by at most a h^2 / 8 with the acceleration a and the time h between
-    them, and by a s t / 2 at one that is left out, s after the last and t before the next. Fits,
+    them, and by a s t / 2 at one that is left out, s after the last and t before the next. That of
+    a spline, whose errors are of the fourth order, grows with the square of the ratio of both from
+    evenly spaced keyframes on: small errors of close ones bend it far in a long gap. Fits,
     from which the residuals of these neighbours are removed, err as between them; where one of
     them has no fit, it is not known by how much, and they are not taken. Two keyframes show
     nothing.
@@ -69,7 +73,8 @@ def between_exact(stamps_ns: Ints, boxes: Floats, keyframes: Keyframes) -> Float
     for first in range(len(at) - 1):
         judges = np.unique(np.clip([first - 1, first], 0, len(at) - 3))  # keyframes at its ends
         ratio = (at[first + 1] - at[first]) ** 2 / (4 * before * after)[judges]
-        spline, line = np.linalg.norm(errors[:, judges] * ratio, axis=1)
+        ratios = ratio * np.maximum(ratio / EVEN, 1), ratio
+        spline, line = np.linalg.norm(errors[:, judges] * ratios, axis=1)
         of_fit = np.linalg.norm(of_fits[judges])
         best = int(np.nanargmin([spline, SCATTER * line, SCATTER * of_fit]))
         if best == len(curves):
