@@ -14,6 +14,7 @@ FILE_REMEDIES = {
 }
 """Remedy by the cause why a file cannot be used."""
 OTHER_REMEDY = 'check its disk or network, and copy it again'
+OWN_PACKAGES = ('boxreg_ros', 'msg_adapters')
 
 
 class BoxregError(Exception):
@@ -55,6 +56,11 @@ def description_of(error: Exception) -> str:
         return str(error)
     if isinstance(error, OSError):
         return f'{error}; {remedy_of(error)}'
+    if isinstance(error, ModuleNotFoundError) and not (error.name or '').startswith(OWN_PACKAGES):
+        return (
+            f'{error}: a package that boxreg_ros depends on is missing; install it in the '
+            f'environment that boxreg runs in, as docs/getting-started.md says'
+        )
     return (
         f'unexpected {type(error).__name__}: {error}; this is a fault of boxreg: please report it '
         f'with the traceback, which --debug prints'

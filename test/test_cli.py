@@ -335,6 +335,22 @@ def test_an_internal_exception_is_one_line_and_is_raised_with_debug(tmp_path, ca
         cli.main(['--debug', 'relabel', 'a', '-o', 'b'])
 
 
+def test_a_package_that_is_missing_is_no_fault_of_boxreg(capsys, monkeypatch):
+    from boxreg_ros.offline import relabel_command
+
+    def without(module):
+        def run(args):
+            raise ModuleNotFoundError(f'No module named {module!r}', name=module)
+
+        monkeypatch.setattr(relabel_command, 'run', run)
+        return boxreg(capsys, 'relabel', 'a', '-o', 'b')
+
+    status, _, err = without('numba.core')
+    assert status == 1
+    assert err.startswith("boxreg: No module named 'numba.core': a package that")
+    assert 'this is a fault of boxreg' in without('boxreg_ros.nothing')[2]
+
+
 def test_help_and_version(capsys):
     status, out, _ = boxreg(capsys, '--help')
     assert status == 0
