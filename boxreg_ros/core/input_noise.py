@@ -50,7 +50,7 @@ def set_noise(
         weights = taken[:, None] * boxes  # (K, 2, K): of each part of each kind, for a kind
         count = weights.sum((1, 2))[:, None]
         share = count / (count + constants.half_weight)
-        weights /= np.maximum(count, 1.0)[..., None]
+        weights /= np.where(count > 0, count, 1.0)[..., None]
         variance += share * (np.tensordot(weights, variances, 2) - variance)
         correlation += share * (np.tensordot(weights, correlations, 2) - correlation)
     correlation[:, DETECTED] = correlation[:, DETECTED].mean(1, keepdims=True)

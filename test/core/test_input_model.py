@@ -173,6 +173,9 @@ def test_noise_of_other_drives_counts_by_its_boxes():
     assert (both['correlation'][0] > 0.35).all()
     unseen = noise_by_kind(values[:0], [], past)
     np.testing.assert_allclose(unseen['deviation'][0] ** 2, posterior(1.0, 1200, 9.0))
+    past['boxes'][0] = 0.5  # a model file may state any number
+    unseen = noise_by_kind(values[:0], [], past)
+    np.testing.assert_allclose(unseen['deviation'][0] ** 2, posterior(1.0, 0.5, 9.0))
 
 
 def test_extents_err_as_much_as_centres_do():
