@@ -50,7 +50,7 @@ DEFAULTS = Config()
 GAP_PERIODS = 3.0
 """A pause longer than this many median periods is a gap."""
 MAX_PARTS = 500
-"""Parts of a recording that `presence_s` tells apart; chosen: what a picture can show."""
+"""Parts of a recording that `presence_s` tells apart; chosen: enough to draw them."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
