@@ -488,7 +488,7 @@ def _minimum_and_jackknife(costs: Floats) -> tuple[float, float]:
 
 
 def _minima(costs: Floats) -> Floats:
-    """Return the candidates of least cost (n, C), by a parabola through them and the next ones."""
+    """Return the minima (n,) [s] of costs (n, C), by parabolas through the least and the next."""
     least = costs.argmin(1)
     middle = least.clip(1, costs.shape[1] - 2)
     rows = np.arange(len(costs))

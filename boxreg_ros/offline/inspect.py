@@ -49,8 +49,8 @@ DEFAULTS = Config()
 """Settings of the proposed command."""
 GAP_PERIODS = 3.0
 """A pause longer than this many median periods is a gap."""
-MAX_PARTS = 500
-"""Parts of a recording that `presence_s` tells apart; chosen: enough to draw them."""
+MAX_SPANS = 500
+"""Spans of messages closer than 1 / MAX_SPANS of a recording are joined; chosen."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -175,8 +175,8 @@ def _rate(count: int, seconds: float) -> float:
 def _merged_spans(
     spans: Sequence[tuple[int, int]], begin_ns: int, seconds: float
 ) -> list[list[float]]:
-    """Return ascending spans [ns] as [s] from the begin; those too close to be seen are joined."""
-    nearest = seconds / MAX_PARTS
+    """Return ascending spans [ns] in [s] after `begin_ns`, with close ones joined."""
+    nearest = seconds / MAX_SPANS
     merged: list[list[float]] = []
     for first_ns, last_ns in spans:
         first = (first_ns - begin_ns) * 1e-9
