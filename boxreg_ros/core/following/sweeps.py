@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 from boxreg_ros.core.method.follow_numbers import FOLLOW
-from boxreg_ros.structures import Floats, Ints
+from boxreg_ros.structures import finite_points, Floats, Ints
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,8 +71,8 @@ class Sweeps(NamedTuple):
 
 def ascending(points: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return finite points (M, 3), ascending by x."""
-    points = points[np.isfinite(points).all(1)]
-    return np.ascontiguousarray(points[np.argsort(points[:, 0])])
+    points = finite_points(points)
+    return points.take(np.argsort(points[:, 0]), 0)
 
 
 def nearest(stamps_ns: Ints, stamp_ns: int) -> tuple[int, int, float]:
@@ -80,5 +81,5 @@ def nearest(stamps_ns: Ints, stamp_ns: int) -> tuple[int, int, float]:
         return 0, 1, 0.0
     away = np.abs(stamps_ns - stamp_ns)
     row = int(away.argmin())
-    steps = np.diff(stamps_ns[max(0, row - 1) : row + 2])
-    return row, int(away[row]), float(steps.max(initial=0)) or USUAL_PERIOD_NS
+    steps = [later - at for at, later in pairwise(stamps_ns[max(0, row - 1) : row + 2].tolist())]
+    return row, int(away[row]), float(max(steps, default=0)) or USUAL_PERIOD_NS

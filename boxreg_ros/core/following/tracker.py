@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import dist
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.following.extents import faces
@@ -19,7 +20,7 @@ from boxreg_ros.core.following.start_speed import at_seed, POSE4, Seeds, StartSp
 from boxreg_ros.core.following.sweeps import Sweeps
 from boxreg_ros.core.method import sweep_fit, turn_rate
 from boxreg_ros.core.method.follow_numbers import FOLLOW
-from boxreg_ros.core.method.surface import empty_surface, insert_foreign
+from boxreg_ros.core.method.surface import empty_surface
 from boxreg_ros.core.method.sweep_fit import Expected, Registered, Target
 from boxreg_ros.core.method.turn_rate import SPEED_STATE, State
 from boxreg_ros.core.observation import crop_numbers
@@ -81,10 +82,7 @@ class Follower:
         self._road = np.nan
         self.num_points = 0
         for row, pose in zip(seeds.rows.tolist(), seeds.boxes[:, POSE4], strict=True):
-            points = self._points.near(row, pose)
-            around = self._points.in_box(points, pose, FOLLOW.margin)
-            insert_foreign(around, half, self._target.surface.slots)
-            self.num_points += self._learn(points, pose)
+            self.num_points += self._learn(self._points.near(row, pose), pose, is_seed=True)
 
     def way(self, seed: int, sign: int, stop: int) -> Way:
         """Follow the object from a seed to the row `stop`, forwards or backwards."""
@@ -175,7 +173,7 @@ class Follower:
         """Return whether the next seed is farther away than such an object can move."""
         rows, boxes = self._seeds.rows[seed : seed + 2], self._seeds.boxes[seed : seed + 2]
         seconds = self._points.sweeps.times[rows[1]] - self._points.sweeps.times[rows[0]]
-        distance = np.linalg.norm(boxes[1, :2] - boxes[0, :2])
+        distance = dist(*boxes[:, :2].tolist())
         return bool(distance > self._kind.max_speed * seconds + FOLLOW.seed_error)
 
     def fit_of(self, rows: Ints, poses: Floats) -> float:
@@ -196,9 +194,9 @@ class Follower:
         found: Registered = sweep_fit.find(points, expected, self._target)
         return points, found
 
-    def _learn(self, points: Floats, pose: Floats) -> int:
+    def _learn(self, points: Floats, pose: Floats, is_seed: bool = False) -> int:
         """Add points at a pose to the surface, and find the road; return how many are new."""
-        count: int = sweep_fit.learn(points, pose, self._target)
+        count: int = sweep_fit.learn(points, pose, self._target, is_seed)
         if np.isnan(self._road):
             self._road = sweep_fit.road_below(points, pose, self._target)
         return count

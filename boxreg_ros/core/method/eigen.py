@@ -1,6 +1,6 @@
 """Eigenvalues and eigenvectors of symmetric matrices (3, 3) in closed form."""
 
-from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.compile import loop
 import numpy as np
 
 
@@ -20,19 +20,20 @@ def eigenvalues(C):
     return low, 3 * mean - high - low, high
 
 
-@kernel
+@loop
 def eigenvector(C, value):
     """Return the unit eigenvector of a symmetric matrix (3, 3) for one of its eigenvalues."""
-    rows = C - value * np.eye(3)
-    best = np.zeros(3)
-    most = 0.0
-    for i in range(3):
-        u, v = rows[i], rows[(i + 1) % 3]
-        x = u[1] * v[2] - u[2] * v[1]
-        y = u[2] * v[0] - u[0] * v[2]
-        z = u[0] * v[1] - u[1] * v[0]
+    a, b, c = C[0, 0] - value, C[1, 1] - value, C[2, 2] - value
+    d, e, f = C[0, 1], C[0, 2], C[1, 2]
+    of_rows = (  # the cross products of C less the value
+        (d * f - e * b, e * d - a * f, a * b - d * d),
+        (b * c - f * f, f * e - d * c, d * f - b * e),
+        (f * e - c * d, c * a - e * e, e * d - f * a),
+    )
+    best, most = (0.0, 0.0, 0.0), 0.0
+    for x, y, z in of_rows:
         squared = x * x + y * y + z * z
         if squared > most:
-            most = squared
-            best[0], best[1], best[2] = x, y, z
-    return best / np.sqrt(most) if most > 0 else best
+            best, most = (x, y, z), squared
+    size = np.sqrt(most) if most > 0 else 1.0
+    return best[0] / size, best[1] / size, best[2] / size

@@ -41,13 +41,17 @@ def cell_of(x, y, z, half, cells):
 @kernel
 def fill_planes(sums, roughness, constants, planes, thickness):
     """Fit a plane (4,) to the moments (4, 4) of each cell; thickness 0 where there is none."""
+    covariance = np.empty((3, 3))
     for cell in range(len(sums)):
         thickness[cell] = 0.0
-        number = sums[cell, 3, 3]
+        moment = sums[cell]
+        number = moment[3, 3]
         if number < constants.min_cell_points:
             continue
-        mean = sums[cell, :3, 3] / number
-        covariance = sums[cell, :3, :3] / number - mean * mean.reshape(3, 1)
+        for j in range(3):
+            for k in range(j, 3):
+                product = moment[j, 3] * moment[k, 3] / number
+                covariance[j, k] = (moment[j, k] - product) / number
         power = eigenvalues(covariance)
         thick = max(power[0], 0.0) + roughness**2
         if power[1] > constants.min_flatness * thick:
@@ -56,7 +60,7 @@ def fill_planes(sums, roughness, constants, planes, thickness):
             planes[cell, 3] = 0.0
             for k in range(3):
                 planes[cell, k] = normal[k]
-                planes[cell, 3] -= normal[k] * mean[k]
+                planes[cell, 3] -= normal[k] * moment[k, 3] / number
 
 
 class ShapeWork(NamedTuple):

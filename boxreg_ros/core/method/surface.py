@@ -52,6 +52,7 @@ def cell_of(x, y, z, slots):
 def insert(points, half, surface):
     """Add points (n, 3) of the box frame to a map; update the normals of their cells."""
     slots, means, normals, used, moments = surface
+    C = np.empty((3, 3))
     for n in range(len(points)):
         x, y, z = points[n]
         i, j, k = cell_of(x, y, z, slots)
@@ -81,7 +82,7 @@ def insert(points, half, surface):
         count = moments[slot, 0]
         if count > FOLLOW.normal_growth * moments[slot, 10]:
             means[slot] = moments[slot, 1:4] / count
-            normals[slot] = normal_at(means[slot], half, slots, moments)
+            normals[slot] = normal_at(means[slot], half, slots, moments, C)
             moments[slot, 10] = count
 
 
@@ -110,46 +111,50 @@ def is_foreign(x, y, z, slots):
     return False
 
 
-@kernel
-def normal_at(mean, half, slots, moments):
+@loop
+def normal_at(mean, half, slots, moments, C):
     """
     Return the normal of the points in the 27 cells around a place (3,); zeros for too few.
 
-    Where they form a line, as those of one ring, the normal is the horizontal one across it.
+    Where they form a line, as those of one ring, the normal is the horizontal one across it. The
+    covariance `C` (3, 3) is to work in.
 
     """
-    none = np.zeros(3)
     if half[0] - abs(mean[0]) < half[1] - abs(mean[1]):
-        none[0] = np.sign(mean[0])
+        across = (np.sign(mean[0]), 0.0, 0.0)
     else:
-        none[1] = np.sign(mean[1])
+        across = (0.0, np.sign(mean[1]), 0.0)
     i, j, k = cell_of(mean[0], mean[1], mean[2], slots)
-    total = np.zeros(11)
+    n, sx, sy, sz = 0.0, 0.0, 0.0, 0.0
+    C[:] = 0.0
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):
             for c in range(k - 1, k + 2):
                 slot = slots[a, b, c] - 1
-                if slot >= 0:
-                    total += moments[slot]
-    n = total[0]
+                if slot < 0:
+                    continue
+                of_cell = moments[slot]
+                n += of_cell[0]
+                sx += of_cell[1]
+                sy += of_cell[2]
+                sz += of_cell[3]
+                C[0, 0] += of_cell[4]
+                C[0, 1] += of_cell[5]
+                C[0, 2] += of_cell[6]
+                C[1, 1] += of_cell[7]
+                C[1, 2] += of_cell[8]
+                C[2, 2] += of_cell[9]
     if n < 4:
-        return none
-    m = total[1:4] / n
-    C = np.empty((3, 3))
-    C[0, 0] = total[4] / n - m[0] * m[0]
-    C[0, 1] = total[5] / n - m[0] * m[1]
-    C[0, 2] = total[6] / n - m[0] * m[2]
-    C[1, 1] = total[7] / n - m[1] * m[1]
-    C[1, 2] = total[8] / n - m[1] * m[2]
-    C[2, 2] = total[9] / n - m[2] * m[2]
-    C[1, 0], C[2, 0], C[2, 1] = C[0, 1], C[0, 2], C[1, 2]
+        return across
+    m = (sx / n, sy / n, sz / n)
+    for p in range(3):
+        for q in range(p, 3):
+            C[p, q] = C[p, q] / n - m[p] * m[q]
     values = eigenvalues(C)
     if values[1] < FOLLOW.line**2 or values[1] < 3 * values[0]:
-        along = eigenvector(C, values[2])
-        length = np.hypot(along[0], along[1])
-        if length < 0.5:
-            return none
-        return np.array([-along[1] / length, along[0] / length, 0.0])
+        x, y, _ = eigenvector(C, values[2])
+        length = np.hypot(x, y)
+        return across if length < 0.5 else (-y / length, x / length, 0.0)
     return eigenvector(C, values[0])
 
 

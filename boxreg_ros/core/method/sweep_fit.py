@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.crop import flat_height
 from boxreg_ros.core.method.follow_numbers import FOLLOW
-from boxreg_ros.core.method.surface import insert, is_foreign, nearest_cell
+from boxreg_ros.core.method.surface import insert, insert_foreign, is_foreign, nearest_cell
 from boxreg_ros.core.method.turn_rate import pose_information
 import numpy as np
 
@@ -345,8 +345,16 @@ def in_box(points, pose, target, margin):
 
 
 @kernel
-def learn(points, pose, target):
-    """Add the points (n, 3) in a box to the map of its surface; return their number."""
+def learn(points, pose, target, is_seed):
+    """
+    Add the points (n, 3) in a box to the map of its surface; return their number.
+
+    Those beside the box of a seed are foreign.
+
+    """
+    if is_seed:
+        beside = in_box(points, pose, target, FOLLOW.margin)
+        insert_foreign(beside, target.half, target.surface.slots)
     inside = in_box(points, pose, target, FOLLOW.tolerance)
     insert(inside, target.half, target.surface)
     return len(inside)
