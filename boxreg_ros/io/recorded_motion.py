@@ -216,7 +216,8 @@ class RecordedMotion:
             )
         raise RecordingError(
             f'{origin}: neither /tf nor odometry has the motion of the frame of the clouds '
-            f'{frame!r}; {known}; if it does not move, set --fixed-frame {shlex.quote(frame)}'
+            f'{frame!r}; {known}; if it does not move, set --fixed-frame '
+            f'{shlex.quote(tree.root(frame))}'
         )
 
     @property

@@ -223,7 +223,7 @@ class Session:
             raise TransformUnavailable(
                 f'neither /tf nor odometry has the motion of the frame of the clouds '
                 f'{sensor_frame!r}; known: {self.tree}; if it does not move, set '
-                f'fixed_frame:={sensor_frame}'
+                f'fixed_frame:={self.tree.root(sensor_frame)}'
             )
         self.fixed_frame = found
         return found

@@ -277,7 +277,7 @@ class TransformTree:
         """
         source = self._known(source)
         path = self.path(source)
-        top = path[-1].parent if path else source
+        top = self.root(source)
         if top in self._odometry:
             return self._odometry[top].parent
         if not all(map(self.is_constant, path)):
@@ -286,6 +286,16 @@ class TransformTree:
             if self.connects(edge.parent, source):
                 return edge.parent
         return top if self.moving_below(source) else None
+
+    def root(self, source: str) -> str:
+        """
+        Return the topmost frame above `source`; itself if there is none.
+
+        Where nothing moves it is the one to refine in: that of a LiDAR may be tilted.
+
+        """
+        path = self.path(source)
+        return path[-1].parent if path else self._known(source)
 
     def path(self, source: str) -> list[Edge]:
         """Return the pairs of frames from `source` up to the root of TF."""

@@ -262,6 +262,9 @@ def test_boxes_without_transform_are_published_unchanged_with_a_remedy():
             "neither /tf nor odometry has the motion of the frame of the clouds 'lidar';" in text
         )
         assert text.endswith('if it does not move, set fixed_frame:=lidar')
+    live = Live()
+    live.feed(drive)
+    assert live.reports[0][1].endswith('set fixed_frame:=base'), 'the root of its static transform'
 
 
 def test_a_stationary_sensor_needs_no_transform():
