@@ -149,9 +149,16 @@ class Corrections:
         found = self._last('class', input_id, stamp_ns)
         return found.value if found else ''
 
-    def is_deleted(self, input_id: str, stamp_ns: int) -> bool:
-        """Return whether a box is deleted."""
-        return self._last('deletion', input_id, stamp_ns) is not None
+    def is_left_out(self, input_id: str, stamp_ns: int) -> bool:
+        """
+        Return whether a box that the input does not have is deleted or rejected.
+
+        In the place of a rejected box that of the input is written: here there is none.
+
+        """
+        found = self._judgement(input_id, stamp_ns)
+        is_rejected = found is not None and found.kind == 'reject'
+        return is_rejected or self._last('deletion', input_id, stamp_ns) is not None
 
     def is_accepted(self, input_id: str, stamp_ns: int) -> bool:
         """Return whether a box is accepted or pinned."""

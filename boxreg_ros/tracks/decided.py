@@ -37,8 +37,8 @@ class Decided(Protocol):
     def class_name(self, input_id: str, stamp_ns: int) -> str:
         """Return the class that was given; empty for none."""
 
-    def is_deleted(self, input_id: str, stamp_ns: int) -> bool:
-        """Return whether the box is deleted."""
+    def is_left_out(self, input_id: str, stamp_ns: int) -> bool:
+        """Return whether the box, which the input does not have, is deleted or rejected."""
 
     def is_accepted(self, input_id: str, stamp_ns: int) -> bool:
         """Return whether the box is accepted or pinned."""
@@ -63,11 +63,11 @@ class Nothing:
 
     class_name = track_id
 
-    def is_deleted(self, input_id: str, stamp_ns: int) -> bool:
+    def is_left_out(self, input_id: str, stamp_ns: int) -> bool:
         """Return False."""
         return False
 
-    is_accepted = is_deleted
+    is_accepted = is_left_out
 
     def pin(self, input_id: str, stamp_ns: int) -> Floats | None:
         """Return none."""
@@ -129,9 +129,9 @@ class DecidedTrack:
             for stamp_ns in (*self.stamps_ns, *added_ns)
         )
 
-    def is_deleted(self, stamp_ns: int) -> bool:
-        """Return whether the box at a stamp is deleted."""
-        return self.decided.is_deleted(self.input_id(stamp_ns), stamp_ns)
+    def is_left_out(self, stamp_ns: int) -> bool:
+        """Return whether the box to add at a stamp is deleted or rejected."""
+        return self.decided.is_left_out(self.input_id(stamp_ns), stamp_ns)
 
     def is_of_another(self, stamp_ns: int) -> bool:
         """Return whether the box at a stamp was given to another track, or left with it."""
@@ -146,21 +146,21 @@ class DecidedTrack:
         Return the boxes to add that no decision forbids.
 
         An extension ends where the boxes are of another track, and is none where its first box is
-        deleted: that end of the track was cut off.
+        deleted or rejected: that end of the track was cut off.
 
         """
         stamps_ns = boxes.stamps_ns.tolist()
         others = [self.is_of_another(stamp_ns) for stamp_ns in stamps_ns]
-        deleted = [self.is_deleted(stamp_ns) for stamp_ns in stamps_ns]
+        left_out = [self.is_left_out(stamp_ns) for stamp_ns in stamps_ns]
         if is_extension and True in others:
-            del deleted[others.index(True) :]
-        if is_extension and deleted[:1] == [True]:
-            deleted.clear()
-        return boxes.take([i for i, gone in enumerate(deleted) if not (gone or others[i])])
+            del left_out[others.index(True) :]
+        if is_extension and left_out[:1] == [True]:
+            left_out.clear()
+        return boxes.take([i for i, gone in enumerate(left_out) if not (gone or others[i])])
 
 
 def with_decisions(track: FollowedTrack, decided: Decided) -> FollowedTrack:
-    """Return a followed track without the boxes that are deleted, or were given to another."""
+    """Return a followed track without boxes left out by a person, or given to another."""
     seeds = [i for i, word in enumerate(track.status) if word == HUMAN]
     if not seeds:
         return track
@@ -174,7 +174,7 @@ def with_decisions(track: FollowedTrack, decided: Decided) -> FollowedTrack:
     left = [
         i
         for i in range(first, end)
-        if i in seeds or not (is_other[i] or of_track.is_deleted(stamps_ns[i]))
+        if i in seeds or not (is_other[i] or of_track.is_left_out(stamps_ns[i]))
     ]
     return replace(
         track,

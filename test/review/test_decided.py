@@ -162,6 +162,16 @@ def test_a_deleted_end_is_not_extended_again(completed, tmp_path):
     assert sum(name == '2' for name, _ in rows) == SWEEPS
 
 
+def test_rejected_boxes_that_the_run_added_are_left_out(completed, tmp_path):
+    run, stamps, before, _ = completed
+    decisions = [Decision('2', stamps[GAP[1]], 'reject'), Decision('1', None, 'reject')]
+    rows = run(tmp_path / 'out', decisions)
+    assert [words_of(rows, '2', stamps)[k] for k in GAP] == ['interpolated', '', 'interpolated']
+    words = words_of(rows, '1', stamps)
+    of_input = {'refined': 'kept', 'kept': 'kept'}
+    assert words == [of_input.get(word, '') for word in words_of(before, '1', stamps)]
+
+
 def test_joined_tracks_stay_one_however_long_the_pause(completed, tmp_path, capsys):
     run, stamps, _, _ = completed
     decisions = [
