@@ -69,6 +69,7 @@ class Session:
         self.placement = placement or SensorPlacement()
         self.fixed_frame = fixed_frame.lstrip('/')
         self.sensor_frame = ''
+        self.trusts_ids = False  # they are a person's: boxes at few sweeps do not show them
         self._convention = convention
         self._config = config
         self._tracker = Tracker(config.max_gap) if convention.associate else None
@@ -265,7 +266,8 @@ class Session:
     @property
     def jumping_ids(self) -> str:
         """Return that ids of the input do not identify objects; empty if they do."""
-        return '' if self._id_check is None else self._id_check.finding
+        is_checked = self._id_check is not None and not self.trusts_ids
+        return self._id_check.finding if is_checked else ''
 
     @property
     def finding(self) -> str:

@@ -44,6 +44,8 @@ class Arrivals:
 
     # the stamp of each sweep, and box arrays, in the fixed frame
     items: list[int | BoxArray] = field(default_factory=list)
+    # largest distance of an array that is of a sweep [ns]; None for half a period
+    reach_ns: int | None = None
 
     def add(self, item: Sweep | BoxArray) -> None:
         """Add an item that has a transform."""
@@ -55,7 +57,7 @@ class Arrivals:
         return [item for item in self.items if isinstance(item, BoxArray)]
 
     def missing_ns(self) -> list[int]:
-        """Return the stamps of sweeps without a box array within half a period."""
+        """Return the stamps of sweeps without a box array within `reach_ns`."""
         stamps_ns = [item for item in self.items if not isinstance(item, BoxArray)]
         sweeps = np.unique(np.array(stamps_ns, np.int64))
         arrays = np.sort(np.array([array.stamp_ns for array in self.arrays], np.int64))
@@ -64,7 +66,8 @@ class Arrivals:
         after = np.searchsorted(arrays, sweeps)
         nearest = np.stack([arrays[(after - 1).clip(0)], arrays[after.clip(0, len(arrays) - 1)]])
         away = np.abs(nearest - sweeps).min(0)
-        missing: list[int] = sweeps[away > np.median(np.diff(sweeps)) / 2].tolist()
+        reach_ns = np.median(np.diff(sweeps)) / 2 if self.reach_ns is None else self.reach_ns
+        missing: list[int] = sweeps[away > reach_ns].tolist()
         return missing
 
     def completed(self, frame_id: str) -> list[BoxArray]:

@@ -9,6 +9,7 @@ from typing import Any
 from boxreg_ros.config import Config
 from boxreg_ros.core.follow import End, follow_points, FollowedTrack, keyframe_deviations
 from boxreg_ros.core.following.person import DEVIATIONS
+from boxreg_ros.io.stamp_join import LARGEST_OFFSET_NS
 from boxreg_ros.io.sweep_store import SweepStore
 from boxreg_ros.offline.completion import Arrivals, Moved
 from boxreg_ros.review.corrections import Corrections
@@ -35,7 +36,8 @@ def keyframes(
 
     """
     stores: list[SweepStore] = []
-    parts = arrivals(stored(items, stores))
+    # A keyframe beside the stamp of a sweep does not take the place of the boxes of that.
+    parts = arrivals(stored(items, stores), LARGEST_OFFSET_NS)
     plan = CompletionPlan([], [])
     tracks: list[FollowedTrack] = []
     deviations = DEVIATIONS
@@ -64,12 +66,12 @@ def stored(items: Iterable[tuple[Moved, bool]], stores: list[SweepStore]) -> Ite
         yield item, restarts
 
 
-def arrivals(items: Iterable[tuple[Moved, bool]]) -> list[Arrivals]:
-    """Return what arrived in each part between time jumps."""
-    parts = [Arrivals()]
+def arrivals(items: Iterable[tuple[Moved, bool]], reach_ns: int | None = None) -> list[Arrivals]:
+    """Return what arrived in each part between time jumps; `reach_ns` is that of `Arrivals`."""
+    parts = [Arrivals(reach_ns=reach_ns)]
     for item, restarts in items:
         if restarts:
-            parts.append(Arrivals())
+            parts.append(Arrivals(reach_ns=reach_ns))
         if item is not None:
             parts[-1].add(item)
     return parts

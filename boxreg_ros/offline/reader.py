@@ -108,6 +108,7 @@ class RecordingReader:
         self._items = FixedFrameItems(
             recording, request.config, convention, request.fixed_frame, clock, ArrayPlace
         )
+        self._items.session.trusts_ids = request.keyframes
         with clock('read'):
             sensor_frame = label_frame_of(
                 recording, self._items.tree, self._items.fixed_frame, request.label_frame

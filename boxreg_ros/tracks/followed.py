@@ -14,7 +14,15 @@ from boxreg_ros.core.following.person import (
     moved,
     residuals,
 )
-from boxreg_ros.structures import BoxArray, Floats, HUMAN, REFINED, RefinedBoxes
+from boxreg_ros.structures import (
+    BoxArray,
+    EXTENDED,
+    Floats,
+    HUMAN,
+    INTERPOLATED,
+    REFINED,
+    RefinedBoxes,
+)
 from boxreg_ros.tracks.complete import AddedBox, CompletionPlan, TrackSteps, unchanged_plan
 from boxreg_ros.tracks.decided import Decided, DecidedTrack, NOTHING
 import numpy as np
@@ -39,23 +47,42 @@ def followed_plan(
     plan = unchanged_plan(given)
     stamps = np.array([array.stamp_ns for array in given], np.int64)
     order = np.argsort(stamps, kind='stable')
+    seeds_of = _arrays_of_tracks(given) if has_seeds else {}
     for track in tracks:
         steps = TrackSteps(track.track_id, track.class_name)
         plan.tracks.append(steps)
         own = DecidedTrack.of_followed(track, decided)
-        for stamp_ns, box, word in zip(track.stamps_ns, track.boxes, track.status, strict=True):
+        seeds = np.array(seeds_of.get(track.track_id, []), np.int64)
+        for stamp_ns, box, followed in zip(
+            track.stamps_ns, track.boxes, track.status, strict=True
+        ):
             after = int(np.searchsorted(stamps[order], stamp_ns))
             near = order[max(0, after - 1) : after + 1]
             array = plan.arrays[int(near[np.abs(stamps[near] - stamp_ns).argmin()])]
-            if word == HUMAN and has_seeds and track.track_id in array.track_ids:
+            word = followed
+            if word == HUMAN and len(seeds) and own.pin(int(stamp_ns)) is None:
+                seed = plan.arrays[int(seeds[np.abs(stamps[seeds] - stamp_ns).argmin()])]
                 if track.status.count(HUMAN) == 1:
                     # The extents of a single one may have grown.
-                    array.moved[array.track_ids.index(track.track_id)] = box
-                continue
+                    seed.moved[seed.track_ids.index(track.track_id)] = box
+                if seed is array:
+                    continue
+                # It is beside the stamp of its sweep, which has a box of its own.
+                is_between = stamps[seeds].min() < stamp_ns < stamps[seeds].max()
+                word = INTERPOLATED if is_between else EXTENDED
             class_name = own.class_name(int(stamp_ns)) if own.stamps_ns else ''
             class_name = class_name or track.class_name
             array.added.append(AddedBox(track.track_id, class_name, word, box, UNSUPPORTED, 1.0))
     return plan
+
+
+def _arrays_of_tracks(given: Sequence[BoxArray]) -> dict[str, list[int]]:
+    """Return the indices of the arrays that have a box of each track."""
+    found: dict[str, list[int]] = {}
+    for index, array in enumerate(given):
+        for track_id in array.track_ids:
+            found.setdefault(track_id, []).append(index)
+    return found
 
 
 def with_evidence(

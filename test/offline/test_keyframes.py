@@ -156,6 +156,26 @@ def test_a_seed_in_an_unknown_frame_is_said(street, tmp_path, capsys):
     assert '--keyframes' not in lines
 
 
+def test_one_box_of_each_object_is_no_fault_of_its_id(street, tmp_path, capsys):
+    words = ['follow', f'{street}/drive.mcap', f'{street}/seeds.csv', '-o', str(tmp_path / 'out')]
+    assert main(words) == 0
+    assert 'associate' not in capsys.readouterr().err
+
+
+def test_a_seed_beside_the_stamp_of_a_sweep_does_not_take_its_place(street, tmp_path):
+    seeds = rows_in(street / 'seeds.csv')
+    beside = [dict(row, stamp_ns=str(int(row['stamp_ns']) + 30_000_000)) for row in seeds]
+    write(tmp_path / 'beside.csv', beside)
+    found = []
+    for name, path in (('at', street / 'seeds.csv'), ('beside', tmp_path / 'beside.csv')):
+        out = tmp_path / name
+        assert main(['follow', f'{street}/drive.mcap', str(path), '-o', str(out)]) == 0
+        found.append({(row['track_id'], int(row['stamp_ns'])) for row in rows_of(out)})
+    own = {(row['track_id'], int(row['stamp_ns'])) for row in beside}
+    assert found[1] == found[0] | own
+    assert scores(tmp_path / 'beside', street / 'truth.csv').mean() > 0.9
+
+
 def test_few_boxes_are_said_and_completed(street, tmp_path, capsys):
     words = ['relabel', f'{street}/drive.mcap', '--labels', f'csv:{street}/keys.csv']
     words += ['--formats', 'csv', '-o', str(tmp_path / 'out')]
