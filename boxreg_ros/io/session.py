@@ -266,8 +266,9 @@ class Session:
     @property
     def jumping_ids(self) -> str:
         """Return that ids of the input do not identify objects; empty if they do."""
-        is_checked = self._id_check is not None and not self.trusts_ids
-        return self._id_check.finding if is_checked else ''
+        if self._id_check is None or self.trusts_ids:
+            return ''
+        return self._id_check.finding
 
     @property
     def finding(self) -> str:
