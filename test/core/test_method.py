@@ -1,13 +1,16 @@
 """The compiled method: residuals and their sum against automatic differentiation, and by hand."""
 
-from boxreg_ros.core.method.arrays import Arrowhead, PIVOT, POSE, SHARED, SIDESLIP, SPAN
-from boxreg_ros.core.method.arrowhead import (
-    factorise,
-    fix_variables,
-    invert_corner,
-    invert_poses,
-    solve,
+from boxreg_ros.core.method.arrays import (
+    Arrowhead,
+    Factor,
+    PIVOT,
+    POSE,
+    REST,
+    SHARED,
+    SIDESLIP,
+    SPAN,
 )
+from boxreg_ros.core.method.arrowhead import factorise, fix_variables, invert_poses, solve
 from boxreg_ros.core.method.assemble import accumulate, empty_axes, marginalise, no_matrix
 from boxreg_ros.core.method.constants import RESIDUAL_NAMES
 from boxreg_ros.core.method.covariance import Inverse
@@ -31,6 +34,12 @@ def matrix(N):
     return Arrowhead(
         np.zeros((N + 2, POSE, SPAN)), np.zeros((N + 2, POSE, SHARED)), np.zeros((SHARED, SHARED))
     )
+
+
+def empty_factor(N):
+    """Return room for the factor of a window of N observations."""
+    shapes = (N, POSE, POSE), (N, POSE, REST), (SHARED, SHARED)
+    return Factor(*(np.empty(shape) for shape in shapes))
 
 
 def summed(x, terms, common, last=None, A=None):
@@ -108,18 +117,17 @@ def test_the_factor_solves_and_inverts(is_held):
         whole *= free[:, None] * free
         whole += np.diag(1 - free)
     fix_variables(A, free)
-    assert factorise(A)
+    factor = empty_factor(N)
+    assert factorise(A, factor)
     right = random_variables(N, 5)
     found = right.copy()
-    solve(A, found)
+    solve(factor, found)
     np.testing.assert_allclose(whole @ found, right, atol=1e-6)
     inverse = np.linalg.inv(whole)
-    corner = np.empty((SHARED, SHARED))
-    blocks, border = np.empty((N, POSE, POSE)), np.empty((N, POSE, SHARED))
-    links = np.empty((N, POSE, 2 * POSE))
-    invert_corner(A.corner, corner)
-    invert_poses(A, corner, blocks, links, border)
-    np.testing.assert_allclose(corner, inverse[6 * N :, 6 * N :], rtol=1e-6, atol=1e-9)
+    blocks, beside = np.empty((N, POSE, POSE)), np.empty((N, POSE, REST))
+    invert_poses(factor, blocks, beside)
+    border, links = beside[:, :, :SHARED], beside[:, :, SHARED:]
+    np.testing.assert_allclose(factor.corner, inverse[6 * N :, 6 * N :], rtol=1e-6, atol=1e-9)
     for n in range(N):
         rows = slice(6 * n, 6 * n + 6)
         np.testing.assert_allclose(blocks[n], inverse[rows, rows], rtol=1e-6, atol=1e-9)
@@ -130,7 +138,7 @@ def test_the_factor_solves_and_inverts(is_held):
     # The covariance of a sum of three poses, with that of the gradient by shared variables.
     factors, G = np.array([2.0, -3.0, 0.5]), np.diag(np.linspace(0.1, 1.0, PIVOT))
     found, rooms = np.empty((4, 4)), (np.empty((4, PIVOT)), np.empty(PIVOT))
-    fill_combination(2, factors, Inverse(blocks, links, border, corner), G, *rooms, found)
+    fill_combination(2, factors, Inverse(blocks, beside), G, *rooms, found)
     J = np.hstack([factor * np.eye(6) for factor in factors])
     rows = slice(12, 30)
     through = (J @ inverse[rows, 6 * N :])[:, :PIVOT]
@@ -142,7 +150,7 @@ def test_a_matrix_that_is_not_positive_definite_has_no_factor():
     A = matrix(2)
     A.corner[3, 3] = -1.0
     fix_variables(A, np.ones(2 * POSE + SHARED))
-    assert not factorise(A)
+    assert not factorise(A, empty_factor(2))
 
 
 # --- marginalisation ----------------------------------------------------------------------------

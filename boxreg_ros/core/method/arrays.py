@@ -19,6 +19,8 @@ EXTENT, BIAS, GAP, PIVOT, ANCHOR, SIDESLIP, SHARED = 0, 3, 9, 15, 16, 22, 23
 labelling margins (6), pivot, anchor of the rigid shape (6), sideslip."""
 PRIOR = 2 * POSE + SHARED
 """Variables of the marginalisation prior: two poses and the shared ones."""
+REST = SHARED + 2 * POSE
+"""Variables that a pose is coupled to: the shared ones and the two poses after it."""
 TOP, BOTTOM = 4, 5
 """The face that is observed by the road, not by points of the object."""
 SPAN = 3 * POSE
@@ -101,16 +103,16 @@ median, slopes
 
 class Arrowhead(NamedTuple):
     """
-    A matrix as `arrowhead` keeps it, or its Cholesky factor.
+    The symmetric matrix of one window as `arrowhead` keeps it.
 
     Attributes
     ----------
-    links : array, shape (B, N + 2, 6, 18)
+    links : array, shape (N + 2, 6, 18)
         Blocks of each pose: upper triangle of its own, and those with the two poses after it. Two
         poses of padding, zero, end the chain.
-    border : array, shape (B, N + 2, 6, 23)
+    border : array, shape (N + 2, 6, 23)
         Blocks of each pose with the shared variables.
-    corner : array, shape (B, 23, 23)
+    corner : array, shape (23, 23)
         Upper triangle of the block of the shared variables.
 
     """
@@ -120,10 +122,30 @@ class Arrowhead(NamedTuple):
     corner: Any
 
 
+class Factor(NamedTuple):
+    """
+    A factor L' D L of B matrices (M1), in blocks: what solves for a right side, and inverts.
+
+    Attributes
+    ----------
+    own : array, shape (B, N, 6, 6)
+        Inverse of the block of each pose, without the poses before it.
+    coupling : array, shape (B, N, 6, 35)
+        Regression of each pose on the variables after it: the shared ones, and two poses.
+    corner : array, shape (B, 23, 23)
+        Inverse of the block of the shared variables, without the poses.
+
+    """
+
+    own: Any
+    coupling: Any
+    corner: Any
+
+
 @kernel
-def matrix_of_window(b, matrix):
-    """Return the matrix of window `b`."""
-    return Arrowhead(matrix.links[b], matrix.border[b], matrix.corner[b])
+def factor_of_window(b, factor):
+    """Return the factor of window `b`."""
+    return Factor(factor.own[b], factor.coupling[b], factor.corner[b])
 
 
 class Posterior(NamedTuple):

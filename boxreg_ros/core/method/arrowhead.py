@@ -1,22 +1,21 @@
 """
-Factorisation of one arrowhead matrix: a chain of poses with a border, in plain loops.
+Factorisation of one arrowhead matrix: a chain of poses with a border.
 
 A pose is coupled to the two poses after it, its `links`, and to the shared variables, the
-`border`; see `Arrowhead`. The Cholesky factor U, A = U' U, has the same shape and replaces
-the matrix A. Large products are those of BLAS, since numba unrolls short loops into scalars.
+`border`; see `Arrowhead`. Poses are eliminated one by another, each as a block: its inverse and
+its regression on the variables after it are the `Factor`. Large products are those of BLAS, since
+numba unrolls short loops into scalars.
 
 """
 
 from math import sqrt
 
-from boxreg_ros.core.method.arrays import PIVOT, POSE, SHARED, SPAN
+from boxreg_ros.core.method.arrays import PIVOT, POSE, REST, SHARED
 from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
 
 NEXT = 2 * POSE
 """Variables of the two poses after one."""
-REST = NEXT + SHARED
-"""Variables that a pose is coupled to."""
 RIDGE = 1e-9
 """Added to the diagonal: an unobserved variable does not break the factorisation. Derived: the
 information of a deviation of 30 km."""
@@ -36,36 +35,19 @@ def fix_variables(A, free):
     n = len(free) - SHARED
     for i in range(n):
         pose, a = i // POSE, i % POSE
-        links, border = A.links[pose, a], A.border[pose, a]
-        for c in range(min(SPAN, n - POSE * pose)):
-            links[c] *= free[i] * free[POSE * pose + c]
-        for s in range(SHARED):
-            border[s] *= free[i] * free[n + s]
-        links[a] += 1.0 - free[i] + RIDGE
+        if free[i] == 0.0:
+            for before in range(max(pose - 2, 0), pose + 1):
+                for b in range(POSE):
+                    A.links[before, b, POSE * (pose - before) + a] = 0.0
+            A.links[pose, a] = 0.0
+            A.border[pose, a] = 0.0
+        A.links[pose, a, a] += 1.0 - free[i] + RIDGE
     for s in range(SHARED):
-        for t in range(s, SHARED):
-            A.corner[s, t] *= free[n + s] * free[n + t]
+        if free[n + s] == 0.0:
+            A.border[:, :, s] = 0.0
+            A.corner[s] = 0.0
+            A.corner[:, s] = 0.0
         A.corner[s, s] += 1.0 - free[n + s] + RIDGE
-
-
-@loop
-def factorise_rows(links, border):
-    """Replace the rows of one pose by those of U; return False if it is not positive definite."""
-    for a in range(POSE):
-        if not links[a, a] > 0.0:
-            return False
-        scale = 1.0 / sqrt(links[a, a])
-        for c in range(a, len(links[a])):
-            links[a, c] *= scale
-        for s in range(len(border[a])):
-            border[a, s] *= scale
-        for b in range(a + 1, POSE):
-            factor = links[a, b]
-            for c in range(b, len(links[b])):
-                links[b, c] -= factor * links[a, c]
-            for s in range(len(border[b])):
-                border[b, s] -= factor * border[a, s]
-    return True
 
 
 @loop
@@ -85,57 +67,6 @@ def factorise_corner(corner):
     return True
 
 
-@kernel
-def eliminate_pose(A, pose):
-    """
-    Factorise the rows of one pose and subtract their products from the poses after it.
-
-    The corner is left to the caller. Returns False if the pose is not positive definite.
-
-    """
-    links, border, _ = A
-    if not factorise_rows(links[pose], border[pose]):
-        return False
-    across = links[pose, :, POSE:].copy()
-    by_links = np.dot(across.T, across)
-    by_border = np.dot(across.T, border[pose])
-    for a in range(POSE):
-        for c in range(NEXT):
-            links[pose + 1, a, c] -= by_links[a, c]
-        for c in range(POSE):
-            links[pose + 2, a, c] -= by_links[POSE + a, POSE + c]
-        for s in range(SHARED):
-            border[pose + 1, a, s] -= by_border[a, s]
-            border[pose + 2, a, s] -= by_border[POSE + a, s]
-    return True
-
-
-@kernel
-def factorise(A):
-    """Replace a matrix by its Cholesky factor; return False where it is not positive definite."""
-    N = len(A.links) - 2
-    for pose in range(N):
-        if not eliminate_pose(A, pose):
-            return False
-    border = A.border[:N].reshape(POSE * N, SHARED)
-    A.corner[:] -= np.dot(border.T, border)
-    return factorise_corner(A.corner)
-
-
-@loop
-def substitute_forward(U, x, count):
-    """Eliminate the first `count` variables of the chain from a right side (6 N + 23,)."""
-    n = len(x) - SHARED
-    for i in range(count):
-        pose, a = i // POSE, i % POSE
-        first = POSE * pose
-        x[i] /= U.links[pose, a, a]
-        for c in range(a + 1, min(SPAN, n - first)):
-            x[first + c] -= U.links[pose, a, c] * x[i]
-        for s in range(SHARED):
-            x[n + s] -= U.border[pose, a, s] * x[i]
-
-
 @loop
 def solve_corner(U, x):
     """Replace a right side `x` (m,) by the solution of U' U x = b, for an upper triangle U."""
@@ -151,106 +82,185 @@ def solve_corner(U, x):
 
 
 @loop
-def solve(U, x):
-    """Replace a right side `x` (6 N + 23,) by the solution of U' U x = b."""
-    links, border, corner = U
-    n = len(x) - SHARED
-    substitute_forward(U, x, n)
-    solve_corner(corner, x[n:])
-    for i in range(n - 1, -1, -1):
-        pose, a = i // POSE, i % POSE
-        first = POSE * pose
-        value = x[i]
-        for c in range(a + 1, min(SPAN, n - first)):
-            value -= links[pose, a, c] * x[first + c]
-        for s in range(SHARED):
-            value -= border[pose, a, s] * x[n + s]
-        x[i] = value / links[pose, a, a]
-
-
-@loop
 def fill_inverse_root(U, inverse):
     """Write the inverse (m, m) of an upper triangle U (m, m)."""
     size = len(inverse)
     for a in range(size - 1, -1, -1):
+        scale = 1.0 / U[a, a]
         for c in range(size):
             inverse[a, c] = 0.0
-        inverse[a, a] = 1.0
+        inverse[a, a] = scale
         for b in range(a + 1, size):
-            factor = U[a, b]
+            factor = scale * U[a, b]
             for c in range(b, size):
                 inverse[a, c] -= factor * inverse[b, c]
-        for c in range(a, size):
-            inverse[a, c] /= U[a, a]
 
 
 @kernel
-def invert_corner(corner, inverse):
-    """Write the inverse (23, 23) of U' U of a corner's factor."""
-    root = np.empty((SHARED, SHARED))
-    fill_inverse_root(corner, root)
+def invert(S, root, inverse):
+    """
+    Write the inverse (m, m) of S, which is changed; return False if S is not positive definite.
+
+    `root` (m, m) is to work in; the inverse may replace S.
+
+    """
+    if not factorise_corner(S):
+        return False
+    fill_inverse_root(S, root)
     np.dot(root, root.T, inverse)
+    return True
+
+
+@kernel
+def eliminate_pose(A, pose, factor, room):
+    """
+    Write the factor of one pose, and subtract its products from the poses after it.
+
+    The corner is left to the caller, and `room` is to work in. Returns False if the pose is not
+    positive definite.
+
+    """
+    links, border, _ = A
+    own, coupling = factor.own[pose], factor.coupling[pose]
+    root, after, rest, change = room
+    for a in range(POSE):
+        for c in range(POSE):
+            own[a, c] = links[pose, a, c]
+        for s in range(SHARED):
+            rest[a, s] = -border[pose, a, s]
+        for c in range(NEXT):
+            after[a, c] = links[pose, a, POSE + c]
+            rest[a, SHARED + c] = -after[a, c]
+    if not invert(own, root, own):
+        return False
+    np.dot(own, rest, coupling)
+    np.dot(after.T, coupling, change)
+    for a in range(POSE):
+        for c in range(NEXT):
+            links[pose + 1, a, c] += change[a, SHARED + c]
+        for c in range(POSE):
+            links[pose + 2, a, c] += change[POSE + a, SHARED + POSE + c]
+        for s in range(SHARED):
+            border[pose + 1, a, s] += change[a, s]
+            border[pose + 2, a, s] += change[POSE + a, s]
+    return True
+
+
+@kernel
+def eliminate_poses(A, factor):
+    """Eliminate the poses of a factor one by another; return False if one is not definite."""
+    N = len(factor.own)
+    room = (
+        np.empty((POSE, POSE)), np.empty((POSE, NEXT)), np.empty((POSE, REST)),
+        np.empty((NEXT, REST)),
+    )  # fmt: skip
+    for pose in range(N):
+        if not eliminate_pose(A, pose, factor, room):
+            return False
+    border = A.border[:N].reshape(POSE * N, SHARED)
+    change = np.dot(border.T, factor.coupling.reshape(POSE * N, REST))
+    for s in range(SHARED):
+        for t in range(s, SHARED):
+            A.corner[s, t] += change[s, t]
+    return True
+
+
+@kernel
+def factorise(A, factor):
+    """Write the factor of a matrix, which is changed; return False if it is not definite."""
+    root = np.empty((SHARED, SHARED))
+    return eliminate_poses(A, factor) and invert(A.corner, root, factor.corner)
 
 
 @loop
-def shift_known(known, own, across):
+def substitute_forward(factor, x):
     """
-    Move the known part of the inverse (35, 35) to the pose before.
+    Eliminate the poses of a factor from a right side (6 N + 23,).
 
-    `own` (6, 6) is the block of this pose, `across` (6, 35) the negative of those beside it.
+    The last poses are coupled to one pose after them or none. What is added beyond the chain is
+    zero.
 
     """
-    for a in range(POSE):
-        for c in range(POSE):
-            known[POSE + a, POSE + c] = known[a, c]
-        for c in range(NEXT, REST):
-            known[POSE + a, c] = known[a, c]
-            known[c, POSE + a] = known[a, c]
-    for a in range(POSE):
-        for c in range(POSE):
-            known[a, c] = own[a, c]
-            known[a, POSE + c] = -across[a, c]
-            known[POSE + c, a] = -across[a, c]
-        for c in range(NEXT, REST):
-            known[a, c] = -across[a, c]
-            known[c, a] = -across[a, c]
+    shared = x[len(x) - SHARED :]
+    for pose in range(len(factor.own)):
+        coupling = factor.coupling[pose]
+        own, after = x[POSE * pose :], x[POSE * (pose + 1) : POSE * (pose + 3)]
+        for s in range(len(shared)):  # loops of unknown length are not unrolled into scalars
+            total = 0.0
+            for a in range(POSE):
+                total += coupling[a, s] * own[a]
+            shared[s] += total
+        for c in range(len(after)):
+            total = 0.0
+            for a in range(POSE):
+                total += coupling[a, SHARED + c] * own[a]
+            after[c] += total
 
 
 @kernel
-def invert_poses(U, corner_inverse, blocks, link_blocks, border_blocks):
+def solve(factor, x):
+    """Replace a right side `x` (6 N + 23,) by the solution of A x = b."""
+    own, coupling, corner = factor
+    substitute_forward(factor, x)
+    first = len(x) - SHARED
+    shared = np.dot(corner, x[first:])
+    x[first:] = shared
+    found = np.empty(POSE)
+    for pose in range(len(own) - 1, -1, -1):
+        right, after = x[POSE * pose :], x[POSE * (pose + 1) : POSE * (pose + 3)]
+        for a in range(POSE):
+            total = 0.0
+            for b in range(POSE):
+                total += own[pose, a, b] * right[b]
+            for s in range(len(shared)):
+                total += coupling[pose, a, s] * shared[s]
+            for c in range(len(after)):
+                total += coupling[pose, a, SHARED + c] * after[c]
+            found[a] = total
+        for a in range(POSE):
+            right[a] = found[a]
+
+
+@loop
+def shift_known(known, own, beside):
+    """Move the known part of the inverse (35, 35) to the pose before, (6, 6) and (6, 35)."""
+    second = SHARED + POSE
+    for a in range(POSE):
+        for c in range(POSE):
+            known[second + a, second + c] = known[SHARED + a, SHARED + c]
+            known[SHARED + a, SHARED + c] = own[a, c]
+            known[SHARED + a, second + c] = beside[a, SHARED + c]
+            known[second + c, SHARED + a] = beside[a, SHARED + c]
+        for s in range(SHARED):
+            known[second + a, s] = known[SHARED + a, s]
+            known[s, second + a] = known[SHARED + a, s]
+            known[SHARED + a, s] = beside[a, s]
+            known[s, SHARED + a] = beside[a, s]
+
+
+@kernel
+def invert_poses(factor, blocks, beside):
     """
     Write the blocks of the poses in the inverse.
 
-    Their own, (N, 6, 6), those with the two poses after, (N, 6, 12), and with the border,
-    (N, 6, 23).
+    Their own, (N, 6, 6), and those with the shared variables and the two poses after, (N, 6, 35).
 
-    The blocks of the inverse Z within the pattern of U follow from the last pose backward
-    (Takahashi), beginning with that of the border, `corner_inverse` (23, 23). With r the two poses
-    after p and the border, and W = inv(U_pp) U_pr: Z_pr = -W Z_rr, and
-    Z_pp = inv(U_pp) inv(U_pp)' - Z_pr W'.
+    The blocks of the inverse Z within the pattern of A follow from the last pose backward
+    (Takahashi), beginning with that of the shared variables. With r those and the two poses after
+    p, and the coupling W: Z_pr = W Z_rr, and Z_pp is the inverse of its own block + Z_pr W'.
 
     """
     known = np.zeros((REST, REST))  # Z_rr
-    known[NEXT:, NEXT:] = corner_inverse
-    rest = np.empty((POSE, REST))  # U_pr
-    coupling = np.empty((POSE, REST))  # W
-    across = np.empty((POSE, REST))  # -Z_pr
-    root = np.empty((POSE, POSE))
+    known[:SHARED, :SHARED] = factor.corner
+    own = np.empty((POSE, POSE))
     for pose in range(len(blocks) - 1, -1, -1):
-        rest[:, :NEXT] = U.links[pose, :, POSE:]
-        rest[:, NEXT:] = U.border[pose]
-        fill_inverse_root(U.links[pose], root)
-        np.dot(root, rest, coupling)
-        np.dot(coupling, known, across)
-        own = np.dot(root, root.T) + np.dot(across, coupling.T)
+        coupling = factor.coupling[pose]
+        np.dot(coupling, known, beside[pose])
+        np.dot(beside[pose], coupling.T, own)
         for a in range(POSE):
             for b in range(POSE):
-                blocks[pose, a, b] = (own[a, b] + own[b, a]) / 2
-            for c in range(NEXT):
-                link_blocks[pose, a, c] = -across[a, c]
-            for s in range(SHARED):
-                border_blocks[pose, a, s] = -across[a, NEXT + s]
-        shift_known(known, blocks[pose], across)
+                blocks[pose, a, b] = factor.own[pose, a, b] + (own[a, b] + own[b, a]) / 2
+        shift_known(known, blocks[pose], beside[pose])
 
 
 @loop

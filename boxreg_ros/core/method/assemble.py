@@ -9,20 +9,23 @@ from boxreg_ros.core.method.arrays import (
     Arrowhead,
     BOX_POSE,
     EXTENT,
+    Factor,
     GAP,
     POSE,
     PRIOR,
+    REST,
     SHARED,
     SPAN,
 )
 from boxreg_ros.core.method.arrowhead import (
     clear,
-    eliminate_pose,
+    eliminate_poses,
     factorise,
+    factorise_corner,
     fix_variables,
     NEXT,
     RIDGE,
-    solve,
+    solve_corner,
     substitute_forward,
 )
 from boxreg_ros.core.method.compile import kernel, loop
@@ -46,6 +49,14 @@ import numpy as np
 UNKNOWN_RIDGE = 1e-6
 """Information of the marginalisation prior in directions that no residual constrains. Derived:
 that of a deviation of 1000 m."""
+
+
+@kernel
+def empty_matrix(N):
+    """Return room for the matrix of a window of N observations."""
+    return Arrowhead(
+        np.empty((N + 2, POSE, SPAN)), np.empty((N + 2, POSE, SHARED)), np.empty((SHARED, SHARED))
+    )
 
 
 @kernel
@@ -340,35 +351,34 @@ def squared_norm(rows, W, r):
 
 
 @kernel
-def linearise(x, terms, common, free, at, out, gradient, A):
+def linearise(x, terms, common, free, at, out, gradient, A, factor):
     """
     Return the value of the terms of one window; write gradient and factor of the curvature.
 
     In the `free` variables. The factor of a matrix that is not positive definite is NaN.
 
     """
-    n = len(x) - SHARED
-    value = accumulate(x, n // POSE, terms, common, at, out, gradient, A)
+    value = accumulate(x, len(terms), terms, common, at, out, gradient, A)
     for k in range(len(x)):
         gradient[k] *= free[k]
     fix_variables(A, free)
-    if not factorise(A):
-        A.links[: n // POSE] = np.nan
-        A.border[: n // POSE] = np.nan
-        A.corner[:] = np.nan
+    if not factorise(A, factor):
+        factor.own[:] = np.nan
+        factor.coupling[:] = np.nan
+        factor.corner[:] = np.nan
     return value
 
 
 @loop
 def fill_dense(A, dense):
-    """Write a matrix with a chain of two poses as a dense one, (35, 35)."""
+    """Write the block of the second pose, the third and the shared variables, (35, 35)."""
     for pose in range(2):
         for a in range(POSE):
             i = POSE * pose + a
             for c in range(a, NEXT - POSE * pose):
-                dense[i, POSE * pose + c] = A.links[pose, a, c]
+                dense[i, POSE * pose + c] = A.links[1 + pose, a, c]
             for s in range(SHARED):
-                dense[i, NEXT + s] = A.border[pose, a, s]
+                dense[i, NEXT + s] = A.border[1 + pose, a, s]
     for s in range(SHARED):
         for t in range(s, SHARED):
             dense[NEXT + s, NEXT + t] = A.corner[s, t]
@@ -392,20 +402,19 @@ def marginalise(x, gradient, A, mean, step, information):
     mean[NEXT:] = x[n:]
     for a in range(POSE):
         A.links[0, a, a] += RIDGE
-    is_definite = eliminate_pose(A, np.int64(0))
-    A.corner[:] -= np.dot(A.border[0].T, A.border[0])
-    rest = Arrowhead(A.links[1:5], A.border[1:5], A.corner)
-    fill_dense(rest, information)
-    for pose in range(2):
-        for a in range(POSE):
-            rest.links[pose, a, a] += UNKNOWN_RIDGE
-    for s in range(SHARED):
-        rest.corner[s, s] += UNKNOWN_RIDGE
-    if not (is_definite and factorise(rest)):
+    oldest = Factor(
+        np.empty((1, POSE, POSE)), np.empty((1, POSE, REST)), np.empty((SHARED, SHARED))
+    )
+    is_definite = eliminate_poses(A, oldest)
+    fill_dense(A, information)
+    substitute_forward(oldest, gradient)
+    step[:NEXT] = -gradient[POSE : POSE + NEXT]
+    step[NEXT:] = -gradient[n:]
+    triangle = information.copy()
+    for k in range(PRIOR):
+        triangle[k, k] += UNKNOWN_RIDGE
+    if not (is_definite and factorise_corner(triangle)):
         step[:] = np.nan
         information[:] = np.nan
         return
-    substitute_forward(A, gradient, np.int64(POSE))
-    step[:NEXT] = -gradient[POSE : POSE + NEXT]
-    step[NEXT:] = -gradient[n:]
-    solve(rest, step)
+    solve_corner(triangle, step)  # an inverse would lose directions of almost no information

@@ -21,17 +21,15 @@ class Inverse(NamedTuple):
 
     Attributes
     ----------
-    poses, links, border : array, shapes (N, 6, 6), (N, 6, 12) and (N, 6, 23)
-        Of each pose: its own, those with the two poses after it, and with the shared variables.
-    corner : array, shape (23, 23)
-        Of the shared variables.
+    poses : array, shape (N, 6, 6)
+        Of each pose.
+    beside : array, shape (N, 6, 35)
+        Of each pose with the shared variables and the two poses after it.
 
     """
 
     poses: Any
-    links: Any
-    border: Any
-    corner: Any
+    beside: Any
 
 
 @kernel
@@ -90,7 +88,7 @@ def fill_pose_covariances(length, times, poses, inverse, G, constants, found):
     shift, through = np.zeros(3), np.empty(PIVOT)
     for n in range(len(poses)):
         found[n] = inverse.poses[n]
-        add_sandwich(inverse.border[n], G, through, found[n])
+        add_sandwich(inverse.beside[n], G, through, found[n])
         found[n, HEADING, HEADING] += constants.heading_deviation**2
         if n >= length:
             continue
@@ -119,7 +117,8 @@ def fill_extent_covariance(corner, free, common, G, found):
 
 
 @kernel
-def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, constants, found):
+def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, corner, constants,
+                   found):  # fmt: skip
     """
     Write covariances, residuals of faces, velocities and accelerations of window `b`.
 
@@ -137,6 +136,8 @@ def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, cons
         1 for variables that are estimated, 0 for those held fixed.
     inverse : Inverse
         Blocks of its inverse curvature.
+    corner : array, shape (23, 23)
+        That of the shared variables.
     constants : record of `Constants`
         Of the method, with the settings.
     found : Posterior
@@ -150,7 +151,7 @@ def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, cons
     marginalised = problem.marginalised_extents[b, 3]
     fill_unclaimed(length, marginalised, terms, common, shape, constants, G)
     fill_pose_covariances(length, problem.times[b], poses, inverse, G, constants, found.poses[b])
-    fill_extent_covariance(inverse.corner, free_shared, common, G, found.extents[b])
+    fill_extent_covariance(corner, free_shared, common, G, found.extents[b])
     forward, sideways, _ = problem.of_class[b].motion
     deviations = np.array((forward, sideways, constants.vertical))
     fill_kinematics(length, problem.times[b], poses, deviations, inverse, G, found.kinematics[b])

@@ -1,6 +1,6 @@
 """Velocity (M26a) and acceleration (M26b) of the boxes of one window, and their covariances."""
 
-from boxreg_ros.core.method.arrays import PIVOT, POSE
+from boxreg_ros.core.method.arrays import PIVOT, POSE, SHARED
 from boxreg_ros.core.method.arrowhead import add_sandwich
 from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
@@ -28,19 +28,19 @@ def fill_combination(first, factors, inverse, G, border, through, found):
         k = RATES[i]
         for s in range(PIVOT):
             border[i, s] = (
-                factors[0] * inverse.border[first, k, s]
-                + factors[1] * inverse.border[first + 1, k, s]
-                + factors[2] * inverse.border[first + 2, k, s]
+                factors[0] * inverse.beside[first, k, s]
+                + factors[1] * inverse.beside[first + 1, k, s]
+                + factors[2] * inverse.beside[first + 2, k, s]
             )
         for j in range(i, len(RATES)):
             m = RATES[j]
             total = 0.0
             for a in range(3):
                 total += factors[a] ** 2 * inverse.poses[first + a, k, m]
-                links = inverse.links[first + a]
+                beside = inverse.beside[first + a]
                 for b in range(a + 1, 3):
-                    of_other = POSE * (b - a - 1)
-                    both = links[k, of_other + m] + links[m, of_other + k]
+                    of_other = SHARED + POSE * (b - a - 1)
+                    both = beside[k, of_other + m] + beside[m, of_other + k]
                     total += factors[a] * factors[b] * both
             found[i, j] = found[j, i] = total
     add_sandwich(border, G, through, found)

@@ -12,18 +12,19 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.arrays import (
     ANCHOR,
-    Arrowhead,
     COMMON,
-    matrix_of_window,
+    Factor,
+    factor_of_window,
     POSE,
+    REST,
     SHARED,
     SIDESLIP,
-    SPAN,
 )
-from boxreg_ros.core.method.arrowhead import invert_corner, invert_poses, solve
+from boxreg_ros.core.method.arrowhead import invert_poses, solve
 from boxreg_ros.core.method.assemble import (
     accumulate,
     empty_axes,
+    empty_matrix,
     linearise,
     marginalise,
     no_matrix,
@@ -46,9 +47,9 @@ class Sums(NamedTuple):
     ----------
     terms, common : array of `TERMS` and `COMMON`, shapes (B, N) and (B,)
         Data and weights.
-    factor : Arrowhead
-        Cholesky factor of the Gauss-Newton curvature at the start of the round; NaN where it is
-        not positive definite.
+    factor : Factor
+        Of the Gauss-Newton curvature at the start of the round; NaN where it is not positive
+        definite.
 
     """
 
@@ -62,10 +63,9 @@ def empty_sums(B: int, N: int, prior_mean: Any, prior_information: Any) -> Sums:
     common = np.zeros(B, COMMON)
     common['prior_mean'] = prior_mean
     common['W_prior'] = prior_information
-    factor = Arrowhead(  # written before it is read
-        np.empty((B, N + 2, POSE, SPAN)), np.empty((B, N + 2, POSE, SHARED)),
-        np.empty((B, SHARED, SHARED)),
-    )  # fmt: skip
+    factor = Factor(  # written before it is read
+        np.empty((B, N, POSE, POSE)), np.empty((B, N, POSE, REST)), np.empty((B, SHARED, SHARED))
+    )
     return Sums(np.zeros((B, N), TERMS), common, factor)
 
 
@@ -99,7 +99,7 @@ def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, s
     """
     N = poses.shape[1]
     n = POSE * N
-    at, out = empty_axes(N), empty_linearised()
+    at, out, A = empty_axes(N), empty_linearised(), empty_matrix(N)
     mean_extents = np.empty(SIZE)
     of_faces = empty_face_work(0, len(problem.counts), problem, constants)
     of_shape = empty_shape_work(0, len(thinned.counts), thinned, N, constants.cells)
@@ -116,8 +116,8 @@ def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, s
         x[row, :n] = poses[b].ravel()
         x[row, n:] = shared[b]
         value[row] = linearise(
-            x[row], terms, common, free[b], at, out, gradient[row],
-            matrix_of_window(b, sums.factor),
+            x[row], terms, common, free[b], at, out, gradient[row], A,
+            factor_of_window(b, sums.factor),
         )  # fmt: skip
 
 
@@ -143,7 +143,7 @@ def evaluate(first, last, rows, x, free, sums, value, gradient):
 def precondition(first, last, rows, factor, vectors):
     """Replace the `vectors` (b, 6 N + 23) of windows by the inverse curvature times them."""
     for row in range(first, last):
-        solve(matrix_of_window(rows[row], factor), vectors[row])
+        solve(factor_of_window(rows[row], factor), vectors[row])
 
 
 @kernel
@@ -185,35 +185,31 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
     n = POSE * N
     oldest = np.int64(1)  # for a literal 1 all that sums residuals would be compiled once more
     at, out, gradient = empty_axes(N), empty_linearised(), np.empty(n + SHARED)
-    inverse = Inverse(
-        np.empty((N, POSE, POSE)), np.empty((N, POSE, 2 * POSE)), np.empty((N, POSE, SHARED)),
-        np.empty((SHARED, SHARED)),
-    )  # fmt: skip
+    first_three = empty_matrix(3)  # poses that residuals of the oldest observation depend on
+    inverse = Inverse(np.empty((N, POSE, POSE)), np.empty((N, POSE, REST)))
     for row in range(first, last):
         b = rows[row]
-        terms, common = sums.terms[b], sums.common[b]
-        A = matrix_of_window(b, sums.factor)
+        terms, common, factor = sums.terms[b], sums.common[b], factor_of_window(b, sums.factor)
         found = x[row, :n].copy().reshape(N, POSE)
         errors = problem.of_class[b].pose
         is_settled = has_settled(found, solution.poses[b], errors, constants.settled_step)
         is_done[row] = is_last or (may_settle and is_settled)
         solution.poses[b] = found
         solution.shared[b] = x[row, n:]
-        invert_corner(A.corner, inverse.corner)
         fill_evidence(
-            common, solution.shared[b], inverse.corner, constants.min_extent_gain,
+            common, solution.shared[b], factor.corner, constants.min_extent_gain,
             solution.evidence[b],
         )  # fmt: skip
         if not is_done[row]:
             continue
-        invert_poses(A, inverse.corner, inverse.poses, inverse.links, inverse.border)
+        invert_poses(factor, inverse.poses, inverse.beside)
         fill_posterior(
-            b, problem, found, solution.shared[b], terms, common, free[b], inverse, constants,
-            solution.posterior,
+            b, problem, found, solution.shared[b], terms, common, free[b], inverse, factor.corner,
+            constants, solution.posterior,
         )  # fmt: skip
         if len(solution.prior_state) and problem.lengths[b] == N:
-            accumulate(x[row], oldest, terms, common, at, out, gradient, A)
+            accumulate(x[row], oldest, terms, common, at, out, gradient, first_three)
             marginalise(
-                x[row], gradient, A, solution.prior_state[b], solution.prior_step[b],
+                x[row], gradient, first_three, solution.prior_state[b], solution.prior_step[b],
                 solution.prior_information[b],
             )  # fmt: skip
