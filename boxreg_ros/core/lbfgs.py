@@ -30,7 +30,7 @@ HISTORY = 6
 Function = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Metric = Callable[[Tensor, Tensor], Tensor]
 CurvaturePair = tuple[Tensor, Tensor, Tensor]
-"""A step s, the change y of the gradient over it, and 1 / s'y: (b, D), (b, D), (b,)."""
+"""A step s, the change y of the gradient over it, and 1 / s'y: (b, D), (b, D), (b, 1)."""
 
 
 class Status(IntEnum):
@@ -62,11 +62,11 @@ class _Search(NamedTuple):
     x: Tensor
     value: Tensor
     gradient: Tensor
-    direction: Tensor
-    slope: Tensor  # of the value along the direction
-    step: Tensor  # length to try next, in multiples of the direction
+    step: Tensor  # (b, D), to try next
+    slope: Tensor  # predicted change of the value over the step
     has_moved: Tensor  # whether the last trial was accepted: a new direction is needed
-    tries: Tensor  # of the present direction
+    backtracks: Tensor  # of the present direction
+    changes: list[tuple[Tensor, Tensor]]  # of x and gradient since there were new directions
     pairs: list[CurvaturePair]
 
 
@@ -114,28 +114,25 @@ def minimize(
     """
     rows = torch.arange(len(start), device=start.device)
     value, gradient = function(start, rows) if first is None else first
-    is_finite = _are_finite(value, gradient)
-    status = torch.where(is_finite, 0, int(Status.FAILED))
-    best = Minimum(start.clone(), value.clone(), status, torch.zeros_like(rows))
-    zeros = torch.zeros_like(rows)
-    search = _Search(
-        rows, start, value, gradient, start, value, value, is_finite, zeros, list[CurvaturePair]()
-    )
+    is_finite = _are_finite(value, gradient.sum(1))
+    status, zeros = int(Status.FAILED) * ~is_finite, torch.zeros_like(rows)
+    best = Minimum(start.clone(), value.clone(), status, zeros.clone())
+    search = _Search(rows, start, value, gradient, start, value, is_finite, zeros, [], [])
     search = _select(search, is_finite.nonzero()[:, 0])
     for turn in range(iterations * MAX_BACKTRACKS):
         if turn >= iterations:
             goes_on = best.iterations[search.rows] < iterations
             search = _select(search, (goes_on | ~search.has_moved).nonzero()[:, 0])
-        if len(search.rows):
-            search = _with_new_directions(search, best, metric, tolerance)
-        if not len(search.rows):
+        if search.rows.numel():
+            search = _with_new_directions(search, best, metric, tolerance, history)
+        if not search.rows.numel():
             break
-        search = _after_trial(search, best, function, history)
+        search = _after_trial(search, best, function)
     return best
 
 
 def _with_new_directions(
-    search: _Search, best: Minimum, metric: Metric | None, tolerance: float
+    search: _Search, best: Minimum, metric: Metric | None, tolerance: float, history: int
 ) -> _Search:
     """
     Give a new direction to the rows that have moved, or leave those out that have converged.
@@ -144,83 +141,75 @@ def _with_new_directions(
 
     """
     moved = search.has_moved.nonzero()[:, 0]
-    if not len(moved):
-        return search._replace(tries=search.tries + 1)
+    if not moved.numel():
+        return search
+    pairs = [*search.pairs, *(_pair(*change) for change in search.changes)]
+    search = search._replace(changes=[], pairs=pairs[-history:])
     rows, _, value, gradient, *_, pairs = _select(search, moved)
-    direction = -_two_loop(gradient, pairs, rows, metric)
-    slope = (gradient * direction).sum(1)
-    is_uphill = ~(slope < 0)
-    if is_uphill.any():
-        direction = torch.where(is_uphill[:, None], -gradient, direction)
-        slope = torch.where(is_uphill, -gradient.square().sum(1), slope)
+    step = -_two_loop(gradient, pairs, rows, metric)
+    slope = (gradient * step).sum(1)
+    if not slope.max() < 0:  # uphill, or not a number
+        is_downhill = slope < 0
+        step = torch.where(is_downhill[:, None], step, -gradient)
+        slope = torch.where(is_downhill, slope, -gradient.square().sum(1))
     if metric is None and not pairs:  # the scale is unknown: a step of length 1 at most
         size = gradient.abs().sum(1).clamp(min=1.0)
-        direction = direction / size[:, None]
+        step = step / size[:, None]
         slope = slope / size
     has_converged = -slope <= tolerance * (1 + value.abs())
-    best.iterations[rows] += ~has_converged
-    if len(moved) == len(search.rows):
-        step, tries = torch.ones_like(slope), torch.ones_like(rows)
-    else:
-        direction = search.direction.index_copy(0, moved, direction)
+    best.iterations.index_add_(0, rows, 1 - has_converged.to(rows.dtype))
+    best.status.index_add_(0, rows, int(Status.CONVERGED) * has_converged)
+    if moved.numel() < search.rows.numel():
+        step = search.step.index_copy(0, moved, step)
         slope = search.slope.index_copy(0, moved, slope)
-        step = torch.where(search.has_moved, 1.0, search.step)
-        tries = torch.where(search.has_moved, 0, search.tries) + 1
-    search = search._replace(direction=direction, slope=slope, step=step, tries=tries)
-    if not has_converged.any():
-        return search
-    best.status[rows[has_converged]] = int(Status.CONVERGED)
-    return _running(search, best)
+    return _running(search._replace(step=step, slope=slope), best)
 
 
-def _after_trial(search: _Search, best: Minimum, function: Function, history: int) -> _Search:
+def _after_trial(search: _Search, best: Minimum, function: Function) -> _Search:
     """
     Evaluate one point per row; accept it, or shorten the step.
 
     Point, value and status of `best` are updated.
 
     """
-    rows, value, slope, step = search.rows, search.value, search.slope, search.step
-    s = step[:, None] * search.direction
-    trial, trial_gradient = function(search.x + s, rows)
-    has_decreased = trial <= value + SUFFICIENT_DECREASE * step * slope
-    is_good = _are_finite(trial, trial_gradient) & has_decreased
-    y = trial_gradient - search.gradient
+    rows, x, value, gradient, s, slope, _, backtracks, changes, _ = search
+    trial, trial_gradient = function(x + s, rows)
+    y = trial_gradient - gradient
+    s_y = (s * y).sum(1)  # finite where the gradient is
+    is_good = _are_finite(trial, s_y) & (trial <= value + SUFFICIENT_DECREASE * slope)
     all_good = bool(is_good.all())
+    backtracks = ~is_good * (backtracks + 1)
+    search = search._replace(has_moved=is_good, backtracks=backtracks)
     if not all_good:
-        is_stuck = ~is_good & (search.tries == MAX_BACKTRACKS)
-        best.status[rows] += int(Status.STUCK) * is_stuck
-        step = _shorter(step, slope, trial - value)
-        s, y = (torch.where(is_good[:, None], change, 0.0) for change in (s, y))
+        best.status.index_add_(0, rows, int(Status.STUCK) * (backtracks == MAX_BACKTRACKS))
+        part = _shorter(slope, trial - value)
+        search = search._replace(step=part[:, None] * s, slope=part * slope)
         trial = torch.where(is_good, trial, value)
-    s_y = (s * y).sum(1)
-    is_curved = s_y > MIN_CURVATURE * vector_norm(s, dim=1) * vector_norm(y, dim=1)
-    pair = s, y, torch.where(is_curved, 1 / s_y, 0.0)
-
+        s, y = (torch.where(is_good[:, None], change, 0.0) for change in (s, y))
     search = search._replace(
-        x=search.x + s,
-        value=trial,
-        gradient=search.gradient + y,
-        step=step,
-        has_moved=is_good,
-        pairs=[*search.pairs, pair][-history:],
+        x=x + s, value=trial, gradient=gradient + y, changes=[*changes, (s, y)]
     )
-    best.x[rows] = search.x  # by Armijo's condition never worse than before
-    best.value[rows] = search.value
+    best.x.index_copy_(0, rows, search.x)  # by Armijo's condition never worse than before
+    best.value.index_copy_(0, rows, trial)
     return search if all_good else _running(search, best)
 
 
-def _are_finite(value: Tensor, gradient: Tensor) -> Tensor:
-    """Return which values (b,) and gradients (b, D) are finite; a sum of finite numbers is."""
-    return (value + gradient.sum(1)).isfinite()
+def _pair(s: Tensor, y: Tensor) -> CurvaturePair:
+    """Return the curvature pair of a change of x and gradient."""
+    s_y = (s * y).sum(1)
+    is_curved = s_y > MIN_CURVATURE * vector_norm(s, dim=1) * vector_norm(y, dim=1)
+    return s, y, torch.where(is_curved, 1 / s_y, 0.0)[:, None]
 
 
-def _shorter(step: Tensor, slope: Tensor, rise: Tensor) -> Tensor:
-    """Return shorter steps (b,), by the parabola through the slope and the `rise` at `step`."""
-    parabola = -slope * step.square() / (2 * (rise - slope * step))
-    least, most = STEP_BOUNDS
-    shorter = torch.where(parabola.isfinite(), parabola, least * step)
-    return shorter.clamp(least * step, most * step)
+def _are_finite(value: Tensor, total: Tensor) -> Tensor:
+    """Return which values (b,) and sums (b,) are finite; a sum of finite numbers is."""
+    return (value + total).isfinite()
+
+
+def _shorter(slope: Tensor, rise: Tensor) -> Tensor:
+    """Return parts (b,) of steps, by the parabola through the slope and the `rise` at the step."""
+    parabola = -slope / (2 * (rise - slope))
+    return parabola.nan_to_num(0.0, 0.0, 0.0).clamp(*STEP_BOUNDS)
 
 
 def _two_loop(
@@ -230,29 +219,31 @@ def _two_loop(
     q = gradient
     alphas = []
     for s, y, rho in reversed(pairs):
-        alpha = rho * (s * q).sum(1)
-        q = q - alpha[:, None] * y
+        alpha = rho * (s * q).sum(1, keepdim=True)
+        q = q - alpha * y
         alphas.append(alpha)
     if metric is not None:
         q = metric(q, rows)
     elif pairs:
         _, y, rho = pairs[-1]
-        scale = 1 / (rho * y.square().sum(1))
-        q = q * torch.where(scale.isfinite(), scale, 1.0)[:, None]
+        scale = 1 / (rho * y.square().sum(1, keepdim=True))
+        q = q * torch.where(scale.isfinite(), scale, 1.0)
     for (s, y, rho), alpha in zip(pairs, reversed(alphas), strict=True):
-        q = q + s * (alpha - rho * (y * q).sum(1))[:, None]
+        q = q + s * (alpha - rho * (y * q).sum(1, keepdim=True))
     return q
 
 
 def _running(search: _Search, best: Minimum) -> _Search:
     """Return the rows of a search that have not ended."""
-    return _select(search, (best.status[search.rows] == Status.RUNNING).nonzero()[:, 0])
+    status = best.status.index_select(0, search.rows)
+    return _select(search, (status == Status.RUNNING).nonzero()[:, 0])
 
 
 def _select(search: _Search, rows: Tensor) -> _Search:
     """Return `rows`, ascending, of a search; if they are all its rows, the search itself."""
-    if len(rows) == len(search.rows):
+    if rows.numel() == search.rows.numel():
         return search
-    *parts, pairs = search
-    chosen = [(s[rows], y[rows], rho[rows]) for s, y, rho in pairs]
-    return _Search._make([*(part[rows] for part in parts), chosen])
+    *parts, changes, pairs = search
+    parts = [part.index_select(0, rows) for part in parts]
+    changes = [(s[rows], y[rows]) for s, y in changes]
+    return _Search._make([*parts, changes, [(s[rows], y[rows], rho[rows]) for s, y, rho in pairs]])
