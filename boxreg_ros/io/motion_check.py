@@ -10,7 +10,7 @@ clouds and boxes are moved by.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from boxreg_ros.errors import TransformUnavailable
@@ -183,7 +183,7 @@ class MotionCheck:
 
     def restart(self) -> None:
         """Forget when messages were received: time has jumped. What was found stays."""
-        self._clouds = ReceiveTimes()
+        self._clouds: dict[str, ReceiveTimes] = {}  # by topic: each LiDAR may have its own clock
         self._boxes = ReceiveTimes()
         self._cloud_stamps = deque[int](maxlen=CAPACITY)
         self._copied: list[bool] = []
@@ -204,7 +204,9 @@ class MotionCheck:
             When it was received [ns], by the clock of the transforms; None if that is not known.
 
         """
-        arrivals = self._clouds if isinstance(item, Sweep) else self._boxes
+        arrivals = self._boxes
+        if isinstance(item, Sweep):
+            arrivals = self._clouds.setdefault(item.topic, ReceiveTimes())
         if received_ns is not None:
             arrivals.add(received_ns, item.stamp_ns)
         if not isinstance(item, Sweep):
@@ -240,7 +242,7 @@ class MotionCheck:
             if text:
                 self.findings[kind] = Finding(REASONS_OF[kind], text)
         for kind in ('clock', 'boxes_clock'):
-            if not found[kind] and len(self._clouds.received_ns) >= SETTLED_CLOUDS:
+            if not found[kind] and len(self._received_ns) >= SETTLED_CLOUDS:
                 self.findings.pop(kind, None)  # an offset of the first ones that is not constant
 
     def _jump_text(self, fixed_frame: str, frame: str) -> str:
@@ -268,9 +270,13 @@ class MotionCheck:
     def _clock_text(self, moving: Sequence[Edge]) -> str:
         """Return how far the clock of the fastest motion is off from that of the clouds."""
         edge = max(moving, key=_way, default=None)
-        measured = None if edge is None else clock_offset(self._clouds, edge.arrivals)
-        if edge is None or measured is None or abs(measured) < MIN_CLOCK_OFFSET:
+        offsets = {} if edge is None else self._offsets_from(edge.arrivals)
+        off = {topic: one for topic, one in offsets.items() if abs(one) >= MIN_CLOCK_OFFSET}
+        if edge is None or not off:
             return ''
+        if len(off) < len(offsets):
+            return _lidars_text(off)
+        measured = min(off.values(), key=abs)
         offset, names = likely_offset(measured)
         total = seconds_text(offset + self._tree.clock_offset)
         of_whom = f', as {names} are' if names else ''
@@ -282,11 +288,21 @@ class MotionCheck:
             f'--clock-offset={total} (node: clock_offset:={total})'
         )
 
+    @property
+    def _received_ns(self) -> list[int]:
+        """Return when clouds were received, of the LiDAR that most are known of."""
+        return max((one.received_ns for one in self._clouds.values()), key=len, default=[])
+
+    def _offsets_from(self, others: ReceiveTimes) -> dict[str, float]:
+        """Return the offset of the clock of each LiDAR, where it is constant; `clock_offset`."""
+        measured = {topic: clock_offset(clouds, others) for topic, clouds in self._clouds.items()}
+        return {topic: offset for topic, offset in measured.items() if offset is not None}
+
     def _microseconds_text(self) -> str:
         """Return that all stamps of the clouds lie at the begins of seconds."""
         if self._first_milliseconds < max(MIN_PAIRS, self._count):
             return ''
-        received = self._clouds.received_ns
+        received = self._received_ns
         if len(received) < MIN_PAIRS or np.median(np.diff(received)) > SHORT_PERIOD * 1e9:
             return ''
         return (
@@ -298,7 +314,7 @@ class MotionCheck:
 
     def _boxes_clock_text(self) -> str:
         """Return how far the clock of the boxes is off from that of the clouds."""
-        measured = clock_offset(self._clouds, self._boxes)
+        measured = min(self._offsets_from(self._boxes).values(), key=abs, default=None)
         if measured is None or -MIN_CLOCK_OFFSET < measured < MAX_BOXES_DELAY:
             return ''
         if measured > 0 and sum(self._copied) >= MIN_COPIED * max(1, len(self._copied)):
@@ -314,6 +330,20 @@ class MotionCheck:
             f'received at the same time{of_whom}; correct them with --boxes-offset={shown} '
             f'(node: boxes_offset:={shown})'
         )
+
+
+def _lidars_text(offsets: Mapping[str, float]) -> str:
+    """Return which of several LiDARs have another clock, or are late, by offsets [s]."""
+    parts = [
+        f'{topic} is {seconds_text(abs(offset))} s {"ahead" if offset > 0 else "behind"}'
+        for topic, offset in sorted(offsets.items())
+    ]
+    return (
+        f'clocks: expected one for all LiDARs, got one that differs from those of the others and '
+        f'of the motion, by messages received at the same time: {", ".join(parts)}: its clouds '
+        f'are not merged with the others; synchronise the clock of this LiDAR (PTP or NTP), or '
+        f'correct its driver where its clouds only arrive late'
+    )
 
 
 def registered_text(tree: TransformTree, fixed_frame: str, frame: str) -> str:
