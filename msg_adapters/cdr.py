@@ -268,6 +268,7 @@ def walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> int:
                 return -1
         if column >= 0:
             if counts[column] < places.shape[1]:
-                places[column, counts[column]] = begin, count
+                place = places[column, counts[column]]
+                place[0], place[1] = begin, count  # a tuple takes numba seconds to compile
             counts[column] += 1
     return position

@@ -31,7 +31,7 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
     sweeps, arrays = _passing_car()
     sweeps[-1] = replace(sweeps[-1], times=np.full(len(sweeps[-1].points), 0.1))
     for sweep, boxes in zip(sweeps, arrays, strict=True):
-        registrar.add_sweep(replace(sweep, points=sweep.points.astype(np.float32)))
+        registrar.add_sweep(sweep)
         registrar.add_boxes(boxes)
     registrar.flush()
 
@@ -63,19 +63,18 @@ def warm_up_labels(config: Config) -> None:
     stamps_ns = np.array([sweep.stamp_ns for sweep in sweeps])
     boxes = np.concatenate([array.boxes for array in arrays])
     track = ObjectTrack('1', 'car', stamps_ns, boxes, np.ones(len(boxes), bool))
-    points = sweeps[0].points.astype(np.float32)
-    sweep = replace(sweeps[0], points=points, times=np.zeros(len(points)))
+    sweep = replace(sweeps[0], times=np.zeros(len(sweeps[0].points)))
     PointLabeller([track], stamps_ns, config, np.zeros((1, 6))).label(sweep)
 
 
 def _passing_car() -> tuple[list[Sweep], list[BoxArray]]:
-    """Return six sweeps of a car, and its boxes."""
+    """Return six sweeps of a car, with points as recordings have them, and its boxes."""
     rng = np.random.default_rng(0)
     sweeps, boxes = [], []
     for k in range(6):
         box = np.array([[10.0 + 0.5 * k, 0, 0, 4, 2, 1.5, 0, 0, 0]])
         points = rng.uniform(-1, 1, (64, 3)) * [2, 1, 0.7] + box[0, :3]
-        sweeps.append(Sweep(k * 10**8, 'map', points))
+        sweeps.append(Sweep(k * 10**8, 'map', points.astype(np.float32)))
         boxes.append(BoxArray(k * 10**8, 'map', ('1',), ('car',), np.ones(1), box))
     return sweeps, boxes
 

@@ -81,7 +81,8 @@ class Follower:
         self._speeds = StartSpeeds(self._points, seeds, self._motion, self._kind.max_speed)
         self._road = np.nan
         self.num_points = 0
-        for row, pose in zip(seeds.rows.tolist(), seeds.boxes[:, POSE4], strict=True):
+        for row, box in zip(seeds.rows.tolist(), seeds.boxes, strict=True):
+            pose = box[POSE4]  # contiguous, as kernels are compiled for; columns are not
             self.num_points += self._learn(self._points.near(row, pose), pose, is_seed=True)
 
     def way(self, seed: int, sign: int, stop: int) -> Way:
@@ -146,13 +147,14 @@ class Follower:
         some = np.unique(
             np.linspace(0, len(rows) - 1, FOLLOW.max_extent_sweeps).round().astype(int)
         )
+        seen = [(int(rows[i]), boxes[i, POSE4]) for i in some]
         points = [
             self._points.in_box(
-                self._points.near(int(rows[i]), pose, FOLLOW.max_growth), pose, FOLLOW.max_growth
+                self._points.near(row, pose, FOLLOW.max_growth), pose, FOLLOW.max_growth
             )
-            for i, pose in zip(some, boxes[:, POSE4][some], strict=True)
+            for row, pose in seen
         ]
-        sees_top = [self._sees_top(int(rows[i]), boxes[i, POSE4]) for i in some]
+        sees_top = [self._sees_top(row, pose) for row, pose in seen]
         low, high = faces(points, self._target.half, is_of_class, np.array(sees_top))
         grown = boxes.copy()
         shift = (low + high) / 2
