@@ -374,15 +374,21 @@ class Config:
     complete: CompleteConfig = CompleteConfig()
     ingredients: Ingredients = Ingredients()
     vehicle: ClassConfig = ClassConfig(
-        names=('car', 'van', 'truck', 'bus', 'vehicle', 'trailer', 'suv', 'pickup', 'tram')
-    )
+        names=(
+            'car', 'van', 'truck', 'bus', 'vehicle', 'trailer', 'suv', 'pickup', 'tram', 'lorry',
+            'taxi', 'train',
+        )
+    )  # fmt: skip
     cyclist: ClassConfig = ClassConfig(
-        names=('cyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'rider', 'scooter'),
+        names=(
+            'cyclist', 'bicyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'motorbike',
+            'rider', 'scooter',
+        ),
         acceleration=1.5, cornering=1.5, turning=1.0, slip=0.4,
         shape=0.15, heading=0.08, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
     pedestrian: ClassConfig = ClassConfig(
-        names=('pedestrian', 'person', 'walker', 'people', 'child'),
+        names=('pedestrian', 'person', 'walker', 'people', 'child', 'adult', 'human'),
         acceleration=0.8, cornering=0.8, turning=1.0, slip=0.5,
         shape=0.2, heading=0.2, extent=0.07, gap_spread=0.2,
     )  # fmt: skip

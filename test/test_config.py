@@ -179,6 +179,9 @@ def test_errors_of_unreadable_files_name_the_file(tmp_path):
         ('pedestrian/child', 'pedestrian'),
         ('motorcycle_rider', 'cyclist'),
         ('BICYCLE', 'cyclist'),
+        ('BICYCLIST', 'cyclist'),  # of Argoverse 2
+        ('motorbike', 'cyclist'),
+        ('Adult', 'pedestrian'),
         ('carpet', 'vehicle'),
         ('', 'vehicle'),
     ],
