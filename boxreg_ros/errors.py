@@ -1,6 +1,8 @@
 """Errors; each message names the argument, what was expected, the actual value and a remedy."""
 
+from collections.abc import Iterable
 import errno
+from importlib import import_module
 from os import PathLike
 
 FILE_REMEDIES = {
@@ -70,3 +72,12 @@ def description_of(error: Exception) -> str:
 def unreadable(path: str | PathLike[str], error: OSError) -> str:
     """Return the message of a file that cannot be read, with the remedy for its cause."""
     return f'{path}: cannot be read: {error.strerror}; {remedy_of(error)}'
+
+
+def require_packages(what: str, packages: Iterable[str]) -> None:
+    """Raise ConfigError for a package of pip, needed by `what`, that is not installed."""
+    for package in packages:
+        try:
+            import_module(package.replace('-', '_'))
+        except ImportError as error:
+            raise ConfigError(f'{what} needs {package}: pip install {package} ({error})') from None

@@ -15,6 +15,7 @@ header.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self, TypeVar
 
 from boxreg_ros.errors import ShapeError
 import numpy as np
@@ -293,7 +294,55 @@ class FrameMotion:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BoxArray:
+class Columns:
+    """
+    A record some of whose fields have a row for each of n items.
+
+    Attributes
+    ----------
+    COLUMNS : tuple of str
+        Names of these fields. Each is an array of n rows, a tuple of n, a record with columns of
+        its own, or None or an empty tuple where no item has a value.
+
+    """
+
+    COLUMNS: ClassVar[tuple[str, ...]] = ()
+
+    def take(self, rows: Sequence[int] | Ints) -> Self:
+        """Return the items `rows` only, in their order."""
+        return replace(
+            self, **{name: _rows_of(getattr(self, name), rows) for name in self.COLUMNS}
+        )
+
+
+def _rows_of(column: Any, rows: Sequence[int] | Ints) -> Any:
+    if isinstance(column, tuple):
+        return tuple(column[row] for row in rows) if column else ()
+    if isinstance(column, Columns):
+        return column.take(rows)
+    return None if column is None else column[rows]
+
+
+_Columns = TypeVar('_Columns', bound=Columns)
+
+
+def concatenated(records: Sequence[_Columns]) -> _Columns:
+    """Return the items of several records, at least one, as those of the first of them."""
+    first = records[0]
+    parts = {name: [getattr(one, name) for one in records] for name in first.COLUMNS}
+    return replace(first, **{name: _joined(columns) for name, columns in parts.items()})
+
+
+def _joined(columns: Sequence[Any]) -> Any:
+    if isinstance(columns[0], tuple):
+        return tuple(row for column in columns for row in column)
+    if isinstance(columns[0], Columns):
+        return concatenated(columns)
+    return None if columns[0] is None else np.concatenate(columns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoxArray(Columns):
     """
     All boxes of one stamp; boxes without an identity have the track id ``''``.
 
@@ -323,6 +372,10 @@ class BoxArray:
         Velocities and accelerations, records `KINEMATICS`. None for an input.
 
     """
+
+    COLUMNS: ClassVar[tuple[str, ...]] = (
+        *('track_ids', 'class_names', 'scores', 'boxes', 'pinned', 'attributes', 'kinematics'),
+    )
 
     stamp_ns: int
     frame_id: str
@@ -355,18 +408,10 @@ class BoxArray:
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)  # the class is frozen
 
-    def take(self, rows: Sequence[int]) -> 'BoxArray':
-        """Return the boxes `rows` only."""
-        return replace(
-            self,
-            track_ids=tuple(self.track_ids[row] for row in rows),
-            class_names=tuple(self.class_names[row] for row in rows),
-            scores=self.scores[rows],
-            boxes=self.boxes[rows],
-            pinned=None if self.pinned is None else self.pinned[rows],
-            attributes=tuple(self.attributes[row] for row in rows) if self.attributes else (),
-            kinematics=None if self.kinematics is None else self.kinematics[rows],
-        )
+    @classmethod
+    def empty(cls, stamp_ns: int, frame_id: str) -> Self:
+        """Return an array without boxes."""
+        return cls(stamp_ns, frame_id, (), (), np.zeros(0), np.zeros((0, 9)))
 
     def attributes_of(self, row: int) -> Mapping[str, str]:
         """Return the attributes of a box by name."""
@@ -381,7 +426,7 @@ class BoxArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RefinedBoxes:
+class RefinedBoxes(Columns):
     """
     The refined boxes of one box array, in the order of the input.
 
@@ -413,6 +458,11 @@ class RefinedBoxes:
 
     """
 
+    COLUMNS: ClassVar[tuple[str, ...]] = (
+        *('boxes', 'status', 'reasons', 'num_points', 'covariances', 'extent_covariances'),
+        *('face_distances', 'near_points'),
+    )
+
     boxes: BoxArray
     status: tuple[str, ...]
     reasons: tuple[str, ...]
@@ -433,19 +483,10 @@ class RefinedBoxes:
         if len(self.near_points) != n:
             object.__setattr__(self, 'near_points', np.zeros((n, 2), np.int64))
 
-    def take(self, rows: Sequence[int]) -> 'RefinedBoxes':
-        """Return the boxes `rows` only."""
-        return RefinedBoxes(
-            self.boxes.take(rows),
-            tuple(self.status[row] for row in rows),
-            tuple(self.reasons[row] for row in rows),
-            self.num_points[rows],
-            self.covariances[rows],
-            self.is_final,
-            self.extent_covariances[rows],
-            self.face_distances[rows],
-            self.near_points[rows],
-        )
+    def without(self, *words: str) -> 'RefinedBoxes':
+        """Return the boxes whose status is none of some words; itself if that is all of them."""
+        rows = [row for row, word in enumerate(self.status) if word not in words]
+        return self if len(rows) == len(self.status) else self.take(rows)
 
 
 def kept(boxes: BoxArray, reason: str) -> RefinedBoxes:
@@ -453,3 +494,35 @@ def kept(boxes: BoxArray, reason: str) -> RefinedBoxes:
     n = len(boxes.track_ids)
     unknown = np.broadcast_to(np.eye(6), (n, 6, 6))
     return RefinedBoxes(boxes, (KEPT,) * n, (str(reason),) * n, np.zeros(n, np.int64), unknown)
+
+
+def with_rejected(
+    refined: RefinedBoxes, gone: BoxArray, rows: Sequence[int], reasons: Sequence[str]
+) -> RefinedBoxes:
+    """
+    Return a result with boxes that were not registered as rejected ones.
+
+    Parameters
+    ----------
+    refined : RefinedBoxes
+        Of the other boxes of the input, and of added ones behind them.
+    gone : BoxArray
+        The k boxes that were not registered.
+    rows : sequence of k int
+        Their rows in the input, ascending.
+    reasons : sequence of k str
+        Why each was rejected.
+
+    """
+    rejected = replace(kept(gone, ''), status=(REJECTED,) * len(rows), reasons=tuple(reasons))
+    parts = [
+        replace(
+            one,
+            boxes=replace(one.boxes, pinned=None, kinematics=one.boxes.known_kinematics),
+        )
+        for one in (refined, rejected)
+    ]
+    first = len(refined.status)
+    places = np.array(rows, np.int64) - np.arange(len(rows))
+    order = np.insert(np.arange(first), places, first + np.arange(len(rows)))
+    return concatenated(parts).take(order)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.following import person
@@ -24,6 +24,7 @@ from boxreg_ros.structures import (
     BOX_EXTENT,
     BoxArray,
     checked,
+    Columns,
     EXTENDED,
     Floats,
     HUMAN,
@@ -48,8 +49,10 @@ class End(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FollowedTrack:
+class FollowedTrack(Columns):
     """One object over time; N is 0 without a seed that can be used."""
+
+    COLUMNS: ClassVar[tuple[str, ...]] = ('rows', 'stamps_ns', 'boxes', 'status')
 
     track_id: str
     class_name: str

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import cast, NamedTuple
 
 from boxreg_ros.datasets.protocol import DatasetModule, Scene
-from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.errors import RecordingError, require_packages
 
 DATASETS = {
     'nuscenes': 'boxreg_ros.datasets.nuscenes',
@@ -76,13 +76,7 @@ def scene_names(address: Address) -> list[str]:
 
     """
     module = module_of(address.dataset)
-    for package in module.DATASET.packages:
-        try:
-            import_module(package)
-        except ImportError as error:
-            raise ConfigError(
-                f'data set {address.dataset!r} needs {package}: pip install {package} ({error})'
-            ) from None
+    require_packages(f'data set {address.dataset!r}', module.DATASET.packages)
     root = address.root
     if not root.is_dir():
         raise RecordingError(f'{address}: no such folder: {str(root)!r}')

@@ -10,7 +10,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, cast
 
-from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.errors import ConfigError, RecordingError, require_packages
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.class_names import ClassNames
 from boxreg_ros.labels.protocol import (
@@ -46,13 +46,7 @@ COMMAND_LINE_OPTIONS = ('camera', 'with_points', 'swap_axes', 'class_map', 'with
 def module_of(name: str) -> FormatModule:
     """Return the module of a format; ConfigError if it does not exist, or lacks a package."""
     module = import_format(name)
-    for package in module.FORMAT.packages:
-        try:
-            import_module(package.replace('-', '_'))
-        except ImportError as error:
-            raise ConfigError(
-                f'format {name!r} needs {package}: pip install {package} ({error})'
-            ) from None
+    require_packages(f'format {name!r}', module.FORMAT.packages)
     return module
 
 

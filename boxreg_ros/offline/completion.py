@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_statistics import Drives
@@ -15,6 +15,7 @@ from boxreg_ros.core.observation import crop
 from boxreg_ros.core.registrar import BoxRegistrar, Submit
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.session import hand_to_registrar
+from boxreg_ros.io.sweep_store import SweepStore
 from boxreg_ros.offline.reader import ArrayPlace
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
@@ -33,11 +34,6 @@ from boxreg_ros.tracks.followed import with_evidence
 import numpy as np
 
 
-def empty_array(stamp_ns: int, frame_id: str) -> BoxArray:
-    """Return an array without boxes."""
-    return BoxArray(stamp_ns, frame_id, (), (), np.zeros(0), np.zeros((0, 9)))
-
-
 @dataclass(slots=True)
 class Arrivals:
     """Sweeps and box arrays of a part of a recording between two time jumps, as they arrived."""
@@ -46,9 +42,18 @@ class Arrivals:
     items: list[int | BoxArray] = field(default_factory=list)
     # largest distance of an array that is of a sweep [ns]; None for half a period
     reach_ns: int | None = None
+    # with the points of the sweeps, where objects are followed through them
+    sweeps: SweepStore | None = None
+
+    @classmethod
+    def empty(cls, with_sweeps: bool, reach_ns: int | None = None) -> Self:
+        """Return a part before its first item."""
+        return cls([], reach_ns, SweepStore() if with_sweeps else None)
 
     def add(self, item: Sweep | BoxArray) -> None:
         """Add an item that has a transform."""
+        if self.sweeps is not None and isinstance(item, Sweep):
+            self.sweeps.add(item)
         self.items.append(item.stamp_ns if isinstance(item, Sweep) else item)
 
     @property
@@ -78,7 +83,7 @@ class Arrivals:
             if isinstance(item, BoxArray):
                 found.append(item)
             stamp_ns = None if isinstance(item, BoxArray) else item
-            found += [empty_array(one, frame_id) for one in inserter.after(stamp_ns, False)]
+            found += [BoxArray.empty(one, frame_id) for one in inserter.after(stamp_ns, False)]
         return found
 
 
@@ -142,7 +147,7 @@ def with_empty_arrays(
         if is_sweep:
             poses[moved.stamp_ns] = item.T_fixed_sensor
         for stamp_ns in inserter.after(moved.stamp_ns if is_sweep else None, item.restarts):
-            empty = empty_array(stamp_ns, frame_id)
+            empty = BoxArray.empty(stamp_ns, frame_id)
             moved = replace(empty, ticket=ArrayPlace())
             pose = poses.pop(stamp_ns)
             yield Item(
@@ -208,6 +213,7 @@ def first_pass(
     fixed_frame: str | None = None,
     drives: Drives | None = None,
     corrected: Callable[[BoxArray], BoxArray] = _unchanged,
+    with_sweeps: bool = False,
 ) -> FirstPass:
     """
     Register a recording, and count the points in its boxes.
@@ -222,9 +228,11 @@ def first_pass(
         With it, sweeps without boxes get an empty array, see `Arrivals`.
     corrected : callable
         Returns boxes in time as a person has decided.
+    with_sweeps : bool
+        Whether the parts have the points of their sweeps.
 
     """
-    parts = [Arrivals()]
+    parts = [Arrivals.empty(with_sweeps)]
     arrived: list[int] = []
     results: dict[object, RefinedBoxes] = {}
     in_time: dict[object, BoxArray] = {}
@@ -247,7 +255,7 @@ def first_pass(
     registrar = BoxRegistrar(config, submit, drives=drives, prepare=prepared)
     for moved, restarts in items:
         if restarts:
-            parts.append(Arrivals())
+            parts.append(Arrivals.empty(with_sweeps))
         if isinstance(moved, BoxArray):
             moved = replace(moved, ticket=len(arrived))
             arrived.append(len(arrived))

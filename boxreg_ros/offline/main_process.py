@@ -20,12 +20,13 @@ from boxreg_ros.core.registrar import BoxRegistrar, Submit
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.input_models import disagreements
 from boxreg_ros.io.session import hand_to_registrar
+from boxreg_ros.offline.notes import closing_line
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.products import (
     checked,
     completed_counts,
+    fitting_truth,
     write_proposals,
-    write_run_report,
     write_track_tables,
 )
 from boxreg_ros.offline.progress import Stopwatch
@@ -106,11 +107,17 @@ class MainProcess:
             self._write_points(folder, sink, registrar, self.sweeps, summary)
         rows, violated = self._write_tables(folder, sink, summary)
         if sink.points is not None:
+            from boxreg_ros.review.report import write_report
+
             sink.points.settle(registrar.box_time.resolved(self.request.config))
-            write_run_report(
-                folder, out, self.request, summary, rows, violated, sink.points, self.truth,
-                self.clock,
-            )  # fmt: skip
+            with self.clock('report'):
+                tracks = [row.track for row in rows]
+                truth = fitting_truth(self.truth, self.request.truth, tracks, summary)
+                write_report(
+                    folder, closing_line(summary, out), summary.as_json(), self.request.config,
+                    rows, violated, sink.points, truth,
+                )  # fmt: skip
+            summary.seconds = self.clock.seconds()
         self._write_input_model(folder, registrar, summary)
         if self.request.decisions is not None:
             copyfile(self.request.decisions, folder / DECISIONS)  # a review goes on from there

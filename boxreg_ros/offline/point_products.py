@@ -27,18 +27,17 @@ from boxreg_ros.core.point_labels import (
 from boxreg_ros.io.fixed_frame import StoredCloud
 from boxreg_ros.labels import LabelFrame, LabelWriter, Options, Provenance, writer_for
 from boxreg_ros.labels.clouds import write_cloud
+from boxreg_ros.labels.records import ReadBox, refined_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stored_sweeps import StoredSweeps
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.structures import (
-    BoxArray,
     FLOAT32_RANGE,
     Floats,
     HUMAN,
     Ints,
     KEPT,
     REFINED,
-    RefinedBoxes,
     REJECTED,
     Sweep,
 )
@@ -187,25 +186,16 @@ class PointProducts:
     def _write_formats(self, cloud: StoredCloud, labels: PointLabels) -> None:
         """Write a sweep in the formats of points."""
         objects = labels.objects
-        rows = np.flatnonzero(~objects.is_lost)
-        tracks = [labels.tracks[row] for row in objects.track[rows]]
-        n = len(rows)
-        refined = RefinedBoxes(
-            BoxArray(
-                cloud.sweep.stamp_ns,
-                self._fixed_frame,
-                tuple(track.track_id for track in tracks),
-                tuple(track.class_name for track in tracks),
-                np.full(n, np.nan),
-                objects.boxes[rows],
-            ),
-            tuple(np.where(objects.is_certain[rows], REFINED, KEPT).tolist()),
-            ('',) * n,
-            np.bincount(labels.owner, minlength=len(objects.track))[rows],
-            np.tile(np.eye(6), (n, 1, 1)),
-        )
+        counts = np.bincount(labels.owner, minlength=len(objects.track))
+        found = []
+        for row in np.flatnonzero(~objects.is_lost):
+            track = labels.tracks[objects.track[row]]
+            status = REFINED if objects.is_certain[row] else KEPT
+            evidence = {'status': status, 'num_points': counts[row]}
+            box = objects.boxes[row]
+            found.append(ReadBox(track.track_id, track.class_name, box, evidence))
         frame = LabelFrame(
-            refined,
+            refined_of(cloud.sweep.stamp_ns, self._fixed_frame, found),
             self._fixed_frame,
             cloud.sweep.frame_id,
             cloud.T_fixed_sweep,

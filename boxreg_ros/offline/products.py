@@ -11,9 +11,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.stamp_join import joined_stamps
 from boxreg_ros.io.times import time_range
-from boxreg_ros.offline.notes import closing_line, MAX_NAMED
-from boxreg_ros.offline.progress import Stopwatch
-from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.notes import MAX_NAMED
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.structures import Ints, PROPOSED
 import numpy as np
@@ -24,7 +22,6 @@ if TYPE_CHECKING:
     from boxreg_ros.review.changes import TrackChanges
     from boxreg_ros.review.rules import Violation
     from boxreg_ros.review.tables import TrackRow
-    from boxreg_ros.review.track_points import PointCollector
     from boxreg_ros.tracks.complete import CompletionPlan, TrackSteps
     from boxreg_ros.tracks.proposals import Proposal
 
@@ -32,6 +29,9 @@ PROPOSALS = 'proposals.csv'
 STEP_COLUMNS = (
     'fragments', 'filled', 'extended', 'rejected', 'reclassified', 'ambiguous', 'unfilled',
 )  # fmt: skip
+"""Fields of `TrackSteps` that ``tracks.csv`` has."""
+SUMMED = ('rejected', 'filled', 'extended', 'reclassified', 'unfilled')
+"""Those whose sums ``summary.json`` has."""
 
 
 def completed_counts(plan: CompletionPlan | None) -> dict[str, int]:
@@ -43,11 +43,7 @@ def completed_counts(plan: CompletionPlan | None) -> dict[str, int]:
         'tracks': len(tracks),
         'joined': sum(track.fragments - 1 for track in tracks),
         'ambiguous': sum(bool(track.ambiguous) for track in tracks),
-        'rejected': sum(track.rejected for track in tracks),
-        'filled': sum(track.filled for track in tracks),
-        'extended': sum(track.extended for track in tracks),
-        'reclassified': sum(track.reclassified for track in tracks),
-        'unfilled': sum(track.unfilled for track in tracks),
+        **{name: sum(getattr(track, name) for track in tracks) for name in SUMMED},
     }
 
 
@@ -84,30 +80,7 @@ def checked(
     return {'before': counts(violations(before)), 'after': counts(found)}, found
 
 
-def write_run_report(
-    folder: Path,
-    out: Path,
-    request: Request,
-    summary: Summary,
-    rows: Sequence[TrackRow],
-    violated: Mapping[str, Sequence[Violation]],
-    points: PointCollector,
-    truth: BoxTable | None,
-    clock: Stopwatch,
-) -> None:
-    """Write the report and add its time to the summary."""
-    from boxreg_ros.review.report import write_report
-
-    with clock('report'):
-        truth = _fitting(truth, request.truth, [row.track for row in rows], summary)
-        line = closing_line(summary, out)
-        write_report(
-            folder, line, summary.as_json(), request.config, rows, violated, points, truth
-        )
-    summary.seconds = clock.seconds()
-
-
-def _fitting(
+def fitting_truth(
     truth: BoxTable | None, path: Path | None, tracks: Sequence[TrackChanges], summary: Summary
 ) -> BoxTable | None:
     """Return the true boxes for the report; None, with a warning, where they do not fit."""
@@ -124,15 +97,13 @@ def _fitting(
     elif names.isdisjoint(truth.track_ids):
         problem = f'tracks {sorted(names)[:MAX_NAMED]}, got {truth.track_ids[:MAX_NAMED]}'
     line = joined.finding('the true boxes', 'the results')
-    if not problem:
-        summary.warning = '; '.join(filter(None, (summary.warning, line)))
-        return replace(truth, stamps_ns=joined.stamps_ns)
-    line = (
-        f'truth {str(path)!r}: expected {problem}; the report is written without it: '
-        f'give the true boxes of this drive to --truth'
-    )
+    if problem:
+        line = (
+            f'truth {str(path)!r}: expected {problem}; the report is written without it: '
+            f'give the true boxes of this drive to --truth'
+        )
     summary.warning = '; '.join(filter(None, (summary.warning, line)))
-    return None
+    return None if problem else replace(truth, stamps_ns=joined.stamps_ns)
 
 
 def _range_of(stamps_ns: Ints) -> str:
@@ -141,18 +112,11 @@ def _range_of(stamps_ns: Ints) -> str:
 
 def _step_cells(tracks: Sequence[TrackSteps]) -> dict[str, list[int | str]]:
     """Return the cells of `STEP_COLUMNS` by track id."""
-    return {
-        track.track_id: [
-            track.fragments,
-            track.filled,
-            track.extended,
-            track.rejected,
-            track.reclassified,
-            ' '.join(track.ambiguous),
-            track.unfilled,
-        ]
-        for track in tracks
-    }
+    found = {one.track_id: [getattr(one, name) for name in STEP_COLUMNS] for one in tracks}
+    words = STEP_COLUMNS.index('ambiguous')
+    for cells in found.values():
+        cells[words] = ' '.join(cells[words])
+    return found
 
 
 def write_proposals(

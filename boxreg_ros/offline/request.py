@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ConfigError
+from boxreg_ros.errors import ConfigError, require_packages
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.storage.urls import entries_of, url_of
 from boxreg_ros.labels import check_options, files_of, labels_points, module_of, Options
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 NO_TOPIC = 'none'
 """In place of a topic of boxes: the drive has no boxes."""
+REPORT_PACKAGES = ('jinja2', 'plotly')
+"""Of ``--report``; a plain installation lacks them."""
 POINT_FORMATS = ('semantickitti', 'lidarseg')
 """Formats that ``--label-points`` writes."""
 
@@ -188,9 +190,7 @@ class Request:
             )
         check_options(self.box_formats, self.options)
         if self.report:
-            from boxreg_ros.review.report import check_packages  # imports torch
-
-            check_packages()
+            require_packages('--report', REPORT_PACKAGES)
 
     def _check_recordings(self) -> None:
         """Refuse a recording that is named twice: its boxes would be refined twice."""

@@ -133,7 +133,7 @@ def drive_of(out: Path) -> DriveSource | None:
     parser = _Parser()
     relabel_command.add_arguments(parser)
     args = parser.parse_args([*command[1:], '-o', str(out)])
-    values = values_of(args, Request) | {'report': False}  # to check that imports torch
+    values = values_of(args, Request) | {'report': False}  # it is written
     if values['labels'] is not None:
         name, path = values['labels']
         values['labels'] = name, _within(folder, path)

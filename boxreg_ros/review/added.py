@@ -73,12 +73,9 @@ class _Near:
 
 def _changes(track: FollowedTrack, points: _Near) -> TrackChanges:
     n = len(track.rows)
-    half = track.boxes[:, BOX_EXTENT] / 2
-    inside = [
-        int((np.abs(local) < extent).all(1).sum())
-        for local, extent in zip(points.local, half, strict=True)
-    ]
-    near = [len(local) - count for local, count in zip(points.local, inside, strict=True)]
+    pairs = zip(points.local, track.boxes[:, BOX_EXTENT] / 2, strict=True)
+    inside = np.array([(np.abs(local) < half).all(1).sum() for local, half in pairs], np.int64)
+    totals = np.array([len(local) for local in points.local], np.int64)
     return TrackChanges(
         track_id=track.track_id,
         class_name=track.class_name,
@@ -90,10 +87,10 @@ def _changes(track: FollowedTrack, points: _Near) -> TrackChanges:
         deviations=np.full((n, 4), np.nan),
         extent_deviations=np.full((n, 3), np.nan),
         face_distances=np.zeros((n, 6)),
-        near_points=np.column_stack([inside, near]).astype(np.int64),
+        near_points=np.column_stack([inside, totals - inside]),
         disagreement=np.zeros(n),
         is_flipped=np.zeros(n, bool),
         status=np.array(track.status),
         reasons=np.full(n, '', '<U1'),
-        num_points=np.array(inside, np.int64),
+        num_points=inside,
     )

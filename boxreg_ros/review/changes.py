@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 from boxreg_ros.core.metrics import iou_3d, pose_errors
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import (
     BoxArray,
+    Columns,
+    concatenated,
     Floats,
     HUMAN,
     Ints,
@@ -24,8 +27,14 @@ from numpy.typing import ArrayLike, NDArray
 
 
 @dataclass(frozen=True, slots=True)
-class TrackChanges:
+class TrackChanges(Columns):
     """The boxes of one track before and after registration, by stamp."""
+
+    COLUMNS: ClassVar[tuple[str, ...]] = (
+        *('input_ids', 'stamps_ns', 'given', 'boxes', 'change', 'deviations'),
+        *('extent_deviations', 'face_distances', 'near_points', 'disagreement', 'is_flipped'),
+        *('status', 'reasons', 'num_points', 'attributes'),
+    )
 
     track_id: str
     class_name: str
@@ -96,13 +105,9 @@ class Changes:
 
     def __init__(self, fixed_frame: str) -> None:
         self._fixed_frame = fixed_frame
-        # Id, class, status, reason, id in the input.
-        self._names: list[tuple[str, str, str, str, str]] = []
-        # Rows of given (9), boxes (9), deviations (4), extent deviations (3), face distances (6),
-        # near points (2), early estimates (9).
-        self._numbers: list[Floats] = []
-        self._counts: list[Ints] = []  # rows of stamp, number of points
-        self._attributes: dict[int, Mapping[str, str]] = {}  # by number of the box
+        self._names: list[tuple[str, str]] = []  # track id and class of each box
+        self._parts: list[TrackChanges] = []  # one for each array
+        self._early: list[Floats] = []  # early estimates (n, 9) of each array
 
     def add(
         self,
@@ -126,81 +131,63 @@ class Changes:
         is_usable = is_valid_box(after) & (boxes.frame_id == self._fixed_frame)
         before[~is_usable] = np.nan
         after[~is_usable] = np.nan
-        deviations = _deviations(after, refined.covariances)
+        is_refined = np.isin(refined.status, (REFINED, HUMAN))
+        unknown = np.where(is_refined, 0.0, np.nan)[:, None]
         variances = np.diagonal(refined.extent_covariances, axis1=1, axis2=2)
-        extent_deviations = np.sqrt(variances.clip(0))
-        self._numbers.append(
-            np.column_stack(
-                [
-                    before,
-                    after,
-                    deviations,
-                    extent_deviations,
-                    refined.face_distances,
-                    refined.near_points,
-                    _refined_early(early, n),
-                ]
+        self._early.append(_refined_early(early, n))
+        self._names += zip(boxes.track_ids, boxes.class_names, strict=True)
+        self._parts.append(
+            TrackChanges(
+                track_id='',
+                class_name='',
+                input_ids=(*given.track_ids, *(added_ids or ('',) * (n - len(given.boxes)))),
+                stamps_ns=np.full(n, boxes.stamp_ns),
+                given=before,
+                boxes=after,
+                change=np.zeros((n, 4)),
+                deviations=_deviations(after, refined.covariances) + unknown,
+                extent_deviations=np.sqrt(variances.clip(0)) + unknown,
+                face_distances=refined.face_distances,
+                near_points=refined.near_points.astype(np.float64),
+                disagreement=np.zeros(n),
+                is_flipped=np.zeros(n, bool),
+                status=np.array(refined.status, str),
+                reasons=np.array(refined.reasons, str),
+                num_points=refined.num_points,
+                attributes=tuple(boxes.attributes_of(row) for row in range(n)),
             )
         )
-        self._counts.append(np.column_stack([np.full(n, boxes.stamp_ns), refined.num_points]))
-        first = len(self._names)
-        self._attributes |= {first + row: one for row, one in enumerate(boxes.attributes) if one}
-        added_ids = added_ids or ('',) * (n - len(given.track_ids))
-        input_ids = (*given.track_ids, *added_ids)
-        names = boxes.track_ids, boxes.class_names, refined.status, refined.reasons, input_ids
-        self._names += zip(*names, strict=True)
 
     def tracks(self) -> list[TrackChanges]:
         """Return all tracks, by descending mean shift."""
-        numbers = np.concatenate([np.zeros((0, 42)), *self._numbers])
-        counts = np.concatenate([np.zeros((0, 2), np.int64), *self._counts])
-        given, boxes, deviations, extent_deviations, face_distances, near_points, early = np.split(
-            numbers, [9, 18, 22, 25, 31, 33], axis=1
-        )
-        disagreement = np.nan_to_num(1 - ious(boxes, early))
-        errors = pose_errors(given, boxes)  # of the input, in the axes of the result
+        if not self._names:
+            return []
+        every = concatenated(self._parts)
+        errors = pose_errors(every.given, every.boxes)  # of the input, in the axes of the result
         yaw_change = wrap_angle(2 * errors.rotation[:, 2]) / 2  # half turns removed
-        change = -np.column_stack([errors.translation, yaw_change])
+        early = np.concatenate(self._early)
+        every = replace(
+            every,
+            change=-np.column_stack([errors.translation, yaw_change]),
+            is_flipped=errors.is_flipped & every.is_refined,
+            disagreement=np.nan_to_num(1 - ious(every.boxes, early)),
+        )
+        rows_of: dict[str, list[int]] = {}
+        for row in np.argsort(every.stamps_ns, kind='stable').tolist():
+            rows_of.setdefault(self._names[row][0], []).append(row)
         found = []
-        for track_id, rows in self._rows_by_track(counts[:, 0]).items():
-            parts = zip(*(self._names[row] for row in rows), strict=True)
-            _, classes, words, reasons, input_ids = parts
-            status = np.array(words)
-            is_refined = np.isin(status, (REFINED, HUMAN))
-            unknown = np.where(is_refined, 0.0, np.nan)[:, None]
+        for track_id, rows in rows_of.items():
+            track = every.take(rows)
+            classes = Counter(self._names[row][1] for row in rows)
             found.append(
-                TrackChanges(
+                replace(
+                    track,
                     track_id=track_id,
-                    class_name=Counter(classes).most_common(1)[0][0],
-                    input_ids=input_ids,
-                    stamps_ns=counts[rows, 0],
-                    given=given[rows],
-                    boxes=boxes[rows],
-                    change=change[rows],
-                    deviations=deviations[rows] + unknown,
-                    extent_deviations=extent_deviations[rows] + unknown,
-                    face_distances=face_distances[rows],
-                    near_points=near_points[rows],
-                    disagreement=disagreement[rows],
-                    is_flipped=errors.is_flipped[rows] & is_refined,
-                    status=status,
-                    reasons=np.array(reasons),
-                    num_points=counts[rows, 1],
-                    attributes=self._attributes_of(rows),
+                    class_name=classes.most_common(1)[0][0],
+                    attributes=track.attributes if any(track.attributes) else (),
                 )
             )
         return sorted(found, key=lambda track: -np.nan_to_num(track.shift, nan=-1.0))
-
-    def _attributes_of(self, rows: Sequence[int]) -> tuple[Mapping[str, str], ...]:
-        found = tuple(self._attributes.get(row, {}) for row in rows)
-        return found if any(found) else ()
-
-    def _rows_by_track(self, stamps_ns: Ints) -> dict[str, list[int]]:
-        """Return the rows of each track id, by stamp."""
-        rows_of: dict[str, list[int]] = {}
-        for row in np.argsort(stamps_ns, kind='stable').tolist():
-            rows_of.setdefault(self._names[row][0], []).append(row)
-        return rows_of
 
 
 def mean(values: ArrayLike) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.reasons import Reason
@@ -15,9 +15,8 @@ from boxreg_ros.structures import (
     Floats,
     HUMAN,
     KEPT,
-    kept,
     RefinedBoxes,
-    REJECTED,
+    with_rejected,
 )
 import numpy as np
 from numpy.typing import NDArray
@@ -64,22 +63,20 @@ class Corrections:
     def seeds(self, frame_id: str) -> list[BoxArray]:
         """Return boxes of added objects, an array each; RecordingError for another frame."""
         found = []
-        for one in self._additions():
+        for one in self._of_kind('add'):
             if one.frame_id != frame_id:
                 raise RecordingError(
                     f'added box of track {one.track_id!r} at {one.stamp_ns}: expected frame '
                     f'{frame_id!r}, got {one.frame_id!r}; relabel with --fixed-frame '
                     f'{one.frame_id}'
                 )
-            assert one.stamp_ns is not None and one.box is not None
-            columns = (one.track_id,), (one.value,), np.ones(1), one.box[None]
-            found.append(BoxArray(one.stamp_ns, frame_id, *columns))
+            found.append(_array_of(one, one.track_id, one.value))
         return found
 
     @property
     def adds(self) -> bool:
         """Return whether objects were added."""
-        return bool(self._additions())
+        return bool(self._of_kind('add'))
 
     def added(self, tracks: Iterable[FollowedTrack]) -> list[FollowedTrack]:
         """Return followed objects without deleted boxes, with the ids and classes decided."""
@@ -89,27 +86,16 @@ class Corrections:
             for row, stamp_ns in enumerate(track.stamps_ns.tolist()):
                 if self._last('deletion', track.track_id, stamp_ns) is not None:
                     continue
-                names = []
-                for topic, name in (('id', track.track_id), ('class', track.class_name)):
-                    changed = self._last(topic, track.track_id, stamp_ns)
-                    names.append(changed.value if changed else name)
-                rows_of.setdefault((names[0], names[1]), []).append(row)
-                self._origins.setdefault(names[0], []).append((stamp_ns, track.track_id))
-            own = {one.scope for one in self._additions() if one.track_id == track.track_id}
+                track_id = self.track_id(track.track_id, stamp_ns) or track.track_id
+                class_name = self.class_name(track.track_id, stamp_ns) or track.class_name
+                rows_of.setdefault((track_id, class_name), []).append(row)
+                self._origins.setdefault(track_id, []).append((stamp_ns, track.track_id))
+            own = {one.scope for one in self._of_kind('add') if one.track_id == track.track_id}
             if len(track.rows):
                 self._unused -= own
             for (track_id, class_name), rows in rows_of.items():
-                found.append(
-                    replace(
-                        track,
-                        track_id=track_id,
-                        class_name=class_name,
-                        rows=track.rows[rows],
-                        stamps_ns=track.stamps_ns[rows],
-                        boxes=track.boxes[rows],
-                        status=tuple(track.status[row] for row in rows),
-                    )
-                )
+                own_boxes = track.take(rows)
+                found.append(replace(own_boxes, track_id=track_id, class_name=class_name))
         return found
 
     def origin_of(self, stamp_ns: int, track_id: str) -> str:
@@ -123,12 +109,7 @@ class Corrections:
     @property
     def names(self) -> set[str]:
         """Return the ids that were given."""
-        return {
-            one.value
-            for decisions in self._of_track.values()
-            for one in decisions
-            if one.kind == 'rename' and not one.is_taken_back
-        }
+        return {one.value for one in self._of_kind('rename') if not one.is_taken_back}
 
     @property
     def apart(self) -> set[str]:
@@ -141,13 +122,11 @@ class Corrections:
 
     def track_id(self, input_id: str, stamp_ns: int) -> str:
         """Return the id that was given to a box; empty for none."""
-        found = self._last('id', input_id, stamp_ns)
-        return found.value if found else ''
+        return self._value('id', input_id, stamp_ns)
 
     def class_name(self, input_id: str, stamp_ns: int) -> str:
         """Return the class that was given to a box; empty for none."""
-        found = self._last('class', input_id, stamp_ns)
-        return found.value if found else ''
+        return self._value('class', input_id, stamp_ns)
 
     def is_left_out(self, input_id: str, stamp_ns: int) -> bool:
         """
@@ -185,23 +164,19 @@ class Corrections:
             for name, class_name in zip(array.track_ids, array.class_names, strict=True)
         }
         found = []
-        for one in self._pins():
-            assert one.stamp_ns is not None and one.box is not None
+        for one in self._of_kind('pin'):
+            assert one.stamp_ns is not None
             track_id = self.track_id(one.track_id, one.stamp_ns) or one.track_id
             is_extra = self.pin(one.track_id, one.stamp_ns) is not None and track_id in class_of
             if not is_extra or one.frame_id != frame_id:
                 continue
             class_name = self.class_name(one.track_id, one.stamp_ns) or class_of[track_id]
-            columns = (track_id,), (class_name,), np.ones(1), one.box[None]
-            found.append(BoxArray(one.stamp_ns, frame_id, *columns))
+            found.append(_array_of(one, track_id, class_name))
             self._input_ids[track_id, one.stamp_ns] = one.track_id
         return found
 
-    def _pins(self) -> list[Decision]:
-        return [one for rows in self._of_track.values() for one in rows if one.kind == 'pin']
-
-    def _additions(self) -> list[Decision]:
-        return [one for rows in self._of_track.values() for one in rows if one.kind == 'add']
+    def _of_kind(self, kind: str) -> list[Decision]:
+        return [one for rows in self._of_track.values() for one in rows if one.kind == kind]
 
     def to_register(self, given: BoxArray, with_pins: bool = True) -> BoxArray:
         """
@@ -311,15 +286,8 @@ class Corrections:
 
     def _first_id(self, track_id: str) -> str:
         """Return an id in the input of a track whose boxes there are later."""
-        return next(
-            (
-                one.track_id
-                for decisions in self._of_track.values()
-                for one in decisions
-                if one.kind == 'rename' and one.value == track_id
-            ),
-            track_id,
-        )
+        renames = (one for one in self._of_kind('rename') if one.value == track_id)
+        return next((one.track_id for one in renames), track_id)
 
     def _decided_attributes(self, input_id: str, stamp_ns: int) -> dict[str, str]:
         topics = dict.fromkeys(
@@ -341,32 +309,24 @@ class Corrections:
         track_ids = list(given.track_ids)
         class_names = list(given.class_names)
         for row, track_id in enumerate(given.track_ids):
-            renamed = self._last('id', track_id, given.stamp_ns)
-            track_ids[row] = renamed.value if renamed else track_id
-            if renamed:
-                self._input_ids[renamed.value, given.stamp_ns] = track_id
+            new_id = self.track_id(track_id, given.stamp_ns)
+            if new_id:
+                track_ids[row] = new_id
+                self._input_ids[new_id, given.stamp_ns] = track_id
             else:
                 self._own_ids.add(track_id)
             if track_id in self._of_track:
                 self._boxes.add((track_id, given.stamp_ns))
-            reclassed = self._last('class', track_id, given.stamp_ns)
-            class_names[row] = reclassed.value if reclassed else class_names[row]
+            class_names[row] = self.class_name(track_id, given.stamp_ns) or class_names[row]
         return replace(given, track_ids=tuple(track_ids), class_names=tuple(class_names))
 
     def _with_deleted(self, given: BoxArray, refined: RefinedBoxes) -> RefinedBoxes:
         """Return a result with the deleted boxes at their place, as rejected."""
-        n = len(given.track_ids)
-        left = self._left(given)
-        deleted = sorted(set(range(n)) - set(left))
+        deleted = sorted(set(range(len(given.track_ids))) - set(self._left(given)))
         if not deleted:
             return refined
-        gone = kept(self._renamed(given).take(deleted), Reason.DELETED)
-        gone = replace(gone, status=(REJECTED,) * len(deleted))
-        order = np.empty(len(refined.status) + len(deleted), np.int64)
-        order[left] = np.arange(len(left))
-        order[deleted] = len(refined.status) + np.arange(len(deleted))
-        order[n:] = np.arange(len(left), len(refined.status))
-        return _joined(refined, gone).take(order.tolist())
+        gone = self._renamed(given).take(deleted)
+        return with_rejected(refined, gone, deleted, [Reason.DELETED] * len(deleted))
 
     def _judgement(self, track_id: str, stamp_ns: int) -> Decision | None:
         """Return the judgement of a box: its own, else that of a range, else of its track."""
@@ -375,6 +335,10 @@ class Corrections:
             if found is None or _closeness(one) >= _closeness(found):
                 found = one
         return found
+
+    def _value(self, topic: str, track_id: str, stamp_ns: int) -> str:
+        found = self._last(topic, track_id, stamp_ns)
+        return found.value if found else ''
 
     def _last(self, topic: str, track_id: str, stamp_ns: int) -> Decision | None:
         """Return the last decision of a topic about a box."""
@@ -393,13 +357,12 @@ class Corrections:
     def _extents_of_pins(self) -> dict[str, Floats]:
         """Return the mean extents (3,) of the pinned boxes of each track that has any, by id."""
         by_track: dict[str, list[Floats]] = {}
-        for track_id, decisions in self._of_track.items():
-            for one in decisions:
-                if one.kind != 'pin' or one.box is None or one.stamp_ns is None:
-                    continue
-                renames = [d for d in decisions if d.kind == 'rename' and d.covers(one.stamp_ns)]
-                new_id = renames[-1].value if renames else track_id
-                by_track.setdefault(new_id, []).append(one.box[BOX_EXTENT])
+        for one in self._of_kind('pin'):
+            assert one.stamp_ns is not None and one.box is not None
+            of_track = self._of_track[one.track_id]
+            renames = [d for d in of_track if d.kind == 'rename' and d.covers(one.stamp_ns)]
+            new_id = renames[-1].value if renames else one.track_id
+            by_track.setdefault(new_id, []).append(one.box[BOX_EXTENT])
         return {track_id: np.mean(extents, axis=0) for track_id, extents in by_track.items()}
 
 
@@ -408,6 +371,13 @@ def _is_pinned(boxes: BoxArray) -> NDArray[np.bool_]:
     if boxes.pinned is None:
         return np.zeros(len(boxes.track_ids), bool)
     return boxes.pinned
+
+
+def _array_of(one: Decision, track_id: str, class_name: str) -> BoxArray:
+    """Return the box of a decision as an array."""
+    assert one.stamp_ns is not None and one.box is not None
+    columns = (track_id,), (class_name,), np.ones(1), one.box[None]
+    return BoxArray(one.stamp_ns, one.frame_id, *columns)
 
 
 def _closeness(decision: Decision) -> int:
@@ -422,31 +392,3 @@ def _text_of(scope: Scope) -> str:
     if stamp_ns is None:
         return f'{track_id!r}'
     return f'{track_id!r} at {stamp_ns}' + (f' to {end_ns}' if end_ns is not None else '')
-
-
-def _joined(first: RefinedBoxes, second: RefinedBoxes) -> RefinedBoxes:
-    """Return the boxes of two results of one stamp as one."""
-
-    def both(name: str, of: Sequence[Any] = (first, second)) -> Any:
-        return np.concatenate([getattr(one, name) for one in of])
-
-    boxes = first.boxes, second.boxes
-    return replace(
-        first,
-        boxes=replace(
-            first.boxes,
-            track_ids=(*boxes[0].track_ids, *boxes[1].track_ids),
-            class_names=(*boxes[0].class_names, *boxes[1].class_names),
-            scores=both('scores', boxes),
-            boxes=both('boxes', boxes),
-            pinned=None,
-            kinematics=both('known_kinematics', boxes),
-        ),
-        status=(*first.status, *second.status),
-        reasons=(*first.reasons, *second.reasons),
-        num_points=both('num_points'),
-        covariances=both('covariances'),
-        extent_covariances=both('extent_covariances'),
-        face_distances=both('face_distances'),
-        near_points=both('near_points'),
-    )

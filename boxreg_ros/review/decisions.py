@@ -353,19 +353,17 @@ def _parsed(row: dict[str, str], version: int) -> Decision:
     if any(row[name] for name in PINNED_BOX_COLUMNS):
         numbers = np.array([float(row[name] or 'nan') for name in PINNED_BOX_COLUMNS])
         (box,) = boxes_from_quaternions(numbers[:3], numbers[7:], numbers[3:7])
-    stamp_ns = int(row['stamp_ns']) if row['stamp_ns'] else None
-    if version == 1:
-        names = row['track_id'], stamp_ns, row['decision'], row['comment'], row['frame_id']
-        return Decision(*names, box)
+    text = str if version == 1 else unprotected
+    stamp, end = (row.get(name, '') for name in ('stamp_ns', 'end_ns'))
     return Decision(
-        unprotected(row['track_id']),
-        stamp_ns,
+        text(row['track_id']),
+        int(stamp) if stamp else None,
         row['decision'],
-        unprotected(row['comment']),
-        unprotected(row['frame_id']),
+        text(row['comment']),
+        text(row['frame_id']),
         box,
-        int(row['end_ns']) if row['end_ns'] else None,
-        unprotected(row['value']),
-        unprotected(row['who']),
-        row['when'],
+        int(end) if end else None,
+        text(row.get('value', '')),
+        text(row.get('who', '')),
+        row.get('when', ''),
     )

@@ -11,14 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from importlib import import_module
 import os
 from pathlib import Path
 import re
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.review.changes import mean, median
@@ -41,7 +39,6 @@ import numpy as np
 REPORT = 'report.html'
 PAGE_VERSION = 2
 """Of the data and the requests of the page: `boxreg review` serves this one alone."""
-PACKAGES = ('jinja2', 'plotly')
 PAGE = Path(__file__).parent / 'page'
 TEMPLATE = 'report.html.j2'
 SCRIPTS = (
@@ -52,15 +49,6 @@ SCRIPTS = (
 """Parts of the script, in the order that they are joined in."""
 MAX_MAP_SENSOR = 2000
 """Positions of the sensor on the map; chosen."""
-
-
-def check_packages(what: str = '--report', packages: Sequence[str] = PACKAGES) -> None:
-    """Raise ConfigError if a package of the report, or of something else, is not installed."""
-    for package in packages:
-        try:
-            import_module(package)
-        except ImportError as error:
-            raise ConfigError(f'{what} needs {package}: pip install {package} ({error})') from None
 
 
 def write_report(

@@ -256,20 +256,23 @@ def evidence(points: Floats, box: Floats) -> tuple[Floats, float]:
 def _changes_of(part: Mapping[str, Any], class_name: str) -> TrackChanges:
     """Return the track of a part, as far as its risk depends on it."""
     n = len(part['stamps'])
-    given, boxes = (np.array(part[name], np.float64).reshape(n, 9) for name in ('given', 'boxes'))
+
+    def column(name: str, *shape: int) -> Floats:
+        return np.array(part[name], np.float64).reshape(n, *shape)
+
     return TrackChanges(
         track_id='',
         class_name=class_name,
         input_ids=('',) * n,
         stamps_ns=np.array(part['stamps'], np.int64),
-        given=given,
-        boxes=boxes,
-        change=np.array(part['change'], np.float64).reshape(n, 4),
-        deviations=np.array(part['deviations'], np.float64).reshape(n, 4),
-        extent_deviations=np.array(part['extent_deviations'], np.float64).reshape(n, 3),
-        face_distances=np.array(part['faces'], np.float64).reshape(n, 6),
-        near_points=np.array(part['near'], np.float64).reshape(n, 2),
-        disagreement=np.array(part['disagreement'], np.float64),
+        given=column('given', 9),
+        boxes=column('boxes', 9),
+        change=column('change', 4),
+        deviations=column('deviations', 4),
+        extent_deviations=column('extent_deviations', 3),
+        face_distances=column('faces', 6),
+        near_points=column('near', 2),
+        disagreement=column('disagreement'),
         is_flipped=np.array(part['flipped'], bool),
         status=np.array(part['status']),
         reasons=np.array(part['reasons']),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from tempfile import gettempdir
 from threading import Condition, Lock, Thread
 from typing import Any
@@ -96,14 +96,13 @@ class DriveScene:
         offset = np.append(origin, np.zeros(6))
         config = self._source.config
         stamps_ns = np.array(self._store.stamps_ns, np.int64)
-        moved = [BoxArray(s.stamp_ns, s.frame_id, s.track_ids, s.class_names, s.scores,
-                          s.boxes - offset) for s in seeds]  # fmt: skip
+        moved = [replace(seed, boxes=seed.boxes - offset) for seed in seeds]
         (track,) = follow_points(stamps_ns, self._store, moved, config, grows=grows)
         if not len(track.rows):
             raise RecordingError('; '.join(track.problems))
         origins = np.array(self._origins) - origin
         (found,) = solved([track], self._store, config, origins)
-        return _at(found, offset)
+        return replace(found, boxes=found.boxes + offset)
 
     def near(self, stamps_ns: Sequence[int], boxes: Floats) -> list[Floats]:
         """Return the points near each box (n, 9) in the frame of the box, n arrays (M_i, 3)."""
@@ -271,10 +270,3 @@ def thinned(points: Sequence[Floats]) -> Floats:
     every = np.concatenate([np.zeros((0, 3)), *points])
     _, first = np.unique(np.floor(every / GRAIN).astype(np.int32), axis=0, return_index=True)
     return np.asarray(every[first])
-
-
-def _at(track: FollowedTrack, offset: Floats) -> FollowedTrack:
-    return FollowedTrack(
-        track.track_id, track.class_name, track.rows, track.stamps_ns, track.boxes + offset,
-        track.status, track.ends, track.problems,
-    )  # fmt: skip

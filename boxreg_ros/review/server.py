@@ -14,7 +14,7 @@ from threading import Thread
 from typing import TYPE_CHECKING
 import webbrowser
 
-from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.errors import ConfigError, RecordingError, require_packages
 
 if TYPE_CHECKING:
     from boxreg_ros.review.scene import DriveSource
@@ -142,9 +142,9 @@ def review_server(
     ConfigError if the port is in use, or a package is missing.
 
     """
-    from boxreg_ros.review.report import check_packages, REPORT
+    from boxreg_ros.review.report import REPORT
 
-    check_packages('boxreg review', SERVER_PACKAGES)
+    require_packages('boxreg review', SERVER_PACKAGES)
     for out, _ in results:
         missing = [name for name in (SUMMARY, REPORT) if not (out / name).is_file()]
         if missing:

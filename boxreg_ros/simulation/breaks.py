@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, Floats, ROLL, X, Y, YAW
+from boxreg_ros.structures import (
+    BOX_CENTER,
+    BOX_EXTENT,
+    BoxArray,
+    concatenated,
+    Floats,
+    ROLL,
+    X,
+    Y,
+    YAW,
+)
 import numpy as np
 from numpy.typing import NDArray
 
@@ -110,13 +120,7 @@ def _renamed(array: BoxArray, sweep: int, new_id: dict[tuple[int, str], str]) ->
     """Return the boxes of a sweep that are left, with their new ids."""
     names = [new_id.get((sweep, track_id), '') for track_id in array.track_ids]
     rows = [row for row, name in enumerate(names) if name]
-    return replace(
-        array,
-        track_ids=tuple(names[row] for row in rows),
-        class_names=tuple(array.class_names[row] for row in rows),
-        scores=array.scores[rows],
-        boxes=array.boxes[rows],
-    )
+    return replace(array, track_ids=tuple(names)).take(rows)
 
 
 def _haunted(
@@ -162,27 +166,23 @@ def _ghost(
 
 
 def _with_ghosts(
-    array: BoxArray, original: BoxArray, ghosts: Iterable[_Ghost], rng: np.random.Generator
+    array: BoxArray, original: BoxArray, ghosts: Sequence[_Ghost], rng: np.random.Generator
 ) -> BoxArray:
     """Return an array with the ghosts of its sweep; duplicates follow the `original` box."""
-    ids = list(array.track_ids)
-    classes = list(array.class_names)
-    boxes = list(array.boxes)
+    boxes = []
     for ghost in ghosts:
         box = ghost.box.copy()
         if ghost.source in original.track_ids:
             box = original.boxes[original.track_ids.index(ghost.source)].copy()
             box[BOX_EXTENT] *= rng.uniform(0.8, 1.2, 3)
         box[BOX_CENTER] += matrix_from_rpy(box[ROLL:]) @ rng.normal(0, GHOST_JITTER, 3)
-        ids.append(ghost.track_id)
-        classes.append(ghost.class_name)
         boxes.append(box)
-    added = len(ids) - len(array.track_ids)
-    scores = np.append(array.scores, rng.uniform(0.5, 0.99, added).round(2))
-    return replace(
-        array,
-        track_ids=tuple(ids),
-        class_names=tuple(classes),
-        scores=scores,
-        boxes=np.array(boxes).reshape(-1, 9),
+    own = BoxArray(
+        array.stamp_ns,
+        array.frame_id,
+        tuple(ghost.track_id for ghost in ghosts),
+        tuple(ghost.class_name for ghost in ghosts),
+        rng.uniform(0.5, 0.99, len(boxes)).round(2),
+        np.array(boxes).reshape(-1, 9),
     )
+    return concatenated([array, own])

@@ -10,15 +10,15 @@ from the points.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.id_switches import by_id, id_switches
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import (
     BoxArray,
+    concatenated,
     EXTENDED,
     Floats,
     HUMAN,
@@ -26,9 +26,8 @@ from boxreg_ros.structures import (
     Ints,
     is_valid_box,
     KEPT,
-    KINEMATICS,
     RefinedBoxes,
-    REJECTED,
+    with_rejected,
     Y,
 )
 from boxreg_ros.tracks.decided import Decided, DecidedTrack, NOTHING
@@ -39,7 +38,6 @@ from boxreg_ros.tracks.static import join_static
 from boxreg_ros.tracks.stitch import join_turns, stitch
 from boxreg_ros.tracks.tracklet import AddedBoxes, Tracklet, tracklets_of
 import numpy as np
-from numpy.typing import NDArray
 
 
 @dataclass(slots=True)
@@ -83,32 +81,34 @@ class PlannedArray:
 
     def to_register(self, given: BoxArray) -> BoxArray:
         """Return the boxes of an array without rejected ones, and with the added ones."""
-        rows = [row for row in range(len(given.track_ids)) if row not in self.rejected]
-        boxes = np.array([self.moved.get(row, given.boxes[row]) for row in rows])
-        of_person = np.array([added.status == HUMAN for added in self.added], bool)
-        pinned = None
-        if given.pinned is not None or of_person.any():
-            own = np.zeros(len(rows), bool) if given.pinned is None else given.pinned[rows]
-            pinned = np.append(own, of_person)
-        return replace(
-            given,
-            track_ids=(*(self.track_ids[i] for i in rows), *(a.track_id for a in self.added)),
-            class_names=(
-                *(self.class_names[i] for i in rows),
-                *(a.class_name for a in self.added),
-            ),
-            scores=np.append(given.scores[rows], [a.score for a in self.added]),
-            boxes=np.concatenate(
-                [boxes.reshape(-1, 9), np.array([a.box for a in self.added]).reshape(-1, 9)]
-            ),
-            pinned=pinned,
-        )
+        added = self.added_boxes(given)
+        boxes = given.boxes.copy()
+        for row, box in self.moved.items():
+            boxes[row] = box
+        pinned = given.pinned
+        if pinned is None and any(one.status == HUMAN for one in self.added):
+            pinned = np.zeros(len(boxes), bool)
+        own = replace(self.renamed(given), boxes=boxes, pinned=pinned, attributes=())
+        rows = [row for row in range(len(boxes)) if row not in self.rejected]
+        return concatenated([own.take(rows), added])
 
     def added_boxes(self, given: BoxArray) -> BoxArray:
         """Return the boxes that are added to an array."""
-        registered = self.to_register(given)
-        count = len(registered.track_ids)
-        return registered.take(range(count - len(self.added), count))
+        return replace(
+            given,
+            track_ids=tuple(one.track_id for one in self.added),
+            class_names=tuple(one.class_name for one in self.added),
+            scores=np.array([one.score for one in self.added]),
+            boxes=np.array([one.box for one in self.added]).reshape(-1, 9),
+            pinned=np.array([one.status == HUMAN for one in self.added], bool),
+            attributes=(),
+            kinematics=None,
+        )
+
+    def renamed(self, given: BoxArray) -> BoxArray:
+        """Return the boxes of an array with their new ids and classes."""
+        names = tuple(self.track_ids), tuple(self.class_names)
+        return replace(given, track_ids=names[0], class_names=names[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,118 +215,176 @@ def complete(
     road in each; arrays outside of the fixed frame stay as they are.
 
     """
-    steps = config.complete
-    if steps.stitch:
-        results = _exchanged(given, results, fixed_frame, decided)
-    tracks = tracklets_of(results, num_points, fixed_frame, config, decided.names)
-    plan = unchanged_plan(given)
-    if steps.prune:  # first: a duplicate could be stitched to its object
-        found = _doubted(tracks, duplicates(tracks, config), given, decided)
-        tracks = _rejected(tracks, found, Reason.DUPLICATE, plan)
-    ambiguous: list[tuple[str, str]] = []
-    if steps.stitch:
-        tracks, left = join_turns(tracks, config, decided)
-        found = _doubted(left, {one.track_id for one in left}, given, decided)
-        _rejected(left, found, Reason.DUPLICATE, plan)
-        tracks, ambiguous = stitch(tracks, config, decided)
-    if steps.static:
-        tracks = join_static(tracks, config, decided)
-    if steps.prune:  # last: a fragment of an object may look like a ghost
-        found = _doubted(tracks, ghosts(tracks), given, decided)
-        tracks = _rejected(tracks, found, Reason.GHOST, plan)
-    of_track = {one.track_id: DecidedTrack.of(one, given, decided) for one in tracks}
-    for track in tracks:
-        _place(track, '', plan, of_track[track.track_id])
-    array_of = _array_of_stamp(given, fixed_frame)
-    stamps_ns = np.array(sorted(array_of), np.int64)
-    if steps.fill:
-        detected = [one for one in given if one.frame_id == fixed_frame and len(one.boxes)]
-        detected_ns = np.unique(np.array([one.stamp_ns for one in detected], np.int64))
-        rare = _doubted(tracks, rarely_detected(tracks, detected_ns, config), given, decided)
-        _fill(tracks, rare, stamps_ns, plan, array_of, config, of_track)
-    if steps.extend:
-        _extend(tracks, stamps_ns, plan, array_of, config, of_track)
-    _note_ambiguous(plan, ambiguous)
-    return plan
+    return _Completer(given, fixed_frame, config, decided).completed(results, num_points)
 
 
-def _exchanged(
-    given: Sequence[BoxArray],
-    results: Sequence[RefinedBoxes],
-    fixed_frame: str,
-    decided: Decided,
-) -> list[RefinedBoxes]:
-    """Return results in which tracks that changed places have their ids back, but named ones."""
-    arrays = [array for array in given if array.frame_id == fixed_frame]
-    if not arrays:
-        return [*results]
-    boxes = np.concatenate([array.boxes for array in arrays])
-    names = [name for array in arrays for name in array.track_ids]
-    is_free = np.array([name not in decided.names for name in names], bool)
-    valid = np.flatnonzero(is_valid_box(boxes) & is_free)
-    stamps_ns = np.repeat([a.stamp_ns for a in arrays], [len(a.track_ids) for a in arrays])
-    tracks = by_id([names[row] for row in valid], stamps_ns[valid], boxes[valid, : Y + 1])
-    found = id_switches(tracks)
-    exchanged = []
-    for result in results:
-        ids = result.boxes.track_ids
-        for switch in reversed(found):
-            ids = tuple(switch.exchanged(name, result.boxes.stamp_ns) for name in ids)
-        exchanged.append(replace(result, boxes=replace(result.boxes, track_ids=ids)))
-    return exchanged
+class _Completer:
+    """The steps, with the input, the decisions and the plan that all of them share."""
 
+    def __init__(
+        self, given: Sequence[BoxArray], fixed_frame: str, config: Config, decided: Decided
+    ) -> None:
+        self._given = given
+        self._fixed_frame = fixed_frame
+        self._config = config
+        self._decided = decided
+        self._plan = unchanged_plan(given)
+        self._of_track: dict[str, DecidedTrack] = {}
+        self._array_of = _array_of_stamp(given, fixed_frame)
+        self._stamps_ns = np.array(sorted(self._array_of), np.int64)
 
-def _doubted(
-    tracks: Sequence[Tracklet], names: set[str], given: Sequence[BoxArray], decided: Decided
-) -> set[str]:
-    """Return those of `names` whose track no person has accepted, or given a box in the input."""
-    return {
-        track.track_id
-        for track in tracks
-        if track.track_id in names
-        and not DecidedTrack.of(track, given, decided).is_accepted()
-        and not _is_pinned(track, given)
-    }
+    def completed(
+        self, results: Sequence[RefinedBoxes], num_points: Sequence[Ints]
+    ) -> CompletionPlan:
+        """Return the plan, from the results of the input."""
+        config, decided = self._config, self._decided
+        steps = config.complete
+        if steps.stitch:
+            results = self._exchanged(results)
+        tracks = tracklets_of(results, num_points, self._fixed_frame, config, decided.names)
+        if steps.prune:  # first: a duplicate could be stitched to its object
+            tracks = self._rejected(tracks, duplicates(tracks, config), Reason.DUPLICATE)
+        ambiguous: list[tuple[str, str]] = []
+        if steps.stitch:
+            tracks, left = join_turns(tracks, config, decided)
+            self._rejected(left, {one.track_id for one in left}, Reason.DUPLICATE)
+            tracks, ambiguous = stitch(tracks, config, decided)
+        if steps.static:
+            tracks = join_static(tracks, config, decided)
+        if steps.prune:  # last: a fragment of an object may look like a ghost
+            tracks = self._rejected(tracks, ghosts(tracks), Reason.GHOST)
+        for track in tracks:
+            self._of_track[track.track_id] = DecidedTrack.of(track, self._given, decided)
+            self._place(track)
+        if steps.fill:
+            self._fill(tracks)
+        if steps.extend:
+            self._extend(tracks)
+        _note_ambiguous(self._plan, ambiguous)
+        return self._plan
 
+    def _exchanged(self, results: Sequence[RefinedBoxes]) -> Sequence[RefinedBoxes]:
+        """Return results with the ids back that tracks have exchanged, but for named tracks."""
+        arrays = self._arrays()
+        if not arrays:
+            return results
+        boxes = np.concatenate([array.boxes for array in arrays])
+        names = [name for array in arrays for name in array.track_ids]
+        is_free = np.array([name not in self._decided.names for name in names], bool)
+        valid = np.flatnonzero(is_valid_box(boxes) & is_free)
+        stamps_ns = np.repeat([a.stamp_ns for a in arrays], [len(a.track_ids) for a in arrays])
+        tracks = by_id([names[row] for row in valid], stamps_ns[valid], boxes[valid, : Y + 1])
+        found = id_switches(tracks)
+        exchanged = []
+        for result in results:
+            ids = result.boxes.track_ids
+            for switch in reversed(found):
+                ids = tuple(switch.exchanged(name, result.boxes.stamp_ns) for name in ids)
+            exchanged.append(replace(result, boxes=replace(result.boxes, track_ids=ids)))
+        return exchanged
 
-def _is_pinned(track: Tracklet, given: Sequence[BoxArray]) -> bool:
-    """Return whether a box of a track is held as it is in the input."""
-    pinned = [(given[index].pinned, row) for index, row in track.places]
-    return any(held is not None and bool(held[row]) for held, row in pinned)
+    def _arrays(self) -> list[BoxArray]:
+        """Return the arrays of the input in the fixed frame."""
+        return [array for array in self._given if array.frame_id == self._fixed_frame]
 
+    def _is_held(self, track: Tracklet) -> bool:
+        """Return whether a person has accepted a track, or given it a box in the input."""
+        pinned = [(self._given[index].pinned, row) for index, row in track.places]
+        return DecidedTrack.of(track, self._given, self._decided).is_accepted() or any(
+            held is not None and bool(held[row]) for held, row in pinned
+        )
 
-def _rejected(
-    tracks: list[Tracklet], names: set[str], reason: str, plan: CompletionPlan
-) -> list[Tracklet]:
-    """Reject the boxes of some tracks in the plan; return the other tracks."""
-    for track in tracks:
-        if track.track_id in names:
-            _place(track, reason, plan)
-    return [track for track in tracks if track.track_id not in names]
+    def _rejected(
+        self, tracks: Sequence[Tracklet], names: set[str], reason: str
+    ) -> list[Tracklet]:
+        """Reject those of `names` that no person holds; return the other tracks."""
+        left = []
+        for track in tracks:
+            if track.track_id in names and not self._is_held(track):
+                self._place(track, reason)
+            else:
+                left.append(track)
+        return left
 
+    def _place(self, track: Tracklet, reason: str = '') -> None:
+        """
+        Write id and class of a track to its input boxes; reject them where there is a reason.
 
-def _place(
-    track: Tracklet, reason: str, plan: CompletionPlan, decided: DecidedTrack | None = None
-) -> None:
-    """
-    Write id and class of a track to its input boxes; reject them where there is a reason.
+        Boxes whose class a person has decided keep it, unless they are rejected.
 
-    Boxes whose class a person has `decided` keep it.
+        """
+        steps = TrackSteps(track.track_id, track.class_name, track.fragments)
+        own = self._of_track.get(track.track_id)
+        for (index, row), stamp_ns in zip(track.places, track.stamps_ns.tolist(), strict=True):
+            array = self._plan.arrays[index]
+            decided = '' if own is None else own.class_name(stamp_ns)
+            class_name = decided or track.class_name
+            steps.reclassified += array.class_names[row] != class_name
+            array.track_ids[row] = track.track_id
+            array.class_names[row] = class_name
+            if reason:
+                array.rejected[row] = reason
+                steps.rejected += 1
+        self._plan.tracks.append(steps)
 
-    """
-    steps = TrackSteps(track.track_id, track.class_name, track.fragments)
-    for (index, row), stamp_ns in zip(track.places, track.stamps_ns.tolist(), strict=True):
-        array = plan.arrays[index]
-        class_name = track.class_name
-        if decided is not None:
-            class_name = decided.class_name(stamp_ns) or class_name
-        steps.reclassified += array.class_names[row] != class_name
-        array.track_ids[row] = track.track_id
-        array.class_names[row] = class_name
-        if reason:
-            array.rejected[row] = reason
-            steps.rejected += 1
-    plan.tracks.append(steps)
+    def _add(self, boxes: AddedBoxes, track: Tracklet, extension: int = -1) -> None:
+        """Add boxes of a track to the arrays of their stamps, as a person has set them."""
+        own = self._of_track[track.track_id]
+        for i, stamp_ns in enumerate(boxes.stamps_ns.tolist()):
+            pin = own.pin(stamp_ns)
+            self._plan.arrays[self._array_of[stamp_ns]].added.append(
+                AddedBox(
+                    track.track_id,
+                    own.class_name(stamp_ns) or track.class_name,
+                    boxes.status if pin is None else HUMAN,
+                    boxes.boxes[i] if pin is None else pin,
+                    boxes.covariances[i],
+                    float(boxes.scores[i]),
+                    extension if pin is None else -1,
+                )
+            )
+
+    def _fill(self, tracks: Sequence[Tracklet]) -> None:
+        """Add the missing boxes of tracks; of rarely detected ones those of a person alone."""
+        detected = [one.stamp_ns for one in self._arrays() if len(one.boxes)]
+        rare = rarely_detected(tracks, np.unique(np.array(detected, np.int64)), self._config)
+        steps = {one.track_id: one for one in self._plan.tracks}
+        for track in tracks:
+            own = self._of_track[track.track_id]
+            gaps = [
+                own.left(gap, is_extension=False)
+                for gap in fill(track, self._stamps_ns, self._config)
+            ]
+            missing_ns = [stamp_ns for gap in gaps for stamp_ns in gap.stamps_ns.tolist()]
+            is_rare = track.track_id in rare and not self._is_held(track)
+            if is_rare and not own.is_accepted(missing_ns):
+                steps[track.track_id].unfilled = len(missing_ns)
+                continue
+            for gap in gaps:
+                self._add(gap, track)
+
+    def _extend(self, tracks: Sequence[Tracklet]) -> None:
+        """Add the candidates of all extensions, as far as no other track owns their place."""
+        owned: dict[int, list[Floats]] = {}
+        for track in tracks:
+            for stamp_ns, box in zip(track.stamps_ns.tolist(), track.boxes, strict=True):
+                owned.setdefault(stamp_ns, []).append(box)
+        for stamp_ns, index in self._array_of.items():
+            added = self._plan.arrays[index].added
+            owned.setdefault(stamp_ns, []).extend(one.box for one in added)
+        extensions = self._plan.extensions
+        for track in tracks:
+            own = self._of_track[track.track_id]
+            for candidates in extend(track, self._stamps_ns, self._config):
+                first = candidates.take(range(num_free(candidates, owned)))
+                free = own.left(first, is_extension=True)
+                if not len(free.boxes):
+                    continue
+                is_last = int(free.stamps_ns[0]) > track.last_ns
+                is_open = [own.pin(stamp_ns) is None for stamp_ns in free.stamps_ns.tolist()]
+                at_end = points_at_end(track, is_last)
+                extensions.append(_Extension(track.track_id, free.stamps_ns[is_open], at_end))
+                self._add(free, track, len(extensions) - 1)
 
 
 def _array_of_stamp(given: Sequence[BoxArray], fixed_frame: str) -> dict[int, int]:
@@ -338,80 +396,6 @@ def _array_of_stamp(given: Sequence[BoxArray], fixed_frame: str) -> dict[int, in
             array_of[array.stamp_ns] = index
             newest_ns = array.stamp_ns
     return array_of
-
-
-def _add(
-    boxes: AddedBoxes,
-    track: Tracklet,
-    plan: CompletionPlan,
-    array_of: dict[int, int],
-    decided: DecidedTrack,
-    extension: int = -1,
-) -> None:
-    """Add boxes of a track to the arrays of their stamps; those that a person has set as such."""
-    for i, stamp_ns in enumerate(boxes.stamps_ns.tolist()):
-        pin = decided.pin(stamp_ns)
-        plan.arrays[array_of[stamp_ns]].added.append(
-            AddedBox(
-                track.track_id,
-                decided.class_name(stamp_ns) or track.class_name,
-                boxes.status if pin is None else HUMAN,
-                boxes.boxes[i] if pin is None else pin,
-                boxes.covariances[i],
-                float(boxes.scores[i]),
-                extension if pin is None else -1,
-            )
-        )
-
-
-def _fill(
-    tracks: Sequence[Tracklet],
-    rare: set[str],
-    stamps_ns: Ints,
-    plan: CompletionPlan,
-    array_of: dict[int, int],
-    config: Config,
-    of_track: Mapping[str, DecidedTrack],
-) -> None:
-    """Add the missing boxes of tracks, but of `rare` ones only where a person has set one."""
-    steps = {one.track_id: one for one in plan.tracks}
-    for track in tracks:
-        own = of_track[track.track_id]
-        gaps = [own.left(gap, is_extension=False) for gap in fill(track, stamps_ns, config)]
-        missing_ns = [stamp_ns for gap in gaps for stamp_ns in gap.stamps_ns.tolist()]
-        if track.track_id in rare and not own.is_accepted(missing_ns):
-            steps[track.track_id].unfilled = len(missing_ns)
-            continue
-        for gap in gaps:
-            _add(gap, track, plan, array_of, own)
-
-
-def _extend(
-    tracks: Sequence[Tracklet],
-    stamps_ns: Ints,
-    plan: CompletionPlan,
-    array_of: dict[int, int],
-    config: Config,
-    of_track: Mapping[str, DecidedTrack],
-) -> None:
-    """Add the candidates of all extensions, as far as no other track owns their place."""
-    owned: dict[int, list[Floats]] = {}
-    for track in tracks:
-        for stamp_ns, box in zip(track.stamps_ns.tolist(), track.boxes, strict=True):
-            owned.setdefault(stamp_ns, []).append(box)
-    for stamp_ns, index in array_of.items():
-        owned.setdefault(stamp_ns, []).extend(added.box for added in plan.arrays[index].added)
-    for track in tracks:
-        for candidates in extend(track, stamps_ns, config):
-            own = of_track[track.track_id]
-            free = own.left(candidates.first(num_free(candidates, owned)), is_extension=True)
-            if not len(free.boxes):
-                continue
-            is_last = int(free.stamps_ns[0]) > track.last_ns
-            is_open = [own.pin(stamp_ns) is None for stamp_ns in free.stamps_ns.tolist()]
-            at_end = points_at_end(track, is_last)
-            plan.extensions.append(_Extension(track.track_id, free.stamps_ns[is_open], at_end))
-            _add(free, track, plan, array_of, own, len(plan.extensions) - 1)
 
 
 def _note_ambiguous(plan: CompletionPlan, ambiguous: Sequence[tuple[str, str]]) -> None:
@@ -432,45 +416,25 @@ def _finished(
     keep: Sequence[bool],
 ) -> RefinedBoxes:
     """Return the result of one array: the input boxes in their order, then the added ones."""
-    n = len(given.track_ids)
-    taken = [row for row in range(n) if row not in array.rejected]
-    kept = [i for i, is_kept in enumerate(keep) if is_kept]
-    rows = [len(taken) + i for i in kept]  # of the added boxes, among the registered ones
-
-    def completed(values: NDArray[Any], of_rejected: NDArray[Any]) -> NDArray[Any]:
-        column = np.broadcast_to(of_rejected, (n, *values.shape[1:])).astype(values.dtype)
-        column[taken] = values[: len(taken)]
-        return np.concatenate([column, values[rows]])
-
-    covariances = completed(registered.covariances, np.eye(6))
-    boxes = completed(registered.boxes.boxes, given.boxes)
-    for i, row in enumerate(rows):
-        added = array.added[kept[i]]
+    first = len(given.track_ids) - len(array.rejected)  # of the added ones that were registered
+    rows = [first + i for i, is_kept in enumerate(keep) if is_kept]
+    found = registered.take([*range(first), *rows])
+    boxes, covariances = found.boxes.boxes.copy(), found.covariances.copy()
+    status, reasons = list(found.status), list(found.reasons)
+    for i, row in enumerate(rows, first):
+        added = array.added[row - first]
         if added.status == HUMAN:
-            boxes[n + i] = added.box
-        if not num_points[row] or registered.status[row] == KEPT:
-            covariances[n + i] = added.covariance  # of the motion model
-    status = [REJECTED] * n
-    reasons = [array.rejected.get(row, '') for row in range(n)]
-    for i, row in enumerate(taken):
-        status[row] = registered.status[i]
-        reasons[row] = registered.reasons[i]
-    return RefinedBoxes(
-        replace(
-            given,
-            track_ids=(*array.track_ids, *(array.added[i].track_id for i in kept)),
-            class_names=(*array.class_names, *(array.added[i].class_name for i in kept)),
-            scores=np.append(given.scores, [array.added[i].score for i in kept]),
-            boxes=boxes,
-            pinned=None,
-            kinematics=completed(registered.boxes.known_kinematics, np.zeros((), KINEMATICS)),
-        ),
-        (*status, *(array.added[i].status for i in kept)),
-        (*reasons, *('',) * len(kept)),
-        completed(registered.num_points, np.zeros(n)),
-        covariances,
-        registered.is_final,
-        completed(registered.extent_covariances, np.eye(3)),
-        completed(registered.face_distances, np.zeros(6)),
-        completed(registered.near_points, np.zeros(2, np.int64)),
+            boxes[i] = added.box
+        if not num_points[row] or status[i] == KEPT:
+            covariances[i] = added.covariance  # of the motion model
+        status[i], reasons[i] = added.status, ''
+    found = replace(
+        found,
+        boxes=replace(found.boxes, boxes=boxes),
+        status=tuple(status),
+        reasons=tuple(reasons),
+        covariances=covariances,
     )
+    gone = sorted(array.rejected)
+    words = tuple(array.rejected[row] for row in gone)
+    return with_rejected(found, array.renamed(given).take(gone), gone, words)

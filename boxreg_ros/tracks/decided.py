@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 from boxreg_ros.core.follow import FollowedTrack
@@ -16,62 +16,48 @@ class Decided(Protocol):
     """
     Decisions about boxes, named by the id that their track has in the input, and their stamp.
 
-    They also hold for boxes that the input does not have, and that a step would add.
+    They also hold for boxes that the input does not have, and that a step would add. What is not
+    implemented is not decided.
 
     """
 
     @property
     def names(self) -> Collection[str]:
         """Return the ids that a person gave: each names one object."""
+        return ()
 
     @property
     def apart(self) -> Collection[str]:
         """Return those of `names` that the input does not have: nothing is joined to them."""
+        return ()
 
     def input_id(self, track_id: str, stamp_ns: int) -> str:
         """Return the id in the input of a box that is registered as one of `track_id`."""
-
-    def track_id(self, input_id: str, stamp_ns: int) -> str:
-        """Return the id that was given; empty for none."""
-
-    def class_name(self, input_id: str, stamp_ns: int) -> str:
-        """Return the class that was given; empty for none."""
-
-    def is_left_out(self, input_id: str, stamp_ns: int) -> bool:
-        """Return whether the box, which the input does not have, is deleted or rejected."""
-
-    def is_accepted(self, input_id: str, stamp_ns: int) -> bool:
-        """Return whether the box is accepted or pinned."""
-
-    def pin(self, input_id: str, stamp_ns: int) -> Floats | None:
-        """Return the box (9,) in the fixed frame that a person has set; None for none."""
-
-
-class Nothing:
-    """No decisions."""
-
-    names: Collection[str] = ()
-    apart: Collection[str] = ()
-
-    def input_id(self, track_id: str, stamp_ns: int) -> str:
-        """Return the id itself."""
         return track_id
 
     def track_id(self, input_id: str, stamp_ns: int) -> str:
-        """Return none."""
+        """Return the id that was given; empty for none."""
         return ''
 
-    class_name = track_id
+    def class_name(self, input_id: str, stamp_ns: int) -> str:
+        """Return the class that was given; empty for none."""
+        return ''
 
     def is_left_out(self, input_id: str, stamp_ns: int) -> bool:
-        """Return False."""
+        """Return whether the box, which the input does not have, is deleted or rejected."""
         return False
 
-    is_accepted = is_left_out
+    def is_accepted(self, input_id: str, stamp_ns: int) -> bool:
+        """Return whether the box is accepted or pinned."""
+        return False
 
     def pin(self, input_id: str, stamp_ns: int) -> Floats | None:
-        """Return none."""
+        """Return the box (9,) in the fixed frame that a person has set; None for none."""
         return None
+
+
+class Nothing(Decided):
+    """No decisions."""
 
 
 NOTHING = Nothing()
@@ -176,10 +162,4 @@ def with_decisions(track: FollowedTrack, decided: Decided) -> FollowedTrack:
         for i in range(first, end)
         if i in seeds or not (is_other[i] or of_track.is_left_out(stamps_ns[i]))
     ]
-    return replace(
-        track,
-        rows=track.rows[left],
-        stamps_ns=track.stamps_ns[left],
-        boxes=track.boxes[left],
-        status=tuple(track.status[i] for i in left),
-    )
+    return track.take(left)

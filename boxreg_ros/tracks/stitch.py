@@ -202,11 +202,12 @@ def join_turns(
                 other, tracklet, config
             ):
                 is_common = np.isin(tracklet.stamps_ns, other.stamps_ns)
-                parts = [other, tracklet.take(~is_common)] if not is_common.all() else [other]
+                common, own = (tracklet.take(np.flatnonzero(x)) for x in (is_common, ~is_common))
+                parts = [other, own] if len(own.stamps_ns) else [other]
                 whole[index] = joined_tracklets(parts, decided.names)
                 (free,) = {one.track_id for one in pair} - {whole[index].track_id}
-                if is_common.any():
-                    left.append(replace(tracklet.take(is_common), track_id=free))
+                if len(common.stamps_ns):
+                    left.append(replace(common, track_id=free))
                 break
         else:
             whole.append(tracklet)

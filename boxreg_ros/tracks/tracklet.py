@@ -7,13 +7,15 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from math import inf
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.core.motion import EndMotion, motion_at, UNKNOWN_SPEED_DEVIATION
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import (
     BOX_CENTER,
+    Columns,
+    concatenated,
     Floats,
     Ints,
     is_valid_box,
@@ -27,7 +29,6 @@ from boxreg_ros.structures import (
     YAW,
 )
 import numpy as np
-from numpy.typing import NDArray
 
 SWITCH_SPEED = 10.0
 """Deviation from constant velocity beyond half a length that is another object [m/s]. Derived: as
@@ -44,8 +45,12 @@ class Place(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Tracklet:
+class Tracklet(Columns):
     """Boxes of one object in the order of stamps; at most one per stamp."""
+
+    COLUMNS: ClassVar[tuple[str, ...]] = (
+        *('places', 'stamps_ns', 'boxes', 'covariances', 'scores', 'num_points'),
+    )
 
     track_id: str
     class_name: str  # the most frequent one of the boxes
@@ -67,19 +72,6 @@ class Tracklet:
         """Return the stamp of the last box [ns]."""
         return int(self.stamps_ns[-1])
 
-    def take(self, chosen: NDArray[np.bool_]) -> Tracklet:
-        """Return the boxes where `chosen` (n,) is True as a tracklet."""
-        rows = np.flatnonzero(chosen)
-        return replace(
-            self,
-            places=tuple(self.places[row] for row in rows),
-            stamps_ns=self.stamps_ns[rows],
-            boxes=self.boxes[rows],
-            covariances=self.covariances[rows],
-            scores=self.scores[rows],
-            num_points=self.num_points[rows],
-        )
-
     def model(self, config: Config) -> ClassConfig:
         """Return the settings of its kind of object."""
         return config.class_config(self.class_name)
@@ -88,23 +80,16 @@ class Tracklet:
 def joined_tracklets(tracklets: Sequence[Tracklet], names: Collection[str] = ()) -> Tracklet:
     """Return tracklets of one object as one, under an id of `names`, else that of the longest."""
     longest = max(tracklets, key=lambda one: (one.track_id in names, len(one.stamps_ns)))
-    stamps_ns = np.concatenate([tracklet.stamps_ns for tracklet in tracklets])
-    order = np.argsort(stamps_ns, kind='stable')
-    places = [place for tracklet in tracklets for place in tracklet.places]
     votes: Counter[str] = Counter()
     for tracklet in tracklets:
         votes[tracklet.class_name] += len(tracklet.stamps_ns)
-    return Tracklet(
-        longest.track_id,
-        votes.most_common(1)[0][0],
-        tuple(places[row] for row in order),
-        stamps_ns[order],
-        np.concatenate([tracklet.boxes for tracklet in tracklets])[order],
-        np.concatenate([tracklet.covariances for tracklet in tracklets])[order],
-        np.concatenate([tracklet.scores for tracklet in tracklets])[order],
-        np.concatenate([tracklet.num_points for tracklet in tracklets])[order],
-        sum(tracklet.fragments for tracklet in tracklets),
+    whole = replace(
+        concatenated(tracklets),
+        track_id=longest.track_id,
+        class_name=votes.most_common(1)[0][0],
+        fragments=sum(tracklet.fragments for tracklet in tracklets),
     )
+    return whole.take(np.argsort(whole.stamps_ns, kind='stable'))
 
 
 def tracklets_of(
@@ -124,22 +109,38 @@ def tracklets_of(
     above the road in each box of each array.
 
     """
-    places_of: dict[str, list[Place]] = {}
-    for index, result in enumerate(results):
-        if result.boxes.frame_id != fixed_frame:
-            continue
-        is_valid = is_valid_box(result.boxes.boxes)
-        for row, track_id in enumerate(result.boxes.track_ids):
-            if track_id and is_valid[row]:
-                places_of.setdefault(track_id, []).append(Place(index, row))
+    own = [(i, one) for i, one in enumerate(results) if one.boxes.frame_id == fixed_frame]
+    if not own:
+        return []
+    arrays = [one.boxes for _, one in own]
+    every = Tracklet(
+        '',
+        '',
+        tuple(Place(index, row) for index, one in own for row in range(len(one.status))),
+        np.repeat([one.stamp_ns for one in arrays], [len(one.boxes) for one in arrays]),
+        np.concatenate([one.boxes for one in arrays]),
+        np.concatenate([one.covariances for _, one in own]),
+        np.concatenate([one.scores for one in arrays]),
+        np.concatenate([num_points[index] for index, _ in own]),
+    )
+    track_ids = [name for one in arrays for name in one.track_ids]
+    class_names = [name for one in arrays for name in one.class_names]
+    is_kept = np.array([word == KEPT for _, one in own for word in one.status], bool)
+    rows_of: dict[str, list[int]] = {}
+    for row in np.flatnonzero(is_valid_box(every.boxes)).tolist():
+        if track_ids[row]:
+            rows_of.setdefault(track_ids[row], []).append(row)
     tracklets = []
-    taken = set(places_of)
-    for track_id, places in places_of.items():
-        parts = _split(places, results, inf if track_id in names else config.max_gap)
+    taken = set(rows_of)
+    for track_id, rows in rows_of.items():
+        parts = _split(every, rows, inf if track_id in names else config.max_gap)
         parts.sort(key=len, reverse=True)  # stable: of equal ones the first keeps the id
         for part in parts:
             name = track_id if part is parts[0] else unused_id(track_id, taken)
-            tracklets.append(_tracklet(name, part, results, num_points, config))
+            class_name = Counter(class_names[row] for row in part).most_common(1)[0][0]
+            tracklet = replace(every.take(part), track_id=name, class_name=class_name)
+            tracklet.covariances[is_kept[part]] = _input_covariance(tracklet.model(config))
+            tracklets.append(tracklet)
     return sorted(tracklets, key=lambda tracklet: tracklet.first_ns)
 
 
@@ -154,8 +155,8 @@ def unused_id(track_id: str, taken: set[str]) -> str:
 class _Part:
     """An open part of an id, with its last two boxes."""
 
-    def __init__(self, place: Place, stamp_ns: int, box: Floats) -> None:
-        self.places = [place]
+    def __init__(self, row: int, stamp_ns: int, box: Floats) -> None:
+        self.rows = [row]
         self._stamp_ns = stamp_ns
         self._box = box
         self._velocity: Floats | None = None  # [m/s]
@@ -173,58 +174,27 @@ class _Part:
         gate = self._box[LENGTH] / 2 + speed * seconds
         return float(np.linalg.norm((box[BOX_CENTER] - predicted)[:2]) / gate)
 
-    def add(self, place: Place, stamp_ns: int, box: Floats) -> None:
+    def add(self, row: int, stamp_ns: int, box: Floats) -> None:
+        """Add a box."""
         seconds = (stamp_ns - self._stamp_ns) * 1e-9
         self._velocity = (box - self._box)[BOX_CENTER] / seconds
-        self.places.append(place)
+        self.rows.append(row)
         self._stamp_ns = stamp_ns
         self._box = box
 
 
-def _split(
-    places: Iterable[Place], results: Sequence[RefinedBoxes], max_gap: float
-) -> list[list[Place]]:
+def _split(every: Tracklet, rows: Iterable[int], max_gap: float) -> list[list[int]]:
     """Return the boxes of one id as parts that are one object each; `inf` joins all in reach."""
-
-    def stamp_of(place: Place) -> int:
-        return results[place.array].boxes.stamp_ns
-
     parts: list[_Part] = []
-    for place in sorted(places, key=stamp_of):
-        stamp_ns = stamp_of(place)
-        box = results[place.array].boxes.boxes[place.row]
+    for row in sorted(rows, key=every.stamps_ns.__getitem__):
+        stamp_ns, box = int(every.stamps_ns[row]), every.boxes[row]
         excess = [part.excess(stamp_ns, box, max_gap) for part in parts]
         best = int(np.argmin(excess)) if excess else -1
         if excess and excess[best] <= 1:
-            parts[best].add(place, stamp_ns, box)
+            parts[best].add(row, stamp_ns, box)
         else:
-            parts.append(_Part(place, stamp_ns, box))
-    return [part.places for part in parts]
-
-
-def _tracklet(
-    track_id: str,
-    places: Sequence[Place],
-    results: Sequence[RefinedBoxes],
-    num_points: Sequence[Ints],
-    config: Config,
-) -> Tracklet:
-    """Return the boxes at some places as a tracklet."""
-    classes = Counter(results[place.array].boxes.class_names[place.row] for place in places)
-    tracklet = Tracklet(
-        track_id,
-        classes.most_common(1)[0][0],
-        tuple(places),
-        np.array([results[place.array].boxes.stamp_ns for place in places]),
-        np.array([results[place.array].boxes.boxes[place.row] for place in places]),
-        np.array([results[place.array].covariances[place.row] for place in places]),
-        np.array([results[place.array].boxes.scores[place.row] for place in places]),
-        np.array([num_points[place.array][place.row] for place in places]),
-    )
-    is_kept = [results[place.array].status[place.row] == KEPT for place in places]
-    covariances = tracklet.covariances.copy()
-    covariances[is_kept] = _input_covariance(tracklet.model(config))
-    return replace(tracklet, covariances=covariances)
+            parts.append(_Part(row, stamp_ns, box))
+    return [part.rows for part in parts]
 
 
 def _input_covariance(model: ClassConfig) -> Floats:
@@ -281,22 +251,13 @@ def between(before: EndMotion, after: EndMotion, stamps_ns: Ints) -> Floats:
 
 
 @dataclass(frozen=True, slots=True)
-class AddedBoxes:
+class AddedBoxes(Columns):
     """Successive boxes that a step adds to one track, in the fixed frame."""
+
+    COLUMNS: ClassVar[tuple[str, ...]] = ('stamps_ns', 'boxes', 'covariances', 'scores')
 
     status: str  # ``interpolated`` or ``extended``
     stamps_ns: Ints  # (n,) [ns]; of an extension from the track outwards
     boxes: Floats  # (n, 9) on the motion model
     covariances: Floats  # (n, 6, 6) of x y z roll pitch yaw on the motion model
     scores: Floats  # (n,) detector confidence, from the neighbours
-
-    def first(self, count: int) -> AddedBoxes:
-        """Return the first `count` of the boxes."""
-        return self.take(range(count))
-
-    def take(self, rows: Sequence[int]) -> AddedBoxes:
-        """Return some of the boxes."""
-        at = np.array(rows, np.int64)
-        return AddedBoxes(
-            self.status, self.stamps_ns[at], self.boxes[at], self.covariances[at], self.scores[at]
-        )

@@ -8,7 +8,7 @@ from boxreg_ros.errors import ConfigError, ShapeError
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.simulation.noise import detector_noise
 from boxreg_ros.structures import is_valid_box
-from measure.drives import Drive
+from measure.drives import Drive, tracks_of
 import numpy as np
 import pytest
 from scenes import cut, drive, simulated, stamps, track_of
@@ -56,7 +56,7 @@ def test_refine_beats_the_paper_in_its_experiment():
     # An SUV on the path of Eq. 10 with the initial errors of Table I: the input has a mean IoU
     # of about 0.6. The robust objective must exceed 0.8, and the paper's objective.
     scene = simulated('paper', 1, 20)
-    (track,), truth = scene.tracks(), scene.truth.boxes
+    (track,), truth = tracks_of(scene), scene.truth.boxes
     few = {'sampling.points': 100}
     ours = iou_3d(only(track, Config().updated(few)).boxes, truth).mean()
     paper = only(track, Config(objective='paper').updated(few))
@@ -618,7 +618,7 @@ def normalised_errors(scenario, seeds, variables):
     for seed in seeds:
         scene = simulated(scenario, seed)
         truth = truth_of(scene)
-        tracks = scene.tracks()
+        tracks = tracks_of(scene)
         for track, refined in zip(tracks, refine(tracks), strict=True):
             for i, stamp_ns in enumerate(track.stamps_ns.tolist()):
                 true = truth[stamp_ns, track.track_id]
@@ -653,7 +653,7 @@ def test_track_estimates_beat_final_ones_at_half_the_rate():
     for seed in range(2):
         scene = simulated('street', seed)
         truth = truth_of(scene)
-        tracks = [cut(track, slice(None, None, 2)) for track in scene.tracks()]
+        tracks = [cut(track, slice(None, None, 2)) for track in tracks_of(scene)]
         lagged, whole = (refine(tracks, Config(estimate=e)) for e in ('final', 'track'))
         for track, *found in zip(tracks, lagged, whole, strict=True):
             true = [truth[stamp_ns, track.track_id] for stamp_ns in track.stamps_ns.tolist()]

@@ -5,6 +5,7 @@ from boxreg_ros.core.method.arrays import BOX_POSE
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.residuals import TERMS
 from boxreg_ros.core.method.rigid_shape import agree, empty_shape_work
+from measure.drives import tracks_of
 import numpy as np
 import pytest
 from scenes import problem_of, simulated
@@ -95,7 +96,7 @@ def test_rigid_shape_improves_relative_poses(seed):
     # A body of which each sweep shows a part: errors that are not common to all boxes fall by a
     # quarter at least, against faces alone.
     scene = simulated('paper', seed)
-    (track,) = scene.tracks()
+    (track,) = tracks_of(scene)
 
     def spread(config):
         (refined,) = refine([track], config)
