@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from boxreg_ros.core.refine import Track
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
@@ -37,38 +36,6 @@ class SimulatedScene:
         """Return the noisy boxes in frame ``odom``."""
         pairs = zip(self.detections, self.T_fixed_sensor, strict=True)
         return [boxes_to_frame(boxes, T, FIXED_FRAME) for boxes, T in pairs]
-
-    def tracks(self, margin: float = 1.5) -> list[Track]:
-        """Return the noisy boxes as tracks, with the points within `margin` [m] of each."""
-        arrays = self.fixed_detections()
-        rows: dict[str, list[tuple[int, int]]] = {}  # sweep and row of each box of a track
-        for i, array in enumerate(arrays):
-            for j, track_id in enumerate(array.track_ids):
-                rows.setdefault(track_id, []).append((i, j))
-        points = [
-            sweep.points @ T[:3, :3].T + T[:3, 3]
-            for sweep, T in zip(self.sweeps, self.T_fixed_sensor, strict=True)
-        ]
-        tracks = []
-        for track_id, places in rows.items():
-            first, row = places[0]
-            boxes = np.array([arrays[i].boxes[j] for i, j in places])
-            near = [
-                points[i][is_near(points[i], box, margin)]
-                for (i, _), box in zip(places, boxes, strict=True)
-            ]
-            tracks.append(
-                Track(
-                    track_id,
-                    arrays[first].class_names[row],
-                    np.array([arrays[i].stamp_ns for i, _ in places]),
-                    boxes,
-                    near,
-                    np.array([self.T_fixed_sensor[i, :3, 3] for i, _ in places]),
-                    np.array([arrays[i].scores[j] for i, j in places]),
-                )
-            )
-        return tracks
 
 
 def make_scene(

@@ -17,7 +17,7 @@ from boxreg_ros.io.transforms import sweep_to_frame
 from boxreg_ros.offline import drive
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.noise import detector_noise
-from boxreg_ros.simulation.scene import SimulatedScene
+from boxreg_ros.simulation.scene import is_near, SimulatedScene
 from boxreg_ros.structures import (
     BOX_EXTENT,
     BoxArray,
@@ -149,3 +149,36 @@ def _main_origin(sweep: Sweep, rows: Ints) -> Floats:
         return sweep.origin
     row = int(np.bincount(sweep.sensors[rows]).argmax())
     return np.asarray(_origins(sweep)[row])
+
+
+def tracks_of(scene: SimulatedScene, margin: float = 1.5) -> list[Track]:
+    """Return the noisy boxes of a scene as tracks, with the points within `margin` [m] of each."""
+    arrays = scene.fixed_detections()
+    rows: dict[str, list[tuple[int, int]]] = {}  # sweep and row of each box of a track
+    for i, array in enumerate(arrays):
+        for j, track_id in enumerate(array.track_ids):
+            rows.setdefault(track_id, []).append((i, j))
+    points = [
+        sweep.points @ T[:3, :3].T + T[:3, 3]
+        for sweep, T in zip(scene.sweeps, scene.T_fixed_sensor, strict=True)
+    ]
+    tracks = []
+    for track_id, places in rows.items():
+        first, row = places[0]
+        boxes = np.array([arrays[i].boxes[j] for i, j in places])
+        near = [
+            points[i][is_near(points[i], box, margin)]
+            for (i, _), box in zip(places, boxes, strict=True)
+        ]
+        tracks.append(
+            Track(
+                track_id,
+                arrays[first].class_names[row],
+                np.array([arrays[i].stamp_ns for i, _ in places]),
+                boxes,
+                near,
+                np.array([scene.T_fixed_sensor[i, :3, 3] for i, _ in places]),
+                np.array([arrays[i].scores[j] for i, j in places]),
+            )
+        )
+    return tracks

@@ -28,6 +28,7 @@ from boxreg_ros.simulation.scenarios import EXTENTS
 from boxreg_ros.simulation.scene import boxes_of, is_near
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import BoxArray, Sweep, YAW
+from measure.drives import tracks_of
 import numpy as np
 from paths import BAGS
 import pytest
@@ -240,7 +241,7 @@ def test_paper_noise_has_the_errors_of_table_one():
 
 
 def test_tracks_hold_all_detections(street):
-    tracks = {track.track_id: track for track in street.tracks()}
+    tracks = {track.track_id: track for track in tracks_of(street)}
     assert sum(len(t.boxes) for t in tracks.values()) == sum(
         len(a.track_ids) for a in street.detections
     )

@@ -12,6 +12,7 @@ from boxreg_ros.core.observation import Observation, observe
 from boxreg_ros.core.window import Window
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import BoxArray, Floats, Sweep
+from measure.drives import tracks_of
 import numpy as np
 from numpy.typing import NDArray
 import torch
@@ -62,7 +63,7 @@ def make_windows(
     truth: list[Floats] = []
     for seed in range(count):
         scene = simulate('paper', seed % 8)
-        (track,) = scene.tracks()
+        (track,) = tracks_of(scene)
         first = (seed // 8 * length) % (101 - length)
         rows = range(first, first + length)
         observations = []
