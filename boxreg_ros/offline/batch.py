@@ -102,7 +102,7 @@ def _check(args: argparse.Namespace) -> None:
             '--learn: expected an output on this machine, got a URL; run boxreg batch here '
             'first, and give its input_model.json files to --input-model'
         )
-    # Options that cannot work together are refused; to check that of the report imports torch.
+    # Options that cannot work together are refused; the workers need the packages of the report.
     Request((), config=config_from(args), **values_of(args, Request) | {'report': False})
 
 

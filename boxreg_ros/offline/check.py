@@ -98,10 +98,7 @@ def _tracks(source: str, config: Config) -> list[LabelTrack]:
 
     name, path = _format_of(source)
     frames = (frame.moved('fixed').refined for frame in frames_of(name, path))
-    labels = (
-        refined.take([i for i, word in enumerate(refined.status) if word != REJECTED])
-        for refined in frames
-    )
+    labels = (refined.without(REJECTED) for refined in frames)
     return _grouped(((refined.boxes, refined.num_points) for refined in labels), config)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.covariance_table import BoxCovariance, COVARIANCES, read_covariances
+from boxreg_ros.io.covariance_table import COVARIANCES, read_covariances
 from boxreg_ros.io.stamp_join import joined_stamps
 from boxreg_ros.io.times import time_range
 from boxreg_ros.io.velocity_table import read_velocities, VELOCITIES
@@ -92,10 +92,17 @@ def run(args: argparse.Namespace) -> int:
     tracks = track_scores(predicted, truth, matches.rows)
     if not has_trackeval():
         _warn('HOTA and IDF1 need the package trackeval: pip install trackeval')
-    certainty = consistency(matches, predicted, truth, _covariances(args.predicted))
+    folder = _result_folder(args.predicted)
+    certainty = {}
+    if folder is not None and (folder / COVARIANCES).is_file():
+        covariances = read_covariances(folder / COVARIANCES)
+        certainty = consistency(matches, predicted, truth, covariances)
     velocities = _velocities(args, matches, predicted, truth, classes)
     if args.json:
-        report = _report(overall, groups(matches)) | {'tracks': asdict(tracks)}
+        report = asdict(overall)
+        for name, group in groups(matches).items():
+            report[name] = {key: asdict(scores) for key, scores in group.items()}
+        report['tracks'] = asdict(tracks)
         report['velocities'] = {name: scores._asdict() for name, scores in velocities.items()}
         if certainty:
             report['consistency'] = {name: group._asdict() for name, group in certainty.items()}
@@ -105,18 +112,12 @@ def run(args: argparse.Namespace) -> int:
         print(_track_lines(tracks))
         if any(scores.boxes for scores in velocities.values()):
             print('\n' + velocity_table(velocities))
-        if certainty:
-            summary = earlier_summary(_folder(args.predicted)) or {}
+        if certainty and folder is not None:
+            summary = earlier_summary(folder) or {}
             estimate = summary.get('estimate', 'written')
             print(f'\ncovariances of the {estimate} estimate')
             print(consistency_table(certainty))
     return 0 if matches.is_matched.any() else 1
-
-
-def _covariances(source: Path) -> dict[tuple[int, str], BoxCovariance]:
-    """Return the covariances beside a table of boxes; none for other sources."""
-    path = _folder(source) / COVARIANCES
-    return read_covariances(path) if _is_table(source) and path.is_file() else {}
 
 
 def _velocities(
@@ -127,8 +128,9 @@ def _velocities(
     classes: list[str],
 ) -> dict[str, VelocityScores]:
     """Return the scores of velocities of the boxes, and of the input if it is given."""
-    path = _folder(args.predicted) / VELOCITIES
-    known = read_velocities(path) if _is_table(args.predicted) and path.is_file() else None
+    folder = _result_folder(args.predicted)
+    has_file = folder is not None and (folder / VELOCITIES).is_file()
+    known = read_velocities(folder / VELOCITIES) if folder and has_file else None
     found = [('boxes', velocity_scores(matches, predicted, truth, known))]
     if args.input is not None:
         boxes = _of_recording(args, args.input)
@@ -137,14 +139,11 @@ def _velocities(
     return beside(found)
 
 
-def _folder(source: Path) -> Path:
-    """Return the folder of a table of boxes."""
-    return source if source.is_dir() else source.parent
-
-
-def _is_table(source: Path) -> bool:
-    """Return whether a source is the table of a result, not a recording or another file."""
-    return source.name == 'boxes.csv' or (source / 'boxes.csv').is_file()
+def _result_folder(source: Path) -> Path | None:
+    """Return the folder of the boxes of a result; None for a recording or another file."""
+    if (source / 'boxes.csv').is_file():
+        return source
+    return source.parent if source.name == 'boxes.csv' else None
 
 
 def _track_lines(scores: TrackScores) -> str:
@@ -206,14 +205,6 @@ def _table_in_frame(tables: dict[str, BoxTable], frame_id: str) -> BoxTable:
                 f'{found.frame_id!r} are compared'
             )
     return found
-
-
-def _report(overall: Scores, grouped: dict[str, dict[str, Scores]]) -> dict[str, Any]:
-    """Return all scores as plain values."""
-    report = asdict(overall)
-    for name, group in grouped.items():
-        report[name] = {key: asdict(scores) for key, scores in group.items()}
-    return report
 
 
 def _print_tables(overall: Scores, grouped: dict[str, dict[str, Scores]]) -> None:

@@ -30,7 +30,7 @@ from boxreg_ros.offline.arguments import (
     words_of,
 )
 from boxreg_ros.offline.notes import sparse_boxes
-from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.request import REPORT_PACKAGES, Request
 
 if TYPE_CHECKING:
     from boxreg_ros.datasets.registry import Address
@@ -43,8 +43,6 @@ SAMPLE_SECONDS = 3.0
 """Part of the recording whose messages are read [s]; chosen: 30 sweeps at 10 Hz take 0.25 s."""
 SAMPLE_ITEMS = 60
 """Clouds and box arrays that are read at most: those of this time at 10 Hz."""
-REPORT_PACKAGES = ('jinja2', 'plotly')
-"""Without them ``--report`` is not proposed; those that a plain installation lacks."""
 DEFAULTS = Config()
 """Settings of the proposed command."""
 GAP_PERIODS = 3.0
@@ -104,21 +102,41 @@ def _contents(paths: list[Path]) -> dict[str, Any]:
         counts: Counter[tuple[str, str]] = Counter()
         for connection in reader.connections:
             counts[connection.topic, connection.msgtype] += connection.msgcount
-        presence = reader.presence()
+        topics = [
+            _topic(topic, kind, count, reader.presence()[topic], (begin_ns, seconds))
+            for (topic, kind), count in sorted(counts.items())
+        ]
         damages = [damage._asdict() for damage in reader.damages]
-    topics = [
-        {
-            'topic': topic,
-            'type': kind,
-            'messages': count,
-            'rate': _rate(count, seconds),
-            'presence_s': _merged_spans(presence[topic], begin_ns, seconds),
-            'gaps_s': _pauses(presence[topic], begin_ns, _rate(count, seconds)),
-        }
-        for (topic, kind), count in sorted(counts.items())
-    ]
     files = [file for part in parts for file in part.files]
     return _facts(files, begin_ns, seconds, topics, damages)
+
+
+def _topic(
+    topic: str, kind: str, count: int, presence: Sequence[tuple[int, int]], of: tuple[int, float]
+) -> dict[str, Any]:
+    """Return the figures of a topic, present in ascending spans [ns], `of` a begin and seconds."""
+    begin_ns, seconds = of
+    rate = (count - 1) / seconds if count > 1 and seconds > 0 else 0.0
+    spans = [((first - begin_ns) * 1e-9, (last - begin_ns) * 1e-9) for first, last in presence]
+    merged: list[list[float]] = []
+    pauses = []
+    end = spans[0][1] if spans else 0.0
+    for first, last in spans:
+        if rate and first - end > GAP_PERIODS / rate:
+            pauses.append([end, first])
+        if merged and first - end <= seconds / MAX_SPANS:
+            merged[-1][1] = max(end, last)
+        else:
+            merged.append([first, last])
+        end = max(end, last)
+    return {
+        'topic': topic,
+        'type': kind,
+        'messages': count,
+        'rate': rate,  # mean [Hz]
+        'presence_s': merged,  # with close spans joined
+        'gaps_s': pauses,
+    }
 
 
 def _facts(
@@ -150,55 +168,14 @@ def _scene_contents(address: Address) -> dict[str, Any]:
     recording = SceneRecording(address)
     recording.has_boxes = False
     with recording:
-        seconds = (recording.end_ns - recording.start_ns) * 1e-9
-        files = recording.files
+        begin_ns, end_ns = recording.start_ns, recording.end_ns
+        seconds = (end_ns - begin_ns) * 1e-9
+        # The stamps of a scene are in files that are not opened here.
         topics = [
-            {
-                'topic': name,
-                'type': 'data set',
-                'messages': count,
-                'rate': _rate(count, seconds),
-                'presence_s': [[0.0, seconds]],
-                'gaps_s': [],  # the stamps of a scene are in files that are not opened here
-            }
+            _topic(name, 'data set', count, [(begin_ns, end_ns)], (begin_ns, seconds))
             for name, count in recording.topics.items()
         ]
-        begin_ns = recording.start_ns
-    return _facts(files, begin_ns, seconds, topics, [])
-
-
-def _rate(count: int, seconds: float) -> float:
-    """Return the mean rate of messages [Hz]; 0 for a single one."""
-    return (count - 1) / seconds if count > 1 and seconds > 0 else 0.0
-
-
-def _merged_spans(
-    spans: Sequence[tuple[int, int]], begin_ns: int, seconds: float
-) -> list[list[float]]:
-    """Return ascending spans [ns] in [s] after `begin_ns`, with close ones joined."""
-    nearest = seconds / MAX_SPANS
-    merged: list[list[float]] = []
-    for first_ns, last_ns in spans:
-        first = (first_ns - begin_ns) * 1e-9
-        last = (last_ns - begin_ns) * 1e-9
-        if merged and first - merged[-1][1] <= nearest:
-            merged[-1][1] = max(merged[-1][1], last)
-        else:
-            merged.append([first, last])
-    return merged
-
-
-def _pauses(parts: list[tuple[int, int]], begin_ns: int, rate: float) -> list[list[float]]:
-    """Return begin and end of the pauses between parts with messages [s from the begin]."""
-    if not rate:
-        return []
-    pauses = []
-    last_ns = parts[0][1]
-    for first_ns, end_ns in parts:
-        if (first_ns - last_ns) * 1e-9 > GAP_PERIODS / rate:
-            pauses.append([(last_ns - begin_ns) * 1e-9, (first_ns - begin_ns) * 1e-9])
-        last_ns = max(last_ns, end_ns)
-    return pauses
+        return _facts(recording.files, begin_ns, seconds, topics, [])
 
 
 @dataclass

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.follow import End, follow_points, FollowedTrack, keyframe_deviations
+from boxreg_ros.core.follow import follow_points, FollowedTrack, keyframe_deviations
 from boxreg_ros.core.following.person import DEVIATIONS
 from boxreg_ros.io.stamp_join import LARGEST_OFFSET_NS
 from boxreg_ros.io.sweep_store import SweepStore
 from boxreg_ros.offline.completion import Arrivals, Moved
 from boxreg_ros.review.corrections import Corrections
-from boxreg_ros.structures import BoxArray, Floats, Sweep
+from boxreg_ros.structures import BoxArray, Floats
 from boxreg_ros.tracks.complete import CompletionPlan
 from boxreg_ros.tracks.decided import with_decisions
 from boxreg_ros.tracks.followed import followed_plan
@@ -35,13 +35,13 @@ def keyframes(
     deviations (9,) of the keyframes, see `person.DEVIATIONS`.
 
     """
-    stores: list[SweepStore] = []
     # A keyframe beside the stamp of a sweep does not take the place of the boxes of that.
-    parts = arrivals(stored(items, stores), LARGEST_OFFSET_NS)
+    parts = arrivals(items, with_sweeps=True, reach_ns=LARGEST_OFFSET_NS)
     plan = CompletionPlan([], [])
     tracks: list[FollowedTrack] = []
     deviations = DEVIATIONS
-    for part, store in zip(parts, stores, strict=True):
+    for part in parts:
+        store = sweeps_of(part)
         pins = corrections.keyframes(part.arrays, fixed_frame)
         seeds = sorted([*part.arrays, *pins], key=lambda array: array.stamp_ns)
         found = followed(seeds, store, config)
@@ -55,32 +55,28 @@ def keyframes(
     return plan, parts, tracks, deviations
 
 
-def stored(items: Iterable[tuple[Moved, bool]], stores: list[SweepStore]) -> Iterator[Any]:
-    """Yield items, and put their sweeps into `stores`: one for each part between time jumps."""
-    stores.append(SweepStore())
-    for item, restarts in items:
-        if restarts:
-            stores.append(SweepStore())
-        if isinstance(item, Sweep):
-            stores[-1].add(item)
-        yield item, restarts
-
-
-def arrivals(items: Iterable[tuple[Moved, bool]], reach_ns: int | None = None) -> list[Arrivals]:
+def arrivals(
+    items: Iterable[tuple[Moved, bool]], with_sweeps: bool, reach_ns: int | None = None
+) -> list[Arrivals]:
     """Return what arrived in each part between time jumps; `reach_ns` is that of `Arrivals`."""
-    parts = [Arrivals(reach_ns=reach_ns)]
+    parts = [Arrivals.empty(with_sweeps, reach_ns)]
     for item, restarts in items:
         if restarts:
-            parts.append(Arrivals(reach_ns=reach_ns))
+            parts.append(Arrivals.empty(with_sweeps, reach_ns))
         if item is not None:
             parts[-1].add(item)
     return parts
 
 
+def sweeps_of(part: Arrivals) -> SweepStore:
+    """Return the sweeps of a part that has them."""
+    assert part.sweeps is not None
+    return part.sweeps
+
+
 def add_objects(
     plan: CompletionPlan,
     parts: Sequence[Arrivals],
-    stores: Sequence[SweepStore],
     corrections: Corrections,
     fixed_frame: str,
     config: Config,
@@ -88,20 +84,20 @@ def add_objects(
     """
     Add the objects of a person to a plan, followed through the sweeps of their part.
 
-    The plan is for the arrays of `Arrivals.completed`; parts and stores are those between time
-    jumps. Return the tracks as they were followed.
+    The plan is for the arrays of `Arrivals.completed`; the parts, between time jumps, have their
+    sweeps. Return the tracks as they were followed.
 
     """
     seeds_of: dict[int, list[BoxArray]] = {}
     for seed in corrections.seeds(fixed_frame):
-        away = [_away(store, seed.stamp_ns) for store in stores]
+        away = [_away(sweeps_of(part), seed.stamp_ns) for part in parts]
         seeds_of.setdefault(int(np.argmin(away)), []).append(seed)
     tracks: list[FollowedTrack] = []
     first = 0
-    for index, (part, store) in enumerate(zip(parts, stores, strict=True)):
+    for index, part in enumerate(parts):
         arrays = part.completed(fixed_frame)
         # Their size is what a person has decided.
-        found = followed(seeds_of.get(index, []), store, config, grows=False)
+        found = followed(seeds_of.get(index, []), sweeps_of(part), config, grows=False)
         plan.add(followed_plan(arrays, corrections.added(found), has_seeds=False), first)
         tracks += found
         first += len(arrays)
@@ -135,16 +131,12 @@ def _from_store(boxes: Floats, store: SweepStore, sign: int = 1) -> Floats:
 
 def ends_of(tracks: Sequence[FollowedTrack]) -> list[dict[str, Any]]:
     """Return where each track ends and why, for ``summary.json``."""
-
-    def end(one: End) -> dict[str, Any]:
-        return {'stamp_ns': one.stamp_ns, 'reason': one.reason}
-
     return [
         {
             'track_id': track.track_id,
             'boxes': len(track.rows),
-            'before': end(track.ends[0]) if track.ends else None,
-            'after': end(track.ends[1]) if track.ends else None,
+            'before': track.ends[0]._asdict() if track.ends else None,
+            'after': track.ends[1]._asdict() if track.ends else None,
             'problems': list(track.problems),
         }
         for track in tracks

@@ -57,7 +57,8 @@ class Sink:
             self._spool = Spool(folder, request.config)
         provenance = Provenance.of(request.recordings, request.config)
         options = writer_options(request)
-        self.output = LabelOutput(folder, request.box_formats, provenance, options)
+        formats = dict.fromkeys(('csv', *request.box_formats))
+        self.output = LabelOutput(folder, tuple(formats), provenance, options)
         self.corrections = corrections
         # These import numba, after the fork of the reader.
         from boxreg_ros.review.changes import Changes

@@ -172,24 +172,17 @@ class RecordingReader:
             'first_unplaced': items.first_unplaced,
             'first_unreadable': '; '.join(map(str, recording.first_errors.values())),
         }
+        warnings = (
+            *(*recording.label_notes, recording.finding, self._jumping_ids),
+            *(items.session.finding, items.ahead),
+        )
         return Findings(
             items.counts,
             items.session.lidar_counts,
             recording.unreadable.total(),
             recording.outside,
             +recording.left_out,
-            '; '.join(
-                filter(
-                    None,
-                    (
-                        *recording.label_notes,
-                        recording.finding,
-                        self._jumping_ids,
-                        items.session.finding,
-                        items.ahead,
-                    ),
-                )
-            ),
+            '; '.join(filter(None, warnings)),
             facts,
             [] if self._sweeps is None else self._sweeps.complete(),
             self._clock.stages(),

@@ -69,8 +69,7 @@ class UnlabelledRecording(Recording):
         for cloud in super().items(tree, wanted._replace(clouds=True)):
             if wanted.clouds:
                 yield cloud
-            sweep = cloud.content
-            none = BoxArray(sweep.stamp_ns, sweep.frame_id, (), (), np.zeros(0), np.zeros((0, 9)))
+            none = BoxArray.empty(cloud.content.stamp_ns, cloud.content.frame_id)
             yield Item(cloud.received_ns, none)
 
 

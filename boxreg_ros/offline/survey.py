@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from boxreg_ros.core.input_statistics import Drives
     from boxreg_ros.core.latency import Latency
     from boxreg_ros.core.method.constants import Constants
-    from boxreg_ros.io.sweep_store import SweepStore
     from boxreg_ros.offline.completion import Arrivals, Completion, Moved
     from boxreg_ros.offline.request import Request
     from boxreg_ros.review.corrections import Corrections
@@ -82,7 +81,7 @@ def survey(
         receive = workers.enter_context(reader(request))
         from boxreg_ros.core.following.person import numbers
         from boxreg_ros.offline.completion import Completion, first_pass
-        from boxreg_ros.offline.keyframes import add_objects, arrivals, ends_of, keyframes, stored
+        from boxreg_ros.offline.keyframes import add_objects, arrivals, ends_of, keyframes
         from boxreg_ros.tracks.complete import unchanged_plan
 
         recording = ReadAhead(receive)
@@ -91,9 +90,6 @@ def survey(
         items: Iterable[tuple[Moved, bool]] = (
             (_plain(item.moved), item.restarts) for item in progress.each(recording)
         )
-        stores: list[SweepStore] = []
-        if corrections.adds:
-            items = stored(items, stores)
         tracks: list[FollowedTrack] = []
         deviations = in_time = latency = None
         if request.keyframes:
@@ -108,19 +104,18 @@ def survey(
                 estimation_worker(request.config, clock, progress.progress.announce)
             )
             first = first_pass(
-                items, request.config, submit, fixed_frame, drives, corrections.to_register
-            )
+                items, request.config, submit, fixed_frame, drives, corrections.to_register,
+                corrections.adds,
+            )  # fmt: skip
             plan = first.plan(fixed_frame, request.config, corrections)
             parts = first.parts
             in_time, latency = first.in_time, first.latency
         else:
-            parts = arrivals(_corrected(items, corrections))
+            parts = arrivals(_corrected(items, corrections), corrections.adds)
             plan = unchanged_plan([a for part in parts for a in part.completed(fixed_frame)])
         if corrections.adds:
             with clock('follow'):
-                tracks += add_objects(
-                    plan, parts, stores, corrections, fixed_frame, request.config
-                )
+                tracks += add_objects(plan, parts, corrections, fixed_frame, request.config)
         completion = Completion(plan, request.config, deviations)
         constants = None if deviations is None else numbers(deviations)
         return Survey(plan, completion, parts, ends_of(tracks), constants, in_time, latency)

@@ -6,8 +6,8 @@ import json
 from boxreg_ros.cli import main
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.offline.completion import Arrivals, empty_array
-from boxreg_ros.structures import Sweep
+from boxreg_ros.offline.completion import Arrivals
+from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest
 from relabel_results import rows_in, rows_of
@@ -188,7 +188,7 @@ def test_few_boxes_are_said_and_completed(street, tmp_path, capsys):
 
 def test_empty_arrays_stand_between_late_ones():
     part = Arrivals()
-    for item in (0, 10, 20, empty_array(0, 'odom'), 30, empty_array(30, 'odom'), 40):
+    for item in (0, 10, 20, BoxArray.empty(0, 'odom'), 30, BoxArray.empty(30, 'odom'), 40):
         is_sweep = isinstance(item, int)
         part.add(Sweep(item, 'odom', np.zeros((0, 3))) if is_sweep else item)
     assert part.missing_ns() == [10, 20, 40]
