@@ -7,7 +7,7 @@ docs/tasks/write-a-label-format.md shows it step by step.
 
 """
 
-from boxreg_ros.labels.output import LabelOutput, notes_of
+from boxreg_ros.labels.output import LabelOutput
 from boxreg_ros.labels.protocol import (
     Format,
     LabelFrame,
@@ -41,7 +41,6 @@ __all__ = [
     'LabelOutput',
     'LabelWriter',
     'module_of',
-    'notes_of',
     'Options',
     'Provenance',
     'SceneFrames',

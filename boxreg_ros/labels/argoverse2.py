@@ -20,7 +20,7 @@ from boxreg_ros.io.transforms import matrix
 from boxreg_ros.labels.arrow import read_rows, read_table
 from boxreg_ros.labels.files import frame_names, to_json
 from boxreg_ros.labels.folder import FolderWriter
-from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance, SceneFrames
+from boxreg_ros.labels.protocol import Format, LabelFrame, SceneFrames
 from boxreg_ros.labels.records import EVIDENCE_COLUMNS, evidence_of, refined_boxes
 from boxreg_ros.rotations import boxes_from_quaternions, quaternion_from_matrix
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, RefinedBoxes, Sweep
@@ -71,8 +71,8 @@ class Writer(FolderWriter):
     folders = ('calibration',)
     cloud_file = 'sensors/lidar/{name}.feather'
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
+    def begin(self) -> None:
+        """Open the files."""
         columns = ANNOTATION_COLUMNS | EVIDENCE_COLUMNS | {GIVEN_CLASS: 'string'}
         self._annotations = self.table(FEATHER_FILE, columns, to_json(self.about))
         self._poses = self.table(EGO_POSES_FILE, {'timestamp_ns': 'int64'} | POSE_COLUMNS)

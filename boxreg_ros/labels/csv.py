@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 import csv
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import IO
 
@@ -19,7 +21,7 @@ from boxreg_ros.io.box_table import BoxTable, cell, COLUMNS, csv_row, protected,
 from boxreg_ros.io.covariance_table import COVARIANCES, CovarianceWriter
 from boxreg_ros.io.velocity_table import VELOCITIES, VelocityWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.records import numbers_of, refined_boxes
+from boxreg_ros.labels.records import numbers_of, ReadBox, refined_of
 from boxreg_ros.structures import BoxArray, Floats, PROPOSED
 import numpy as np
 import orjson
@@ -140,33 +142,25 @@ def read(path: Path) -> Iterator[LabelFrame]:
     }
     attributes = _read_attributes(path.with_name(ATTRIBUTES)) if path.name == 'boxes.csv' else {}
     fixed_frame = max(tables, key=lambda name: len(tables[name].boxes), default='')
-    groups = []
-    for name, table in tables.items():
-        order = np.argsort(table.stamps_ns, kind='stable')
-        starts = np.flatnonzero(np.diff(table.stamps_ns[order])) + 1
-        for rows in np.split(order, starts) if len(order) else ():
-            groups.append((int(table.stamps_ns[rows[0]]), name, rows))
-    for stamp_ns, name, rows in sorted(groups, key=lambda group: group[0]):
+    found = [
+        (stamp_ns, name, row)
+        for name, table in tables.items()
+        for row, stamp_ns in enumerate(table.stamps_ns.tolist())
+    ]
+    found.sort(key=itemgetter(0))
+    for (stamp_ns, name), group in groupby(found, itemgetter(0, 1)):
         table = tables[name]
-        refined = refined_boxes(
-            stamp_ns,
-            name,
-            [table.track_ids[i] for i in rows],
-            [table.class_names[i] for i in rows],
-            table.boxes[rows],
-            [
-                {
-                    'score': score,
-                    'status': table.status[i],
-                    'num_points': count,
-                    'attributes': attributes.get((stamp_ns, table.track_ids[i])),
-                }
-                for i, score, count in zip(
-                    rows, table.scores[rows], table.num_points[rows], strict=True
-                )
-            ],
-        )
-        yield LabelFrame(refined, fixed_frame, '')
+        boxes = []
+        for *_, row in group:
+            evidence = {
+                'score': table.scores[row],
+                'status': table.status[row],
+                'num_points': table.num_points[row],
+                'attributes': attributes.get((stamp_ns, table.track_ids[row])),
+            }
+            names = table.track_ids[row], table.class_names[row]
+            boxes.append(ReadBox(*names, table.boxes[row], evidence))
+        yield LabelFrame(refined_of(stamp_ns, name, boxes), fixed_frame, '')
 
 
 def _read_attributes(path: Path) -> dict[tuple[int, str], dict[str, str]]:

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.covariance_table import POSE_TRIANGLE
-from boxreg_ros.labels.files import following, from_json, require_single
+from boxreg_ros.labels.files import following, require_single
 from boxreg_ros.labels.folder import FolderWriter, frame_name
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame
 from boxreg_ros.labels.records import evidence_of, ReadBox
@@ -36,28 +36,17 @@ FrameBoxes = tuple[list[ReadBox], Mapping[str, int]]
 NO_FRAME_BOXES: FrameBoxes = ([], {})
 
 
-def cuboid_format(
-    name: str,
-    title: str,
-    files: str,
-    reads: str = '',
-    leaves_out: str = '',
-    read_back: str = '',
-) -> Format:
-    """Return the format of a tool with these conventions."""
-    return Format(
-        name=name,
-        title=title,
-        frame='sensor',
-        reference='centre',
-        sizes='length width height (x y z)',
-        rotation='angles x y z, R = Rx Ry Rz',
-        files=files,
-        reads=reads,
-        leaves_out=leaves_out,
-        read_back=read_back,
-        options=('with_points', 'with_images'),
-    )
+CUBOID_FORMAT = Format(
+    name='',
+    title='',
+    frame='sensor',
+    reference='centre',
+    sizes='length width height (x y z)',
+    rotation='angles x y z, R = Rx Ry Rz',
+    files='',
+    options=('with_points', 'with_images'),
+)
+"""The conventions that the tools share."""
 
 
 def xyz_angles(boxes: Floats) -> Floats:
@@ -157,47 +146,6 @@ def single_part(path: Path, what: str, members: Collection[str]) -> tuple[Path, 
     part = require_single(found, path, f'{what}, a folder with {" or ".join(members)}')
     has_sidecar = (part / STAMPS_FILE).exists()
     return part, part if has_sidecar else absolute(part).parent
-
-
-def read_files(
-    folder: Path,
-    labels: Path,
-    names: Iterable[str],
-    what: str,
-    cuboids_of: Callable[[Any], FrameBoxes],
-) -> Iterator[LabelFrame]:
-    """
-    Yield the frames of a folder with sidecar files and a file of labels per frame.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the sidecar files.
-    labels : Path
-        Folder of the files; frames without boxes may lack theirs.
-    names : iterable of str
-        Of all frames that have labels or points.
-    what : str
-        Content of the files, for errors.
-    cuboids_of : callable
-        Returns the boxes of the content of a file.
-
-    Raises
-    ------
-    RecordingError
-        As `read_frames`, and for a file that `cuboids_of` cannot read.
-
-    """
-
-    def cuboids_by_name(name: str) -> FrameBoxes:
-        file = labels / f'{name}.json'
-        if not file.exists():
-            return NO_FRAME_BOXES
-        content = from_json(file)
-        with following(file, what):
-            return cuboids_of(content)
-
-    yield from read_frames(folder, sorted(names), cuboids_by_name)
 
 
 def read_frames(

@@ -26,17 +26,16 @@ from boxreg_ros.labels.attributes import (
 from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.cuboids import EVIDENCE_KEY
 from boxreg_ros.labels.files import at, following, from_json, JsonList, require_single
-from boxreg_ros.labels.protocol import absolute, LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import absolute, LabelFrame
 from boxreg_ros.labels.records import ReadBox, TrackNumbers
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import INTERPOLATED
 
 FORMAT = replace(
-    cuboids.cuboid_format(
-        name='datumaro',
-        title='Datumaro, CVAT',
-        files='annotations/default.json, point_clouds/default/STAMP.pcd',
-    ),
+    cuboids.CUBOID_FORMAT,
+    name='datumaro',
+    title='Datumaro, CVAT',
+    files='annotations/default.json, point_clouds/default/STAMP.pcd',
     sizes='length width height (x y z); height width length with --swap-axes',
     options=('with_points', 'with_images', 'swap_axes'),
     leaves_out='annotations that are no cuboids, objects outside (counted)',
@@ -72,16 +71,16 @@ class Writer(cuboids.CuboidWriter):
     cloud_file = 'point_clouds/default/{name}.pcd'
     image_file = f'{IMAGE_FOLDER}/{{name}}/{{camera}}.{{suffix}}'
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
-        self._axes = 'zyx' if options.swap_axes else 'xyz'
+    def begin(self) -> None:
+        """Open the files."""
+        self._axes = 'zyx' if self.options.swap_axes else 'xyz'
         self._tracks = TrackNumbers()
         self._labels: dict[str, int] = {}
         self._attributes: set[str] = set()
         self._images: list[dict[str, Any]] = []  # of the current frame
-        infos = self.about | {SWAPPED_KEY: options.swap_axes}
+        infos = self.about | {SWAPPED_KEY: self.options.swap_axes}
         head = {'dm_format_version': '1.0', 'media_type': POINT_CLOUD_MEDIA, 'infos': infos}
-        self._items = JsonList(folder / ANNOTATIONS_FILE, head, 'items')
+        self._items = JsonList(self.folder / ANNOTATIONS_FILE, head, 'items')
 
     def add(self, frame: LabelFrame) -> None:
         """Add an item."""
@@ -191,9 +190,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
             with at(f'item {name!r}'):
                 items[name] = _cuboids(item.get('annotations') or (), labels, is_swapped)
                 numbers[name] = _order(item)[0]
-    yield from cuboids.read_frames(
-        folder, list(items), lambda name: items.get(name, cuboids.NO_FRAME_BOXES), numbers
-    )
+    yield from cuboids.read_frames(folder, list(items), items.__getitem__, numbers)
 
 
 def _order(item: dict[str, Any]) -> tuple[int, str]:

@@ -21,6 +21,7 @@ from boxreg_ros.labels.cameras import (
 from boxreg_ros.labels.class_names import ClassNames
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import write_provenance
+from boxreg_ros.labels.kitti_camera import KittiCamera
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.labels.sidecar import POSES_FILE, STAMPS_FILE
 from boxreg_ros.reasons import Reason
@@ -33,9 +34,9 @@ class FolderWriter:
     """
     Write a scene frame by frame: labels by `add`, clouds, and ``boxreg.json``.
 
-    A format derives from it, states the class attributes and implements `add`; one that completes
-    files at the end also `finish`. Of the current frame, `number` counts from 0, and `name` sorts
-    by time. `files` are open until the writer is closed; `about` is the content of
+    A format derives from it, states the class attributes and implements `add`; one with files of
+    the whole scene also `begin` and `finish`. Of the current frame, `number` counts from 0, and
+    `name` sorts by time. `files` are open until the writer is closed; `about` is the content of
     ``boxreg.json``: the provenance, then the names of frames.
 
     """
@@ -58,15 +59,21 @@ class FolderWriter:
     """Name of the format, by which class names are translated; empty if they stay as given."""
     has_sidecar: ClassVar[bool] = False
     """Whether stamps and poses are written beside the labels, as in `sidecar`."""
+    has_kitti_camera: ClassVar[bool] = False
+    """Whether boxes refer to one camera, `kitti_camera`, and images are of this one alone."""
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         self.dropped: Counter[str] = Counter()
         self.folder = folder
+        self.options = options
+        self.provenance = provenance
         self.number = 0
         self.name = ''
         self.about: dict[str, Any] = asdict(provenance)
         self._used_stamps: Counter[int] = Counter()
         self.files = ExitStack()
+        if self.has_kitti_camera:
+            self.kitti_camera = KittiCamera(options, self.form)
         self.class_names = ClassNames(self.form, options.class_map if self.form else None)
         self.cameras: LabelCameras | None = None
         if options.with_images and self.image_file:
@@ -80,11 +87,16 @@ class FolderWriter:
         if self.has_sidecar:
             self._stamps_file = self.text_file(STAMPS_FILE)
             self._poses_file = self.text_file(POSES_FILE)
+        self.begin()
+
+    def begin(self) -> None:
+        """Open the files of the labels, before the first frame."""
 
     @property
     def notes(self) -> list[str]:
         """Return what was assumed, and what programs that read the files leave out."""
-        return self.class_names.notes()
+        assumed = self.kitti_camera.notes if self.has_kitti_camera else []
+        return assumed + self.class_names.notes()
 
     def write(self, frame: LabelFrame) -> None:
         """Add a frame."""
@@ -112,7 +124,9 @@ class FolderWriter:
     def _add_images(self, cameras: LabelCameras, frame: LabelFrame) -> None:
         """Write the image of each camera that is nearest to a frame."""
         stamp_ns = frame.refined.boxes.stamp_ns
-        used = self.used_cameras(cameras.known(frame.sensor_frame, stamp_ns))
+        used = cameras.known(frame.sensor_frame, stamp_ns)
+        if self.has_kitti_camera:
+            used = self.kitti_camera.used(used)
         if self.number == 0:
             for camera in used:
                 self.add_camera(camera)
@@ -132,10 +146,6 @@ class FolderWriter:
             images.append((camera, image, path))
         self.add_images(images)
         self.about['images'] = dict(cameras.counts)
-
-    def used_cameras(self, cameras: Sequence[LabelCamera]) -> Sequence[LabelCamera]:
-        """Return those of the cameras of the recording that the format has a place for."""
-        return cameras
 
     def add_camera(self, camera: LabelCamera) -> None:
         """Write the calibration of a camera, where it is the same for all frames."""

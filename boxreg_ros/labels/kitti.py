@@ -11,23 +11,18 @@ the files of `sidecar`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.attributes import FALSE, is_set, OCCLUDED, PARTLY, TRUE, TRUNCATED
 from boxreg_ros.labels.camera import Camera
-from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, following, read_provenance, require_single
 from boxreg_ros.labels.folder import FolderWriter
-from boxreg_ros.labels.kitti_camera import KittiCamera
 from boxreg_ros.labels.protocol import (
     absolute,
     Format,
     LabelFrame,
-    Options,
-    Provenance,
     SceneFrames,
 )
 from boxreg_ros.labels.records import ReadBox, require_radians, TrackNumbers
@@ -78,10 +73,10 @@ class Writer(FolderWriter):
     cloud_file = f'velodyne/{SEQUENCE}/{{number:06d}}.bin'
     image_file = f'image_02/{SEQUENCE}/{{number:06d}}.png'
     has_sidecar = True
+    has_kitti_camera = True
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        self._camera = KittiCamera(options, 'format kitti')
-        super().__init__(folder, provenance, options)
+    def begin(self) -> None:
+        """Open the files."""
         self._file = self.text_file(f'label_02/{SEQUENCE}.txt')
         self._tracks = TrackNumbers()
         self._given_classes: dict[str, str] = {}  # by number of the track and class as written
@@ -90,7 +85,8 @@ class Writer(FolderWriter):
         """Add the lines of a frame."""
         rows, boxes = frame.boxes_in('sensor', self.dropped)
         array = frame.refined.boxes
-        truncation, columns = columns_of(self._camera.in_frame(frame.sensor_frame), boxes)
+        camera = self.kitti_camera.in_frame(frame.sensor_frame)
+        truncation, columns = columns_of(camera, boxes)
         for i, row in enumerate(rows):
             track = self._tracks.of(array.track_ids[row])
             given = array.class_names[row]
@@ -102,18 +98,9 @@ class Writer(FolderWriter):
             self._file.write(f'{self.number} {track} {name} {cut} {occlusion_of(attributes)} ')
             self._file.write(decimals(columns[i], array.scores[row]) + '\n')
 
-    @property
-    def notes(self) -> list[str]:
-        """Return what was assumed, the camera among it."""
-        return self._camera.notes + super().notes
-
-    def used_cameras(self, cameras: Sequence[LabelCamera]) -> Sequence[LabelCamera]:
-        """Return the camera that the boxes refer to."""
-        return self._camera.used(cameras)
-
     def finish(self) -> None:
         """Name the tracks, and write the calibration."""
-        write_calibration(self._camera.camera, self.folder / 'calib' / f'{SEQUENCE}.txt')
+        write_calibration(self.kitti_camera.camera, self.folder / 'calib' / f'{SEQUENCE}.txt')
         if names := self._tracks.names():
             self.about['tracks'] = names
         if self._given_classes:
@@ -211,17 +198,6 @@ def decimals(numbers: Floats, score: float) -> str:
     return ' '.join(f'{value:.6f}' for value in values)
 
 
-class _Line(NamedTuple):
-    """A box of a label file; `numbers` are height, width, length, x, y, z and rotation_y."""
-
-    frame: int
-    track: str
-    class_name: str
-    numbers: list[float]
-    score: float
-    attributes: Mapping[str, str]
-
-
 def read(path: Path) -> Iterator[LabelFrame]:
     """
     Yield the frames of a label file, or of the only sequence of a folder.
@@ -236,7 +212,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     folder = absolute(path).parent.parent
     lines, left_out = _read_lines(path)
     camera = Camera.read(folder / 'calib' / path.name)
-    yield from numbered_frames(folder, _boxes_by_frame(path, lines, camera), left_out)
+    yield from numbered_frames(folder, _placed(path, lines, camera), left_out)
 
 
 def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
@@ -255,8 +231,7 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
             f'{path}: expected the calibration of a camera, which the scene {scene.name!r} '
             f'lacks; read it with a scene of kitti-tracking'
         )
-    boxes = _boxes_by_frame(path, lines, scene.camera)
-    yield from numbered_scene(path, boxes, left_out, scene)
+    yield from numbered_scene(path, _placed(path, lines, scene.camera), left_out, scene)
 
 
 def _file_of_sequence(folder: Path, name: str) -> Path:
@@ -270,9 +245,13 @@ def _file_of_sequence(folder: Path, name: str) -> Path:
     )
 
 
-def _read_lines(path: Path) -> tuple[list[_Line], dict[int, Counter[str]]]:
+Lines = dict[int, list[ReadBox]]
+"""Boxes by frame: of a line height, width, length, x, y, z and rotation_y, or placed (9,)."""
+
+
+def _read_lines(path: Path) -> tuple[Lines, dict[int, Counter[str]]]:
     """Return the lines of a label file, in their order, and the regions in each frame."""
-    lines = []
+    lines: Lines = {}
     left_out: dict[int, Counter[str]] = {}
     with following(path, '17 or 18 columns of KITTI tracking'):
         for number, text in enumerate(path.read_text(encoding='utf-8').splitlines(), 1):
@@ -290,26 +269,28 @@ def _read_lines(path: Path) -> tuple[list[_Line], dict[int, Counter[str]]]:
                     continue
                 numbers = [float(word) for word in words[10:17]]
                 score = float(words[17]) if len(words) > 17 else np.nan
-                attributes = attributes_of(*words[3:5])
-                lines.append(_Line(frame, words[1], words[2], numbers, score, attributes))
+                evidence = {'score': score, 'attributes': attributes_of(*words[3:5])}
+                box = ReadBox(words[1], words[2], numbers, evidence)
+                lines.setdefault(frame, []).append(box)
     return lines, left_out
 
 
-def _boxes_by_frame(
-    path: Path, lines: Sequence[_Line], camera: Camera
-) -> dict[int, list[ReadBox]]:
-    """Return the boxes of a label file in the LiDAR frame; tracks have the names beside it."""
+def _placed(path: Path, lines: Lines, camera: Camera) -> Lines:
+    """Return the boxes of lines in the LiDAR frame; tracks have the names beside the file."""
     about = read_provenance(absolute(path).parent.parent)
-    tracks, given = about.get('tracks', {}), about.get('given_classes', {})
-    with following(path, 'rotations in radians'):
-        boxes = boxes_of(camera, np.array([line.numbers for line in lines]).reshape(-1, 7))
-    found: dict[int, list[ReadBox]] = {}
-    for line, box in zip(lines, boxes, strict=True):
-        track_id = '' if line.track == NO_TRACK else tracks.get(line.track, line.track)
-        class_name = given.get(f'{line.track} {line.class_name}', line.class_name)
-        evidence = {'score': line.score, 'attributes': line.attributes}
-        read_box = ReadBox(track_id, class_name, box, evidence)
-        found.setdefault(line.frame, []).append(read_box)
+    tracks, given = {NO_TRACK: ''} | about.get('tracks', {}), about.get('given_classes', {})
+    found: Lines = {}
+    for frame, items in lines.items():
+        with following(path, 'rotations in radians'):
+            boxes = boxes_of(camera, np.array([item.box for item in items]))
+        found[frame] = [
+            item._replace(
+                track_id=tracks.get(item.track_id, item.track_id),
+                class_name=given.get(f'{item.track_id} {item.class_name}', item.class_name),
+                box=box,
+            )
+            for item, box in zip(items, boxes, strict=True)
+        ]
     return found
 
 

@@ -34,8 +34,8 @@ class KittiCamera:
     options : Options
         `Options.camera` is a file, or a topic of the recording; by default it is the camera of the
         scene of a data set, or the only one of the recording. Without any it is assumed.
-    needed_by : str
-        The format, in messages.
+    form : str
+        Name of the format, for messages.
 
     Attributes
     ----------
@@ -50,9 +50,9 @@ class KittiCamera:
 
     """
 
-    def __init__(self, options: Options, needed_by: str) -> None:
+    def __init__(self, options: Options, form: str) -> None:
         self._options = options
-        self._needed_by = needed_by
+        self._needed_by = f'format {form}'
         self._frame = ''
         self._label_camera: LabelCamera | None = None
         self.camera = self._choose()

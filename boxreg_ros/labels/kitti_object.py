@@ -9,14 +9,16 @@ its edge, and occlusion is 3, unknown. Names of files are stamps, see `per_frame
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from boxreg_ros.errors import RecordingError, unreadable
+from boxreg_ros.labels import kitti
 from boxreg_ros.labels.attributes import TRUNCATED
 from boxreg_ros.labels.camera import Camera
-from boxreg_ros.labels.cameras import black_png, LabelCamera
+from boxreg_ros.labels.cameras import black_png
 from boxreg_ros.labels.kitti import (
     attributes_of,
     boxes_of,
@@ -30,22 +32,17 @@ from boxreg_ros.labels.kitti import (
     truncation_of,
     write_calibration,
 )
-from boxreg_ros.labels.kitti_camera import KittiCamera
 from boxreg_ros.labels.per_frame import EVIDENCE_FOLDER, numbers_of, PerFrameWriter, read_lines
-from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import absolute, LabelFrame
 from boxreg_ros.labels.records import ReadBox
 from boxreg_ros.structures import BoxArray, Floats, Ints
 import numpy as np
 
-FORMAT = Format(
+FORMAT = replace(
+    kitti.FORMAT,
     name='kitti_object',
     title='KITTI object',
-    frame='rectified camera (`--camera`)',
-    reference='centre of the bottom face',
-    sizes='height width length',
-    rotation="rotation_y about the camera's y; roll and pitch are lost",
     files='label_2/STAMP.txt, calib/STAMP.txt, velodyne/STAMP.bin',
-    options=('camera', 'with_points', 'with_images', 'class_map'),
     leaves_out='regions without a 3D box (counted), the rectangles in the image',
     read_back='datumaro 1.13.12',
     reads='15 or 16 columns, of labels or of a detector',
@@ -66,30 +63,18 @@ class Writer(PerFrameWriter):
     label_folder = LABEL_FOLDER
     cloud_file = 'velodyne/{name}.bin'
     image_file = f'{KITTI_IMAGES}/{{name}}.png'
-
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        self._chosen = KittiCamera(options, 'format kitti_object')
-        super().__init__(folder, provenance, options)
+    has_kitti_camera = True
 
     def add(self, frame: LabelFrame) -> None:
         """Write the files of a frame."""
-        self._camera = self._chosen.in_frame(frame.sensor_frame)
+        self._camera = self.kitti_camera.in_frame(frame.sensor_frame)
         super().add(frame)
         path = self.folder / 'calib' / f'{self.name}.txt'
         write_calibration(self._camera, path, CALIBRATION_NAMES)
-        if self._chosen.is_assumed:  # OpenPCDet takes the size of the image from its file
+        if self.kitti_camera.is_assumed:  # OpenPCDet takes the size of the image from its file
             image = self.folder / KITTI_IMAGES / f'{self.name}.png'
             image.parent.mkdir(exist_ok=True)
             image.write_bytes(black_png(*self._camera.size))
-
-    @property
-    def notes(self) -> list[str]:
-        """Return what was assumed, the camera among it."""
-        return self._chosen.notes + super().notes
-
-    def used_cameras(self, cameras: Sequence[LabelCamera]) -> Sequence[LabelCamera]:
-        """Return the camera that the boxes refer to."""
-        return self._chosen.used(cameras)
 
     def lines(self, array: BoxArray, rows: Ints, boxes: Floats) -> Iterator[str]:
         """Yield the line of each box; see `PerFrameWriter.lines`."""

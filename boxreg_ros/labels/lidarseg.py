@@ -12,12 +12,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.labels import nuscenes
 from boxreg_ros.labels.class_names import NUSCENES, official
-from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import LabelFrame
 from boxreg_ros.structures import Ints, RefinedBoxes
 import numpy as np
 
@@ -44,11 +43,12 @@ MAX_PANOPTIC_INSTANCE = 999
 class Writer(nuscenes.Writer):
     """Write the tables of nuScenes, and two files of labels per sweep."""
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
+    def begin(self) -> None:
+        """Open the files."""
+        super().begin()
         self._rows: dict[str, list[dict[str, str]]] = {'lidarseg': [], 'panoptic': []}
         for name in self._rows:
-            (folder / name / self.version).mkdir(parents=True)
+            (self.folder / name / self.version).mkdir(parents=True)
         for name in NUSCENES:
             self._categories[name] = self._token('category', name)
         self._codes: Ints | None = None

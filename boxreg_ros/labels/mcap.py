@@ -84,7 +84,7 @@ class Writer:
 
     def write(self, frame: LabelFrame) -> None:
         """Add the boxes of a message, and copy messages up to the next missing boxes."""
-        if _without_added(frame.refined).status:
+        if frame.refined.without(*ADDED).status:
             stamp_ns = frame.refined.boxes.stamp_ns
             self._waiting.setdefault(stamp_ns, deque()).append(frame)
         self._copy(is_end=False)
@@ -122,12 +122,12 @@ class Writer:
         if not waiting:
             return None
         frame = waiting.popleft()
-        refined = _without_added(frame.refined)
+        refined = frame.refined.without(*ADDED)
         count = len(given.track_ids)
         if len(refined.status) > count:  # of several messages, which have a part of the boxes each
-            rows = range(len(refined.status))
-            waiting.appendleft(replace(frame, refined=refined.take(list(rows[count:]))))
-            refined = refined.take(list(rows[:count]))
+            rest = refined.take(range(count, len(refined.status)))
+            waiting.appendleft(replace(frame, refined=rest))
+            refined = refined.take(range(count))
         if not waiting:
             del self._waiting[given.stamp_ns]
         T = frame.T_fixed_given
@@ -182,11 +182,3 @@ def _new_message(store: Typestore, kind: str, **fields: Any) -> Any:
             is_number = inner[0][0] is Nodetype.BASE
             fields[name] = np.zeros(0, inner[0][1][0]) if is_number else []
     return store.types[kind](**fields)
-
-
-def _without_added(refined: RefinedBoxes) -> RefinedBoxes:
-    """Return the boxes without added ones, for which the message has no entry."""
-    rows = [i for i, status in enumerate(refined.status) if status not in ADDED]
-    if len(rows) == len(refined.status):
-        return refined
-    return refined.take(rows)

@@ -11,7 +11,7 @@ several instances. T4 has these values in a file beside its tables.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 import hashlib
 from pathlib import Path
 from typing import Any, TypeVar
@@ -28,11 +28,9 @@ from boxreg_ros.labels.protocol import (
     AUTOMATIC_STATUS,
     Format,
     LabelFrame,
-    Options,
-    Provenance,
     SceneFrames,
 )
-from boxreg_ros.labels.records import evidence_of, refined_boxes
+from boxreg_ros.labels.records import evidence_of, ReadBox, refined_of
 from boxreg_ros.rotations import boxes_from_quaternions, quaternion_from_matrix
 from boxreg_ros.structures import BOX_CENTER, Floats, HEIGHT, LENGTH, RefinedBoxes, WIDTH
 from msg_adapters.poses import quaternions_of
@@ -81,9 +79,9 @@ class Writer(FolderWriter):
     date_key = 'date_captured'
     needs_pose = True
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
-        self._tables = folder / self.version
+    def begin(self) -> None:
+        """Open the files."""
+        self._tables = self.folder / self.version
         self._tables.mkdir()
         self._streams = {
             name: files.JsonList(self._tables / f'{name}.json') for name in STREAMED_TABLES
@@ -125,53 +123,54 @@ class Writer(FolderWriter):
     def _add_sample(self, stamp_ns: int, T_fixed_sensor: Floats) -> None:
         """Add the rows of a sample: itself, its sweep and the pose of the ego vehicle."""
         timestamp = round(stamp_ns / 1000)
-        sample = self._token('sample', self.number)
-        pose = self._token('ego_pose', self.number)
         self._link(
             'sample',
             {
-                'token': sample,
+                'token': self._token('sample', self.number),
                 'timestamp': timestamp,
                 'prev': '',
                 'next': '',
                 'scene_token': self._token('scene'),
             },
         )
-        sweep = self._token('sample_data', self.number)
-        self._link(
-            'sample_data',
-            {
-                'token': sweep,
-                'sample_token': sample,
-                'ego_pose_token': pose,
-                'calibrated_sensor_token': self._token('calibrated_sensor'),
-                'timestamp': timestamp,
-                'fileformat': 'pcd.bin',
-                'is_key_frame': True,
-                'height': 0,
-                'width': 0,
-                'filename': self.cloud_file.format(number=self.number),
-                'prev': '',
-                'next': '',
-                'is_valid': True,
-                **self._own_columns(sweep, {'stamp_ns': stamp_ns}),
-            },
-        )
-        qx, qy, qz, qw = quaternion_from_matrix(T_fixed_sensor[:3, :3]).tolist()
+        self._add_sample_data(self.cloud_file.format(number=self.number), stamp_ns)
         self._streams['ego_pose'].append(
             {
-                'token': pose,
+                'token': self._token('ego_pose', self.number),
                 'timestamp': timestamp,
-                'rotation': [qw, qx, qy, qz],
+                'rotation': _rotation(T_fixed_sensor),
                 'translation': T_fixed_sensor[:3, 3].tolist(),
             }
         )
+
+    def _add_sample_data(
+        self, path: str, stamp_ns: int, camera: str = '', size: tuple[int, int] = (0, 0)
+    ) -> None:
+        """Add the row of a file of a sample: its sweep, or the image of a camera."""
+        token = self._token('sample_data', f'{self.number} {camera}'.rstrip())
+        width, height = size
+        row = {
+            'token': token,
+            'sample_token': self._token('sample', self.number),
+            'ego_pose_token': self._token('ego_pose', self.number),
+            'calibrated_sensor_token': self._token('calibrated_sensor', camera),
+            'timestamp': round(stamp_ns / 1000),
+            'fileformat': Path(path).name.partition('.')[2],
+            'is_key_frame': True,
+            'height': height,
+            'width': width,
+            'filename': path,
+            'prev': '',
+            'next': '',
+            'is_valid': True,
+            **self._own_columns(token, {'stamp_ns': stamp_ns}),
+        }
+        self._link('sample_data', row, camera=camera)
 
     def add_camera(self, camera: LabelCamera) -> None:
         """Hold the rows of a camera, whose pose is that in the LiDAR."""
         sensor = self._token('sensor', camera.name)
         T_sensor_camera = inverse(camera.T_camera_sensor)
-        qx, qy, qz, qw = quaternion_from_matrix(T_sensor_camera[:3, :3]).tolist()
         distortion = camera.image.distortion.tolist()
         self._sensors.append(
             {'token': sensor, 'channel': f'CAM_{camera.name.upper()}', 'modality': 'camera'}
@@ -181,7 +180,7 @@ class Writer(FolderWriter):
                 'token': self._token('calibrated_sensor', camera.name),
                 'sensor_token': sensor,
                 'translation': T_sensor_camera[:3, 3].tolist(),
-                'rotation': [qw, qx, qy, qz],
+                'rotation': _rotation(T_sensor_camera),
                 'camera_intrinsic': camera.intrinsics.tolist(),
                 'camera_distortion': distortion if len(distortion) in DISTORTIONS else [],
             }
@@ -190,25 +189,7 @@ class Writer(FolderWriter):
     def add_images(self, images: Sequence[tuple[LabelCamera, Image, str]]) -> None:
         """Add a row for each image of a sample, which has the pose of the sample."""
         for camera, image, path in images:
-            width, height = camera.image.size
-            token = self._token('sample_data', f'{self.number} {camera.name}')
-            row = {
-                'token': token,
-                'sample_token': self._token('sample', self.number),
-                'ego_pose_token': self._token('ego_pose', self.number),
-                'calibrated_sensor_token': self._token('calibrated_sensor', camera.name),
-                'timestamp': round(image.stamp_ns / 1000),
-                'fileformat': path.rpartition('.')[2],
-                'is_key_frame': True,
-                'height': height,
-                'width': width,
-                'filename': path,
-                'prev': '',
-                'next': '',
-                'is_valid': True,
-                **self._own_columns(token, {'stamp_ns': image.stamp_ns}),
-            }
-            self._link('sample_data', row, camera=camera.name)
+            self._add_sample_data(path, image.stamp_ns, camera.name, camera.image.size)
 
     def _add_annotations(
         self, frame: LabelFrame, sample: str, rows: list[int], boxes: Floats
@@ -234,17 +215,21 @@ class Writer(FolderWriter):
                 key = f'\0{self._num_single}'
             keys_in_sample.add(key)
             token = self._token('annotation', f'{sample} {key}')
-            own = self._evidence(refined, row) | {'stamp_ns': array.stamp_ns}
-            own['class_name'] = array.class_names[row]
+            own = self._evidence(refined, row) | {
+                'stamp_ns': array.stamp_ns,
+                'class_name': array.class_names[row],
+            }
             attributes = array.attributes_of(row)
-            names = self.attribute_names(attributes)
             if attributes:
                 own['attributes'] = dict(attributes)
             annotation = {
                 'token': token,
                 'sample_token': sample,
                 'instance_token': self._instance(key, track_id, class_name, token),
-                'attribute_tokens': [self._attribute(name) for name in names],
+                'attribute_tokens': [
+                    self._attributes.setdefault(name, self._token('attribute', name))
+                    for name in self.attribute_names(attributes)
+                ],
                 'visibility_token': 'unavailable',
                 'translation': centre,
                 'size': size,
@@ -269,19 +254,14 @@ class Writer(FolderWriter):
         names = to_nuscenes(attributes, 'vehicle.parked')
         return [name for name in names if name.partition('.')[0] in ATTRIBUTE_GROUPS][:1]
 
-    def _attribute(self, name: str) -> str:
-        """Return the token of an attribute."""
-        return self._attributes.setdefault(name, self._token('attribute', name))
-
     def _evidence(self, refined: RefinedBoxes, row: int) -> dict[str, Any]:
         """Return what an annotation states beside the columns of the devkit."""
         return evidence_of(refined, row)
 
     def _instance(self, key: str, track_id: str, class_name: str, annotation: str) -> str:
         """Return the token of an instance, and count the annotation."""
-        if class_name not in self._categories:
-            self._categories[class_name] = self._token('category', class_name)
-        category = self._categories[class_name]
+        token = self._token('category', class_name)
+        category = self._categories.setdefault(class_name, token)
         if key not in self._instances:
             self._instances[key] = {
                 'token': self._token('instance', key),
@@ -312,10 +292,6 @@ class Writer(FolderWriter):
         recordings = ', '.join(self.about['recordings'])
         samples = [self._token('sample', number) for number in (0, self.number - 1)]
         first, last = samples if self.number else ('', '')
-        categories = [
-            {'token': token, 'name': name, 'description': ''}
-            for name, token in self._categories.items()
-        ]
         calibrated_sensor = {
             'token': self._token('calibrated_sensor'),
             'sensor_token': sensor,
@@ -336,11 +312,8 @@ class Writer(FolderWriter):
         }
         area = {'log_tokens': [log], 'category': '', 'filename': EMPTY_MAP}
         return {
-            'category': categories,
-            'attribute': [
-                {'token': token, 'name': name, 'description': ''}
-                for name, token in self._attributes.items()
-            ],
+            'category': _named(self._categories),
+            'attribute': _named(self._attributes),
             'visibility': [{'token': 'unavailable', 'level': 'unavailable', 'description': ''}],
             'instance': list(self._instances.values()),
             'sensor': [
@@ -357,6 +330,17 @@ class Writer(FolderWriter):
         """Return 32 digits that are the same in every run over the same recording."""
         text = f'{self._drive} {kind} {key}'
         return hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()
+
+
+def _named(tokens: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return the rows of a table of names."""
+    return [{'token': token, 'name': name, 'description': ''} for name, token in tokens.items()]
+
+
+def _rotation(T: Floats) -> list[float]:
+    """Return qw qx qy qz of a pose (4, 4)."""
+    qx, qy, qz, qw = quaternion_from_matrix(T[:3, :3]).tolist()
+    return [qw, qx, qy, qz]
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
@@ -378,20 +362,14 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
 
 def _read_tables(tables: Path) -> Iterator[LabelFrame]:
-    instances = {item['token']: item for item in files.from_json(tables / 'instance.json')}
+    boxes = _annotations(tables, files.from_json)
     poses = _poses(tables)
-    annotations: dict[str, list[dict[str, Any]]] = {}
-    own = own_values(tables.parent)
-    attributes = _attribute_names(tables)
-    for item in files.from_json(tables / 'sample_annotation.json'):
-        whole = _with_attributes(item, attributes) | own.get(item['token'], {})
-        annotations.setdefault(item['sample_token'], []).append(whole)
-    samples = sorted(files.from_json(tables / 'sample.json'), key=lambda item: item['timestamp'])
     fixed_frame, sensor_frame = files.frame_names(tables.parent)
-    names = _category_names(tables)
+    samples = sorted(files.from_json(tables / 'sample.json'), key=lambda item: item['timestamp'])
     for sample in samples:
-        items = annotations.get(sample['token'], [])
-        refined = _annotated(_stamp_ns(sample, items), fixed_frame, items, instances, names)
+        found = boxes.get(sample['token'], [])
+        own_ns = (int(box.evidence['stamp_ns']) for box in found if 'stamp_ns' in box.evidence)
+        refined = refined_of(next(own_ns, int(sample['timestamp'] * 1000)), fixed_frame, found)
         yield LabelFrame(refined, fixed_frame, sensor_frame, poses.get(sample['token']))
 
 
@@ -403,57 +381,72 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     are submitted: ``{"meta": ..., "results": {sample_token: [...]}}``.
 
     """
-    read_boxes = _scene_annotations if path.is_dir() else _scene_results
     with files.following(path, 'the tables or results of nuScenes'):
-        boxes_by_sample = read_boxes(path, scene)
-    for token in scene.stamps_ns:
-        yield LabelFrame(boxes_by_sample[token], scene.fixed_frame, scene.sensor_frame)
+        if path.is_dir():
+            boxes = _annotations(path, files.json_items, scene.stamps_ns)
+        else:
+            boxes = _results(path, scene)
+    for token, stamp_ns in scene.stamps_ns.items():
+        refined = refined_of(stamp_ns, scene.fixed_frame, boxes.get(token, []))
+        yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame)
 
 
-def _scene_annotations(tables: Path, scene: SceneFrames) -> dict[str, RefinedBoxes]:
-    """Return the annotations of a scene by sample."""
-    annotations: dict[str, list[dict[str, Any]]] = {token: [] for token in scene.stamps_ns}
+def _annotations(
+    tables: Path,
+    rows_of: Callable[[Path], Iterable[dict[str, Any]]],
+    samples: Container[str] | None = None,
+) -> dict[str, list[ReadBox]]:
+    """Return the annotations of samples, by default of all, by the tokens of these."""
     own = own_values(tables.parent)
-    attributes = _attribute_names(tables)
-    for item in files.json_items(tables / 'sample_annotation.json'):
-        if item['sample_token'] in annotations:
-            whole = _with_attributes(item, attributes) | own.get(item['token'], {})
-            annotations[item['sample_token']].append(whole)
-    used = {item['instance_token'] for items in annotations.values() for item in items}
-    rows = files.json_items(tables / 'instance.json')
-    instances = {item['token']: item for item in rows if item['token'] in used}
-    names = _category_names(tables)
-    return {
-        token: _annotated(stamp_ns, scene.fixed_frame, annotations[token], instances, names)
-        for token, stamp_ns in scene.stamps_ns.items()
+    items = [
+        item | own.get(item['token'], {})
+        for item in rows_of(tables / 'sample_annotation.json')
+        if samples is None or item['sample_token'] in samples
+    ]
+    used = {item['instance_token'] for item in items}
+    instances = {
+        row['token']: row for row in rows_of(tables / 'instance.json') if row['token'] in used
     }
+    categories = _names(tables / 'category.json')
+    path = tables / 'attribute.json'
+    attributes = _names(path) if path.exists() else {}
+    found: dict[str, list[ReadBox]] = {}
+    for item, box in zip(items, _boxes_of(items), strict=True):
+        track = _row_of(instances, item['instance_token'], 'instance')
+        tokens = item.get('attribute_tokens') or ()
+        names = [attributes[token] for token in tokens if token in attributes]
+        read_box = ReadBox(
+            track.get('instance_name') or track['token'],
+            item.get('class_name') or _row_of(categories, track['category_token'], 'category'),
+            box,
+            {'attributes': of_nuscenes(names)} | _evidence_of(item),
+        )
+        found.setdefault(item['sample_token'], []).append(read_box)
+    return found
 
 
-def _scene_results(path: Path, scene: SceneFrames) -> dict[str, RefinedBoxes]:
+def _results(path: Path, scene: SceneFrames) -> dict[str, list[ReadBox]]:
     """Return the detections or tracked boxes of a scene by sample."""
-    results: dict[str, list[dict[str, Any]]] = {}
+    found: dict[str, list[ReadBox]] = {}
     others = 0
     for token, items in files.json_members(path, 'results'):
-        if token in scene.stamps_ns:
-            results[token] = items
-        else:
+        if token not in scene.stamps_ns:
             others += 1
-    if not results:
+            continue
+        task = 'tracking' if items and 'tracking_name' in items[0] else 'detection'
+        found[token] = [
+            ReadBox(
+                str(item.get('tracking_id', '')),
+                item[f'{task}_name'],
+                box,
+                {'score': item[f'{task}_score']},
+            )
+            for item, box in zip(items, _boxes_of(items), strict=True)
+        ]
+    if not found:
         raise RecordingError(
             f'{path}: expected results of the {len(scene.stamps_ns)} samples of {scene.name}, '
             f'got those of {others} other samples; name the results of the split of this scene'
-        )
-    found = {}
-    for token, stamp_ns in scene.stamps_ns.items():
-        items = results.get(token, [])
-        task = 'tracking' if items and 'tracking_name' in items[0] else 'detection'
-        found[token] = refined_boxes(
-            stamp_ns,
-            scene.fixed_frame,
-            [str(item.get('tracking_id', '')) for item in items],
-            [item[f'{task}_name'] for item in items],
-            _boxes_of(items),
-            [{'score': item[f'{task}_score']} for item in items],
         )
     return found
 
@@ -464,41 +457,9 @@ def own_values(folder: Path) -> dict[str, dict[str, Any]]:
     return {item['token']: item for item in files.json_items(path)} if path.is_file() else {}
 
 
-def _attribute_names(tables: Path) -> dict[str, str]:
-    path = tables / 'attribute.json'
-    return {item['token']: item['name'] for item in files.from_json(path)} if path.exists() else {}
-
-
-def _with_attributes(item: dict[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
-    """Return an annotation with the attributes of its tokens, unless it states them itself."""
-    tokens = item.get('attribute_tokens') or ()
-    return {'attributes': of_nuscenes([names[one] for one in tokens if one in names])} | item
-
-
-def _category_names(tables: Path) -> dict[str, str]:
-    return {item['token']: item['name'] for item in files.from_json(tables / 'category.json')}
-
-
-def _annotated(
-    stamp_ns: int,
-    frame_id: str,
-    items: list[dict[str, Any]],
-    instances: Mapping[str, dict[str, Any]],
-    names: Mapping[str, str],
-) -> RefinedBoxes:
-    """Return the boxes of the annotations of a sample."""
-    tracks = [_row_of(instances, item['instance_token'], 'instance') for item in items]
-    return refined_boxes(
-        stamp_ns,
-        frame_id,
-        [track.get('instance_name') or track['token'] for track in tracks],
-        [
-            item.get('class_name') or _row_of(names, track['category_token'], 'category')
-            for item, track in zip(items, tracks, strict=True)
-        ],
-        _boxes_of(items),
-        [_evidence_of(item) for item in items],
-    )
+def _names(table: Path) -> dict[str, str]:
+    """Return the names of a table by their tokens."""
+    return {item['token']: item['name'] for item in files.from_json(table)}
 
 
 def _evidence_of(item: dict[str, Any]) -> dict[str, Any]:
@@ -526,13 +487,6 @@ def _boxes_of(items: list[dict[str, Any]]) -> Floats:
         [[*item['translation'], *item['size'], *item['rotation']] for item in items], np.float64
     ).reshape(-1, 10)
     return boxes_from_quaternions(numbers[:, :3], numbers[:, [4, 3, 5]], numbers[:, [7, 8, 9, 6]])
-
-
-def _stamp_ns(sample: dict[str, Any], annotations: list[dict[str, Any]]) -> int:
-    for item in annotations:
-        if 'stamp_ns' in item:
-            return int(item['stamp_ns'])
-    return int(sample['timestamp'] * 1000)
 
 
 def _poses(tables: Path) -> dict[str, Floats]:

@@ -10,11 +10,10 @@ numbered, as the format requires, and have the track id as their name.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, replace
 from decimal import Decimal
 from itertools import count
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from boxreg_ros.io.transforms import inverse, moved_boxes
 from boxreg_ros.labels.attributes import attributes_from, plain
 from boxreg_ros.labels.files import at, following, from_json, to_json
 from boxreg_ros.labels.protocol import Format, INPUT_STATUS, LabelFrame, Options, Provenance
-from boxreg_ros.labels.records import ReadBox, refined_of, require_radians
+from boxreg_ros.labels.records import evidence_of, ReadBox, refined_of, require_radians
 from boxreg_ros.labels.sidecar import STAMPS_FILE, whole_stamps
 from boxreg_ros.labels.stamps import read_stamp_values, Stamps
 from boxreg_ros.reasons import Reason
@@ -104,11 +103,14 @@ class Writer:
         boxes = refined.boxes
         self._frame_ids.add(boxes.frame_id)
         objects: dict[int, Any] = {}
-        names = zip(boxes.track_ids, boxes.class_names, strict=True)
-        for name, cuboid in zip(names, _cuboids(refined), strict=True):
-            number = self._number(*name, objects)
+        # A track that changes its class is several objects.
+        tracks = zip(boxes.track_ids, boxes.class_names, strict=True)
+        for track, cuboid in zip(tracks, _cuboids(refined), strict=True):
+            number = self._number_of_track.get(track)
+            if number is None or number in objects:
+                number = self._new_object(*track)
             objects[number] = {'object_data': {'cuboid': [cuboid]}}
-            self._point_to(number, cuboid)
+            self._prolong(self._objects[number], cuboid)
         properties: dict[str, Any] = {
             'timestamp': boxes.stamp_ns / 1e9,
             'stamp_ns': boxes.stamp_ns,
@@ -116,7 +118,13 @@ class Writer:
         if frame.T_fixed_sensor is not None and frame.sensor_frame != frame.fixed_frame:
             self._frame_ids |= {frame.sensor_frame, frame.fixed_frame}
             self._parents[frame.sensor_frame] = frame.fixed_frame
-            properties['transforms'] = _transforms(frame, frame.T_fixed_sensor)
+            properties['transforms'] = {
+                f'{frame.sensor_frame}_to_{frame.fixed_frame}': {
+                    'src': frame.sensor_frame,
+                    'dst': frame.fixed_frame,
+                    'transform_src_to_dst': {'matrix4x4': frame.T_fixed_sensor.ravel().tolist()},
+                }
+            }
         content = to_json({'frame_properties': properties, 'objects': objects})
         separator = ',' if self._frames else ''
         self._file.write(f'{separator}\n"{self._frames}": {content}')
@@ -147,27 +155,18 @@ class Writer:
             'children': [child for child, parent in self._parents.items() if parent == name],
         }
 
-    def _number(self, track_id: str, class_name: str, in_frame: dict[int, Any]) -> int:
-        """Return the number of the object, and add the current frame to its intervals."""
-        track = (track_id, class_name)  # a track that changes its class is several objects
-        number = self._number_of_track.get(track) if track_id else None
-        if number is None or number in in_frame:
-            number = self._new_object(track_id, class_name)
-        intervals = self._objects[number]['frame_intervals']
+    def _prolong(self, item: dict[str, Any], cuboid: dict[str, Any]) -> None:
+        """Add the current frame and the attributes of its cuboid to an object."""
+        intervals = item['frame_intervals']
         if intervals and intervals[-1]['frame_end'] == self._frames - 1:
             intervals[-1]['frame_end'] = self._frames
         else:
             intervals.append({'frame_start': self._frames, 'frame_end': self._frames})
-        return number
-
-    def _point_to(self, number: int, cuboid: dict[str, Any]) -> None:
-        """Add the attributes of a cuboid that few have to the pointers of its object."""
-        pointer = self._objects[number]['object_data_pointers']['box']
+        pointer = item['object_data_pointers']['box']
         for kind in ('boolean', 'text'):
-            for item in cuboid['attributes'].get(kind, ()):
-                if item['name'] not in pointer['attribute_pointers']:
-                    known = pointer['attribute_pointers']
-                    pointer['attribute_pointers'] = known | {item['name']: kind}
+            kinds = {one['name']: kind for one in cuboid['attributes'].get(kind, ())}
+            known = pointer['attribute_pointers']
+            pointer['attribute_pointers'] = known | kinds | known
 
     def _new_object(self, track_id: str, class_name: str) -> int:
         """Add an object and return its number; the first of a track stands for the track."""
@@ -188,46 +187,33 @@ class Writer:
 def _cuboids(refined: RefinedBoxes) -> Iterator[dict[str, Any]]:
     """Yield boxes with their evidence as attributes."""
     boxes = refined.boxes
-    position = boxes.boxes[:, BOX_CENTER]
-    extent = boxes.boxes[:, BOX_EXTENT]
-    values = np.hstack([position, quaternions_of(boxes.boxes), extent])
-    covariances = refined.covariances.reshape(-1, 36).round(COVARIANCE_DIGITS)
-    extents = refined.extent_covariances.reshape(-1, 9).round(COVARIANCE_DIGITS)
-    columns = (values, refined.num_points, boxes.scores, covariances, extents)
-    rows = zip(refined.status, refined.reasons, *(c.tolist() for c in columns), strict=True)
-    for i, row in enumerate(rows):
-        status, reason, value, num_points, score, covariance, extent_covariance = row
-        numbers = [{'name': 'num_points', 'val': num_points}]
-        if isfinite(score):
-            numbers.append({'name': 'score', 'val': score})
-        attributes: dict[str, list[dict[str, Any]]] = {
-            'text': [{'name': 'status', 'val': status}, {'name': 'reason', 'val': reason}],
-            'num': numbers,
-            'vec': [
-                {'name': 'covariance', 'val': covariance},
-                {'name': 'extent_covariance', 'val': extent_covariance},
-            ],
+    places = boxes.boxes[:, BOX_CENTER], quaternions_of(boxes.boxes), boxes.boxes[:, BOX_EXTENT]
+    rounded = replace(
+        refined,
+        covariances=refined.covariances.round(COVARIANCE_DIGITS),
+        extent_covariances=refined.extent_covariances.round(COVARIANCE_DIGITS),
+    )
+    for row, values in enumerate(np.hstack(places).tolist()):
+        evidence = evidence_of(rounded, row) | {'num_points': int(refined.num_points[row])}
+        attributes = {
+            'text': _named(evidence, 'status', 'reason'),
+            'num': _named(evidence, 'num_points', 'score'),
+            'vec': _named(evidence, 'covariance', 'extent_covariance'),
         }
-        for name, word in boxes.attributes_of(i).items():
+        for name, word in boxes.attributes_of(row).items():
             kind = 'boolean' if isinstance(plain(word), bool) else 'text'
             attributes.setdefault(kind, []).append({'name': name, 'val': plain(word)})
         yield {
             'name': 'box',
             'coordinate_system': boxes.frame_id,
-            'val': value,
+            'val': values,
             'attributes': attributes,
         }
 
 
-def _transforms(frame: LabelFrame, T_fixed_sensor: Floats) -> dict[str, Any]:
-    """Return the pose of the sensor as the transform of a frame."""
-    return {
-        f'{frame.sensor_frame}_to_{frame.fixed_frame}': {
-            'src': frame.sensor_frame,
-            'dst': frame.fixed_frame,
-            'transform_src_to_dst': {'matrix4x4': T_fixed_sensor.ravel().tolist()},
-        }
-    }
+def _named(values: Mapping[str, Any], *names: str) -> list[dict[str, Any]]:
+    """Return some values that are known as attributes."""
+    return [{'name': name, 'val': values[name]} for name in names if values[name] is not None]
 
 
 def read(path: Path) -> Iterator[LabelFrame]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.cuboids import UNKNOWN_CLASS
 from boxreg_ros.labels.per_frame import EVIDENCE_FOLDER, numbers_of, PerFrameWriter, read_lines
-from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import Format, LabelFrame
 from boxreg_ros.labels.records import ReadBox, require_radians
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BoxArray, Floats, Ints, ROLL
@@ -50,8 +50,8 @@ class Writer(PerFrameWriter):
     label_folder = 'labels'
     cloud_file = 'points/{name}.npy'
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
+    def begin(self) -> None:
+        """Open the files."""
         self._names = self.text_file('ImageSets/train.txt')
         self.text_file('ImageSets/val.txt')
 

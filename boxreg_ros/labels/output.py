@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from boxreg_ros.labels.protocol import LabelFrame, LabelWriter, Options, Provenance
+from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.labels.registry import require_boxes, writer_for
-from boxreg_ros.structures import RefinedBoxes, REJECTED
+from boxreg_ros.structures import REJECTED
 
 WITH_REJECTED = ('csv', 'mcap')
 """Formats that hold every box of the input; the messages of an overlay are those of the input."""
 
 
 class LabelOutput:
-    """Write each frame in every format, ``boxes.csv`` always; errors are those of `writer_for`."""
+    """
+    Write each frame in every format; errors are those of `writer_for`.
+
+    Rejected boxes, which a step or a person has taken out, are in the formats `WITH_REJECTED`.
+
+    """
 
     def __init__(
         self, folder: Path, formats: Sequence[str], provenance: Provenance, options: Options
     ) -> None:
         require_boxes(formats)
-        self._writers = {
-            name: writer_for(name, folder, provenance, options) for name in with_csv(formats)
-        }
+        self._writers = {name: writer_for(name, folder, provenance, options) for name in formats}
 
     def write(self, frame: LabelFrame) -> None:
         """Add the boxes of one stamp to every format."""
-        accepted = replace(frame, refined=_accepted(frame.refined))
+        accepted = replace(frame, refined=frame.refined.without(REJECTED))
         for name, writer in self._writers.items():
             writer.write(frame if name in WITH_REJECTED else accepted)
 
@@ -42,27 +45,9 @@ class LabelOutput:
         return {name: dropped for name, dropped in counts.items() if dropped}
 
     def notes(self) -> list[str]:
-        """Return what the writers assumed, see `notes_of`."""
-        return notes_of(self._writers)
-
-
-def notes_of(writers: Mapping[str, LabelWriter]) -> list[str]:
-    """Return what writers assumed, and what readers of their files leave out, with the format."""
-    return [
-        f'format {name}: {note}'
-        for name, writer in writers.items()
-        for note in getattr(writer, 'notes', ())
-    ]
-
-
-def with_csv(formats: Sequence[str]) -> tuple[str, ...]:
-    """Return the formats to write, each once, ``csv`` first."""
-    return tuple(dict.fromkeys(('csv', *formats)))
-
-
-def _accepted(refined: RefinedBoxes) -> RefinedBoxes:
-    """Return a result without the rejected boxes."""
-    if REJECTED not in refined.status:
-        return refined
-    rows = [row for row, status in enumerate(refined.status) if status != REJECTED]
-    return refined.take(rows)
+        """Return what writers assumed, and what readers of files leave out, with the format."""
+        return [
+            f'format {name}: {note}'
+            for name, writer in self._writers.items()
+            for note in getattr(writer, 'notes', ())
+        ]

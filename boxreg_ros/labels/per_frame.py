@@ -39,13 +39,21 @@ class PerFrameWriter(FolderWriter):
 
     def add(self, frame: LabelFrame) -> None:
         """Write the files of a frame."""
+        array = frame.refined.boxes
         rows, boxes = frame.boxes_in('sensor', self.dropped)
-        lines = list(self.lines(frame.refined.boxes, rows, boxes))
+        lines = list(self.lines(array, rows, boxes))
         text = ''.join(f'{line}\n' for line in lines)
         path = self.folder / self.label_folder / f'{self.name}.txt'
         path.write_text(text, encoding='utf-8')
         evidence = [
-            {'line': line} | _evidence(frame, row)
+            {
+                'line': line,
+                'track_id': array.track_ids[row],
+                'class_name': array.class_names[row],
+                'num_points': int(frame.refined.num_points[row]),
+                'attributes': dict(array.attributes_of(row)),
+                **evidence_of(frame.refined, row),
+            }
             for line, row in zip(lines, rows.tolist(), strict=True)
         ]
         write_json(self.folder / EVIDENCE_FOLDER / f'{self.name}.json', evidence)
@@ -65,18 +73,6 @@ class PerFrameWriter(FolderWriter):
 
         """
         raise NotImplementedError
-
-
-def _evidence(frame: LabelFrame, row: int) -> dict[str, Any]:
-    """Return what a line has no place for."""
-    array = frame.refined.boxes
-    return {
-        'track_id': array.track_ids[row],
-        'class_name': array.class_names[row],
-        'num_points': int(frame.refined.num_points[row]),
-        'attributes': dict(array.attributes_of(row)),
-        **evidence_of(frame.refined, row),
-    }
 
 
 def read_lines(

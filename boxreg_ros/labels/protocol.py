@@ -118,13 +118,10 @@ class LabelFrame:
 
     def keyframes(self) -> LabelFrame:
         """Return it with the boxes of a person alone; the others are in `left_out`."""
-        status = self.refined.status
-        rows = [row for row, word in enumerate(status) if word not in NOT_OF_A_PERSON]
-        if len(rows) == len(status):
-            return self
+        refined = self.refined.without(*NOT_OF_A_PERSON)
         left_out = Counter(self.left_out)
-        left_out[Reason.NOT_A_KEYFRAME] += len(status) - len(rows)
-        return replace(self, refined=self.refined.take(rows), left_out=left_out)
+        left_out[Reason.NOT_A_KEYFRAME] += len(self.refined.status) - len(refined.status)
+        return replace(self, refined=refined, left_out=+left_out)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
 
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.label_messages import from_text, LabelMessage, LABELS_TOPIC, LABELS_TYPE
@@ -35,13 +34,6 @@ FORMAT = Format(
     files='none: `ros2 bag record` writes it',
 )
 BOXES_TOPIC = 'refined_boxes_final'
-
-
-class _Source(NamedTuple):
-    """The topic of the labels, and its type."""
-
-    topic: str
-    kind: str
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
@@ -77,13 +69,13 @@ def _messages(path: Path) -> Iterator[tuple[str, LabelFrame]]:
     drive, asked = _parts(path)
     with closing(Reader([part_of(Path(drive))])) as reader:
         topics = Topics(reader.connections, drive)
-        source = _source_of(topics, drive, asked)
+        topic = _topic_of(topics, drive, asked)
         decoder = MessageDecoder(drive)
-        for record in reader.messages(topics.connections({source.topic}), None, None):
+        for record in reader.messages(topics.connections({topic}), None, None):
             try:
                 message = decoder.message(record)
-                with malformed(f'topic {source.topic!r}'):
-                    found = _content(message, source)
+                with malformed(f'topic {topic!r}'):
+                    found = _content(message, topics.kinds[topic])
             except UnsupportedMessage as error:
                 raise RecordingError(
                     f'labels {drive!r}: {error}; give the labels by boxreg relabel --set '
@@ -92,7 +84,7 @@ def _messages(path: Path) -> Iterator[tuple[str, LabelFrame]]:
             yield found
 
 
-def _source_of(topics: Topics, drive: str, asked: str) -> _Source:
+def _topic_of(topics: Topics, drive: str, asked: str) -> str:
     """Return the topic asked for, that of labels, or that of final boxes."""
     kinds = topics.kinds
     able = [topic for topic, kind in kinds.items() if kind == LABELS_TYPE or kind in ADAPTERS]
@@ -102,7 +94,7 @@ def _source_of(topics: Topics, drive: str, asked: str) -> _Source:
         labels = [t for t in able if kinds[t] == LABELS_TYPE and _last(t) == LABELS_TOPIC]
         found = labels or [t for t in able if kinds[t] in ADAPTERS and _last(t) == BOXES_TOPIC]
     if len(found) == 1:
-        return _Source(found[0], kinds[found[0]])
+        return found[0]
     wanted = asked or f'{LABELS_TOPIC} or {BOXES_TOPIC}'
     got = ', '.join(found) or 'none'
     raise RecordingError(
@@ -115,12 +107,12 @@ def _last(topic: str) -> str:
     return topic.rsplit('/', 1)[-1]
 
 
-def _content(message: object, source: _Source) -> tuple[str, LabelFrame]:
+def _content(message: object, kind: str) -> tuple[str, LabelFrame]:
     """Return hash of the settings and labels of a message."""
-    if source.kind == LABELS_TYPE:
+    if kind == LABELS_TYPE:
         found: LabelMessage = from_text(message.data)  # type: ignore[attr-defined]
         return found.config_hash, LabelFrame(found.refined, found.fixed_frame, '')
-    boxes = adapter_for(source.kind).from_msg(message)
+    boxes = adapter_for(kind).from_msg(message)
     evidence = [{'score': score} for score in boxes.scores.tolist()]
     refined = refined_boxes(
         boxes.stamp_ns, boxes.frame_id, boxes.track_ids, boxes.class_names, boxes.boxes, evidence

@@ -53,7 +53,8 @@ def refined_boxes(
     n = len(track_ids)
     items = evidence or [{}] * n
     scores = [item.get('score') for item in items]
-    extents = [item.get('extent_covariance') for item in items]
+    covariances = [_matrix(item.get('covariance'), 6) for item in items]
+    extents = [_matrix(item.get('extent_covariance'), 3) for item in items]
     attributes = tuple(item.get('attributes') or {} for item in items)
     return RefinedBoxes(
         BoxArray(
@@ -68,24 +69,17 @@ def refined_boxes(
         tuple(str(item.get('status') or INPUT_STATUS) for item in items),
         tuple(str(item.get('reason') or '') for item in items),
         np.array([item.get('num_points') or 0 for item in items], np.int64),
-        np.reshape([_covariance(item.get('covariance')) for item in items], (n, 6, 6)),
-        extent_covariances=np.reshape(
-            [
-                np.eye(3) if extent is None else np.reshape(np.asarray(extent, np.float64), (3, 3))
-                for extent in extents
-            ],
-            (n, 3, 3),
-        ),
+        np.reshape(covariances, (n, 6, 6)),
+        extent_covariances=np.reshape(extents, (n, 3, 3)),
     )
 
 
-def _covariance(values: ArrayLike | None) -> Floats:
-    """Return the matrix (6, 6) of its rows or of its upper triangle; the unit matrix for None."""
+def _matrix(values: ArrayLike | None, size: int) -> Floats:
+    """Return a matrix of its rows or of its upper triangle; the unit matrix for None."""
     if values is None:
-        return np.eye(6)
-    if np.size(values) == 36:
-        return np.reshape(np.asarray(values, np.float64), (6, 6))
-    return symmetric(np.asarray(values, np.float64), 6)
+        return np.eye(size)
+    numbers = np.asarray(values, np.float64)
+    return numbers.reshape(size, size) if numbers.size == size**2 else symmetric(numbers, size)
 
 
 def require_radians(angles: ArrayLike) -> Floats:

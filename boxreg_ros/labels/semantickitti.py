@@ -10,13 +10,12 @@ are those of the LiDAR, relative to the first one; the calibration is the identi
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from boxreg_ros.config import words_of
 from boxreg_ros.io.transforms import inverse
 from boxreg_ros.labels.folder import FolderWriter
-from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import Format, LabelFrame
 from boxreg_ros.structures import Floats
 import numpy as np
 from numpy.typing import NDArray
@@ -61,9 +60,9 @@ class Writer(FolderWriter):
     has_sidecar = True
     needs_pose = True
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
-        self._sequence = folder / SEQUENCE_FOLDER
+    def begin(self) -> None:
+        """Open the files."""
+        self._sequence = self.folder / SEQUENCE_FOLDER
         identity = ' '.join(map(str, np.eye(4)[:3].ravel()))
         lines = [f'{name}: {identity}\n' for name in ('P0', 'P1', 'P2', 'P3', 'Tr')]
         self.text_file(f'{SEQUENCE_FOLDER}/calib.txt').writelines(lines)

@@ -9,7 +9,8 @@ which they take the track.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 import shutil
 from tempfile import TemporaryFile
@@ -19,7 +20,7 @@ from boxreg_ros.io.images import Image
 from boxreg_ros.labels import cuboids
 from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.files import at, following, from_json, to_json, write_json
-from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import LabelFrame
 from boxreg_ros.labels.records import ReadBox, TrackNumbers
 from boxreg_ros.labels.supervisely import (
     boxes_of,
@@ -31,7 +32,8 @@ from boxreg_ros.labels.supervisely import (
     write_calibrations,
 )
 
-FORMAT = cuboids.cuboid_format(
+FORMAT = replace(
+    cuboids.CUBOID_FORMAT,
     name='sly_pointcloud',
     title='Supervisely clouds, CVAT Sly Point Cloud',
     files='meta.json, key_id_map.json, ds0/ann/STAMP.pcd.json, ds0/pointcloud/STAMP.pcd',
@@ -56,16 +58,16 @@ class Writer(cuboids.CuboidWriter):
     cloud_file = 'ds0/pointcloud/{name}.pcd'
     image_file = 'ds0/related_images/{name}_pcd/{camera}.{suffix}'
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
+    def begin(self) -> None:
+        """Open the files."""
         self._classes: dict[str, None] = {}
         self._tracks = TrackNumbers()
         self._objects: dict[str, int] = {}
         self._tags: dict[str, None] = dict.fromkeys(TAGS)
         self._figures = 0
         # Figures are as many as boxes: their numbers wait in a file.
-        self._figure_ids = TemporaryFile('w+', encoding='utf-8', dir=folder)  # noqa: SIM115
-        self._cloud_ids = TemporaryFile('w+', encoding='utf-8', dir=folder)  # noqa: SIM115
+        self._figure_ids = TemporaryFile('w+', encoding='utf-8', dir=self.folder)  # noqa: SIM115
+        self._cloud_ids = TemporaryFile('w+', encoding='utf-8', dir=self.folder)  # noqa: SIM115
 
     def add(self, frame: LabelFrame) -> None:
         """Write the file of a frame."""
@@ -157,10 +159,10 @@ def read(path: Path) -> Iterator[LabelFrame]:
         boxes[Path(file.stem).stem] = found
         clouds_of.update({box.track_id for box in found} & set(map(str, objects)))
     if len(boxes) > 1 and max(clouds_of.values(), default=2) == 1:
-        boxes = {name: _without_objects(found, clouds_of) for name, found in boxes.items()}
-    yield from cuboids.read_frames(folder, list(boxes), lambda name: (boxes.get(name, []), {}))
-
-
-def _without_objects(boxes: list[ReadBox], objects: Collection[str]) -> list[ReadBox]:
-    """Return boxes whose track id is none of some objects."""
-    return [box._replace(track_id='') if box.track_id in objects else box for box in boxes]
+        boxes = {
+            name: [
+                one._replace(track_id='') if one.track_id in clouds_of else one for one in found
+            ]
+            for name, found in boxes.items()
+        }
+    yield from cuboids.read_frames(folder, list(boxes), lambda name: (boxes[name], {}))

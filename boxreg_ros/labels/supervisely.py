@@ -8,6 +8,7 @@ Supervisely: a project of point cloud episodes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from uuid import NAMESPACE_URL, uuid5
@@ -22,13 +23,12 @@ from boxreg_ros.labels.protocol import (
     AUTOMATIC_STATUS,
     INPUT_STATUS,
     LabelFrame,
-    Options,
-    Provenance,
 )
 from boxreg_ros.labels.records import ReadBox
 from boxreg_ros.structures import INTERPOLATED
 
-FORMAT = cuboids.cuboid_format(
+FORMAT = replace(
+    cuboids.CUBOID_FORMAT,
     name='supervisely',
     title='Supervisely episodes',
     files='meta.json, episode/annotation.json, episode/pointcloud/STAMP.pcd',
@@ -56,9 +56,9 @@ class Writer(cuboids.CuboidWriter):
     cloud_file = 'episode/pointcloud/{name}.pcd'
     image_file = 'episode/related_images/{name}_pcd/{camera}.{suffix}'
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
-        self._episode = folder / 'episode'
+    def begin(self) -> None:
+        """Open the files."""
+        self._episode = self.folder / 'episode'
         head = {'description': to_json(self.about), 'key': key_of('episode'), 'tags': []}
         self._records = JsonList(self._episode / ANNOTATION_FILE, head, 'frames')
         self._clouds: list[str] = []
@@ -161,7 +161,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
             with at(f'frame {index}'):
                 found = boxes_of(figures.get(index) or (), objects, int(index))
                 boxes[Path(cloud).stem] = found
-    yield from cuboids.read_frames(folder, list(boxes), lambda name: (boxes.get(name, []), {}))
+    yield from cuboids.read_frames(folder, list(boxes), lambda name: (boxes[name], {}))
 
 
 def write_calibrations(folder: Path, images: Iterable[tuple[LabelCamera, Image, str]]) -> None:

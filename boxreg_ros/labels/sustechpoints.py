@@ -9,24 +9,24 @@ distinguishes them from boxes that a person drew or edited, and does not learn f
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from boxreg_ros.labels import cuboids
 from boxreg_ros.labels.attributes import is_set, PARTLY, TRUE
 from boxreg_ros.labels.cameras import LabelCamera
-from boxreg_ros.labels.files import at, write_json
+from boxreg_ros.labels.files import at, following, from_json, write_json
 from boxreg_ros.labels.protocol import (
     AUTOMATIC_STATUS,
     INPUT_STATUS,
     LabelFrame,
-    Options,
-    Provenance,
 )
 from boxreg_ros.labels.records import ReadBox
 from boxreg_ros.structures import INTERPOLATED
 
-FORMAT = cuboids.cuboid_format(
+FORMAT = replace(
+    cuboids.CUBOID_FORMAT,
     name='sustechpoints',
     title='SUSTechPOINTS',
     files='label/STAMP.json, lidar/STAMP.pcd, desc.json',
@@ -45,9 +45,9 @@ class Writer(cuboids.CuboidWriter):
     cloud_file = 'lidar/{name}.pcd'
     image_file = 'camera/{camera}/{name}.{suffix}'
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
-        write_json(folder / 'desc.json', self.about)
+    def begin(self) -> None:
+        """Open the files."""
+        write_json(self.folder / 'desc.json', self.about)
 
     def add(self, frame: LabelFrame) -> None:
         """Write the file of a frame."""
@@ -89,8 +89,15 @@ def read(path: Path) -> Iterator[LabelFrame]:
         If a file is missing or does not follow the format.
 
     """
-    names = {file.stem for file in path.glob('label/*.json')}
-    yield from cuboids.read_files(path, path / 'label', names, 'boxes of SUSTechPOINTS', _cuboids)
+
+    def boxes_of(name: str) -> cuboids.FrameBoxes:
+        file = path / 'label' / f'{name}.json'
+        content = from_json(file)
+        with following(file, 'boxes of SUSTechPOINTS'):
+            return _cuboids(content), {}
+
+    names = sorted(file.stem for file in path.glob('label/*.json'))
+    yield from cuboids.read_frames(path, names, boxes_of)
 
 
 def _item(cuboid: cuboids.Cuboid) -> dict[str, Any]:
@@ -115,12 +122,12 @@ def _words(attributes: Mapping[str, str]) -> Iterator[str]:
             yield name if value in (TRUE, PARTLY) else f'{name} {value}'
 
 
-def _cuboids(content: Any) -> cuboids.FrameBoxes:
+def _cuboids(content: Any) -> list[ReadBox]:
     boxes = []
     for number, item in enumerate(content['objs'] if isinstance(content, dict) else content):
         with at(f'box {number}'):
             boxes.append(_cuboid(item))
-    return boxes, {}
+    return boxes
 
 
 def _cuboid(item: dict[str, Any]) -> ReadBox:

@@ -13,14 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from boxreg_ros.labels import nuscenes
 from boxreg_ros.labels.attributes import to_nuscenes
 from boxreg_ros.labels.files import JsonList
 from boxreg_ros.labels.nuscenes import OWN_VALUES, read, read_scene
-from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import LabelFrame
 from boxreg_ros.structures import HUMAN, RefinedBoxes
 import numpy as np
 
@@ -49,10 +48,11 @@ class Writer(nuscenes.Writer):
     image_file = 'data/{channel}/{number:05d}.{suffix}'
     date_key = 'data_captured'
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
-        self._own_values = JsonList(folder / OWN_VALUES)
-        self._model = f'{provenance.tool} {provenance.version}'
+    def begin(self) -> None:
+        """Open the files."""
+        super().begin()
+        self._own_values = JsonList(self.folder / OWN_VALUES)
+        self._model = f'{self.provenance.tool} {self.provenance.version}'
         self._stamp_ns = 0
         # Stamp [ns] and centre of the last two boxes, by instance key
         self._places: dict[str, list[tuple[int, list[float]]]] = {}

@@ -10,8 +10,9 @@ see `_convention_of`; ``--swap-axes`` writes files for them.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 import re
 import shutil
@@ -30,8 +31,6 @@ from boxreg_ros.labels.protocol import (
     INPUT_STATUS,
     LabelFrame,
     NOT_OF_A_PERSON,
-    Options,
-    Provenance,
     SceneFrames,
 )
 from boxreg_ros.labels.records import ReadBox
@@ -120,13 +119,13 @@ class Writer(FolderWriter):
     cloud_file = 'velodyne_points/data/{number:010d}.bin'
     has_sidecar = True
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
-        self._is_swapped = options.swap_axes
+    def begin(self) -> None:
+        """Open the files."""
+        self._is_swapped = self.options.swap_axes
         origin = self.about | ({'axes': SWAPPED_COMMENT} if self._is_swapped else {})
         self._origin = _comment(to_json(origin))
         # The file begins with the number of tracklets: they are collected in another file first.
-        self._body = TemporaryFile('w+', encoding='utf-8', dir=folder)  # noqa: SIM115
+        self._body = TemporaryFile('w+', encoding='utf-8', dir=self.folder)  # noqa: SIM115
         self._open: dict[tuple[str, str], _Tracklet] = {}
         self._count = 0
 
@@ -221,8 +220,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         If a file is missing or does not follow the format.
 
     """
-    if path.is_dir():
-        path = path / FILE
+    path = _file_of(path)
     content = _read_file(path)
     raw_stamps = path.parent / 'velodyne_points' / 'timestamps.txt'
     stamps = raw_stamps if raw_stamps.exists() else None
@@ -233,10 +231,13 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
 def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """Yield the frames of a drive, by the stamps of the data set."""
-    if path.is_dir():
-        path = path / FILE
+    path = _file_of(path)
     content = _read_file(path)
     yield from content.noted(numbered_scene(path, content.boxes, content.left_out, scene))
+
+
+def _file_of(path: Path) -> Path:
+    return path / FILE if path.is_dir() else path
 
 
 class _Convention(NamedTuple):
@@ -335,7 +336,10 @@ def _content(root: ElementTree.Element, convention: _Convention, is_own: bool = 
             f'objects would be longest upwards or sideways'
         )
     content = _Content({}, {}, note)
-    status_of = _KittiStatus() if is_own or not convention.is_centre else _DatumaroStatus(items)
+    status_of = _kitti_status
+    if not is_own and convention.is_centre:
+        poses = [pose for item in items for pose in item.findall('poses/item')]
+        status_of = partial(_datumaro_status, any(map(_keyframe, poses)))
     for number, item in enumerate(items):
         with at(f'tracklet {number}'):
             _add(content, item, str(number), convention, status_of)
@@ -351,7 +355,7 @@ def _add(
 ) -> None:
     """Add the boxes of a tracklet; `name` is its track id where it states none."""
     track_id = _track_id(item, name)
-    class_name = (item.findtext('objectType') or '').strip()
+    class_name = _text(item, 'objectType')
     extent = [_number(item, tag) for tag in convention.tags]
     first_frame = int(_number(item, 'first_frame'))
     for index, pose in enumerate(item.findall('poses/item'), first_frame):
@@ -368,40 +372,30 @@ def _add(
         content.boxes.setdefault(index, []).append(read_box)
 
 
-class _KittiStatus:
-    """Status of a pose by its ``state``: 0 is not set, 1 interpolated, 2 drawn by a person."""
-
-    def __call__(self, pose: ElementTree.Element) -> str | None:
-        is_interpolated = (pose.findtext('state') or '').strip() == str(INTERPOLATED_STATE)
-        return INTERPOLATED if is_interpolated else INPUT_STATUS
+def _kitti_status(pose: ElementTree.Element) -> str | None:
+    """Return the status by ``state``: 0 is not set, 1 interpolated, 2 drawn by a person."""
+    is_interpolated = _text(pose, 'state') == str(INTERPOLATED_STATE)
+    return INTERPOLATED if is_interpolated else INPUT_STATUS
 
 
-class _DatumaroStatus:
+def _datumaro_status(has_keyframes: bool, pose: ElementTree.Element) -> str | None:
     """
-    Status of a pose by ``occlusion_kf``, or an attribute; None for one that fills a gap.
+    Return the status by ``occlusion_kf``, or an attribute; None for a pose that fills a gap.
 
     Datumaro writes the state 2 for all poses. Where a track is interrupted it repeats the last
     pose, marked as outside of the image and without an occlusion.
 
     """
-
-    def __init__(self, items: Sequence[ElementTree.Element]) -> None:
-        poses = [pose for item in items for pose in item.findall('poses/item')]
-        self._has_keyframes = any(_keyframe(pose) for pose in poses)
-
-    def __call__(self, pose: ElementTree.Element) -> str | None:
-        truncation, occlusion = (
-            (pose.findtext(tag) or '').strip() for tag in ('truncation', 'occlusion')
-        )
-        if truncation in OUTSIDE_TRUNCATIONS and occlusion in UNSET_OCCLUSIONS:
-            return None
-        is_interpolated = self._has_keyframes and not _keyframe(pose)
-        return INTERPOLATED if is_interpolated else INPUT_STATUS
+    is_outside = _text(pose, 'truncation') in OUTSIDE_TRUNCATIONS
+    if is_outside and _text(pose, 'occlusion') in UNSET_OCCLUSIONS:
+        return None
+    is_interpolated = has_keyframes and not _keyframe(pose)
+    return INTERPOLATED if is_interpolated else INPUT_STATUS
 
 
 def _attributes(pose: ElementTree.Element) -> dict[str, str]:
     """Return the attributes of a pose: its flags, and those that Datumaro adds."""
-    flags = ((pose.findtext(tag) or '').strip() for tag in ('truncation', 'occlusion'))
+    flags = [_text(pose, tag) for tag in ('truncation', 'occlusion')]
     numbers = [str(NAMED_FLAGS.get(flag.rpartition('.')[2], flag or '-1')) for flag in flags]
     found = attributes_of(*numbers)
     for attribute in pose.findall('attributes/attribute'):
@@ -415,28 +409,30 @@ def _keyframe(pose: ElementTree.Element) -> bool:
     """Return whether a pose of Datumaro is marked as a keyframe."""
     for attribute in pose.findall('attributes/attribute'):
         if attribute.findtext('name') == 'keyframe':
-            return (attribute.findtext('value') or '').strip().lower() == 'true'
-    return (pose.findtext('occlusion_kf') or '').strip() == '1'
+            return _text(attribute, 'value').lower() == 'true'
+    return _text(pose, 'occlusion_kf') == '1'
 
 
 def _track_id(item: ElementTree.Element, default: str) -> str:
     """Return the track id in the comment of a tracklet, or the default."""
     for element in item:
+        # The tag of a comment is the function `Comment`, though it is annotated as text.
+        is_comment = cast(object, element.tag) is ElementTree.Comment
         text = str(element.text)
-        if _is_comment(element) and text.startswith(TRACK_COMMENT):
+        if is_comment and text.startswith(TRACK_COMMENT):
             return _uncomment(text.removeprefix(TRACK_COMMENT))
     return default
-
-
-def _is_comment(element: ElementTree.Element) -> bool:
-    # The tag of a comment is the function `Comment`, though it is annotated as text.
-    return cast(object, element.tag) is ElementTree.Comment
 
 
 def _shifted_centres(boxes: Floats, shift: float) -> Floats:
     """Return the centres (n, 3) of boxes (n, 9), moved along z of the box by `shift` [m]."""
     R = matrix_from_rpy(boxes[:, ROLL:])
     return boxes[:, BOX_CENTER] + shift * R[:, :, 2]
+
+
+def _text(item: ElementTree.Element, tag: str) -> str:
+    """Return the text of a tag; empty without it."""
+    return (item.findtext(tag) or '').strip()
 
 
 def _number(item: ElementTree.Element, tag: str) -> float:

@@ -17,7 +17,7 @@ from boxreg_ros.config import Config, words_of
 from boxreg_ros.labels.arrow import read_rows, read_table
 from boxreg_ros.labels.files import frame_names, require_single, to_json
 from boxreg_ros.labels.folder import FolderWriter
-from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import absolute, Format, LabelFrame
 from boxreg_ros.labels.records import EVIDENCE_COLUMNS, evidence_of, refined_boxes
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, HEIGHT, YAW
@@ -83,9 +83,9 @@ class Writer(FolderWriter):
     form = 'waymo'
     folders = ('lidar_box', 'vehicle_pose')
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
-        self._segment = Path((*provenance.recordings, 'boxreg')[0]).stem
+    def begin(self) -> None:
+        """Open the files."""
+        self._segment = Path((*self.provenance.recordings, 'boxreg')[0]).stem
         file = f'{self._segment}.parquet'
         origin = to_json(self.about)
         self._boxes = self.table(f'lidar_box/{file}', BOX_COLUMNS, origin)

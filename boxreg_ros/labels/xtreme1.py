@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,13 +24,12 @@ from boxreg_ros.labels.protocol import (
     AUTOMATIC_STATUS,
     INPUT_STATUS,
     LabelFrame,
-    Options,
-    Provenance,
 )
 from boxreg_ros.labels.records import ReadBox
 from boxreg_ros.reasons import Reason
 
-FORMAT = cuboids.cuboid_format(
+FORMAT = replace(
+    cuboids.CUBOID_FORMAT,
     name='xtreme1',
     title='Xtreme1',
     files='scene_1/result/STAMP.json, scene_1/lidar_point_cloud_0/STAMP.pcd',
@@ -57,8 +57,8 @@ class Writer(cuboids.CuboidWriter):
     cloud_file = f'scene_1/{LIDAR_FOLDER}/{{name}}.pcd'
     image_file = 'scene_1/camera_image_{index}/{name}.{suffix}'
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        super().__init__(folder, provenance, options)
+    def begin(self) -> None:
+        """Open the files."""
         self._origin = dict(self.about)
 
     def add(self, frame: LabelFrame) -> None:

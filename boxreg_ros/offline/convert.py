@@ -19,9 +19,8 @@ from boxreg_ros.labels import (
     check_options,
     frames_of,
     LabelFrame,
-    notes_of,
+    LabelOutput,
     Provenance,
-    writer_for,
 )
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.labels.recording import config_hash, files_of
@@ -31,7 +30,7 @@ from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
 from boxreg_ros.offline.sources import label_frame_of, writer_options
 from boxreg_ros.reasons import Reason
-from boxreg_ros.structures import BoxArray, is_valid_box, Sweep
+from boxreg_ros.structures import BoxArray, is_valid_box, REJECTED, Sweep
 
 FORMAT_OF_NODE = 'recording'
 """Format of labels that are messages of a recording, which also has the clouds and poses."""
@@ -60,7 +59,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
     axes = AxisCheck(request.convention, Config().drives)
     unused: dict[str, Any] = {'unreadable': 0, 'unused': '', 'damage': []}  # of the recording
     with claimed(out), whole_folder(out, request.inputs()) as folder:
-        writers = {name: writer_for(name, folder, provenance, options) for name in request.formats}
+        output = LabelOutput(folder, request.formats, provenance, options)
         for frame in _read_frames(request, folder, unused):
             counts['frames'] += 1
             counts['boxes'] += len(frame.refined.status)
@@ -69,13 +68,12 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             if frame.note:
                 assumed.append(frame.note)
             axes.add(frame.moved('fixed').refined.boxes)
-            for writer in writers.values():
-                writer.write(frame)
-        for writer in writers.values():
-            writer.close()
-        left_out = {name: dict(+writer.dropped) for name, writer in writers.items()}
+            counts['rejected'] += frame.refined.status.count(REJECTED)
+            output.write(frame)
+        output.close()
+        left_out = output.left_out()
         _require_valid_boxes(source, counts)
-        _require_boxes(request, left_out, counts['boxes'])
+        _require_boxes(request, left_out, counts['boxes'] - counts['rejected'])
         summary = {
             'source': str(source),
             'recordings': [str(path) for path in request.recordings],
@@ -84,12 +82,13 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             'frames': counts['frames'],
             'boxes': counts['boxes'],
             'invalid_boxes': counts['boxes'] - counts['valid'],
+            'rejected_boxes': counts['rejected'],
             'left_out_of_source': dict(+not_read),
             'assumed': assumed,
             **unused,
             'warning': axes.finding,
-            'left_out_of_labels': {name: found for name, found in left_out.items() if found},
-            'label_notes': notes_of(writers),
+            'left_out_of_labels': left_out,
+            'label_notes': output.notes(),
             'versions': {'boxreg_ros': __version__},
             'fingerprint': request.fingerprint(),
         }
@@ -255,6 +254,10 @@ def run(args: argparse.Namespace) -> int:
     if summary['invalid_boxes']:
         parts.append(
             f'{summary["invalid_boxes"]:,} boxes are invalid: {Reason.INVALID_BOX.meaning}'
+        )
+    if summary['rejected_boxes']:
+        parts.append(
+            f'{summary["rejected_boxes"]:,} boxes are rejected, which are no labels: in csv alone'
         )
     parts += [left_out_line(*item) for item in summary['left_out_of_source'].items()]
     parts += summary['assumed']

@@ -269,6 +269,29 @@ def test_convert_without_poses_is_refused(tmp_path, drive, camera):
         convert(conversion(table, ('sustechpoints',), Options(with_points=True)), tmp_path / 'out')
 
 
+def test_rejected_boxes_are_no_labels_of_other_formats(tmp_path, drive, capsys):
+    _, path = drive
+    table = BoxTable.read(path)
+    status = ('rejected', *table.status[1:])
+    replace(table, status=status).write(path)
+    words = [
+        'convert',
+        str(path),
+        '--from',
+        'csv',
+        '--to',
+        'csv,parquet',
+        '-o',
+        str(tmp_path / 'c'),
+    ]
+    assert cli.main(words) == 0
+    assert '1 boxes are rejected' in capsys.readouterr().out
+    assert BoxTable.read(tmp_path / 'c' / 'boxes.csv').status == status
+    frames = frames_of('parquet', tmp_path / 'c' / 'parquet')
+    found = [word for frame in frames for word in frame.refined.status]
+    assert found == list(status[1:])
+
+
 def test_convert_skips_unreadable_clouds(tmp_path, drive, capsys):
     _, table = drive
     broken = Drive(sweeps=7)
