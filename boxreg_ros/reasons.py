@@ -348,6 +348,12 @@ class Reason(StrEnum):
         'in the drive: it may be no object',
         'accept the track in `boxreg review`, and it is filled',
     )
+    REJECTED_LABEL = (
+        'rejected_label',
+        'box of label files',
+        'its status is `rejected`: the run that wrote the file, or a person, has rejected it',
+        'give it another status to have it used',
+    )
     NOT_A_KEYFRAME = (
         'not_a_keyframe',
         'box of label files',

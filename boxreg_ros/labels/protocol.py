@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import os
 from pathlib import Path
@@ -14,7 +14,15 @@ from boxreg_ros.config import Config
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.options import option
 from boxreg_ros.reasons import Reason
-from boxreg_ros.structures import ADDED, Floats, Ints, is_valid_box, RefinedBoxes, Sweep
+from boxreg_ros.structures import (
+    ADDED,
+    Floats,
+    Ints,
+    is_valid_box,
+    RefinedBoxes,
+    REJECTED,
+    Sweep,
+)
 import numpy as np
 
 if TYPE_CHECKING:
@@ -116,11 +124,19 @@ class LabelFrame:
         boxes = boxes_to_frame(boxes, T, target)
         return replace(self, refined=replace(self.refined, boxes=boxes))
 
+    def labels(self) -> LabelFrame:
+        """Return it without rejected boxes, which are in `left_out`."""
+        return self._without((REJECTED,), Reason.REJECTED_LABEL)
+
     def keyframes(self) -> LabelFrame:
         """Return it with the boxes of a person alone; the others are in `left_out`."""
-        refined = self.refined.without(*NOT_OF_A_PERSON)
+        return self._without(NOT_OF_A_PERSON, Reason.NOT_A_KEYFRAME)
+
+    def _without(self, words: Sequence[str], reason: Reason) -> LabelFrame:
+        """Return it without the boxes of some status, which are in `left_out` for a reason."""
+        refined = self.refined.without(*words)
         left_out = Counter(self.left_out)
-        left_out[Reason.NOT_A_KEYFRAME] += len(self.refined.status) - len(refined.status)
+        left_out[reason] += len(self.refined.status) - len(refined.status)
         return replace(self, refined=refined, left_out=+left_out)
 
 

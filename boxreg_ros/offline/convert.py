@@ -23,6 +23,7 @@ from boxreg_ros.labels import (
     Provenance,
 )
 from boxreg_ros.labels.cloud_spool import Spool
+from boxreg_ros.labels.output import WITH_REJECTED
 from boxreg_ros.labels.recording import config_hash, files_of
 from boxreg_ros.offline.arguments import add_options, values_of
 from boxreg_ros.offline.notes import left_out_line
@@ -257,7 +258,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if summary['rejected_boxes']:
         parts.append(
-            f'{summary["rejected_boxes"]:,} boxes are rejected, which are no labels: in csv alone'
+            f'{summary["rejected_boxes"]:,} boxes are rejected, which are no labels: they are in '
+            f'{" and ".join(WITH_REJECTED)} alone'
         )
     parts += [left_out_line(*item) for item in summary['left_out_of_source'].items()]
     parts += summary['assumed']

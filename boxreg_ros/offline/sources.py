@@ -16,7 +16,7 @@ from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.items import EVERYTHING, Item, ItemSource, Wanted
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
-from boxreg_ros.labels import frames_of, module_of, Options
+from boxreg_ros.labels import frames_of, LabelFrame, module_of, Options
 from boxreg_ros.labels.merging import keyframes_of, LabelMerger
 from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.structures import BoxArray
@@ -45,7 +45,8 @@ class LabelledRecording(Recording):
 
     def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
         """Yield clouds and boxes; see `Recording.items`. Boxes have `Item.refined`."""
-        frames = frames_of(*self._labels, convention=self._label_convention)
+        given = frames_of(*self._labels, convention=self._label_convention)
+        frames: Iterator[LabelFrame] = (frame.labels() for frame in given)
         if self._keyframes:
             frames = keyframes_of(frames)
         merger = LabelMerger(frames, tree, self.sensor_frame(), self.start_ns, self._is_part)

@@ -331,6 +331,25 @@ def test_poses_with_which_datumaro_fills_a_gap_are_no_boxes(tmp_path):
     assert ids(read('tracklets', tracklets(tmp_path, [item], 3))) == [('0',)] * 3
 
 
+def test_rejected_boxes_of_a_result_are_no_input(tmp_path, capsys):
+    """A box that a person has deleted does not come back, nor is it followed as a keyframe."""
+    drive = Drive(sweeps=7)
+    arrays = []
+    for stamp, boxes in drive.truth.items():
+        array = BoxArray(stamp, 'odom', ('1', '2'), ('car', 'car'), np.ones(2), boxes)
+        status = ('refined', 'rejected')
+        refined = RefinedBoxes(array, status, ('', ''), np.zeros(2, int), np.zeros((2, 6, 6)))
+        arrays.append(LabelFrame(refined, 'odom', 'lidar'))
+    write('csv', tmp_path, arrays)
+    recording = str(drive.write(tmp_path / 'drive'))
+    for options in ([], ['--keyframes']):
+        out = tmp_path / f'out{len(options)}'
+        words = ['relabel', recording, '-o', str(out), '--labels', f'csv:{tmp_path}/boxes.csv']
+        assert main([*words, '--set=solver.rounds=2', *options]) == 0
+        assert 'labels: 7 boxes are left out (rejected_label)' in capsys.readouterr().err
+        assert {row['track_id'] for row in rows_of(out)} == {'1'}
+
+
 def test_keyframes_of_cvat_in_tracklets(tmp_path):
     flags = [f'<state>2</state><occlusion_kf>{kf}</occlusion_kf>' for kf in (1, 0)]
     item = ('Car', (4.5, 1.9, 1.6), flags)
