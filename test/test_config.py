@@ -191,6 +191,12 @@ def test_class_names_select_a_group(class_name, group):
     assert config.class_config(class_name) is getattr(config, group)
 
 
+def test_classes_that_are_numbers_are_named_as_text():
+    with pytest.raises(ConfigError, match=r"a list of texts such as \[car, '2'\], got \[2\]"):
+        Config().updated({'pedestrian.names': [2]})
+    assert Config().updated({'pedestrian.names': ['2']}).kind('2') == 'pedestrian'
+
+
 def test_names_of_a_group_may_be_in_any_case():
     config = Config().updated({'pedestrian.names': ['Fussgaenger']})
     for name in ('FUSSGAENGER', 'fussgaenger', 'human-Fussgaenger'):
