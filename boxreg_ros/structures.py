@@ -234,6 +234,13 @@ class Sweep:
         if self.T_frame_points is not None:
             self._set('T_frame_points', checked('T_frame_points', self.T_frame_points, (4, 4)))
 
+    def in_columns(self) -> 'Sweep':
+        """Return the sweep with each of x, y and z together in memory, as kernels read them."""
+        columns = self.points.T
+        if columns.flags.c_contiguous:
+            return self
+        return replace(self, points=np.ascontiguousarray(columns).T)
+
     def in_frame(self) -> 'Sweep':
         """
         Return the sweep with its points in `frame_id`.

@@ -191,13 +191,17 @@ def _failed_tests(
 
     """
     before = problem.counts  # at most: counting those of the input boxes takes time
-    is_blind = np.broadcast_to(before.sum(1, keepdims=True) == 0, before.shape)
     least = (1 - max_lost_part) * before - CONSTANTS.min_face_points
     if (held < least).any():
         extent = np.ascontiguousarray(problem.boxes[..., 3:6])
         before = _held(problem, problem.boxes[..., POSE], extent)
         least = (1 - max_lost_part) * before - CONSTANTS.min_face_points
-    return np.stack(np.broadcast_arrays(is_blind, ~is_finite, held < least, is_bent[:, None]))
+    failed = np.empty((len(KEPT_REASONS), *held.shape), bool)
+    failed[0] = problem.counts.sum(1, keepdims=True) == 0
+    failed[1] = ~is_finite
+    failed[2] = held < least
+    failed[3] = is_bent[:, None]
+    return failed
 
 
 def _held(problem: Problem, poses: Floats, extent: Floats) -> Ints:

@@ -9,20 +9,11 @@ from collections.abc import Sequence
 
 from boxreg_ros.core.input_statistics import NOISE
 from boxreg_ros.core.method.constants import Constants
-from boxreg_ros.core.method.expectation import SIZE
-from boxreg_ros.core.method.noise import estimate, fill_residuals
+from boxreg_ros.core.method.noise import estimate, fill_errors, fill_residuals
 from boxreg_ros.core.problem import Problem
 from boxreg_ros.structures import Floats
 import numpy as np
 from numpy.typing import NDArray
-
-EXTENT_ERRORS = ((0.9, 0.9, 0.9), (0.8, 1.6, 0.65), (2.7, 1.6, 0.65))
-"""Error of extents that is constant along a track, over the one of the settings, of vehicles,
-cyclists and pedestrians. Measured of PointRCNN on KITTI, widths of the latter two on PandaSet."""
-DETECTED = [0, 1, 2, 5]
-"""Variables of a pose that detectors estimate, with one correlation: x, y, z, yaw."""
-LEAST_RATIO = 0.02
-"""Least estimated error over the one of the settings. Chosen."""
 
 
 def set_noise(
@@ -39,27 +30,10 @@ def set_noise(
     each: a kind that was seen in few boxes errs as the others do, in proportion to its settings.
 
     """
-    found = np.array([noise_of(of_kind, constants) for of_kind in residuals])
-    boxes = np.stack([past['boxes'], found['boxes']])  # (2, K)
-    variances = np.stack([past['deviation'], found['deviation']]) ** 2  # (2, K, 9)
-    correlations = np.stack([past['correlation'], found['correlation']])
-    variance = np.ones((len(inputs), 9))
-    correlation = np.full((len(inputs), 9), constants.typical_correlation)
-    is_own = np.eye(len(inputs))
-    for taken in (1.0 - is_own, is_own):
-        weights = taken[:, None] * boxes  # (K, 2, K): of each part of each kind, for a kind
-        count = weights.sum((1, 2))[:, None]
-        share = count / (count + constants.half_weight)
-        weights /= np.where(count > 0, count, 1.0)[..., None]
-        variance += share * (np.tensordot(weights, variances, 2) - variance)
-        correlation += share * (np.tensordot(weights, correlations, 2) - correlation)
-    correlation[:, DETECTED] = correlation[:, DETECTED].mean(1, keepdims=True)
-    deviation = np.sqrt(variance).clip(LEAST_RATIO)
-    inputs['deviation'], inputs['correlation'] = deviation, correlation
-    of_centres = np.exp(np.log(deviation[:, :SIZE]).mean(1))
-    inputs['low_noise'] = (of_centres / constants.low_noise).clip(max=1.0)
-    # Trackers may hold the extents: no residual shows their errors. Those of the centre do.
-    inputs['extent_error'] = EXTENT_ERRORS * inputs['low_noise'][:, None]
+    found = np.zeros(len(inputs), NOISE)
+    for k, of_kind in enumerate(residuals):
+        found[k] = noise_of(of_kind, constants)
+    fill_errors(past, found, constants.record(), inputs)
 
 
 def noise_of(residuals: Floats, constants: Constants) -> NDArray[np.void]:

@@ -259,15 +259,18 @@ def stack_windows(
 
     """
     lengths = np.array([len(window.observations) for window in windows])
-    valid = np.arange(lengths.max()) < lengths[:, None]  # (B, N)
     seen, rows = Observations.gathered([item for w in windows for item in w.observations])
-    boxes, times, origins, ground, ring_heights = _stack_observations(seen, rows, valid)
+    column, last = np.arange(lengths.max()), lengths[:, None] - 1
+    valid = column <= last  # (B, N)
+    first = (np.cumsum(lengths) - lengths)[:, None]
+    rows = rows[first + np.minimum(column, last)]  # padding repeats the last of a window
+    boxes, pinned = seen.boxes[rows], seen.is_pinned[rows] & valid
+    elapsed = (seen.stamps_ns[rows] - seen.stamps_ns[rows[:, :1]]) * 1e-9
+    times = elapsed + PADDING_PERIOD * np.maximum(column - last, 0)
     priors = [w.prior or _no_prior(w.observations[0].box[:3]) for w in windows]
     base, state, step, information, extents, _ = (
         np.array(part) for part in zip(*priors, strict=True)
     )
-    pinned = np.zeros(valid.shape, bool)
-    pinned[valid] = seen.is_pinned[rows]
     if config.ingredients.heading_sign:
         boxes[..., ROLL:] = _resolved_angles(boxes, times, lengths, pinned, state[:, 5].copy())
     else:
@@ -277,11 +280,6 @@ def stack_windows(
     start[..., :3] -= base[:, None]
     minimum, is_usable = _prior_minimum(start, state, step)
     information *= decay * is_usable[:, None, None]
-    first, counts = np.zeros((2, *valid.shape), np.int64)
-    first[valid] = seen.first[rows]
-    counts[valid] = seen.counts[rows]
-    if not config.ingredients.ring_inset:
-        ring_heights[:] = 0.0
     if not config.ingredients.marginalisation:
         information[:] = 0.0
     kind, of_class = _of_classes(windows, config)
@@ -291,13 +289,13 @@ def stack_windows(
         start=start,
         lengths=lengths,
         times=times,
-        origins=origins,
-        ground=ground,
-        ring_heights=ring_heights,
+        origins=seen.origins[rows],
+        ground=seen.ground[rows],
+        ring_heights=seen.ring_heights[rows] * config.ingredients.ring_inset,
         points=seen.points,
         delays=delays,
-        first=first,
-        counts=counts,
+        first=seen.first[rows],
+        counts=seen.counts[rows] * valid,
         stride=1,
         is_moving=bool(delays.any()),
         pinned=pinned,
@@ -313,33 +311,6 @@ def stack_windows(
 def _no_prior(base: Floats) -> MarginalisationPrior:
     """Return a prior without information, NaN as its linearisation point."""
     return MarginalisationPrior(base, *NO_PRIOR)
-
-
-def _stack_observations(
-    seen: Observations, rows: Ints, valid: NDArray[np.bool_]
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """
-    Return input boxes, times, sensor origins, and heights of road and rings, of `rows`, padded.
-
-    Shapes (B, N, 9), (B, N), (B, N, K, 3) and twice (B, N). Padding repeats the last box of a
-    window, at later times, and the last sensor of an observation.
-
-    """
-    B, N = valid.shape
-    lengths = valid.sum(1)
-    begin = np.cumsum(lengths) - lengths
-    column = np.arange(N)
-    last = lengths[:, None] - 1
-    padded = rows[begin[:, None] + np.minimum(column, last)]  # (B, N), the last row repeats
-    origins = np.zeros((B, N, *seen.origins.shape[1:]))
-    origins[valid] = seen.origins[rows]
-    ground = np.full((B, N), np.nan)
-    ground[valid] = seen.ground[rows]
-    ring_heights = np.zeros((B, N))
-    ring_heights[valid] = seen.ring_heights[rows]
-    stamps_ns = seen.stamps_ns[padded]
-    times = (stamps_ns - stamps_ns[:, :1]) * 1e-9 + PADDING_PERIOD * np.maximum(column - last, 0)
-    return seen.boxes[padded], times, origins, ground, ring_heights
 
 
 def _delays(seen: Observations, config: Config) -> NDArray[np.float32]:

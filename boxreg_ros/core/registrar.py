@@ -192,6 +192,7 @@ class BoxRegistrar:
 
     def add_sweep(self, sweep: Sweep) -> list[RefinedBoxes]:
         """Add a sweep; return the box arrays that are completed by it."""
+        sweep = sweep.in_columns()
         self.counts['sweeps'] += not sweep.is_dropped
         self.followed.add_sweep(sweep)
         self._correction.add_sweep(sweep)

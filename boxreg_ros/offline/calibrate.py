@@ -17,10 +17,10 @@ from typing import Any
 
 from boxreg_ros.config import Config, KINDS, Setting, settings
 from boxreg_ros.core.input_model import FACE_GROUPS, InputModel
-from boxreg_ros.core.input_noise import DETECTED, noise_of, normalised_residuals
+from boxreg_ros.core.input_noise import noise_of, normalised_residuals
 from boxreg_ros.core.matching import AT_ONCE
 from boxreg_ros.core.method.constants import CONSTANTS
-from boxreg_ros.core.method.noise import MAD_TO_DEVIATION
+from boxreg_ros.core.method.noise import DETECTED, MAD_TO_DEVIATION
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.problem import group_windows, stack_windows
 from boxreg_ros.core.window import Window
@@ -182,7 +182,7 @@ def _errors_of_kind(
 def _deviations(residuals: Floats) -> Floats:
     """Return the deviations (4,) of all `ERRORS` but the extent, of residuals (B, N, 9)."""
     noise = noise_of(residuals, CONSTANTS)
-    deviations: Floats = noise['deviation'][DETECTED]
+    deviations: Floats = noise['deviation'][[*DETECTED]]
     return deviations
 
 

@@ -3,13 +3,14 @@
 from boxreg_ros.config import Config, FaceConfig, KINDS
 from boxreg_ros.core.following import person
 from boxreg_ros.core.input_model import GAP_DEVIATIONS, InputModel
-from boxreg_ros.core.input_noise import EXTENT_ERRORS, normalised_residuals, set_noise
 from boxreg_ros.core.input_noise import noise_of as estimate
+from boxreg_ros.core.input_noise import normalised_residuals, set_noise
 from boxreg_ros.core.input_statistics import NOISE
 from boxreg_ros.core.method.arrays import BOX_POSE, COMMON
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.expectation import fill_evidence, population_factor
 from boxreg_ros.core.method.margins import pooled
+from boxreg_ros.core.method.noise import EXTENT_ERRORS
 from boxreg_ros.core.method.population import population_slopes
 from boxreg_ros.core.method.residuals import TERMS
 import numpy as np

@@ -8,11 +8,10 @@ they are solved with these; where they show smaller ones, the solution moves tow
 
 from __future__ import annotations
 
-from boxreg_ros.core.input_noise import LEAST_RATIO
 from boxreg_ros.core.method.arrays import BOX_POSE
 from boxreg_ros.core.method.constants import CONSTANTS, Constants
 from boxreg_ros.core.method.follow_numbers import FOLLOW
-from boxreg_ros.core.method.noise import MAD_TO_DEVIATION
+from boxreg_ros.core.method.noise import LEAST_RATIO, MAD_TO_DEVIATION
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL
 import numpy as np

@@ -254,18 +254,17 @@ def fill_velocity(poses, times, n, length, velocity):
         velocity[k] = (poses[after, k] - poses[before, k]) / duration
 
 
-@kernel
+@loop
 def fill_moved(b, n, problem, velocity, moved):
     """Write the points of one observation at the stamp of its box (M12), (3, M) [m]."""
-    points = returns_of(problem, problem.points, b, n)
-    delays = returns_of(problem, problem.delays, b, n)
-    for i in range(len(points)):
+    first, stride, m = problem.first[b, n], problem.stride, problem.counts[b, n]
+    for i in range(m):
         for k in range(3):
-            moved[k, i] = points[i, k]
+            moved[k, i] = problem.points[first + i * stride, k]
     if problem.is_moving:
-        for k in range(3):
-            for i in range(len(points)):
-                moved[k, i] -= velocity[k] * delays[i]
+        for i in range(m):
+            for k in range(3):
+                moved[k, i] -= velocity[k] * problem.delays[first + i * stride]
 
 
 @loop
