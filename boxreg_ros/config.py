@@ -579,5 +579,9 @@ def _cast(name: str, value: Any, default: Any) -> Any:
         return value
     elif isinstance(default, str) and type(value) in (int, float):
         return str(value)  # in place of a word; `check` knows which settings take a number
-    kind = "a list of texts such as [car, '2']" if isinstance(default, tuple) else type(default).__name__
+    kind = (
+        "a list of texts such as [car, '2']"
+        if isinstance(default, tuple)
+        else type(default).__name__
+    )
     raise ConfigError(f'{name}: expected {kind}, got {value!r}')
