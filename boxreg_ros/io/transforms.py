@@ -12,8 +12,8 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
-from types import MappingProxyType
+from itertools import chain, pairwise
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import TransformUnavailable
@@ -84,13 +84,16 @@ A vehicle has tens of frames; trackers that publish a frame per object add some 
 """
 
 
-class Link(NamedTuple):
-    """A pair of parent and child frame; `stamps_ns` ascend, and are one for a static pair."""
+class Sample(NamedTuple):
+    """A transform or odometry, as it was received."""
 
     parent: str
     child: str
-    is_static: bool
-    stamps_ns: tuple[int, ...]
+    stamp_ns: int
+    pose: tuple[float, ...]
+    """x y z qx qy qz qw of the child in the parent [m]."""
+    is_static: bool = False
+    received_ns: int | None = None
 
 
 class TransformTree:
@@ -123,11 +126,8 @@ class TransformTree:
 
     def clear(self) -> None:
         """Forget all frames and transforms."""
-        self._tf: dict[str, Edge] = {}
-        self._odometry: dict[str, Edge] = {}
-        self._of_other_parents: dict[tuple[str, str], Edge] = {}
-        self._parent_changes: Counter[str] = Counter()
-        self._parents: dict[str, list[str]] = {}  # of children with several, as they came
+        self._tf: dict[str, Attachment] = {}  # by child
+        self._odometry: dict[str, Attachment] = {}
         self._routes: dict[tuple[str, str], list[tuple[Edge, bool]]] = {}
         self.same_frames: dict[str, str] = {}
         """Frames that are taken for one, since one name is the other with a prefix."""
@@ -150,33 +150,36 @@ class TransformTree:
 
         """
         for item in transforms:
-            position, turn = item.transform.translation, item.transform.rotation
-            self._add(self._tf, item, position, turn, is_static, received_ns)
+            place = item.transform.translation, item.transform.rotation
+            self._add(self._tf, self._sample(item, *place, received_ns, is_static))
 
     def add_pose(self, parent: str, child: str, stamp_ns: int, pose: Floats) -> None:
         """Add the pose of `child` in `parent` at a stamp: x y z qx qy qz qw."""
-        self._add_to(self._tf, _name(parent), _name(child), stamp_ns, tuple(pose.tolist()), False)
+        sample = Sample(_name(parent), _name(child), stamp_ns, tuple(pose.tolist()))
+        self._add(self._tf, sample)
 
     def add_odometry(self, msg: Any, received_ns: int | None = None) -> None:
         """Add a ``nav_msgs/Odometry``: the pose of its child frame in its header's frame."""
         pose = msg.pose.pose
-        self._add(self._odometry, msg, pose.position, pose.orientation, False, received_ns)
+        sample = self._sample(msg, pose.position, pose.orientation, received_ns)
+        child = sample.child or self.odometry_child
+        self._add(self._odometry, sample._replace(child=child))
 
     def rewind(self, stamp_ns: int) -> None:
         """Forget samples of moving frames that are later than a stamp that time went back to."""
-        for edge in self._edges():
+        for edge in self.edges():
             edge.rewind(stamp_ns)
 
     def newest_ns(self) -> int | None:
         """Return the newest stamp of all moving frames [ns]; None if there are none."""
         return max(
-            (e.stamps[-1] for e in self._edges() if e.stamps and not e.is_static), default=None
+            (e.stamps[-1] for e in self.edges() if e.stamps and not e.is_static), default=None
         )
 
     @property
     def stamps_ahead(self) -> Counter[str]:
         """Return for each pair of frames how many samples had a stamp ahead of all others."""
-        return Counter({f'{e.parent} -> {e.child}': e.num_ahead for e in self._edges()})
+        return Counter({f'{e.parent} -> {e.child}': e.num_ahead for e in self.edges()})
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Floats:
         """Return ``T_target_source`` (4, 4) at a stamp, or raise TransformUnavailable."""
@@ -237,7 +240,7 @@ class TransformTree:
     def moving_below(self, frame: str) -> list[str]:
         """Return the frames that move in `frame` or below it, and have no others below, sorted."""
         children: dict[str, list[Edge]] = {}
-        for edge in self._edges():
+        for edge in self.edges():
             children.setdefault(edge.parent, []).append(edge)
         found = set()
         first = self._known(frame)
@@ -259,11 +262,8 @@ class TransformTree:
 
     def other_parents(self, edge: Edge) -> list[str]:
         """Return the other parents that transforms of the child of a pair have, sorted."""
-        if not self._has_two_parents(edge.child):
-            return []
-        edges = (self._tf.get(edge.child), *self._of_other_parents.values())
-        parents = {one.parent for one in edges if one is not None and one.child == edge.child}
-        return sorted(parents - {edge.parent})
+        known = self._tf.get(edge.child)
+        return [] if known is None else sorted({e.parent for e in known.all} - {edge.parent})
 
     def fixed_frame(self, source: str) -> str | None:
         """
@@ -279,12 +279,12 @@ class TransformTree:
         path = self.path(source)
         top = self.root(source)
         if top in self._odometry:
-            return self._odometry[top].parent
+            return self._odometry[top].used.parent
         if not all(map(self.is_constant, path)):
             return top
-        for edge in self._odometry.values():
-            if self.connects(edge.parent, source):
-                return edge.parent
+        for moved in self._odometry.values():
+            if self.connects(moved.used.parent, source):
+                return moved.used.parent
         return top if self.moving_below(source) else None
 
     def root(self, source: str) -> str:
@@ -309,28 +309,24 @@ class TransformTree:
 
     def _above(self, child: str) -> Edge | None:
         """Return the edge from a frame up in TF, or in the odometry that takes its place."""
-        return self._replacement_of(child) or self._tf.get(child)
-
-    def _replacement_of(self, child: str) -> Edge | None:
-        """Return the odometry that takes the place of the transform of a frame."""
-        return self._odometry.get(child) if self.prefers_odometry else None
+        known = self._tf.get(child)
+        if self.prefers_odometry:
+            known = self._odometry.get(child, known)
+        return None if known is None else known.used
 
     def __str__(self) -> str:
         """Return all pairs of parent and child."""
-        pairs = dict.fromkeys(f'{edge.parent} -> {edge.child}' for edge in self._edges())
+        pairs = dict.fromkeys(f'{edge.parent} -> {edge.child}' for edge in self.edges())
         return ', '.join(pairs) or 'none'
 
-    def links(self) -> list[Link]:
-        """Return all pairs of parent and child with the stamps that are known."""
-        return [
-            Link(edge.parent, edge.child, edge.is_static, tuple(edge.stamps))
-            for edge in self._edges()
-        ]
+    def edges(self) -> list[Edge]:
+        """Return all pairs of parent and child."""
+        return list(dict.fromkeys((*self._tf_edges(), *_used(self._odometry))))
 
     def groups(self) -> list[list[str]]:
         """Return the names of frames that transforms connect with each other, sorted."""
         group_of: dict[str, list[str]] = {name: [name] for name in self.frames()}
-        for edge in self._edges():
+        for edge in self.edges():
             ours, others = group_of[edge.parent], group_of[edge.child]
             if ours is not others:
                 ours += others
@@ -339,94 +335,47 @@ class TransformTree:
 
     def frames(self) -> list[str]:
         """Return the names of all frames, sorted."""
-        return sorted({name for edge in self._edges() for name in (edge.parent, edge.child)})
+        return sorted({name for edge in self.edges() for name in (edge.parent, edge.child)})
 
-    def _add(
+    def _sample(
         self,
-        edges: dict[str, Edge],
         item: Any,
         position: Any,
         turn: Any,
-        is_static: bool,
         received_ns: int | None,
-    ) -> None:
-        parent, child = _name(item.header.frame_id), _name(item.child_frame_id)
-        if edges is self._odometry:
-            child = child or self.odometry_child
-        if not parent or not child:
-            return  # refused by tf2, too; errors of lookups list the known transforms
-        stamp_ns = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
+        is_static: bool = False,
+    ) -> Sample:
+        stamp = item.header.stamp
+        stamp_ns = stamp.sec * 10**9 + stamp.nanosec
         if not is_static:
             stamp_ns += round(self.clock_offset * 1e9)
         pose = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
-        edge = self._add_to(edges, parent, child, stamp_ns, pose, is_static, received_ns)
-        if received_ns is not None and not edge.is_static and not edge.is_holding:
-            edge.arrivals.add(received_ns, stamp_ns)
+        names = _name(item.header.frame_id), _name(item.child_frame_id)
+        return Sample(*names, stamp_ns, pose, is_static, received_ns)
 
-    def _add_to(
-        self,
-        edges: dict[str, Edge],
-        parent: str,
-        child: str,
-        stamp_ns: int,
-        pose: tuple[float, ...],
-        is_static: bool,
-        received_ns: int | None = None,
-    ) -> Edge:
-        edge = edges.get(child)
+    def _add(self, frames: dict[str, Attachment], sample: Sample) -> None:
+        """Add a sample to the frames of TF, or to those of odometry."""
+        if not sample.parent or not sample.child:
+            return  # refused by tf2, too; errors of lookups list the known transforms
+        parent, child = sample.parent, sample.child
+        frame = frames.get(child)
+        edge = None if frame is None else frame.edge_to(parent)
         if edge is None:
-            edge = edges[child] = Edge(parent, child, self._buffer_ns)
+            edge = Edge(parent, child, self._buffer_ns)
+            if frame is None:
+                frames[child] = Attachment(edge)
+            else:
+                edge = frame.attach(edge, sample.is_static)
             self._forget_routes()
-        elif edge.parent != parent:
-            edge = self._of_another_parent(edges, edge, parent, is_static)
-        edge.is_static |= is_static
-        edge.add(stamp_ns, pose, received_ns)
-        if len(edges) > self._frames_limit:
-            oldest_ns = stamp_ns - self._buffer_ns
-            for name in [name for name, edge in edges.items() if edge.is_older(oldest_ns)]:
-                del edges[name]
-            for key in [k for k, e in self._of_other_parents.items() if e.is_older(oldest_ns)]:
-                del self._of_other_parents[key]
-            self._frames_limit = max(FRAMES_BEFORE_CLEANUP, 2 * len(edges))
-        return edge
-
-    def _of_another_parent(
-        self, edges: dict[str, Edge], edge: Edge, parent: str, is_static: bool
-    ) -> Edge:
-        """
-        Return the edge of a child that comes with another parent than that of `edge`.
-
-        It takes the place of `edge`: the frame was attached to another one. Where two publishers
-        state two parents all the time, both edges stay, and one that moves has precedence, else
-        the one that was known first.
-
-        """
-        child = edge.child
-        other = self._of_other_parents.get((parent, child))
-        if self._has_two_parents(child) and other is not None:
-            return other
-        self._forget_routes()
-        self._parent_changes[child] += 1
-        parents = self._parents.setdefault(child, [edge.parent])
-        if parent not in parents:
-            parents.append(parent)
-        if edge.is_static or is_static:  # a static frame is attached once
-            self._parent_changes[child] = CHANGES_OF_PARENT
-        if not self._has_two_parents(child) or other is None:
-            other = Edge(parent, child, self._buffer_ns)  # samples of an earlier time are old
-        self._of_other_parents[edge.parent, child] = edge
-        self._of_other_parents[parent, child] = other
-        used = other
-        if self._has_two_parents(child):
-            static_of = {edge.parent: edge.is_static, parent: is_static}
-            first = min((p for p in parents if p in static_of), key=static_of.__getitem__)
-            used = edge if first == edge.parent else other
-        edges[child] = used
-        del self._of_other_parents[used.parent, child]
-        return other
-
-    def _has_two_parents(self, child: str) -> bool:
-        return self._parent_changes[child] >= CHANGES_OF_PARENT
+        edge.is_static |= sample.is_static
+        edge.add(sample.stamp_ns, sample.pose, sample.received_ns)
+        if sample.received_ns is not None and not edge.is_static and not edge.is_holding:
+            edge.arrivals.add(sample.received_ns, sample.stamp_ns)
+        if len(frames) > self._frames_limit:
+            oldest_ns = sample.stamp_ns - self._buffer_ns
+            for name in [n for n, frame in frames.items() if frame.used.is_older(oldest_ns)]:
+                del frames[name]
+            self._frames_limit = max(FRAMES_BEFORE_CLEANUP, 2 * len(frames))
 
     def _is_once(self, edge: Edge, stamp_ns: int = 0) -> bool:
         """Return whether a moving pair has been published once, long before others or a stamp."""
@@ -435,26 +384,17 @@ class TransformTree:
         newest_ns = max(self.newest_ns() or 0, stamp_ns)
         return newest_ns - edge.stamps[0] >= round(ONCE * 1e9)
 
-    def _edges(self) -> list[Edge]:
-        return list(dict.fromkeys((*self._tf_edges(), *self._odometry.values())))
-
     def _tf_edges(self) -> list[Edge]:
-        """Return the edges of TF; those to other parents only where a frame has two at once."""
-        others = [
-            edge for (_, child), edge in self._of_other_parents.items()
-            if self._has_two_parents(child)
-        ]  # fmt: skip
-        edges = [*self._tf.values(), *others]
-        if not self.prefers_odometry:
-            return edges
-        kept = [edge for edge in edges if edge.child not in self._odometry]
-        return [*self._odometry.values(), *kept]
+        """Return the edges of TF; with `prefers_odometry`, odometry in place of those it has."""
+        replacing = self._odometry if self.prefers_odometry else {}
+        frames = [frame for child, frame in self._tf.items() if child not in replacing]
+        return [*_used(replacing), *(edge for frame in frames for edge in frame.all)]
 
     def alike(self, frame: str) -> list[str]:
         """Return the known frames whose name is that of another with a prefix, or without one."""
         name = _name(frame)
-        pairs = self._same_by_prefix({name, *self.frames()}).values()
-        return sorted({other for pair in pairs for other in pair.get(name, ())})
+        pairs = chain(*self._same_by_prefix({name, *self.frames()}).values())
+        return sorted({other for pair in pairs if name in pair for other in pair} - {name})
 
     def _known(self, frame: str) -> str:
         """Return the name by which transforms know a frame: its own, or the only one alike."""
@@ -463,36 +403,28 @@ class TransformTree:
         others = [] if name in known else self.alike(name)
         return others[0] if len(others) == 1 else name
 
-    def _same_by_prefix(self, names: set[str]) -> dict[str, dict[str, list[str]]]:
-        """Return for each prefix the names that are alike but for it, by both of their names."""
-        found: dict[str, dict[str, list[str]]] = {}
+    def _same_by_prefix(self, names: set[str]) -> dict[str, list[tuple[str, str]]]:
+        """Return for each prefix the pairs of names that it distinguishes, with and without."""
+        found: dict[str, list[tuple[str, str]]] = {}
         for name in names:
             for at in (place for place, letter in enumerate(name) if letter == '/'):
-                prefix, rest = name[:at], name[at + 1 :]
-                if rest in names:
-                    same = found.setdefault(prefix, {})
-                    same.setdefault(name, []).append(rest)
-                    same.setdefault(rest, []).append(name)
+                if name[at + 1 :] in names:
+                    found.setdefault(name[:at], []).append((name, name[at + 1 :]))
         return found
 
     def _prefixed_route(self, target: str, source: str) -> list[tuple[Edge, bool]] | None:
         """Return the route where names that differ by one prefix are one; None if not unique."""
-        edges = self._edges()
-        names = {target, source, *self.frames()}
-        routes = {
-            prefix: route
-            for prefix, same in self._same_by_prefix(names).items()
-            if (route := _connect(target, source, edges, same)) is not None
-        }
+        edges = self.edges()
+        routes = []
+        for pairs in self._same_by_prefix({target, source, *self.frames()}).values():
+            same = [_identity(*pair) for pair in pairs]
+            route = _connect(target, source, [*edges, *same])
+            if route is not None:
+                routes.append((route, same))
         if len(routes) != 1:
             return None
-        ((prefix, route),) = routes.items()
-        on_route = {name for edge, _ in route for name in (edge.parent, edge.child)}
-        for name in {target, source, *on_route}:
-            rest = name.removeprefix(f'{prefix}/')
-            full = f'{prefix}/{rest}'
-            if rest in {target, source, *on_route} and full in names and rest != full:
-                self.same_frames[full] = rest
+        ((route, same),) = routes
+        self.same_frames |= {edge.child: edge.parent for edge, _ in route if edge in same}
         return route
 
     def _forget_routes(self) -> None:
@@ -506,7 +438,7 @@ class TransformTree:
         if key not in self._routes:
             route = _connect(*key, self._tf_edges())
             if route is None:
-                route = _connect(*key, self._edges())
+                route = _connect(*key, self.edges())
             if route is None:
                 route = self._prefixed_route(*key)
             if route is None:
@@ -516,6 +448,51 @@ class TransformTree:
                 )
             self._routes[key] = route
         return self._routes[key]
+
+
+class Attachment:
+    """
+    The edges of one frame: that to its parent, which is `used`, and those to parents before.
+
+    A new parent takes the place of the one before: the frame was attached to another. Where two
+    publishers state two parents all the time, both edges stay, and one that moves has precedence,
+    else the one that was known first.
+
+    """
+
+    def __init__(self, first: Edge) -> None:
+        self.used = first
+        self._edges = {first.parent: first}  # in the order in which they came
+        self._changes = 0
+
+    @property
+    def all(self) -> list[Edge]:
+        """Return the edge in use, and behind it the others where a frame has several at once."""
+        if not self._has_two_parents:
+            return [self.used]
+        return [self.used, *(edge for edge in self._edges.values() if edge is not self.used)]
+
+    def edge_to(self, parent: str) -> Edge | None:
+        """Return the edge to a parent; None if the frame is not attached to it."""
+        return next((edge for edge in self.all if edge.parent == parent), None)
+
+    def attach(self, new: Edge, is_static: bool) -> Edge:
+        """Attach the frame to a new parent by an edge; return the edge to add samples to."""
+        self._changes += 1
+        if self.used.is_static or is_static:  # a static frame is attached once
+            self._changes = CHANGES_OF_PARENT
+        if not self._has_two_parents:
+            self._edges[new.parent] = self.used = new  # samples of an earlier time are old
+            return new
+        new = self._edges.setdefault(new.parent, new)
+        new.is_static |= is_static
+        known = [edge for edge in self._edges.values() if edge in (self.used, new)]
+        self.used = min(known, key=attrgetter('is_static'))
+        return new
+
+    @property
+    def _has_two_parents(self) -> bool:
+        return self._changes >= CHANGES_OF_PARENT
 
 
 class Edge:
@@ -573,26 +550,29 @@ class Edge:
             return
         held = self._ahead
         self._ahead = None
+        new = stamp_ns, pose, received_ns
         is_ahead = self._clock.is_ahead(stamp_ns, received_ns)
         if held is not None and not (is_ahead and is_near(stamp_ns, held[0])):
             self.num_ahead += 1
             held = None
         if is_ahead and held is None:
-            self._ahead = stamp_ns, pose, received_ns
+            self._ahead = new
             return
         if held is not None:
-            self._clock.note(held[0], held[2])
-            self._use(*held[:2])
-        self._clock.note(stamp_ns, received_ns)
-        self._use(stamp_ns, pose)
+            self._accept(*held)
+        self._accept(*new)
 
     def _confirm(self, stamp_ns: int) -> None:
         """Use the sample that is held if it is of the time of a stamp of another stream."""
         held = self._ahead
         if held is not None and abs(stamp_ns - held[0]) <= round(TIME_JUMP * 1e9):
             self._ahead = None
-            self._clock.note(held[0], held[2])
-            self._use(*held[:2])
+            self._accept(*held)
+
+    def _accept(self, stamp_ns: int, pose: tuple[float, ...], received_ns: int | None) -> None:
+        """Use a sample whose stamp fits those before it."""
+        self._clock.note(stamp_ns, received_ns)
+        self._use(stamp_ns, pose)
 
     def _use(self, stamp_ns: int, pose: tuple[float, ...]) -> None:
         values = np.array(pose, dtype=np.float64)
@@ -867,13 +847,21 @@ def _name(frame_id: str) -> str:
     return frame_id.lstrip('/')
 
 
-def _connect(
-    target: str,
-    source: str,
-    edges: Iterable[Edge],
-    same: Mapping[str, Sequence[str]] = MappingProxyType({}),
-) -> list[tuple[Edge, bool]] | None:
-    """Return the shortest path from `source` to `target`, or None; `same` has names of one."""
+def _used(frames: Mapping[str, Attachment]) -> list[Edge]:
+    """Return the edges in use of some frames."""
+    return [frame.used for frame in frames.values()]
+
+
+def _identity(child: str, parent: str) -> Edge:
+    """Return the edge between two names of one frame."""
+    edge = Edge(parent, child, 0)
+    edge.is_static = True
+    edge.add(0, (0, 0, 0, 0, 0, 0, 1))
+    return edge
+
+
+def _connect(target: str, source: str, edges: Iterable[Edge]) -> list[tuple[Edge, bool]] | None:
+    """Return the shortest path from `source` to `target`, or None."""
     neighbours: dict[str, list[tuple[Edge, bool]]] = {}
     for edge in edges:
         neighbours.setdefault(edge.child, []).append((edge, True))
@@ -881,9 +869,6 @@ def _connect(
     routes: dict[str, list[tuple[Edge, bool]]] = {source: []}
     queue = [source]
     for frame in queue:
-        others = [name for name in same.get(frame, ()) if name not in routes]
-        routes |= dict.fromkeys(others, routes[frame])
-        queue += others
         for edge, is_upward in neighbours.get(frame, ()):
             following = edge.parent if is_upward else edge.child
             if following not in routes:

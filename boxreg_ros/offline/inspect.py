@@ -35,7 +35,7 @@ from boxreg_ros.offline.request import REPORT_PACKAGES, Request
 if TYPE_CHECKING:
     from boxreg_ros.datasets.registry import Address
     from boxreg_ros.io.items import Item, ItemSource
-    from boxreg_ros.io.transforms import Link
+    from boxreg_ros.io.transforms import Edge
 
 DONE = 0
 FAILED = 1
@@ -236,7 +236,7 @@ def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
         'recorded_apart': recording.apart,
         'fixed_frame': session.fixed_frame,
         'sensor_frame': recording.sensor_frame(),
-        'transforms': [_transform(link) for link in session.tree.links()],
+        'transforms': list(map(_transform, session.tree.edges())),
         'connected_frames': session.tree.groups(),
         'point_layouts': recording.placement.layouts,
         'sample': _summary(sample),
@@ -244,15 +244,15 @@ def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
     }
 
 
-def _transform(link: Link) -> dict[str, Any]:
+def _transform(edge: Edge) -> dict[str, Any]:
     """Return rate and gaps of the transform between two frames."""
-    stamps = list(link.stamps_ns)
+    stamps = edge.stamps
     return {
-        'parent': link.parent,
-        'child': link.child,
-        'is_static': link.is_static,
-        'period_s': None if link.is_static else _period(stamps),
-        'gaps_s': [] if link.is_static else _gaps(stamps),
+        'parent': edge.parent,
+        'child': edge.child,
+        'is_static': edge.is_static,
+        'period_s': None if edge.is_static else _period(stamps),
+        'gaps_s': [] if edge.is_static else _gaps(stamps),
     }
 
 
