@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from functools import partial
 from itertools import pairwise
 from statistics import median
@@ -37,10 +37,10 @@ class Inbox:
     """
     Bounded queues of clouds and box arrays, and an unbounded one of events.
 
-    Events are transforms, odometry, parameter changes and service requests. The worker handles
-    them before the next message. Thread-safe: neither thread waits for the other. `capacity` is
-    the number of clouds of each LiDAR that may wait; the attribute has it by topic. `wake_up` is
-    set whenever something was put.
+    Events are info messages, boxes to follow, lost clouds, parameter changes and service requests.
+    The worker handles them before the next message. Thread-safe: neither thread waits for the
+    other. `capacity` is the number of clouds of each LiDAR that may wait; the attribute has it by
+    topic. `wake_up` is set whenever something was put.
 
     """
 
@@ -49,16 +49,15 @@ class Inbox:
         self.wake_up = Event()
         self._lock = Lock()
         self._number = 0
-        self._events: deque[tuple[str, Any]] = deque()
+        self._events: deque[Callable[[], None]] = deque()
         self._waiting: dict[str, deque[Message]] = {
             topic: deque() for topic in ('points', 'boxes', 'passing')
         }
 
-    def put_event(self, kind: str, content: Any, wakes: bool = True) -> None:
-        """Add an event; none is ever dropped. Transforms, which are polled, wake nobody."""
-        self._events.append((kind, content))
-        if wakes:
-            self.wake_up.set()
+    def put_event(self, handle: Callable[..., None], *content: Any) -> None:
+        """Add an event, which the worker handles by calling `handle`; none is ever dropped."""
+        self._events.append(partial(handle, *content))
+        self.wake_up.set()
 
     def put(self, topic: str, content: Any, lidar: str = '') -> Message | None:
         """Add a cloud or box array; return the oldest one of its kind if the queue is full."""
@@ -78,7 +77,7 @@ class Inbox:
             self._waiting['passing'].append(message._replace(topic='passing'))
         self.wake_up.set()
 
-    def take_events(self) -> list[tuple[str, Any]]:
+    def take_events(self) -> list[Callable[[], None]]:
         """Remove and return all events, oldest first."""
         return [self._events.popleft() for _ in range(len(self._events))]
 

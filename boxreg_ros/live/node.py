@@ -249,20 +249,21 @@ class BoxregNode(PolledClockNode):
             callback = partial(self._on_points, lidar)
             self._topics.subscribe(points_type, topic, callback, qos(), is_required=True)
         if lidars.info:
-            put = partial(self._inbox.put_event, 'points_info')
+            put = partial(self._inbox.put_event, self.worker.add_info)
             self._topics.subscribe(INFO_TYPE, lidars.info, put, qos(), is_required=True)
 
     def _subscribe_to_motion(self) -> None:
         """Subscribe to odometry and transforms, which the worker polls."""
         subscribe = partial(self._topics.subscribe, is_polled=True)
         qos = QoSProfile(depth=MOTION_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        subscribe('nav_msgs/msg/Odometry', 'odom', self._on_odometry, qos)
+        tree = self._live.session.tree
+        subscribe('nav_msgs/msg/Odometry', 'odom', tree.add_odometry, qos)
         reliable = QoSProfile(depth=MOTION_DEPTH)
         # That of tf2_ros.
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         try:
             for topic, qos in (('/tf', reliable), ('/tf_static', latched)):
-                callback = partial(self._on_transforms, topic)
+                callback = partial(self._on_transforms, topic == '/tf_static')
                 subscribe('tf2_msgs/msg/TFMessage', topic, callback, qos)
         except UnsupportedMessage as error:
             self.get_logger().warning(f'transforms are not received, odometry is: {error}')
@@ -295,16 +296,13 @@ class BoxregNode(PolledClockNode):
         )  # fmt: skip
         few = QoSProfile(depth=FOLLOW_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._topics.subscribe(
-            type_name, FOLLOW_TOPIC, partial(self._inbox.put_event, 'follow'), few,
+            type_name, FOLLOW_TOPIC, partial(self._inbox.put_event, self.worker.follow), few,
             is_raw=serialized is not None,
         )  # fmt: skip
         self.get_logger().info(f'boxes are {type_name}; {self._topics.description()}')
 
-    def _on_transforms(self, topic: str, msg: Any, received_ns: int) -> None:
-        self._inbox.put_event(topic, (msg.transforms, received_ns), wakes=False)
-
-    def _on_odometry(self, msg: Any, received_ns: int) -> None:
-        self._inbox.put_event('odom', (msg, received_ns), wakes=False)
+    def _on_transforms(self, is_static: bool, msg: Any, received_ns: int) -> None:
+        self._live.session.tree.add_transforms(msg.transforms, is_static, received_ns)
 
     def _on_points(self, lidar: str, msg: Any) -> None:
         self.worker.note_cloud(msg, lidar)
@@ -319,7 +317,7 @@ class BoxregNode(PolledClockNode):
     # ------------------------------------------------------------ services and parameters
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._inbox.put_event('reset', None)
+        self._inbox.put_event(self.worker.reset)
         response.success = True
         response.message = 'tracks and estimated input errors are deleted, transforms are kept'
         return response
@@ -346,7 +344,10 @@ class BoxregNode(PolledClockNode):
 
     def _take_parameters(self, parameters: list[Parameter]) -> None:
         self._settings = changed(*self._settings, parameters)
-        self._inbox.put_event('settings', self._settings)
+        self._inbox.put_event(self._change_worker)
+
+    def _change_worker(self) -> None:
+        self.worker.change(*self._settings)  # that of the time, of a lifecycle node
 
     def _error_of_empty_lists(self) -> ConfigError:
         """Return the error for parameters that are empty lists, which rclpy refuses."""

@@ -10,6 +10,7 @@ from threading import Event
 import time
 from typing import Any
 
+from boxreg_ros.config import Config
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.label_messages import LabelMessage, to_text
@@ -22,6 +23,7 @@ from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.inbox import CloudPatience, Inbox, Message
 from boxreg_ros.live.model_file import ModelFile
 from boxreg_ros.live.outgoing import labels_passed_through, Outgoing
+from boxreg_ros.live.params import NodeOptions
 from boxreg_ros.live.pipeline import MessagePipeline
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.structures import BoxArray, Sweep
@@ -57,9 +59,9 @@ class Worker:
     The worker alone uses the registrar, its transforms and the markers. It shares the inbox and
     the counters with the executor's thread, which also calls `note_cloud`: `cloud_frame` is that
     of the newest cloud, `cloud_received` when it arrived (monotonic) [s]. A cloud may wait
-    `backlog` [s] for the solver; `poll` puts transforms and odometry that have arrived into the
-    inbox. `fixed_frame` is empty until it is chosen, `tracks` counts those of the newest boxes,
-    `newest_transform_ns` is the stamp of the newest transform or odometry.
+    `backlog` [s] for the solver; `poll` adds the transforms and odometry that have arrived to
+    those of the pipeline. `fixed_frame` is empty until it is chosen, `tracks` counts those of the
+    newest boxes, `newest_transform_ns` is the stamp of the newest transform or odometry.
 
     """
 
@@ -172,8 +174,39 @@ class Worker:
             self._publish([Outgoing(message.content, False)])
             self._inbox.put_passing(message)  # the final copy, in the order of all
         else:
-            lost = stamp_ns(header_of(message.content)), message.lidar
-            self._inbox.put_event('lost', lost)
+            lost_ns = stamp_ns(header_of(message.content))
+            self._inbox.put_event(self._lose, lost_ns, message.lidar)
+
+    def add_info(self, message: Any) -> None:
+        """Add the info on a concatenated cloud; for events."""
+        try:
+            self._live.session.placement.add_info(message)
+        except UnsupportedMessage as error:
+            self._health.report(Reason.UNREADABLE, f'points_info: {error}')
+
+    def follow(self, message: Any) -> None:
+        """Follow the objects of boxes; for events."""
+        assert self._live.adapter is not None  # set before boxes are subscribed to
+        try:
+            boxes = self._live.adapter.from_msg(message)
+        except UnsupportedMessage as error:
+            self._health.report(Reason.NOT_FOLLOWED, str(error))
+        except Exception as error:
+            self._health.report_failure(error)
+        else:
+            self._live.following.add(Item(time.monotonic_ns(), boxes, message=message))
+
+    def reset(self) -> None:
+        """Forget everything but the transforms; for events."""
+        self._publish(self._guarded(self._live.reset))
+
+    def change(self, config: Config, options: NodeOptions) -> None:
+        """Use other settings from now on; for events."""
+        self._live.registrar.config = self._live.session.config = config
+        self._live.wait.output_frame = options.output_frame.lstrip('/')
+        self._live.wait.timeout = options.transform_timeout
+        self._budget.deadline = options.deadline
+        self._patience.backlog = options.backlog
 
     def _next(self) -> Item | None:
         """Return the next message decoded, or None if there is none to process now."""
@@ -273,10 +306,10 @@ class Worker:
         self._publish(self._guarded(release))
 
     def _take_events(self) -> None:
-        """Handle all events of the inbox, in the order of their arrival, and transforms."""
+        """Add transforms, and handle all events of the inbox in the order of their arrival."""
         self._poll()
-        for kind, content in self._inbox.take_events():
-            self._take_event(kind, content)
+        for handle in self._inbox.take_events():
+            handle()
         tree = self._live.session.tree
         self.newest_transform_ns = tree.newest_ns()
         for pair, number in (tree.stamps_ahead - self._stamps_ahead).items():
@@ -284,34 +317,9 @@ class Worker:
             self._health.report(Reason.STAMP_AHEAD, text, number)
         self._stamps_ahead = tree.stamps_ahead
 
-    def _take_event(self, kind: str, content: Any) -> None:
-        match kind:
-            case '/tf' | '/tf_static':
-                transforms, received_ns = content
-                is_static = kind == '/tf_static'
-                self._live.session.tree.add_transforms(transforms, is_static, received_ns)
-            case 'odom':
-                self._live.session.tree.add_odometry(*content)
-            case 'points_info':
-                try:
-                    self._live.session.placement.add_info(content)
-                except UnsupportedMessage as error:
-                    self._health.report(Reason.UNREADABLE, f'points_info: {error}')
-            case 'follow':
-                self._follow(content)
-            case 'lost':
-                self._publish(self._guarded(partial(self._live.lose, *content)))
-            case 'reset':
-                self._publish(self._guarded(self._live.reset))
-            case 'settings':
-                config, options = content
-                self._live.registrar.config = self._live.session.config = config
-                self._live.wait.output_frame = options.output_frame.lstrip('/')
-                self._live.wait.timeout = options.transform_timeout
-                self._budget.deadline = options.deadline
-                self._patience.backlog = options.backlog
-            case _:
-                raise ValueError(f'kind: expected that of an event, got {kind!r}')
+    def _lose(self, lost_ns: int, lidar: str) -> None:
+        """Release the boxes that wait for a cloud that was dropped."""
+        self._publish(self._guarded(partial(self._live.lose, lost_ns, lidar)))
 
     def _publish_labels(self, out: Outgoing) -> None:
         """Publish status and all else that label files hold, while somebody subscribes."""
@@ -326,17 +334,6 @@ class Worker:
             fixed_frame = self._live.session.fixed_frame
             content = LabelMessage(refined, fixed_frame, self._live.registrar.config.digest)
             publisher.publish(String(data=to_text(content)))
-
-    def _follow(self, message: Any) -> None:
-        assert self._live.adapter is not None  # set before boxes are subscribed to
-        try:
-            boxes = self._live.adapter.from_msg(message)
-        except UnsupportedMessage as error:
-            self._health.report(Reason.NOT_FOLLOWED, str(error))
-        except Exception as error:
-            self._health.report_failure(error)
-        else:
-            self._live.following.add(Item(time.monotonic_ns(), boxes, message=message))
 
     def _process(self, item: Item) -> None:
         if isinstance(item.content, BoxArray):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, ExitStack
-from heapq import heapify, heappop, heapreplace
+from heapq import merge
+from itertools import starmap
+from operator import itemgetter
 from pathlib import Path, PurePath
 import re
 from typing import Any, NamedTuple
@@ -233,19 +235,15 @@ def _channel(connection: Connection) -> tuple[str, ...]:
 
 def merged_streams(streams: Sequence[tuple[int, Iterator[Record]]]) -> Iterator[Record]:
     """Merge streams by receive time; a stream is begun when its start time [ns] is reached."""
-    ahead: list[tuple[int, int, Record | None]] = [
-        (start_ns, i, None) for i, (start_ns, _) in enumerate(streams)
-    ]
-    heapify(ahead)
-    while ahead:
-        _, i, record = ahead[0]
+
+    def timed(start_ns: int, stream: Iterator[Record]) -> Iterator[tuple[int, Record | None]]:
+        yield start_ns, None  # `merge` asks each stream for its first item at once
+        for record in stream:
+            yield record.received_ns, record
+
+    for _, record in merge(*starmap(timed, streams), key=itemgetter(0)):
         if record is not None:
             yield record
-        following = next(streams[i][1], None)
-        if following is None:
-            heappop(ahead)
-        else:
-            heapreplace(ahead, (following.received_ns, i, following))
 
 
 def _kind(path: Path) -> str:
