@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from boxreg_ros.io.findings import Finding
-from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import Sweep
 import numpy as np
 from numpy.typing import NDArray
@@ -44,11 +42,10 @@ class CloudCheck:
         self._coordinates = self._coordinates or _unit_text(sweep) or _coarse_text(sweep)
 
     @property
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[str]:
         """Return what was found so far."""
         packets = _packets_text(self._sectors) if len(self._sectors) == PACKET_CLOUDS else ''
-        texts = (packets, self._coordinates)
-        return [Finding(Reason.CLOUD_FAULT, text) for text in texts if text]
+        return [text for text in (packets, self._coordinates) if text]
 
 
 def _coarse_text(sweep: Sweep) -> str:

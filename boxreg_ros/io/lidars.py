@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import ConfigError, TransformUnavailable, UnsupportedMessage
@@ -328,38 +328,8 @@ class MergedSweep(NamedTuple):
     extras: tuple[Any, ...]
 
 
-@dataclass(slots=True)
-class _Group:
-    """Clouds of one period, by topic."""
-
-    clouds: dict[str, tuple[Sweep, Any]] = field(default_factory=dict)
-
-    @property
-    def first_ns(self) -> int:
-        return min(sweep.stamp_ns for sweep, _ in self.clouds.values())
-
-    @property
-    def last_ns(self) -> int:
-        return max(sweep.stamp_ns for sweep, _ in self.clouds.values())
-
-    def takes(self, sweep: Sweep, span_ns: int, offsets_ns: Mapping[str, int]) -> bool:
-        """
-        Return whether a cloud belongs here: the first of its topic, within the span.
-
-        `offsets_ns` are those of the LiDARs from the begin of a period, where known. By these it
-        has to be of the same period: where the cloud before it is lost, one of the next period
-        may be within the span, too.
-
-        """
-        first_ns = min(self.first_ns, sweep.stamp_ns)
-        last_ns = max(self.last_ns, sweep.stamp_ns)
-        if sweep.topic in self.clouds or last_ns - first_ns > span_ns:
-            return False
-        topic, (other, _) = next(iter(self.clouds.items()))
-        if topic not in offsets_ns or sweep.topic not in offsets_ns:
-            return True
-        begin_ns = other.stamp_ns - offsets_ns[topic]
-        return abs(sweep.stamp_ns - offsets_ns[sweep.topic] - begin_ns) <= span_ns // 2
+_Period = dict[str, tuple[Sweep, Any]]
+"""Clouds of one period, by topic, with the `extra` object of each."""
 
 
 class SweepMerger:
@@ -383,11 +353,11 @@ class SweepMerger:
         self._span_ns = round(span * 1e9)
         self._report = report
         self.counts = {topic: Counter[str]() for topic in topics}
-        self.reset()
+        self.forget()
 
-    def reset(self) -> None:
+    def forget(self) -> None:
         """Forget all clouds; keep the counts."""
-        self._groups: list[_Group] = []  # ascending by stamp
+        self._groups: list[_Period] = []  # ascending by stamp
         self._heard_ns: dict[str, int] = {}
         self._offsets_ns: dict[str, int] = {}  # of the LiDARs in the last sweep, if complete
         self._returned_ns: int | None = None
@@ -407,7 +377,7 @@ class SweepMerger:
                 f'a cloud of {sweep.stamp_ns} ns arrived after the others of its time were merged',
             )
             return []
-        group.clouds[sweep.topic] = sweep, extra
+        group[sweep.topic] = sweep, extra
         if not self._heard_ns:  # those that have not been heard are waited for at the start
             self._heard_ns = dict.fromkeys(self._topics, sweep.stamp_ns)
         self._heard_ns[sweep.topic] = sweep.stamp_ns
@@ -417,60 +387,78 @@ class SweepMerger:
         """Return all sweeps that are held, complete or not."""
         return self._pop(len(self._groups))
 
-    def _group_for(self, sweep: Sweep) -> _Group | None:
+    def _group_for(self, sweep: Sweep) -> _Period | None:
         """Return the oldest group that takes a cloud, a new one, or None for a late cloud."""
         for group in self._groups:
-            if group.takes(sweep, self._span_ns, self._offsets_ns):
+            if self._takes(group, sweep):
                 return group
-        newest_ns = self._groups[-1].first_ns if self._groups else self._returned_ns
+        newest_ns = _first_ns(self._groups[-1]) if self._groups else self._returned_ns
         if newest_ns is not None and sweep.stamp_ns <= newest_ns:
             return None
-        self._groups.append(_Group())
+        self._groups.append({})
         return self._groups[-1]
+
+    def _takes(self, group: _Period, sweep: Sweep) -> bool:
+        """
+        Return whether a cloud belongs to a group: the first of its topic, within the span.
+
+        Where the offsets of the LiDARs from the begin of a period are known, it also has to be of
+        the same period by these: where the cloud before it is lost, one of the next period may be
+        within the span, too.
+
+        """
+        stamps_ns = [sweep.stamp_ns, *(other.stamp_ns for other, _ in group.values())]
+        if sweep.topic in group or max(stamps_ns) - min(stamps_ns) > self._span_ns:
+            return False
+        offsets_ns = self._offsets_ns
+        topic, (other, _) = next(iter(group.items()))
+        if topic not in offsets_ns or sweep.topic not in offsets_ns:
+            return True
+        begin_ns = other.stamp_ns - offsets_ns[topic]
+        return abs(sweep.stamp_ns - offsets_ns[sweep.topic] - begin_ns) <= self._span_ns // 2
 
     def _pop_complete(self) -> list[MergedSweep]:
         complete = [i for i, group in enumerate(self._groups) if not self._awaited(group)]
         count = complete[-1] + 1 if complete else 0
         return self._pop(max(count, len(self._groups) - MAX_OPEN_GROUPS))
 
-    def _awaited(self, group: _Group) -> list[str]:
+    def _awaited(self, group: _Period) -> list[str]:
         """Return the topics without a cloud in a group that are not silent."""
-        oldest_ns = group.first_ns - round(LIDAR_SILENCE * 1e9)
-        return [
-            topic
-            for topic in self._topics
-            if topic not in group.clouds and self._heard_ns[topic] >= oldest_ns
-        ]
+        oldest_ns = _first_ns(group) - round(LIDAR_SILENCE * 1e9)
+        lacking = [topic for topic in self._topics if topic not in group]
+        return [topic for topic in lacking if self._heard_ns[topic] >= oldest_ns]
 
     def _pop(self, count: int) -> list[MergedSweep]:
         groups = self._groups[:count]
         del self._groups[:count]
         return [self._merged(group) for group in groups]
 
-    def _merged(self, group: _Group) -> MergedSweep:
-        lacking = [topic for topic in self._topics if topic not in group.clouds]
-        for topic in lacking:
-            self._note(topic, CLOUD_MISSING, f'no cloud at {group.first_ns} ns')
-        for topic in group.clouds:
-            self.counts[topic][CLOUD_MERGED] += 1
-        self._returned_ns = group.last_ns
+    def _merged(self, group: _Period) -> MergedSweep:
+        first_ns = _first_ns(group)
+        for topic in self._topics:
+            if topic in group:
+                self.counts[topic][CLOUD_MERGED] += 1
+            else:
+                self._note(topic, CLOUD_MISSING, f'no cloud at {first_ns} ns')
+        self._returned_ns = max(sweep.stamp_ns for sweep, _ in group.values())
         self._offsets_ns = {}
         if not self._awaited(group):
-            self._offsets_ns = {
-                topic: sweep.stamp_ns - group.first_ns
-                for topic, (sweep, _) in group.clouds.items()
-            }
-        clouds = [group.clouds[topic] for topic in self._topics if topic in group.clouds]
-        there = [(sweep, extra) for sweep, extra in clouds if not sweep.is_dropped]
+            self._offsets_ns = {t: sweep.stamp_ns - first_ns for t, (sweep, _) in group.items()}
+        clouds = [group[topic] for topic in self._topics if topic in group]
+        there = [cloud for cloud in clouds if not cloud[0].is_dropped]
         if not there:
             return MergedSweep(clouds[0][0], ())
-        return MergedSweep(
-            merged([sweep for sweep, _ in there]), tuple(extra for _, extra in there)
-        )
+        sweeps, extras = zip(*there, strict=True)
+        return MergedSweep(merged(sweeps), extras)
 
     def _note(self, topic: str, reason: Reason, text: str) -> None:
         self.counts[topic][reason] += 1
         self._report(reason, f'{topic}: {text}; the other LiDARs are used', 1)
+
+
+def _first_ns(group: _Period) -> int:
+    """Return the oldest stamp of a group [ns]."""
+    return min(sweep.stamp_ns for sweep, _ in group.values())
 
 
 def merged(sweeps: Sequence[Sweep]) -> Sweep:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import count
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import (
@@ -129,20 +129,16 @@ class MarkerBoard:
             if refined.reasons[i] == Reason.BUDGET:
                 colour = YELLOW
             spread = refined.covariances[i, :2, :2] if is_refined else np.zeros((2, 2))
-            grey = m.Marker(header=header, ns='input', id=number, action=DELETE)
-            if is_given:
-                grey = _cube(
-                    m, header, 'input', number, given.boxes[i], before[i], TRANSLUCENT_GREY
-                )
-            markers += [
-                grey,
-                _cube(m, header, 'refined', number, box, after[i], colour),
-                _arrow(m, header, number, box, after[i]),
-                _text(m, header, number, box, refined.boxes.track_ids[i]),
-                _ellipse(m, header, number, box, spread),
-            ]
+            shapes = {
+                'input': _cube(given.boxes[i], before[i], TRANSLUCENT_GREY) if is_given else None,
+                'refined': _cube(box, after[i], colour),
+                'heading': _arrow(box, after[i]),
+                'id': _text(box, refined.boxes.track_ids[i]),
+                'covariance': _ellipse(box, spread),
+            }
+            markers += [_marker(m, header, ns, number, shape) for ns, shape in shapes.items()]
         markers += [
-            m.Marker(header=header, ns=ns, id=number, action=DELETE)
+            _marker(m, header, ns, number, None)
             for number in self._shown.gone
             for ns in BOX_NAMESPACES
         ]
@@ -156,13 +152,10 @@ class MarkerBoard:
         quaternions_xyzw = quaternions_of(boxes.boxes)
         rows = np.flatnonzero(is_valid_box(boxes.boxes)).tolist()
         markers = [
-            _outline(m, header, number, boxes.boxes[i], quaternions_xyzw[i])
+            _marker(m, header, FINAL, number, _outline(boxes.boxes[i], quaternions_xyzw[i]))
             for i, number in self._shown_finals.replace(boxes.track_ids, rows)
         ]
-        markers += [
-            m.Marker(header=header, ns=FINAL, id=number, action=DELETE)
-            for number in self._shown_finals.gone
-        ]
+        markers += [_marker(m, header, FINAL, number, None) for number in self._shown_finals.gone]
         return m.MarkerArray(markers=markers)
 
     def clear(self) -> Any:
@@ -178,69 +171,65 @@ class MarkerBoard:
         return m.Header(stamp=m.Time(sec=sec, nanosec=nanosec), frame_id=boxes.frame_id)
 
 
-def _cube(
-    m: Any, header: Any, ns: str, number: int, box: Floats, quaternion_xyzw: Floats, colour: Colour
-) -> Any:
-    pose = _pose(m, box[BOX_CENTER], quaternion_xyzw)
-    return _marker(m, header, ns, number, CUBE, pose, box[BOX_EXTENT], colour)
+class Shape(NamedTuple):
+    """What a marker shows."""
+
+    kind: int
+    position: Floats
+    quaternion_xyzw: Iterable[float]
+    scale: Iterable[float]
+    colour: Colour
+    points: Sequence[tuple[float, float, float]] = ()
+    text: str = ''
 
 
-def _outline(m: Any, header: Any, number: int, box: Floats, quaternion_xyzw: Floats) -> Any:
+def _cube(box: Floats, quaternion_xyzw: Floats, colour: Colour) -> Shape:
+    return Shape(CUBE, box[BOX_CENTER], quaternion_xyzw, box[BOX_EXTENT], colour)
+
+
+def _outline(box: Floats, quaternion_xyzw: Floats) -> Shape:
     """Return the outline of the bottom face: it hides no colour of the box above it."""
     length, width, height = map(float, box[BOX_EXTENT])
-    points = [m.Point(x=x * length / 2, y=y * width / 2, z=-height / 2) for x, y in OUTLINE]
-    pose = _pose(m, box[BOX_CENTER], quaternion_xyzw)
-    return _marker(m, header, FINAL, number, LINE_STRIP, pose, (0.1, 0, 0), CYAN, points=points)
+    points = [(x * length / 2, y * width / 2, -height / 2) for x, y in OUTLINE]
+    return Shape(LINE_STRIP, box[BOX_CENTER], quaternion_xyzw, (0.1, 0, 0), CYAN, points)
 
 
-def _arrow(m: Any, header: Any, number: int, box: Floats, quaternion_xyzw: Floats) -> Any:
+def _arrow(box: Floats, quaternion_xyzw: Floats) -> Shape:
     """Return an arrow from the centre along the heading, beyond the front."""
-    pose = _pose(m, box[BOX_CENTER], quaternion_xyzw)
     scale = (0.8 * box[LENGTH], 0.15, 0.15)
-    return _marker(m, header, 'heading', number, ARROW, pose, scale, WHITE)
+    return Shape(ARROW, box[BOX_CENTER], quaternion_xyzw, scale, WHITE)
 
 
-def _ellipse(m: Any, header: Any, number: int, box: Floats, spread: Floats) -> Any:
+def _ellipse(box: Floats, spread: Floats) -> Shape:
     """Return the covariance (2, 2) of x and y as a disc on the roof; a dot where it is zero."""
     variances, axes = np.linalg.eigh(spread)
     across, along = 2 * ELLIPSE_DEVIATIONS * np.sqrt(variances.clip(0)) + 1e-3
     half = 0.5 * np.arctan2(axes[1, 1], axes[0, 1])  # eigenvalues ascend
     above = box[BOX_CENTER] + [0, 0, 0.5 * box[HEIGHT]]
-    pose = _pose(m, above, (0, 0, np.sin(half), np.cos(half)))
-    return _marker(m, header, 'covariance', number, SPHERE, pose, (along, across, 0.02), BLUE)
+    return Shape(SPHERE, above, (0, 0, np.sin(half), np.cos(half)), (along, across, 0.02), BLUE)
 
 
-def _text(m: Any, header: Any, number: int, box: Floats, text: str) -> Any:
-    pose = _pose(m, box[BOX_CENTER] + [0, 0, 0.5 * box[HEIGHT] + 0.5])
-    return _marker(m, header, 'id', number, TEXT, pose, (0, 0, 0.8), WHITE, text=text)
+def _text(box: Floats, text: str) -> Shape:
+    above = box[BOX_CENTER] + [0, 0, 0.5 * box[HEIGHT] + 0.5]
+    return Shape(TEXT, above, UPRIGHT, (0, 0, 0.8), WHITE, text=text)
 
 
-def _marker(
-    m: Any,
-    header: Any,
-    ns: str,
-    number: int,
-    kind: int,
-    pose: Any,
-    scale: Iterable[float],
-    colour: Colour,
-    **fields: Any,
-) -> Any:
-    """Return a marker; messages take plain floats only."""
-    x, y, z = map(float, scale)
-    color = m.ColorRGBA(**dict(zip('rgba', colour, strict=True)))
+def _marker(m: Any, header: Any, ns: str, number: int, shape: Shape | None) -> Any:
+    """Return the marker of a shape, or the one that deletes it; messages take plain floats."""
+    if shape is None:
+        return m.Marker(header=header, ns=ns, id=number, action=DELETE)
+    turn = dict(zip('xyzw', map(float, shape.quaternion_xyzw), strict=True))
+    pose = m.Pose(position=m.Point(**_xyz(shape.position)), orientation=m.Quaternion(**turn))
     return m.Marker(
-        header=header, ns=ns, id=number, type=kind, action=ADD, pose=pose,
-        scale=m.Vector3(x=x, y=y, z=z), color=color, **fields,
+        header=header, ns=ns, id=number, type=shape.kind, action=ADD, pose=pose,
+        scale=m.Vector3(**_xyz(shape.scale)),
+        color=m.ColorRGBA(**dict(zip('rgba', shape.colour, strict=True))),
+        points=[m.Point(**_xyz(point)) for point in shape.points], text=shape.text,
     )  # fmt: skip
 
 
-def _pose(m: Any, position: Iterable[float], quaternion_xyzw: Iterable[float] = UPRIGHT) -> Any:
-    x, y, z = map(float, position)
-    qx, qy, qz, qw = map(float, quaternion_xyzw)
-    return m.Pose(
-        position=m.Point(x=x, y=y, z=z), orientation=m.Quaternion(x=qx, y=qy, z=qz, w=qw)
-    )
+def _xyz(values: Iterable[float]) -> dict[str, float]:
+    return dict(zip('xyz', map(float, values), strict=True))
 
 
 def ros_messages() -> SimpleNamespace:

@@ -147,10 +147,8 @@ class JumpSearch:
         cosine = np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1)
         step = float(np.linalg.norm(change[:3, 3]) + np.arccos(cosine) * STEP_RADIUS)
         if step >= MIN_STEP:
-            known = self.steps.setdefault(
-                (edge.parent, edge.child), FrameSteps(edge.parent, edge.child)
-            )
-            known.add(step, stamp_ns)
+            key = edge.parent, edge.child
+            self.steps.setdefault(key, FrameSteps(*key)).add(step, stamp_ns)
 
     def _add_speed(self, edge: Edge, row: int) -> None:
         """Note two samples of the motion that lie too far apart, or go back and forth."""
@@ -179,9 +177,9 @@ class MotionCheck:
         self._named_sensors = named_sensors
         self._jumps = JumpSearch()
         self.findings: dict[str, Finding] = {}
-        self.restart()
+        self.forget()
 
-    def restart(self) -> None:
+    def forget(self) -> None:
         """Forget when messages were received: time has jumped. What was found stays."""
         self._clouds: dict[str, ReceiveTimes] = {}  # by topic: each LiDAR may have its own clock
         self._boxes = ReceiveTimes()

@@ -41,6 +41,15 @@ CLOUDS_WITHOUT_FRAME = (
     "sensor_frames:=['FRAME'] (boxreg relabel: --sensor-frame FRAME), or set it in the driver"
 )
 """What to do about clouds without a frame."""
+BOXES_WITHOUT_FRAME = (
+    'boxes have an empty frame_id: expected the name of their frame; they are taken to be in that '
+    'of the clouds, {!r}'
+)
+SAME_FRAMES = (
+    'frames: expected one name for each, got names that differ by a prefix alone: {}; each pair '
+    'is taken for one frame, since nothing else connects them'
+)
+ASSOCIATE = 'set associate:=true (boxreg relabel: --associate)'
 
 
 class Session:
@@ -72,17 +81,16 @@ class Session:
         self.trusts_ids = False  # they are a person's: boxes at few sweeps do not show them
         self._convention = convention
         self._config = config
-        self._tracker = Tracker(config.max_gap) if convention.associate else None
-        self._merger: SweepMerger | None = None
-        topics = self.placement.lidars.topics
-        if len(topics) > 1:
-            self._merger = SweepMerger(topics, config.merge_span, report)
         lidars = self.placement.lidars
+        self._merger: SweepMerger | None = None
+        if len(lidars.topics) > 1:
+            self._merger = SweepMerger(lidars.topics, config.merge_span, report)
         self._motion_check = MotionCheck(self.tree, bool(lidars.frames or lidars.info))
         self._id_check = None if convention.associate else IdCheck(config.max_gap)
+        self._tracker = self._id_check.tracker if self._id_check else Tracker(config.max_gap)
         self._axis_check = AxisCheck(convention, config.drives)
         self._common_motion = CommonMotionCheck()
-        self._has_boxes_without_frame = False
+        self._boxes_without_frame = ''
         self._has_clouds_without_frame = False
         self._cloud_check = CloudCheck(is_merged=self._merger is not None)
         self._pose_check = PoseCheck(self._convention, AT_ONCE)
@@ -96,22 +104,16 @@ class Session:
     @config.setter
     def config(self, config: Config) -> None:
         self._config = config
-        if self._tracker is not None:
-            self._tracker.max_gap = config.max_gap
+        self._tracker.max_gap = config.max_gap
 
     def restart(self) -> None:
         """Forget all but the transforms; ids that were assigned are not used again."""
         self._pose_check = PoseCheck(self._convention, AT_ONCE)
         self._place_check = PlaceCheck(self._convention, AT_ONCE)
-        self._motion_check.restart()
-        self._axis_check.forget()
-        self._common_motion.forget()
-        if self._id_check is not None:
-            self._id_check.forget()
-        if self._merger is not None:
-            self._merger.reset()
-        if self._tracker is not None:
-            self._tracker.forget()
+        parts = (self._motion_check, self._axis_check, self._common_motion, self._merger)
+        for part in (*parts, self._id_check or self._tracker):
+            if part is not None:
+                part.forget()
 
     def admit(self, item: Item, ticket: object = None) -> Item:
         """
@@ -130,7 +132,7 @@ class Session:
             return item
         if isinstance(given, BoxArray) and not given.frame_id and self.sensor_frame:
             given = replace(given, frame_id=self.sensor_frame)
-            self._has_boxes_without_frame = True
+            self._boxes_without_frame = BOXES_WITHOUT_FRAME.format(self.sensor_frame)
         try:
             fixed_frame = self.require_fixed_frame(given)
             self._motion_check.add(given, fixed_frame, item.received_ns)
@@ -151,14 +153,13 @@ class Session:
         self._pose_check.add(moved)
         self._place_check.add(moved, T_fixed_item, self._other_frames(given))
         if isinstance(moved, BoxArray):
-            if self._tracker is not None:
+            if self._id_check is None:
                 moved = self._tracker.identify(moved)
-            if self._id_check is not None:
+            else:
                 self._id_check.add(moved)
-            tracker = self._tracker if self._id_check is None else self._id_check.tracker
-            if tracker is not None and self.sensor_frame:
+            if self.sensor_frame:
                 route = self.tree.route(self.fixed_frame, self.sensor_frame)
-                self._common_motion.add(moved.stamp_ns, tracker, route)
+                self._common_motion.add(moved.stamp_ns, self._tracker, route)
             frame_yaw = float(np.arctan2(T_fixed_item[1, 0], T_fixed_item[0, 0]))
             self._axis_check.add(moved, frame_yaw)
         return item._replace(moved=moved, T_fixed_item=T_fixed_item, reason=reason, detail=detail)
@@ -232,36 +233,22 @@ class Session:
     @property
     def findings(self) -> list[Finding]:
         """Return the faults of the input, and guesses about it, that were found so far."""
-        found = [*self._motion_check.findings.values()]
-        found += [Finding(Reason.POINT_TIMES, text) for text in self.placement.normalised.values()]
-        if self.tree.same_frames:
-            same = sorted(self.tree.same_frames.items())
-            pairs = ', '.join(f'{full!r} and {rest!r}' for full, rest in same)
-            text = (
-                f'frames: expected one name for each, got names that differ by a prefix alone: '
-                f'{pairs}; each pair is taken for one frame, since nothing else connects them'
-            )
-            found.append(Finding(Reason.TRANSFORM_FAULT, text))
-        found += self._cloud_check.findings
-        if self._common_motion.finding:
-            found.append(Finding(Reason.TRANSFORM_FAULT, self._common_motion.finding))
-        if self._has_boxes_without_frame:
-            text = (
-                f'boxes have an empty frame_id: expected the name of their frame; they are taken '
-                f'to be in that of the clouds, {self.sensor_frame!r}'
-            )
-            found.append(Finding(Reason.TRANSFORM_FAULT, text))
-        axes = self._axis_check.finding
+        same = ', '.join(f'{a!r} and {b!r}' for a, b in sorted(self.tree.same_frames.items()))
         # Points show which horizontal extent is which, motion also which axis points forward;
         # boxes in another place show neither.
         place = self._place_check
-        poses = place.finding or axes or self._pose_check.finding or place.flat
-        if poses:
-            found.append(Finding(Reason.POSE_REFERENCE, poses))
-        if self.jumping_ids:
-            how = 'set associate:=true (boxreg relabel: --associate)'
-            found.append(Finding(Reason.TRACK_IDS_JUMP, f'{self.jumping_ids}; {how}'))
-        return found
+        poses = place.finding or self._axis_check.finding or self._pose_check.finding or place.flat
+        texts = [
+            *((Reason.POINT_TIMES, text) for text in self.placement.normalised.values()),
+            (Reason.TRANSFORM_FAULT, same and SAME_FRAMES.format(same)),
+            *((Reason.CLOUD_FAULT, text) for text in self._cloud_check.findings),
+            (Reason.TRANSFORM_FAULT, self._common_motion.finding),
+            (Reason.TRANSFORM_FAULT, self._boxes_without_frame),
+            (Reason.POSE_REFERENCE, poses),
+            (Reason.TRACK_IDS_JUMP, self.jumping_ids and f'{self.jumping_ids}; {ASSOCIATE}'),
+        ]
+        found = [Finding(reason, text) for reason, text in texts if text]
+        return [*self._motion_check.findings.values(), *found]
 
     @property
     def jumping_ids(self) -> str:
@@ -278,7 +265,7 @@ class Session:
     @property
     def facts(self) -> dict[str, object]:
         """Return the origin of the ids, for reports."""
-        if self._tracker is None:
+        if self._id_check is not None:
             return {'ids': 'of the input'}
         return {'ids': 'by association', 'associated_tracks': self._tracker.count}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from math import inf
 from statistics import median
@@ -31,6 +31,8 @@ EARLY_REFINED = 'early_refined'
 EARLY_BUDGET = 'early_budget'
 EARLY_KEPT = 'early_kept'
 """Counters of early boxes, those of the core are of final ones."""
+LATENCY, STATIC_LATENCY = 'latency', 'static_points latency'
+STATIC_CPU, TICK = 'static_points CPU', 'tick'
 LATENCY_QUANTILES = (('median', 0.5), ('p99', 0.99), ('most', 1.0))
 
 
@@ -50,9 +52,7 @@ class Health:
         self._reported: Counter[str] = Counter()
         self._logged: Counter[str] = Counter()
         self._logged_at = {WAITING: time.monotonic()}
-        self._latencies: list[float] = []
-        self._ticks: list[float] = []
-        self._static: list[tuple[float, float]] = []
+        self._times = defaultdict[str, list[float]](list)  # by what took them [s]
         self._since = time.monotonic()
 
     def count(self, name: str, number: int = 1) -> None:
@@ -78,9 +78,9 @@ class Health:
 
         """
         with self._lock:
-            self._latencies.append(seconds)
+            self._times[LATENCY].append(seconds)
             if took is not None:
-                self._ticks.append(took)
+                self._times[TICK].append(took)
 
     def add_early(self, refined: RefinedBoxes) -> None:
         """Count early boxes: refined, without time to solve them, and kept for other reasons."""
@@ -94,7 +94,8 @@ class Health:
     def add_static(self, seconds: float, cpu: float) -> None:
         """Record latency and CPU time of a cloud without moving objects [s]."""
         with self._lock:
-            self._static.append((seconds, cpu))
+            self._times[STATIC_LATENCY].append(seconds)
+            self._times[STATIC_CPU].append(cpu)
 
     def report(self, reason: Reason, text: str, number: int = 1) -> None:
         """Count a reason and log the text, at most once per `LOG_PERIOD` and reason."""
@@ -148,23 +149,17 @@ class Health:
             counts = self._counts + self._core_counts
             recent = counts - self._reported
             self._reported = counts
-            latencies = sorted(self._latencies)
-            self._latencies = []
-            ticks = sorted(self._ticks)
-            self._ticks = []
-            static = self._static
-            self._static = []
+            times, self._times = self._times, defaultdict(list)
             period = max(now - self._since, 1e-3)
             self._since = now
         values: dict[str, object] = {
             f'{rate} [Hz]': f'{recent[rate] / period:.1f}' for rate in RATES
         }
-        values |= _latency_values('latency', latencies)
-        values |= _latency_values('static_points latency', sorted(wait for wait, _ in static))
-        values |= _latency_values('static_points CPU', sorted(cpu for _, cpu in static))
+        for what in (LATENCY, STATIC_LATENCY, STATIC_CPU):
+            values |= _latency_values(what, sorted(times[what]))
         values |= facts
         values |= dict(sorted(counts.items()))
-        late = _late_text(recent, ticks, deadline)
+        late = _late_text(recent, times[TICK], deadline)
         if late and self.is_due(Reason.BUDGET):
             self._logger.warning(late)
         return diagnosis(name, *_level_and_message(recent, late), values)

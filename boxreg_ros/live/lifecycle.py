@@ -28,15 +28,38 @@ HEARTBEAT_PERIOD = 0.1
 """Time between two heartbeats [s]; that of the nodes of Nav2."""
 HEARTBEAT_TIMEOUT = 4.0
 """Silence after which the other end takes the bond for broken [s]; that of Nav2 by default."""
-STATUS_DEPTH = 10
-"""Queue size of /diagnostics: as many seconds."""
-BOND_DEPTH = 10
-"""Queue size: a second of heartbeats."""
+DEPTH = 10
+"""Queue size: a second of heartbeats, ten of /diagnostics."""
 END_HEARD_TIME = 1.0
 """Longest wait for the other end to take the last message [s]; ten of its heartbeats."""
 
 
-class Bond:
+class Heartbeat:
+    """Publish what a function returns, every `period` [s] until `end`."""
+
+    def __init__(
+        self, node: Node, kind: Any, topic: str, period: float, message: Callable[[], Any]
+    ) -> None:
+        self._node = node
+        self._message = message
+        self._publisher = node.create_publisher(kind, topic, DEPTH)
+        # A steady clock: the manager's timeout runs on while /clock stands still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(period, self.publish, clock=steady)
+
+    def publish(self) -> None:
+        """Publish now."""
+        message = self._message()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+
+    def end(self) -> None:
+        """Publish no more."""
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_publisher(self._publisher)
+
+
+class Bond(Heartbeat):
     """
     Publish heartbeats on `BOND_TOPIC` until `end`, which announces the end.
 
@@ -46,15 +69,11 @@ class Bond:
     """
 
     def __init__(self, node: Node, kind: Any) -> None:
-        self._node = node
         self._status = kind(
             id=node.get_name(), instance_id=str(uuid4()), active=True,
             heartbeat_timeout=HEARTBEAT_TIMEOUT, heartbeat_period=HEARTBEAT_PERIOD,
         )  # fmt: skip
-        self._publisher = node.create_publisher(kind, BOND_TOPIC, BOND_DEPTH)
-        # A steady clock: the manager's timeout runs on while /clock stands still.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(HEARTBEAT_PERIOD, self._publish, clock=steady)
+        super().__init__(node, kind, BOND_TOPIC, HEARTBEAT_PERIOD, lambda: self._status)
 
     @classmethod
     def offered_by(cls, node: Node) -> Bond | None:
@@ -68,39 +87,11 @@ class Bond:
 
     def end(self) -> None:
         """Announce the end of the bond, and publish no more."""
-        self._node.destroy_timer(self._timer)
         self._status.active = False
-        self._publish()
+        self.publish()
         # A publisher that is destroyed takes along what was not acknowledged.
         self._publisher.wait_for_all_acked(Duration(seconds=END_HEARD_TIME))
-        self._node.destroy_publisher(self._publisher)
-
-    def _publish(self) -> None:
-        self._status.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(self._status)
-
-
-class InactiveStatus:
-    """Publish the state of a node on /diagnostics while it is not active, until `end`."""
-
-    def __init__(self, node: Node, state: Callable[[], str]) -> None:
-        self._node = node
-        self._state = state
-        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', STATUS_DEPTH)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(STATUS_PERIOD, self._publish, clock=steady)
-
-    def end(self) -> None:
-        """Publish no more."""
-        self._node.destroy_timer(self._timer)
-        self._node.destroy_publisher(self._publisher)
-
-    def _publish(self) -> None:
-        name = f'{self._node.get_fully_qualified_name()}: registration'
-        status = diagnosis(name, DiagnosticStatus.OK, self._state(), {})
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(message)
+        super().end()
 
 
 AnswerChange = Callable[[ChangeState.Request, ChangeState.Response], ChangeState.Response]
@@ -126,10 +117,16 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
         self._activated = Queue[Worker | None]()
         self._drained = Event()
         self._is_active = False
-        self._status = InactiveStatus(self, self._state_name)
+        self._status = self._inactive_status()
 
-    def _state_name(self) -> str:
-        return str(self._state_machine.current_state[1])
+    def _inactive_status(self) -> Heartbeat:
+        """Publish the state on /diagnostics while the node is not active."""
+        return Heartbeat(self, DiagnosticArray, '/diagnostics', STATUS_PERIOD, self._state_message)
+
+    def _state_message(self) -> DiagnosticArray:
+        name = f'{self.get_fully_qualified_name()}: registration'
+        state = str(self._state_machine.current_state[1])
+        return DiagnosticArray(status=[diagnosis(name, DiagnosticStatus.OK, state, {})])
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Warm up."""
@@ -156,7 +153,7 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
         self.worker.stop()
         self._drained.wait()
         self.close_topics()
-        self._status = InactiveStatus(self, self._state_name)
+        self._status = self._inactive_status()
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:

@@ -10,7 +10,7 @@ def found_in(clouds, is_merged=False):
     check = CloudCheck(is_merged)
     for k, points in enumerate(clouds):
         check.add(Sweep(START + k, 'lidar', points))
-    return ' '.join(finding.text for finding in check.findings)
+    return ' '.join(check.findings)
 
 
 def test_coordinates_that_float32_rounds_to_centimetres_are_named():
