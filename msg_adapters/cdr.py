@@ -9,6 +9,7 @@ compiled loop walks once through its bytes; numbers are then copied to and from 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 import re
@@ -114,6 +115,7 @@ def _class_of(name: str) -> Any:
     return getattr(import_module(f'{package}.msg'), kind)
 
 
+@dataclass(eq=False, repr=False)
 class Fields:
     """
     The fields that a `Layout` has found in a message.
@@ -124,34 +126,31 @@ class Fields:
 
     """
 
-    def __init__(
-        self,
-        data: bytes,
-        body: NDArray[np.uint8],
-        places: dict[str, NDArray[np.int64]],
-    ) -> None:
-        self.data = data
-        self._body = body
-        self._places = places
+    data: bytes
+    body: NDArray[np.uint8]
+    places: dict[str, NDArray[np.int64]]
+
+    def __post_init__(self) -> None:
+        """Begin with no string decoded."""
         self._strings: dict[str, list[bytes]] = {}  # by path, once they are asked for
 
     def copied(self) -> Fields:
         """Return fields to put other numbers into, which do not change these."""
-        return Fields(self.data, self._body.copy(), self._places)
+        return Fields(self.data, self.body.copy(), self.places)
 
     def counts(self, path: str) -> NDArray[np.int64]:
         """Return how many elements (k,) a sequence or array has, for each item that it is in."""
-        return self._places[path][:, 1]
+        return self.places[path][:, 1]
 
     def numbers(self, path: str, dtype: str, width: int = 1) -> NDArray[Any]:
         """Return a field and the numbers that follow it without a gap, as an array (k, width)."""
-        values: NDArray[Any] = self._body.view(dtype)[self._index(path, dtype, width)]
+        values: NDArray[Any] = self.body.view(dtype)[self._index(path, dtype, width)]
         return values
 
     def put(self, path: str, values: NDArray[Any]) -> None:
         """Replace the numbers that `numbers` returns for `path` by an array (k, width)."""
         dtype = values.dtype.str
-        self._body.view(dtype)[self._index(path, dtype, values.shape[1])] = values
+        self.body.view(dtype)[self._index(path, dtype, values.shape[1])] = values
 
     def texts(self, path: str) -> list[str]:
         """Return strings; bytes that are no UTF-8 are replaced."""
@@ -165,12 +164,12 @@ class Fields:
 
     def message(self) -> bytes:
         """Return the message with the numbers that were put."""
-        return self.data[:HEADER] + self._body[: len(self.data) - HEADER].tobytes()
+        return self.data[:HEADER] + self.body[: len(self.data) - HEADER].tobytes()
 
     def _encoded(self, path: str) -> list[bytes]:
         """Return strings without the zero that ends each."""
         if path not in self._strings:
-            offset, length = self._places[path].T
+            offset, length = self.places[path].T
             begin = HEADER + offset
             ends = (begin + np.maximum(length - 1, 0)).tolist()
             data = self.data
@@ -180,7 +179,7 @@ class Fields:
         return self._strings[path]
 
     def _index(self, path: str, dtype: str, width: int) -> NDArray[np.int64]:
-        first = self._places[path][:, :1] // np.dtype(dtype).itemsize
+        first = self.places[path][:, :1] // np.dtype(dtype).itemsize
         index: NDArray[np.int64] = first + np.arange(width)
         return index
 

@@ -77,6 +77,7 @@ class BoxFields:
     """Writes what depends on the box beside pose, size and covariance."""
 
 
+@dataclass(eq=False, repr=False)
 class SerializedAdapter:
     """
     An `Adapter` whose messages are bytes, as they arrive and as they are published.
@@ -86,27 +87,23 @@ class SerializedAdapter:
 
     """
 
-    def __init__(
-        self,
-        type_name: str,
-        kind: Any,
-        inner: Adapter,
-        deserialize: Callable[[bytes, Any], Any],
-    ) -> None:
-        self._at = BOX_FIELDS[type_name]
-        self._kind = kind
-        self._inner = inner
-        self._deserialize = deserialize
-        at = self._at
+    type_name: str
+    kind: Any
+    inner: Adapter
+    deserialize: Callable[[bytes, Any], Any]
+
+    def __post_init__(self) -> None:
+        """Find the fields in the definition of the type."""
+        at = self._at = BOX_FIELDS[self.type_name]
         paths = (at.stamp, *at.frames, at.pose, at.size, at.covariance, *at.others)
-        self._layout = Layout(kind, [path for path in dict.fromkeys(paths) if path])
+        self._layout = Layout(self.kind, [path for path in dict.fromkeys(paths) if path])
         self._walked = deque[Fields](maxlen=MOST_WALKED)
 
     def from_msg(self, msg: bytes) -> BoxArray:
         """Return the boxes of a message, see `Adapter`."""
         fields = self._ordinary(msg)
         if fields is None:
-            return self._inner.from_msg(self._deserialize(msg, self._kind))
+            return self.inner.from_msg(self.deserialize(msg, self.kind))
         return self._boxes_of(fields)
 
     def _boxes_of(self, fields: Fields) -> BoxArray:
@@ -133,12 +130,12 @@ class SerializedAdapter:
     ) -> Any:
         """Return a copy with its boxes replaced, see `Adapter`: bytes, or a message."""
         if not isinstance(msg, bytes):
-            return self._inner.to_msg(msg, boxes, covariances, T_out_in)
+            return self.inner.to_msg(msg, boxes, covariances, T_out_in)
         fields = self._ordinary(msg) if T_out_in is None else None
         at = self._at
         if fields is None or fields.texts(at.frames[0])[0] != boxes.frame_id:
-            given = self._deserialize(msg, self._kind)
-            return self._inner.to_msg(given, boxes, covariances, T_out_in)
+            given = self.deserialize(msg, self.kind)
+            return self.inner.to_msg(given, boxes, covariances, T_out_in)
         fields = fields.copied()  # the final boxes are written into the same message
         rows = self._rows(fields)
         pose = fields.numbers(at.pose, '<f8', POSE_WIDTH)
@@ -161,8 +158,8 @@ class SerializedAdapter:
 
     def with_added(self, msg: bytes, sources: Sequence[tuple[bytes, int]]) -> Any:
         """Return a message with boxes of earlier ones added, see `Adapter`."""
-        earlier = [(self._deserialize(source, self._kind), row) for source, row in sources]
-        return self._inner.with_added(self._deserialize(msg, self._kind), earlier)
+        earlier = [(self.deserialize(source, self.kind), row) for source, row in sources]
+        return self.inner.with_added(self.deserialize(msg, self.kind), earlier)
 
     def _ordinary(self, msg: bytes) -> Fields | None:
         """Return the fields of a message with one frame and one stamp that has boxes."""

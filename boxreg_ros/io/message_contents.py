@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
@@ -15,27 +16,24 @@ from boxreg_ros.structures import BoxArray, Floats, Sweep
 from msg_adapters import Adapter, clouds, pointcloud
 
 
+@dataclass(eq=False, repr=False)
 class MessageContents:
     """
     Read clouds and boxes of messages; box arrays of one stamp, received at once, are one array.
 
-    `adapter` reads the messages on `boxes_topic`; there are none without it. `decoded_topics` are
-    those with messages that could be read since `reset`.
+    The adapter reads the messages on the topic of the boxes; there are none without it.
+    `decoded_topics` are those with messages that could be read since `reset`.
 
     """
 
-    def __init__(
-        self,
-        decoder: MessageDecoder,
-        placement: SensorPlacement,
-        boxes_topic: str,
-        adapter: Adapter | None,
-    ) -> None:
+    _decoder: MessageDecoder
+    _placement: SensorPlacement
+    _boxes_topic: str
+    _adapter: Adapter | None
+
+    def __post_init__(self) -> None:
+        """Begin with no message."""
         self.decoded_topics: set[str] = set()
-        self._decoder = decoder
-        self._placement = placement
-        self._boxes_topic = boxes_topic
-        self._adapter = adapter
         self._joined: set[int] = set()  # records whose boxes are in an array before them, by id
         self._joins = 0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 import shlex
 from typing import Any
@@ -35,34 +36,30 @@ ReadTopics = Callable[[Collection[str], int | None, int | None], Iterator[Record
 """Yields the messages on some topics, received from a time to another [ns], in order."""
 
 
+@dataclass(eq=False, repr=False)
 class RecordedMotion:
     """
     Transforms and odometry of a recording, in the part from begin to end of receive time [ns].
 
     `odometry_topic` is the one that was asked for, which comes before TF, then the one in use. Of
-    TF the topics are used that `tf` names, one or several; else those of all namespaces, but for
-    others that state the same frames as the namespace of the clouds. `notes` say what was chosen.
+    TF the topics are used that were asked for, one or several; else those of all namespaces, but
+    for others that state the same frames as the namespace of the clouds. `notes` say what was
+    chosen.
 
     """
 
-    def __init__(
-        self,
-        topics: Topics,
-        decoder: MessageDecoder,
-        read: ReadTopics,
-        part_ns: tuple[int, int],
-        odometry_topic: str | None,
-        points_topics: Sequence[str] = (),
-        tf: Sequence[str] = (),
-    ) -> None:
-        self._topics = topics
-        self._decoder = decoder
-        self._read = read
-        self._start_ns, self._end_ns = part_ns
-        self.odometry_topic = odometry_topic
-        self._is_odometry_asked = odometry_topic is not None
-        self._points_topics = points_topics
-        self._asked_tf = tf
+    _topics: Topics
+    _decoder: MessageDecoder
+    _read: ReadTopics
+    _part_ns: tuple[int, int]
+    odometry_topic: str | None
+    _points_topics: Sequence[str]
+    _asked_tf: Sequence[str]
+
+    def __post_init__(self) -> None:
+        """Begin without a choice."""
+        self._is_odometry_asked = self.odometry_topic is not None
+        self._start_ns, self._end_ns = self._part_ns
         self._transforms: set[str] | None = None
         self.notes: dict[str, str] = {}
 

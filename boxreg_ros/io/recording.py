@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast, NamedTuple, Self
+from typing import Any, cast, Self
 
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.definitions import known_store
@@ -34,21 +35,7 @@ from rosbags.interfaces import Connection
 from rosbags.typesys.store import Typestore
 
 
-class Asked(NamedTuple):
-    """What a user says about a recording; topics that are not named are found by type."""
-
-    lidars: Lidars
-    boxes: str | None
-    odometry: str | None
-    start: float | None
-    """Of the part that is read, from the beginning [s]; so is `end`."""
-    end: float | None
-    convention: Convention
-    tf: Sequence[str]
-    clock_offset: float
-    """Added to the stamps of motion [s]."""
-
-
+@dataclass(eq=False, repr=False)
 class Recording:
     """
     One or several recordings of one drive, merged by receive time.
@@ -69,20 +56,21 @@ class Recording:
 
     has_boxes = True
 
-    def __init__(
-        self,
-        paths: Sequence[Path],
-        lidars: Lidars = SINGLE_LIDAR,
-        boxes: str | None = None,
-        odometry: str | None = None,
-        start: float | None = None,
-        end: float | None = None,
-        convention: Convention = STANDARD,
-        tf: Sequence[str] = (),
-        clock_offset: float = 0.0,
-    ) -> None:
-        self._paths = [Path(path) for path in paths]
-        self._asked = Asked(lidars, boxes, odometry, start, end, convention, tf, clock_offset)
+    paths: Sequence[Path]
+    lidars: Lidars = SINGLE_LIDAR
+    boxes: str | None = None
+    odometry: str | None = None
+    start: float | None = None
+    """Of the part that is read, from the beginning [s]; so is `end`."""
+    end: float | None = None
+    convention: Convention = STANDARD
+    tf: Sequence[str] = ()
+    clock_offset: float = 0.0
+    """Added to the stamps of motion [s]."""
+
+    def __post_init__(self) -> None:
+        """Begin without files."""
+        self.paths = [Path(path) for path in self.paths]
         self._sensor_frame = ''  # once it is chosen
         self.outside = 0
         self.left_out: Counter[str] = Counter()
@@ -90,7 +78,7 @@ class Recording:
 
     def __enter__(self) -> Self:
         """Open all files and find the topics."""
-        parts = [part_of(path) for path in self._paths]
+        parts = [part_of(path) for path in self.paths]
         self.files = [file for part in parts for file in part.files]
         self._reader = Reader(parts)
         try:
@@ -102,17 +90,16 @@ class Recording:
 
     def _open(self) -> None:
         """Find the topics, the definitions of their messages, the part to read, and its motion."""
-        asked = self._asked
         self._topics = topics = Topics(self._reader.connections, str(self))
-        lidars, self.points_topic = topics.find_lidars(asked.lidars)
+        lidars, self.points_topic = topics.find_lidars(self.lidars)
         self.placement = SensorPlacement(lidars)
         self.boxes_topic = ''
         adapter = None
         if self.has_boxes:
-            self.boxes_topic = topics.find_boxes(asked.boxes, asked.convention.associate)
-            adapter = adapter_for(topics.kinds[self.boxes_topic], asked.convention)
-        if asked.odometry:
-            topics.find('odometry', 'odometry', (ODOMETRY_TYPE,), asked.odometry)
+            self.boxes_topic = topics.find_boxes(self.boxes, self.convention.associate)
+            adapter = adapter_for(topics.kinds[self.boxes_topic], self.convention)
+        if self.odometry:
+            topics.find('odometry', 'odometry', (ODOMETRY_TYPE,), self.odometry)
         self._decoder = MessageDecoder(str(self))
         self._contents = MessageContents(self._decoder, self.placement, self.boxes_topic, adapter)
         motion = topics.transforms | topics.of((ODOMETRY_TYPE,))
@@ -120,11 +107,11 @@ class Recording:
         self._chosen = list(filter(None, chosen))
         self._timeline = MessageOrder(self._reader, self.points_topic, self._stamp_of)
         span_ns = self._timeline.span_ns(self.data_topics | motion - topics.static_transforms)
-        part_ns = requested_part(str(self), *span_ns, asked.start, asked.end)
+        part_ns = requested_part(str(self), *span_ns, self.start, self.end)
         self.start_ns, self.end_ns = part_ns
         self._motion = RecordedMotion(
-            topics, self._decoder, self._read, part_ns, asked.odometry, self.points_topics,
-            asked.tf,
+            topics, self._decoder, self._read, part_ns, self.odometry, self.points_topics,
+            self.tf,
         )  # fmt: skip
 
     @property
@@ -150,8 +137,8 @@ class Recording:
     @property
     def part_ns(self) -> tuple[int | None, int | None]:
         """Return begin and end that were asked for, in receive time [ns]; None where not."""
-        begin = self.start_ns if self._asked.start else None
-        return begin, None if self._asked.end is None else self.end_ns
+        begin = self.start_ns if self.start else None
+        return begin, None if self.end is None else self.end_ns
 
     @property
     def unreadable(self) -> Counter[str]:
@@ -169,7 +156,7 @@ class Recording:
 
     def __str__(self) -> str:
         """Return the paths."""
-        return ', '.join(map(str, self._paths))
+        return ', '.join(map(str, self.paths))
 
     def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
         """
@@ -310,8 +297,8 @@ class Recording:
         the clouds.
 
         """
-        tree.clock_offset = self._asked.clock_offset
-        tree.prefers_odometry = self._asked.odometry is not None
+        tree.clock_offset = self.clock_offset
+        tree.prefers_odometry = self.odometry is not None
         first_error: RecordingError | None = None
         for frame in self._sensor_frames():  # the others go on where TF does not know one
             try:
@@ -389,7 +376,7 @@ class Recording:
                 header = clouds.header_of(stamped[0]) if len(stamped) else None
             stamp_ns = 0 if header is None else poses.stamp_ns(header)
             if stamp_ns and connection.topic not in self.data_topics:
-                stamp_ns += round(self._asked.clock_offset * 1e9)
+                stamp_ns += round(self.clock_offset * 1e9)
             return stamp_ns or None
         except UnsupportedMessage:
             return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from functools import partial
 from math import inf
 from statistics import median
@@ -37,6 +38,7 @@ LARGEST_RESERVE = 0.5
 overrun is an interruption of the process, and would be late with any reserve."""
 
 
+@dataclass(eq=False, repr=False)
 class TickBudget:
     """
     Limit the windows that are solved for a box array, so that it is published by its deadline.
@@ -58,16 +60,13 @@ class TickBudget:
 
     """
 
-    def __init__(
-        self,
-        deadline: float,
-        clock: Callable[[], float] = time.monotonic,
-        solve: Solve = estimate_windows,
-    ) -> None:
-        self.deadline = deadline
-        self._clock = clock
-        self._solve = solve
-        self._since = clock()
+    deadline: float
+    clock: Callable[[], float] = time.monotonic
+    solve: Solve = estimate_windows
+
+    def __post_init__(self) -> None:
+        """Begin without a tick."""
+        self._since = self.clock()
         self._solved_at = self._since
         self._planned_end = inf
         self._publishing_times = deque[float](maxlen=RECENT)  # [s]
@@ -95,7 +94,7 @@ class TickBudget:
 
         """
         if self._solved_at:
-            now = self._clock()
+            now = self.clock()
             self._publishing_times.append(now - self._solved_at)
             self._overruns.append((now, now - self._planned_end))
             self._solved_at = 0.0
@@ -112,7 +111,7 @@ class TickBudget:
         number = 0
         if self._times:
             planned_end = self._since + self.seconds - self._reserve
-            time_left = planned_end - _median(self._publishing_times) - self._clock()
+            time_left = planned_end - _median(self._publishing_times) - self.clock()
             number = int(time_left / _median(self._times)) - BATCH_OVERHEAD
         least = max(1, min(needed, BATCH_OVERHEAD))
         if number >= least:  # the tick can be in time
@@ -138,7 +137,7 @@ class TickBudget:
     @property
     def _reserve(self) -> float:
         """Return the second largest of the recent overruns that a reserve can hold [s]."""
-        oldest = self._clock() - RESERVE_MEMORY
+        oldest = self.clock() - RESERVE_MEMORY
         while self._overruns and self._overruns[0][0] < oldest:
             self._overruns.popleft()
         most = LARGEST_RESERVE * self.seconds
@@ -155,9 +154,9 @@ class TickBudget:
     def _timed(
         self, windows: list[Window], config: Config, model: InputModel
     ) -> list[Estimate | None]:
-        begin = self._clock()
-        estimates = self._solve(windows, config, model)
-        self._solved_at = self._clock()
+        begin = self.clock()
+        estimates = self.solve(windows, config, model)
+        self._solved_at = self.clock()
         num_solved = sum(estimate is not None for estimate in estimates)
         if num_solved:
             self._times.append((self._solved_at - begin) / (num_solved + BATCH_OVERHEAD))

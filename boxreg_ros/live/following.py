@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
@@ -18,6 +19,7 @@ LOST_SHOWN = 10
 """Followed objects that were lost or refused last, of which /diagnostics says why; chosen."""
 
 
+@dataclass(eq=False, repr=False)
 class Following:
     """
     Start to follow objects once their transforms are known, and report those that are lost.
@@ -27,17 +29,13 @@ class Following:
 
     """
 
-    def __init__(
-        self,
-        registrar: BoxRegistrar,
-        session: Session,
-        wait: TransformWait,
-        trouble: Callable[[Reason, str, int], None],
-    ) -> None:
-        self._registrar = registrar
-        self._session = session
-        self._wait = wait
-        self._trouble = trouble
+    _registrar: BoxRegistrar
+    _session: Session
+    _wait: TransformWait
+    _trouble: Callable[[Reason, str, int], None]
+
+    def __post_init__(self) -> None:
+        """Begin with no object."""
         self.facts: dict[str, object] = {}
         self.restart()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 import gc
 from threading import Event
@@ -52,49 +53,42 @@ ACKNOWLEDGEMENT_TIME = 0.4
 """Wait at shutdown for subscribers to acknowledge the last messages, over all publishers [s]."""
 
 
+@dataclass(eq=False, repr=False)
 class Worker:
     """
     Registers boxes in a thread of its own, from `run` until `stop`.
 
     The worker alone uses the registrar, its transforms and the markers. It shares the inbox and
     the counters with the executor's thread, which also calls `note_cloud`: `cloud_frame` is that
-    of the newest cloud, `cloud_received` when it arrived (monotonic) [s]. A cloud may wait
-    `backlog` [s] for the solver; `poll` adds the transforms and odometry that have arrived to
-    those of the pipeline. `fixed_frame` is empty until it is chosen, `tracks` counts those of the
-    newest boxes, `newest_transform_ns` is the stamp of the newest transform or odometry.
+    of the newest cloud, `cloud_received` when it arrived (monotonic) [s]. A cloud may wait for the
+    solver for the backlog [s]; polling adds the transforms and odometry that have arrived to those
+    of the pipeline. `fixed_frame` is empty until it is chosen, `tracks` counts those of the newest
+    boxes, `newest_transform_ns` is the stamp of the newest transform or odometry.
 
     """
 
-    def __init__(
-        self,
-        live: MessagePipeline,
-        inbox: Inbox,
-        health: Health,
-        logger: RcutilsLogger,
-        budget: TickBudget,
-        backlog: float,
-        markers: Publisher,
-        model: ModelFile,
-        poll: Callable[[], None],
-    ) -> None:
+    _live: MessagePipeline
+    _inbox: Inbox
+    _health: Health
+    _logger: RcutilsLogger
+    _budget: TickBudget
+    _backlog: float
+    _markers: Publisher
+    _model: ModelFile
+    _poll: Callable[[], None]
+
+    def __post_init__(self) -> None:
+        """Begin with no message."""
         self.cloud_frame = ''
         self.cloud_received = 0.0
         self.fixed_frame = ''
         self.tracks = 0
         self.newest_transform_ns: int | None = None
-        self._live = live
-        self._inbox = inbox
-        self._health = health
-        self._logger = logger
-        self._budget = budget
-        self._patience = CloudPatience(backlog)
+        self._patience = CloudPatience(self._backlog)
         self._complete_at = 0.0  # when a message got its transforms, and how long it had waited
         self._waited = 0.0
         self._fully_collected_at = time.monotonic()
         self._board = MarkerBoard()
-        self._markers = markers
-        self._model = model
-        self._poll = poll
         self.static: Publisher | None = None  # of clouds without moving objects
         self._early: Publisher | None = None
         self._final: Publisher | None = None

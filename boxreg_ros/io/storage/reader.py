@@ -76,19 +76,11 @@ class Reader:
         """Yield the messages on `connections` by receive time; damage is added to `damages`."""
         streams = []
         for file in self._files:
-            wanted = {c.id: c for c in connections if c.owner is file}
-            own = [c for c in file.connections if c.id in wanted]
+            own = [connection for connection in connections if connection.owner is file]
             if own:
-                streams.append(
-                    (file.start_time, _renamed(file.messages(own, start, stop), wanted))
-                )
+                streams.append((file.start_time, file.messages(own, start, stop)))
         with readable(self._origin, READ_FORMATS, 'copy it again, or leave it out'):
             yield from merged_streams(streams)
-
-
-def _renamed(records: Iterator[Record], wanted: dict[int, Connection]) -> Iterator[Record]:
-    for record in records:
-        yield record._replace(connection=wanted[record.connection.id])
 
 
 def decompressed(data: bytes) -> bytes:
