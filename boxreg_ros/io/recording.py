@@ -46,8 +46,10 @@ class Recording:
     are not named are found by type, if only one has it. Use as a context manager; a copy can be
     opened again.
 
-    Attributes are those of `ItemSource`; also the `files`, all `topics` with their types, and
-    `part_ns`: begin and end that were asked for, in receive time [ns], None where not.
+    Attributes are those of `ItemSource`; also the `files`, all `topics` with their types,
+    `points_topics`, `data_topics` of clouds and boxes, whether messages are encoded as by ROS 2
+    (`is2`), and `part_ns`: begin and end that were asked for, in receive time [ns], None where
+    not.
 
     Raises RecordingError on entering, if a file or topic cannot be read or found; the message
     lists the topics.
@@ -91,8 +93,10 @@ class Recording:
     def _open(self) -> None:
         """Find the topics, the definitions of their messages, the part to read, and its motion."""
         self._topics = topics = Topics(self._reader.connections, str(self))
+        self.topics, self.is2 = topics.kinds, self._reader.is2
         lidars, self.points_topic = topics.find_lidars(self.lidars)
         self.placement = SensorPlacement(lidars)
+        self.points_topics = lidars.topics
         self.boxes_topic = ''
         adapter = None
         if self.has_boxes:
@@ -100,7 +104,9 @@ class Recording:
             adapter = adapter_for(topics.kinds[self.boxes_topic], self.convention)
         if self.odometry:
             topics.find('odometry', 'odometry', (ODOMETRY_TYPE,), self.odometry)
+        self.data_topics = {*self.points_topics, self.boxes_topic}
         self._decoder = MessageDecoder(str(self))
+        self.unreadable, self.first_errors = self._decoder.unreadable, self._decoder.first_errors
         self._contents = MessageContents(self._decoder, self.placement, self.boxes_topic, adapter)
         motion = topics.transforms | topics.of((ODOMETRY_TYPE,))
         chosen = map(self.choose_definition, topics.connections(self.data_topics | motion))
@@ -115,40 +121,10 @@ class Recording:
         )  # fmt: skip
 
     @property
-    def topics(self) -> dict[str, str]:
-        """Return the types of all topics."""
-        return self._topics.kinds
-
-    @property
-    def is2(self) -> bool:
-        """Return whether messages are encoded as by ROS 2."""
-        return self._reader.is2
-
-    @property
-    def points_topics(self) -> tuple[str, ...]:
-        """Return the topics of the clouds."""
-        return self.placement.lidars.topics
-
-    @property
-    def data_topics(self) -> set[str]:
-        """Return the topics of clouds and boxes."""
-        return {*self.points_topics, self.boxes_topic}
-
-    @property
     def part_ns(self) -> tuple[int | None, int | None]:
         """Return begin and end that were asked for, in receive time [ns]; None where not."""
         begin = self.start_ns if self.start else None
         return begin, None if self.end is None else self.end_ns
-
-    @property
-    def unreadable(self) -> Counter[str]:
-        """Return the number of messages that could not be decoded, by topic."""
-        return self._decoder.unreadable
-
-    @property
-    def first_errors(self) -> dict[str, UnsupportedMessage]:
-        """Return the error of the first of them."""
-        return self._decoder.first_errors
 
     def __exit__(self, *_: object) -> None:
         """Close all files."""

@@ -80,7 +80,7 @@ class Session:
         self.sensor_frame = ''
         self.trusts_ids = False  # they are a person's: boxes at few sweeps do not show them
         self._convention = convention
-        self._config = config
+        self.config = config
         lidars = self.placement.lidars
         self._merger: SweepMerger | None = None
         if len(lidars.topics) > 1:
@@ -95,16 +95,6 @@ class Session:
         self._cloud_check = CloudCheck(is_merged=self._merger is not None)
         self._pose_check = PoseCheck(self._convention, AT_ONCE)
         self._place_check = PlaceCheck(self._convention, AT_ONCE)
-
-    @property
-    def config(self) -> Config:
-        """Return the settings; `max_gap` may change at any time."""
-        return self._config
-
-    @config.setter
-    def config(self, config: Config) -> None:
-        self._config = config
-        self._tracker.max_gap = config.max_gap
 
     def restart(self) -> None:
         """Forget all but the transforms; ids that were assigned are not used again."""
@@ -153,6 +143,7 @@ class Session:
         self._pose_check.add(moved)
         self._place_check.add(moved, T_fixed_item, self._other_frames(given))
         if isinstance(moved, BoxArray):
+            self._tracker.max_gap = self.config.max_gap  # which may change
             if self._id_check is None:
                 moved = self._tracker.identify(moved)
             else:

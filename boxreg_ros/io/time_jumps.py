@@ -101,7 +101,8 @@ class JumpConfirmation(Generic[_T]):
     def restart(self) -> None:
         """Forget all stamps and the items that wait for a second one."""
         self._clocks: dict[str, StreamClock] = {}
-        self._held: list[Held[_T]] = []
+        self.held: list[Held[_T]] = []
+        """The items that wait for a second one, in order of arrival."""
 
     def add(
         self, item: _T, content: Sweep | BoxArray, received_ns: int | None = None
@@ -129,15 +130,15 @@ class JumpConfirmation(Generic[_T]):
             result.items.append(item)
             clock.note(stamp_ns, received_ns)
             return result
-        confirming = [held for held in self._held if new.confirms(held)]
+        confirming = [held for held in self.held if new.confirms(held)]
         if not confirming:
             result = self._refuted(stream)
-            self._held.append(new)
+            self.held.append(new)
             return result
         has_jumped = not is_ahead
         if has_jumped:
             self._clocks.clear()
-        self._held = [held for held in self._held if held not in confirming]
+        self.held = [held for held in self.held if held not in confirming]
         for held in (*confirming, new):
             clock = self._clocks.setdefault(held.stream, StreamClock())
             clock.note(held.stamp_ns, held.received_ns)
@@ -145,14 +146,9 @@ class JumpConfirmation(Generic[_T]):
 
     def release(self, held: Held[_T] | None = None) -> list[_T]:
         """Remove and return one item that waits, or all: no other confirms or refutes them."""
-        released = [one for one in self._held if held is None or one is held]
-        self._held = [one for one in self._held if one not in released]
+        released = [one for one in self.held if held is None or one is held]
+        self.held = [one for one in self.held if one not in released]
         return [one.item for one in released]
-
-    @property
-    def held(self) -> list[Held[_T]]:
-        """Return the items that wait for a second one, in order of arrival."""
-        return list(self._held)
 
     def _is_reached(self, stamp_ns: int) -> bool:
         """Return whether another stream has come to about a stamp [ns]."""
@@ -162,8 +158,8 @@ class JumpConfirmation(Generic[_T]):
 
     def _refuted(self, stream: str) -> Confirmed[_T]:
         """Remove the items of a stream that wait: its next stamp fits those before them."""
-        refuted = [held for held in self._held if held.stream == stream]
-        self._held = [held for held in self._held if held.stream != stream]
+        refuted = [held for held in self.held if held.stream == stream]
+        self.held = [held for held in self.held if held.stream != stream]
         return Confirmed(
             [held.item for held in refuted if not held.is_ahead],
             ahead=[held.item for held in refuted if held.is_ahead],

@@ -42,13 +42,21 @@ def nearest_namespace(topics: Collection[str], spaces: Collection[str]) -> str |
 
 
 class Topics:
-    """Topics of a recording; `kinds` has all of them, sorted, with the types of their messages."""
+    """
+    Topics of a recording.
+
+    `kinds` has all of them, sorted, with the types of their messages; `transforms` are those of
+    TF, `static_transforms` those of its static part.
+
+    """
 
     def __init__(self, connections: Sequence[Connection], origin: str) -> None:
         self._origin = origin
         self._connections = connections
         ordered = sorted(connections, key=lambda connection: connection.topic)
         self.kinds = {connection.topic: connection.msgtype for connection in ordered}
+        self.transforms = self.of(TF_TYPES)
+        self.static_transforms = {t for t in self.transforms if t.endswith('tf_static')}
         self._filled = {connection.topic for connection in connections if connection.msgcount}
 
     def connections(self, topics: Collection[str]) -> list[Connection]:
@@ -62,16 +70,6 @@ class Topics:
     def filled(self, types: Collection[str]) -> list[str]:
         """Return the topics of these types that have messages."""
         return [topic for topic in self.kinds if topic in self.of(types) & self._filled]
-
-    @property
-    def transforms(self) -> set[str]:
-        """Return the topics of TF."""
-        return self.of(TF_TYPES)
-
-    @property
-    def static_transforms(self) -> set[str]:
-        """Return the topics of static transforms."""
-        return {topic for topic in self.transforms if topic.endswith('tf_static')}
 
     def find(self, role: str, content: str, types: Sequence[str], asked: str | None) -> str:
         """

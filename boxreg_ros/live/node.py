@@ -43,6 +43,9 @@ from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
 NAME = 'boxreg_node'
+BOXES_TOPICS = {False: 'refined_boxes', True: 'refined_boxes_final'}
+LABELS_TOPICS = {False: EARLY_TOPIC, True: LABELS_TOPIC}
+"""Topics of early (False) and final (True) boxes, and of what label files hold of them."""
 COMPILING_READER = 'compiling the reader of messages, once after an installation: some seconds'
 GRAPH_PERIOD = 0.2
 """Time between two looks for the type of the boxes [s]."""
@@ -284,11 +287,12 @@ class BoxregNode(PolledClockNode):
         )
         capacity = self._inbox.capacity['boxes']
         at_end = FINALS_MARGIN + config.lag + capacity  # published at once at the end
-        early = self._topics.publish(type_name, 'refined_boxes', at_end)
-        final = self._topics.publish(type_name, 'refined_boxes_final', at_end)
-        self.worker.labels = self._topics.publish(LABELS_TYPE, LABELS_TOPIC, at_end)
-        self.worker.early_status = self._topics.publish(LABELS_TYPE, EARLY_TOPIC, at_end)
-        self.worker.open_boxes(serialized or adapter, early, final)
+        publish = partial(self._topics.publish, depth=at_end)
+        boxes = {is_final: publish(type_name, topic) for is_final, topic in BOXES_TOPICS.items()}
+        labels = {
+            is_final: publish(LABELS_TYPE, topic) for is_final, topic in LABELS_TOPICS.items()
+        }
+        self.worker.open_boxes(serialized or adapter, boxes, labels)
         qos = QoSProfile(depth=2 * capacity, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._topics.subscribe(
             type_name, 'boxes', partial(self._receive, 'boxes'), qos, is_required=True,

@@ -90,21 +90,31 @@ class Worker:
         self._fully_collected_at = time.monotonic()
         self._board = MarkerBoard()
         self.static: Publisher | None = None  # of clouds without moving objects
-        self._early: Publisher | None = None
-        self._final: Publisher | None = None
-        self.labels: Publisher | None = None  # of all that label files hold of final boxes
-        self.early_status: Publisher | None = None  # of the same of early boxes
+        self._boxes: dict[bool, Publisher] = {}  # by whether they are final
+        self._labels: dict[bool, Publisher] = {}  # of all that label files hold of the same boxes
         self.times: DebugTimes | None = None
         self._stopping = Event()
         self._confirmed: deque[Item] = deque()
         self._logged_layouts: set[str] = set()
         self._stamps_ahead: Counter[str] = Counter()
 
-    def open_boxes(self, adapter: Adapter, early: Publisher, final: Publisher) -> None:
-        """Set adapter and publishers of the boxes; to be called before they are subscribed to."""
+    def open_boxes(
+        self, adapter: Adapter, boxes: dict[bool, Publisher], labels: dict[bool, Publisher]
+    ) -> None:
+        """
+        Set how boxes are read and published; to be called before they are subscribed to.
+
+        Parameters
+        ----------
+        adapter : Adapter
+            Reads and writes their messages.
+        boxes, labels : dict
+            Publishers of early (False) and final (True) boxes, and of all that label files hold
+            of them.
+
+        """
         self._live.adapter = JoiningAdapter(adapter)
-        self._early = early
-        self._final = final
+        self._boxes, self._labels = boxes, labels
 
     def facts(self) -> dict[str, object]:
         """Return the facts about the boxes for /diagnostics, beside the counters."""
@@ -317,8 +327,8 @@ class Worker:
 
     def _publish_labels(self, out: Outgoing) -> None:
         """Publish status and all else that label files hold, while somebody subscribes."""
-        publisher = self.labels if out.is_final else self.early_status
-        if publisher is None or not publisher.get_subscription_count():
+        publisher = self._labels[out.is_final]
+        if not publisher.get_subscription_count():
             return
         refined = out.in_fixed
         if refined is None:
@@ -395,8 +405,7 @@ class Worker:
 
     def _publish_boxes(self, out: Outgoing) -> None:
         """Publish the message, or the messages of one stamp, of early or final boxes."""
-        publisher = self._final if out.is_final else self._early
-        assert publisher is not None  # made before boxes are subscribed to
+        publisher = self._boxes[out.is_final]
         for message in messages_of(out.message):
             publisher.publish(message)
             self._health.count('final_published' if out.is_final else 'early_published')
@@ -444,6 +453,5 @@ class Worker:
         self._save_model()
         self._publish_static()
         self._markers.publish(self._board.clear())
-        publishers = [p for p in (self._early, self._final, self._markers) if p is not None]
-        for publisher in publishers:
+        for publisher in (*self._boxes.values(), self._markers):
             publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGEMENT_TIME / 3))
