@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import permutations
 from math import isfinite, pi
 
@@ -114,13 +114,9 @@ class Convention:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        choices = {
-            'size_order': SIZE_ORDERS,
-            'forward_axis': tuple(FORWARD),
-            'orientation': ORIENTATIONS,
-        }
-        for name, known in choices.items():
-            if getattr(self, name) not in known:
+        for item in fields(self):
+            name, known = item.name, item.metadata['option'].choices
+            if known and getattr(self, name) not in known:
                 raise ConfigError(
                     f'{name}: expected one of {", ".join(known)}, got {getattr(self, name)!r}'
                 )

@@ -135,10 +135,10 @@ def _track_id(detection: Any) -> str:
 
 def _id_fields(detection: Any, track_id: str) -> dict[str, Any]:
     """Return the fields of the track id of a detection: its own, or else `track_id`."""
+    known = _track_id(detection) or track_id
     if hasattr(detection, 'is_tracking'):
-        own = str(detection.tracking_id) if detection.is_tracking else ''
-        return {'is_tracking': bool(own or track_id), 'tracking_id': own or track_id}
-    return {'id': detection.id or track_id} if hasattr(detection, 'id') else {}
+        return {'is_tracking': bool(known), 'tracking_id': known}
+    return {'id': known} if hasattr(detection, 'id') else {}
 
 
 def _hypothesis_of(result: Any) -> Any:

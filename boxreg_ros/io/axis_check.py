@@ -112,10 +112,7 @@ class AxisCheck:
             self.finding = self._text()
 
     def _add(self, track_id: str, stamp_ns: int, box: Floats, frame_yaw: float) -> None:
-        way = self._ways.get(track_id)
-        if way is None:
-            self._ways[track_id] = _Way(stamp_ns, box, frame_yaw)
-            return
+        way = self._ways.setdefault(track_id, _Way(stamp_ns, box, frame_yaw))
         step = (box[:2] - way.box[:2]).tolist()
         moved = hypot(*step)
         if moved < MIN_WAY:
@@ -132,9 +129,7 @@ class AxisCheck:
             self._axes[axis] += 1
             self._ratios.append(float(box[LENGTH] / box[WIDTH]))
             way.axes[axis] += 1
-        way.stamp_ns = stamp_ns
-        way.box = box
-        way.frame_yaw = frame_yaw
+        self._ways[track_id] = _Way(stamp_ns, box, frame_yaw, way.axes)
 
     @property
     def wanted(self) -> Convention:

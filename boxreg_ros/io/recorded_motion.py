@@ -20,7 +20,7 @@ from boxreg_ros.io.topics import (
     TF_TYPES,
     Topics,
 )
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transforms import numbers_of, TransformTree
 
 TF_SEARCH_NS = 10 * 10**9
 """Odometry is used if TF does not connect the frames in this first part of a recording [ns]."""
@@ -335,8 +335,7 @@ class _Stated:
     def add(self, transforms: Iterable[Any]) -> None:
         """Add the transforms of a TFMessage."""
         for item in transforms:
-            at, turn = item.transform.translation, item.transform.rotation
-            values = (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)
+            values = numbers_of(item.transform.translation, item.transform.rotation)
             pose = tuple(round(float(value), 6) for value in values)
             stamp = item.header.stamp
             stated = item.header.frame_id, stamp.sec * 10**9 + stamp.nanosec, pose

@@ -84,14 +84,18 @@ A vehicle has tens of frames; trackers that publish a frame per object add some 
 """
 
 
+Pose = tuple[float, ...]
+"""x y z qx qy qz qw [m]."""
+
+
 class Sample(NamedTuple):
     """A transform or odometry, as it was received."""
 
     parent: str
     child: str
     stamp_ns: int
-    pose: tuple[float, ...]
-    """x y z qx qy qz qw of the child in the parent [m]."""
+    pose: Pose
+    """Of the child in the parent."""
     is_static: bool = False
     received_ns: int | None = None
 
@@ -150,8 +154,8 @@ class TransformTree:
 
         """
         for item in transforms:
-            place = item.transform.translation, item.transform.rotation
-            self._add(self._tf, self._sample(item, *place, received_ns, is_static))
+            pose = numbers_of(item.transform.translation, item.transform.rotation)
+            self._add(self._tf, self._sample(item, pose, received_ns, is_static))
 
     def add_pose(self, parent: str, child: str, stamp_ns: int, pose: Floats) -> None:
         """Add the pose of `child` in `parent` at a stamp: x y z qx qy qz qw."""
@@ -161,7 +165,7 @@ class TransformTree:
     def add_odometry(self, msg: Any, received_ns: int | None = None) -> None:
         """Add a ``nav_msgs/Odometry``: the pose of its child frame in its header's frame."""
         pose = msg.pose.pose
-        sample = self._sample(msg, pose.position, pose.orientation, received_ns)
+        sample = self._sample(msg, numbers_of(pose.position, pose.orientation), received_ns)
         child = sample.child or self.odometry_child
         self._add(self._odometry, sample._replace(child=child))
 
@@ -338,18 +342,11 @@ class TransformTree:
         return sorted({name for edge in self.edges() for name in (edge.parent, edge.child)})
 
     def _sample(
-        self,
-        item: Any,
-        position: Any,
-        turn: Any,
-        received_ns: int | None,
-        is_static: bool = False,
+        self, item: Any, pose: Pose, received_ns: int | None, is_static: bool = False
     ) -> Sample:
-        stamp = item.header.stamp
-        stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+        stamp_ns = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
         if not is_static:
             stamp_ns += round(self.clock_offset * 1e9)
-        pose = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
         names = _name(item.header.frame_id), _name(item.child_frame_id)
         return Sample(*names, stamp_ns, pose, is_static, received_ns)
 
@@ -526,7 +523,7 @@ class Edge:
         self.num_ahead = 0
         self._was_old = False  # whether the last sample was: one far behind the newest
         self._clock = StreamClock()
-        self._ahead: tuple[int, tuple[float, ...], int | None] | None = None
+        self._ahead: tuple[int, Pose, int | None] | None = None
         self._was_forgotten = False
         self._last_added: tuple[int, Floats] | None = None
         # A cloud, its boxes and its label files ask for the same stamp.
@@ -537,7 +534,7 @@ class Edge:
         """Return whether the last sample waits for the next one to confirm its stamp."""
         return self._ahead is not None
 
-    def add(self, stamp_ns: int, pose: tuple[float, ...], received_ns: int | None = None) -> None:
+    def add(self, stamp_ns: int, pose: Pose, received_ns: int | None = None) -> None:
         """
         Add x y z qx qy qz qw; a second one of the same stamp replaces the first.
 
@@ -569,12 +566,12 @@ class Edge:
             self._ahead = None
             self._accept(*held)
 
-    def _accept(self, stamp_ns: int, pose: tuple[float, ...], received_ns: int | None) -> None:
+    def _accept(self, stamp_ns: int, pose: Pose, received_ns: int | None) -> None:
         """Use a sample whose stamp fits those before it."""
         self._clock.note(stamp_ns, received_ns)
         self._use(stamp_ns, pose)
 
-    def _use(self, stamp_ns: int, pose: tuple[float, ...]) -> None:
+    def _use(self, stamp_ns: int, pose: Pose) -> None:
         values = np.array(pose, dtype=np.float64)
         if not np.isfinite(values).all() or not np.any(values[3:]):
             return  # no pose; the error of a lookup has the stamps that are known
@@ -725,6 +722,12 @@ class Edge:
         if later < len(stamps) and stamps[later] - stamps[after] <= limit_ns:
             nodes.append(later)
         return nodes
+
+
+def numbers_of(position: Any, orientation: Any) -> Pose:
+    """Return the numbers of a position and an orientation of ROS."""
+    at, turn = position, orientation
+    return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
 
 
 def matrix(pose: Floats) -> Floats:

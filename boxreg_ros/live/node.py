@@ -27,7 +27,7 @@ from boxreg_ros.live.model_file import ModelFile
 from boxreg_ros.live.params import changed, declare, numbers_as_declared, parameters_yaml
 from boxreg_ros.live.pipeline import MessagePipeline
 from boxreg_ros.live.polling import PolledClockNode
-from boxreg_ros.live.topics import FOLLOW_TOPIC, import_message, NodeTopics
+from boxreg_ros.live.topics import Endpoint, FOLLOW_TOPIC, import_message, NodeTopics
 from boxreg_ros.live.transform_wait import TransformWait
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
@@ -247,27 +247,28 @@ class BoxregNode(PolledClockNode):
             depth=2 * self._inbox.capacity['points'],
             reliability=ReliabilityPolicy.BEST_EFFORT,
         )
+        subscribe = self._topics.subscribe
         for topic in lidars.topics or ('points',):
             lidar = topic if len(lidars.topics) > 1 else ''
             callback = partial(self._on_points, lidar)
-            self._topics.subscribe(points_type, topic, callback, qos(), is_required=True)
+            subscribe(Endpoint(points_type, topic, qos(), callback, is_required=True))
         if lidars.info:
             put = partial(self._inbox.put_event, self.worker.add_info)
-            self._topics.subscribe(INFO_TYPE, lidars.info, put, qos(), is_required=True)
+            subscribe(Endpoint(INFO_TYPE, lidars.info, qos(), put, is_required=True))
 
     def _subscribe_to_motion(self) -> None:
         """Subscribe to odometry and transforms, which the worker polls."""
-        subscribe = partial(self._topics.subscribe, is_polled=True)
+        polled, subscribe = partial(Endpoint, is_polled=True), self._topics.subscribe
         qos = QoSProfile(depth=MOTION_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         tree = self._live.session.tree
-        subscribe('nav_msgs/msg/Odometry', 'odom', tree.add_odometry, qos)
+        subscribe(polled('nav_msgs/msg/Odometry', 'odom', qos, tree.add_odometry))
         reliable = QoSProfile(depth=MOTION_DEPTH)
         # That of tf2_ros.
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         try:
             for topic, qos in (('/tf', reliable), ('/tf_static', latched)):
                 callback = partial(self._on_transforms, topic == '/tf_static')
-                subscribe('tf2_msgs/msg/TFMessage', topic, callback, qos)
+                subscribe(polled('tf2_msgs/msg/TFMessage', topic, qos, callback))
         except UnsupportedMessage as error:
             self.get_logger().warning(f'transforms are not received, odometry is: {error}')
 
@@ -294,15 +295,12 @@ class BoxregNode(PolledClockNode):
         }
         self.worker.open_boxes(serialized or adapter, boxes, labels)
         qos = QoSProfile(depth=2 * capacity, reliability=ReliabilityPolicy.BEST_AVAILABLE)
-        self._topics.subscribe(
-            type_name, 'boxes', partial(self._receive, 'boxes'), qos, is_required=True,
-            is_raw=serialized is not None,
-        )  # fmt: skip
+        boxed = partial(Endpoint, type_name, is_raw=serialized is not None)
+        receive = partial(self._receive, 'boxes')
+        self._topics.subscribe(boxed('boxes', qos, receive, is_required=True))
         few = QoSProfile(depth=FOLLOW_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
-        self._topics.subscribe(
-            type_name, FOLLOW_TOPIC, partial(self._inbox.put_event, self.worker.follow), few,
-            is_raw=serialized is not None,
-        )  # fmt: skip
+        follow = partial(self._inbox.put_event, self.worker.follow)
+        self._topics.subscribe(boxed(FOLLOW_TOPIC, few, follow))
         self.get_logger().info(f'boxes are {type_name}; {self._topics.description()}')
 
     def _on_transforms(self, is_static: bool, msg: Any, received_ns: int) -> None:

@@ -71,16 +71,16 @@ class Mismatch(NamedTuple):
 class Endpoint:
     """A subscription or publisher of the node."""
 
-    topic: str  # before namespace and remaps
-    name: str  # after them
     type_name: str  # as ``package/msg/Type``
+    topic: str  # before namespace and remaps
     qos: QoSProfile  # overrides are written into it when the entity is made
     callback: Callable[..., None] | None = None  # takes the messages of a subscription
     is_required: bool = False  # the node refines nothing without messages on it
     is_raw: bool = False  # the callback takes bytes
     # messages wait for `NodeTopics.poll`; the callback also takes the time of receipt [ns]
     is_polled: bool = False
-    entity: Any = None  # of rclpy, once made
+    name: str = ''  # of the topic, after namespace and remaps, once the entity is made
+    entity: Any = None  # of rclpy
     # when the endpoint was made (monotonic) [s]
     since: float = field(default_factory=time.monotonic)
     received: int = 0  # number of messages
@@ -101,18 +101,9 @@ class NodeTopics:
         self._logged: set[str] = set()
         self._polled = PolledGroup()
 
-    def subscribe(
-        self,
-        type_name: str,
-        topic: str,
-        callback: Callable[..., None],
-        qos: QoSProfile,
-        is_required: bool = False,
-        is_raw: bool = False,
-        is_polled: bool = False,
-    ) -> None:
+    def subscribe(self, endpoint: Endpoint) -> None:
         """
-        Create a subscription; the arguments are those of `Endpoint`.
+        Create a subscription.
 
         With reliability ``BEST_AVAILABLE``, rclpy chooses by the publishers that exist when it
         subscribes. The subscription is created anew when one comes that offers less. Raises
@@ -120,22 +111,19 @@ class NodeTopics:
         UnsupportedMessage if the message package is missing.
 
         """
-        name = self._node.resolve_topic_name(topic)
-        endpoint = Endpoint(topic, name, type_name, qos, callback, is_required, is_raw, is_polled)
-        self._refuse_two_types(endpoint)
+        self._name(endpoint)
         self._create_subscription(endpoint)
         self._endpoints.append(endpoint)
 
     def publish(self, type_name: str, topic: str, depth: int) -> Publisher:
         """Create a publisher; parameters may override its QoS profile. Raises as `subscribe`."""
         kind = import_message(type_name)
-        name = self._node.resolve_topic_name(topic)
-        endpoint = Endpoint(topic, name, type_name, QoSProfile(depth=depth))
+        endpoint = Endpoint(type_name, topic, QoSProfile(depth=depth))
+        self._name(endpoint)
         events = PublisherEventCallbacks(
             incompatible_qos=lambda _: self._health.count(Reason.QOS_INCOMPATIBLE)
         )
-        self._refuse_two_types(endpoint)
-        _check_overrides(self._node, f'qos_overrides.{name}.publisher')
+        _check_overrides(self._node, f'qos_overrides.{endpoint.name}.publisher')
         endpoint.entity = self._node.create_publisher(
             kind, topic, endpoint.qos, event_callbacks=events,
             qos_overriding_options=QOS_OVERRIDES,
@@ -237,8 +225,9 @@ class NodeTopics:
             f'{name}: nobody publishes it; published topics of a fitting type: {there}; {remedy}',
         )
 
-    def _refuse_two_types(self, endpoint: Endpoint) -> None:
-        """Raise ConfigError for a topic that the node uses with another type already."""
+    def _name(self, endpoint: Endpoint) -> None:
+        """Resolve a topic; raise ConfigError if the node uses it with another type already."""
+        endpoint.name = self._node.resolve_topic_name(endpoint.topic)
         for other in self._endpoints:
             if other.name == endpoint.name and other.type_name != endpoint.type_name:
                 raise ConfigError(

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.polling import PolledClockNode
-from boxreg_ros.live.topics import import_message, mismatches, NodeTopics
+from boxreg_ros.live.topics import Endpoint, import_message, mismatches, NodeTopics
 from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters.convention import Convention
 from preloaded import CODE, IMPATIENT_NODE
@@ -72,7 +72,8 @@ def test_no_executor_wakes_for_transforms_odometry_and_clock(graph):
     taken = []
     for topic in ('/tf', '/odom'):
         take = partial(lambda name, message, at_ns: taken.append((name, at_ns)), topic)
-        topics.subscribe(kinds[topic], topic, take, QoSProfile(depth=1000), is_polled=True)
+        qos = QoSProfile(depth=1000)
+        topics.subscribe(Endpoint(kinds[topic], topic, qos, take, is_polled=True))
     executor = SingleThreadedExecutor(context=graph.context)
     executor.add_node(node)
     publishers = graph.publishers
