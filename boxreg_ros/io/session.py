@@ -11,7 +11,7 @@ transforms and publishing; `boxreg relabel` adds reading and writing.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from boxreg_ros.config import Config
@@ -52,6 +52,7 @@ SAME_FRAMES = (
 ASSOCIATE = 'set associate:=true (boxreg relabel: --associate)'
 
 
+@dataclass(eq=False, repr=False)
 class Session:
     """
     Prepare sweeps and boxes for the registrar.
@@ -66,25 +67,23 @@ class Session:
 
     """
 
-    def __init__(
-        self,
-        convention: Convention,
-        config: Config,
-        fixed_frame: str = '',
-        placement: SensorPlacement | None = None,
-        report: Report = ignore,
-    ) -> None:
+    convention: Convention
+    config: Config
+    fixed_frame: str = ''
+    placement: SensorPlacement = field(default_factory=SensorPlacement)
+    report: Report = ignore
+
+    def __post_init__(self) -> None:
+        """Begin with no message."""
+        convention, config = self.convention, self.config
         self.tree = TransformTree()
-        self.placement = placement or SensorPlacement()
-        self.fixed_frame = fixed_frame.lstrip('/')
+        self.fixed_frame = self.fixed_frame.lstrip('/')
         self.sensor_frame = ''
         self.trusts_ids = False  # they are a person's: boxes at few sweeps do not show them
-        self._convention = convention
-        self.config = config
         lidars = self.placement.lidars
         self._merger: SweepMerger | None = None
         if len(lidars.topics) > 1:
-            self._merger = SweepMerger(lidars.topics, config.merge_span, report)
+            self._merger = SweepMerger(lidars.topics, config.merge_span, self.report)
         self._motion_check = MotionCheck(self.tree, bool(lidars.frames or lidars.info))
         self._id_check = None if convention.associate else IdCheck(config.max_gap)
         self._tracker = self._id_check.tracker if self._id_check else Tracker(config.max_gap)
@@ -93,13 +92,13 @@ class Session:
         self._boxes_without_frame = ''
         self._has_clouds_without_frame = False
         self._cloud_check = CloudCheck(is_merged=self._merger is not None)
-        self._pose_check = PoseCheck(self._convention, AT_ONCE)
-        self._place_check = PlaceCheck(self._convention, AT_ONCE)
+        self._pose_check = PoseCheck(self.convention, AT_ONCE)
+        self._place_check = PlaceCheck(self.convention, AT_ONCE)
 
     def restart(self) -> None:
         """Forget all but the transforms; ids that were assigned are not used again."""
-        self._pose_check = PoseCheck(self._convention, AT_ONCE)
-        self._place_check = PlaceCheck(self._convention, AT_ONCE)
+        self._pose_check = PoseCheck(self.convention, AT_ONCE)
+        self._place_check = PlaceCheck(self.convention, AT_ONCE)
         parts = (self._motion_check, self._axis_check, self._common_motion, self._merger)
         for part in (*parts, self._id_check or self._tracker):
             if part is not None:

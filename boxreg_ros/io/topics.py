@@ -82,7 +82,7 @@ class Topics:
         """
         candidates = self.filled(types)
         if asked is not None:
-            return self._checked(asked, role, content, types, candidates)
+            return self._checked(asked, role, content, types)
         if len(candidates) == 1:
             return candidates[0]
         if candidates:
@@ -111,17 +111,10 @@ class Topics:
             f'{WITHOUT_BOXES if role == "boxes" else ""}'
         )
 
-    def _checked(
-        self,
-        asked: str,
-        role: str,
-        content: str,
-        types: Sequence[str],
-        candidates: Sequence[str],
-    ) -> str:
+    def _checked(self, asked: str, role: str, content: str, types: Sequence[str]) -> str:
         """Return the topic asked for if it is there, and of one of the types."""
         if asked not in self.kinds:
-            fitting = ', '.join(candidates) or 'none'
+            fitting = ', '.join(self.filled(types)) or 'none'
             raise RecordingError(
                 f'{self._origin}: no topic {asked!r}; topics with {content}: {fitting}; choose '
                 f'one with --{role}'

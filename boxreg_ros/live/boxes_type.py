@@ -53,16 +53,16 @@ class BoxesTypeSearch:
             if not others or self._chosen not in types:
                 return []
             text = f'also has boxes of type {", ".join(others)}: set boxes_type if these are meant'
-            return [TopicProblem(DiagnosticStatus.WARN, f'{self._name}: {text}')]
+            return [TopicProblem(f'{self._name}: {text}')]
         if errors and not readable:
-            return [TopicProblem(DiagnosticStatus.ERROR, f'{self._name}: {errors[0]}')]
+            return [TopicProblem(f'{self._name}: {errors[0]}', DiagnosticStatus.ERROR)]
         refiners = self._topics.refiners('boxes')
         if refiners and not types:
             text = (
                 f'has nothing but the refined boxes of {refiners}; remap boxes to their input, or '
                 f'set boxes_type if they are meant'
             )
-            return [TopicProblem(DiagnosticStatus.WARN, f'{self._name}: {text}')]
+            return [TopicProblem(f'{self._name}: {text}')]
         if not types and time.monotonic() >= self._since + PATIENCE:
             return [self._absence()]
         return []
@@ -72,7 +72,7 @@ class BoxesTypeSearch:
         if not self._topics.is_published_without_node('boxes'):
             return self._topics.unpublished('boxes', set(ADAPTERS))
         text = 'its publishers belong to no known node; set boxes_type if they send boxes'
-        return TopicProblem(DiagnosticStatus.WARN, f'{self._name}: {text}')
+        return TopicProblem(f'{self._name}: {text}')
 
     def _sorted_out(self, types: set[str]) -> tuple[list[str], list[str]]:
         """Return the types that can be read, sorted, and an error text for each of the others."""

@@ -54,8 +54,8 @@ INFINITE_NS = 9223372036854775807
 class TopicProblem(NamedTuple):
     """Something that keeps messages from arriving; `level` is one of DiagnosticStatus."""
 
-    level: bytes
     text: str
+    level: bytes = DiagnosticStatus.WARN
     is_qos: bool = False
 
 
@@ -221,7 +221,6 @@ class NodeTopics:
         there = ', '.join(candidates) if candidates else 'none'
         remedy = 'check the remap' if is_remapped else f'start the publisher or remap {topic}'
         return TopicProblem(
-            DiagnosticStatus.WARN,
             f'{name}: nobody publishes it; published topics of a fitting type: {there}; {remedy}',
         )
 
@@ -286,7 +285,6 @@ class NodeTopics:
             yield self.unpublished(endpoint.topic, {endpoint.type_name})
         elif any(peer.topic_type == endpoint.type_name for peer in peers):
             yield TopicProblem(
-                DiagnosticStatus.WARN,
                 f'{endpoint.name}: nothing received yet from {_nodes(peers)}; check that messages '
                 f'are sent, and shared memory and network in between',
             )
@@ -297,7 +295,6 @@ class NodeTopics:
         others = [topic for topic in published if topic.endswith(TF_TOPIC)]
         if others and not endpoint.received:
             yield TopicProblem(
-                DiagnosticStatus.WARN,
                 f'{endpoint.name}: nobody publishes it, but transforms are published on '
                 f'{", ".join(others)}; if the clouds are of that robot, start the node with -r '
                 f'{TF_TOPIC}:={others[0]} -r {TF_TOPIC}_static:={others[0]}_static',
@@ -310,7 +307,6 @@ class NodeTopics:
             is_like = topic.rsplit('/', 1)[-1] == last and endpoint.type_name in types
             if is_like and not self._node.count_subscribers(topic):
                 yield TopicProblem(
-                    DiagnosticStatus.WARN,
                     f'{topic}: nobody subscribes to it; this node takes boxes to follow on '
                     f'{endpoint.name}: publish there',
                 )
@@ -412,7 +408,7 @@ def _qos_problems(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Iterato
                 f'qos_overrides.{endpoint.name}.{ours[0]}.{policy} to {theirs[2]}, or change the '
                 f'{theirs[0]}'
             )
-            yield TopicProblem(DiagnosticStatus.ERROR, f'{endpoint.name}: {text}', is_qos=True)
+            yield TopicProblem(f'{endpoint.name}: {text}', DiagnosticStatus.ERROR, is_qos=True)
 
 
 def _type_problem(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> TopicProblem:
@@ -420,7 +416,6 @@ def _type_problem(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> TopicPr
     types = ', '.join(sorted({peer.topic_type for peer in peers}))
     if not endpoint.is_input:
         return TopicProblem(
-            DiagnosticStatus.WARN,
             f'{endpoint.name}: {_nodes(peers)} subscribes with type {types}, this node publishes '
             f'{endpoint.type_name}; change the subscription',
         )
@@ -430,9 +425,9 @@ def _type_problem(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> TopicPr
     if endpoint.topic == 'boxes':
         remedy = 'set boxes_type, or restart the node if the type of the topic has changed'
     return TopicProblem(
-        DiagnosticStatus.ERROR,
         f'{endpoint.name}: expected messages of type {endpoint.type_name}, got {types} from '
         f'{_nodes(peers)}; {remedy}',
+        DiagnosticStatus.ERROR,
     )
 
 

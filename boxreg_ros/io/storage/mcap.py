@@ -422,15 +422,9 @@ class McapFile:
         self._file.check_unchanged()
         self._note(f'damaged chunk ({one_line(error)})', *place[:4])
 
-    def _note(
-        self,
-        reason: str,
-        first_byte: int,
-        end_byte: int | None = None,
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-    ) -> None:
-        self.damages[Damage(self.name, reason, first_byte, end_byte, start_ns, end_ns)] = None
+    def _note(self, reason: str, *place: int | None) -> None:
+        """Note a damage with begin and end of its bytes, and of its times [ns] if known."""
+        self.damages[Damage(self.name, reason, *place)] = None
 
 
 _time = itemgetter(0)

@@ -52,9 +52,7 @@ def url_of(path: Path) -> str | None:
 
 def entry_of(path: Path) -> Entry:
     """Return size and version of a file behind a URL; RecordingError without an answer."""
-    system, name = system_of(path)
-    about = answer_of(path, lambda: system.info(name, **limit_of(system)))
-    return _entry(path, about)
+    return _entry(path, _answer(path, 'info'))
 
 
 def entries_of(path: Path, is_deep: bool = False) -> list[Entry]:
@@ -78,11 +76,10 @@ def entries_of(path: Path, is_deep: bool = False) -> list[Entry]:
         paths = sorted(path.glob('**/*' if is_deep else '*')) if path.is_dir() else [path]
         found = [(file, file.stat()) for file in paths if file.is_file()]
         return [Entry(file, status.st_size, str(status.st_mtime_ns)) for file, status in found]
-    system, name = system_of(path)
-    about = answer_of(path, lambda: system.info(name, **limit_of(system)))
+    about = _answer(path, 'info')
     if about['type'] != 'directory':
         return [_entry(path, about)]
-    listed = answer_of(path, lambda: system.ls(name, detail=True, **limit_of(system)))
+    listed = _answer(path, 'ls', detail=True)
     inner = sorted(listed, key=lambda one: str(one['name']))
     files = [one for one in inner if one['type'] == 'file']
     return [_entry(path / Path(one['name']).name, one) for one in files]
@@ -92,10 +89,7 @@ def read_text(path: Path) -> str:
     """Return the text of a file of this machine or behind a URL; OSError if there is none."""
     if url_of(path) is None:
         return path.read_text(encoding='utf-8')
-    system, name = system_of(path)
-    content = answer_of(
-        path, lambda: system.cat_file(name, **limit_of(system)), missing_is_error=False
-    )
+    content = _answer(path, 'cat_file', missing_is_error=False)
     return bytes(content).decode()
 
 
@@ -114,8 +108,8 @@ def delete_files(path: Path, names: Iterable[str]) -> None:
 
 def sizes_of(path: Path) -> dict[str, int]:
     """Return names and sizes [bytes] of all files below a folder behind a URL."""
-    system, name = system_of(path)
-    found = answer_of(path, lambda: system.find(name, detail=True, **limit_of(system)))
+    _, name = system_of(path)
+    found = _answer(path, 'find', detail=True)
     return {
         str(one).removeprefix(name).lstrip('/'): int(about['size']) for one, about in found.items()
     }
@@ -138,6 +132,13 @@ def upload(folder: Path, target: Path, last: str) -> None:
     for file in sorted(files, key=lambda file: (file == last, file)):
         answer_of(target, partial(system.put_file, str(folder / file), f'{name}/{file}'))
     delete_files(target, [UPLOAD])
+
+
+def _answer(path: Path, request: str, missing_is_error: bool = True, **options: Any) -> Any:
+    """Return the answer of fsspec to a request for what is behind a URL; see `answer_of`."""
+    system, name = system_of(path)
+    ask = partial(getattr(system, request), name, **options, **limit_of(system))
+    return answer_of(path, ask, missing_is_error)
 
 
 def limit_of(system: Any) -> dict[str, float]:
