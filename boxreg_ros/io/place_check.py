@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from boxreg_ros.io.pose_check import PairedCheck, POINT_MARGIN, Points
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, moved_boxes
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
@@ -19,7 +20,6 @@ from boxreg_ros.structures import (
 )
 from msg_adapters.convention import Convention
 import numpy as np
-from numpy.typing import NDArray
 
 ENOUGH_BOXES = 12
 """Boxes with points around them that a finding needs; chosen."""
@@ -27,8 +27,6 @@ MAX_COMPARED = 100
 """Boxes after which the check ends; chosen: a second of 10 boxes at 10 Hz."""
 MIN_POINTS_AROUND = 10
 """Points around a box that it is counted from; chosen."""
-POINT_MARGIN = 0.1
-"""Points up to this distance outside of a box are of its object [m]: range noise and labels."""
 GROUND_MARGIN = 0.2
 """Points up to this height above the bottom of a box may be of the road [m]; chosen."""
 MIN_COVERAGE = 0.5
@@ -91,7 +89,7 @@ class _Place:
         return float(np.sum(self.coverages))
 
 
-class PlaceCheck:
+class PlaceCheck(PairedCheck):
     """
     Compare the first boxes with the points around them, where they are and in other places.
 
@@ -103,8 +101,8 @@ class PlaceCheck:
     """
 
     def __init__(self, convention: Convention, tolerance: float) -> None:
+        super().__init__(tolerance)
         self._convention = convention
-        self._tolerance_ns = round(tolerance * 1e9)
         scale = 2 * convention.size_scale
         self._meant = {
             'mirrored': replace(convention, orientation='left_handed'),
@@ -118,8 +116,6 @@ class PlaceCheck:
         self._tilted: list[tuple[bool, bool]] = []  # as read, and with w first
         self._within: list[float] = []
         self._heights: list[float] = []  # in the frame of the messages
-        self._sweep: Sweep | None = None
-        self._boxes: BoxArray | None = None
         self._frames: dict[str, Floats] = {}
         self.finding = ''
 
@@ -149,19 +145,15 @@ class PlaceCheck:
         """
         if not self.is_open:
             return
-        if isinstance(item, Sweep):
-            self._sweep = item
-        else:
-            self._boxes = boxes_to_frame(item, inverse(T_fixed_item), '')
+        if isinstance(item, BoxArray):
+            item = boxes_to_frame(item, inverse(T_fixed_item), '')
             self._frames = {'': T_fixed_item, **frames}
-        if self._sweep is None or self._boxes is None:
-            return
-        if abs(self._sweep.stamp_ns - self._boxes.stamp_ns) <= self._tolerance_ns:
-            self._compare(_Points(self._sweep.in_frame().points), self._boxes)
-            self._sweep = self._boxes = None
+        pair = self._paired(item)
+        if pair is not None:
+            self._compare(*pair)
             self.finding = self._tilt_text() or self._place_text() or self._size_text()
 
-    def _compare(self, points: _Points, array: BoxArray) -> None:
+    def _compare(self, points: Points, array: BoxArray) -> None:
         """Add what boxes in the frame of their message contain of the points, in each place."""
         boxes = array.boxes[is_valid_box(array.boxes)][: MAX_COMPARED - len(self._tilted)]
         count = len(boxes)
@@ -261,21 +253,7 @@ class PlaceCheck:
         return place.total >= MIN_RATIO_OF_COVERAGE * own.total
 
 
-class _Points:
-    """Points (N, 3) in the order of x: those around a place are found without the others."""
-
-    def __init__(self, points: NDArray[np.floating]) -> None:
-        self._points = points[np.argsort(points[:, 0])]
-
-    def around(self, center: Floats, reach: float) -> Floats:
-        """Return the points (n, 3) nearer than `reach` along each axis, relative to `center`."""
-        ends = np.searchsorted(self._points[:, 0], (center[0] - reach, center[0] + reach))
-        away = self._points[slice(*ends)] - center
-        found: Floats = away[(np.abs(away) < reach).all(axis=1)]
-        return found
-
-
-def _share_within(points: _Points, box: Floats) -> float | None:
+def _share_within(points: Points, box: Floats) -> float | None:
     """Return the share of the points in the upper half of a box that its inner part contains."""
     if not np.isfinite(box).all():
         return None
@@ -287,7 +265,7 @@ def _share_within(points: _Points, box: Floats) -> float | None:
     return float(np.mean(parts <= MAX_FILLED)) if len(parts) >= MIN_POINTS_AROUND else None
 
 
-def _add_coverages(place: _Place, points: _Points, boxes: Floats) -> None:
+def _add_coverages(place: _Place, points: Points, boxes: Floats) -> None:
     """Add for each of n boxes (n, 9) with enough points around it the part that it contains."""
     for box in boxes:
         if not np.isfinite(box).all():

@@ -25,8 +25,8 @@ MAX_BOXES = 300
 """After this number of boxes, with points or without, the check ends."""
 MIN_POINTS_OF_POSE = 10
 """Points that the best convention must have in a box for the box to be counted."""
-HELD_POINT_MARGIN = 0.1
-"""Points up to this distance outside of a box count as inside [m]: range noise and labels."""
+POINT_MARGIN = 0.1
+"""Points up to this distance outside of a box are of its object [m]: range noise and labels."""
 EQUIVALENT_SHARE = 0.85
 """A convention with this share of the points of the best one counts as equal to it."""
 MIN_GAIN = 1.3
@@ -40,7 +40,44 @@ DIRECTIONS = (
 )
 
 
-class PoseCheck:
+class Points:
+    """Points (N, 3) in the order of x: those around a place are found without the others."""
+
+    def __init__(self, points: NDArray[np.floating]) -> None:
+        self._points = points[np.argsort(points[:, 0])]
+
+    def around(self, center: Floats, reach: float) -> Floats:
+        """Return the points (n, 3) nearer than `reach` along each axis, relative to `center`."""
+        ends = np.searchsorted(self._points[:, 0], (center[0] - reach, center[0] + reach))
+        away = self._points[slice(*ends)] - center
+        found: Floats = away[(np.abs(away) < reach).all(axis=1)]
+        return found
+
+
+class PairedCheck:
+    """A check of the first boxes and the sweeps of their stamps, which arrive in any order."""
+
+    def __init__(self, tolerance: float) -> None:
+        self._tolerance_ns = round(tolerance * 1e9)
+        self._sweep: Sweep | None = None
+        self._boxes: BoxArray | None = None
+
+    def _paired(self, item: Sweep | BoxArray) -> tuple[Points, BoxArray] | None:
+        """Take the next sweep or boxes; return points and boxes if they are of one time."""
+        if isinstance(item, Sweep):
+            self._sweep = item
+        else:
+            self._boxes = item
+        sweep, boxes = self._sweep, self._boxes
+        if sweep is None or boxes is None:
+            return None
+        if abs(sweep.stamp_ns - boxes.stamp_ns) > self._tolerance_ns:
+            return None
+        self._sweep = self._boxes = None
+        return Points(sweep.in_frame().points), boxes
+
+
+class PoseCheck(PairedCheck):
     """
     Compare the first boxes with their points under every convention.
 
@@ -52,31 +89,21 @@ class PoseCheck:
     """
 
     def __init__(self, convention: Convention, tolerance: float) -> None:
+        super().__init__(tolerance)
         self._convention = convention
-        self._tolerance_ns = round(tolerance * 1e9)
         self._others = [
             *(replace(convention, pose_reference=name) for name in REFERENCES),
             *(replace(convention, size_order=order) for order in SIZE_ORDERS),
         ]
         self._counts: list[Ints] = []
-        self._sweep: Sweep | None = None
-        self._boxes: BoxArray | None = None
         self._seen = 0
         self.finding = ''
 
     def add(self, item: Sweep | BoxArray) -> None:
         """Add the next sweep or boxes."""
-        if self._is_over:
-            return
-        if isinstance(item, Sweep):
-            self._sweep = item
-        else:
-            self._boxes = item
-        if self._sweep is None or self._boxes is None:
-            return
-        if abs(self._sweep.stamp_ns - self._boxes.stamp_ns) <= self._tolerance_ns:
-            self._count(self._sweep.in_frame().points, self._boxes)
-            self._sweep = self._boxes = None
+        pair = None if self._is_over else self._paired(item)
+        if pair is not None:
+            self._count(*pair)
             if len(self._counts) >= DECISIVE_BOXES:
                 self.finding = self._result()
 
@@ -84,7 +111,7 @@ class PoseCheck:
     def _is_over(self) -> bool:
         return len(self._counts) >= DECISIVE_BOXES or self._seen >= MAX_BOXES
 
-    def _count(self, points: NDArray[np.floating], boxes: BoxArray) -> None:
+    def _count(self, points: Points, boxes: BoxArray) -> None:
         """Count the points in each box under each convention."""
         valid = is_valid_box(boxes.boxes)
         n = int(valid.sum())
@@ -95,8 +122,9 @@ class PoseCheck:
             if self._is_over:
                 break
             self._seen += 1
-            reach = 1.5 * np.linalg.norm(rows[0, BOX_EXTENT])
-            counts = _inside(_near(points, rows[0, BOX_CENTER], reach), rows)
+            center = rows[0, BOX_CENTER]
+            reach = 1.5 * float(np.linalg.norm(rows[0, BOX_EXTENT]))
+            counts = _inside(points.around(center, reach) + center, rows)
             if counts.max() >= MIN_POINTS_OF_POSE:
                 self._counts.append(counts)
 
@@ -139,20 +167,10 @@ class PoseCheck:
         )
 
 
-def _near(
-    points: NDArray[np.floating], centre: Floats, reach: np.floating
-) -> NDArray[np.floating]:
-    """Return the points whose coordinates all differ by less than `reach` from a centre (3,)."""
-    columns = points.T  # each lies without gaps
-    for axis, place in enumerate(centre):
-        columns = columns.take(np.flatnonzero(np.abs(columns[axis] - place) < reach), 1)
-    return columns.T
-
-
 def _inside(points: NDArray[np.floating], boxes: Floats) -> Ints:
     """Count the points in each of n boxes, a margin around it included, (n,)."""
     R = matrix_from_rpy(boxes[:, ROLL:])
     local = (points - boxes[:, None, BOX_CENTER]) @ R  # (n, points, 3)
-    limit = boxes[:, None, BOX_EXTENT] / 2 + HELD_POINT_MARGIN
+    limit = boxes[:, None, BOX_EXTENT] / 2 + POINT_MARGIN
     counts: Ints = (np.abs(local) <= limit).all(axis=2).sum(axis=1)
     return counts
