@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from boxreg_ros.io.pose_check import PairedCheck, POINT_MARGIN, Points
+from boxreg_ros.io.pose_check import PairedCheck, POINT_MARGIN, SortedPoints
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, moved_boxes
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
@@ -153,7 +153,7 @@ class PlaceCheck(PairedCheck):
             self._compare(*pair)
             self.finding = self._tilt_text() or self._place_text() or self._size_text()
 
-    def _compare(self, points: Points, array: BoxArray) -> None:
+    def _compare(self, points: SortedPoints, array: BoxArray) -> None:
         """Add what boxes in the frame of their message contain of the points, in each place."""
         boxes = array.boxes[is_valid_box(array.boxes)][: MAX_COMPARED - len(self._tilted)]
         count = len(boxes)
@@ -253,7 +253,7 @@ class PlaceCheck(PairedCheck):
         return place.total >= MIN_RATIO_OF_COVERAGE * own.total
 
 
-def _share_within(points: Points, box: Floats) -> float | None:
+def _share_within(points: SortedPoints, box: Floats) -> float | None:
     """Return the share of the points in the upper half of a box that its inner part contains."""
     if not np.isfinite(box).all():
         return None
@@ -265,7 +265,7 @@ def _share_within(points: Points, box: Floats) -> float | None:
     return float(np.mean(parts <= MAX_FILLED)) if len(parts) >= MIN_POINTS_AROUND else None
 
 
-def _add_coverages(place: _Place, points: Points, boxes: Floats) -> None:
+def _add_coverages(place: _Place, points: SortedPoints, boxes: Floats) -> None:
     """Add for each of n boxes (n, 9) with enough points around it the part that it contains."""
     for box in boxes:
         if not np.isfinite(box).all():

@@ -40,7 +40,7 @@ DIRECTIONS = (
 )
 
 
-class Points:
+class SortedPoints:
     """Points (N, 3) in the order of x: those around a place are found without the others."""
 
     def __init__(self, points: NDArray[np.floating]) -> None:
@@ -62,7 +62,7 @@ class PairedCheck:
         self._sweep: Sweep | None = None
         self._boxes: BoxArray | None = None
 
-    def _paired(self, item: Sweep | BoxArray) -> tuple[Points, BoxArray] | None:
+    def _paired(self, item: Sweep | BoxArray) -> tuple[SortedPoints, BoxArray] | None:
         """Take the next sweep or boxes; return points and boxes if they are of one time."""
         if isinstance(item, Sweep):
             self._sweep = item
@@ -74,7 +74,7 @@ class PairedCheck:
         if abs(sweep.stamp_ns - boxes.stamp_ns) > self._tolerance_ns:
             return None
         self._sweep = self._boxes = None
-        return Points(sweep.in_frame().points), boxes
+        return SortedPoints(sweep.in_frame().points), boxes
 
 
 class PoseCheck(PairedCheck):
@@ -111,7 +111,7 @@ class PoseCheck(PairedCheck):
     def _is_over(self) -> bool:
         return len(self._counts) >= DECISIVE_BOXES or self._seen >= MAX_BOXES
 
-    def _count(self, points: Points, boxes: BoxArray) -> None:
+    def _count(self, points: SortedPoints, boxes: BoxArray) -> None:
         """Count the points in each box under each convention."""
         valid = is_valid_box(boxes.boxes)
         n = int(valid.sum())

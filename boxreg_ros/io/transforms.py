@@ -267,7 +267,7 @@ class TransformTree:
     def other_parents(self, edge: Edge) -> list[str]:
         """Return the other parents that transforms of the child of a pair have, sorted."""
         known = self._tf.get(edge.child)
-        return [] if known is None else sorted({e.parent for e in known.all} - {edge.parent})
+        return [] if known is None else sorted({e.parent for e in known.valid} - {edge.parent})
 
     def fixed_frame(self, source: str) -> str | None:
         """
@@ -385,7 +385,7 @@ class TransformTree:
         """Return the edges of TF; with `prefers_odometry`, odometry in place of those it has."""
         replacing = self._odometry if self.prefers_odometry else {}
         frames = [frame for child, frame in self._tf.items() if child not in replacing]
-        return [*_used(replacing), *(edge for frame in frames for edge in frame.all)]
+        return [*_used(replacing), *(edge for frame in frames for edge in frame.valid)]
 
     def alike(self, frame: str) -> list[str]:
         """Return the known frames whose name is that of another with a prefix, or without one."""
@@ -463,7 +463,7 @@ class Attachment:
         self._changes = 0
 
     @property
-    def all(self) -> list[Edge]:
+    def valid(self) -> list[Edge]:
         """Return the edge in use, and behind it the others where a frame has several at once."""
         if not self._has_two_parents:
             return [self.used]
@@ -471,7 +471,7 @@ class Attachment:
 
     def edge_to(self, parent: str) -> Edge | None:
         """Return the edge to a parent; None if the frame is not attached to it."""
-        return next((edge for edge in self.all if edge.parent == parent), None)
+        return next((edge for edge in self.valid if edge.parent == parent), None)
 
     def attach(self, new: Edge, is_static: bool) -> Edge:
         """Attach the frame to a new parent by an edge; return the edge to add samples to."""
