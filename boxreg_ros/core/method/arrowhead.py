@@ -82,32 +82,22 @@ def solve_corner(U, x):
 
 
 @loop
-def fill_inverse_root(U, inverse):
-    """Write the inverse (m, m) of an upper triangle U (m, m)."""
-    size = len(inverse)
-    for a in range(size - 1, -1, -1):
-        scale = 1.0 / U[a, a]
-        for c in range(size):
-            inverse[a, c] = 0.0
-        inverse[a, a] = scale
-        for b in range(a + 1, size):
-            factor = scale * U[a, b]
-            for c in range(b, size):
-                inverse[a, c] -= factor * inverse[b, c]
-
-
-@kernel
-def invert(S, root, inverse):
-    """
-    Write the inverse (m, m) of S, which is changed; return False if S is not positive definite.
-
-    `root` (m, m) is to work in; the inverse may replace S.
-
-    """
-    if not factorise_corner(S):
-        return False
-    fill_inverse_root(S, root)
-    np.dot(root, root.T, inverse)
+def invert(S):
+    """Replace a matrix (m, m) by its inverse; return False if it is not positive definite."""
+    size = len(S)
+    for k in range(size):  # Gauss and Jordan
+        if not S[k, k] > 0.0:
+            return False
+        scale = 1.0 / S[k, k]
+        S[k, k] = 1.0
+        for j in range(size):
+            S[k, j] *= scale
+        for i in range(size):
+            if i != k:
+                factor = S[i, k]
+                S[i, k] = 0.0
+                for j in range(size):
+                    S[i, j] -= factor * S[k, j]
     return True
 
 
@@ -122,16 +112,16 @@ def eliminate_pose(A, pose, factor, room):
     """
     links, border, _ = A
     own, coupling = factor.own[pose], factor.coupling[pose]
-    root, after, rest, change = room
+    after, rest, change = room
     for a in range(POSE):
-        for c in range(POSE):
-            own[a, c] = links[pose, a, c]
+        for c in range(a, POSE):
+            own[a, c] = own[c, a] = links[pose, a, c]
         for s in range(SHARED):
             rest[a, s] = -border[pose, a, s]
         for c in range(NEXT):
             after[a, c] = links[pose, a, POSE + c]
             rest[a, SHARED + c] = -after[a, c]
-    if not invert(own, root, own):
+    if not invert(own):
         return False
     np.dot(own, rest, coupling)
     np.dot(after.T, coupling, change)
@@ -150,10 +140,7 @@ def eliminate_pose(A, pose, factor, room):
 def eliminate_poses(A, factor):
     """Eliminate the poses of a factor one by another; return False if one is not definite."""
     N = len(factor.own)
-    room = (
-        np.empty((POSE, POSE)), np.empty((POSE, NEXT)), np.empty((POSE, REST)),
-        np.empty((NEXT, REST)),
-    )  # fmt: skip
+    room = np.empty((POSE, NEXT)), np.empty((POSE, REST)), np.empty((NEXT, REST))
     for pose in range(N):
         if not eliminate_pose(A, pose, factor, room):
             return False
@@ -168,8 +155,12 @@ def eliminate_poses(A, factor):
 @kernel
 def factorise(A, factor):
     """Write the factor of a matrix, which is changed; return False if it is not definite."""
-    root = np.empty((SHARED, SHARED))
-    return eliminate_poses(A, factor) and invert(A.corner, root, factor.corner)
+    if not eliminate_poses(A, factor):
+        return False
+    for s in range(SHARED):
+        for t in range(s, SHARED):
+            factor.corner[s, t] = factor.corner[t, s] = A.corner[s, t]
+    return invert(factor.corner)
 
 
 @loop
