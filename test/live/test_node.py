@@ -134,11 +134,11 @@ def test_boxes_without_a_fixed_frame_are_published_unchanged(graph, tmp_path):
     for before, after in zip(given, node.final, strict=True):
         assert np.array_equal(vision.from_msg(before).boxes, vision.from_msg(after).boxes)
     assert ended_cleanly(node)
-    assert 'fixed_frame:=lidar' in node.output()
+    assert 'fixed_frame:=base' in node.output()
 
     node.early.clear()
     node.final.clear()
-    settings = ('-p', 'fixed_frame:=lidar', '-p', f'boxes_type:={DETECTIONS}')
+    settings = ('-p', 'fixed_frame:=base', '-p', f'boxes_type:={DETECTIONS}')
     left = graph.endpoints()
     second = graph.start(*RELIABLE, *QUICK, *settings)
     graph.wait_until_connected(left)
