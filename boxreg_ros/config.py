@@ -312,7 +312,8 @@ class Config:
 
     objective: str = setting(
         'robust',
-        'objective function: robust (default), or Eq. 4-8 of the paper',
+        'objective function: robust (default), or Eq. 4-8 of the paper, to compare with: its '
+        'boxes may be worse than the input',
         choices=('robust', 'paper'),
     )
     mode: str = setting(
