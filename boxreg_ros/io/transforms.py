@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain, pairwise
 from operator import attrgetter
@@ -265,9 +265,12 @@ class TransformTree:
         return edge.is_static or self._is_once(edge)
 
     def other_parents(self, edge: Edge) -> list[str]:
-        """Return the other parents that transforms of the child of a pair have, sorted."""
-        known = self._tf.get(edge.child)
-        return [] if known is None else sorted({e.parent for e in known.valid} - {edge.parent})
+        """Return the other parents of the child of a pair, by the same source, sorted."""
+        for frames in (self._tf, self._odometry):
+            known = frames.get(edge.child)
+            if known is not None and edge in known.valid:
+                return sorted(one.parent for one in known.valid if one is not edge)
+        return []
 
     def fixed_frame(self, source: str) -> str | None:
         """
@@ -325,7 +328,7 @@ class TransformTree:
 
     def edges(self) -> list[Edge]:
         """Return all pairs of parent and child."""
-        return list(dict.fromkeys((*self._tf_edges(), *_used(self._odometry))))
+        return list(dict.fromkeys((*self._tf_edges(), *_edges_of(self._odometry.values()))))
 
     def groups(self) -> list[list[str]]:
         """Return the names of frames that transforms connect with each other, sorted."""
@@ -385,7 +388,7 @@ class TransformTree:
         """Return the edges of TF; with `prefers_odometry`, odometry in place of those it has."""
         replacing = self._odometry if self.prefers_odometry else {}
         frames = [frame for child, frame in self._tf.items() if child not in replacing]
-        return [*_used(replacing), *(edge for frame in frames for edge in frame.valid)]
+        return [*_edges_of(replacing.values()), *_edges_of(frames)]
 
     def alike(self, frame: str) -> list[str]:
         """Return the known frames whose name is that of another with a prefix, or without one."""
@@ -850,9 +853,10 @@ def _name(frame_id: str) -> str:
     return frame_id.lstrip('/')
 
 
-def _used(frames: Mapping[str, Attachment]) -> list[Edge]:
-    """Return the edges in use of some frames."""
-    return [frame.used for frame in frames.values()]
+def _edges_of(frames: Iterable[Attachment]) -> list[Edge]:
+    """Return the edges of some frames: those in use, and behind all of these the others."""
+    valid = [frame.valid for frame in frames]
+    return [*(edges[0] for edges in valid), *(edge for edges in valid for edge in edges[1:])]
 
 
 def _identity(child: str, parent: str) -> Edge:

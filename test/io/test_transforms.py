@@ -178,6 +178,20 @@ def test_tf_has_priority_over_odometry():
     np.testing.assert_array_equal(tree.lookup('map', 'lidar', S)[:3, 3], [5, 0, 2])
 
 
+def test_a_frame_has_other_parents_where_one_source_states_several():
+    static = [(0, 'base', 'lidar', (0, 0, 2))]
+    transforms = [(S, 'map', 'base', (5, 0, 0))]
+    tree = tree_of(*transforms, static=static, odometry=[(S, 'odom', 'base', (7, 0, 0))])
+    tree.prefers_odometry = True
+    assert [tree.other_parents(edge) for edge in tree.route('odom', 'lidar')] == [[], []]
+    for k in range(4):
+        parent = 'world' if k % 2 else 'odom'
+        tree.add_odometry(M.odometry((k + 2) * S, parent, 'base', (7, 0, 0)))
+    for parent, other in (('odom', 'world'), ('world', 'odom')):
+        assert tree.lookup(parent, 'base', 4 * S)[0, 3] == 7
+        assert tree.other_parents(tree.route(parent, 'base')[0]) == [other]
+
+
 def test_odometry_that_is_preferred_takes_the_place_of_the_transform_of_its_frame():
     tree = TransformTree()
     tree.prefers_odometry = True
