@@ -325,7 +325,8 @@ class Corrections:
         deleted = sorted(set(range(len(given.track_ids))) - set(self._left(given)))
         if not deleted:
             return refined
-        gone = self._renamed(given).take(deleted)
+        # `with_attributes` gives the result its own
+        gone = replace(self._renamed(given), attributes=()).take(deleted)
         return with_rejected(refined, gone, deleted, [Reason.DELETED] * len(deleted))
 
     def _judgement(self, track_id: str, stamp_ns: int) -> Decision | None:

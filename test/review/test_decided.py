@@ -403,7 +403,7 @@ def of_boxes(boxes):
 
 
 def test_attributes_of_label_files_pass_a_run(completed, tmp_path):
-    """An added box has those of the box before it."""
+    """An added box has those of the box before it; a deleted one keeps its own."""
     _, stamps, _, out = completed
     labels = tmp_path / 'labels'
     shutil.copytree(out, labels)
@@ -416,7 +416,9 @@ def test_attributes_of_label_files_pass_a_run(completed, tmp_path):
     lines = [f'{row["stamp_ns"]},2,colour,red' for row in keyframes[:4]]
     (labels / 'attributes.csv').write_text('\n'.join(['stamp_ns,track_id,name,value', *lines]))
     recording = out.parent / 'drive'
-    again = Run(recording, '--complete', f'--labels=csv:{labels}')(tmp_path / 'out')
+    deleted = Decision('2', stamps[1], 'delete')
+    again = Run(recording, '--complete', f'--labels=csv:{labels}')(tmp_path / 'out', [deleted])
+    assert words_of(again, '2', stamps)[1] == 'rejected'
     found = attributes_in(tmp_path / 'out')
     assert [words_of(again, '2', stamps)[k] for k in GAP] == ['interpolated'] * 3
     assert [found.get(('2', stamp), {}).get('colour', '') for stamp in stamps] == [
