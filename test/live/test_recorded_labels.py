@@ -195,6 +195,15 @@ def test_boxes_alone_are_labels_without_status(run, tmp_path):
         assert max(abs(float(a[name]) - float(b[name])) for a, b in pairs) < 1e-9
 
 
+def test_labels_of_the_node_are_refined_again_and_completed(run, tmp_path):
+    records, _, _ = run
+    bag = write_bag(tmp_path / 'drive', records)
+    command = ['relabel', str(bag), '-o', str(tmp_path / 'out'), '--complete', '--formats=csv']
+    assert main([*command, f'--labels=recording:{bag}']) == 0
+    rows = rows_in(tmp_path / 'out' / 'boxes.csv')
+    assert {row['status'] for row in rows} >= {'refined'}
+
+
 def test_recordings_without_labels_and_other_texts_are_refused(run, tmp_path, capsys):
     records, _, _ = run
     inputs = [record for record in records if 'refined' not in record.topic]
