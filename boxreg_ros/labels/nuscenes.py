@@ -386,9 +386,9 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
             boxes = _annotations(path, files.json_items, scene.stamps_ns)
         else:
             boxes = _results(path, scene)
-    for token, stamp_ns in scene.stamps_ns.items():
-        refined = refined_of(stamp_ns, scene.fixed_frame, boxes.get(token, []))
-        yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame)
+        for token, stamp_ns in scene.stamps_ns.items():
+            refined = refined_of(stamp_ns, scene.fixed_frame, boxes.get(token, []))
+            yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame)
 
 
 def _annotations(

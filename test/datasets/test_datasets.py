@@ -497,6 +497,19 @@ def test_detections_are_associated_and_relabelled(tmp_path, capsys):
     assert {row['track_id'] for row in rows_of(tmp_path / 'out')} == {'1'}
 
 
+def test_results_with_a_score_that_is_no_number_are_named(tmp_path, capsys):
+    layouts.nuscenes(tmp_path / 'data')
+    results = layouts.nuscenes_results(tmp_path / 'results.json', 'detection')
+    content = json.loads(results.read_text())
+    for box in itertools.chain(*content['results'].values()):
+        box['detection_score'] = 'high'
+    results.write_text(json.dumps(content))
+    address = f'nuscenes:{tmp_path / "data"}#scene-0061'
+    arguments = ['relabel', address, '-o', str(tmp_path / 'out'), '--formats=csv', *QUICK]
+    assert main([*arguments, f'--labels=nuscenes:{results}', '--associate']) == 1
+    assert f'{results}: expected the tables or results of nuScenes' in capsys.readouterr().err
+
+
 def broken(name, tmp_path, *parts):
     """Write a data set and delete a part of it."""
     CASES[name].write(tmp_path)
