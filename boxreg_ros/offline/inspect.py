@@ -102,8 +102,9 @@ def _contents(paths: list[Path]) -> dict[str, Any]:
         counts: Counter[tuple[str, str]] = Counter()
         for connection in reader.connections:
             counts[connection.topic, connection.msgtype] += connection.msgcount
+        presence = reader.presence()
         topics = [
-            _topic(topic, kind, count, reader.presence()[topic], (begin_ns, seconds))
+            _topic(topic, kind, count, presence[topic], (begin_ns, seconds))
             for (topic, kind), count in sorted(counts.items())
         ]
         damages = [damage._asdict() for damage in reader.damages]
