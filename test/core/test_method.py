@@ -146,6 +146,22 @@ def test_the_factor_solves_and_inverts(is_held):
     np.testing.assert_allclose(found, expected[np.ix_(RATES, RATES)], rtol=1e-6, atol=1e-9)
 
 
+def test_a_weak_direction_of_a_strong_link_is_not_lost():
+    # The first pose has an error of 1 in each direction, the second one moves with it: by errors
+    # of 1e-4 to 1 along six directions that are no axes.
+    A, N, variances = matrix(2), 2, np.logspace(-8, 0, POSE)
+    axes, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(POSE, POSE)))
+    link = axes / variances @ axes.T
+    A.links[0, :, : 2 * POSE] = np.hstack([link + np.eye(POSE), -link])
+    A.links[1, :, :POSE] = link
+    A.corner[:] = np.eye(SHARED)
+    factor, blocks = empty_factor(N), np.empty((N, POSE, POSE))
+    assert factorise(A, factor)
+    invert_poses(factor, blocks, np.empty((N, POSE, REST)))
+    np.testing.assert_allclose(blocks[0], np.eye(POSE), atol=1e-6)
+    np.testing.assert_allclose(blocks[1], np.eye(POSE) + axes * variances @ axes.T, atol=1e-6)
+
+
 def test_a_matrix_that_is_not_positive_definite_has_no_factor():
     A = matrix(2)
     A.corner[3, 3] = -1.0

@@ -83,20 +83,26 @@ def solve_corner(U, x):
 
 @loop
 def invert(S):
-    """Replace a matrix (m, m) by its inverse; return False if it is not positive definite."""
-    size = len(S)
+    """
+    Replace a matrix (m, m) by its inverse; return False if it is not positive definite.
+
+    Columns beside it, S (m, m + k), are replaced by the inverse times them. Their product with the
+    inverse would have an error larger by the condition number of the matrix.
+
+    """
+    size, width = S.shape
     for k in range(size):  # Gauss and Jordan
         if not S[k, k] > 0.0:
             return False
         scale = 1.0 / S[k, k]
         S[k, k] = 1.0
-        for j in range(size):
+        for j in range(width):
             S[k, j] *= scale
         for i in range(size):
             if i != k:
                 factor = S[i, k]
                 S[i, k] = 0.0
-                for j in range(size):
+                for j in range(width):
                     S[i, j] -= factor * S[k, j]
     return True
 
@@ -112,18 +118,19 @@ def eliminate_pose(A, pose, factor, room):
     """
     links, border, _ = A
     own, coupling = factor.own[pose], factor.coupling[pose]
-    after, rest, change = room
+    rows, after, change = room
     for a in range(POSE):
         for c in range(a, POSE):
-            own[a, c] = own[c, a] = links[pose, a, c]
+            rows[a, c] = rows[c, a] = links[pose, a, c]
         for s in range(SHARED):
-            rest[a, s] = -border[pose, a, s]
+            rows[a, POSE + s] = -border[pose, a, s]
         for c in range(NEXT):
             after[a, c] = links[pose, a, POSE + c]
-            rest[a, SHARED + c] = -after[a, c]
-    if not invert(own):
+            rows[a, POSE + SHARED + c] = -after[a, c]
+    if not invert(rows):
         return False
-    np.dot(own, rest, coupling)
+    own[:] = rows[:, :POSE]
+    coupling[:] = rows[:, POSE:]
     np.dot(after.T, coupling, change)
     for a in range(POSE):
         for c in range(NEXT):
@@ -140,7 +147,7 @@ def eliminate_pose(A, pose, factor, room):
 def eliminate_poses(A, factor):
     """Eliminate the poses of a factor one by another; return False if one is not definite."""
     N = len(factor.own)
-    room = np.empty((POSE, NEXT)), np.empty((POSE, REST)), np.empty((NEXT, REST))
+    room = np.empty((POSE, POSE + REST)), np.empty((POSE, NEXT)), np.empty((NEXT, REST))
     for pose in range(N):
         if not eliminate_pose(A, pose, factor, room):
             return False
