@@ -420,6 +420,10 @@ class BoxArray(Columns):
         """Return an array without boxes."""
         return cls(stamp_ns, frame_id, (), (), np.zeros(0), np.zeros((0, 9)))
 
+    def plain(self) -> Self:
+        """Return them without attributes and `kinematics`, of which a result has its own."""
+        return replace(self, attributes=(), kinematics=None)
+
     def attributes_of(self, row: int) -> Mapping[str, str]:
         """Return the attributes of a box by name."""
         return self.attributes[row] if self.attributes else {}

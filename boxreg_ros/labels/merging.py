@@ -127,7 +127,7 @@ def keyframes_of(frames: Iterator[LabelFrame]) -> Iterator[LabelFrame]:
 def _item(frame: LabelFrame, received_ns: int, tree: TransformTree, sensor_frame: str) -> Item:
     """Return the boxes of a label frame, in a frame that the transforms know if possible."""
     placed = frame.moved('sensor')
-    boxes = replace(placed.refined.boxes, kinematics=None)  # those of a run before: no input
+    boxes = placed.refined.boxes
     is_sensor = frame.sensor_frame != '' and boxes.frame_id == frame.sensor_frame
     if is_sensor and not tree.connects(boxes.frame_id, sensor_frame):
         boxes = replace(boxes, frame_id=sensor_frame)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.io.items import Item
@@ -123,7 +123,7 @@ def survey(
 
 def _plain(item: Moved) -> Moved:
     """Return boxes without attributes, which the plan does not need."""
-    return replace(item, attributes=()) if isinstance(item, BoxArray) else item
+    return item.plain() if isinstance(item, BoxArray) else item
 
 
 def _corrected(

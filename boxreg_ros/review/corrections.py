@@ -188,7 +188,7 @@ class Corrections:
         frame.
 
         """
-        given = replace(given, attributes=())  # `with_attributes` gives the result its own
+        given = given.plain()  # `with_attributes` gives the result its own
         if not self._of_track:
             return given
         rows = self._left(given)
@@ -325,8 +325,7 @@ class Corrections:
         deleted = sorted(set(range(len(given.track_ids))) - set(self._left(given)))
         if not deleted:
             return refined
-        # `with_attributes` gives the result its own
-        gone = replace(self._renamed(given), attributes=()).take(deleted)
+        gone = self._renamed(given.plain()).take(deleted)
         return with_rejected(refined, gone, deleted, [Reason.DELETED] * len(deleted))
 
     def _judgement(self, track_id: str, stamp_ns: int) -> Decision | None:
