@@ -140,7 +140,8 @@ class SceneRecording:
         self.first_errors.clear()
         self._readable = 0
         tree.rewind(0)  # the pose that was read to choose a frame is read again
-        frames = self._frames() if self.has_boxes else iter(())
+        given = self._frames() if self.has_boxes else iter(())
+        frames: Iterator[LabelFrame] = (frame.labels() for frame in given)
         if self._keyframes:
             frames = keyframes_of(frames)
         is_part = self._start is not None or self._end is not None

@@ -497,6 +497,23 @@ def test_detections_are_associated_and_relabelled(tmp_path, capsys):
     assert {row['track_id'] for row in rows_of(tmp_path / 'out')} == {'1'}
 
 
+def test_rejected_boxes_of_label_files_of_a_scene_are_left_out(tmp_path):
+    layouts.nuscenes(tmp_path / 'data')
+    address = f'nuscenes:{tmp_path / "data"}#scene-0061'
+    arguments = ['relabel', address, '--formats=csv', *QUICK]
+    assert main([*arguments, '-o', str(tmp_path / 'first')]) == 0
+    rows = rows_of(tmp_path / 'first')
+    table = tmp_path / 'first' / 'boxes.csv'
+    words = {row['status'] for row in rows}
+    text = table.read_text()
+    for word in words:
+        text = text.replace(f',{word},', ',rejected,', 1)
+    table.write_text(text)
+    labels = f'--labels=csv:{tmp_path / "first"}'
+    assert main([*arguments, labels, '-o', str(tmp_path / 'second')]) == 0
+    assert len(rows_of(tmp_path / 'second')) == len(rows) - len(words)
+
+
 def test_results_with_a_score_that_is_no_number_are_named(tmp_path, capsys):
     layouts.nuscenes(tmp_path / 'data')
     results = layouts.nuscenes_results(tmp_path / 'results.json', 'detection')
