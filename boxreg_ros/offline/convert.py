@@ -181,6 +181,7 @@ def _read_with_recording(
         unused.update(
             unreadable=recording.unreadable.total(), unused=items.left_out(),
             damage=[str(damage) for damage in recording.damages],
+            left_out_of_source=dict(+recording.left_out),
         )  # fmt: skip
     if spool is not None:
         yield from map(spool.with_cloud, waiting)

@@ -270,7 +270,7 @@ def test_convert_without_poses_is_refused(tmp_path, drive, camera):
 
 
 def test_rejected_boxes_are_no_labels_of_other_formats(tmp_path, drive, capsys):
-    _, path = drive
+    recording, path = drive
     table = BoxTable.read(path)
     status = ('rejected', *table.status[1:])
     replace(table, status=status).write(path)
@@ -290,6 +290,9 @@ def test_rejected_boxes_are_no_labels_of_other_formats(tmp_path, drive, capsys):
     frames = frames_of('parquet', tmp_path / 'c' / 'parquet')
     found = [word for frame in frames for word in frame.refined.status]
     assert found == list(status[1:])
+    words[-1] = str(tmp_path / 'placed')
+    assert cli.main([*words, '--recording', str(recording)]) == 0
+    assert 'labels: 1 boxes are left out (rejected_label)' in capsys.readouterr().out
 
 
 def test_convert_skips_unreadable_clouds(tmp_path, drive, capsys):
