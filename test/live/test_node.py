@@ -138,7 +138,8 @@ def test_boxes_without_a_fixed_frame_are_published_unchanged(graph, tmp_path):
 
     node.early.clear()
     node.final.clear()
-    settings = ('-p', 'fixed_frame:=base', '-p', f'boxes_type:={DETECTIONS}')
+    options = ('fixed_frame:=base', 'transform_timeout:=20.0', f'boxes_type:={DETECTIONS}')
+    settings = [part for option in options for part in ('-p', option)]
     left = graph.endpoints()
     second = graph.start(*RELIABLE, *QUICK, *settings)
     graph.wait_until_connected(left)
