@@ -411,6 +411,8 @@ class BoxArray(Columns):
             _check_shape('pinned', self.pinned.shape, (n,))
         if self.kinematics is not None:
             _check_shape('kinematics', self.kinematics.shape, (n,))
+        if self.attributes:  # those of another box are a fault that no number shows
+            _check_shape('attributes', (len(self.attributes),), (n,))
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)  # the class is frozen

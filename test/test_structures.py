@@ -61,6 +61,7 @@ def test_a_stream_takes_boxes_of_any_precision(kind):
         (boxes, {'class_names': 'c'}, ['class_names', "'c'"]),
         (boxes, {'class_names': ()}, ['class_names', '1', '0']),
         (boxes, {'pinned': [True, False]}, ['pinned', '(2,)']),
+        (boxes, {'attributes': ({}, {})}, ['attributes', '(1,)', '(2,)']),
         (boxes, {'stamp_ns': 0.1}, ['stamp_ns', '0.1', '1e9']),
         (sweep, {'stamp_ns': 0.1}, ['stamp_ns', '0.1', '1e9']),
         (sweep, {'points': np.zeros((2, 4))}, ['points', '(2, 4)', 'x y z']),

@@ -135,6 +135,7 @@ class PendingArray:
             scores=np.append(given.scores, 0.0),
             boxes=np.vstack([given.boxes, one.box]),
             pinned=None if given.pinned is None else np.append(given.pinned, False),
+            attributes=(*given.attributes, {}) if given.attributes else (),
         )
         self.reasons.append('')
         self.num_points = np.append(self.num_points, 0)

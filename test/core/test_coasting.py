@@ -1,5 +1,7 @@
 """A track that misses a detection goes on with its predicted box while its points confirm it."""
 
+from dataclasses import replace
+
 from boxreg_ros import Config
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.registrar import BoxRegistrar
@@ -61,9 +63,9 @@ def run(truth, config, missed, gone=lambda track_id, step: False, extra=None):
         ids = tuple(name for name, _ in here)
         boxes = np.array([box for _, box in here]).reshape(-1, 9)
         results += registrar.add_sweep(sweep)
-        results += registrar.add_boxes(
-            BoxArray(stamp_ns, 'odom', ids, ('car',) * len(ids), np.ones(len(ids)), boxes)
-        )
+        given = BoxArray(stamp_ns, 'odom', ids, ('car',) * len(ids), np.ones(len(ids)), boxes)
+        words = tuple({'name': name} for name in ids)
+        results += registrar.add_boxes(replace(given, attributes=words))
     return results + registrar.flush(), registrar.counts
 
 
@@ -99,6 +101,8 @@ def test_missed_boxes_are_added_at_once_and_lie_on_the_object(truth, estimate):
         n = result.status.count(COASTED)
         assert result.status[len(result.status) - n :] == (COASTED,) * n, 'behind the given boxes'
         assert result.boxes.scores.tolist() == [1.0] * (len(result.status) - n) + [0.0] * n
+        words = [result.boxes.attributes_of(row).get('name') for row in range(len(result.status))]
+        assert words == [*result.boxes.track_ids[: len(words) - n], *[None] * n]
 
 
 def test_without_the_setting_no_box_is_added_and_others_do_not_change(truth):
