@@ -47,12 +47,17 @@ class TransferError(RecordingError):
     """Bytes could not be copied from or to a disk or server; of their content nothing is known."""
 
 
+def one_line(error: BaseException) -> str:
+    """Return the text of an error in one line."""
+    return ' '.join(str(error).split()).rstrip('.') or type(error).__name__
+
+
 def remedy_of(error: OSError) -> str:
     """Return what helps against an error of a file."""
     return FILE_REMEDIES.get(error.errno or 0, OTHER_REMEDY)
 
 
-def description_of(error: Exception) -> str:
+def description_of(error: BaseException) -> str:
     """Return what a failed run says of an error, with a remedy."""
     if isinstance(error, BoxregError):
         return str(error)

@@ -163,7 +163,8 @@ class Reason(StrEnum):
         'no_sweep',
         'box',
         'no cloud within `reach` of its stamp',
-        'copy the stamp of the cloud to its boxes; check the counters of clouds; raise `queue` if '
+        'copy the stamp of the cloud to its boxes; where there are more boxes than clouds, raise '
+        '`reach` to half the period of the clouds; check the counters of clouds; raise `queue` if '
         'boxes arrive more than `queue` clouds late',
     )
     COMPILING = (
@@ -201,7 +202,8 @@ class Reason(StrEnum):
         'message',
         'its boxes are displaced from their points; the log has the figures',
         'set `pose_reference`, `size_order`, `forward_axis`, `orientation`, `size_scale` or '
-        '`boxes_frame` as the log suggests',
+        '`boxes_frame` as the log suggests; these are for all classes: correct boxes of classes '
+        'that the log names beside right ones where they are made, or in a `boxes.csv`',
     )
     TRACK_IDS_JUMP = (
         'track_ids_jump',
@@ -235,8 +237,8 @@ class Reason(StrEnum):
     CLOUD_FAULT = (
         'cloud_fault',
         'message',
-        'its clouds are parts of sweeps, in millimetres, or too far from their origin for '
-        'float32; the log says which',
+        'its clouds are parts of sweeps, of several LiDARs on one topic, in millimetres, or too '
+        'far from their origin for float32; the log says which',
         'mend them in the driver of the LiDAR, or in a node before this one, as the log says',
     )
     TRANSFORM_FAULT = (

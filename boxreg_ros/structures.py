@@ -32,6 +32,7 @@ LARGEST_EXTENT = 1e3
 """Objects are smaller [m]; chosen: twice the longest ship."""
 LARGEST_COORDINATE = 3e7
 """Centres are nearer to the origin [m]; maps have up to 20,037,509 m (Web Mercator)."""
+LARGEST_BOX = np.array([LARGEST_COORDINATE] * 3 + [LARGEST_EXTENT] * 3 + [np.inf] * 3)
 BOX_AXES = 'x y z length width height roll pitch yaw'
 
 REFINED, KEPT = 'refined', 'kept'
@@ -150,11 +151,9 @@ def is_valid_box(boxes: Floats) -> NDArray[np.bool_]:
     within `LARGEST_COORDINATE`.
 
     """
-    extents = boxes[..., BOX_EXTENT]
-    is_finite = np.isfinite(boxes).all(axis=-1)
-    is_sized = ((extents > 0) & (extents < LARGEST_EXTENT)).all(axis=-1)
-    is_placed = (np.abs(boxes[..., : Z + 1]) < LARGEST_COORDINATE).all(axis=-1)
-    return np.asarray(is_finite & is_sized & is_placed)
+    is_within = (np.abs(boxes) < LARGEST_BOX).all(axis=-1)
+    is_sized = (boxes[..., BOX_EXTENT] > 0).all(axis=-1)
+    return np.asarray(is_within & is_sized)
 
 
 def finite_points(points: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -162,6 +161,11 @@ def finite_points(points: NDArray[np.floating]) -> NDArray[np.floating]:
     is_finite = np.isfinite(points)
     # Row by row takes forty times as long.
     return points if is_finite.all() else points[is_finite.all(axis=1)]
+
+
+def on_lines(at: NDArray[Any], values: Floats, wanted: NDArray[Any]) -> Floats:
+    """Return rows (n, k) on the lines between values (m, k) at ascending places (m,)."""
+    return np.stack([np.interp(wanted, at, column) for column in values.T], axis=1)
 
 
 def _is_float_array(value: object) -> bool:
@@ -324,7 +328,7 @@ class Columns:
 
 def _rows_of(column: Any, rows: Sequence[int] | Ints) -> Any:
     if isinstance(column, tuple):
-        return tuple(column[row] for row in rows) if column else ()
+        return tuple(map(column.__getitem__, rows)) if column else ()
     if isinstance(column, Columns):
         return column.take(rows)
     return None if column is None else column[rows]
@@ -429,6 +433,11 @@ class BoxArray(Columns):
     def attributes_of(self, row: int) -> Mapping[str, str]:
         """Return the attributes of a box by name."""
         return self.attributes[row] if self.attributes else {}
+
+    @property
+    def is_pinned(self) -> NDArray[np.bool_]:
+        """Return which boxes are `pinned`, shape (n,)."""
+        return np.zeros(len(self.track_ids), bool) if self.pinned is None else self.pinned
 
     @property
     def known_kinematics(self) -> NDArray[np.void]:

@@ -78,7 +78,7 @@ class BoxTimeEvidence:
         n observations `seen` are of one table; `velocities` (n, 3) are those of the objects [m/s].
 
         """
-        if not seen:
+        if not (seen and velocities.any()):
             return
         rows = [observation.row for observation in seen]
         motions = velocities * seen[0].table.sights[rows, None]  # from the stamp [m]

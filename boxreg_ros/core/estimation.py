@@ -17,26 +17,30 @@ from functools import partial
 from itertools import repeat
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.articulation import changes_shape, extent_ranges
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import normalised_residuals
+from boxreg_ros.core.method.acceptance import accept, ACCEPTED, Tested
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, Solution
-from boxreg_ros.core.method.constants import CONSTANTS
-from boxreg_ros.core.method.faces import count_held
+from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.observation import SIDE_NOISE
 from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.problem import group_windows, NO_RANGE, Problem, stack_windows
 from boxreg_ros.core.solver import solve
+from boxreg_ros.core.tables import stacked
 from boxreg_ros.core.threads import one_torch_thread, run, shared_between
 from boxreg_ros.core.window import Estimate, Estimates, MarginalisationPrior, Window
 from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import Floats, Ints, KEPT, KINEMATICS, POSE, REFINED, ROLL
+from boxreg_ros.structures import BOX_EXTENT, Floats, KEPT, KINEMATICS, REFINED, ROLL
 import numpy as np
 from numpy.typing import NDArray
 
-KEPT_REASONS = (Reason.NO_POINTS, Reason.NOT_FINITE, Reason.NO_GAIN, Reason.NOT_RIGID)
-"""Why a box is kept, in the order of `_failed_tests`."""
+KEPT_REASONS = np.array(
+    ['', Reason.NO_POINTS, Reason.NOT_FINITE, Reason.NO_GAIN, Reason.NOT_RIGID], np.str_
+)
+"""Why a box is kept, by the results of the acceptance tests."""
+STATUS = np.array([REFINED, *[KEPT] * (len(KEPT_REASONS) - 1)], np.str_)
+"""The status of a box by the same."""
 
 
 @one_torch_thread()
@@ -57,20 +61,20 @@ def estimate_windows(
         return [None] * len(windows)
     parts = [[windows[i] for i in rows] for rows in groups]
     decay = model.constants.prior_decay
-    stacked = [stack_windows(part, config, decay) for part in parts]
+    problems = [stack_windows(part, config, decay) for part in parts]
     with shared_between(config.solver.threads):
-        for part, (problem, _) in zip(parts, stacked, strict=True):
+        for part, (problem, _) in zip(parts, problems, strict=True):
             _update_margins(model, part, problem, config)
         # Whole tracks show their own noise.
         inputs = model.inputs(config, with_noise=config.estimate != 'track')
-        for rows, part, (problem, base) in zip(groups, parts, stacked, strict=True):
+        for rows, part, (problem, base) in zip(groups, parts, problems, strict=True):
             if config.objective == 'paper':
                 solution = solve_paper(problem, config)
             else:
                 observe = partial(_update_margins, model, part, problem, config)
                 solution = solve(problem, config, model, inputs, part[0].is_warm, observe)
                 _update_noise(model, part, problem, solution, config)
-            found = _accepted(part, problem, base, solution, config, model.constants.max_lost_part)
+            found = _accepted(part, problem, base, solution, config, model.constants)
             estimates.update(zip(rows, found, strict=True))
     return [estimates.get(i) for i in range(len(windows))]
 
@@ -129,10 +133,10 @@ def _accepted(
     base: Floats,
     solution: Solution,
     config: Config,
-    max_lost_part: float,
+    constants: Constants,
 ) -> list[Estimate]:
     """
-    Return the estimate of each window in the fixed frame, after the acceptance tests.
+    Return the estimate of each window in the fixed frame, after the acceptance tests (M27).
 
     `base` (B, 3) is the origin of the centres of `problem` [m].
 
@@ -142,22 +146,27 @@ def _accepted(
     extent = problem.boxes[..., 3:6]
     if config.extent == 'track':
         extent = np.repeat(solution.shared[:, None, EXTENT:BIAS], problem.length, axis=1)
-    held = _held(problem, poses, extent)
-    found = np.concatenate([poses[..., :3], extent, wrap_angle(poses[..., 3:])], -1)
-    is_finite = np.isfinite(found).all(-1) & (extent > 0).all(-1)
-    is_finite &= np.isfinite(covariances).all((2, 3))
-    past = [window.prior.extent_range if window.prior else NO_RANGE for window in windows]
-    ranges = extent_ranges(problem, np.array(past), config.window)
-    is_bent = changes_shape(ranges, problem.of_class['extent'])
-    priors = _priors(base, problem, solution, is_finite.all(1), ranges)
-    failed = _failed_tests(problem, is_finite, held, is_bent, max_lost_part)
-    is_kept = failed.any(0)
-    reasons = np.select(failed, KEPT_REASONS, '')
-    status = np.where(is_kept, KEPT, REFINED)
-    found[..., :3] += base[:, None]
-    near_points = np.stack([held, problem.counts - held], -1)
+    tested = Tested(
+        np.empty(valid.shape, np.int8), np.empty(valid.shape, np.int64),
+        stacked([w.prior.extent_range if w.prior else NO_RANGE for w in windows]),
+        np.empty(len(valid), bool),
+    )  # fmt: skip
+    run(
+        accept, 5, len(valid), problem, np.ascontiguousarray(poses), np.ascontiguousarray(extent),
+        covariances, SIDE_NOISE, config.window, constants.record(), tested,
+    )  # fmt: skip
+    priors = _priors(base, problem, solution, tested.is_finite, tested.ranges)
+    is_kept = tested.results != ACCEPTED
+    reasons, status = KEPT_REASONS[tested.results], STATUS[tested.results]
+    found = np.empty((*valid.shape, 9))
+    found[..., :3] = poses[..., :3] + base[:, None]
+    found[..., BOX_EXTENT] = extent
+    found[..., ROLL:] = wrap_angle(poses[..., 3:])
+    near_points = np.empty((*valid.shape, 2), np.int64)
+    near_points[..., 0] = tested.held
+    near_points[..., 1] = problem.counts - tested.held
     extent_covariances = np.repeat(extent_covariances[:, None], problem.length, axis=1)
-    for b, i in np.argwhere(valid & is_kept).tolist():
+    for b, i in np.argwhere(is_kept).tolist():
         found[b, i] = windows[b].observations[i].box
         covariances[b, i] = np.eye(6)
         extent_covariances[b, i] = np.eye(3)
@@ -174,44 +183,6 @@ def _accepted(
     return list(map(Estimate, repeat(table), [0, *ends], ends, priors))
 
 
-def _failed_tests(
-    problem: Problem,
-    is_finite: NDArray[np.bool_],
-    held: Ints,
-    is_bent: NDArray[np.bool_],
-    max_lost_part: float,
-) -> NDArray[np.bool_]:
-    """
-    Return the acceptance tests that each refined box fails (M27), shape (4, B, N).
-
-    The tests, in the order of `KEPT_REASONS`: the window has points; box and covariance are finite
-    and the extent is positive; the refined box holds nearly as many points, `held` (B, N), as the
-    input box, which the objective does not require; the body keeps its shape, as the objective
-    assumes, and is not `is_bent` (B,).
-
-    """
-    before = problem.counts  # at most: counting those of the input boxes takes time
-    least = (1 - max_lost_part) * before - CONSTANTS.min_face_points
-    if (held < least).any():
-        extent = np.ascontiguousarray(problem.boxes[..., 3:6])
-        before = _held(problem, problem.boxes[..., POSE], extent)
-        least = (1 - max_lost_part) * before - CONSTANTS.min_face_points
-    failed = np.empty((len(KEPT_REASONS), *held.shape), bool)
-    failed[0] = problem.counts.sum(1, keepdims=True) == 0
-    failed[1] = ~is_finite
-    failed[2] = held < least
-    failed[3] = is_bent[:, None]
-    return failed
-
-
-def _held(problem: Problem, poses: Floats, extent: Floats) -> Ints:
-    """Return how many points are in boxes at `poses` (B, N, 6) of `extent` (B, N, 3), (B, N)."""
-    held = np.zeros(problem.counts.shape, np.int64)
-    contiguous = np.ascontiguousarray(poses), np.ascontiguousarray(extent)
-    run(count_held, len(held), problem, *contiguous, SIDE_NOISE, held)
-    return held
-
-
 def _priors(
     base: Floats,
     problem: Problem,
@@ -226,9 +197,8 @@ def _priors(
     first = np.concatenate([problem.boxes[:, 0, 3:6], np.ones((len(base), 1))], axis=1)
     extents = problem.marginalised_extents + first
     has_prior = is_solved & np.isfinite(step).all(1)
+    columns = zip(base, state, step, information, extents, ranges, strict=True)
     return [
-        MarginalisationPrior(base[b], state[b], step[b], information[b], extents[b], ranges[b])
-        if has_prior[b]
-        else None
-        for b in range(len(base))
+        MarginalisationPrior(*column) if is_left else None
+        for column, is_left in zip(columns, has_prior.tolist(), strict=True)
     ]

@@ -1,5 +1,6 @@
 """The upper edge of the field of view of a LiDAR, which may hide the top of an object (M11)."""
 
+from boxreg_ros.core.method.rings import fill_slopes_of
 from boxreg_ros.structures import Floats, Ints, Sweep
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,8 @@ class FieldOfView:
         is_hidden = np.zeros(len(centers), bool)
         if sweep.origins is not None:
             return is_hidden
-        slopes = _slopes(sweep.points[::POINT_STEP], origin)
+        looked_at = np.arange(0, len(sweep.points), POINT_STEP, dtype=row.dtype)
+        slopes = _slopes(sweep.points, looked_at, origin)
         higher = slopes[slopes > self._highest]
         if len(higher) >= MIN_RETURNS:
             self._highest = float(np.partition(higher, -MIN_RETURNS)[-MIN_RETURNS])
@@ -60,7 +62,7 @@ class FieldOfView:
         ends = np.searchsorted(owner, np.arange(len(centers) + 1))
         for k in np.flatnonzero(may_reach).tolist():
             own = row[ends[k] : ends[k + 1]]
-            of_own = _slopes(sweep.points[own], origin)
+            of_own = _slopes(sweep.points, own, origin)
             top = of_own.max(initial=-np.inf)
             half_ring = ring_heights[k] / run[k] / 2
             if top > self._highest - half_ring:
@@ -70,10 +72,8 @@ class FieldOfView:
         return is_hidden
 
 
-def _slopes(points: NDArray[np.float32], origin: Floats) -> NDArray[np.float32]:
-    """Return the rise of rays from the sensor to points (M, 3) over their run, (M,)."""
-    x, y, z = (points[:, k] - np.float32(origin[k]) for k in range(3))
-    with np.errstate(over='ignore', invalid='ignore'):
-        slopes: NDArray[np.float32] = z / np.maximum(np.sqrt(x * x + y * y), np.float32(1e-9))
-    slopes[~np.isfinite(slopes)] = -np.inf
+def _slopes(points: NDArray[np.floating], rows: Ints, origin: Floats) -> Floats:
+    """Return the rise of rays from the sensor to `rows` of points (M, 3) over their run."""
+    slopes = np.empty(len(rows))
+    fill_slopes_of(points, rows, origin, slopes)
     return slopes

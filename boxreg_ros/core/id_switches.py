@@ -70,17 +70,17 @@ def _switches_of(first: str, second: str, tracks: Mapping[str, Centers]) -> list
     if len(common) < 2 * NUM_BOXES:
         return []
     both = np.stack([centers[rows], other_centers[other_rows]], 1)  # (n, 2 tracks, 2)
-    seconds = (common - common[0]) * 1e-9
     at = np.arange(NUM_BOXES, len(common) - NUM_BOXES + 1)  # first rows after a switch
+    at = at[np.linalg.norm(both[at, 0] - both[at, 1], axis=1) < MOST_APART]
+    seconds = (common - common[0]) * 1e-9
     middle = (seconds[at - 1] + seconds[at]) / 2
     before = _lines(seconds, both, at - NUM_BOXES, middle)
     after = _lines(seconds, both, at, middle)
     own = np.linalg.norm(before - after, axis=-1).sum((1, 2))
     exchanged = np.linalg.norm(before - after[:, :, ::-1], axis=-1).sum((1, 2))
-    is_near = np.linalg.norm(both[at, 0] - both[at, 1], axis=1) < MOST_APART
-    is_switch = is_near & (exchanged < MAX_SHARE * own) & (own - exchanged > MIN_SWITCH_GAIN)
+    is_switch = (exchanged < MAX_SHARE * own) & (own - exchanged > MIN_SWITCH_GAIN)
     shown = np.flatnonzero(is_switch)
-    runs = np.split(shown, np.flatnonzero(np.diff(shown) >= NUM_BOXES) + 1)
+    runs = np.split(shown, np.flatnonzero(np.diff(at[shown]) >= NUM_BOXES) + 1)
     best = [run[np.argmax((own - exchanged)[run])] for run in runs if len(run)]
     return [Switch(int(common[at[row]]), first, second) for row in best]
 

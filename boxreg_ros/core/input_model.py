@@ -131,7 +131,7 @@ class InputModel:
             inputs = self.inputs(config, with_noise=False)
         terms = np.zeros(problem.counts.shape, TERMS)
         run(
-            observe_faces, len(poses), problem, np.ascontiguousarray(poses),
+            observe_faces, 4, len(poses), problem, np.ascontiguousarray(poses),
             problem.expected_shared(inputs), inputs,
             self.constants.with_settings(config).record(), terms,
         )  # fmt: skip
@@ -240,7 +240,9 @@ class InputModel:
             return
         record = self.constants.record()
         for k in range(len(KINDS)):
-            known = np.concatenate([self._tracks_of(k)['evidence'], evidence[kinds == k]])
+            known = np.ascontiguousarray(self._tracks_of(k)['evidence'])
+            if len(evidence):
+                known = np.concatenate([known, evidence[kinds == k]])
             if len(known):
                 population_slopes(known, record, inputs['median'][k], inputs['slopes'][k])
 

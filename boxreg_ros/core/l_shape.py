@@ -1,5 +1,5 @@
 """
-The heading of an object by its points, which lie on two of its sides.
+The rectangle of an object by its points, which lie on two of its sides.
 
 Zhang et al., Efficient L-Shape Fitting for Vehicle Detection Using Laser Scanners, IV 2017: the
 rectangle whose sides are nearest to the points (closeness criterion).
@@ -41,3 +41,30 @@ def closest_heading(points: Floats, yaws: Floats) -> float:
         ]
     )
     return float(yaws[(1 / np.maximum(to_sides, LEAST_DISTANCE)).sum(0).argmax()])
+
+
+def turned(points: Floats, yaw: float) -> Floats:
+    """Return points (..., 2) turned by an angle [rad]."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]))
+
+
+def span(points: Floats, yaw: float) -> tuple[Floats, Floats]:
+    """Return the least and the largest coordinates (2,) of points along the axes of a heading."""
+    local = turned(points, -yaw)
+    return local.min(0), local.max(0)
+
+
+def completed(points: Floats, yaw: float, sensor: Floats, usual: Floats) -> tuple[Floats, Floats]:
+    """
+    Return centre and sides (2,) of the rectangle of points (M, 2) along the axes of a heading.
+
+    Sides that are shorter than `usual` (2,) grow away from the sensor at (2,).
+
+    """
+    low, high = span(points, yaw)
+    sides = np.maximum(high - low, usual)
+    # Of each axis, the side on the side of the sensor is seen.
+    is_low_seen = turned(sensor, -yaw) < (low + high) / 2
+    low = np.where(is_low_seen, low, high - sides)
+    return turned(low + sides / 2, yaw), sides

@@ -19,15 +19,15 @@ from typing import Any, NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core.matching import Pair
 from boxreg_ros.core.measured_tracks import MeasuredTracks
+from boxreg_ros.core.method.path_costs import fill_costs, PATH_REACH
 from boxreg_ros.core.observation import crop
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, LENGTH, Sweep, X, Y, YAW, Z
 import numpy as np
-from numpy.typing import NDArray
 
 # All of these are chosen, except where an origin stands beside them.
 NOTABLE = 0.05
 """Less is neither corrected nor a warning [s]: without latency, estimates err by up to 0.04 s."""
-CANDIDATES = np.arange(-0.2, 0.801, 0.05)
+CANDIDATES = np.arange(-0.4, 0.801, 0.05)
 """Latencies that are compared [s]; negative ones are of boxes that are predicted too far."""
 ENDS = np.array([0, len(CANDIDATES) - 1])
 """Rows of the two candidates that show whether an object moves."""
@@ -45,18 +45,17 @@ GAIN = 2.0
 """Deviations by which tracks must fit better at a latency than in time, for it to be corrected."""
 SIGNIFICANCE = 3.0
 """Deviations by which a latency, or a drift of it, is more than an error of the estimate."""
+SECOND_MINIMUM = 0.15
+"""Least depth of a minimum in time, below the rise to the least cost, as part of their range;
+measured: between 0.15 and 0.33 by rows of parked cars, up to 0.12 where boxes are late."""
 PREFERENCE = 1.2
 """
 Deviations by which late boxes fit better at the stamp, or where points were seen, to be of that
 time; otherwise the smaller latency is taken. Measured: 1.2 to 2.6 on simulated highways with boxes
 of the stamp, up to 1.4 for a while where human labels are of neither.
 """
-PATH_REACH = 0.3
-"""Points up to this far outside of the predicted boxes are compared with them [m]."""
 ROAD_CLEARANCE = 0.3
 """Points less than this above the bottom of a box may be of the road [m]."""
-FACE_DEPTH = 0.35
-"""Distances from a face beyond this are no worse [m]."""
 FULL_WEIGHT = 5
 """Comparisons by which a track has its whole weight."""
 OBJECTS_COMPARED = 16
@@ -94,13 +93,22 @@ class Latency(NamedTuple):
     """Moving objects that provide evidence."""
     drifts: bool = False
     """Whether it is not one time: older evidence was forgotten."""
+    is_beyond: bool = False
+    """Whether it is as large as what is compared, or larger: nothing is corrected."""
 
     @property
     def warning(self) -> str:
         """Return what a user should know; empty for boxes that are in time, or may be."""
-        if self.estimated is None or not (self.drifts or abs(self.seconds) >= NOTABLE):
+        if self.estimated is None:
             return ''
-        word = 'late' if self.seconds > 0 else 'early'
+        word = 'late' if self.estimated > 0 else 'early'
+        if self.is_beyond:
+            return (
+                f'boxes are {abs(self.estimated):.1f} s {word} or more, which is not corrected: '
+                f'correct the stamps where they are made, or set sampling.box_time'
+            )
+        if not (self.drifts or abs(self.seconds) >= NOTABLE):
+            return ''
         changes = ', at the end of a latency that drifts' if self.drifts else ''
         return (
             f'boxes are {abs(self.seconds):.2f} s {word}{changes}, and moved to where their '
@@ -353,35 +361,15 @@ class LatencyCorrection:
 
 
 def _costs(path: _Path, points: Floats, times: Floats) -> Floats | None:
-    """
-    Return how badly the boxes of a path fit points (M, 3), (2, C); None with too few points.
-
-    `times` (M,) are relative to the stamp [s]. The part of the points outside of a box, and their
-    mean distance from its faces: the first is robust, the second precise. First for the points
-    where they were seen, then for those at the stamp.
-
-    """
-    boxes = path.boxes
-    if len(points) < FEWEST_POINTS:
-        return None
-    at_stamp = points - times[:, None] * path.velocities.mean(0)
-    x, y = (np.stack([points[:, k], at_stamp[:, k]])[..., None] - boxes[:, k] for k in (X, Y))
-    cos, sin = np.cos(boxes[:, YAW]), np.sin(boxes[:, YAW])
-    along = np.abs(cos * x + sin * y) - boxes[:, LENGTH] / 2  # (2, M, C)
-    across = np.abs(cos * y - sin * x) - boxes[:, LENGTH + 1] / 2
-    outside = np.maximum(along, across)
-    is_of_path: NDArray[np.bool_] = np.any(outside < PATH_REACH, axis=2)
-    if is_of_path.sum(1).min() < FEWEST_POINTS:
-        return None
-    inside = ((outside < PATH_REACH / 2) & is_of_path[..., None]).sum(1)
-    depth = np.abs(outside).clip(max=FACE_DEPTH).mean(1, where=is_of_path[..., None])
-    most = inside.max(1, keepdims=True).clip(min=FEWEST_POINTS)
-    costs: Floats = 1.5 * depth / FACE_DEPTH - inside / most
-    return costs
+    """Return the costs (2, C) of the boxes of a path; None with too few points."""
+    costs = np.empty((2, len(path.boxes)))
+    velocity = path.velocities.mean(0)
+    is_known = fill_costs(points, times, velocity, path.boxes, FEWEST_POINTS, costs)
+    return costs if is_known else None
 
 
 def _points_near(sweep: Sweep, paths: Sequence[_Path]) -> list[tuple[Floats, Floats]]:
-    """Return points (M, 3) around the boxes of each path, above the road, and their times (M,)."""
+    """Return points (3, M) around the boxes of each path, above the road, and their times (M,)."""
     if not paths:
         return []
     around = _boxes_around(np.array([path.boxes for path in paths]))
@@ -392,8 +380,10 @@ def _points_near(sweep: Sweep, paths: Sequence[_Path]) -> list[tuple[Floats, Flo
         stride = max(1, -(-(last - first) // POINTS_COMPARED))
         kept = slice(first, last, stride)
         rows = near.row[kept]
-        points = near.offset[:, kept].T + around[path, : Z + 1]
-        times = np.zeros(len(rows)) if sweep.times is None else sweep.times[rows]
+        points = np.ascontiguousarray(near.offset[:, kept] + around[path, : Z + 1, None])
+        times = np.zeros(len(rows))
+        if sweep.times is not None:
+            times[:] = sweep.times[rows]
         found.append((points, times))
     return found
 
@@ -439,9 +429,11 @@ def _estimated(samples: Sequence[_Sample]) -> Latency:
     is_significant = abs(estimated) >= max(NOTABLE, SIGNIFICANCE * deviation)
     is_inside = CANDIDATES[0] < estimated < CANDIDATES[-1]  # at the ends it is no minimum
     is_usable = deviation <= max(USABLE_DEVIATION, USABLE_PART * abs(estimated))
-    if is_significant and is_inside and is_usable and _fits_better(costs[:, way]):
-        found = found._replace(seconds=estimated)
-    elif deviation > USABLE_DEVIATION or is_significant:
+    if is_significant and is_usable and _fits_better(costs[:, way]):
+        if is_inside:
+            return found._replace(seconds=estimated)
+        return found._replace(is_beyond=True, finding='it is beyond what is compared')
+    if deviation > USABLE_DEVIATION or is_significant:
         found = found._replace(
             finding=f'the latency of the boxes is not known: {estimated:.2f} s with a deviation '
             f'of {deviation:.2f} s, by {n} moving objects'
@@ -468,9 +460,20 @@ def _way(costs: Floats, ways: Floats) -> int:
 
 
 def _fits_better(costs: Floats) -> bool:
-    """Return whether the tracks of costs (n, C) fit better at the minimum than in time."""
-    in_time = int(np.abs(CANDIDATES).argmin())
-    gain = costs[:, in_time] - costs[:, costs.sum(0).argmin()]  # of each track
+    """
+    Return whether the tracks of costs (n, C) fit better at the minimum than in time.
+
+    They do not if they have another minimum in time: those in a row, as parked cars, fit again
+    where their vehicle has passed one more.
+
+    """
+    total = costs.sum(0)
+    in_time, least = int(np.abs(CANDIDATES).argmin()), int(total.argmin())
+    second = in_time - 1 + int(total[in_time - 1 : in_time + 2].argmin())
+    first, last = sorted((second, least))
+    if total[first : last + 1].max() - total[second] > SECOND_MINIMUM * np.ptp(total):
+        return False
+    gain = costs[:, in_time] - costs[:, least]  # of each track
     # The mean is `GAIN` times its deviation s / sqrt(n) where the sum is so many root sums of
     # squares. A single track has no spread, and a ratio of 1.
     n = len(costs)

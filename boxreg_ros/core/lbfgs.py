@@ -8,11 +8,13 @@ result does not depend on the other rows. See docs/decisions.md.
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from boxreg_ros.structures import Floats, Ints
+import numpy as np
+from numpy.typing import NDArray
 import torch
 from torch import Tensor
-from torch.linalg import vector_norm
 
 SUFFICIENT_DECREASE = 1e-4
 """Part of the predicted decrease that a step must reach: c1 of Armijo's condition. Literature:
@@ -28,9 +30,9 @@ HISTORY = 6
 """Curvature pairs that are kept. Literature: 3 to 20 (Nocedal and Wright, section 7.2)."""
 
 Function = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-Metric = Callable[[Tensor, Tensor], Tensor]
+Metric = Callable[[Tensor], Tensor]
 CurvaturePair = tuple[Tensor, Tensor, Tensor]
-"""A step s, the change y of the gradient over it, and 1 / s'y: (b, D), (b, D), (b, 1)."""
+"""A step s, the change y of the gradient over it, and 1 / s'y: (B, D), (B, D), (B, 1)."""
 
 
 class Status(IntEnum):
@@ -49,27 +51,35 @@ class Minimum(NamedTuple):
     """(B, D), best point; that of the start if nothing better was found."""
     value: Tensor
     """(B,), its value."""
-    status: Tensor
+    status: Ints
     """(B,), `Status`; RUNNING: the iterations ran out."""
-    iterations: Tensor
+    iterations: Ints
     """(B,), taken."""
 
 
-class _Search(NamedTuple):
-    """The state of the rows (b,) that are still in the batch."""
+class _Points(NamedTuple):
+    """A point of each of b rows, its value and gradient: (b, D), (b,), (b, D)."""
 
-    rows: Tensor
     x: Tensor
     value: Tensor
     gradient: Tensor
-    step: Tensor  # (b, D), to try next
-    slope: Tensor  # predicted change of the value over the step
-    has_moved: Tensor  # whether the last trial was accepted: a new direction is needed
-    backtracks: Tensor  # of the present direction
-    changes: list[tuple[Tensor, Tensor]]  # of x and gradient since there were new directions
-    pairs: list[CurvaturePair]
+
+    def of(self, rows: Ints) -> '_Points':
+        """Return those of `rows`, ascending."""
+        if len(rows) == len(self.x):
+            return self
+        index = torch.from_numpy(rows)
+        return _Points(*(part.index_select(0, index) for part in self))
+
+    def with_rows(self, rows: Ints, others: '_Points') -> '_Points':
+        """Return these with `others` in place of those of `rows`, ascending."""
+        if len(rows) == len(self.x):
+            return others
+        index, parts = torch.from_numpy(rows), zip(self, others, strict=True)
+        return _Points(*(part.index_copy(0, index, other) for part, other in parts))
 
 
+@np.errstate(all='ignore')  # numbers that are not finite have a status, or a shorter step
 def minimize(
     function: Function,
     start: Tensor,
@@ -94,7 +104,7 @@ def minimize(
         A row has converged when the predicted decrease of its value is less, as part of
         1 + |value|.
     metric : callable, optional
-        Maps vectors (b, D) and their rows to the inverse of an approximate Hessian times them.
+        Maps vectors (B, D) to the inverse of an approximate Hessian of each row times them.
         Without it the usual scaled identity is used.
     first : pair of Tensor, optional
         Values and gradients at the start, where they are known.
@@ -107,114 +117,114 @@ def minimize(
     Notes
     -----
     Two-loop recursion (Nocedal and Wright, algorithm 7.4), then backtracking from a full step by
-    quadratic interpolation until Armijo's condition holds. Every turn evaluates one point per row:
-    a row that accepts it goes on from there while its neighbour still shortens its step. Ended
-    rows leave the batch.
+    quadratic interpolation until Armijo's condition holds: no row gets worse. Ended rows are not
+    evaluated.
 
     """
-    rows = torch.arange(len(start), device=start.device)
-    value, gradient = function(start, rows) if first is None else first
-    is_finite = _are_finite(value, gradient.sum(1))
-    status, zeros = int(Status.FAILED) * ~is_finite, torch.zeros_like(rows)
-    best = Minimum(start.clone(), value.clone(), status, zeros.clone())
-    search = _Search(rows, start, value, gradient, start, value, is_finite, zeros, [], [])
-    search = _select(search, is_finite.nonzero()[:, 0])
-    for turn in range(iterations * MAX_BACKTRACKS):
-        if turn >= iterations:
-            goes_on = best.iterations[search.rows] < iterations
-            search = _select(search, (goes_on | ~search.has_moved).nonzero()[:, 0])
-        if search.rows.numel():
-            search = _with_new_directions(search, best, metric, tolerance, history)
-        if not search.rows.numel():
+    every = torch.from_numpy(np.arange(len(start)))
+    at = _Points(start, *(function(start, every) if first is None else first))
+    status = np.where(_are_finite(at), int(Status.RUNNING), int(Status.FAILED))
+    taken = np.zeros(len(start), int)
+    pairs: list[CurvaturePair] = []
+    for _ in range(iterations):
+        step = -_two_loop(at.gradient, pairs, metric)
+        step, slope = _downhill(step, at.gradient, is_scaled=bool(pairs) or metric is not None)
+        is_flat = -slope <= tolerance * (1 + np.abs(at.value.numpy()))
+        status[is_flat & (status == Status.RUNNING)] = Status.CONVERGED
+        rows = np.flatnonzero(status == Status.RUNNING)
+        if not len(rows):
             break
-        search = _after_trial(search, best, function)
-    return best
+        taken[rows] += 1
+        before = at
+        at, stuck = _line_search(function, before, rows, step, slope)
+        status[stuck] = Status.STUCK
+        pairs = [*pairs, _pair(before, at)][-history:]
+    return Minimum(at.x, at.value, status, taken)
 
 
-def _with_new_directions(
-    search: _Search, best: Minimum, metric: Metric | None, tolerance: float, history: int
-) -> _Search:
+def _downhill(step: Tensor, gradient: Tensor, is_scaled: bool) -> tuple[Tensor, Floats]:
     """
-    Give a new direction to the rows that have moved, or leave those out that have converged.
+    Return steps (B, D), and the predicted changes of the values (B,).
 
-    Status and iterations of `best` are updated.
+    A step uphill is replaced by that along the gradient. Where the scale is unknown, a step has a
+    length of 1 at most.
 
     """
-    moved = search.has_moved.nonzero()[:, 0]
-    if not moved.numel():
-        return search
-    pairs = [*search.pairs, *(_pair(*change) for change in search.changes)]
-    search = search._replace(changes=[], pairs=pairs[-history:])
-    rows, _, value, gradient, *_, pairs = _select(search, moved)
-    step = -_two_loop(gradient, pairs, rows, metric)
-    slope = (gradient * step).sum(1)
-    if not slope.max() < 0:  # uphill, or not a number
-        is_downhill = slope < 0
-        step = torch.where(is_downhill[:, None], step, -gradient)
-        slope = torch.where(is_downhill, slope, -gradient.square().sum(1))
-    if metric is None and not pairs:  # the scale is unknown: a step of length 1 at most
+    slope = _product(gradient, step)
+    is_downhill = slope < 0
+    if not is_downhill.all():  # uphill, or not a number
+        step = torch.where(_column(is_downhill), step, -gradient)
+        slope = np.where(is_downhill, slope, -_product(gradient, gradient))
+    if not is_scaled:
         size = gradient.abs().sum(1).clamp(min=1.0)
         step = step / size[:, None]
-        slope = slope / size
-    has_converged = -slope <= tolerance * (1 + value.abs())
-    best.iterations.index_add_(0, rows, 1 - has_converged.to(rows.dtype))
-    best.status.index_add_(0, rows, int(Status.CONVERGED) * has_converged)
-    if moved.numel() < search.rows.numel():
-        step = search.step.index_copy(0, moved, step)
-        slope = search.slope.index_copy(0, moved, slope)
-    return _running(search._replace(step=step, slope=slope), best)
+        slope = slope / size.numpy()
+    return step, slope
 
 
-def _after_trial(search: _Search, best: Minimum, function: Function) -> _Search:
+def _line_search(
+    function: Function, before: _Points, rows: Ints, step: Tensor, slope: Floats
+) -> tuple[_Points, Ints]:
     """
-    Evaluate one point per row; accept it, or shorten the step.
+    Return the points where a step of each of `rows` ends, and the rows that found no better one.
 
-    Point, value and status of `best` are updated.
+    The steps (B, D) and `slope` (B,), as those `before`, are of all rows; the others stay.
 
     """
-    rows, x, value, gradient, s, slope, _, backtracks, changes, _ = search
-    trial, trial_gradient = function(x + s, rows)
-    y = trial_gradient - gradient
-    s_y = (s * y).sum(1)  # finite where the gradient is
-    is_good = _are_finite(trial, s_y) & (trial <= value + SUFFICIENT_DECREASE * slope)
-    all_good = bool(is_good.all())
-    backtracks = ~is_good * (backtracks + 1)
-    search = search._replace(has_moved=is_good, backtracks=backtracks)
-    if not all_good:
-        best.status.index_add_(0, rows, int(Status.STUCK) * (backtracks == MAX_BACKTRACKS))
-        part = _shorter(slope, trial - value)
-        search = search._replace(step=part[:, None] * s, slope=part * slope)
-        trial = torch.where(is_good, trial, value)
-        s, y = (torch.where(is_good[:, None], change, 0.0) for change in (s, y))
-    search = search._replace(
-        x=x + s, value=trial, gradient=gradient + y, changes=[*changes, (s, y)]
-    )
-    best.x.index_copy_(0, rows, search.x)  # by Armijo's condition never worse than before
-    best.value.index_copy_(0, rows, trial)
-    return search if all_good else _running(search, best)
+    found = before
+    if len(rows) < len(slope):
+        step, slope = step.index_select(0, torch.from_numpy(rows)), slope[rows]
+    for _ in range(MAX_BACKTRACKS):
+        start = before.of(rows)
+        x = start.x + step
+        trial = _Points(x, *function(x, torch.from_numpy(rows)))
+        value, before_step = trial.value.numpy(), start.value.numpy()
+        is_good = (value <= before_step + SUFFICIENT_DECREASE * slope) & _are_finite(trial)
+        if is_good.all():
+            return found.with_rows(rows, trial), rows[:0]
+        good, others = np.flatnonzero(is_good), np.flatnonzero(~is_good)
+        found = found.with_rows(rows[good], trial.of(good))
+        part = _shorter(slope, value - before_step)[others]
+        slope = part * slope[others]
+        step = _column(part) * step.index_select(0, torch.from_numpy(others))
+        rows = rows[others]
+    return found, rows
 
 
-def _pair(s: Tensor, y: Tensor) -> CurvaturePair:
-    """Return the curvature pair of a change of x and gradient."""
-    s_y = (s * y).sum(1)
-    is_curved = s_y > MIN_CURVATURE * vector_norm(s, dim=1) * vector_norm(y, dim=1)
-    return s, y, torch.where(is_curved, 1 / s_y, 0.0)[:, None]
+def _pair(before: _Points, after: _Points) -> CurvaturePair:
+    """Return the curvature pair of a step; of a row that did not move, one without effect."""
+    s, y = after.x - before.x, after.gradient - before.gradient
+    s_y = _product(s, y)
+    is_curved = s_y > MIN_CURVATURE * np.sqrt(_product(s, s) * _product(y, y))
+    return s, y, _column(np.divide(1, s_y, out=np.zeros(len(s_y)), where=is_curved))
 
 
-def _are_finite(value: Tensor, total: Tensor) -> Tensor:
-    """Return which values (b,) and sums (b,) are finite; a sum of finite numbers is."""
-    return (value + total).isfinite()
+def _product(a: Tensor, b: Tensor) -> Floats:
+    """Return the inner products (B,) of vectors (B, D)."""
+    product: Floats = (a * b).sum(1).numpy()
+    return product
 
 
-def _shorter(slope: Tensor, rise: Tensor) -> Tensor:
+def _column(numbers: NDArray[Any]) -> Tensor:
+    """Return a number of each row as a column (B, 1)."""
+    return torch.from_numpy(numbers[:, None])
+
+
+def _are_finite(points: _Points) -> NDArray[np.bool_]:
+    """Return which points (b,) have a finite value and gradient; a sum of finite numbers is."""
+    total = points.value + points.gradient.sum(1)
+    return np.asarray(np.isfinite(total.numpy()))
+
+
+def _shorter(slope: Floats, rise: Floats) -> Floats:
     """Return parts (b,) of steps, by the parabola through the slope and the `rise` at the step."""
     parabola = -slope / (2 * (rise - slope))
-    return parabola.nan_to_num(0.0, 0.0, 0.0).clamp(*STEP_BOUNDS)
+    shortest, longest = STEP_BOUNDS
+    part: Floats = np.fmin(np.fmax(parabola, shortest), longest)  # the shortest of NaN
+    return part
 
 
-def _two_loop(
-    gradient: Tensor, pairs: list[CurvaturePair], rows: Tensor, metric: Metric | None
-) -> Tensor:
+def _two_loop(gradient: Tensor, pairs: list[CurvaturePair], metric: Metric | None) -> Tensor:
     """Return the inverse Hessian approximated by `pairs`, times `gradient`."""
     q = gradient
     alphas = []
@@ -223,7 +233,7 @@ def _two_loop(
         q = q - alpha * y
         alphas.append(alpha)
     if metric is not None:
-        q = metric(q, rows)
+        q = metric(q)
     elif pairs:
         _, y, rho = pairs[-1]
         scale = 1 / (rho * y.square().sum(1, keepdim=True))
@@ -231,19 +241,3 @@ def _two_loop(
     for (s, y, rho), alpha in zip(pairs, reversed(alphas), strict=True):
         q = q + s * (alpha - rho * (y * q).sum(1, keepdim=True))
     return q
-
-
-def _running(search: _Search, best: Minimum) -> _Search:
-    """Return the rows of a search that have not ended."""
-    status = best.status.index_select(0, search.rows)
-    return _select(search, (status == Status.RUNNING).nonzero()[:, 0])
-
-
-def _select(search: _Search, rows: Tensor) -> _Search:
-    """Return `rows`, ascending, of a search; if they are all its rows, the search itself."""
-    if rows.numel() == search.rows.numel():
-        return search
-    *parts, changes, pairs = search
-    parts = [part.index_select(0, rows) for part in parts]
-    changes = [(s[rows], y[rows]) for s, y in changes]
-    return _Search._make([*parts, changes, [(s[rows], y[rows], rho[rows]) for s, y, rho in pairs]])

@@ -238,8 +238,10 @@ class MeasuredTracks:
         self.newest_ns = max(self.newest_ns, boxes.stamp_ns)
         array = MeasuredArray(boxes, self._candidates)
         for row in rows_with_latency(boxes):
-            track = self.by_id.setdefault(boxes.track_ids[row], MeasuredTrack())
-            track.add(array, boxes.boxes[row])
+            name = boxes.track_ids[row]
+            if name not in self.by_id:
+                self.by_id[name] = MeasuredTrack()
+            self.by_id[name].add(array, boxes.boxes[row])
         ended = [name for name, track in self.by_id.items() if track.newest_ns <= oldest_ns]
         for name in ended:
             del self.by_id[name]
@@ -318,9 +320,7 @@ class MeasuredTracks:
 
 def rows_with_latency(boxes: BoxArray) -> list[int]:
     """Return the rows of valid boxes of a track; a pinned box holds at its stamp."""
-    is_valid = is_valid_box(boxes.boxes)
-    if boxes.pinned is not None:
-        is_valid &= ~boxes.pinned
+    is_valid = is_valid_box(boxes.boxes) & ~boxes.is_pinned
     return [row for row in np.flatnonzero(is_valid).tolist() if boxes.track_ids[row]]
 
 

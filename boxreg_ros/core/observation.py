@@ -127,21 +127,9 @@ class Observations(NamedTuple):
 
     def take(self, rows: Ints) -> 'Observations':
         """Return some of the rows (n,), in their order."""
-        counts = self.counts[rows]
-        points = _runs(self.first[rows], counts)
-        return Observations(
-            stamps_ns=self.stamps_ns[rows],
-            boxes=self.boxes[rows],
-            points=self.points[points],
-            delays=self.delays[points],
-            counts=counts,
-            origins=self.origins[rows],
-            ground=self.ground[rows],
-            ring_heights=self.ring_heights[rows],
-            num_points=self.num_points[rows],
-            sights=self.sights[rows],
-            is_pinned=self.is_pinned[rows],
-        )
+        points = _runs(self.first[rows], self.counts[rows])
+        rows_of = {name: points if name in ('points', 'delays') else rows for name in self._fields}
+        return Observations(*(getattr(self, name)[own] for name, own in rows_of.items()))
 
     def relative_to(self, boxes: Floats, shifts: Floats) -> 'Observations':
         """Return these for other `boxes` (n, 9), whose centres are `-shifts` (n, 3) away [m]."""
@@ -187,27 +175,6 @@ class Observation(NamedTuple):
     def delays(self) -> NDArray[np.float32]:
         """Time of each point relative to the stamp, (M,) [s]."""
         return self.table.delays[self._points]
-
-    @property
-    def origins(self) -> Floats:
-        """Sensors that see the object minus centre, (K, 3) [m]; the last repeats."""
-        origins: Floats = self.table.origins[self.row]
-        return origins
-
-    @property
-    def ground(self) -> float:
-        """Height of the road minus z of the centre [m]; NaN where not found."""
-        return float(self.table.ground[self.row])
-
-    @property
-    def num_points(self) -> int:
-        """Sweep points inside the box."""
-        return int(self.table.num_points.item(self.row))
-
-    @property
-    def sight(self) -> float:
-        """When the sweep saw the object, relative to the stamp [s]."""
-        return float(self.table.sights.item(self.row))
 
 
 def observe(

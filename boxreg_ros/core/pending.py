@@ -15,9 +15,9 @@ from math import dist, inf
 from boxreg_ros.config import Config
 from boxreg_ros.core.method.margins import MIN_HITS
 from boxreg_ros.core.motion import motion_at
-from boxreg_ros.core.observation import Observation, Observations
+from boxreg_ros.core.observation import Observation
 from boxreg_ros.core.support import points_to_confirm
-from boxreg_ros.core.tables import by_table, column, joined
+from boxreg_ros.core.tables import rows_of
 from boxreg_ros.core.window import Estimate, Estimates, MarginalisationPrior, PRIOR_POSES
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import (
@@ -144,6 +144,20 @@ class PendingArray:
         if one.is_followed:
             self.followed.append(one.row)
 
+    def _kept(self) -> Estimates:
+        """Return the input boxes as estimates that keep them."""
+        n = len(self.estimates)
+        return Estimates(
+            boxes=self.input.boxes,
+            status=np.full(n, KEPT),
+            reasons=np.array(self.reasons, np.str_),
+            covariances=np.repeat(np.eye(6)[None], n, axis=0),
+            extent_covariances=np.repeat(np.eye(3)[None], n, axis=0),
+            face_distances=np.zeros((n, 6)),
+            near_points=np.zeros((n, 2), np.int64),
+            kinematics=np.zeros(n, KINEMATICS),
+        )
+
     def result(self, is_final: bool) -> RefinedBoxes:
         """
         Return the present estimates as copies; without an estimate, the input box.
@@ -152,29 +166,19 @@ class PendingArray:
 
         """
         n = len(self.estimates)
-        columns = Estimates(
-            boxes=self.input.boxes.copy(),
-            status=np.full(n, KEPT, object),
-            reasons=np.array(self.reasons, object),
-            covariances=np.repeat(np.eye(6)[None], n, axis=0),
-            extent_covariances=np.repeat(np.eye(3)[None], n, axis=0),
-            face_distances=np.zeros((n, 6)),
-            near_points=np.zeros((n, 2), np.int64),
-            kinematics=np.zeros(n, KINEMATICS),
-        )
-        known = {row: found for row, found in enumerate(self.estimates) if found is not None}
-        estimated = np.array([*known], int)
-        for table, places, rows in by_table([*known.values()]):
-            for values, estimates in zip(columns, table, strict=True):
-                values[estimated[places]] = estimates[rows]
+        found = [one for one in self.estimates if one is not None]
+        if len(found) < n or not n:
+            kept = self._kept()
+            found = [one or (kept, row) for row, one in enumerate(self.estimates)]
+        columns: Estimates = rows_of(found) if found else kept
         is_returned = columns.status == REFINED
         is_returned[: self.num_given] = True
         is_returned[self.followed] = True
-        columns.status[self.num_given :] = COASTED
+        added = (COASTED,) * (n - self.num_given)
         whole = RefinedBoxes(
             replace(self.input, boxes=columns.boxes, kinematics=columns.kinematics),
-            tuple(columns.status.tolist()),
-            tuple(map(str, columns.reasons)),
+            (*columns.status[: self.num_given].tolist(), *added),
+            tuple(columns.reasons.tolist()),
             self.num_points.copy(),
             columns.covariances,
             is_final,
@@ -200,8 +204,6 @@ class PendingBox:
     observation: Observation = field(init=False)
     place: list[float] = field(init=False)
     """x y z length of the box as plain numbers, of which motion is computed [m]."""
-    estimate: tuple[Estimates | Observations, int] | None = None
-    """Row of a table with `boxes`, which the next window starts from."""
     is_settled: bool = False
 
     def settle(self) -> None:
@@ -218,6 +220,8 @@ class ObservedTrack:
     track_id: str
     class_name: str
     entries: list[PendingBox] = field(default_factory=list)
+    starts: Floats = field(default_factory=lambda: np.zeros((0, 9)))
+    """Boxes that the next window starts from, of the first entries."""
     prior: MarginalisationPrior | None = None
     num_carried: int = 0
     """Newest observations that were in no window yet, because the budget was used up."""
@@ -244,12 +248,19 @@ class ObservedTrack:
 
         """
         self.num_carried += 1
-        before, newest = self.entries[-2:]
+        newest = self.entries[-1]
         newest.array.reasons[newest.row] = Reason.BUDGET
-        if before.estimate is not None:  # else the track is cold: its first window is to come
-            newest.estimate = newest.observation
+        if len(self.starts) == len(self.entries) - 1:  # else its first window is to come
+            self.starts = np.vstack([self.starts, newest.observation.box])
+        excess = slice(PRIOR_POSES, PRIOR_POSES + max(0, len(self.entries) - length))
+        del self.entries[excess]
+        self.starts = np.delete(self.starts, excess, axis=0)
+
+    def forget(self, length: int) -> None:
+        """Leave only the last `length` observations to the next window."""
         excess = max(0, len(self.entries) - length)
-        del self.entries[PRIOR_POSES : PRIOR_POSES + excess]
+        self.entries = self.entries[excess:]
+        self.starts = self.starts[excess:]
 
     def coasts(self, stamp_ns: int, config: Config) -> bool:
         """Return whether a box may be predicted at a stamp without a detection."""
@@ -262,9 +273,9 @@ class ObservedTrack:
 
     def predicted(self, stamp_ns: int, config: Config) -> Floats:
         """Return the box (9,) at a stamp by the motion of the newest estimates."""
-        stamps_ns = np.array([entry.observation.stamp_ns for entry in self.entries])
-        tables, rows = joined([entry.estimate or entry.observation for entry in self.entries])
-        boxes = column(tables, 'boxes')[rows]
+        seen = [entry.observation for entry in self.entries]
+        stamps_ns = np.array([one.stamp_ns for one in seen])
+        boxes = np.array([*self.starts, *(one.box for one in seen[len(self.starts) :])])
         motion = motion_at(stamps_ns, boxes, -1, config.class_config(self.class_name))
         return motion.predict(stamp_ns)
 
@@ -292,16 +303,21 @@ class ObservedTrack:
             if dist(entry.place[:2], (x, y)) < gate:
                 return None
         moved = [copy(entry) for entry in self.entries[-2:]]
-        for entry in moved:
-            entry.estimate = None
         del self.entries[-2:]
+        self.starts = self.starts[: len(self.entries)]
         return ObservedTrack(self.track_id, self.class_name, moved, detected_ns=self.detected_ns)
 
-    def write(self, estimate: Estimate, entries: list[PendingBox]) -> None:
-        """Pass the estimate of the window of `entries` to the box arrays that are not settled."""
-        self.prior = estimate.prior
+    def write(self, estimate: Estimate, entries: list[PendingBox], length: int) -> None:
+        """
+        Pass the estimate of the window of `entries` to the box arrays that are not settled.
+
+        The next window begins with the last `length` of them.
+
+        """
         self.num_carried = 0
-        for row, entry in enumerate(entries, estimate.begin):
-            entry.estimate = found = estimate.table, row
+        table, begin, end, self.prior = estimate
+        first = max(begin, end - length)
+        self.starts = table.boxes[first : min(first + len(self.entries), end)]
+        for row, entry in enumerate(entries, begin):
             if not entry.is_settled:
-                entry.array.estimates[entry.row] = found
+                entry.array.estimates[entry.row] = table, row

@@ -8,16 +8,18 @@ numbers each and the shared variables s of `method.arrays`, the same for all obs
 
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import chain
+from itertools import repeat
 from typing import NamedTuple
 
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, GAP, PIVOT, POSE, PRIOR, SHARED
 from boxreg_ros.core.method.constants import CONSTANTS
-from boxreg_ros.core.method.headings import resolve_headings
+from boxreg_ros.core.method.expectation import fill_all_mean_extents
+from boxreg_ros.core.method.headings import align, correct_flips
 from boxreg_ros.core.observation import Observations
+from boxreg_ros.core.tables import stacked
 from boxreg_ros.core.window import MarginalisationPrior, Window
-from boxreg_ros.structures import Floats, Ints, ROLL, YAW
+from boxreg_ros.structures import Floats, Ints, YAW
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,8 +29,6 @@ MAX_BATCH_VALUES = 3e7
 """Most point coordinates, or entries of the Hessian, in a batch; derived: 240 MB as float64."""
 VALUES_PER_POINT = 18
 """Values held per point while a batch is solved; estimated from the temporary arrays."""
-PRIOR_ANGLES = [3, 4, 5, 9, 10, 11]
-"""Angles among the variables of the marginalisation prior: of its two poses."""
 NO_RANGE = np.array([[np.inf] * 3, [-np.inf] * 3])
 """Range of the extents of a track before its first window is full."""
 NO_PRIOR = (
@@ -109,10 +109,10 @@ class Problem(NamedTuple):
     pinned: NDArray[np.bool_]
     """(B, N), whether a person has corrected a box."""
     prior_mean: Floats
-    """(B, 35), minimum of the marginalisation prior (M9), on the two oldest poses and the
+    """(B, 29), minimum of the marginalisation prior (M9), on the two oldest poses and the
     shared variables."""
     prior_information: Floats
-    """(B, 35, 35), of that prior; 0 without one."""
+    """(B, 29, 29), of that prior; 0 without one."""
     marginalised_extents: Floats
     """(B, 4), sum of the input extents of marginalised observations [m], and the number of
     these."""
@@ -152,9 +152,9 @@ class Problem(NamedTuple):
 
         """
         lengths = np.array(list(map(len, columns)))
-        column = np.repeat([[of_window[-1]] for of_window in columns], lengths.max(), axis=1)
-        valid = np.indices(column.shape)[1] < lengths[:, None]
-        column[valid] = list(chain.from_iterable(columns))
+        most = lengths.max()
+        padded = [[*part, *repeat(part[-1], most - len(part))] for part in columns]
+        column, valid = np.array(padded), np.arange(most) < lengths[:, None]
         rows = np.array(windows)
         row = rows[:, None]
         b = len(rows)
@@ -189,31 +189,33 @@ class Problem(NamedTuple):
         Of windows with pinned boxes the mean extents of these.
 
         """
-        has_pin = self.pinned.any(1, keepdims=True)
-        counted = np.where(has_pin, self.pinned, self.valid)[..., None]
-        marginalised = np.where(has_pin, 0.0, self.marginalised_extents)
-        total = (self.boxes[..., 3:6] * counted).sum(1) + marginalised[:, :3]
-        mean: Floats = total / (counted.sum(1) + marginalised[:, 3:])
-        return mean
+        means = np.empty((len(self.boxes), 3))
+        fill_all_mean_extents(self, means)
+        return means
 
-    def expected_shared(self, inputs: NDArray[np.void]) -> Floats:
+    def expected_shared(self, inputs: NDArray[np.void], number: int = SHARED) -> Floats:
         """
-        Return the means of the shared variables without a population, (B, 23).
+        Return the means of a `number` S of shared variables without a population, (B, S).
 
         `inputs` (K,) are records `INPUTS`.
 
         """
-        shared = np.zeros((len(self.boxes), SHARED))
+        shared = np.zeros((len(self.boxes), number))
         shared[:, EXTENT:BIAS] = self.mean_extents()
         shared[:, GAP:PIVOT] = self.of_class['gaps'] + inputs['margin'][self.kind]
         shared[:, PIVOT] = shared[:, EXTENT] * CONSTANTS.pivot
         return shared
 
-    def free_variables(self, config: Config) -> Floats:
-        """Return 1 for every variable (B, 6 N + 23) that is estimated, 0 for those held fixed."""
+    def free_variables(self, config: Config, number: int = SHARED) -> Floats:
+        """
+        Return 1 for every variable (B, 6 N + S) that is estimated, 0 for those held fixed.
+
+        `number` is that of the shared variables, S.
+
+        """
         B, N = self.counts.shape
         pose = np.repeat(self.valid[..., None].astype(np.float64), POSE, axis=2)
-        shared = np.ones((B, SHARED))
+        shared = np.ones((B, number))
         if config.mode == 'bev':
             pose[..., [2, 3, 4]] = 0.0
             shared[:, 2] = 0.0
@@ -268,20 +270,17 @@ def stack_windows(
     elapsed = (seen.stamps_ns[rows] - seen.stamps_ns[rows[:, :1]]) * 1e-9
     times = elapsed + PADDING_PERIOD * np.maximum(column - last, 0)
     priors = [w.prior or _no_prior(w.observations[0].box[:3]) for w in windows]
-    base, state, step, information, extents, _ = (
-        np.array(part) for part in zip(*priors, strict=True)
-    )
+    base, state, step, information, extents = map(stacked, list(zip(*priors, strict=True))[:5])
     if config.ingredients.heading_sign:
-        boxes[..., ROLL:] = _resolved_angles(boxes, times, lengths, pinned, state[:, 5].copy())
+        correct_flips(boxes, times, lengths, pinned, np.ascontiguousarray(state[:, 5]))
     else:
         boxes[..., YAW] = np.unwrap(boxes[..., YAW])
     start = _starting_boxes(windows, boxes)
+    minimum = state + step
+    align(boxes, start, state, minimum, information)
     boxes[..., :3] -= base[:, None]
     start[..., :3] -= base[:, None]
-    minimum, is_usable = _prior_minimum(start, state, step)
-    information *= decay * is_usable[:, None, None]
-    if not config.ingredients.marginalisation:
-        information[:] = 0.0
+    information *= decay if config.ingredients.marginalisation else 0.0
     kind, of_class = _of_classes(windows, config)
     delays = _delays(seen, config)
     problem = Problem(
@@ -299,7 +298,7 @@ def stack_windows(
         stride=1,
         is_moving=bool(delays.any()),
         pinned=pinned,
-        prior_mean=np.nan_to_num(minimum),
+        prior_mean=minimum,
         prior_information=information,
         marginalised_extents=extents,
         kind=kind,
@@ -320,55 +319,13 @@ def _delays(seen: Observations, config: Config) -> NDArray[np.float32]:
     return seen.delays
 
 
-def _resolved_angles(
-    boxes: Floats,
-    times: Floats,
-    lengths: Ints,
-    pinned: NDArray[np.bool_],
-    known_yaw: Floats,
-) -> Floats:
-    """
-    Return roll, pitch and yaw (B, N, 3) of `boxes` (B, N, 9) with 180° flips corrected.
-
-    A pinned box decides on the heading of its window.
-
-    """
-    yaw = np.empty(times.shape)
-    resolve_headings(boxes, times, lengths, known_yaw, yaw)
-    is_contrary = np.any(pinned & (np.cos(yaw - boxes[..., YAW]) < 0), axis=1, keepdims=True)
-    yaw = np.where(is_contrary, yaw + np.pi, yaw)
-    # A half turn about the z axis of the box changes the signs of roll and pitch.
-    is_same = np.sign(np.cos(yaw - boxes[..., YAW]))
-    tilt = boxes[..., ROLL:YAW] * is_same[..., None]
-    return np.concatenate([(tilt + np.pi) % (2 * np.pi) - np.pi, yaw[..., None]], axis=-1)
-
-
 def _starting_boxes(windows: Sequence[Window], boxes: Floats) -> Floats:
     """Return where the search starts (B, N, 9): earlier estimates, else the input `boxes`."""
     start = boxes.copy()
     lengths = np.array([len(window.start) for window in windows])
     is_known = np.arange(boxes.shape[1]) < lengths[:, None]
     start[is_known] = np.concatenate([window.start for window in windows])
-    # Whole turns, and half turns of yaw: a kept box is returned with the heading of its input.
-    period = np.pi * np.array([2, 2, 1])
-    start[..., ROLL:] += period * np.round((boxes[..., ROLL:] - start[..., ROLL:]) / period)
     return start
-
-
-def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """
-    Return the minimum of each prior (B, 35), and which priors fit the present headings (B,).
-
-    Angles are moved by half turns to those of `start` (B, N, 9). A prior that an odd number of
-    them is needed for holds for the other heading sign.
-
-    """
-    B, N = start.shape[:2]
-    angles = start[:, [0, 1 % N], ROLL:].reshape(B, len(PRIOR_ANGLES))
-    half_turns = np.rint((angles - state[:, PRIOR_ANGLES]) / np.pi)
-    minimum = state + step
-    minimum[:, PRIOR_ANGLES] += np.pi * half_turns
-    return minimum, np.asarray((half_turns % 2 == 0).all(1))
 
 
 @lru_cache(maxsize=4)
@@ -384,6 +341,7 @@ def settings_of_kinds(config: Config) -> NDArray[np.void]:
 
 def _of_classes(windows: Sequence[Window], config: Config) -> tuple[Ints, NDArray[np.void]]:
     """Return kind (B,) and settings of the class of each window."""
-    kinds = {name: config.kind(name) for name in {window.class_name for window in windows}}
-    kind = np.array([KINDS.index(kinds[window.class_name]) for window in windows])
+    names = [window.class_name for window in windows]
+    kind_of = {name: KINDS.index(config.kind(name)) for name in set(names)}
+    kind = np.array([kind_of[name] for name in names])
     return kind, settings_of_kinds(config)[kind]

@@ -22,6 +22,7 @@ from boxreg_ros.structures import (
     Ints,
     is_valid_box,
     KINEMATICS,
+    on_lines,
     RefinedBoxes,
     ROLL,
     Sweep,
@@ -326,7 +327,6 @@ def _interpolated(stamps_ns: Ints, boxes: Floats, wanted_ns: Ints) -> Floats:
     """Return `boxes` (N, 9) of `stamps_ns` (N,) interpolated linearly at `wanted_ns`."""
     unwrapped = boxes.copy()
     unwrapped[:, ROLL:] = np.unwrap(boxes[:, ROLL:], axis=0)
-    columns = [np.interp(wanted_ns, stamps_ns, column) for column in unwrapped.T]
-    found = np.stack(columns, axis=1)
+    found = on_lines(stamps_ns, unwrapped, wanted_ns)
     found[:, ROLL:] = wrap_angle(found[:, ROLL:])
     return found

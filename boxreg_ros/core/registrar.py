@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import accumulate, chain
+from itertools import chain
 from math import ceil, inf
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from boxreg_ros.core.observation import Observation, observe
 from boxreg_ros.core.pending import ObservedTrack, PendingArray, PendingBox
 from boxreg_ros.core.problem import SETTINGS_OF
 from boxreg_ros.core.support import is_owned, points_inside
-from boxreg_ros.core.tables import by_table, column, joined
+from boxreg_ros.core.tables import by_table
 from boxreg_ros.core.window import Estimate, PRIOR_POSES, Window
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, RefinedBoxes, Sweep, X, Z
@@ -368,6 +368,8 @@ class BoxRegistrar:
         if len(confirmed) < len(coasting):
             # A box that is not confirmed owns no points.
             self.counts[Reason.COAST_UNCONFIRMED] += len(coasting) - len(confirmed)
+            if not (given or confirmed):
+                return
             seen, velocities = self._seen([*given, *confirmed], boxes, sweep)
         self.box_time.add(seen[: len(given)], velocities[: len(given)])
         for track, one in confirmed:
@@ -521,7 +523,7 @@ class BoxRegistrar:
         config = self.box_time.resolved(self.config)
         self._get_estimates = submit(windows, config, self._input_model)
         for track in tracks:
-            track.entries = track.entries[-self._num_overlapping :]
+            track.forget(self._num_overlapping)
         self._ended_tracks = []
         self._arrays_since_solve = 0
         goes_on = self.config.estimate == 'track' and self._submit is not None
@@ -533,7 +535,7 @@ class BoxRegistrar:
         estimates = self._get_estimates()
         for (track, entries, is_ended), estimate in zip(self._submitted, estimates, strict=True):
             if estimate is not None:
-                track.write(estimate, entries)
+                track.write(estimate, entries, self._num_overlapping)
             settled = entries if is_ended else entries[: -self._num_unsettled]
             for entry in settled:
                 entry.settle()
@@ -559,17 +561,14 @@ class BoxRegistrar:
 
 def _windows(tracks: Sequence[ObservedTrack]) -> list[Window]:
     """Return for each track the window of all observations that it holds."""
-    known = [[e.estimate for e in track.entries if e.estimate is not None] for track in tracks]
-    tables, rows = joined(list(chain.from_iterable(known)))
-    starts = column(tables, 'boxes')[rows] if tables else np.zeros((0, 9))
-    ends = list(accumulate(map(len, known)))
     windows = []
-    for track, begin, end in zip(tracks, [0, *ends], ends, strict=False):
+    for track in tracks:
         observations = [entry.observation for entry in track.entries]
-        num_new = len(observations) - (end - begin)
-        start = starts[begin:end]
+        num_new = len(observations) - len(track.starts)
         windows.append(
-            Window(track.track_id, track.class_name, observations, num_new, start, track.prior)
+            Window(
+                track.track_id, track.class_name, observations, num_new, track.starts, track.prior
+            )
         )
     return windows
 

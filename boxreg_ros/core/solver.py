@@ -15,7 +15,7 @@ from boxreg_ros.core.input_model import InputModel, Inputs
 from boxreg_ros.core.input_noise import normalised_residuals
 from boxreg_ros.core.lbfgs import HISTORY, minimize
 from boxreg_ros.core.method import round as method
-from boxreg_ros.core.method.arrays import BIAS, EXTENT, Posterior, PRIOR, SHARED, Solution
+from boxreg_ros.core.method.arrays import ANCHOR, BIAS, EXTENT, Posterior, PRIOR, SHARED, Solution
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.problem import Problem
 from boxreg_ros.core.threads import run, shared_between
@@ -74,7 +74,7 @@ class Batch(NamedTuple):
 
     problem: Problem
     free: Floats
-    """(B, 6 N + 23), 1 for variables that are estimated."""
+    """(B, 6 N + S), 1 for variables that are estimated."""
     sums: method.Sums
     """The sums of residuals of the round."""
     solution: Solution
@@ -130,12 +130,13 @@ def solve(
 def start(problem: Problem, config: Config, plan: SolverPlan, inputs: Inputs) -> Batch:
     """Return a batch where the first round starts, without covariances and prior."""
     B, N = problem.counts.shape
-    free = problem.free_variables(config)
-    shared = problem.expected_shared(inputs)
+    number = SHARED if plan.uses_rigid_shape else ANCHOR
+    free = problem.free_variables(config, number)
+    shared = problem.expected_shared(inputs, number)
     evidence = np.zeros((B, 3, 3))
     evidence[:, 0] = np.log(shared[:, EXTENT:BIAS])
     if plan.starts_from_fit:
-        is_free = free[:, -SHARED:][:, EXTENT:BIAS]
+        is_free = free[:, -number:][:, EXTENT:BIAS]
         shared[:, EXTENT:BIAS] += is_free * (problem.start[:, 0, 3:6] - shared[:, EXTENT:BIAS])
     leaving = B if plan.marginalises and config.window == N else 0
     solution = Solution(
@@ -148,7 +149,7 @@ def start(problem: Problem, config: Config, plan: SolverPlan, inputs: Inputs) ->
         np.full((leaving, PRIOR, PRIOR), np.nan),
     )  # fmt: skip
     prior = problem.prior_mean, problem.prior_information
-    return Batch(problem, free, method.empty_sums(B, N, *prior), solution)
+    return Batch(problem, free, method.empty_sums(B, N, number, *prior), solution)
 
 
 @torch.inference_mode()
@@ -175,7 +176,7 @@ def run_round(
     b, D = len(rows), free.shape[1]
     x, value, gradient = np.empty((b, D)), np.empty(b), np.empty((b, D))
     run(
-        method.begin, b, rows, problem, problem.thinned(constants.shape_points), inputs, free,
+        method.begin, 70, b, rows, problem, problem.thinned(constants.shape_points), inputs, free,
         record, solution.poses, solution.shared, sums, x, value, gradient,
     )  # fmt: skip
     objective = Objective(rows, free, sums)
@@ -186,7 +187,7 @@ def run_round(
     )  # fmt: skip
     is_done = np.empty(b, bool)
     run(
-        method.end, b, rows, found.x.numpy(), problem, free, record, sums, solution,
+        method.end, 30, b, rows, found.x.numpy(), problem, free, record, sums, solution,
         turn + 1 >= plan.rounds, turn > 0, is_done,
     )  # fmt: skip
     return is_done
@@ -201,16 +202,15 @@ class Objective(NamedTuple):
 
     def value_and_gradient(self, x: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
         """Return values (p,) and gradients (p, D) of the windows `rows[part]` at x (p, D)."""
-        value, gradient = torch.empty(len(x), dtype=x.dtype), torch.empty_like(x)
+        value, gradient = np.empty(len(x)), np.empty(x.shape)
         run(
-            method.evaluate, len(x), self.rows[part.numpy()], x.contiguous().numpy(), self.free,
-            self.sums, value.numpy(), gradient.numpy(),
+            method.evaluate, 8, len(x), self.rows[part.numpy()], x.contiguous().numpy(), self.free,
+            self.sums, value, gradient,
         )  # fmt: skip
-        return value, gradient
+        return torch.from_numpy(value), torch.from_numpy(gradient)
 
-    def metric(self, vectors: Tensor, part: Tensor) -> Tensor:
-        """Return the inverse Gauss-Newton curvature times `vectors` (p, D)."""
-        found = vectors.clone()
-        run(method.precondition, len(found), self.rows[part.numpy()], self.sums.factor,
-            found.numpy())  # fmt: skip
-        return found
+    def metric(self, vectors: Tensor) -> Tensor:
+        """Return the inverse Gauss-Newton curvature times `vectors` (b, D)."""
+        found = vectors.numpy().copy()
+        run(method.precondition, 1.6, len(found), self.rows, self.sums.factor, found)
+        return torch.from_numpy(found)

@@ -7,27 +7,11 @@ of a table and a row in it: many small arrays take longer to stack than a few la
 """
 
 from collections.abc import Sequence
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from typing import Any
 
-from boxreg_ros.structures import Ints
+from boxreg_ros.structures import Floats, Ints
 import numpy as np
-
-
-def joined(items: Sequence[tuple[Any, int]]) -> tuple[list[Any], Ints]:
-    """
-    Return the different tables of some items, in the order of their first item.
-
-    And the row (n,) of each item in their concatenation.
-
-    """
-    owners, rows = zip(*items, strict=True) if items else ((), ())
-    ids = list(map(id, owners))
-    of_id = dict(zip(ids, owners, strict=True))
-    lengths = [len(table[0]) for table in of_id.values()]
-    first = dict(zip(of_id, accumulate(lengths, initial=0), strict=False))
-    before = np.array([first[number] for number in ids], int)
-    return list(of_id.values()), before + np.array(rows, int)
 
 
 def by_table(items: Sequence[tuple[Any, int]]) -> list[tuple[Any, Ints, Ints]]:
@@ -36,7 +20,9 @@ def by_table(items: Sequence[tuple[Any, int]]) -> list[tuple[Any, Ints, Ints]]:
     ids = list(map(id, owners))
     of_id = dict(zip(ids, owners, strict=True))
     numbers = dict(zip(of_id, range(len(of_id)), strict=True))
-    number, row = np.array([numbers[i] for i in ids], int), np.array(rows, int)
+    kind = np.min_scalar_type(len(of_id))  # small numbers are fast to sort
+    number = np.fromiter(map(numbers.__getitem__, ids), kind, len(ids))
+    row = np.fromiter(rows, int, len(ids))
     order = np.argsort(number, kind='stable')
     ends = np.cumsum(np.bincount(number, minlength=len(of_id))).tolist()
     parts = [order[begin:end] for begin, end in pairwise([0, *ends])]
@@ -47,3 +33,22 @@ def column(tables: Sequence[Any], name: str) -> Any:
     """Return the field `name` of the concatenation of `tables`; of one table, no copy."""
     parts = [getattr(table, name) for table in tables]
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def stacked(arrays: Sequence[Floats]) -> Floats:
+    """Return n arrays of one shape, at least one, as one (n, ...): faster than `np.stack`."""
+    whole: Floats = np.concatenate(arrays).reshape(len(arrays), *arrays[0].shape)
+    return whole
+
+
+def rows_of(items: Sequence[tuple[Any, int]]) -> Any:
+    """Return the rows of some items, at least one, as one table in their order."""
+    parts = by_table(items)
+    table, _, rows = parts[0]
+    if len(parts) == 1:
+        return table._make(part[rows] for part in table)
+    back = np.argsort(np.concatenate([places for _, places, _ in parts]))
+    return table._make(
+        np.concatenate([getattr(owner, name)[rows] for owner, _, rows in parts])[back]
+        for name in table._fields
+    )

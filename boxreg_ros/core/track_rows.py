@@ -32,32 +32,37 @@ class TrackRows:
 
     def seen(self, track_ids: Sequence[str]) -> tuple[Ints, Ints]:
         """
-        Mark different tracks as seen now, and make rows for the new ones.
+        Mark tracks as seen now, and make rows for the new ones.
 
         Returns which of `track_ids` are kept, (m,), and their rows in `arrays`, (m,).
 
         """
+        new_ids = []
         for track_id in track_ids:
-            if track_id in self._row_of:
-                self._row_of[track_id] = self._row_of.pop(track_id)
-        together = set(track_ids)
-        for track_id in track_ids:
-            if track_id not in self._row_of:
-                self._give_row(track_id, together)
-        new = np.repeat(self._fresh, len(self._row_of) - len(self.arrays), axis=0)
-        if len(new):
+            row = self._row_of.pop(track_id, None)
+            if row is None:
+                new_ids.append(track_id)
+            else:
+                self._row_of[track_id] = row
+        together = set(track_ids) if new_ids else set[str]()
+        for track_id in new_ids:
+            if track_id not in self._row_of and not self._takes_row(track_id, together):
+                break  # nor do those after it
+        if len(self._row_of) > len(self.arrays):
+            new = np.repeat(self._fresh, len(self._row_of) - len(self.arrays), axis=0)
             self.arrays = np.concatenate([self.arrays, new])
         rows = np.array([self._row_of.get(track_id, -1) for track_id in track_ids], int)
         places = np.flatnonzero(rows >= 0)
         return places, rows[places]
 
-    def _give_row(self, track_id: str, together: set[str]) -> None:
-        """Give a new track a row, unless all others are seen `together` with it."""
-        if len(self._row_of) < self._capacity:
-            self._row_of[track_id] = len(self._row_of)
-            return
-        longest_ago = next(iter(self._row_of))
-        if longest_ago not in together:
+    def _takes_row(self, track_id: str, together: set[str]) -> bool:
+        """Give a new track a row, unless all others are seen `together` with it; return if so."""
+        row = len(self._row_of)
+        if row == self._capacity:
+            longest_ago = next(iter(self._row_of))
+            if longest_ago in together:
+                return False
             row = self._row_of.pop(longest_ago)
-            self._row_of[track_id] = row
             self.arrays[row] = self._fresh[0]
+        self._row_of[track_id] = row
+        return True

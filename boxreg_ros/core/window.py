@@ -25,18 +25,18 @@ class MarginalisationPrior(NamedTuple):
     Quadratic prior on a window from observations that have been marginalised.
 
     Its variables are the poses of the two oldest observations and the parameters that all
-    observations of a track share (35 in all).
+    observations of a track share (29 in all).
 
     """
 
     base: Floats
     """(3,), fixed origin of all positions of the track, in the fixed frame [m]."""
     state: Floats
-    """(35,), linearisation point: the variables when the last observation was marginalised."""
+    """(29,), linearisation point: the variables when the last observation was marginalised."""
     step: Floats
-    """(35,), minimum of the quadratic form minus `state`."""
+    """(29,), minimum of the quadratic form minus `state`."""
     information: Floats
-    """(35, 35), Hessian of the quadratic form."""
+    """(29, 29), Hessian of the quadratic form."""
     marginalised_extents: Floats
     """(4,), sum of the input extents of marginalised observations [m], and their number."""
     extent_range: Floats
@@ -83,7 +83,7 @@ class Estimates(NamedTuple):
     status: NDArray[np.str_]
     """(n,), ``refined`` or ``kept``."""
     reasons: NDArray[np.str_]
-    """(n,), one of `KEPT_REASONS` for kept boxes, '' for refined ones."""
+    """(n,), one of `KEPT_REASONS`, '' for refined ones."""
     covariances: Floats
     """(n, 6, 6), of x y z roll pitch yaw [m, rad]; the identity for kept boxes."""
     extent_covariances: Floats
@@ -107,27 +107,3 @@ class Estimate(NamedTuple):
     """The row after its last."""
     prior: MarginalisationPrior | None = None
     """For the next window, if this one is full and was solved."""
-
-    @property
-    def boxes(self) -> Floats:
-        """Boxes of the window, (N, 9) [m, rad]."""
-        return self.table.boxes[self._rows]
-
-    @property
-    def status(self) -> tuple[str, ...]:
-        """``refined`` or ``kept``, N of them."""
-        return tuple(self.table.status[self._rows].tolist())
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """Why boxes are kept, N of them."""
-        return tuple(self.table.reasons[self._rows].tolist())
-
-    @property
-    def covariances(self) -> Floats:
-        """Covariances of the poses, (N, 6, 6) [m, rad]."""
-        return self.table.covariances[self._rows]
-
-    @property
-    def _rows(self) -> slice:
-        return slice(self.begin, self.end)

@@ -3,9 +3,8 @@
 from dataclasses import replace
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.articulation import changes_shape, extent_ranges
-from boxreg_ros.core.estimation import estimate_windows
 from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.method.articulation import changes_shape, extent_ranges
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.problem import NO_RANGE
 from boxreg_ros.reasons import Reason
@@ -13,10 +12,10 @@ from boxreg_ros.simulation.simulate import simulate
 from measure.drives import Drive
 import numpy as np
 import pytest
-from scenes import drive, problem_of, track_of, window_of
+from scenes import drive, solved, track_of, window_of
 
 LIVE = Config().updated({'estimate': 'final'})
-DEVIATION = np.array([0.05])
+DEVIATION, GATE = 0.05, 3.0
 
 
 def boxes_with(extents):
@@ -25,27 +24,30 @@ def boxes_with(extents):
     return np.hstack([np.zeros_like(extents), extents, np.zeros_like(extents)])
 
 
+def ranges_of(extents, past=NO_RANGE, length=None):
+    """Return the range of these extents (n, 3), of which the first ones are no padding."""
+    ranges = past.copy()
+    extent_ranges(boxes_with(extents), length or len(extents), 10, ranges)
+    return ranges
+
+
 def is_flexible(extents):
-    boxes = boxes_with(extents)
-    ranges = extent_ranges(problem_of(boxes[None]), NO_RANGE[None], 10)
-    return bool(changes_shape(ranges, DEVIATION)[0])
+    return changes_shape(ranges_of(extents), DEVIATION, GATE)
 
 
 def test_ranges_are_those_of_medians():
     rng = np.random.default_rng(0)
     extents = [12, 2.5, 3.5] * np.exp(rng.normal(0, 0.1, (40, 3)))
-    problem = problem_of(boxes_with(extents)[None], lengths=[35])  # the last five are padding
-    (found,) = extent_ranges(problem, NO_RANGE[None], 10)
+    found = ranges_of(extents, length=35)  # the last five are padding
     medians = np.array([np.median(np.log(extents[i : i + 10]), axis=0) for i in range(26)])
     np.testing.assert_allclose(found, [medians.min(0), medians.max(0)])
-    past = np.array([[[2.0, 2.0, 2.0], [3.0, 0.0, 3.0]]])
-    (longer,) = extent_ranges(problem, past, 10)
+    longer = ranges_of(extents, np.array([[2.0, 2.0, 2.0], [3.0, 0.0, 3.0]]), length=35)
     np.testing.assert_array_equal(
         longer, [np.minimum(found[0], 2), np.maximum(found[1], [3, 0, 3])]
     )
-    short = extent_ranges(problem_of(boxes_with(extents[:9])[None]), NO_RANGE[None], 10)
-    np.testing.assert_array_equal(short, NO_RANGE[None])
-    assert not changes_shape(short, DEVIATION)
+    short = ranges_of(extents[:9])
+    np.testing.assert_array_equal(short, NO_RANGE)
+    assert not changes_shape(short, DEVIATION, GATE)
 
 
 def test_only_a_width_that_changes_alone_is_a_bend():
@@ -79,7 +81,7 @@ def test_a_body_once_seen_to_bend_is_kept_by_later_windows():
             observations=whole.observations[first : first + 10], num_new=10 - len(start),
             start=start, prior=prior,
         )  # fmt: skip
-        (found,) = estimate_windows([one], LIVE, InputModel(LIVE.faces))
+        (found,) = solved([one], LIVE, InputModel(LIVE.faces))
         prior, start = found.prior, found.boxes[1:]
         reasons.append(set(found.reasons))
     assert reasons[:5] == [{''}] * 5

@@ -53,7 +53,7 @@ def test_points_on_the_faces_decide(known):
     velocity = np.array([30.0, 0, 0])
     found = seen(known, velocity, -0.04)
     few = observation(
-        boxes=BOX, points=found.points[1:], delays=found.delays[1:], sights=found.sight
+        boxes=BOX, points=found.points[1:], delays=found.delays[1:], sights=found.sights
     )
     for _ in range(MIN_VOTES):
         evidence.add([found], 0.1 * velocity[None])  # slow

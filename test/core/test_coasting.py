@@ -114,11 +114,15 @@ def test_without_the_setting_no_box_is_added_and_others_do_not_change(truth):
         np.testing.assert_array_equal(a.boxes.boxes, b.boxes.boxes)
 
 
-def test_a_box_without_confirming_points_is_not_added(truth):
-    results, counts = run(truth, config_with(), misses_a, gone=misses_a)
+@pytest.mark.parametrize('names', ['a', 'ab'])
+def test_a_box_without_confirming_points_is_not_added(truth, names):
+    def is_missed(name, step):
+        return name in names and step in MISSED
+
+    results, counts = run(truth, config_with(), is_missed, gone=is_missed)
     assert not coasted(results, True)
     assert not coasted(results, False)
-    assert counts['coast_unconfirmed'] == len(MISSED)
+    assert counts['coast_unconfirmed'] == len(names) * len(MISSED)
 
 
 def test_a_track_coasts_no_longer_than_the_setting(truth):

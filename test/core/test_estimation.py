@@ -5,7 +5,6 @@ from threading import Event
 
 from boxreg_ros.config import Config
 from boxreg_ros.core import paper, solver
-from boxreg_ros.core.estimation import estimate_windows
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.lbfgs import minimize, Minimum
 from boxreg_ros.core.method import round as method
@@ -18,7 +17,7 @@ from boxreg_ros.structures import POSE
 import numpy as np
 import pytest
 from reference import objective
-from scenes import changed, drive, EXTENT, track_of, window_of
+from scenes import changed, drive, EXTENT, solved, track_of, window_of
 import torch
 
 D = torch.float64
@@ -67,9 +66,7 @@ def test_constant_errors_of_extents_are_corrected():
         track = track_of(truth, np.random.default_rng(k), str(k))
         track.boxes[:, 3] *= 1.06 if k % 2 else 0.94
         many.append(window_of(track, WHOLE))
-    lengths = [
-        found.boxes[0, 3] for found in estimate_windows(many, WHOLE, InputModel(WHOLE.faces))
-    ]
+    lengths = [found.boxes[0, 3] for found in solved(many, WHOLE, InputModel(WHOLE.faces))]
     before = 0.12 * truth[0, 3]
     assert np.mean(lengths[1::2]) - np.mean(lengths[::2]) < before / 2
 
@@ -91,7 +88,7 @@ def test_repeated_parked_boxes_are_not_taken_for_exact():
                 drift = 0.8 * drift + 0.6 * 0.15 * rng.normal(size=2)
                 box[:2] += drift
         many.append(window_of(track, WHOLE))
-    estimates = estimate_windows(many, WHOLE, InputModel(WHOLE.faces))
+    estimates = solved(many, WHOLE, InputModel(WHOLE.faces))
     parked = [found.boxes for k, found in enumerate(estimates) if k % 4]
     off = np.linalg.norm((np.array(parked) - truths)[..., :2], axis=2)
     assert off.mean() < 0.2 / 2
@@ -104,9 +101,9 @@ def test_repeated_parked_boxes_are_not_taken_for_exact():
 def test_a_batch_equals_single_windows(config):
     # Padded to the longest, and to the one with most points.
     many = windows(config)
-    together = estimate_windows(many, config, InputModel(config.faces))
+    together = solved(many, config, InputModel(config.faces))
     for one, found in zip(many, together, strict=True):
-        (known,) = estimate_windows([one], config, InputModel(config.faces))
+        (known,) = solved([one], config, InputModel(config.faces))
         np.testing.assert_allclose(found.boxes, known.boxes, atol=1e-8)
         np.testing.assert_allclose(found.covariances, known.covariances, atol=1e-8)
         assert (found.status, found.reasons) == (known.status, known.reasons)
@@ -115,10 +112,10 @@ def test_a_batch_equals_single_windows(config):
 def test_an_ill_conditioned_window_does_not_affect_others():
     # Stamps a nanosecond apart let the curvature lose its definiteness in rounding.
     many = windows()
-    known = estimate_windows(many, ALONE, InputModel(ALONE.faces))
+    known = solved(many, ALONE, InputModel(ALONE.faces))
     bad = [changed(o, stamps_ns=i) for i, o in enumerate(many[2].observations)]
     many[2] = many[2]._replace(observations=bad)
-    found = estimate_windows(many, ALONE, InputModel(ALONE.faces))
+    found = solved(many, ALONE, InputModel(ALONE.faces))
     for i in (0, 1, 3):
         np.testing.assert_allclose(found[i].boxes, known[i].boxes, atol=1e-6)
         assert found[i].status == known[i].status
@@ -130,14 +127,14 @@ def test_observations_update_the_margins_once():
     config = ALONE.updated({'faces.learn': True})
     model = InputModel(config.faces)
     many = [window(drive(12), seed, config, str(seed)) for seed in range(4)]
-    estimate_windows(many, config, model)
+    solved(many, config, model)
     known = [row.tolist() for row in model.gaps_of_tracks(range(6))]
     unknown = InputModel(config.faces).inputs(config)['margin']
     assert np.abs(model.inputs(config)['margin'] - unknown).max() > 1e-4
     again = [
         w._replace(num_new=0, observations=w.observations[-4:], start=given(w)[-4:]) for w in many
     ]
-    estimate_windows(again, config, model)
+    solved(again, config, model)
     assert [row.tolist() for row in model.gaps_of_tracks(range(6))] == known
 
 
@@ -148,7 +145,7 @@ def test_each_box_counts_once_in_the_noise(length):
     whole = window(drive(length))
     for end in range(3, length + 1):
         seen = whole.observations[max(0, end - 10) : end]
-        estimate_windows([whole._replace(observations=seen, num_new=len(seen))], ALONE, model)
+        solved([whole._replace(observations=seen, num_new=len(seen))], ALONE, model)
     counted = length - 9
     known = counted if counted >= 5 else 0
     (taught,) = model.statistics('one').values()
@@ -157,14 +154,14 @@ def test_each_box_counts_once_in_the_noise(length):
 
 def test_short_windows_have_no_estimate():
     many = [window(drive(2), 0, name='a'), window(drive(3), 0, name='b')]
-    short, long = estimate_windows(many, ALONE, InputModel(ALONE.faces))
+    short, long = solved(many, ALONE, InputModel(ALONE.faces))
     assert short is None
     assert set(long.status) == {'refined'}
 
 
 @pytest.mark.parametrize('many', [[], [window(drive(1))]], ids=['none', 'one box'])
 def test_no_windows_to_solve(many):
-    assert estimate_windows(many, ALONE, InputModel(ALONE.faces)) == [None] * len(many)
+    assert solved(many, ALONE, InputModel(ALONE.faces)) == [None] * len(many)
 
 
 # --- threads ------------------------------------------------------------------------------------
@@ -173,12 +170,10 @@ def test_no_windows_to_solve(many):
 @pytest.mark.parametrize('estimate', ['final', 'track'])
 def test_the_number_of_threads_does_not_change_results(estimate):
     config = ALONE.updated({'estimate': estimate})
-    known = estimate_windows(windows(), config, InputModel(config.faces))
+    known = solved(windows(), config, InputModel(config.faces))
     for threads in (0, 1, 3):
         more = config.updated({'solver.threads': threads})
-        for a, b in zip(
-            estimate_windows(windows(), more, InputModel(more.faces)), known, strict=True
-        ):
+        for a, b in zip(solved(windows(), more, InputModel(more.faces)), known, strict=True):
             assert (a.status, a.reasons) == (b.status, b.reasons)
             np.testing.assert_array_equal(a.boxes, b.boxes)
             np.testing.assert_array_equal(a.covariances, b.covariances)
@@ -219,7 +214,7 @@ def test_every_window_passes_through_lbfgs(monkeypatch, estimate):
     whole = window(drive(12), config=config)
     many = [*windows(config), whole._replace(track_id='warm')]
     many[-1] = many[-1]._replace(num_new=1, start=given(whole)[:-1])
-    estimate_windows(many, config, model)
+    solved(many, config, model)
     assert searches == rounds
     assert rounds[-1] == 1 and rounds[0] == 4  # warm windows come last, in one round
 
@@ -232,7 +227,7 @@ def test_an_error_in_a_thread_is_raised(monkeypatch):
 
     monkeypatch.setattr(method, 'begin', broken)
     with pytest.raises(RuntimeError, match='broken'):
-        estimate_windows(windows(), ALONE, InputModel(ALONE.faces))
+        solved(windows(), ALONE, InputModel(ALONE.faces))
     assert torch.get_num_threads() == threads
 
 
@@ -274,7 +269,7 @@ def test_shrunk_extents_are_corrected_by_the_population():
         many.append(window_of(track, config))
 
     def slope(config):
-        found = estimate_windows(many, config, InputModel(config.faces))
+        found = solved(many, config, InputModel(config.faces))
         wrong = np.log([estimate.boxes[0, 3] for estimate in found]) - np.log(lengths)
         return np.polyfit(np.log(lengths), wrong, 1)[0]
 
@@ -302,7 +297,7 @@ def test_a_warm_window_uses_the_extents_of_the_tick_before(extents_used, changes
     whole = window(drive(6), extent=0.05)
     start = given(whole)[:-1]
     start[:, 3:6] = found
-    estimate_windows([whole._replace(num_new=1, start=start)], config, InputModel(config.faces))
+    solved([whole._replace(num_new=1, start=start)], config, InputModel(config.faces))
     assert len(extents_used) == 1  # the one round of a tick
     known = np.where(np.isin(np.arange(3), held), given(whole)[:, 3:6].mean(0), found)
     np.testing.assert_allclose(extents_used[0], known)
@@ -312,7 +307,7 @@ def test_a_warm_window_uses_the_extents_of_the_tick_before(extents_used, changes
 def test_a_cold_window_starts_from_the_mean_extents_of_the_input(extents_used, rounds):
     config = ALONE.updated({'solver.rounds': rounds})
     whole = window(drive(6), extent=0.05)
-    estimate_windows([whole], config, InputModel(config.faces))
+    solved([whole], config, InputModel(config.faces))
     assert len(extents_used) == rounds
     np.testing.assert_allclose(extents_used[0], given(whole)[:, 3:6].mean(0))
 
@@ -323,7 +318,7 @@ def test_a_cold_window_starts_from_the_mean_extents_of_the_input(extents_used, r
 def test_full_windows_leave_a_marginalisation_prior():
     # A full window of ten observations marginalises the first; a shorter window leaves no prior.
     many = windows()
-    found = estimate_windows(many, ALONE, InputModel(ALONE.faces))
+    found = solved(many, ALONE, InputModel(ALONE.faces))
     assert [estimate.prior is not None for estimate in found] == [True, False, False, False]
     prior, boxes = found[0].prior, found[0].boxes
     first = given(many[0])[0]
@@ -335,7 +330,7 @@ def test_full_windows_leave_a_marginalisation_prior():
     np.testing.assert_allclose(prior.information, prior.information.T, atol=1e-6)
     assert np.linalg.eigvalsh(prior.information).min() > -1e-6 * prior.information.max()
     for config in (ALONE.updated({'estimate': 'track'}), BRIEF):
-        found = estimate_windows(windows(config), config, InputModel(config.faces))
+        found = solved(windows(config), config, InputModel(config.faces))
         assert {estimate.prior for estimate in found} == {None}
 
 
@@ -347,7 +342,7 @@ def slid(whole, count, turns=0.0, config=ALONE):
         one = whole._replace(
             observations=observations, num_new=10 - len(start), start=start, prior=prior
         )
-        estimates += estimate_windows([one], config, InputModel(config.faces))
+        estimates += solved([one], config, InputModel(config.faces))
         prior, start = estimates[-1].prior, estimates[-1].boxes[1:]
         state = prior.state.copy()
         state[[5, 11]] += turns
@@ -367,7 +362,7 @@ def test_marginalisation_prior_improves_the_newest_box():
     last = whole._replace(
         observations=whole.observations[4:], num_new=1, start=estimates[3].boxes[1:]
     )
-    (forgetful,) = estimate_windows([last], ALONE, InputModel(ALONE.faces))
+    (forgetful,) = solved([last], ALONE, InputModel(ALONE.faces))
     spread = [np.trace(e.covariances[-1][:2, :2]) for e in (estimates[4], forgetful)]
     assert spread[0] < spread[1]
 

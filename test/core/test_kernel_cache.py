@@ -47,6 +47,54 @@ def test_a_caller_is_compiled_again_when_a_called_kernel_of_another_module_chang
     assert result_and_cache_hits(1) == ['1', '0']
     assert result_and_cache_hits(1) == ['1', '1']
     assert result_and_cache_hits(2) == ['2', '0']
+    # `inner` is part of `outer`: alone, it is neither translated nor kept.
+    assert not list((tmp_path / '__pycache__').glob('inner.*'))
+
+
+COLLECTED = """
+import gc
+from boxreg_ros.core.method.compile import kernel
+from numba.core import event
+
+states = []
+
+
+class Watch(event.Listener):
+    def on_start(self, event):
+        states.append(gc.isenabled())
+
+    def on_end(self, event):
+        states.append(gc.isenabled())
+
+
+@kernel
+def inner(value):
+    return value + 1
+
+
+@kernel
+def outer(value):
+    return inner(value) / value  # zero divided by zero raises nothing
+
+
+with event.install_listener('numba:compile', Watch()):
+    outer(0)
+    try:
+        outer('a')
+    except Exception:
+        states.append('raised')
+print(*states, gc.isenabled())
+"""
+
+
+def test_no_garbage_is_collected_while_a_kernel_is_compiled(tmp_path):
+    (tmp_path / 'collected.py').write_text(COLLECTED)
+    command = [sys.executable, '-B', 'collected.py']
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    # The events of `outer` are around those of `inner`; the collector goes on after the last.
+    *states, goes_on = run.stdout.split()
+    assert states[:3] == ['False', 'False', 'False'] and 'raised' in states
+    assert goes_on == 'True'
 
 
 def test_the_digest_depends_on_every_source_that_is_imported(tmp_path):
@@ -133,6 +181,7 @@ def test_a_full_disk_gives_one_warning(copy):
 
 
 def test_a_damaged_cache_is_written_again_with_one_warning(copy):
+    assert rotated(copy) == []
     cache = copy / 'boxreg_ros' / 'core' / 'method' / '__pycache__'
     indexes = list(cache.glob('rotation.fill_rotation*.nbi'))
     assert indexes

@@ -52,14 +52,21 @@ def sample_drive():
 
 
 def test_one_latency_is_found_and_none_where_there_is_none(sample_drive):
-    for seconds in (0.3, 0.1, 0.0):
+    for seconds in (0.3, 0.1, 0.0, -0.1, -0.3):
         found = estimated(sample_drive.sweeps, late(sample_drive.boxes, seconds))
         assert found.tracks >= 5
         assert found.estimated == pytest.approx(seconds, abs=0.02)
         assert found.deviation < 0.03
-        corrected = 0.0 if seconds < NOTABLE else found.estimated
+        corrected = 0.0 if abs(seconds) < NOTABLE else found.estimated
         assert found.seconds == pytest.approx(corrected, abs=STEP)
-        assert bool(found.warning) == (seconds > NOTABLE)
+        assert bool(found.warning) == (abs(seconds) > NOTABLE)
+
+
+@pytest.mark.parametrize('seconds, words', [(-0.6, '0.4 s early'), (1.0, '0.8 s late')])
+def test_more_than_is_compared_is_not_corrected_but_said(sample_drive, seconds, words):
+    found = estimated(sample_drive.sweeps, late(sample_drive.boxes, seconds))
+    assert found.seconds == 0
+    assert f'boxes are {words} or more, which is not corrected' in found.warning
 
 
 def test_of_many_objects_every_one_is_evidence(sample_drive, monkeypatch):
@@ -124,6 +131,13 @@ def test_boxes_that_are_in_time_in_one_way_are_in_time():
     assert found.seconds == pytest.approx(0.12, abs=0.005)
     found = latency._estimated(parabolas([0.07, 0.12], [1.1, 1.0]))
     assert found.seconds == pytest.approx(0.07, abs=0.005)
+
+
+@pytest.mark.parametrize('depth, corrected', [(0.3, 0.0), (0.03, 0.6)])
+def test_a_row_of_parked_cars_that_fits_again_further_on_is_in_time(depth, corrected):
+    in_time = depth * np.minimum(np.square(latency.CANDIDATES) / 0.01, 1) - depth
+    samples = [sample._replace(costs=sample.costs + in_time) for sample in parabolas([0.6, 0.6])]
+    assert latency._estimated(samples).seconds == pytest.approx(corrected, abs=0.005)
 
 
 def test_tracks_that_do_not_agree_correct_nothing():

@@ -58,12 +58,12 @@ def test_minima_of_rosenbrock():
 
 @pytest.mark.parametrize('iterations', [1, 5, 300])
 def test_a_batch_equals_single_rows(iterations):
-    # Rows end at different times, so ended ones leave the batch on the way.
+    # Rows end at different times: those that have ended are not evaluated any more.
     start = torch.cat([starts(7, 4), torch.ones(1, 4, dtype=D)])
     many = minimize(rosenbrock, start, iterations, 5, 1e-12)
     alone = [minimize(rosenbrock, start[i : i + 1], iterations, 5, 1e-12) for i in range(8)]
     for name in ('x', 'value', 'status', 'iterations'):
-        known = torch.cat([getattr(minimum, name) for minimum in alone])
+        known = np.concatenate([getattr(minimum, name) for minimum in alone])
         np.testing.assert_allclose(getattr(many, name), known, rtol=1e-9, atol=1e-12)
     if iterations == 300:
         assert len(set(many.iterations.tolist())) > 2
@@ -135,11 +135,30 @@ def test_the_inverse_hessian_as_metric_solves_a_quadratic_in_one_step():
     inverse = torch.linalg.inv(A)
     found = minimize(
         quadratic(A, known), starts(4, 5), 20, 5, 1e-14,
-        metric=lambda vector, rows: (inverse[rows] @ vector[..., None])[..., 0],
+        metric=lambda vector: (inverse @ vector[..., None])[..., 0],
     )  # fmt: skip
     np.testing.assert_allclose(found.x, known, atol=1e-9)
     assert (found.iterations <= 2).all()
     assert (found.status == Status.CONVERGED).all()
+
+
+@pytest.mark.filterwarnings('error')
+def test_numbers_that_are_not_finite_are_no_warnings():
+    weight, start = torch.tensor([1.0, 1.0, 1.0, 50.0], dtype=D), torch.ones(4, 2, dtype=D)
+    start[1] = torch.inf
+
+    def function(x, rows):  # the first two rows are linear, the third one has a wall
+        value = weight[rows] * torch.where(rows < 2, x.sum(1), 0.5 * x.square().sum(1))
+        gradient = weight[rows, None] * torch.where(rows[:, None] < 2, 1.0, x)
+        return torch.where((rows == 2) & (x.sum(1) < 1.5), torch.inf, value), gradient
+
+    found = minimize(function, start, 3, 3, 1e-9)
+    assert found.status.tolist() == [
+        Status.RUNNING,
+        Status.FAILED,
+        Status.RUNNING,
+        Status.CONVERGED,
+    ]
 
 
 def test_every_status():

@@ -1,16 +1,23 @@
 """The compiled method: residuals and their sum against automatic differentiation, and by hand."""
 
 from boxreg_ros.core.method.arrays import (
+    ANCHOR,
     Arrowhead,
+    BLOCK,
     Factor,
     PIVOT,
     POSE,
-    REST,
+    PRIOR,
     SHARED,
     SIDESLIP,
-    SPAN,
 )
-from boxreg_ros.core.method.arrowhead import factorise, fix_variables, invert_poses, solve
+from boxreg_ros.core.method.arrowhead import (
+    factorise,
+    fix_variables,
+    invert_poses,
+    NEXT,
+    solve,
+)
 from boxreg_ros.core.method.assemble import accumulate, empty_axes, marginalise, no_matrix
 from boxreg_ros.core.method.constants import RESIDUAL_NAMES
 from boxreg_ros.core.method.covariance import Inverse
@@ -19,6 +26,7 @@ from boxreg_ros.core.method.residuals import (
     empty_linearised,
     fill_axes,
     fill_plane,
+    level_of,
     RESIDUALS,
     TERMS,
 )
@@ -29,16 +37,14 @@ from reference import objective
 from scenes import dense, random_terms, random_variables, shared_of
 
 
-def matrix(N):
-    """Return room for the curvature of a window of N observations."""
-    return Arrowhead(
-        np.zeros((N + 2, POSE, SPAN)), np.zeros((N + 2, POSE, SHARED)), np.zeros((SHARED, SHARED))
-    )
+def matrix(N, S=SHARED):
+    """Return room for the curvature of a window of N observations and S shared variables."""
+    return Arrowhead(np.zeros(N + 2, BLOCK), np.zeros((S, S)))
 
 
 def empty_factor(N):
     """Return room for the factor of a window of N observations."""
-    shapes = (N, POSE, POSE), (N, POSE, REST), (SHARED, SHARED)
+    shapes = (N, POSE, POSE), (N, POSE, SHARED + NEXT), (SHARED, SHARED)
     return Factor(*(np.empty(shape) for shape in shapes))
 
 
@@ -124,7 +130,7 @@ def test_the_factor_solves_and_inverts(is_held):
     solve(factor, found)
     np.testing.assert_allclose(whole @ found, right, atol=1e-6)
     inverse = np.linalg.inv(whole)
-    blocks, beside = np.empty((N, POSE, POSE)), np.empty((N, POSE, REST))
+    blocks, beside = np.empty((N, POSE, POSE)), np.empty((N, POSE, SHARED + NEXT))
     invert_poses(factor, blocks, beside)
     border, links = beside[:, :, :SHARED], beside[:, :, SHARED:]
     np.testing.assert_allclose(factor.corner, inverse[6 * N :, 6 * N :], rtol=1e-6, atol=1e-9)
@@ -152,12 +158,12 @@ def test_a_weak_direction_of_a_strong_link_is_not_lost():
     A, N, variances = matrix(2), 2, np.logspace(-8, 0, POSE)
     axes, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(POSE, POSE)))
     link = axes / variances @ axes.T
-    A.links[0, :, : 2 * POSE] = np.hstack([link + np.eye(POSE), -link])
-    A.links[1, :, :POSE] = link
+    A.poses['links'][0, :, : 2 * POSE] = np.hstack([link + np.eye(POSE), -link])
+    A.poses['links'][1, :, :POSE] = link
     A.corner[:] = np.eye(SHARED)
     factor, blocks = empty_factor(N), np.empty((N, POSE, POSE))
     assert factorise(A, factor)
-    invert_poses(factor, blocks, np.empty((N, POSE, REST)))
+    invert_poses(factor, blocks, np.empty((N, POSE, SHARED + NEXT)))
     np.testing.assert_allclose(blocks[0], np.eye(POSE), atol=1e-6)
     np.testing.assert_allclose(blocks[1], np.eye(POSE) + axes * variances @ axes.T, atol=1e-6)
 
@@ -176,7 +182,8 @@ def test_the_prior_is_the_schur_complement_of_the_oldest_residuals():
     # All residuals that the oldest observation has a part in, but the prior on shared variables.
     N = 6
     terms, common = random_terms(N)
-    x, A = random_variables(N), matrix(N)
+    terms['W'][:, 1] = 0.0  # a sliding window has no rigid shape
+    x, A = random_variables(N)[: 6 * N + ANCHOR], matrix(N, ANCHOR)
     _, gradient = summed(x, terms, common, last=1, A=A)
     first = terms.copy()
     first['W'][1:], first['W_faces'][1:] = 0.0, 0.0
@@ -184,9 +191,9 @@ def test_the_prior_is_the_schur_complement_of_the_oldest_residuals():
     only['W_shared'] = 0.0
     _, pull, H = objective.linearise(x, first, only)
     np.testing.assert_allclose(dense(A, N), H, atol=1e-9 * np.abs(H).max())
-    mean, step, information = np.empty(35), np.empty(35), np.empty((35, 35))
+    mean, step, information = np.empty(PRIOR), np.empty(PRIOR), np.empty((PRIOR, PRIOR))
     marginalise(x, gradient, A, mean, step, information)
-    left = [*range(6, 18), *range(6 * N, 6 * N + SHARED)]
+    left = [*range(6, 18), *range(6 * N, 6 * N + ANCHOR)]
     across = np.linalg.solve(H[:6, :6], H[:6])
     schur = (H - H[:, :6] @ across)[np.ix_(left, left)]
     np.testing.assert_array_equal(mean, x[left])
@@ -201,27 +208,28 @@ def test_the_prior_is_exact_for_linear_residuals():
     # linearised. Ridges of 1e-6 beside curvatures of 100 change 1e-8 of the step.
     N = 7
     terms, common = random_terms(N)
-    terms['W'][:, [1, 4]], terms['W_faces'] = 0.0, 0.0
+    others = [RESIDUAL_NAMES.index(name) for name in ('rigid shape', 'slip')]
+    terms['W'][:, others], terms['W_faces'] = 0.0, 0.0
     terms['W'] *= 100
     common['W_shared'] *= 100
-    common['W_prior'] += 100 * np.eye(35)
+    common['W_prior'] += 100 * np.eye(PRIOR)
     known = minimum(terms, common)
     rng = np.random.default_rng(9)
     for n in (N - 1, N - 2):
-        away = known[-6 * (n + 1) - SHARED :] + 0.1 * rng.normal(size=6 * (n + 1) + SHARED)
-        A = matrix(n + 1)
+        away = known[-6 * (n + 1) - ANCHOR :] + 0.1 * rng.normal(size=6 * (n + 1) + ANCHOR)
+        A = matrix(n + 1, ANCHOR)
         _, gradient = summed(away, terms, common, last=1, A=A)
-        mean, step, information = np.empty(35), np.empty(35), np.empty((35, 35))
+        mean, step, information = np.empty(PRIOR), np.empty(PRIOR), np.empty((PRIOR, PRIOR))
         marginalise(away, gradient, A, mean, step, information)
         terms = terms[1:]
         common['prior_mean'], common['W_prior'] = mean + step, information
-        np.testing.assert_allclose(minimum(terms, common), known[-6 * n - SHARED :], atol=1e-7)
+        np.testing.assert_allclose(minimum(terms, common), known[-6 * n - ANCHOR :], atol=1e-7)
 
 
 def minimum(terms, common):
-    """Return where the sum of linear residuals is least."""
+    """Return where the sum of linear residuals of a sliding window is least."""
     N = len(terms)
-    x, A = np.zeros(6 * N + SHARED), matrix(N)
+    x, A = np.zeros(6 * N + ANCHOR), matrix(N, ANCHOR)
     _, gradient = summed(x, terms, common, A=A)
     return np.linalg.solve(dense(A, N), -gradient)
 
@@ -239,12 +247,11 @@ def residual(name, poses, shared=None, times=None, **fields):
     for field, value in fields.items():
         terms[field] = value
     (row,) = (row for row in RESIDUALS if row.name == name)
-    at, out = empty_axes(len(poses)), empty_linearised()
+    at, out = empty_axes(len(poses)), empty_linearised()[0]
     fill_axes(poses, 0, len(poses), at)
-    out.J[:], out.S[:] = 0.0, 0.0
     shared = shared_of()[0] if shared is None else shared
     rows, _ = row.function(0, poses, shared, terms, at, out)
-    return out.r[:rows]
+    return out['r'][:rows]
 
 
 def test_acceleration_by_hand():
@@ -326,13 +333,14 @@ def test_planes_are_signed_distances_of_points():
     poses = np.array([[0.0, 1, 0, 0, 0, np.pi / 2]])
     terms = np.zeros(1, TERMS)
     terms['inset'] = 0.05
-    at, v, by_angles = empty_axes(1), np.empty(4), np.empty((4, 3))
+    at, plane, by_angles = empty_axes(1), np.empty(4), np.empty((4, 3))
     fill_axes(poses, 0, 1, at)
     point = np.array([0.3, 2.5, 0.2, 1.0])  # from the input centre: 1.5 m ahead, 0.3 m right
     shared = shared_of(GAP=0.1)[0]
     for face, known in enumerate([1.5 - 1.85, -1.5 - 1.85, -0.3 - 0.85, 0.3 - 0.85, -0.65, -1.05]):
-        fill_plane(0, face, poses, shared, terms, at, v, by_angles)
-        np.testing.assert_allclose(v @ point, known, atol=1e-12)
+        fill_plane(0, face // 2, poses, terms, at, plane, by_angles)
+        found = (1 - 2 * (face % 2)) * plane @ point + level_of(0, face, shared, terms)
+        np.testing.assert_allclose(found, known, atol=1e-12)
 
 
 def test_shared_columns_are_those_of_their_variables():

@@ -1,10 +1,11 @@
 """Observations of boxes in a sweep, against values calculated by hand and plain loops."""
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.observation import farthest_point_sample, Observation, observe
+from boxreg_ros.core.observation import farthest_point_sample, observe
 from boxreg_ros.structures import Sweep
 import numpy as np
 import pytest
+from scenes import Seen
 from scipy.spatial.transform import Rotation
 
 STAMP_NS = 5 * 10**8
@@ -18,7 +19,7 @@ def sweep(points, **more):
 def observed(points, *boxes, changes=None, **more):
     config = Config().updated(changes or {})
     table = observe(sweep(points, **more), np.array(boxes), STAMP_NS, config)
-    return [Observation(table, row) for row in range(len(boxes))]
+    return [Seen(table, row) for row in range(len(boxes))]
 
 
 def near(*offsets):
@@ -101,7 +102,7 @@ def test_the_crop_is_the_same_at_any_position(x, y, kind):
         box = np.r_[center, CAR[3:6], 0, 0, yaw]
         scan = Sweep(STAMP_NS, 'odom', (center + offsets).astype(kind))
         config = Config().updated({'sampling.points': 10000})
-        seen = Observation(observe(scan, box[None], STAMP_NS, config), 0)
+        seen = Seen(observe(scan, box[None], STAMP_NS, config), 0)
         known = offsets[(np.abs(offsets[:, 0]) < a) & (np.abs(offsets[:, 1]) < b)]
         # At (4000, -7000) numbers of 32 bits are 0.0005 m apart.
         np.testing.assert_allclose(rows(seen.points), rows(known), atol=5e-4)
@@ -337,7 +338,7 @@ def test_a_box_is_seen_at_the_median_time_of_its_points():
     points = near(*([x, 0, 0.1 * k] for x, count in ((0, 4), (20, 3)) for k in range(count)))
     times = np.array([0.04, 0.01, 0.02, 0.07, 0.09, 0.05, 0.06])
     seen = observed(points, CAR, behind, ahead, times=times)
-    assert [o.sight for o in seen] == pytest.approx([0.03, 0.0, 0.06])
+    assert [o.sights for o in seen] == pytest.approx([0.03, 0.0, 0.06])
 
 
 def test_an_observation_of_another_box_keeps_its_points_in_place():

@@ -1,6 +1,8 @@
 """The rings of a LiDAR, found in the points of an object."""
 
-from boxreg_ros.core.method.rings import covering_gap, ring_heights
+import time
+
+from boxreg_ros.core.method.rings import covering_gap, covering_gap_of_many, ring_heights
 import numpy as np
 import pytest
 
@@ -66,4 +68,24 @@ def test_each_object_has_its_own_points():
 def test_half_of_the_range_is_covered_by_smaller_gaps():
     # Gaps .1 .1 .1 .3 .4 of a range of 1: sorted, half of it is reached with the .3.
     values = np.cumsum([0, 0.4, 0.1, 0.3, 0.1, 0.1])
-    assert covering_gap(values) == pytest.approx(0.3)
+    values = np.random.default_rng(0).permutation(values)
+    assert covering_gap(values, *np.empty((2, 6))) == pytest.approx(0.3)
+
+
+def test_gaps_of_many_points_are_those_of_all_pairs():
+    values = np.random.default_rng(0).normal(0, 1, 500).round(2)
+    by_pairs = covering_gap(values, *np.empty((2, 500)))
+    assert covering_gap_of_many(values, np.empty(500)) == pytest.approx(by_pairs, rel=1e-9)
+
+
+def test_the_time_of_many_points_grows_as_they_do():
+    points = wall(np.arange(-40, 40) * 0.002, columns=100)
+
+    def seconds(n):
+        begin = time.thread_time()
+        heights_of(points[:n], [-20, 0, 0])
+        return time.thread_time() - begin
+
+    seconds(len(points))
+    few, many = (min(seconds(n) for _ in range(5)) for n in (1000, 8000))
+    assert many < 30 * few

@@ -55,7 +55,7 @@ def input_pose(p, s, t):
 
 def rigid_shape(p, s, t):
     """(M4)."""
-    off = along(t, p - t['start']) - s[ANCHOR:SIDESLIP] - t['wanted']
+    off = along(t, p - t['start']) - s[ANCHOR:] - t['wanted']
     return weighted('rigid shape', (t['root'].mT @ off[..., None])[..., 0], t)
 
 
@@ -98,12 +98,14 @@ def shared_prior(p, s, c):
 
 def marginalisation_prior(p, s, c):
     """(M9)."""
-    return root(c['W_prior']).mT @ (torch.cat([p[:2].flatten(), s]) - c['prior_mean'])
+    return root(c['W_prior']).mT @ (torch.cat([p[:2].flatten(), s[:ANCHOR]]) - c['prior_mean'])
 
 
 def whitened(x, terms, common):
-    """Return all whitened residuals (R,) at variables x (6 N + 23,)."""
-    p, s = x[:-SHARED].view(-1, 6), x[-SHARED:]
+    """Return all whitened residuals (R,) at variables x (6 N + S,); without an anchor it is 0."""
+    end = 6 * len(terms['time'])
+    p, s = x[:end].view(-1, 6), x[end:]
+    s = torch.cat([s, s.new_zeros(SHARED - len(s))])
     parts = [OF_OBSERVATIONS[name](p, s, terms) for name in RESIDUAL_NAMES]
     parts += [faces(p, s, terms)]
     return torch.cat([*parts, shared_prior(p, s, common), marginalisation_prior(p, s, common)])

@@ -8,7 +8,7 @@ from boxreg_ros.core.following.start_speed import POSE4, Seeds
 from boxreg_ros.core.following.tracker import Follower, Way
 from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import Floats, Ints
+from boxreg_ros.structures import Floats, Ints, on_lines
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
@@ -78,9 +78,7 @@ def _bridged(on: Way, back: Way, times: Floats, ends: Ints, poses: Floats) -> li
     rows = np.array(sorted(known))
     values = np.array([known[row] for row in rows.tolist()])
     values[:, 3] = np.unwrap(values[:, 3])
-    wanted = times[start + 1 : stop]
-    columns = [np.interp(wanted, times[rows], column) for column in values.T]
-    return [np.stack(columns, axis=1)]
+    return [on_lines(times[rows], values, times[start + 1 : stop])]
 
 
 def _blended(a: Floats, b: Floats, part: Floats) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, ROLL, YAW
+from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, on_lines, ROLL, YAW
 import numpy as np
 from scipy.interpolate import CubicSpline
 
@@ -67,7 +67,7 @@ def between_exact(stamps_ns: Ints, boxes: Floats, keyframes: Keyframes) -> Float
         ]
     )
     of_fits = _sizes(residuals[1:-1] - _line_without(at, residuals), half_length)  # (n - 2,)
-    curves = np.array([_spline(at, keys, times), _line(at, keys, times)])  # (2, N, 9)
+    curves = np.array([_spline(at, keys, times), on_lines(at, keys, times)])  # (2, N, 9)
     curves[:, :, BOX_EXTENT] = curves[1, :, BOX_EXTENT]
     before, after = at[1:-1] - at[:-2], at[2:] - at[1:-1]
     for first in range(len(at) - 1):
@@ -83,10 +83,6 @@ def between_exact(stamps_ns: Ints, boxes: Floats, keyframes: Keyframes) -> Float
         found[rows] = curves[best, rows]
         found[rows, ROLL:] = wrap_angle(found[rows, ROLL:])
     return found
-
-
-def _line(at: Floats, values: Floats, times: Floats) -> Floats:
-    return np.stack([np.interp(times, at, column) for column in values.T], axis=1)
 
 
 def _spline(at: Floats, values: Floats, times: Floats) -> Floats:

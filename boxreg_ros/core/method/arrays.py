@@ -3,24 +3,24 @@ What the functions of a round pass to each other: records, and named tuples of a
 
 Letters of the shapes: B windows, N observations of a window, K kinds of objects. The terms of a
 batch are an array (B, N) of records `residuals.TERMS`, and (B,) of `COMMON`. Only the first
-`lengths` observations of a window are read; the others are padding.
+`lengths` observations of a window are read; the others are padding. There are S shared variables,
+`SHARED` of whole tracks and `ANCHOR` of sliding windows.
 
 """
 
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
 
 POSE = 6
 """Variables of a pose: x y z roll pitch yaw."""
-EXTENT, BIAS, GAP, PIVOT, ANCHOR, SIDESLIP, SHARED = 0, 3, 9, 15, 16, 22, 23
+EXTENT, BIAS, GAP, PIVOT, SIDESLIP, ANCHOR, SHARED = 0, 3, 9, 15, 16, 17, 23
 """First of the shared variables of each kind, and their number: extent (3), input bias (6),
-labelling margins (6), pivot, anchor of the rigid shape (6), sideslip."""
-PRIOR = 2 * POSE + SHARED
-"""Variables of the marginalisation prior: two poses and the shared ones."""
-REST = SHARED + 2 * POSE
-"""Variables that a pose is coupled to: the shared ones and the two poses after it."""
+labelling margins (6), pivot, sideslip, anchor of the rigid shape (6). Sliding windows have none of
+the last."""
+PRIOR = 2 * POSE + ANCHOR
+"""Variables of the marginalisation prior: two poses and the shared ones of a sliding window."""
 TOP, BOTTOM = 4, 5
 """The face that is observed by the road, not by points of the object."""
 SPAN = 3 * POSE
@@ -61,7 +61,7 @@ margin_variance
 W_shared
     Weights of the shared variables (M8), (23,).
 prior_mean, W_prior
-    Marginalisation prior (M9): minimum and information, (35,) and (35, 35).
+    Marginalisation prior (M9): minimum and information, (29,) and (29, 29).
 """
 
 INPUTS = np.dtype(
@@ -101,24 +101,31 @@ median, slopes
 """
 
 
+BLOCK = np.dtype([('links', float, (POSE, SPAN)), ('border', float, (POSE, SHARED))], align=True)
+"""
+The rows of one pose in the symmetric matrix of a window.
+
+links
+    Upper triangle of its own block, and the blocks with the two poses after it, (6, 18).
+border
+    Block with the S shared variables, in the first columns, (6, 23).
+"""
+
+
 class Arrowhead(NamedTuple):
     """
     The symmetric matrix of one window as `arrowhead` keeps it.
 
     Attributes
     ----------
-    links : array, shape (N + 2, 6, 18)
-        Blocks of each pose: upper triangle of its own, and those with the two poses after it. Two
-        poses of padding, zero, end the chain.
-    border : array, shape (N + 2, 6, 23)
-        Blocks of each pose with the shared variables.
-    corner : array, shape (23, 23)
+    poses : array of `BLOCK`, shape (N + 2,)
+        Two poses of padding, zero, end the chain.
+    corner : array, shape (S, S)
         Upper triangle of the block of the shared variables.
 
     """
 
-    links: Any
-    border: Any
+    poses: Any
     corner: Any
 
 
@@ -130,9 +137,9 @@ class Factor(NamedTuple):
     ----------
     own : array, shape (B, N, 6, 6)
         Inverse of the block of each pose, without the poses before it.
-    coupling : array, shape (B, N, 6, 35)
+    coupling : array, shape (B, N, 6, S + 12)
         Regression of each pose on the variables after it: the shared ones, and two poses.
-    corner : array, shape (B, 23, 23)
+    corner : array, shape (B, S, S)
         Inverse of the block of the shared variables, without the poses.
 
     """
@@ -140,6 +147,18 @@ class Factor(NamedTuple):
     own: Any
     coupling: Any
     corner: Any
+
+
+@loop
+def copy(values, target):
+    """
+    Write the first of some values to a target (n,).
+
+    Where a slice is set to an array, numba compiles the text of an error into the kernel.
+
+    """
+    for k in range(len(target)):
+        target[k] = values[k]
 
 
 @kernel
@@ -178,14 +197,14 @@ class Solution(NamedTuple):
 
     Attributes
     ----------
-    poses, shared : array, shapes (B, N, 6) and (B, 23)
+    poses, shared : array, shapes (B, N, 6) and (B, S)
         Boxes, and the variables that all observations of a window share.
     evidence : array, shape (B, 3, 3)
         Evidence of the points about the extents (M18): logarithms of the input extents;
         corrections by the points alone; their weights.
     posterior : Posterior
         Of windows that are done.
-    prior_state, prior_step, prior_information : array, shapes (B, 35), (B, 35), (B, 35, 35)
+    prior_state, prior_step, prior_information : array, shapes (B, 29), (B, 29), (B, 29, 29)
         What full windows leave to the next ones (M13): linearisation point, step from there to
         the minimum, information; NaN for others, no rows if it is not wanted.
 

@@ -10,7 +10,7 @@ numba unrolls short loops into scalars.
 
 from math import sqrt
 
-from boxreg_ros.core.method.arrays import PIVOT, POSE, REST, SHARED
+from boxreg_ros.core.method.arrays import copy, PIVOT, POSE
 from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
 
@@ -24,27 +24,30 @@ information of a deviation of 30 km."""
 @loop
 def clear(A):
     """Set a matrix to zero."""
-    A.links[:] = 0.0
-    A.border[:] = 0.0
+    for n in range(len(A.poses)):
+        A.poses[n].links[:] = 0.0
+        A.poses[n].border[:] = 0.0
     A.corner[:] = 0.0
 
 
 @loop
 def fix_variables(A, free):
-    """Make rows and columns of variables that are not `free` (6 N + 23,) those of the identity."""
-    n = len(free) - SHARED
+    """Make rows and columns of variables that are not `free` (6 N + S,) those of the identity."""
+    S = len(A.corner)
+    n = len(free) - S
     for i in range(n):
         pose, a = i // POSE, i % POSE
         if free[i] == 0.0:
             for before in range(max(pose - 2, 0), pose + 1):
                 for b in range(POSE):
-                    A.links[before, b, POSE * (pose - before) + a] = 0.0
-            A.links[pose, a] = 0.0
-            A.border[pose, a] = 0.0
-        A.links[pose, a, a] += 1.0 - free[i] + RIDGE
-    for s in range(SHARED):
+                    A.poses[before].links[b, POSE * (pose - before) + a] = 0.0
+            A.poses[pose].links[a] = 0.0
+            A.poses[pose].border[a] = 0.0
+        A.poses[pose].links[a, a] += 1.0 - free[i] + RIDGE
+    for s in range(S):
         if free[n + s] == 0.0:
-            A.border[:, :, s] = 0.0
+            for pose in range(len(A.poses)):
+                A.poses[pose].border[:, s] = 0.0
             A.corner[s] = 0.0
             A.corner[:, s] = 0.0
         A.corner[s, s] += 1.0 - free[n + s] + RIDGE
@@ -82,79 +85,115 @@ def solve_corner(U, x):
 
 
 @loop
+def reduce(rows):
+    """
+    Reduce the matrix at the left of rows (m, m + k) to the identity, by Gauss and Jordan.
+
+    What stands beside it is replaced by the inverse times that: a product with the inverse would
+    have an error larger by the condition number of the matrix. Returns False if it is not
+    positive definite.
+
+    """
+    size, width = rows.shape
+    for k in range(size):
+        if not rows[k, k] > 0.0:
+            return False
+        scale = 1.0 / rows[k, k]
+        for j in range(width):
+            rows[k, j] *= scale
+        for i in range(size):
+            if i != k:
+                factor = rows[i, k]
+                for j in range(width):
+                    rows[i, j] -= factor * rows[k, j]
+    return True
+
+
+@loop
 def invert(S):
-    """
-    Replace a matrix (m, m) by its inverse; return False if it is not positive definite.
-
-    Columns beside it, S (m, m + k), are replaced by the inverse times them. Their product with the
-    inverse would have an error larger by the condition number of the matrix.
-
-    """
-    size, width = S.shape
-    for k in range(size):  # Gauss and Jordan
+    """Replace a matrix (m, m) by its inverse; return False if it is not positive definite."""
+    size = len(S)
+    for k in range(size):  # Gauss and Jordan, in place: half as long as beside the identity
         if not S[k, k] > 0.0:
             return False
         scale = 1.0 / S[k, k]
         S[k, k] = 1.0
-        for j in range(width):
+        for j in range(size):
             S[k, j] *= scale
         for i in range(size):
             if i != k:
                 factor = S[i, k]
                 S[i, k] = 0.0
-                for j in range(width):
+                for j in range(size):
                     S[i, j] -= factor * S[k, j]
     return True
 
 
-@kernel
-def eliminate_pose(A, pose, factor, room):
-    """
-    Write the factor of one pose, and subtract its products from the poses after it.
-
-    The corner is left to the caller, and `room` is to work in. Returns False if the pose is not
-    positive definite.
-
-    """
-    links, border, _ = A
-    own, coupling = factor.own[pose], factor.coupling[pose]
-    rows, after, change = room
+@loop
+def fill_rows(block, S, rows):
+    """Write the block of a pose, the identity, and less what it is coupled to, (6, S + 24)."""
+    links, border = block.links, block.border
     for a in range(POSE):
-        for c in range(a, POSE):
-            rows[a, c] = rows[c, a] = links[pose, a, c]
-        for s in range(SHARED):
-            rows[a, POSE + s] = -border[pose, a, s]
-        for c in range(NEXT):
-            after[a, c] = links[pose, a, POSE + c]
-            rows[a, POSE + SHARED + c] = -after[a, c]
-    if not invert(rows):
-        return False
-    own[:] = rows[:, :POSE]
-    coupling[:] = rows[:, POSE:]
-    np.dot(after.T, coupling, change)
-    for a in range(POSE):
-        for c in range(NEXT):
-            links[pose + 1, a, c] += change[a, SHARED + c]
         for c in range(POSE):
-            links[pose + 2, a, c] += change[POSE + a, SHARED + POSE + c]
-        for s in range(SHARED):
-            border[pose + 1, a, s] += change[a, s]
-            border[pose + 2, a, s] += change[POSE + a, s]
-    return True
+            rows[a, c] = links[min(a, c), max(a, c)]
+            rows[a, POSE + c] = 1.0 if a == c else 0.0
+        for s in range(S):
+            rows[a, NEXT + s] = -border[a, s]
+        for c in range(NEXT):
+            rows[a, NEXT + S + c] = -links[a, POSE + c]
+
+
+@loop
+def keep(rows, block, own, coupling, after, border):
+    """Write the factor of a pose from its `rows`, and what it is coupled to, from its block."""
+    rest = coupling.shape[1]
+    for a in range(POSE):
+        for c in range(POSE):
+            own[a, c] = rows[a, POSE + c]
+        for r in range(rest):
+            coupling[a, r] = rows[a, NEXT + r]
+        for c in range(NEXT):
+            after[a, c] = block.links[a, POSE + c]
+        for s in range(rest - NEXT):
+            border[a, s] = block.border[a, s]
+
+
+@loop
+def subtract(change, S, first, second):
+    """Add the `change` (12, S + 12) of the two poses after one."""
+    for a in range(POSE):
+        for c in range(NEXT):
+            first.links[a, c] += change[a, S + c]
+        for c in range(POSE):
+            second.links[a, c] += change[POSE + a, S + POSE + c]
+        for s in range(S):
+            first.border[a, s] += change[a, s]
+            second.border[a, s] += change[POSE + a, s]
 
 
 @kernel
 def eliminate_poses(A, factor):
-    """Eliminate the poses of a factor one by another; return False if one is not definite."""
-    N = len(factor.own)
-    room = np.empty((POSE, POSE + REST)), np.empty((POSE, NEXT)), np.empty((NEXT, REST))
+    """
+    Write the factor of each pose, and subtract its products from the variables after it.
+
+    Returns False if a pose is not positive definite.
+
+    """
+    N, S = len(factor.own), len(A.corner)
+    rows, after = np.empty((POSE, 2 * NEXT + S)), np.empty((POSE, NEXT))
+    change, border = np.empty((NEXT, S + NEXT)), np.empty((N, POSE, S))
     for pose in range(N):
-        if not eliminate_pose(A, pose, factor, room):
+        block, own, coupling = A.poses[pose], factor.own[pose], factor.coupling[pose]
+        fill_rows(block, S, rows)
+        if not reduce(rows):
             return False
-    border = A.border[:N].reshape(POSE * N, SHARED)
-    change = np.dot(border.T, factor.coupling.reshape(POSE * N, REST))
-    for s in range(SHARED):
-        for t in range(s, SHARED):
+        keep(rows, block, own, coupling, after, border[pose])
+        np.dot(after.T, coupling, change)
+        subtract(change, S, A.poses[pose + 1], A.poses[pose + 2])
+    columns = factor.coupling.reshape(POSE * N, S + NEXT)
+    change = np.dot(border.reshape(POSE * N, S).T, columns)
+    for s in range(S):
+        for t in range(s, S):
             A.corner[s, t] += change[s, t]
     return True
 
@@ -164,76 +203,95 @@ def factorise(A, factor):
     """Write the factor of a matrix, which is changed; return False if it is not definite."""
     if not eliminate_poses(A, factor):
         return False
-    for s in range(SHARED):
-        for t in range(s, SHARED):
+    S = len(A.corner)
+    for s in range(S):
+        for t in range(s, S):
             factor.corner[s, t] = factor.corner[t, s] = A.corner[s, t]
     return invert(factor.corner)
 
 
 @loop
-def substitute_forward(factor, x):
+def substitute_forward(factor, x, rest):
     """
-    Eliminate the poses of a factor from a right side (6 N + 23,).
+    Eliminate the poses of a factor from a right side (6 N + S,).
 
-    The last poses are coupled to one pose after them or none. What is added beyond the chain is
-    zero.
+    The last poses are coupled to one pose after them or none. `rest` (S + 12,) is to work in: what
+    a pose is coupled to.
 
     """
-    shared = x[len(x) - SHARED :]
+    S = len(factor.corner)
+    end = len(x) - S
+    for s in range(S):
+        rest[s] = x[end + s]
     for pose in range(len(factor.own)):
-        coupling = factor.coupling[pose]
-        own, after = x[POSE * pose :], x[POSE * (pose + 1) : POSE * (pose + 3)]
-        for s in range(len(shared)):  # loops of unknown length are not unrolled into scalars
+        coupling, own, after = factor.coupling[pose], x[POSE * pose :], POSE * (pose + 1)
+        for c in range(NEXT):
+            rest[S + c] = x[after + c] if after + c < end else 0.0
+        for r in range(len(rest)):  # loops of unknown length are not unrolled into scalars
             total = 0.0
             for a in range(POSE):
-                total += coupling[a, s] * own[a]
-            shared[s] += total
-        for c in range(len(after)):
+                total += coupling[a, r] * own[a]
+            rest[r] += total
+        for c in range(min(NEXT, end - after)):
+            x[after + c] = rest[S + c]
+    for s in range(S):
+        x[end + s] = rest[s]
+
+
+@loop
+def substitute_backward(factor, x, rest, found):
+    """Replace what `substitute_forward` leaves by the solution; `found` (6,) is to work in."""
+    S = len(factor.corner)
+    end = len(x) - S
+    for s in range(S):
+        rest[s] = x[end + s]
+    for c in range(NEXT):
+        rest[S + c] = 0.0
+    for pose in range(len(factor.own) - 1, -1, -1):
+        own, coupling, right = factor.own[pose], factor.coupling[pose], x[POSE * pose :]
+        for a in range(POSE):
             total = 0.0
-            for a in range(POSE):
-                total += coupling[a, SHARED + c] * own[a]
-            after[c] += total
+            for b in range(POSE):
+                total += own[a, b] * right[b]
+            for r in range(len(rest)):
+                total += coupling[a, r] * rest[r]
+            found[a] = total
+        for a in range(POSE):
+            rest[S + POSE + a] = rest[S + a]
+            rest[S + a] = right[a] = found[a]
 
 
 @kernel
 def solve(factor, x):
-    """Replace a right side `x` (6 N + 23,) by the solution of A x = b."""
-    own, coupling, corner = factor
-    substitute_forward(factor, x)
-    first = len(x) - SHARED
-    shared = np.dot(corner, x[first:])
-    x[first:] = shared
-    found = np.empty(POSE)
-    for pose in range(len(own) - 1, -1, -1):
-        right, after = x[POSE * pose :], x[POSE * (pose + 1) : POSE * (pose + 3)]
-        for a in range(POSE):
-            total = 0.0
-            for b in range(POSE):
-                total += own[pose, a, b] * right[b]
-            for s in range(len(shared)):
-                total += coupling[pose, a, s] * shared[s]
-            for c in range(len(after)):
-                total += coupling[pose, a, SHARED + c] * after[c]
-            found[a] = total
-        for a in range(POSE):
-            right[a] = found[a]
+    """Replace a right side `x` (6 N + S,) by the solution of A x = b."""
+    rest, found = np.empty(factor.coupling.shape[2]), np.empty(POSE)
+    first = POSE * len(factor.own)
+    substitute_forward(factor, x, rest)
+    copy(np.dot(factor.corner, x[first:]), x[first:])
+    substitute_backward(factor, x, rest, found)
 
 
 @loop
 def shift_known(known, own, beside):
-    """Move the known part of the inverse (35, 35) to the pose before, (6, 6) and (6, 35)."""
-    second = SHARED + POSE
+    """
+    Move the known part of the inverse (S + 12, S + 12) to the pose before.
+
+    Its own block is (6, 6), that with the variables after it (6, S + 12).
+
+    """
+    S = len(known) - NEXT
+    second = S + POSE
     for a in range(POSE):
         for c in range(POSE):
-            known[second + a, second + c] = known[SHARED + a, SHARED + c]
-            known[SHARED + a, SHARED + c] = own[a, c]
-            known[SHARED + a, second + c] = beside[a, SHARED + c]
-            known[second + c, SHARED + a] = beside[a, SHARED + c]
-        for s in range(SHARED):
-            known[second + a, s] = known[SHARED + a, s]
-            known[s, second + a] = known[SHARED + a, s]
-            known[SHARED + a, s] = beside[a, s]
-            known[s, SHARED + a] = beside[a, s]
+            known[second + a, second + c] = known[S + a, S + c]
+            known[S + a, S + c] = own[a, c]
+            known[S + a, second + c] = beside[a, S + c]
+            known[second + c, S + a] = beside[a, S + c]
+        for s in range(S):
+            known[second + a, s] = known[S + a, s]
+            known[s, second + a] = known[S + a, s]
+            known[S + a, s] = beside[a, s]
+            known[s, S + a] = beside[a, s]
 
 
 @kernel
@@ -241,15 +299,19 @@ def invert_poses(factor, blocks, beside):
     """
     Write the blocks of the poses in the inverse.
 
-    Their own, (N, 6, 6), and those with the shared variables and the two poses after, (N, 6, 35).
+    Their own, (N, 6, 6), and those with the shared variables and the two poses after,
+    (N, 6, S + 12).
 
     The blocks of the inverse Z within the pattern of A follow from the last pose backward
     (Takahashi), beginning with that of the shared variables. With r those and the two poses after
     p, and the coupling W: Z_pr = W Z_rr, and Z_pp is the inverse of its own block + Z_pr W'.
 
     """
-    known = np.zeros((REST, REST))  # Z_rr
-    known[:SHARED, :SHARED] = factor.corner
+    S = len(factor.corner)
+    known = np.zeros((S + NEXT, S + NEXT))  # Z_rr
+    for s in range(S):
+        for t in range(S):
+            known[s, t] = factor.corner[s, t]
     own = np.empty((POSE, POSE))
     for pose in range(len(blocks) - 1, -1, -1):
         coupling = factor.coupling[pose]

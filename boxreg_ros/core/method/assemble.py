@@ -6,16 +6,16 @@ Every residual adds r' W r / 2 to the value, J' W r to the gradient and J' W J t
 """
 
 from boxreg_ros.core.method.arrays import (
+    ANCHOR,
     Arrowhead,
+    BLOCK,
     BOX_POSE,
+    copy,
     EXTENT,
     Factor,
     GAP,
     POSE,
     PRIOR,
-    REST,
-    SHARED,
-    SPAN,
 )
 from boxreg_ros.core.method.arrowhead import (
     clear,
@@ -30,9 +30,10 @@ from boxreg_ros.core.method.arrowhead import (
 )
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.residuals import (
-    Axes,
+    AXES,
     fill_axes,
     fill_plane,
+    level_of,
     RESIDUALS,
 )
 from boxreg_ros.core.method.weights import (
@@ -52,29 +53,31 @@ that of a deviation of 1000 m."""
 
 
 @kernel
-def empty_matrix(N):
+def empty_matrix(N, S):
     """Return room for the matrix of a window of N observations."""
-    return Arrowhead(
-        np.empty((N + 2, POSE, SPAN)), np.empty((N + 2, POSE, SHARED)), np.empty((SHARED, SHARED))
-    )
+    return Arrowhead(np.empty(N + 2, BLOCK), np.empty((S, S)))
 
 
 @kernel
 def no_matrix():
     """Return the matrix of an evaluation without curvature."""
-    return Arrowhead(np.empty((0, POSE, SPAN)), np.empty((0, POSE, SHARED)), np.empty((0, 0)))
+    return Arrowhead(np.empty(0, BLOCK), np.empty((0, 0)))
 
 
 @loop
 def is_wanted(A):
     """Return whether the curvature is wanted."""
-    return len(A.links) > 0
+    return len(A.poses) > 0
 
 
 @loop
-def add(n, poses, rows, columns, W, out, gradient, A):
-    """Add one residual `out` of some poses from n on, with diagonal weights W (6,)."""
-    first = len(gradient) - SHARED
+def add(n, poses, rows, columns, W, out, first, gradient, A):
+    """
+    Add one residual `out` of some poses from n on, with diagonal weights W (6,).
+
+    The gradient by the shared variables begins at `first`.
+
+    """
     width = POSE * poses
     value = 0.0
     for row in range(rows):
@@ -86,16 +89,15 @@ def add(n, poses, rows, columns, W, out, gradient, A):
             gradient[first + out.columns[s]] += S[s] * pull
         if not is_wanted(A):
             continue
-        for a in range(width):
-            weighted = W[row] * J[a]
-            if weighted == 0.0:
-                continue
-            pose = a // POSE
-            links, border = A.links[n + pose, a - POSE * pose], A.border[n + pose, a - POSE * pose]
-            for b in range(a, width):
-                links[b - POSE * pose] += weighted * J[b]
-            for s in range(columns):
-                border[out.columns[s]] += weighted * S[s]
+        for i in range(poses):
+            own = A.poses[n + i]
+            for a in range(POSE):
+                weighted = W[row] * J[POSE * i + a]
+                for k in range(i, poses):
+                    for b in range(POSE):
+                        own.links[a, POSE * (k - i) + b] += weighted * J[POSE * k + b]
+                for s in range(columns):
+                    own.border[a, out.columns[s]] += weighted * S[s]
         for s in range(columns):
             weighted = W[row] * S[s]
             if weighted == 0.0:
@@ -106,60 +108,122 @@ def add(n, poses, rows, columns, W, out, gradient, A):
 
 
 @loop
-def add_plane(n, face, w, v, by_angles, pull, weighted, gradient, A):
+def add_combination(n, poses, columns, W, out, first, gradient, A):
     """
-    Add the plane v (4,) of a face with the weight w (4, 4): the sum over its outermost points.
+    Add one residual `out` of a combination of some poses from n on, as `add` does.
 
-    The generic `add` for the derivatives of `fill_plane`, written out: this is half of a round.
-    `pull` (4,) and `weighted` (4, 3) are to work in.
+    With J the derivatives by the combination, J' W J is computed once for all of the poses.
 
     """
-    axis = face // 2
-    first = len(gradient) - SHARED
+    J, share, pull, curvature = out.J, out.share, out.pull, out.curvature
     value = 0.0
-    for a in range(4):
-        pull[a] = w[a, 0] * v[0] + w[a, 1] * v[1] + w[a, 2] * v[2] + w[a, 3] * v[3]
-        value += 0.5 * v[a] * pull[a]
-    for k in range(3):
-        gradient[POSE * n + k] -= v[k] * pull[3]
+    for row in range(POSE):
+        value += 0.5 * W[row] * out.r[row] ** 2
+    for a in range(POSE):
+        total = 0.0
+        for row in range(POSE):
+            total += J[row, a] * W[row] * out.r[row]
+        pull[a] = total
+    for i in range(poses):
+        for a in range(POSE):
+            gradient[POSE * (n + i) + a] += share[i] * pull[a]
+    for s in range(columns):
+        for row in range(POSE):
+            gradient[first + out.columns[s]] += out.S[row, s] * W[row] * out.r[row]
+    if not is_wanted(A):
+        return value
+    for a in range(POSE):
+        for b in range(a, POSE):
+            total = 0.0
+            for row in range(POSE):
+                total += J[row, a] * W[row] * J[row, b]
+            curvature[a, b] = curvature[b, a] = total
+    for i in range(poses):
+        for k in range(i, poses):
+            links, after = A.poses[n + i].links, POSE * (k - i)
+            for a in range(POSE):
+                for b in range(POSE):
+                    links[a, after + b] += share[i] * share[k] * curvature[a, b]
+    for s in range(columns):
+        for row in range(POSE):
+            weighted = W[row] * out.S[row, s]
+            if weighted == 0.0:
+                continue
+            for i in range(poses):
+                border = A.poses[n + i].border
+                for a in range(POSE):
+                    border[a, out.columns[s]] += share[i] * weighted * J[row, a]
+            for t in range(s, columns):
+                A.corner[out.columns[s], out.columns[t]] += weighted * out.S[row, t]
+    return value
+
+
+@loop
+def add_faces(n, axis, shared, terms, room, first, gradient, A):
+    """
+    Add the two faces (M2) along an axis of a box: sums over their outermost points.
+
+    The generic `add` for the derivatives of `fill_plane`, written out. What both faces have in
+    common is computed once, of the sum of their weights (4, 4).
+
+    """
+    u, by_angles, pull, weighted = room.plane, room.by_angles, room.pull, room.weighted
+    front, back = terms[n].W_faces[2 * axis], terms[n].W_faces[2 * axis + 1]
+    value = 0.0
+    for side in range(2):
+        face = 2 * axis + side
+        sign = 1.0 - 2.0 * side
+        w, level = terms[n].W_faces[face], level_of(n, face, shared, terms)
         for a in range(4):
-            gradient[POSE * n + 3 + k] += by_angles[a, k] * pull[a]
-    gradient[first + GAP + face] += pull[3]
-    gradient[first + EXTENT + axis] -= 0.5 * pull[3]
+            pull[a] = w[a, 3] * level
+            for b in range(4):
+                pull[a] += sign * w[a, b] * u[b]
+            value += 0.5 * sign * u[a] * pull[a]
+        value += 0.5 * level * pull[3]
+        for k in range(3):
+            gradient[POSE * n + k] -= sign * u[k] * pull[3]
+            for a in range(4):
+                gradient[POSE * n + 3 + k] += sign * by_angles[a, k] * pull[a]
+        gradient[first + GAP + face] += pull[3]
+        gradient[first + EXTENT + axis] -= 0.5 * pull[3]
+        if is_wanted(A):
+            border, own = A.poses[n].border, w[3, 3]
+            for k in range(3):
+                turn = 0.0
+                for a in range(4):
+                    turn += sign * w[3, a] * by_angles[a, k]
+                border[k, GAP + face] -= sign * own * u[k]
+                border[k, EXTENT + axis] += 0.5 * sign * own * u[k]
+                border[3 + k, GAP + face] += turn
+                border[3 + k, EXTENT + axis] -= 0.5 * turn
+            A.corner[GAP + face, GAP + face] += own
+            A.corner[EXTENT + axis, GAP + face] -= 0.5 * own
+            A.corner[EXTENT + axis, EXTENT + axis] += 0.25 * own
     if not is_wanted(A):
         return value
     for a in range(4):
         for k in range(3):
-            weighted[a, k] = (
-                w[a, 0] * by_angles[0, k] + w[a, 1] * by_angles[1, k]
-                + w[a, 2] * by_angles[2, k] + w[a, 3] * by_angles[3, k]
-            )  # fmt: skip
-    links, border, level = A.links[n], A.border[n], w[3, 3]
+            weighted[a, k] = 0.0
+            for b in range(4):
+                weighted[a, k] += (front[a, b] + back[a, b]) * by_angles[b, k]
+    links, both = A.poses[n].links, front[3, 3] + back[3, 3]
     for k in range(3):
         for m in range(k, 3):
-            links[k, m] += level * v[k] * v[m]
+            links[k, m] += both * u[k] * u[m]
             total = 0.0
             for a in range(4):
                 total += by_angles[a, k] * weighted[a, m]
             links[3 + k, 3 + m] += total
         for m in range(3):
-            links[k, 3 + m] -= v[k] * weighted[3, m]
-        border[k, GAP + face] -= level * v[k]
-        border[k, EXTENT + axis] += 0.5 * level * v[k]
-        border[3 + k, GAP + face] += weighted[3, k]
-        border[3 + k, EXTENT + axis] -= 0.5 * weighted[3, k]
-    A.corner[GAP + face, GAP + face] += level
-    A.corner[EXTENT + axis, GAP + face] -= 0.5 * level
-    A.corner[EXTENT + axis, EXTENT + axis] += 0.25 * level
+            links[k, 3 + m] -= u[k] * weighted[3, m]
     return value
 
 
 @loop
-def add_shared_prior(shared, common, gradient, A):
+def add_shared_prior(shared, common, first, gradient, A):
     """Add the deviation of the shared variables from those expected (M8)."""
-    first = len(gradient) - SHARED
     value = 0.0
-    for s in range(SHARED):
+    for s in range(len(shared)):
         off = shared[s] - common.shared[s]
         value += 0.5 * common.W_shared[s] * off**2
         gradient[first + s] += common.W_shared[s] * off
@@ -169,10 +233,9 @@ def add_shared_prior(shared, common, gradient, A):
 
 
 @kernel
-def add_marginal_prior(x, common, gradient, A):
+def add_marginal_prior(x, common, first, gradient, A):
     """Add the quadratic form in the two oldest poses and the shared variables (M9)."""
     W, mean = common.W_prior, common.prior_mean
-    first = len(gradient) - SHARED
     r = np.empty(PRIOR)
     for k in range(PRIOR):
         r[k] = x[k if k < NEXT else first + k - NEXT] - mean[k]
@@ -186,13 +249,14 @@ def add_marginal_prior(x, common, gradient, A):
     if is_wanted(A):
         for k in range(NEXT):
             pose = k // POSE
-            links, border = A.links[pose, k - POSE * pose], A.border[pose, k - POSE * pose]
+            own = A.poses[pose]
+            links, border = own.links[k - POSE * pose], own.border[k - POSE * pose]
             for m in range(k, NEXT):
                 links[m - POSE * pose] += W[k, m]
-            for s in range(SHARED):
+            for s in range(ANCHOR):
                 border[s] += W[k, NEXT + s]
-        for s in range(SHARED):
-            for t in range(s, SHARED):
+        for s in range(ANCHOR):
+            for t in range(s, ANCHOR):
                 A.corner[s, t] += W[NEXT + s, NEXT + t]
     return value
 
@@ -200,7 +264,7 @@ def add_marginal_prior(x, common, gradient, A):
 @kernel
 def empty_axes(N):
     """Return room for the axes of N poses."""
-    return Axes(np.empty((N, 3, 3)), np.empty((N, 3, 3, 3)))
+    return np.empty(N, AXES)
 
 
 @loop
@@ -213,10 +277,11 @@ def has_weight(W):
 
 
 @kernel
-def add_all(poses, shared, last, terms, at, out, gradient, A):
+def add_all(poses, shared, last, terms, at, room, first, gradient, A):
     """Add all `RESIDUALS` that begin at the first `last` observations."""
     value = 0.0
     i = 0
+    out = room[0]
     for row in literal_unroll(RESIDUALS):
         for n in range(min(last, number_of(len(poses), row.poses, True))):
             W = terms[n].W[i]
@@ -224,7 +289,10 @@ def add_all(poses, shared, last, terms, at, out, gradient, A):
                 out.J[:] = 0.0
                 out.S[:] = 0.0
                 rows, columns = row.function(n, poses, shared, terms, at, out)
-                value += add(n, row.poses, rows, columns, W, out, gradient, A)
+                if row.is_combination:
+                    value += add_combination(n, row.poses, columns, W, out, first, gradient, A)
+                else:
+                    value += add(n, row.poses, rows, columns, W, out, first, gradient, A)
         i += 1
     return value
 
@@ -236,40 +304,39 @@ def accumulate(x, last, terms, common, at, out, gradient, A):
 
     Parameters
     ----------
-    x : array, shape (6 N + 23,)
+    x : array, shape (6 N + S,)
         Poses and shared variables.
     last : int
         Only residuals that begin at the first `last` observations; less than N leaves out the
         prior on the shared variables too, which belongs to no observation.
     terms, common : array of `TERMS`, shape (N,), and record `COMMON`
         Data and weights of the window.
-    at, out : Axes, Linearised
+    at, out : array of `AXES`, shape (N,), and of `LINEARISED`, shape (1,)
         To work in.
-    gradient : array, shape (6 N + 23,)
+    gradient : array, shape (6 N + S,)
         Written.
     A : Arrowhead
         Gauss-Newton matrix, written; of `no_matrix` where it is not wanted.
 
     """
-    n_shared = len(x) - SHARED
-    N = n_shared // POSE
-    poses, shared = x[:n_shared].reshape(N, POSE), x[n_shared:]
-    v, by_angles, pull, weighted = np.empty(4), np.empty((4, 3)), np.empty(4), np.empty((4, 3))
+    N = len(terms)
+    first = POSE * N
+    poses, shared = x[:first].reshape(N, POSE), x[first:]
+    room = out[0]
     gradient[:] = 0.0
     clear(A)
     fill_axes(poses, 0, min(last + 1, N), at)
     value = 0.0
     for n in range(min(last, N)):
-        for face in range(6):
-            w = terms[n].W_faces[face]
-            if w[3, 3] != 0.0:
-                fill_plane(n, face, poses, shared, terms, at, v, by_angles)
-                value += add_plane(n, face, w, v, by_angles, pull, weighted, gradient, A)
-    value += add_all(poses, shared, last, terms, at, out, gradient, A)
+        for axis in range(3):
+            if terms[n].W_faces[2 * axis, 3, 3] + terms[n].W_faces[2 * axis + 1, 3, 3] != 0.0:
+                fill_plane(n, axis, poses, terms, at, room.plane, room.by_angles)
+                value += add_faces(n, axis, shared, terms, room, first, gradient, A)
+    value += add_all(poses, shared, last, terms, at, out, first, gradient, A)
     if common.W_prior[0, 0] != 0.0:
-        value += add_marginal_prior(x, common, gradient, A)
+        value += add_marginal_prior(x, common, first, gradient, A)
     if last >= N:
-        value += add_shared_prior(shared, common, gradient, A)
+        value += add_shared_prior(shared, common, first, gradient, A)
     return value
 
 
@@ -284,11 +351,11 @@ def weigh(b, problem, poses, shared, constants, at, out, terms, common):
         The window.
     problem : Problem
         Input of the batch.
-    poses, shared : array, shapes (N, 6) and (23,)
+    poses, shared : array, shapes (N, 6) and (S,)
         Boxes and shared variables of the window.
     constants : record of `Constants`
         Of the method, with the settings.
-    at, out : Axes, Linearised
+    at, out : array of `AXES`, shape (N,), and of `LINEARISED`, shape (1,)
         To work in.
     terms, common : array of `TERMS`, shape (N,), and record `COMMON`
         Of the window, with its face observations, rigid shape and expectation: the rest is
@@ -304,9 +371,11 @@ def weigh(b, problem, poses, shared, constants, at, out, terms, common):
     fill_axes(poses, 0, N, at)
     for n in range(N):
         terms[n].time = times[n]
-        terms[n].axes[:] = at.R[n]
-        terms[n].start[:] = poses[n]
+        for i in range(3):
+            for j in range(3):
+                terms[n].axes[i, j] = at[n].R[i, j]
         for k in range(POSE):
+            terms[n].start[k] = poses[n, k]
             terms[n].given[k] = boxes[n, BOX_POSE[k]]
         terms[n].W[:] = 0.0
     weigh_faces(length, of_class.roughness, constants, terms, face_weight)
@@ -319,10 +388,11 @@ def weigh(b, problem, poses, shared, constants, at, out, terms, common):
 
 
 @kernel
-def weigh_each(poses, shared, terms, window, constants, at, out):
+def weigh_each(poses, shared, terms, window, constants, at, room):
     """Write the weights of each of `RESIDUALS` where they are not zero."""
     squared = np.zeros(len(poses))
     i = 0
+    out = room[0]
     for row in literal_unroll(RESIDUALS):
         count = number_of(window.length, row.poses, constants.residuals[i])
         for n in range(count):
@@ -371,16 +441,17 @@ def linearise(x, terms, common, free, at, out, gradient, A, factor):
 
 @loop
 def fill_dense(A, dense):
-    """Write the block of the second pose, the third and the shared variables, (35, 35)."""
+    """Write the block of the second pose, the third and the shared variables, (29, 29)."""
+    S = len(A.corner)
     for pose in range(2):
         for a in range(POSE):
             i = POSE * pose + a
             for c in range(a, NEXT - POSE * pose):
-                dense[i, POSE * pose + c] = A.links[1 + pose, a, c]
-            for s in range(SHARED):
-                dense[i, NEXT + s] = A.border[1 + pose, a, s]
-    for s in range(SHARED):
-        for t in range(s, SHARED):
+                dense[i, POSE * pose + c] = A.poses[1 + pose].links[a, c]
+            for s in range(S):
+                dense[i, NEXT + s] = A.poses[1 + pose].border[a, s]
+    for s in range(S):
+        for t in range(s, S):
             dense[NEXT + s, NEXT + t] = A.corner[s, t]
     for i in range(len(dense)):
         for j in range(i):
@@ -392,24 +463,23 @@ def marginalise(x, gradient, A, mean, step, information):
     """
     Write the quadratic form that replaces the oldest observation of one window (M13).
 
-    In the next two poses and the shared variables: where they are (35,), the step from there to
-    the minimum (35,), and the curvature (35, 35). The sums of the residuals of the oldest
+    In the next two poses and the shared variables: where they are (29,), the step from there to
+    the minimum (29,), and the curvature (29, 29). The sums of the residuals of the oldest
     observation, from `accumulate`, are the input; they are changed.
 
     """
-    n = len(x) - SHARED
-    mean[:NEXT] = x[POSE : POSE + NEXT]
-    mean[NEXT:] = x[n:]
+    S = len(A.corner)
+    n = len(x) - S
+    copy(x[POSE:], mean[:NEXT])
+    copy(x[n:], mean[NEXT:])
     for a in range(POSE):
-        A.links[0, a, a] += RIDGE
-    oldest = Factor(
-        np.empty((1, POSE, POSE)), np.empty((1, POSE, REST)), np.empty((SHARED, SHARED))
-    )
+        A.poses[0].links[a, a] += RIDGE
+    oldest = Factor(np.empty((1, POSE, POSE)), np.empty((1, POSE, S + NEXT)), np.empty((S, S)))
     is_definite = eliminate_poses(A, oldest)
     fill_dense(A, information)
-    substitute_forward(oldest, gradient)
-    step[:NEXT] = -gradient[POSE : POSE + NEXT]
-    step[NEXT:] = -gradient[n:]
+    substitute_forward(oldest, gradient, np.empty(S + NEXT))
+    for k in range(PRIOR):
+        step[k] = -gradient[POSE + k if k < NEXT else n + k - NEXT]
     triangle = information.copy()
     for k in range(PRIOR):
         triangle[k, k] += UNKNOWN_RIDGE

@@ -6,6 +6,7 @@ from data; all others are *chosen*, and `make results` halves and doubles each o
 
 """
 
+from functools import lru_cache
 from math import inf
 from typing import Any, NamedTuple
 
@@ -208,8 +209,9 @@ class Constants(NamedTuple):
         is_robust = self.is_robust and is_smooth
         return self._replace(uses_shape=uses_shape, residuals=residuals, is_robust=is_robust)
 
+    @lru_cache(maxsize=8)  # noqa: B019
     def record(self) -> np.void:
-        """Return these numbers as one record, which kernels take by reference."""
+        """Return these numbers as one record, which kernels take by reference and only read."""
         record: np.void = np.array([tuple(self)], RECORD)[0]
         return record
 

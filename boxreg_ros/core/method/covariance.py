@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import EXTENT, GAP, PIVOT
+from boxreg_ros.core.method.arrays import copy, EXTENT, GAP, PIVOT, POSE
 from boxreg_ros.core.method.arrowhead import add_sandwich
 from boxreg_ros.core.method.compile import kernel
 from boxreg_ros.core.method.expectation import FACES, HEADING, SIZE
@@ -23,7 +23,7 @@ class Inverse(NamedTuple):
     ----------
     poses : array, shape (N, 6, 6)
         Of each pose.
-    beside : array, shape (N, 6, 35)
+    beside : array, shape (N, 6, S + 12)
         Of each pose with the shared variables and the two poses after it.
 
     """
@@ -87,7 +87,9 @@ def fill_pose_covariances(length, times, poses, inverse, G, constants, found):
     """Write the covariances of the poses, (N, 6, 6)."""
     shift, through = np.zeros(3), np.empty(PIVOT)
     for n in range(len(poses)):
-        found[n] = inverse.poses[n]
+        for i in range(POSE):
+            for j in range(POSE):
+                found[n, i, j] = inverse.poses[n, i, j]
         add_sandwich(inverse.beside[n], G, through, found[n])
         found[n, HEADING, HEADING] += constants.heading_deviation**2
         if n >= length:
@@ -107,7 +109,8 @@ def fill_pose_covariances(length, times, poses, inverse, G, constants, found):
 def fill_extent_covariance(corner, free, common, G, found):
     """Write the covariance of the extents, (3, 3); held ones have the errors of the input."""
     rows = corner[EXTENT : EXTENT + SIZE]
-    found[:] = rows[:, EXTENT : EXTENT + SIZE]
+    for i in range(SIZE):
+        copy(rows[i, EXTENT:], found[i])
     add_sandwich(rows, G, np.empty(PIVOT), found)
     for i in range(SIZE):
         for j in range(SIZE):
@@ -128,15 +131,15 @@ def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, corn
         The window.
     problem : Problem
         Input of the batch.
-    poses, shared : array, shapes (N, 6) and (23,)
+    poses, shared : array, shapes (N, 6) and (S,)
         Estimate of the window.
     terms, common : array of `TERMS`, shape (N,), and record `COMMON`
         Of the window in the last round.
-    free : array, shape (6 N + 23,)
+    free : array, shape (6 N + S,)
         1 for variables that are estimated, 0 for those held fixed.
     inverse : Inverse
         Blocks of its inverse curvature.
-    corner : array, shape (23, 23)
+    corner : array, shape (S, S)
         That of the shared variables.
     constants : record of `Constants`
         Of the method, with the settings.

@@ -1,8 +1,9 @@
 """Pairs of a point and a box that are near each other, and the road beside the boxes."""
 
+from math import sqrt
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.selection import nth
 import numpy as np
 
@@ -274,24 +275,57 @@ def road_heights(owner, height, n, numbers):
 
 
 @kernel
-def clear_foreign(tolerance, row, depth, is_owned):
+def pairs_of_boxes(cells, first, boxes, count, n):
     """
-    Clear `is_owned` (P,) of the pairs whose point belongs to another box (M10a).
+    Return which points are near each of n boxes, in their order.
 
-    A point belongs to the boxes that it is deepest inside of, up to a tolerance [m]. The pairs of
-    one point, its `row` (P,), follow each other.
+    Those of box b are place[start[b]:start[b + 1]], indices of `cells` (K,), the cells of all
+    points; `first`, `boxes` and `count` are those of `candidates`.
 
     """
-    start = 0
-    while start < len(row):
-        end = start
-        deepest = depth[start]
-        while end < len(row) and row[end] == row[start]:
-            deepest = min(deepest, depth[end])
-            end += 1
-        for k in range(start, end):
-            is_owned[k] &= depth[k] <= deepest + tolerance
-        start = end
+    point, box = np.empty(count, np.int32), np.empty(count, np.int32)
+    pair = 0
+    for i in range(len(cells)):
+        for k in range(first[cells[i]], first[cells[i] + 1]):
+            point[pair], box[pair] = i, boxes[k]
+            pair += 1
+    return grouped(point, box, n)
+
+
+@loop
+def measure(points, near, place, shapes, box, numbers, offset, x, depth, height, is_beside):
+    """
+    Write where the points `near[place]` (m,) are in and around a box.
+
+    Their offset from its centre along x of the fixed frame, their distance outside of the face
+    that they are least inside of, their height above its bottom along its z axis, and whether
+    they may be of the road beside it, (m,) each. `offset` (3, m) is to work in.
+
+    """
+    center, half = shapes.centers[box], shapes.half[box]
+    turn, R = shapes.turn, shapes.rotations[box]
+    square = sqrt(half[0] ** 2 + half[1] ** 2) + numbers.road_width
+    for j in range(len(place)):  # the next loop is compiled to vector instructions
+        for k in range(3):
+            offset[k, j] = points[k, near[place[j]]]
+    for j in range(len(place)):
+        dx, dy, dz = offset[0, j] - center[0], offset[1, j] - center[1], offset[2, j] - center[2]
+        dx, dy, dz = turned(turn, dx, dy, dz)
+        up = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+        u = abs(R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) - half[0]
+        v = abs(R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) - half[1]
+        w = abs(up) - half[2]
+        aside = u if u > v else v
+        deep = aside if aside > w else w
+        high = half[2] + up
+        x[j], depth[j], height[j] = dx, deep, high
+        is_beside[j] = (
+            (aside > numbers.road_gap)
+            & (deep < numbers.road_width)
+            & (abs(high) < numbers.road_range)
+            & (abs(dx) < square)
+            & (abs(dy) < square)
+        )
 
 
 @kernel
@@ -315,7 +349,9 @@ def sorted_by_x(owner, x, n):
     place = np.empty(P, np.uint32)
     for k in range(P):
         place[k] = np.uint32((owner[k] + 0.5 + x[k] / scale / 4) * unit)
-    order, other = np.arange(P), np.empty(P, np.int64)
+    order, other = np.empty(P, np.int64), np.empty(P, np.int64)
+    for k in range(P):
+        order[k] = k
     count = np.empty(256, np.int64)
     for shift in range(0, 32, 8):
         count[:] = 0
@@ -354,54 +390,47 @@ def own_points(points, shapes, numbers):
         Points inside each box.
 
     """
-    half = shapes.half
-    n = len(half)
-    near, cells, first, boxes, capacity = candidates(points, shapes)
-    row = np.empty(capacity, np.int32)
-    owner = np.empty(capacity, np.int32)
-    x = np.empty(capacity)
-    depth = np.empty(capacity)  # outside of the face that the point is least inside of
-    height = np.empty(capacity)  # above the bottom of the box, along its z axis
-    beside = np.empty(capacity, np.int32)
-    level = np.empty(capacity)
-    num_inside = np.zeros(n, np.int64)
-    square = np.hypot(half[:, 0], half[:, 1]) + numbers.road_width
-    P, B = 0, 0  # without branches: the next pair replaces one too far
-    for k in range(len(near)):
-        for place in range(first[cells[k]], first[cells[k] + 1]):
-            i, box = near[k], boxes[place]
-            dx, dy, dz = offset_of(points, i, shapes, box)
-            R = shapes.rotations[box]
-            up = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
-            u = abs(R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) - half[box, 0]
-            v = abs(R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) - half[box, 1]
-            w = abs(up) - half[box, 2]
-            aside = max(u, v)
-            deep = max(aside, w)
-            high = half[box, 2] + up
-            row[P], owner[P] = i, box
-            x[P], depth[P], height[P] = dx, deep, high
-            beside[B], level[B] = box, high
-            B += (
-                (aside > numbers.road_gap)
-                & (deep < numbers.road_width)
-                & (abs(high) < numbers.road_range)
-                & (max(abs(dx), abs(dy)) < square[box])
+    n = len(shapes.half)
+    near, cells, first, boxes, P = candidates(points, shapes)
+    place, start = pairs_of_boxes(cells, first, boxes, P, n)
+    x, depth, height = np.empty(P), np.empty(P), np.empty(P)
+    most = 0
+    for box in range(n):
+        most = max(most, start[box + 1] - start[box])
+    offset, level, is_beside = np.empty((3, most)), np.empty(most), np.empty(most, np.bool_)
+    road, num_inside = np.full(n, np.nan), np.zeros(n, np.int64)
+    deepest = np.full(len(near), np.inf)  # of each point in any box
+    for box in range(n):
+        begin, end = start[box], start[box + 1]
+        measure(
+            points, near, place[begin:end], shapes, box, numbers, offset, x[begin:end],
+            depth[begin:end], height[begin:end], is_beside,
+        )  # fmt: skip
+        count, inside = 0, 0  # without branches: the next one replaces one too far
+        for k in range(begin, end):
+            level[count] = height[k]
+            count += is_beside[k - begin]
+            inside += depth[k] <= 0.0
+            if depth[k] < deepest[place[k]]:
+                deepest[place[k]] = depth[k]
+        num_inside[box] = inside
+        if numbers.has_road:
+            road[box] = flat_height(
+                level[:count], numbers.road_quantiles, numbers.road_flatness,
+                numbers.min_road_points,
+            )  # fmt: skip
+    own = np.empty(P, np.int32)
+    owner = np.empty(P, np.int32)
+    count = 0
+    for box in range(n):
+        least = numbers.clearance + (road[box] if road[box] == road[box] else 0.0)
+        for k in range(start[box], start[box + 1]):
+            own[count], owner[count] = k, box
+            count += (
+                (depth[k] < numbers.own_margin)
+                & (height[k] > least)
+                & (depth[k] <= deepest[place[k]] + numbers.ownership_tolerance)
             )
-            num_inside[box] += deep <= 0.0
-            P += deep < numbers.margin
-    road = np.full(n, np.nan)
-    if numbers.has_road:
-        road = road_heights(beside[:B], level[:B], n, numbers)
-    is_owned = np.empty(P, np.bool_)
-    for k in range(P):
-        ground = road[owner[k]] if road[owner[k]] == road[owner[k]] else 0.0
-        is_owned[k] = depth[k] < numbers.own_margin and height[k] > ground + numbers.clearance
-    if numbers.ownership_tolerance < np.inf:
-        clear_foreign(numbers.ownership_tolerance, row[:P], depth[:P], is_owned)
-    own = 0
-    for k in range(P):
-        row[own], owner[own], x[own] = row[k], owner[k], x[k]
-        own += is_owned[k]
-    order = sorted_by_x(owner[:own], x[:own], n)
-    return row[order], owner[order], road, num_inside
+    own, owner = own[:count], owner[:count]
+    order = sorted_by_x(owner, x[own], n)
+    return near[place[own[order]]], owner[order], road, num_inside

@@ -39,6 +39,13 @@ def fill_mean_extents(b, problem, mean):
 
 
 @kernel
+def fill_all_mean_extents(problem, means):
+    """Write the mean input extents of each window, (B, 3) [m]."""
+    for b in range(len(means)):
+        fill_mean_extents(b, problem, means[b])
+
+
+@kernel
 def interval_of(b, problem):
     """Return the mean time step of window `b` [s]."""
     length = problem.lengths[b]
@@ -132,8 +139,8 @@ def fill_shared(b, problem, inputs, constants, mean, common):
         deviation[GAP + face] = spread * sqrt(between)
         common.margin_variance[face] = inputs.margin_variance[face]
     shared[PIVOT] = deviation[PIVOT] = mean[0] * constants.pivot
-    deviation[ANCHOR:SIDESLIP] = 1.0
     deviation[SIDESLIP] = constants.sideslip
+    deviation[ANCHOR:] = 1.0
 
 
 @kernel
@@ -167,7 +174,7 @@ def fill_evidence(common, shared, corner, min_gain, evidence):
     """
     Write the evidence of the points alone about the extents (M18), see `Solution.evidence`.
 
-    `corner` (23, 23) is the covariance of the shared variables: the part of the prior in the fit
+    `corner` (S, S) is the covariance of the shared variables: the part of the prior in the fit
     is removed.
 
     """

@@ -17,8 +17,12 @@ FACES = 5
 """Front, back, left, right, top: the bottom is observed by the road."""
 STRIP_AXIS = (1, 1, 0, 0, 1)
 """Box axis along which the strips of each of these lie side by side."""
-NOWHERE = 1e9
-"""Depth of points that are not on a face [m]."""
+INDEX_BITS = 17
+"""Bits of the index of a point, below those of its depth. Derived: `sampling.points` is less."""
+DEPTH_UNITS = 2.0**40
+"""Units of a depth per metre. Derived: with the index and the sign, depths are within +-64 m."""
+NOWHERE = np.iinfo(np.int64).max
+"""Depth of points that are not on a face."""
 ALWAYS_VISIBLE = 9.0
 """Tangent of the roof; that of the bottom is its negative."""
 FAR_SENSOR = 1e6
@@ -28,31 +32,37 @@ MIN_ALONG = 0.5
 
 
 @loop
-def fill_candidates(depth, m, constants, index):
+def fill_candidates(depth, m, constants, candidates):
     """
-    Write which of m points may be outermost on a face; return how many, and their largest depth.
+    Write the depths of those of m points that may be outermost on a face; return how many.
 
     Those further behind the outermost one than `max_depth` are on another surface.
 
     """
-    limit = constants.deepest - constants.max_depth
+    limit = packed(constants.deepest - constants.max_depth, 0)
     for i in range(m):
         limit = min(limit, depth[i])
-    limit += constants.max_depth
+    limit += packed(constants.max_depth, 0)
     count = 0
     for i in range(m):
-        index[count] = i
+        candidates[count] = depth[i]
         count += depth[i] <= limit
-    return count, limit
+    return count
+
+
+@loop
+def packed(depth, index):
+    """Return a depth [m] and the index of a point as one integer: points are ordered by depth."""
+    return (np.int64(depth * DEPTH_UNITS) << INDEX_BITS) | index
 
 
 @loop
 def fill_depths(m, half, level, constants, work):
     """
-    Write how far inside of the expected surface of each face each of m points is, (5, M) [m].
+    Write how far inside of the expected surface of each face each of m points is, (5, M).
 
-    Points that are beside a face, or too deep to be on it, are at `NOWHERE`. Writes the strips
-    (2, M) too; returns how many points are in and near the box.
+    `packed` with their indices. Points that are beside a face, or too deep to be on it, are at
+    `NOWHERE`. Writes the strips (2, M) too; returns how many points are in and near the box.
 
     """
     local, excess, strip, depth = work.local, work.excess, work.strip, work.depth
@@ -85,7 +95,7 @@ def fill_depths(m, half, level, constants, work):
             d = surface - sign * local[axis, i]
             counts = (excess[one, i] <= edge_margin) & (excess[other, i] <= edge_margin)
             counts &= (d >= -outside_margin) & (d < deepest)
-            depth[face, i] = d if counts else NOWHERE
+            depth[face, i] = packed(d, i) if counts else NOWHERE
     return near
 
 
@@ -98,33 +108,30 @@ def outermost_points(m, wanted, constants, work, moments):
 
     """
     points, candidates = work.moved, work.candidates
-    best_depth, best_index = work.best_depth, work.best_index
+    best, mask = work.best, (1 << INDEX_BITS) - 1
     for face in range(FACES):
         own_strip, depth = work.strip[STRIP_AXIS[face]], work.depth[face]
-        count, limit = fill_candidates(depth, m, constants, candidates)
-        best_depth[:, :wanted] = NOWHERE
+        count = fill_candidates(depth, m, constants, candidates)
+        best[:, :wanted] = NOWHERE
         for candidate in range(count):
-            i = candidates[candidate]
-            s = own_strip[i]
-            d, next_depth, next_index = depth[i], depth[i], np.int64(i)
+            point = candidates[candidate]
+            own = best[own_strip[point & mask]]
             for place in range(wanted):  # without a branch: half would be predicted wrong
-                here, here_index = best_depth[s, place], best_index[s, place]
-                is_behind = d < here
-                best_depth[s, place] = next_depth if is_behind else here
-                best_index[s, place] = next_index if is_behind else here_index
-                next_depth = here if is_behind else next_depth
-                next_index = here_index if is_behind else next_index
+                here = own[place]
+                own[place] = min(here, point)
+                point = max(here, point)
         number = 0
         total = 0.0
         moment = moments[face]
         moment[:] = 0.0
-        for s in range(len(best_depth)):
+        for s in range(len(best)):
             for rank in range(wanted):
-                if not best_depth[s, rank] <= limit:
+                point = best[s, rank]
+                if point == NOWHERE:
                     break
                 number += 1
-                total += best_depth[s, rank]
-                i = best_index[s, rank]
+                total += (point >> INDEX_BITS) / DEPTH_UNITS
+                i = point & mask
                 for a in range(3):
                     for b in range(a, 3):
                         moment[a, b] += points[a, i] * points[b, i]
@@ -305,9 +312,10 @@ class FaceWork(NamedTuple):
     depth : array, shape (5, M)
         See `fill_depths`.
     candidates : array, shape (M + 1,)
-        Points that may be outermost on one face; the last place is for one that may not.
-    best_depth, best_index : array
-        The outermost points of each strip of one face.
+        Depths of the points that may be outermost on one face; the last place is for one that may
+        not.
+    best : array
+        Depths of the outermost points of each strip of one face.
     number, mean_depth : array, shape (5,)
         Of the outermost points of each face.
 
@@ -319,8 +327,7 @@ class FaceWork(NamedTuple):
     strip: Any
     depth: Any
     candidates: Any
-    best_depth: Any
-    best_index: Any
+    best: Any
     number: Any
     mean_depth: Any
 
@@ -332,7 +339,7 @@ def empty_face_work(begin, end, problem, constants):
     size = ceil(max(constants.min_face_points, constants.outermost / constants.strips * M)) + 1
     return FaceWork(
         np.empty((3, M)), np.empty((3, M)), np.empty((3, M)), np.empty((2, M), np.int32),
-        np.empty((FACES, M)), np.empty(M + 1, np.int32), np.empty((constants.strips, size)),
+        np.empty((FACES, M), np.int64), np.empty(M + 1, np.int64),
         np.empty((constants.strips, size), np.int64), np.empty(FACES, np.int64), np.empty(FACES),
     )  # fmt: skip
 
@@ -360,7 +367,7 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
         The window.
     problem : Problem
         Input of the batch.
-    poses, shared : array, shapes (N, 6) and (23,)
+    poses, shared : array, shapes (N, 6) and (S,)
         Boxes of the window in this round.
     inputs : record `INPUTS`
         With the insets of its kind.
@@ -438,41 +445,3 @@ def observe_faces(first, last, problem, poses, shared, inputs, constants, terms)
     for b in range(first, last):
         kind = problem.kind[b]
         observe_window(b, problem, poses[b], shared[b], inputs[kind], constants, work, terms[b])
-
-
-@kernel
-def count_held(begin, end, problem, poses, extents, margin, held):
-    """
-    Write how many points are in each box, or less than `margin` outside of it, (B, N).
-
-    Boxes at `poses` (B, N, 6) of `extents` (B, N, 3); windows `begin` to `end`.
-
-    """
-    M = max(1, problem.counts[begin:end].max()) if end > begin else 1
-    moved = np.empty((3, M))
-    local = np.empty((3, M))
-    R = np.empty((3, 3))
-    velocity = np.zeros(3)
-    shift = np.empty(3)
-    for b in range(begin, end):
-        for n in range(problem.lengths[b]):
-            m = problem.counts[b, n]
-            pose, extent, box = poses[b, n], extents[b, n], problem.boxes[b, n]
-            fill_rotation(pose[3], pose[4], pose[5], R)
-            if problem.is_moving:
-                fill_velocity(poses[b], problem.times[b], n, problem.lengths[b], velocity)
-            for k in range(3):
-                shift[k] = pose[k] - box[k]
-            fill_moved(b, n, problem, velocity, moved)
-            to_box_axes(m, moved, shift, R, local)
-            reach_x, reach_y, reach_z = (
-                extent[0] / 2 + margin, extent[1] / 2 + margin, extent[2] / 2 + margin
-            )  # fmt: skip
-            count = 0
-            for i in range(m):
-                count += (
-                    (abs(local[0, i]) < reach_x)
-                    & (abs(local[1, i]) < reach_y)
-                    & (abs(local[2, i]) < reach_z)
-                )
-            held[b, n] = count

@@ -2,10 +2,13 @@
 
 from math import cos, pi, sin
 
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.arrays import copy, POSE
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.selection import lower_median
 import numpy as np
 
+ANGLES = (6, 7, 8)
+"""Places of roll, pitch and yaw in a box."""
 HEADING = 8
 """Place of the yaw in a box."""
 MAX_REVERSE_SPEED = 6.0
@@ -84,9 +87,70 @@ def resolve_headings(boxes, times, lengths, known_yaw, yaw):
     """
     for b in range(len(boxes)):
         length = lengths[b]
-        yaw[b] = boxes[b, :, HEADING]
+        copy(boxes[b, :, HEADING], yaw[b])
         if boxes.shape[1] == 1:
             continue  # nothing contradicts a single heading
         unwrap_half_turns(yaw[b])
         if is_reversed(boxes[b, :length], times[b, :length], known_yaw[b], yaw[b, :length]):
-            yaw[b] += pi
+            for n in range(yaw.shape[1]):
+                yaw[b, n] += pi
+
+
+@kernel
+def correct_flips(boxes, times, lengths, pinned, known_yaw):
+    """
+    Correct 180° flips of the angles of boxes, as `resolve_headings`.
+
+    A pinned box, of those `pinned` (B, N), decides on the heading sign of its window.
+
+    """
+    yaw = np.empty(times.shape)
+    resolve_headings(boxes, times, lengths, known_yaw, yaw)
+    for b in range(len(boxes)):
+        is_contrary = False
+        for n in range(boxes.shape[1]):
+            is_contrary |= pinned[b, n] and cos(yaw[b, n] - boxes[b, n, HEADING]) < 0
+        for n in range(boxes.shape[1]):
+            box = boxes[b, n]
+            angle = yaw[b, n] + (pi if is_contrary else 0.0)
+            # A half turn about the z axis of the box changes the signs of roll and pitch.
+            sign = 1.0 if cos(angle - box[HEADING]) >= 0 else -1.0
+            for k in ANGLES[:2]:
+                box[k] = (sign * box[k] + pi) % (2 * pi) - pi
+            box[HEADING] = angle
+
+
+@loop
+def align(boxes, start, state, minimum, information):
+    """
+    Move the angles of starts and priors by whole turns to those of the boxes (B, N, 9).
+
+    Yaw, and the angles of priors, by half turns: a kept box is returned with the heading of its
+    input. A prior that an odd number of them is needed for holds for the other heading sign.
+
+    Parameters
+    ----------
+    boxes, start : array, shape (B, N, 9)
+        Input boxes, and where the search starts, which is written [m, rad].
+    state, minimum, information : array, shapes (B, 29), (B, 29) and (B, 29, 29)
+        Linearisation point of each prior, NaN without one, and its minimum, which is written, as
+        is the information: 0 of one that does not hold.
+
+    """
+    for b in range(len(boxes)):
+        for n in range(boxes.shape[1]):
+            for k in ANGLES:
+                period = pi if k == HEADING else 2 * pi
+                start[b, n, k] += period * np.rint((boxes[b, n, k] - start[b, n, k]) / period)
+        is_contrary = False
+        for pose in range(2):
+            for k in range(3):
+                j = POSE * pose + 3 + k
+                angle = start[b, pose % start.shape[1], ANGLES[k]]
+                half_turns = np.rint((angle - state[b, j]) / pi)
+                minimum[b, j] += pi * half_turns
+                is_contrary |= half_turns % 2 != 0
+        if is_contrary:
+            information[b] = 0.0
+        if state[b, 0] != state[b, 0]:
+            minimum[b] = 0.0

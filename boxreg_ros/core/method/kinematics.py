@@ -1,7 +1,7 @@
 """Velocity (M26a) and acceleration (M26b) of the boxes of one window, and their covariances."""
 
-from boxreg_ros.core.method.arrays import PIVOT, POSE, SHARED
-from boxreg_ros.core.method.arrowhead import add_sandwich
+from boxreg_ros.core.method.arrays import PIVOT, POSE
+from boxreg_ros.core.method.arrowhead import add_sandwich, NEXT
 from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
 
@@ -24,6 +24,7 @@ def fill_combination(first, factors, inverse, G, border, through, found):
     Of their variables `RATES`. `border` (4, 15) and `through` (15,) are to work in.
 
     """
+    first_link = inverse.beside.shape[2] - NEXT
     for i in range(len(RATES)):
         k = RATES[i]
         for s in range(PIVOT):
@@ -39,7 +40,7 @@ def fill_combination(first, factors, inverse, G, border, through, found):
                 total += factors[a] ** 2 * inverse.poses[first + a, k, m]
                 beside = inverse.beside[first + a]
                 for b in range(a + 1, 3):
-                    of_other = SHARED + POSE * (b - a - 1)
+                    of_other = first_link + POSE * (b - a - 1)
                     both = beside[k, of_other + m] + beside[m, of_other + k]
                     total += factors[a] * factors[b] * both
             found[i, j] = found[j, i] = total

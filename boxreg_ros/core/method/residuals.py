@@ -36,6 +36,8 @@ class Residual(NamedTuple):
         Whether (M24) down-weights it as a whole.
     name : str
         Of the switch of `measure ablation`, and in docs/method.md.
+    is_combination : bool
+        Whether it has six rows and depends on its poses by one linear combination of them.
 
     """
 
@@ -44,79 +46,85 @@ class Residual(NamedTuple):
     poses: int
     is_robust: bool
     name: str
+    is_combination: bool = False
 
 
-class Linearised(NamedTuple):
-    """
-    One residual at one state, of at most 6 rows.
+LINEARISED = np.dtype(
+    [
+        ('r', float, POSE),
+        ('J', float, (POSE, SPAN)),
+        ('S', float, (POSE, POSE)),
+        ('columns', int, POSE),
+        ('share', float, 3),
+        ('R', float, (3, 3)),
+        ('dR', float, (3, 3, 3)),
+        ('step', float, POSE),
+        ('pull', float, POSE),
+        ('curvature', float, (POSE, POSE)),
+        ('plane', float, 4),
+        ('by_angles', float, (4, 3)),
+        ('weighted', float, (4, 3)),
+    ],
+    align=True,
+)
+"""
+One residual at one state, of at most 6 rows.
 
-    Attributes
-    ----------
-    r, J, S : array, shapes (6,), (6, 18) and (6, 6)
-        Residual; derivatives by up to three poses, and by the shared variables `columns`. J and S
-        are zero before a residual function is called.
-    columns : array, shape (6,)
-        Of the shared variables.
-    R, dR : array, shapes (3, 3) and (3, 3, 3)
-        To work in.
-
-    """
-
-    r: Any
-    J: Any
-    S: Any
-    columns: Any
-    R: Any
-    dR: Any
+r, J, S
+    Residual (6,); derivatives by up to three poses (6, 18), and by the shared variables `columns`
+    (6, 6). J and S are zero before a residual function is called.
+columns
+    Of the shared variables, (6,).
+share
+    Factors of the poses in a combination of them, (3,): the first six columns of J are derivatives
+    by this.
+R, dR, step, pull, curvature, plane, by_angles, weighted
+    To work in.
+"""
 
 
-class Axes(NamedTuple):
-    """
-    Axes of the poses of a state.
+AXES = np.dtype([('R', float, (3, 3)), ('dR', float, (3, 3, 3))], align=True)
+"""
+Axes of a pose of a state.
 
-    Attributes
-    ----------
-    R, dR : array, shapes (N, 3, 3) and (N, 3, 3, 3)
-        Columns are the axes; derivatives by roll, pitch and yaw, in front.
-
-    """
-
-    R: Any
-    dR: Any
+R, dR
+    Columns are the axes (3, 3); derivatives by roll, pitch and yaw, in front (3, 3, 3).
+"""
 
 
 @kernel
 def empty_linearised():
     """Return room for one residual."""
-    return Linearised(
-        np.zeros(POSE), np.zeros((POSE, SPAN)), np.zeros((POSE, POSE)), np.zeros(POSE, np.int64),
-        np.zeros((3, 3)), np.zeros((3, 3, 3)),
-    )  # fmt: skip
+    return np.zeros(1, LINEARISED)
 
 
 @loop
-def fill_plane(n, face, poses, shared, terms, at, v, by_angles):
+def fill_plane(n, axis, poses, terms, at, plane, by_angles):
     """
-    Write the plane of a face (M2): its signed distance from a point q is v'(q, 1).
+    Write the plane u of a box centre, normal to an axis: q is u'(q, 1) in front of it.
 
-    q is seen from the input centre. The normal turns with the angles of the pose, `by_angles`
-    (4, 3); the level also falls by the normal with the position, rises with the margin, and falls
-    by half of the extent.
+    q is seen from the input centre. u (4,) turns with the angles of the pose, `by_angles` (4, 3).
+    The distance of q from a face along the axis (M2) is that, or its negative for the face at the
+    back, plus `level_of`.
 
     """
-    R, dR, given = at.R[n], at.dR[n], terms[n].given
-    axis = face // 2
-    sign = 1.0 - 2.0 * (face % 2)
-    v[3] = terms[n].inset[face] + shared[GAP + face] - shared[EXTENT + axis] / 2
+    R, dR, given = at[n].R, at[n].dR, terms[n].given
+    plane[3] = 0.0
     for k in range(3):
         by_angles[3, k] = 0.0
     for j in range(3):
         shift = poses[n, j] - given[j]
-        v[j] = sign * R[j, axis]
-        v[3] -= v[j] * shift
+        plane[j] = R[j, axis]
+        plane[3] -= plane[j] * shift
         for k in range(3):
-            by_angles[j, k] = sign * dR[k, j, axis]
+            by_angles[j, k] = dR[k, j, axis]
             by_angles[3, k] -= by_angles[j, k] * shift
+
+
+@loop
+def level_of(n, face, shared, terms):
+    """Return how far a point at the box centre is in front of a face: mostly less than 0 [m]."""
+    return terms[n].inset[face] + shared[GAP + face] - shared[EXTENT + face // 2] / 2
 
 
 @loop
@@ -129,6 +137,7 @@ def fill_step(pose, origin, axes, out):
             out.J[k, j] = axes[j, k]
         out.r[3 + k] = pose[3 + k] - origin[3 + k]
         out.J[3 + k, 3 + k] = 1.0
+    out.share[0] = 1.0
 
 
 @loop
@@ -147,7 +156,7 @@ def rigid_shape(n, poses, shared, terms, at, out):
     """Write root'(step - anchor - wanted step), the rigid shape of the track (M4)."""
     fill_step(poses[n], terms[n].start, terms[n].axes, out)
     root, wanted, axes = terms[n].root, terms[n].wanted, terms[n].axes
-    step = out.R.ravel()
+    step = out.step
     for k in range(POSE):
         step[k] = out.r[k] - shared[ANCHOR + k] - wanted[k]
         out.columns[k] = ANCHOR + k
@@ -171,18 +180,18 @@ def acceleration(n, poses, shared, terms, at, out):
     first = terms[n + 1].time - terms[n].time
     second = terms[n + 2].time - terms[n + 1].time
     mean = (first + second) / 2
-    share = (1 / (first * mean), -(1 / first + 1 / second) / mean, 1 / (second * mean))
-    change = out.R.ravel()
+    out.share[0], out.share[2] = 1 / (first * mean), 1 / (second * mean)
+    out.share[1] = -(1 / first + 1 / second) / mean
+    change = out.step
     for k in range(POSE):
         forward = (poses[n + 2, k] - poses[n + 1, k]) / second
         change[k] = (forward - (poses[n + 1, k] - poses[n, k]) / first) / mean
     for k in range(3):
         out.r[k] = axes[0, k] * change[0] + axes[1, k] * change[1] + axes[2, k] * change[2]
         out.r[3 + k] = change[3 + k]
-        for i in range(3):
-            for j in range(3):
-                out.J[k, POSE * i + j] = share[i] * axes[j, k]
-            out.J[3 + k, POSE * i + 3 + k] = share[i]
+        for j in range(3):
+            out.J[k, j] = axes[j, k]
+        out.J[3 + k, 3 + k] = 1.0
     return POSE, 0
 
 
@@ -191,8 +200,8 @@ def zero_motion(n, poses, shared, terms, at, out):
     """Write the step from a pose to the next (M6)."""
     for k in range(POSE):
         out.r[k] = poses[n + 1, k] - poses[n, k]
-        out.J[k, k] = -1.0
-        out.J[k, POSE + k] = 1.0
+        out.J[k, k] = 1.0
+    out.share[0], out.share[1] = -1.0, 1.0
     return POSE, 0
 
 
@@ -218,7 +227,7 @@ def slip(n, poses, shared, terms, at, out):
         sideslip = shared[SIDESLIP] if side == 0 else 0.0
         out.r[side] = 0.0
         for j in range(3):
-            turned = at.R[n + 1, j, 0] - at.R[n, j, 0]
+            turned = at[n + 1].R[j, 0] - at[n].R[j, 0]
             step = after[j] - before[j] - pivot * turned
             across = (out.R[j, axis] - sideslip * out.R[j, 0]) * rate
             out.r[side] += across * step
@@ -229,19 +238,19 @@ def slip(n, poses, shared, terms, at, out):
                 out.S[side, 1] -= out.R[j, 0] * rate * step
             for k in range(3):
                 tilt = step * (out.dR[k, j, axis] - sideslip * out.dR[k, j, 0]) * rate / 2
-                out.J[side, 3 + k] += tilt + pivot * across * at.dR[n, k, j, 0]
-                out.J[side, POSE + 3 + k] += tilt - pivot * across * at.dR[n + 1, k, j, 0]
+                out.J[side, 3 + k] += tilt + pivot * across * at[n].dR[k, j, 0]
+                out.J[side, POSE + 3 + k] += tilt - pivot * across * at[n + 1].dR[k, j, 0]
     return 2, 2
 
 
 RESIDUALS = (
-    Residual(input_pose, input_weight, 1, False, 'input'),
-    Residual(rigid_shape, rigid_shape_weight, 1, False, 'rigid shape'),
-    Residual(acceleration, acceleration_weight, 3, True, 'acceleration'),
-    Residual(zero_motion, zero_motion_weight, 2, False, 'zero motion'),
+    Residual(input_pose, input_weight, 1, False, 'input', True),
+    Residual(rigid_shape, rigid_shape_weight, 1, False, 'rigid shape', True),
+    Residual(acceleration, acceleration_weight, 3, True, 'acceleration', True),
+    Residual(zero_motion, zero_motion_weight, 2, False, 'zero motion', True),
     Residual(slip, slip_weight, 2, True, 'slip'),
 )
-"""All residuals of observations but those of the faces, which `assemble.add_plane` sums."""
+"""All residuals of observations but those of the faces, which `assemble.add_faces` sums."""
 
 
 TERMS = np.dtype(
@@ -295,4 +304,4 @@ W
 def fill_axes(poses, first, last, at):
     """Write the axes of the poses `first` to `last`."""
     for n in range(first, last):
-        fill_rotation_derivatives(poses[n, 3], poses[n, 4], poses[n, 5], at.R[n], at.dR[n])
+        fill_rotation_derivatives(poses[n, 3], poses[n, 4], poses[n, 5], at[n].R, at[n].dR)

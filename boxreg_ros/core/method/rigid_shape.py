@@ -11,6 +11,7 @@ in point-to-plane ICP.
 from math import sqrt
 from typing import Any, NamedTuple
 
+from boxreg_ros.core.method.arrays import copy
 from boxreg_ros.core.method.arrowhead import factorise_corner, solve_corner
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.eigen import eigenvalues, eigenvector
@@ -157,9 +158,11 @@ def fill_agreement(m, local, half, constants, work, total, wanted):
         for k in range(j, 6):
             total[j, k] *= scale
             total[k, j] = total[j, k]
-    factor = total + STEP_RIDGE * np.eye(6)
+    factor = total.copy()
+    for j in range(6):
+        factor[j, j] += STEP_RIDGE
     factorise_corner(factor)
-    wanted[:] = pull
+    copy(pull, wanted)
     solve_corner(factor, wanted)
 
 

@@ -2,8 +2,14 @@
 
 from math import inf, isfinite, sqrt
 
+from boxreg_ros.core.method.arrays import copy
 from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
+
+LEAST_RUN = 1e-9
+"""Points are at least this far beside the sensor [m]. Derived: no slope is NaN."""
+MOST_RANKED = 400
+"""Points that are ordered by comparing all pairs. Measured: of more, a sort is faster."""
 
 
 @kernel
@@ -31,7 +37,7 @@ def ring_heights(points, counts, origins):
     """
     heights = np.zeros(len(counts))
     most = max(counts.max(), 1) if len(counts) else 0
-    slopes, ordered = np.empty(most), np.empty(most)
+    slopes, ordered, rest = np.empty(most), np.empty(most), np.empty(most)
     first = 0
     for i in range(len(counts)):
         m = counts[i]
@@ -41,9 +47,10 @@ def ring_heights(points, counts, origins):
         for k in range(origins.shape[1]):
             if m > 1 and isfinite(origins[i, k, 0]):
                 fill_slopes(own, origins[i, k], known)
-                ordered[:m] = known
-                ordered[:m].sort()
-                ring = covering_gap(ordered[:m])
+                if m > MOST_RANKED:
+                    ring = covering_gap_of_many(known, ordered[:m])
+                else:
+                    ring = covering_gap(known, ordered[:m], rest[:m])
                 away = sqrt(origins[i, k, 0] ** 2 + origins[i, k, 1] ** 2)
                 height = min(height, away * ring, height_of_highest(own, known, ring))
         if isfinite(height):
@@ -70,22 +77,72 @@ def fill_slopes(points, origin, slopes):
     """Write the rise of the rays to points (M, 3) from a sensor over their run, (M,)."""
     for i in range(len(points)):
         x, y = points[i, 0] - origin[0], points[i, 1] - origin[1]
-        slopes[i] = (points[i, 2] - origin[2]) / sqrt(x**2 + y**2)
+        slopes[i] = (points[i, 2] - origin[2]) / max(sqrt(x**2 + y**2), LEAST_RUN)
 
 
-@kernel
-def covering_gap(values):
+@loop
+def fill_slopes_of(points, rows, origin, slopes):
+    """Write the same of some rows (n,) of the points of a sweep, -inf where it is no number."""
+    for i in range(len(rows)):
+        x, y, z = points[rows[i], 0], points[rows[i], 1], points[rows[i], 2]
+        run = max(sqrt((x - origin[0]) ** 2 + (y - origin[1]) ** 2), LEAST_RUN)
+        slope = (z - origin[2]) / run
+        slopes[i] = slope if isfinite(slope) else -inf
+
+
+@loop
+def sort_by_rank(values, rank, ordered):
+    """
+    Write values (n,) in ascending order; `rank` (n,) is to work in.
+
+    All pairs are compared, by vector instructions: a sort of a hundred takes twice as long, since
+    half of its branches are predicted wrong.
+
+    """
+    rank[:] = 0.0
+    for j in range(len(values)):
+        for i in range(len(values)):
+            rank[i] += 1.0 if values[i] > values[j] else 0.0
+        for i in range(j):
+            rank[i] += 1.0 if values[i] == values[j] else 0.0
+    for i in range(len(values)):
+        ordered[int(rank[i])] = values[i]
+
+
+@loop
+def covering_gap(values, ordered, gaps):
     """
     Return the gap between neighbours that covers the middle of all gaps in their order; 0 without.
 
-    Half of the range of the sorted `values` is covered by gaps up to this one: neither the many
-    small ones within rings count, nor one large one where nothing returned.
+    Half of the range of the `values` (n,) is covered by gaps up to this one: neither the many
+    small ones within rings count, nor one large one where nothing returned. `ordered` and `gaps`
+    (n,) are to work in.
 
     """
     n = len(values) - 1
-    if n < 1:
-        return 0.0
-    gaps = values[1:] - values[:-1]
+    sort_by_rank(values, gaps, ordered)
+    for i in range(n):
+        gaps[i] = ordered[i + 1] - ordered[i]
+    covered = ordered  # by gaps up to each one
+    covered[:] = 0.0
+    total = 0.0
+    for j in range(n):
+        total += gaps[j]
+        for i in range(n):
+            covered[i] += gaps[j] if gaps[j] <= gaps[i] else 0.0
+    least = inf
+    for i in range(n):
+        if covered[i] >= total / 2:
+            least = min(least, gaps[i])
+    return least if n > 0 else 0.0
+
+
+@kernel
+def covering_gap_of_many(values, ordered):
+    """Return the same of so many `values` (n,) that all pairs of them take longer than a sort."""
+    copy(values, ordered)
+    ordered.sort()
+    gaps = ordered[1:] - ordered[:-1]
     gaps.sort()
     half = gaps.sum() / 2
     covered = 0.0

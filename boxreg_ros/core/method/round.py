@@ -13,14 +13,12 @@ from typing import Any, NamedTuple
 from boxreg_ros.core.method.arrays import (
     ANCHOR,
     COMMON,
+    copy,
     Factor,
     factor_of_window,
     POSE,
-    REST,
-    SHARED,
-    SIDESLIP,
 )
-from boxreg_ros.core.method.arrowhead import invert_poses, solve
+from boxreg_ros.core.method.arrowhead import invert_poses, NEXT, solve
 from boxreg_ros.core.method.assemble import (
     accumulate,
     empty_axes,
@@ -58,15 +56,16 @@ class Sums(NamedTuple):
     factor: Any
 
 
-def empty_sums(B: int, N: int, prior_mean: Any, prior_information: Any) -> Sums:
-    """Return room for B windows of N observations with a prior (B, 35) and (B, 35, 35)."""
-    common = np.zeros(B, COMMON)
+def empty_sums(B: int, N: int, S: int, prior_mean: Any, prior_information: Any) -> Sums:
+    """Return room for B windows of N observations with a prior (B, 29) and (B, 29, 29)."""
+    # All of it is written before it is read.
+    common = np.empty(B, COMMON)
     common['prior_mean'] = prior_mean
     common['W_prior'] = prior_information
-    factor = Factor(  # written before it is read
-        np.empty((B, N, POSE, POSE)), np.empty((B, N, POSE, REST)), np.empty((B, SHARED, SHARED))
+    factor = Factor(
+        np.empty((B, N, POSE, POSE)), np.empty((B, N, POSE, S + NEXT)), np.empty((B, S, S))
     )
-    return Sums(np.zeros((B, N), TERMS), common, factor)
+    return Sums(np.empty((B, N), TERMS), common, factor)
 
 
 @kernel
@@ -85,36 +84,36 @@ def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, s
         Input of the batch, and the same with the points of the rigid shape.
     inputs : array of `INPUTS`, shape (K,)
         Noise, margins and population of the input, by kind.
-    free : array, shape (B, 6 N + 23)
+    free : array, shape (B, 6 N + S)
         1 for variables that are estimated, 0 for those held fixed.
     constants : record of `Constants`
         Of the method, with the settings.
-    poses, shared : array, shapes (B, N, 6) and (B, 23)
+    poses, shared : array, shapes (B, N, 6) and (B, S)
         Start of the round.
     sums : Sums
         Of the batch: written.
-    x, value, gradient : array, shapes (b, 6 N + 23), (b,) and (b, 6 N + 23)
+    x, value, gradient : array, shapes (b, 6 N + S), (b,) and (b, 6 N + S)
         Written: variables of the windows, and the sum of the residuals there.
 
     """
     N = poses.shape[1]
     n = POSE * N
-    at, out, A = empty_axes(N), empty_linearised(), empty_matrix(N)
+    at, out, A = empty_axes(N), empty_linearised(), empty_matrix(N, shared.shape[1])
     mean_extents = np.empty(SIZE)
     of_faces = empty_face_work(0, len(problem.counts), problem, constants)
     of_shape = empty_shape_work(0, len(thinned.counts), thinned, N, constants.cells)
     for row in range(first, last):
         b = rows[row]
         kind = problem.kind[b]
-        shared[b, ANCHOR:SIDESLIP] = 0.0
+        shared[b, ANCHOR:] = 0.0
         terms, common = sums.terms[b], sums.common[b]
         expect(b, problem, inputs[kind], constants, mean_extents, common)
         observe_window(b, problem, poses[b], shared[b], inputs[kind], constants, of_faces, terms)
         if constants.uses_shape:
             agree(b, thinned, poses[b], shared[b, :3], constants, of_shape, terms)
         weigh(b, problem, poses[b], shared[b], constants, at, out, terms, common)
-        x[row, :n] = poses[b].ravel()
-        x[row, n:] = shared[b]
+        copy(poses[b].ravel(), x[row, :n])
+        copy(shared[b], x[row, n:])
         value[row] = linearise(
             x[row], terms, common, free[b], at, out, gradient[row], A,
             factor_of_window(b, sums.factor),
@@ -124,24 +123,23 @@ def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, s
 @kernel
 def evaluate(first, last, rows, x, free, sums, value, gradient):
     """
-    Write value (b,) and gradient (b, 6 N + 23) of the windows `rows[first:last]` at `x`.
+    Write value (b,) and gradient (b, 6 N + S) of the windows `rows[first:last]` at `x`.
 
     `free` and `sums` are as in `begin`.
 
     """
-    D = x.shape[1]
-    N = (D - SHARED) // POSE
-    at, out = empty_axes(N), empty_linearised()
+    D, N = x.shape[1], sums.terms.shape[1]
+    at, out, matrix = empty_axes(N), empty_linearised(), no_matrix()
     for row in range(first, last):
         terms, common = sums.terms[rows[row]], sums.common[rows[row]]
-        value[row] = accumulate(x[row], N, terms, common, at, out, gradient[row], no_matrix())
+        value[row] = accumulate(x[row], N, terms, common, at, out, gradient[row], matrix)
         for k in range(D):
             gradient[row, k] *= free[rows[row], k]
 
 
 @kernel
 def precondition(first, last, rows, factor, vectors):
-    """Replace the `vectors` (b, 6 N + 23) of windows by the inverse curvature times them."""
+    """Replace the `vectors` (b, 6 N + S) of windows by the inverse curvature times them."""
     for row in range(first, last):
         solve(factor_of_window(rows[row], factor), vectors[row])
 
@@ -171,7 +169,7 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
     ----------
     first, last, rows, problem, free, constants, sums
         As in `begin`.
-    x : array, shape (b, 6 N + 23)
+    x : array, shape (b, 6 N + S)
         Minimum of each sum.
     solution : Solution
         Of the batch: written.
@@ -181,12 +179,12 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
         Written.
 
     """
-    N = solution.poses.shape[1]
+    N, S = solution.poses.shape[1], solution.shared.shape[1]
     n = POSE * N
     oldest = np.int64(1)  # for a literal 1 all that sums residuals would be compiled once more
-    at, out, gradient = empty_axes(N), empty_linearised(), np.empty(n + SHARED)
-    first_three = empty_matrix(3)  # poses that residuals of the oldest observation depend on
-    inverse = Inverse(np.empty((N, POSE, POSE)), np.empty((N, POSE, REST)))
+    at, out, gradient = empty_axes(N), empty_linearised(), np.empty(n + S)
+    first_three = empty_matrix(3, S)  # poses that residuals of the oldest observation depend on
+    inverse = Inverse(np.empty((N, POSE, POSE)), np.empty((N, POSE, S + NEXT)))
     for row in range(first, last):
         b = rows[row]
         terms, common, factor = sums.terms[b], sums.common[b], factor_of_window(b, sums.factor)
@@ -194,8 +192,8 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
         errors = problem.of_class[b].pose
         is_settled = has_settled(found, solution.poses[b], errors, constants.settled_step)
         is_done[row] = is_last or (may_settle and is_settled)
-        solution.poses[b] = found
-        solution.shared[b] = x[row, n:]
+        copy(x[row], solution.poses[b].ravel())
+        copy(x[row, n:], solution.shared[b])
         fill_evidence(
             common, solution.shared[b], factor.corner, constants.min_extent_gain,
             solution.evidence[b],

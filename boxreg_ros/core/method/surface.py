@@ -81,8 +81,11 @@ def insert(points, half, surface):
     for slot in range(used[0]):
         count = moments[slot, 0]
         if count > FOLLOW.normal_growth * moments[slot, 10]:
-            means[slot] = moments[slot, 1:4] / count
-            normals[slot] = normal_at(means[slot], half, slots, moments, C)
+            for k in range(3):
+                means[slot, k] = moments[slot, 1 + k] / count
+            normal = normal_at(means[slot], half, slots, moments, C)
+            for k in range(3):
+                normals[slot, k] = normal[k]
             moments[slot, 10] = count
 
 

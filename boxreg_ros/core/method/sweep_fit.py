@@ -2,6 +2,8 @@
 
 from typing import Any, NamedTuple
 
+from boxreg_ros.core.method.arrays import copy
+from boxreg_ros.core.method.arrowhead import factorise_corner, invert, solve_corner
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.crop import flat_height
 from boxreg_ros.core.method.follow_numbers import FOLLOW
@@ -134,24 +136,29 @@ def registered(points, start, prior, information, target, iterations):
     """
     points = np.ascontiguousarray(points[:: 1 + len(points) // FOLLOW.max_sweep_points])
     pose = start.copy()
-    total = information.copy()
+    total, factor = information.copy(), information.copy()
     for _ in range(iterations):
-        H, g, count = _system(points, pose, target)
+        H, step, count = _system(points, pose, target)
         if count < FOLLOW.min_points:
             break
-        total = H + information
-        gradient = g + information @ (pose - prior)
-        step = np.linalg.solve(total, gradient)
+        for a in range(4):
+            for b in range(4):
+                total[a, b] = factor[a, b] = H[a, b] + information[a, b]
+                step[a] += information[a, b] * (pose[b] - prior[b])
+        factorise_corner(factor)
+        solve_corner(factor, step)
         size = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
         step *= min(1.0, 2 * FOLLOW.cell / max(size, 1e-9))
         pose = pose - step
         if size < FOLLOW.settled and abs(step[3]) < FOLLOW.settled_yaw:
             break
     found = fit(points, pose, target)
-    covariance = np.linalg.inv(total)
-    off = pose - prior
-    jump = off @ information @ off
-    return Registered(pose, covariance, found, jump, _reason(pose, covariance, found, jump))
+    invert(total)
+    jump = 0.0
+    for a in range(4):
+        for b in range(4):
+            jump += (pose[a] - prior[a]) * information[a, b] * (pose[b] - prior[b])
+    return Registered(pose, total, found, jump, _reason(pose, total, found, jump))
 
 
 @kernel
@@ -304,7 +311,7 @@ def _outside(points, center, half, R):
     for n in range(len(points)):
         _, _, x, y, z = offset_in_box(points, n, center, R)
         if abs(x) > half[0] or abs(y) > half[1] or abs(z) > half[2]:
-            points[count] = points[n]
+            copy(points[n], points[count])
             count += 1
     return points[:count]
 
@@ -313,7 +320,12 @@ def _outside(points, center, half, R):
 def axes(pose, tilt):
     """Return the axes of a box as columns (3, 3)."""
     c, s = np.cos(pose[3]), np.sin(pose[3])
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt
+    R = np.empty((3, 3))
+    for k in range(3):
+        R[0, k] = c * tilt[0, k] - s * tilt[1, k]
+        R[1, k] = s * tilt[0, k] + c * tilt[1, k]
+        R[2, k] = tilt[2, k]
+    return R
 
 
 @loop

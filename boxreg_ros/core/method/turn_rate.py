@@ -7,6 +7,7 @@ The object turns about a point `pivot` behind its centre, where it has no sidewa
 
 from typing import Any, NamedTuple
 
+from boxreg_ros.core.method.arrowhead import invert
 from boxreg_ros.core.method.compile import kernel
 import numpy as np
 
@@ -29,6 +30,26 @@ class State(NamedTuple):
     def speed(self) -> float:
         """Speed along the heading [m/s]."""
         return float(self.values[SPEED_STATE])
+
+
+@kernel
+def propagated(F, covariance):
+    """
+    Return F C F' (n, n) for a matrix F (n, m) and a covariance C (m, m).
+
+    Products by BLAS, outer products and inverses by LAPACK take numba seconds to compile.
+
+    """
+    n, m = F.shape
+    rows, found = np.zeros((n, m)), np.zeros((n, n))
+    for i in range(n):
+        for k in range(m):
+            for j in range(m):
+                rows[i, j] += F[i, k] * covariance[k, j]
+        for j in range(n):
+            for k in range(m):
+                found[i, j] += rows[i, k] * F[j, k]
+    return found
 
 
 @kernel
@@ -56,18 +77,22 @@ def predict(state, seconds, noise, pivot):
     F[0, RATE_STATE] = -seconds * (speed * s / 2 + pivot * np.sin(turned))
     F[1, RATE_STATE] = seconds * (speed * c / 2 + pivot * np.cos(turned))
     F[YAW_STATE, RATE_STATE] = seconds
-    found = F @ state.covariance @ F.T
+    found = propagated(F, state.covariance)
     t = abs(seconds)
     place, rate_of = np.zeros((3, STATE)), np.zeros((2, STATE))
     place[0, 0], place[0, 1] = np.cos(yaw), np.sin(yaw)
     place[1, YAW_STATE] = 1.0
     place[2, 0], place[2, 1] = -np.sin(yaw), np.cos(yaw)
     rate_of[0, SPEED_STATE] = rate_of[1, RATE_STATE] = np.sign(seconds)
-    for k in range(2):  # white accelerations along the heading, and of it
-        a, b = place[k], rate_of[k]
-        both = np.outer(a, b) + np.outer(b, a)
-        found += noise[k] * (np.outer(a, a) * t**3 / 3 + both * t**2 / 2 + np.outer(b, b) * t)
-    found += noise[2] * t * np.outer(place[2], place[2])
+    for i in range(STATE):
+        for j in range(STATE):
+            for k in range(2):  # white accelerations along the heading, and of it
+                a, b = place[k], rate_of[k]
+                both = a[i] * b[j] + b[i] * a[j]
+                found[i, j] += noise[k] * (
+                    a[i] * a[j] * t**3 / 3 + both * t**2 / 2 + b[i] * b[j] * t
+                )
+            found[i, j] += noise[2] * t * place[2, i] * place[2, j]
     found[2, 2] += noise[3] * t
     found[YAW_STATE, YAW_STATE] += noise[4] * t
     return State(values, found)
@@ -76,7 +101,9 @@ def predict(state, seconds, noise, pivot):
 @kernel
 def pose_information(state):
     """Return the information (4, 4) about x y z yaw."""
-    return np.linalg.inv(state.covariance[:SPEED_STATE, :SPEED_STATE].copy())
+    information = state.covariance[:SPEED_STATE, :SPEED_STATE].copy()
+    invert(information)
+    return information
 
 
 @kernel
@@ -88,9 +115,20 @@ def update(state, pose, covariance):
     follow by their regression on the pose.
 
     """
-    of_pose = np.ascontiguousarray(state.covariance[:, :SPEED_STATE])
-    gain = of_pose @ pose_information(state)  # (6, 4)
-    step = pose - state.values[:SPEED_STATE]
-    change = of_pose[:SPEED_STATE] - covariance
-    found = state.covariance - gain @ change @ gain.T
-    return State(state.values + gain @ step, (found + found.T) / 2)
+    information = pose_information(state)
+    gain, change = np.zeros((STATE, SPEED_STATE)), np.empty((SPEED_STATE, SPEED_STATE))
+    values = state.values.copy()
+    for i in range(STATE):
+        for j in range(SPEED_STATE):
+            for k in range(SPEED_STATE):
+                gain[i, j] += state.covariance[i, k] * information[k, j]
+            values[i] += gain[i, j] * (pose[j] - state.values[j])
+    for i in range(SPEED_STATE):
+        for j in range(SPEED_STATE):
+            change[i, j] = state.covariance[i, j] - covariance[i, j]
+    found, explained = np.empty((STATE, STATE)), propagated(gain, change)
+    for i in range(STATE):
+        for j in range(STATE):
+            both = state.covariance[i, j] + state.covariance[j, i]
+            found[i, j] = (both - explained[i, j] - explained[j, i]) / 2
+    return State(values, found)

@@ -1,0 +1,149 @@
+"""Which boxes of an estimate are accepted (M27)."""
+
+from typing import Any, NamedTuple
+
+from boxreg_ros.core.method.arrays import BOX_POSE, POSE
+from boxreg_ros.core.method.articulation import changes_shape, extent_ranges
+from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.expectation import SIZE
+from boxreg_ros.core.method.faces import fill_moved, fill_velocity, to_box_axes
+from boxreg_ros.core.method.noise import are_finite
+from boxreg_ros.core.method.rotation import fill_rotation
+import numpy as np
+
+ACCEPTED, NO_POINTS, NOT_FINITE, NO_GAIN, NOT_RIGID = range(5)
+"""Results of the tests; of several that fail the first."""
+
+
+class Tested(NamedTuple):
+    """
+    What the tests find of B windows.
+
+    Attributes
+    ----------
+    results : array, shape (B, N)
+        One of `ACCEPTED` and the others; padding is accepted.
+    held : array, shape (B, N)
+        Points in each refined box, or near it.
+    ranges : array, shape (B, 2, 3)
+        Of the input extents, see `extent_ranges`: those of the windows before, widened.
+    is_finite : array, shape (B,)
+        Whether all boxes and covariances of a window are finite, those of padding as well.
+
+    """
+
+    results: Any
+    held: Any
+    ranges: Any
+    is_finite: Any
+
+
+class _Room(NamedTuple):
+    """Arrays to work in, for observations of at most M points: (3, M) and (3, 3)."""
+
+    moved: Any
+    local: Any
+    R: Any
+
+
+@loop
+def count_held(b, n, problem, velocity, pose, extent, margin, room):
+    """Return how many points of an observation are in a box, or less than `margin` outside."""
+    moved, local, R = room
+    m, box = problem.counts[b, n], problem.boxes[b, n]
+    fill_rotation(pose[3], pose[4], pose[5], R)
+    fill_moved(b, n, problem, velocity, moved)
+    shift = (pose[0] - box[0], pose[1] - box[1], pose[2] - box[2])
+    to_box_axes(m, moved, shift, R, local)
+    reach_x, reach_y, reach_z = (
+        extent[0] / 2 + margin, extent[1] / 2 + margin, extent[2] / 2 + margin
+    )  # fmt: skip
+    count = 0
+    for i in range(m):
+        count += (
+            (abs(local[0, i]) < reach_x)
+            & (abs(local[1, i]) < reach_y)
+            & (abs(local[2, i]) < reach_z)
+        )
+    return count
+
+
+@kernel
+def input_poses(boxes):
+    """Return the poses (N, 6) of boxes (N, 9)."""
+    poses = np.empty((len(boxes), POSE))
+    for n in range(len(boxes)):
+        for k in range(POSE):
+            poses[n, k] = boxes[n, BOX_POSE[k]]
+    return poses
+
+
+@kernel
+def accept(first, last, problem, poses, extents, covariances, margin, span, constants, found):
+    """
+    Test the refined boxes of windows `first` to `last`.
+
+    The tests, in their order: the window has points; box and covariance are finite and the extent
+    is positive; the refined box holds nearly as many points as the input box, which the objective
+    does not require; the body keeps its shape, as the objective assumes.
+
+    Parameters
+    ----------
+    first, last : int
+        First window, and the one after the last.
+    problem : Problem
+        Input of the batch.
+    poses, extents : array, shapes (B, N, 6) and (B, N, 3)
+        The refined boxes [m, rad].
+    covariances : array, shape (B, N, 6, 6)
+        Of the poses.
+    margin : float
+        Points up to this far outside of a box are held [m].
+    span : int
+        Of `extent_ranges`.
+    constants : record of `Constants`
+        Of the method.
+    found : Tested
+        Written; the ranges of the windows before are given.
+
+    """
+    M = max(1, problem.counts[first:last].max()) if last > first else 1
+    room = _Room(np.empty((3, M)), np.empty((3, M)), np.empty((3, 3)))
+    velocity = np.zeros(3)
+    kept_part = 1 - constants.max_lost_part
+    for b in range(first, last):
+        length, boxes, times = problem.lengths[b], problem.boxes[b], problem.times[b]
+        extent_ranges(boxes, length, span, found.ranges[b])
+        is_bent = changes_shape(found.ranges[b], problem.of_class[b].extent, constants.gate)
+        has_points = problem.counts[b].sum() > 0
+        found.is_finite[b] = True
+        given = np.empty((0, POSE))
+        for n in range(len(boxes)):
+            pose, extent = poses[b, n], extents[b, n]
+            is_finite = are_finite(pose) and are_finite(covariances[b, n].ravel())
+            is_finite &= are_finite(extent) and min(extent[0], extent[1], extent[2]) > 0.0
+            found.is_finite[b] &= is_finite
+            found.results[b, n], found.held[b, n] = ACCEPTED, 0
+            if n >= length:
+                continue
+            if problem.is_moving:
+                fill_velocity(poses[b], times, n, length, velocity)
+            held = count_held(b, n, problem, velocity, pose, extent, margin, room)
+            found.held[b, n] = held
+            least = kept_part * problem.counts[b, n] - constants.min_face_points
+            if held < least:  # at most: counting those of the input boxes takes time
+                if not len(given):
+                    given = input_poses(boxes)
+                if problem.is_moving:
+                    fill_velocity(given, times, n, length, velocity)
+                extent = boxes[n, 3 : 3 + SIZE]
+                before = count_held(b, n, problem, velocity, given[n], extent, margin, room)
+                least = kept_part * before - constants.min_face_points
+            if not has_points:
+                found.results[b, n] = NO_POINTS
+            elif not is_finite:
+                found.results[b, n] = NOT_FINITE
+            elif held < least:
+                found.results[b, n] = NO_GAIN
+            elif is_bent:
+                found.results[b, n] = NOT_RIGID
