@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import atan2, hypot, pi
 
+from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, LENGTH, WIDTH, YAW
 from msg_adapters.convention import Convention, FORWARD
 import numpy as np
@@ -80,6 +81,7 @@ class AxisCheck:
         self._axes: Counter[str] = Counter()
         self._tracks: Counter[str] = Counter()  # by the axis along which they moved first
         self._mirrored: Counter[bool] = Counter()  # where one sense of yaw fits alone: the other?
+        self._angles: list[tuple[float, float]] = []  # from x of a box, as read and mirrored
         self.finding = ''
         self.forget()
 
@@ -119,10 +121,14 @@ class AxisCheck:
             return
         if moved <= MAX_OBJECT_SPEED * (stamp_ns - way.stamp_ns) * 1e-9:
             heading = atan2(step[1], step[0])
-            yaws = np.array([way.box[YAW], box[YAW]])
-            axis = _axis_of(heading - _mean_angle(yaws))
+            # Headings may be unresolved: a mean of opposite ones is across both.
+            turn = pi * round((box[YAW] - way.box[YAW]) / pi)
+            yaws = np.array([way.box[YAW] + turn, box[YAW]])
             mirrored = 2 * np.array([way.frame_yaw, frame_yaw]) - yaws
-            fits_mirrored = _axis_of(heading - _mean_angle(mirrored)) == 'x+'
+            angles = heading - _mean_angle(yaws), heading - _mean_angle(mirrored)
+            self._angles.append(angles)
+            axis = _axis_of(angles[0])
+            fits_mirrored = _axis_of(angles[1]) == 'x+'
             if fits_mirrored != (axis == 'x+'):
                 self._mirrored[fits_mirrored] += 1
             self._tracks[axis] += not way.axes[axis]
@@ -179,7 +185,15 @@ class AxisCheck:
             return False
         # A box that is turned by a quarter or a half seems mirrored where its way crosses an axis.
         fitting = self._axes['x+'] + total[True] - total[False]
-        return fitting >= MIN_SHARE * self._axes.total()
+        if fitting < MIN_SHARE * self._axes.total():
+            return False
+        axis = self._axis()
+        if axis is None:
+            return True
+        # Vehicles of one road may fit both: the nearer one is taken.
+        angles = np.array(self._angles) - (FORWARD[axis], 0)
+        as_read, mirrored = np.median(np.abs(wrap_angle(angles)), axis=0)
+        return bool(mirrored < as_read)
 
     def _noise_text(self) -> str:
         """Return that yaw has nothing to do with the way, as degrees taken for radians have."""

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 import csv
 from dataclasses import dataclass
 from functools import lru_cache
 from io import StringIO
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.rotations import boxes_from_quaternions, quaternion_from_rpy
-from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, Ints, ROLL
+from boxreg_ros.structures import (
+    BOX_EXTENT,
+    BoxArray,
+    Columns,
+    concatenated,
+    Floats,
+    Ints,
+    REJECTED,
+    ROLL,
+)
 import numpy as np
 from numpy.typing import NDArray
+import orjson
 
 COLUMNS = (
     'stamp_ns', 'frame_id', 'track_id', 'class_name', 'score', 'x', 'y', 'z',
@@ -28,8 +38,12 @@ csv.field_size_limit(2**31 - 1)  # ids may be as long as messages
 
 
 @dataclass(frozen=True, slots=True)
-class BoxTable:
+class BoxTable(Columns):
     """Boxes of many stamps, one row each, as in ``boxes.csv``."""
+
+    COLUMNS: ClassVar[tuple[str, ...]] = (
+        *('stamps_ns', 'track_ids', 'class_names', 'scores', 'boxes', 'status', 'num_points'),
+    )
 
     stamps_ns: Ints
     """(n,), of the headers [ns]."""
@@ -53,19 +67,23 @@ class BoxTable:
             raise RecordingError(
                 f'boxes: expected one frame, got {", ".join(sorted(frame_ids))}; relabel first'
             )
-        count = sum(len(array.track_ids) for array in arrays)
+        every = concatenated([BoxArray.empty(0, ''), *(array.plain() for array in arrays)])
+        count = len(every.track_ids)
+        counts = [len(array.track_ids) for array in arrays]
         return cls(
-            np.repeat([a.stamp_ns for a in arrays], [len(a.track_ids) for a in arrays]).astype(
-                np.int64
-            ),
+            np.repeat([array.stamp_ns for array in arrays], counts).astype(np.int64),
             frame_ids.pop() if frame_ids else '',
-            tuple(name for a in arrays for name in a.track_ids),
-            tuple(name for a in arrays for name in a.class_names),
-            np.concatenate([np.zeros(0)] + [a.scores for a in arrays]),
-            np.concatenate([np.zeros((0, 9))] + [a.boxes for a in arrays]),
+            every.track_ids,
+            every.class_names,
+            every.scores,
+            every.boxes,
             (status,) * count,
             np.zeros(count, np.int64),
         )
+
+    def without_rejected(self) -> BoxTable:
+        """Return it without rejected boxes, which are no labels."""
+        return self.rows(np.array([status != REJECTED for status in self.status], bool))
 
     @classmethod
     def read(cls, path: str | Path) -> BoxTable:
@@ -146,17 +164,7 @@ class BoxTable:
 
     def rows(self, keep: NDArray[np.bool_]) -> BoxTable:
         """Return the rows where `keep` (n,) is True."""
-        kept = np.flatnonzero(keep).tolist()
-        return BoxTable(
-            self.stamps_ns[kept],
-            self.frame_id,
-            tuple(self.track_ids[row] for row in kept),
-            tuple(self.class_names[row] for row in kept),
-            self.scores[kept],
-            self.boxes[kept],
-            tuple(self.status[row] for row in kept),
-            self.num_points[kept],
-        )
+        return self.take(np.flatnonzero(keep))
 
     def write(self, path: str | Path) -> None:
         """Write all rows as CSV, in the columns of ``boxes.csv``."""
@@ -172,25 +180,30 @@ class BoxTable:
                 ]))  # fmt: skip
 
 
-def read_by_box(path: Path, parsed: Callable[[dict[str, str]], _T]) -> dict[tuple[int, str], _T]:
-    """
-    Return what is `parsed` of each row of a table beside ``boxes.csv``, by stamp [ns] and id.
-
-    Of several rows of one box the first counts. Raises RecordingError if the table is damaged.
-
-    """
-    found: dict[tuple[int, str], _T] = {}
+def parsed_rows(path: Path, parsed: Callable[[dict[str, str]], _T]) -> Iterator[_T]:
+    """Yield what is `parsed` of each row of a table; RecordingError if it is damaged."""
     try:
         with path.open(newline='', encoding='utf-8-sig') as file:
-            for row in csv.DictReader(file):
-                found.setdefault((int(row['stamp_ns']), unprotected(row['track_id'])), parsed(row))
+            yield from map(parsed, csv.DictReader(file))
     except OSError as error:
         raise RecordingError(unreadable(path, error)) from None
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise RecordingError(
-            f'{path}: expected the columns of {path.name} with a number in each cell, got '
+            f'{path}: expected the columns of {path.name}, with numbers where they belong, got '
             f'{error}; relabel again, or delete the file'
         ) from None
+
+
+def box_of(row: dict[str, str]) -> tuple[int, str]:
+    """Return stamp [ns] and id of a row of a table beside ``boxes.csv``."""
+    return int(row['stamp_ns']), unprotected(row['track_id'])
+
+
+def read_by_box(path: Path, parsed: Callable[[dict[str, str]], _T]) -> dict[tuple[int, str], _T]:
+    """Return what is `parsed` of the first row of each box, as `box_of` and `parsed_rows` do."""
+    found: dict[tuple[int, str], _T] = {}
+    for box, values in parsed_rows(path, lambda row: (box_of(row), parsed(row))):
+        found.setdefault(box, values)
     return found
 
 
@@ -199,6 +212,22 @@ def csv_row(cells: Iterable[object]) -> str:
     row = StringIO(newline='')
     csv.writer(row, lineterminator='\r\n').writerow(cells)
     return row.getvalue()[:-2] + '\n'
+
+
+def number_cells(numbers: Floats) -> list[str]:
+    """
+    Return the cells of each row of numbers (n, k) in single precision, with commas between them.
+
+    They have as few digits as state the number, nine at most; ``nan`` stands for all that are not
+    finite.
+
+    """
+    if not len(numbers):
+        return []
+    with np.errstate(over='ignore'):
+        rows = np.ascontiguousarray(numbers, np.float32)
+    text = orjson.dumps(rows, option=orjson.OPT_SERIALIZE_NUMPY).decode()
+    return text[2:-2].replace('null', 'nan').split('],[')
 
 
 @lru_cache(1024)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
-
+from boxreg_ros.io.stamp_join import nearest_rows
 import numpy as np
 
 MIN_CLOCK_OFFSET = 0.4
@@ -70,15 +69,17 @@ def clock_offset(first: ReceiveTimes, second: ReceiveTimes) -> float | None:
     played faster or slower. None if too few were, or the offset is not constant.
 
     """
-    offsets = []
-    for received_ns, delay_ns in zip(second.received_ns, second.delays_ns, strict=True):
-        row = _nearest(first.received_ns, received_ns)
-        if row is not None:
-            offsets.append((delay_ns - first.delays_ns[row]) * 1e-9)
+    if not (first.received_ns and second.received_ns):
+        return None
+    ours_ns, theirs_ns = np.array(first.received_ns), np.array(second.received_ns)
+    rows = nearest_rows(theirs_ns, ours_ns)
+    is_near = np.abs(ours_ns[rows] - theirs_ns) <= PAIR_NS
+    delays_ns = np.array(second.delays_ns) - np.array(first.delays_ns)[rows]
+    offsets = delays_ns[is_near] * 1e-9
     if len(offsets) < MIN_PAIRS:
         return None
     offset = float(np.median(offsets))
-    if np.median(np.abs(np.array(offsets) - offset)) > MAX_SCATTER:
+    if np.median(np.abs(offsets - offset)) > MAX_SCATTER:
         return None
     return offset
 
@@ -94,13 +95,3 @@ def likely_offset(offset: float) -> tuple[float, str]:
 def seconds_text(seconds: float) -> str:
     """Return seconds with up to two decimals and all digits before them, as options take them."""
     return f'{seconds:.2f}'.rstrip('0').rstrip('.')
-
-
-def _nearest(received_ns: list[int], wanted_ns: int) -> int | None:
-    """Return the row of the receive time next to another; None if it is not near."""
-    after = bisect_left(received_ns, wanted_ns)
-    rows = [row for row in (after - 1, after) if 0 <= row < len(received_ns)]
-    nearest = min(rows, key=lambda row: abs(received_ns[row] - wanted_ns), default=None)
-    if nearest is None or abs(received_ns[nearest] - wanted_ns) > PAIR_NS:
-        return None
-    return nearest

@@ -12,14 +12,25 @@ MAX_ROUNDING = 0.02
 """Step between coordinates from which they are named as coarse [m]; chosen: the range noise."""
 UNIT_POINTS = 100
 """Points of a cloud that its unit is looked up by; chosen."""
-MAX_MEDIAN_DISTANCE = 1000.0
-"""Median distance of points from their middle that no LiDAR on the ground has [m]; chosen."""
+MAX_MEDIAN_DISTANCE = 200.0
+"""
+Median distance of points from their middle that no LiDAR on the ground has [m].
+
+Chosen: clouds of a street have 4 to 60; in centimetres 400 to 6000.
+
+"""
 SECTORS = 72
 """Parts of the azimuth that a cloud may cover; chosen: 5 degrees."""
 PACKET_CLOUDS = 30
 """Clouds by which it is seen whether each is a whole sweep; chosen: packets are 10 or more."""
 MIN_PACKETS = 3
 """Clouds that a revolution is split into, at least; chosen: two LiDARs may share a frame."""
+PERIOD_QUANTILE = 0.8
+"""Quantile of the steps between clouds that is a period; derived: up to four LiDARs on a topic."""
+SHORT_STEP, SHORT_SHARE = 0.25, 0.4
+"""Steps of so many periods are short, and so large a part of them is no jitter; chosen."""
+LONGEST_CLOUD_PERIOD = 0.1
+"""Period that is taken for a longer one [s]: of a LiDAR clouds are lost, or left out, then."""
 
 
 class CloudCheck:
@@ -34,18 +45,25 @@ class CloudCheck:
         self._is_merged = is_merged
         self._coordinates = ''
         self._sectors: list[NDArray[np.bool_]] = []
+        self._stamps_ns: list[int] = []
 
     def add(self, sweep: Sweep) -> None:
         """Add a cloud in its own frame."""
         if not self._is_merged and len(self._sectors) < PACKET_CLOUDS:
-            self._sectors.append(_sectors(sweep))
+            sectors = _sectors(sweep)
+            is_again = self._stamps_ns[-1:] == [sweep.stamp_ns]
+            if not (is_again and np.array_equal(sectors, self._sectors[-1])):
+                self._sectors.append(sectors)
+                self._stamps_ns.append(sweep.stamp_ns)
         self._coordinates = self._coordinates or _unit_text(sweep) or _coarse_text(sweep)
 
     @property
     def findings(self) -> list[str]:
         """Return what was found so far."""
-        packets = _packets_text(self._sectors) if len(self._sectors) == PACKET_CLOUDS else ''
-        return [text for text in (packets, self._coordinates) if text]
+        parts = ''
+        if len(self._sectors) == PACKET_CLOUDS:
+            parts = _lidars_text(self._stamps_ns) or _packets_text(self._sectors)
+        return [text for text in (parts, self._coordinates) if text]
 
 
 def _coarse_text(sweep: Sweep) -> str:
@@ -66,16 +84,18 @@ def _coarse_text(sweep: Sweep) -> str:
 def _unit_text(sweep: Sweep) -> str:
     """Return that the points of a cloud lie too far from each other to be in metres, or ''."""
     points = sweep.points[:: max(1, len(sweep.points) // UNIT_POINTS)]
+    if len(points) < UNIT_POINTS or np.ptp(points) < MAX_MEDIAN_DISTANCE / 2:
+        return ''  # as most clouds in the frame of their LiDAR: a look at one number
     points = points[np.isfinite(points).all(axis=1)]
-    if len(points) < UNIT_POINTS:
-        return ''
+    if len(points) < UNIT_POINTS or np.linalg.norm(np.ptp(points, axis=0)) < MAX_MEDIAN_DISTANCE:
+        return ''  # as most clouds: none is so far from another
     distance = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
     if distance < MAX_MEDIAN_DISTANCE:
         return ''
     return (
         f'clouds in {sweep.frame_id!r}: expected metres, got points of which half are more than '
-        f'{distance:.0f} from their middle: they are in millimetres, or scaled otherwise; divide '
-        f'x, y and z by 1000, in the driver or in a copy of the recording'
+        f'{distance:.0f} from their middle: they are in millimetres (or centimetres); divide '
+        f'x, y and z by 1000 (or 100), in the driver or in a copy of the recording'
     )
 
 
@@ -99,6 +119,21 @@ def _packets_text(seen: Sequence[NDArray[np.bool_]]) -> str:
         f'{together * degrees:.0f}: most boxes have no points in the cloud of their time; join '
         f'the clouds of each revolution, by the setting of the driver, or in a copy of the '
         f'recording, with the times of the points'
+    )
+
+
+def _lidars_text(stamps_ns: Sequence[int]) -> str:
+    """Return that clouds with these stamps [ns] come several at a time; '' if one by one."""
+    steps = np.diff(np.sort(np.array(stamps_ns))) * 1e-9
+    period = float(np.quantile(steps, PERIOD_QUANTILE))
+    share = float((steps < SHORT_STEP * min(period, LONGEST_CLOUD_PERIOD)).mean())
+    if share < SHORT_SHARE:
+        return ''
+    return (
+        f'clouds: expected one every {period:.3f} s, got {1 / (1 - share):.0f} at a time: several '
+        f'LiDARs publish on one topic, and a box takes the points of one cloud; give each a topic '
+        f'of its own (Livox: multi_topic 1) and name them by --points (node: points), or join the '
+        f'clouds of each time in a copy of the recording'
     )
 
 

@@ -6,24 +6,23 @@ from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import NamedTuple
 
-from boxreg_ros.io.box_table import cell, read_by_box
+from boxreg_ros.io.box_table import cell, number_cells, read_by_box
 from boxreg_ros.structures import Floats, KEPT, RefinedBoxes, X, Y
 import numpy as np
 
 COVARIANCES = 'covariances.csv'
 POSE_NAMES = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
 EXTENT_NAMES = ('length', 'width', 'height')
-COVARIANCE_KEYS = ('stamp_ns', 'track_id', 'range')
 COVARIANCE_NUMBERS = tuple(
     f'{a}_{b}'
     for names in (POSE_NAMES, EXTENT_NAMES)
     for a, b in combinations_with_replacement(names, 2)
 )
 """Upper triangles of the two matrices, row by row [m^2, m rad, rad^2]."""
+COVARIANCE_COLUMNS = ('stamp_ns', 'track_id', 'range', *COVARIANCE_NUMBERS)
 POSE_TRIANGLE = np.triu_indices(6)
 EXTENT_TRIANGLE = np.triu_indices(3)
 NUM_POSE = len(POSE_TRIANGLE[0])
-NUMBERS_FORMAT = ','.join(['%.7g'] * len(COVARIANCE_NUMBERS)) + '\n'
 
 
 class BoxCovariance(NamedTuple):
@@ -37,37 +36,23 @@ class BoxCovariance(NamedTuple):
     """(3, 3), of length, width and height [m]."""
 
 
-class CovarianceWriter:
-    """Write the covariances of refined boxes, with seven significant digits."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = path.open('w', newline='', encoding='utf-8')
-        self._file.write(','.join((*COVARIANCE_KEYS, *COVARIANCE_NUMBERS)) + '\n')
-
-    def write(self, refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> None:
-        """Add a row for each box with an estimate: kept boxes have none."""
-        boxes = refined.boxes
-        distances = [''] * len(refined.status)
-        if T_fixed_sensor is not None:
-            offset = boxes.boxes[:, [X, Y]] - T_fixed_sensor[:2, 3]
-            distances = [f'{distance:.3f}' for distance in np.hypot(*offset.T).tolist()]
-        numbers = np.hstack(
-            [
-                refined.covariances[:, *POSE_TRIANGLE],
-                refined.extent_covariances[:, *EXTENT_TRIANGLE],
-            ]
-        )
-        rows = zip(refined.status, boxes.track_ids, distances, numbers.tolist(), strict=True)
-        lines = [
-            f'{boxes.stamp_ns},{cell(track_id)},{distance},' + NUMBERS_FORMAT % tuple(row)
-            for status, track_id, distance, row in rows
-            if status != KEPT
-        ]
-        self._file.write(''.join(lines))
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+def covariance_lines(refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> list[str]:
+    """Return the line of each box with an estimate, in single precision; kept boxes have none."""
+    boxes = refined.boxes
+    rows = [row for row, status in enumerate(refined.status) if status != KEPT]
+    distances = [''] * len(refined.status)
+    if T_fixed_sensor is not None:
+        offset = boxes.boxes[:, [X, Y]] - T_fixed_sensor[:2, 3]
+        distances = [f'{distance:.3f}' for distance in np.hypot(*offset.T).tolist()]
+    triangles = (
+        refined.covariances[:, *POSE_TRIANGLE],
+        refined.extent_covariances[:, *EXTENT_TRIANGLE],
+    )
+    numbers = number_cells(np.hstack(triangles)[rows])
+    return [
+        f'{boxes.stamp_ns},{cell(boxes.track_ids[row])},{distances[row]},{cells}\n'
+        for row, cells in zip(rows, numbers, strict=True)
+    ]
 
 
 def read_covariances(path: Path) -> dict[tuple[int, str], BoxCovariance]:

@@ -17,6 +17,7 @@ import re
 from typing import Any, NamedTuple
 
 import msg_adapters
+from msg_adapters.cdr import Definitions
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.msg import normalize_msgtype
@@ -97,6 +98,23 @@ def known_store(kinds: Iterable[str], is_ros1: bool = False) -> Typestore:
             raise KeyError(kind)
         types.update(complete)
     return _store_of(types)
+
+
+def fields_of(store: Typestore) -> Definitions:
+    """Return the function that gives the fields of each type of a store."""
+
+    def fields(name: str) -> dict[str, str]:
+        return {field: _text_of(node) for field, node in store.fielddefs[name][1]}
+
+    return fields
+
+
+def _text_of(node: Any) -> str:
+    """Return the type of a field, which rosbags has as a tree, in the words of rclpy."""
+    kind, (first, second) = node if node[0] != Nodetype.NAME else (node[0], (node[1], 0))
+    if kind == Nodetype.ARRAY:
+        return f'{_text_of(first)}[{second}]'
+    return f'sequence<{_text_of(first)}>' if kind == Nodetype.SEQUENCE else str(first)
 
 
 def types_of(kind: str, recorded: MessageDefinition) -> Types:

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import ClassVar, NamedTuple
 
-from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, Floats, Ints, is_valid_box
+from boxreg_ros.structures import (
+    BOX_CENTER,
+    BOX_EXTENT,
+    BoxArray,
+    Columns,
+    concatenated,
+    Floats,
+    Ints,
+    is_valid_box,
+)
 import numpy as np
-from numpy.typing import NDArray
 
 CENTER_STD = 0.3
 """Standard deviation of a detected centre [m]."""
@@ -48,8 +56,8 @@ Chosen: objects come and go, and trackers begin again after gaps, at far fewer b
 """
 
 
-@dataclass(eq=False, slots=True)
-class _Tracks:
+@dataclass(frozen=True, eq=False, slots=True)
+class _Tracks(Columns):
     """
     Constant-velocity Kalman filters of the centres of K tracks, each with one covariance per axis.
 
@@ -58,7 +66,11 @@ class _Tracks:
 
     """
 
-    ids: list[str]
+    COLUMNS: ClassVar[tuple[str, ...]] = (
+        *('ids', 'stamps_ns', 'centers', 'velocities', 'covariances', 'extents'),
+    )
+
+    ids: tuple[str, ...]
     stamps_ns: Ints
     centers: Floats
     velocities: Floats
@@ -72,7 +84,7 @@ class _Tracks:
         covariances = np.tile([CENTER_STD**2, 0.0, INITIAL_SPEED_STD**2], (count, 1))
         stamps_ns = np.full(count, stamp_ns, np.int64)
         centers, extents = boxes[:, BOX_CENTER], boxes[:, BOX_EXTENT]
-        return cls(ids, stamps_ns, centers, np.zeros((count, 3)), covariances, extents)
+        return cls(tuple(ids), stamps_ns, centers, np.zeros((count, 3)), covariances, extents)
 
     def predicted(self, stamp_ns: int) -> tuple[Floats, Floats]:
         """Return centres (K, 3) and covariances (K, 3) at a stamp."""
@@ -137,26 +149,13 @@ class _Tracks:
         )
         self.extents[columns] = boxes[:, BOX_EXTENT]
 
-    def kept(self, is_kept: NDArray[np.bool_]) -> _Tracks:
-        """Return some of the tracks."""
-        ids = [name for name, keeps in zip(self.ids, is_kept.tolist(), strict=True) if keeps]
-        return _Tracks(ids, *(values[is_kept] for values in self._arrays()))
-
-    def joined(self, others: _Tracks) -> _Tracks:
-        """Return these tracks and others behind them."""
-        pairs = zip(self._arrays(), others._arrays(), strict=True)
-        return _Tracks(self.ids + others.ids, *(np.concatenate(pair) for pair in pairs))
-
-    def _arrays(self) -> tuple[Any, ...]:
-        return self.stamps_ns, self.centers, self.velocities, self.covariances, self.extents
-
 
 class Costs(NamedTuple):
     """How well the boxes of an array fit the tracks before it."""
 
     rows: Ints
     """(n,) rows of the valid boxes in their array."""
-    track_ids: list[str]
+    track_ids: tuple[str, ...]
     """Of the tracks before it."""
     values: Floats
     """(n, tracks) squared distances in standard deviations."""
@@ -182,10 +181,10 @@ class Tracker:
         """End all tracks; ids that were assigned are not used again."""
         self._tracks = _Tracks.started([], 0, np.zeros((0, 9)))
         self._newest_ns: int | None = None
-        self.costs = Costs(np.zeros(0, np.int64), [], np.zeros((0, 0)))
+        self.costs = Costs(np.zeros(0, np.int64), (), np.zeros((0, 0)))
 
     @property
-    def track_ids(self) -> list[str]:
+    def track_ids(self) -> tuple[str, ...]:
         """Return the ids of the tracks that may go on."""
         return self._tracks.ids
 
@@ -205,10 +204,11 @@ class Tracker:
         """
         from scipy.optimize import linear_sum_assignment  # slow, and only association needs it
 
-        is_late = self._is_late(boxes.stamp_ns)
+        is_late = self.is_late(boxes.stamp_ns)
+        self._end_tracks(boxes.stamp_ns)
         rows = np.flatnonzero(is_valid_box(boxes.boxes))
         costs = self._tracks.distances(boxes.stamp_ns, boxes.boxes[rows, None])
-        self.costs = Costs(rows, list(self._tracks.ids), costs)
+        self.costs = Costs(rows, self._tracks.ids, costs)
         # Costs are cut off at the gate: a pair beyond it costs as much as no pair.
         chosen, columns = linear_sum_assignment(np.minimum(costs, GATE))
         is_near = costs[chosen, columns] < GATE
@@ -232,27 +232,37 @@ class Tracker:
             box is beyond the gate of its track, or two boxes have one.
 
         """
-        is_late = self._is_late(boxes.stamp_ns)
+        is_late = self.is_late(boxes.stamp_ns)
+        self._end_tracks(boxes.stamp_ns)
         rows = np.flatnonzero(is_valid_box(boxes.boxes))
         column_of = {name: column for column, name in enumerate(self._tracks.ids)}
         names = [track_of.get(boxes.track_ids[row], '') for row in rows.tolist()]
         columns = np.array([column_of.get(name, -1) for name in names], np.int64)
         kept, columns = rows[columns >= 0], columns[columns >= 0]
-        if len(np.unique(columns)) < len(columns):
+        if len(set(columns.tolist())) < len(columns):
             return None
         if (self._tracks.distances(boxes.stamp_ns, boxes.boxes[kept], columns) >= GATE).any():
             return None
         return self._assign(boxes, rows, kept, columns, is_late)
 
-    def _is_late(self, stamp_ns: int) -> bool:
-        """Return whether an array is older than others before; end the tracks that it ends."""
-        max_gap_ns = round(self.max_gap * 1e9)
-        if self._newest_ns is not None and stamp_ns < self._newest_ns - max_gap_ns:
+    def is_late(self, stamp_ns: int) -> bool:
+        """Return whether an array is not newer than one before it, and of the same pass."""
+        newest_ns = self._newest_ns
+        return newest_ns is not None and newest_ns - self._max_gap_ns <= stamp_ns <= newest_ns
+
+    def _end_tracks(self, stamp_ns: int) -> None:
+        """End the tracks that an array ends."""
+        if self.is_late(stamp_ns):
+            return
+        if self._newest_ns is not None and stamp_ns < self._newest_ns:
             self.forget()  # a recording in a loop
-        is_late = self._newest_ns is not None and stamp_ns <= self._newest_ns
-        if not is_late:
-            self._tracks = self._tracks.kept(self._tracks.stamps_ns >= stamp_ns - max_gap_ns)
-        return is_late
+        goes_on = self._tracks.stamps_ns >= stamp_ns - self._max_gap_ns
+        if not goes_on.all():
+            self._tracks = self._tracks.take(np.flatnonzero(goes_on))
+
+    @property
+    def _max_gap_ns(self) -> int:
+        return round(self.max_gap * 1e9)
 
     def _assign(
         self, boxes: BoxArray, rows: Ints, chosen: Ints, columns: Ints, is_late: bool
@@ -262,7 +272,10 @@ class Tracker:
         ids = [''] * len(boxes.boxes)
         for row, column in zip(chosen.tolist(), columns.tolist(), strict=True):
             ids[row] = tracks.ids[column]
-        new = np.setdiff1d(rows, chosen)
+        is_new = np.zeros(len(ids), bool)
+        is_new[rows] = True
+        is_new[chosen] = False
+        new = np.flatnonzero(is_new)
         names = [str(self.count + number) for number in range(1, len(new) + 1)]
         self.count += len(new)
         for row, name in zip(new.tolist(), names, strict=True):
@@ -270,8 +283,9 @@ class Tracker:
         if not is_late:
             self._newest_ns = boxes.stamp_ns
             tracks.update(columns, boxes.stamp_ns, boxes.boxes[chosen])
-            started = _Tracks.started(names, boxes.stamp_ns, boxes.boxes[new])
-            self._tracks = tracks.joined(started)
+            if names:
+                started = _Tracks.started(names, boxes.stamp_ns, boxes.boxes[new])
+                self._tracks = concatenated([tracks, started])
         return replace(boxes, track_ids=tuple(ids))
 
 
@@ -308,9 +322,12 @@ class IdCheck:
         Parameters
         ----------
         boxes : BoxArray
-            In a fixed frame, with the ids of the input.
+            In a fixed frame, with the ids of the input. Late ones, and those of a second message
+            with one stamp, are not compared: they are kept.
 
         """
+        if self.tracker.is_late(boxes.stamp_ns):
+            return
         self.count += len(boxes.track_ids)
         if '' in boxes.track_ids:
             self.nameless += boxes.track_ids.count('')

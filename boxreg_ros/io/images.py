@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from io import BytesIO
+import re
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
@@ -29,12 +30,18 @@ NEAR = (0.15, 1.5)
 """Images are looked for so far around a stamp [s]: first nearby, then at a slow camera."""
 MAGIC = {b'\xff\xd8\xff': 'image/jpeg', b'\x89PNG': 'image/png', b'RIFF': 'image/webp'}
 """Formats that browsers show, by the first bytes of a file."""
-CHANNELS = {'rgb8': 'RGB', 'bgr8': 'BGR', 'rgba8': 'RGBX', 'bgra8': 'BGRX', '8UC3': 'BGR'}
-"""Raw encodings of colours by the mode that Pillow reads them in."""
-GREY = ('mono8', '8UC1', 'mono16', '16UC1')
 PATTERNS = ('bayer_rggb8', 'bayer_bggr8', 'bayer_gbrg8', 'bayer_grbg8')
-"""Raw encodings of one channel; colour patterns are shown as grey."""
+RAW_MODES = {
+    **{'rgb8': 'RGB', 'bgr8': 'BGR', 'rgba8': 'RGBX', 'bgra8': 'BGRX', '8UC3': 'BGR'},
+    **dict.fromkeys(('mono8', '8UC1', *PATTERNS), 'L'),
+}
+"""Raw encodings by the mode that Pillow reads them in; colour patterns are shown as grey."""
+WIDE_GREY = ('mono16', '16UC1')
+LUMINANCE = {'yuv422': 1, 'uyvy': 1, 'yuv422_yuy2': 0, 'yuyv': 0}
+"""Encodings that are shown as grey, by the first byte of it."""
 QUALITY = 90
+RECTIFIED = {'rect', 'rectified'}
+"""Words of the topics of images whose distortion is undone."""
 
 
 class ImageCamera(NamedTuple):
@@ -44,15 +51,17 @@ class ImageCamera(NamedTuple):
     frame_id: str
     """Of the camera: x right, y down, z forward."""
     size: tuple[int, int]
-    """Width and height [px]; 0 without a model."""
+    """Width and height of the images [px]; 0 where neither they nor a model state it."""
     matrix: Floats | None
-    """(3, 4), projects points in the camera's frame [px]; None where no model was recorded."""
+    """(3, 4), projects points in `T_image_camera` [px]; None where no model was recorded."""
     distortion: Floats
     """(k,), coefficients of the model; empty for rectified images."""
     model: str
     """``plumb_bob``, ``rational_polynomial``, ``equidistant`` and the like."""
     info_topic: str = ''
     """Of the info that states the model; empty without one."""
+    T_image_camera: Floats = np.eye(4)
+    """Pose (4, 4) of the camera's frame in that of its images: rectified ones are turned."""
 
 
 class Image(NamedTuple):
@@ -77,7 +86,7 @@ class RecordedImages:
             if first is not None:
                 received_ns, stamp_ns, message = first
                 self._delays[topic] = received_ns - stamp_ns
-                frame_id = str(clouds.header_of(message).frame_id).lstrip('/')
+                frame_id = _frame_of(message)
                 self.cameras.append(self._camera(topic, frame_id, message))
 
     def without_images(self) -> list[ImageCamera]:
@@ -89,10 +98,10 @@ class RecordedImages:
             first = next(self._messages({name}), None)
             if first is None or name in known:
                 continue
-            frame_id = str(clouds.header_of(first[2]).frame_id).lstrip('/')
+            frame_id = _frame_of(first[2])
             if frame_id not in frames:
                 bare = ImageCamera(name, frame_id, (0, 0), None, np.zeros(0), '')
-                found.append(_with_model(bare, name, first[2]))
+                found.append(_with_model(bare, name, first[2], has_own_frame=True))
         return found
 
     def nearest(self, camera: ImageCamera, stamp_ns: int) -> Image:
@@ -122,18 +131,20 @@ class RecordedImages:
 
     def _camera(self, topic: str, frame_id: str, message: Any) -> ImageCamera:
         """Return the camera of a topic by the info beside it, or of its frame."""
-        size = (int(getattr(message, 'width', 0)), int(getattr(message, 'height', 0)))
-        camera = ImageCamera(topic, frame_id, size, None, np.zeros(0), '')
-        infos = [
-            (name, next(self._messages({name}), None)) for name in self._topics.filled(INFO_TYPES)
-        ]
-        for is_own in (
-            lambda name, _: _parent(name) in (_parent(topic), _parent(_parent(topic))),
-            lambda _, info: str(clouds.header_of(info).frame_id).lstrip('/') == frame_id,
+        camera = ImageCamera(topic, frame_id, _size_of(message), None, np.zeros(0), '')
+        infos = {
+            name: found[2]
+            for name in self._topics.filled(INFO_TYPES)
+            if (found := next(self._messages({name}), None)) is not None
+        }
+        of_frame = [name for name, info in infos.items() if _frame_of(info) == frame_id]
+        for own in (
+            [name for name in infos if _parent(name) == _parent(topic)],
+            [name for name in infos if _parent(name) == _parent(_parent(topic))],
+            of_frame,
         ):
-            for name, found in infos:
-                if found is not None and is_own(name, found[2]):
-                    return _with_model(camera, name, found[2])
+            if own:
+                return _with_model(camera, own[0], infos[own[0]], len(of_frame) < 2)
         return camera
 
 
@@ -141,30 +152,87 @@ def _parent(topic: str) -> str:
     return topic.rpartition('/')[0]
 
 
+def _frame_of(message: Any) -> str:
+    return str(clouds.header_of(message).frame_id).lstrip('/')
+
+
+def _size_of(message: Any) -> tuple[int, int]:
+    """Return width and height of an image [px]; 0 for a file that Pillow is needed to read."""
+    if hasattr(message, 'width'):
+        return int(message.width), int(message.height)
+    with suppress(ImportError, OSError):
+        from PIL import Image as Picture
+
+        with Picture.open(BytesIO(pointcloud.bytes_of(message.data))) as picture:
+            return picture.size
+    return 0, 0
+
+
 def _stamp_of(record: Record, message: Any) -> int:
     with malformed(f'topic {record.connection.topic!r}'):
         return poses.stamp_ns(clouds.header_of(message))
 
 
-def _with_model(camera: ImageCamera, info_topic: str, info: Any) -> ImageCamera:
-    """Return a camera with the model of a CameraInfo; ROS 1 and Foxglove write capitals."""
+def _with_model(
+    camera: ImageCamera, info_topic: str, info: Any, has_own_frame: bool
+) -> ImageCamera:
+    """
+    Return a camera with the model of a CameraInfo; ROS 1 and Foxglove write capitals.
+
+    The fourth column of P counts where cameras share a frame, that of the first; the frame of a
+    camera of its own is where it is.
+
+    """
 
     def values(name: str) -> Floats:
         found = getattr(info, name, None)
         return np.asarray(getattr(info, name.upper()) if found is None else found, np.float64)
 
-    is_rectified = 'rect' in camera.topic
-    matrix = np.zeros((3, 4))
+    is_rectified = not RECTIFIED.isdisjoint(re.split('[/_]', camera.topic))
+    matrix, T_image_camera = np.zeros((3, 4)), np.eye(4)
     name, columns = ('p', 4) if is_rectified else ('k', 3)
     if values(name).size == 3 * columns:  # lists of Foxglove may be empty
         matrix[:, :columns] = values(name).reshape(3, columns)
+    is_calibrated = np.isfinite(matrix).all() and np.linalg.matrix_rank(matrix[:, :3]) == 3
+    if is_calibrated and not has_own_frame:
+        T_image_camera[:3, 3] = np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    rotation = values('r')
+    if is_rectified and rotation.size == 9 and rotation.any():
+        T_image_camera[:3, :3] = rotation.reshape(3, 3)
+    matrix[:, 3] = 0
+    size, to_pixels = _pixels_of(camera.size, info)
     return camera._replace(
-        size=(int(info.width), int(info.height)),
-        matrix=matrix if matrix.any() else None,  # zeros: not calibrated
+        size=size,
+        matrix=to_pixels @ matrix if is_calibrated else None,
         distortion=np.zeros(0) if is_rectified else values('d').ravel(),
         model=str(info.distortion_model),
         info_topic=info_topic,
+        T_image_camera=T_image_camera,
     )
+
+
+def _pixels_of(size: tuple[int, int], info: Any) -> tuple[tuple[int, int], Floats]:
+    """
+    Return the size of images, and the matrix (3, 3) to their pixels from those of a CameraInfo.
+
+    Its matrices are of the whole sensor: images may be of a region, binned, or made smaller. Where
+    their own size, `size`, is 0, region and binning state it.
+
+    """
+    whole = int(info.width), int(info.height)
+    region = getattr(info, 'roi', None)
+    first, part = (0, 0), whole
+    if region is not None and region.width and region.height:
+        first, part = (region.x_offset, region.y_offset), (region.width, region.height)
+    if not all(size):
+        by_x, by_y = (getattr(info, f'binning_{axis}', 0) or 1 for axis in 'xy')
+        size = part[0] // by_x, part[1] // by_y
+    if size == whole or not all(part):
+        return size, np.eye(3)
+    scale = size[0] / part[0], size[1] / part[1]
+    to_pixels = np.diag([*scale, 1.0])
+    to_pixels[:2, 2] = -np.multiply(scale, first)
+    return size, to_pixels
 
 
 def _as_file(topic: str, message: Any) -> tuple[str, bytes]:
@@ -192,29 +260,31 @@ def _as_jpeg(topic: str, message: Any) -> bytes:
         raise UnsupportedMessage(
             f'{topic}: expected {height} rows of {step} bytes, got {len(data)} bytes'
         )
-    rows = data[: height * step].reshape(height, step)
-    picture = Picture.fromarray(_pixels(topic, message, rows, width))
+    mode = RAW_MODES.get(str(message.encoding))
+    try:
+        if mode is None:
+            rows = data[: height * step].reshape(height, step)
+            picture = Picture.fromarray(_grey(topic, message, rows, width))
+        else:
+            shown, size = 'L' if mode == 'L' else 'RGB', (width, height)
+            picture = Picture.frombytes(shown, size, data, 'raw', mode, step)
+    except ValueError as error:
+        raise UnsupportedMessage(
+            f'{topic}: expected {width} pixels in {step} bytes, got: {error}'
+        ) from None
     file = BytesIO()
     picture.save(file, 'JPEG', quality=QUALITY)
     return file.getvalue()
 
 
-def _pixels(topic: str, message: Any, rows: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    """Return the pixels (h, w) or (h, w, 3) of rows of bytes."""
+def _grey(topic: str, message: Any, rows: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    """Return the pixels (h, w) of rows of bytes that Pillow does not read."""
     encoding = str(message.encoding)
-    if encoding in CHANNELS:
-        mode = CHANNELS[encoding]
-        pixels = rows[:, : width * len(mode)].reshape(len(rows), width, len(mode))
-        order = [mode.index(channel) for channel in 'RGB']
-        return np.ascontiguousarray(pixels[..., order])
-    if encoding in (*GREY, *PATTERNS):
-        if '16' not in encoding:
-            return np.ascontiguousarray(rows[:, :width])
+    if encoding in WIDE_GREY:
         kind = '>u2' if getattr(message, 'is_bigendian', False) else '<u2'
         values = np.ascontiguousarray(rows[:, : 2 * width]).view(kind)
         return np.asarray(values / max(1, values.max()) * 255).astype(np.uint8)
-    if encoding in ('yuv422', 'uyvy', 'yuv422_yuy2', 'yuyv'):  # the luminance
-        first = int(encoding in ('yuv422', 'uyvy'))
-        return np.ascontiguousarray(rows[:, first : 2 * width : 2])
-    known = ', '.join((*CHANNELS, *GREY, *PATTERNS))
+    if encoding in LUMINANCE:
+        return np.ascontiguousarray(rows[:, LUMINANCE[encoding] : 2 * width : 2])
+    known = ', '.join((*RAW_MODES, *WIDE_GREY, *LUMINANCE))
     raise UnsupportedMessage(f'{topic}: expected an encoding of {known}, got {encoding!r}')

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.io.definitions import fields_of, known_store
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.joining import are_parts, JOIN_NS, joined
 from boxreg_ros.io.lidars import SensorPlacement
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder
+from boxreg_ros.io.storage.files import encoding_of
+from boxreg_ros.io.storage.reader import decompressed
 from boxreg_ros.io.storage.record import Record
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from msg_adapters import Adapter, clouds, pointcloud
+from msg_adapters.convention import Convention
+from msg_adapters.serialized import BOX_FIELDS, BoxReader
+from rosbags.interfaces import Connection
+from rosbags.typesys.store import Typestore
 
 
 @dataclass(eq=False, repr=False)
@@ -30,12 +38,14 @@ class MessageContents:
     _placement: SensorPlacement
     _boxes_topic: str
     _adapter: Adapter | None
+    _convention: Convention
 
     def __post_init__(self) -> None:
         """Begin with no message."""
         self.decoded_topics: set[str] = set()
         self._joined: set[int] = set()  # records whose boxes are in an array before them, by id
         self._joins = 0
+        self._readers: dict[Typestore, BoxReader | None] = {}
 
     def reset(self) -> None:
         """Forget which topics could be read: the recording is read again."""
@@ -63,17 +73,31 @@ class MessageContents:
             self._joined.remove(id(record))
             return None
         topic = record.connection.topic
+        intensities = None
+        content: Sweep | BoxArray
         try:
-            message = self._decoder.message(record)
-            content = self.of(topic, message)
+            if topic == self._boxes_topic:
+                content = self._whole(self.boxes(record.connection, record.data), record, later)
+            else:
+                message = self._decoder.message(record)
+                content = self.of(topic, message)
+                intensities = self._intensities(topic, message) if with_intensities else None
         except UnsupportedMessage as error:
             self._decoder.count_unreadable(topic, error)
             return None
         self.decoded_topics.add(topic)
-        if isinstance(content, BoxArray):
-            return Item(record.received_ns, self._whole(content, record, later))
-        intensities = self._intensities(topic, message) if with_intensities else None
         return Item(record.received_ns, content, intensities)
+
+    def boxes(self, connection: Connection, data: bytes) -> BoxArray:
+        """Return the boxes of a message; UnsupportedMessage if it is malformed."""
+        reader = self._reader_of(connection)
+        with malformed(f'topic {connection.topic!r}'):
+            fields = None if reader is None else reader.ordinary(decompressed(data))
+            if reader is not None and fields is not None:
+                boxes = reader.boxes_of(fields)
+                is_standard = self._convention.is_standard
+                return boxes if is_standard else self._convention.to_centers(boxes)
+        return cast(BoxArray, self.of(connection.topic, self._decoder.decoded(connection, data)))
 
     def of(self, topic: str, message: Any) -> Sweep | BoxArray:
         """Return the sweep or the boxes of a message; UnsupportedMessage if it has none."""
@@ -88,6 +112,22 @@ class MessageContents:
         """Return a copy of a message of the boxes' topic with its boxes replaced."""
         assert self._adapter is not None  # it has read the message
         return self._adapter.to_msg(message, boxes, covariances)
+
+    def _reader_of(self, connection: Connection) -> BoxReader | None:
+        """Return what reads the boxes of serialised messages; None if only objects can be read."""
+        store = self._decoder.store_of(connection)
+        is_plain = encoding_of(connection) != 'ros1' and connection.msgtype in BOX_FIELDS
+        if store is None or not is_plain:
+            return None
+        if store not in self._readers:
+            found = None
+            known = known_store([connection.msgtype])
+            with suppress(UnsupportedMessage):  # an older definition, which the adapter reads
+                found = BoxReader(connection.msgtype, fields_of(store))
+            # Other types of its fields, as float32 for float64, would be read as wrong numbers.
+            is_usual = found and found.reads_as(BoxReader(connection.msgtype, fields_of(known)))
+            self._readers[store] = found if is_usual else None
+        return self._readers[store]
 
     def _intensities(self, topic: str, message: Any) -> Floats | None:
         """Return the intensities of a cloud; None, and counted, where they cannot be read."""
@@ -105,10 +145,9 @@ class MessageContents:
             if other.connection.topic != self._boxes_topic:
                 continue
             try:
-                more = self.of(self._boxes_topic, self._decoder.message(other))
+                more = self.boxes(other.connection, other.data)
             except UnsupportedMessage:
                 continue  # counted in its turn
-            assert isinstance(more, BoxArray)
             if not are_parts(boxes, more):
                 break
             boxes = joined(boxes, more)

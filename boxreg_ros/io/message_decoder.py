@@ -8,12 +8,12 @@ from contextlib import contextmanager, suppress
 from itertools import islice
 from typing import Any
 
-from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.errors import one_line, UnsupportedMessage
 from boxreg_ros.io.definitions import definitions_of, RELEASES, TypeDefinition
 from boxreg_ros.io.foxglove import ChannelDecoder, FOXGLOVE_ENCODINGS
 from boxreg_ros.io.storage.files import encoding_of
 from boxreg_ros.io.storage.reader import decompressed, is_message
-from boxreg_ros.io.storage.record import one_line, Record
+from boxreg_ros.io.storage.record import Record
 from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
 from rosbags.serde import SerdeError
 from rosbags.typesys import TypesysError

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import median
 
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.clocks import (
@@ -27,7 +28,7 @@ from boxreg_ros.io.clocks import (
 from boxreg_ros.io.findings import Finding
 from boxreg_ros.io.transforms import Edge, inverse, matrix, MAX_LINEAR_GAP, TransformTree
 from boxreg_ros.reasons import Reason
-from boxreg_ros.structures import BoxArray, Sweep
+from boxreg_ros.structures import BoxArray, Floats, Sweep
 import numpy as np
 
 MIN_STEP = 0.15
@@ -49,7 +50,8 @@ MIN_REVERSALS = 3
 MAX_BOXES_DELAY = 1.0
 """Delay of boxes after their clouds that is reported [s]; a live detector takes 0.1 to 0.5 s."""
 MIN_COPIED = 0.5
-"""Part of the boxes with stamps of clouds that means that one clock has set both; chosen."""
+"""Part of the stamps that are those of clouds by which one clock has set both; chosen."""
+LATE_ODOMETRY = ', unless it is computed from these clouds, whose stamps it has, and comes late'
 LOOK_PERIOD = 10
 """Clouds between two looks at what changes slowly; chosen: 1 s at 10 Hz."""
 SETTLED_CLOUDS = 15
@@ -58,6 +60,21 @@ SHORT_PERIOD = 0.9
 """Period of clouds that do not all come at the begin of a second [s]; chosen: some may at 1 Hz."""
 FIRST_LOOK = 5
 """Cloud of the first look, for short recordings."""
+MIN_JITTER = 0.03
+"""
+Standard deviation of the position of the sensor that is reported [m].
+
+Chosen: boxes lose .02 of 3D IoU by it, and all of their gain by twice as much; drives have 0.001.
+
+"""
+JITTER_CLOUDS = 50
+"""Newest clouds by which it is measured, and the most that are needed; chosen: 5 s."""
+MIN_JITTER_CLOUDS = 30
+"""Clouds by which it is reported; chosen."""
+MIN_CARRIED_WAY = 1.0
+"""Way of the fixed frame, with the sensor, that is reported [m]; chosen: a drift is less."""
+MIN_RISE = 5.0
+"""Rise, more than the path in the plane, that is reported [m]; chosen: roads are not so."""
 LIDAR_WORDS = (
     *('lidar', 'laser', 'velodyne', 'hesai', 'pandar', 'ouster', 'os_sensor', 'livox', 'mid360'),
     *('rslidar', 'robosense', 'innovusion', 'aeva', 'luminar', 'scan'),
@@ -111,7 +128,8 @@ class JumpSearch:
 
     def look(self, tree: TransformTree, fixed_frame: str, sensor_frame: str) -> None:
         """Add the samples that are new in `tree`, between both frames."""
-        moving = [e for e in tree.route(fixed_frame, sensor_frame) if not tree.is_constant(e)]
+        route = tree.route(fixed_frame, sensor_frame)
+        moving = [edge for edge in route if not tree.is_constant(edge) and _moves(edge)]
         for number, edge in enumerate(moving):
             for row in self._new_rows(edge):
                 if number:
@@ -164,6 +182,49 @@ class JumpSearch:
             self.alternations.setdefault(key, FrameSteps(*key)).add(way, edge.stamps[row])
 
 
+def _moves(edge: Edge) -> bool:
+    """Return whether poses differ: publishers of ROS 1 repeat static ones on /tf."""
+    poses = edge.poses  # empty where all samples were unset
+    return len(poses) > 0 and not np.array_equal(poses[0], poses[-1])
+
+
+class PoseJitter:
+    """
+    Standard deviation of independent errors of the horizontal position of a sensor, per axis [m].
+
+    With independent errors a position is off the line through those before and after it, and the
+    next one is off to the other side. The smaller one of both distances has the standard deviation
+    as its median; motions of vehicles go on to one side.
+
+    """
+
+    def __init__(self) -> None:
+        self._poses = deque[tuple[int, Floats]](maxlen=3)
+        self._away: Floats | None = None
+        self._steps = deque[float](maxlen=JITTER_CLOUDS)
+
+    @property
+    def deviation(self) -> float:
+        """Return the standard deviation; 0 while it is not known."""
+        return median(self._steps) if len(self._steps) >= MIN_JITTER_CLOUDS else 0.0
+
+    def add(self, stamp_ns: int, position: Floats) -> None:
+        """Add the next position (2,) at a stamp."""
+        if self._poses and not 0 < stamp_ns - self._poses[-1][0] <= MAX_LINEAR_GAP * 1e9:
+            self._poses.clear()
+            self._away = None
+        self._poses.append((stamp_ns, position))
+        if len(self._poses) < 3:
+            return
+        (first_ns, first), (middle_ns, middle), (last_ns, last) = self._poses
+        part = (middle_ns - first_ns) / (last_ns - first_ns)
+        before, self._away = self._away, middle - first - part * (last - first)
+        if before is not None:
+            goes_back = self._away @ before < 0
+            smaller = min(np.linalg.norm(before), np.linalg.norm(self._away))
+            self._steps.append(float(goes_back * smaller))
+
+
 class MotionCheck:
     """
     Watch the transforms of a stream of clouds and boxes for what makes their motion wrong.
@@ -187,6 +248,9 @@ class MotionCheck:
         self._copied: list[bool] = []
         self._count = 0
         self._first_milliseconds = 0
+        self._jitters: dict[str, PoseJitter] = {}  # by the frame of the clouds
+        # First and last position (3,), and length of the path in the plane [m], likewise.
+        self._paths: dict[str, tuple[Floats, Floats, float]] = {}
 
     def add(self, item: Sweep | BoxArray, fixed_frame: str, received_ns: int | None) -> None:
         """
@@ -219,28 +283,56 @@ class MotionCheck:
         if self._count == FIRST_LOOK or self._count % LOOK_PERIOD == 0:
             self._look(fixed_frame, item.frame_id)
 
+    def add_pose(self, cloud: Sweep, fixed_frame: str, T_fixed_cloud: Floats) -> None:
+        """Add the pose (4, 4) of the frame of a cloud at its stamp."""
+        jitter = self._jitters.setdefault(cloud.frame_id, PoseJitter())
+        jitter.add(cloud.stamp_ns, T_fixed_cloud[:2, 3])
+        if jitter.deviation >= MIN_JITTER and 'publishers' not in self.findings:
+            text = (
+                f'the position of {cloud.frame_id!r} in {fixed_frame!r} errs by '
+                f'{jitter.deviation:.2f} m from cloud to cloud, back and forth: points and boxes '
+                f'are displaced as much, and more where its yaw errs too; use a smoother source '
+                f'of motion, with --fixed-frame or --odometry, or smooth this one'
+            )
+            self.findings['jitter'] = Finding(Reason.TRANSFORM_FAULT, text)
+        position = T_fixed_cloud[:3, 3]
+        begin, last, length = self._paths.get(cloud.frame_id, (position, position, 0.0))
+        length += float(np.linalg.norm(position[:2] - last[:2]))
+        self._paths[cloud.frame_id] = begin, position, length
+        rise = abs(position[2] - begin[2])
+        if rise > max(MIN_RISE, length):
+            text = (
+                f'{cloud.frame_id!r} has moved by {rise:.0f} m in '
+                f'{fixed_frame!r}, mostly along z: expected z up, got poses of a camera with z '
+                f'ahead, as of KITTI odometry or visual SLAM, or axes of another convention: '
+                f'convert them to poses of the LiDAR (with its calibration Tr of KITTI: inverse '
+                f'of Tr, pose, Tr), or choose another motion with --fixed-frame or --odometry'
+            )
+            self.findings.setdefault('axes', Finding(Reason.TRANSFORM_FAULT, text))
+
     def _look(self, fixed_frame: str, frame: str) -> None:
         """Look at the transforms as they are now."""
         tree = self._tree
         route = tree.route(fixed_frame, frame)
         moving = [edge for edge in route if not tree.is_constant(edge)]
         self._jumps.look(tree, fixed_frame, frame)
+        sensor = '' if self._named_sensors else registered_text(tree, fixed_frame, frame)
+        fault, clock = Reason.TRANSFORM_FAULT, Reason.CLOCK_OFFSET
         found = {
-            'jumps': self._jump_text(fixed_frame, frame),
-            'publishers': self._publisher_text() or _contradiction_text(route),
-            'clock': self._clock_text(moving),
-            'boxes_clock': self._boxes_clock_text(),
-            'microseconds': self._microseconds_text(),
-            'sensor': '' if self._named_sensors else registered_text(tree, fixed_frame, frame),
-            'sparse': _sparse_text(moving),
-            'parents': _parents_text(tree, route),
-            'once': _once_text([edge for edge in route if edge not in moving]),
+            'jumps': Finding(Reason.FIXED_FRAME_JUMPS, self._jump_text(fixed_frame, frame)),
+            'publishers': Finding(fault, self._publisher_text() or _contradiction_text(route)),
+            'clock': Finding(clock, self._clock_text(moving)),
+            'boxes_clock': Finding(clock, self._boxes_clock_text()),
+            'microseconds': Finding(clock, self._microseconds_text()),
+            'sensor': Finding(Reason.SENSOR_POSITION, sensor),
+            'carried': Finding(fault, _carried_text(tree, fixed_frame, frame)),
+            'sparse': Finding(fault, _sparse_text(moving)),
+            'parents': Finding(fault, _parents_text(tree, route)),
+            'once': Finding(fault, _once_text([edge for edge in route if edge not in moving])),
         }
-        for kind, text in found.items():
-            if text:
-                self.findings[kind] = Finding(REASONS_OF[kind], text)
+        self.findings |= {kind: one for kind, one in found.items() if one.text}
         for kind in ('clock', 'boxes_clock'):
-            if not found[kind] and len(self._received_ns) >= SETTLED_CLOUDS:
+            if not found[kind].text and len(self._received_ns) >= SETTLED_CLOUDS:
                 self.findings.pop(kind, None)  # an offset of the first ones that is not constant
 
     def _jump_text(self, fixed_frame: str, frame: str) -> str:
@@ -267,7 +359,7 @@ class MotionCheck:
 
     def _clock_text(self, moving: Sequence[Edge]) -> str:
         """Return how far the clock of the fastest motion is off from that of the clouds."""
-        edge = max(moving, key=_way, default=None)
+        edge = max(moving, key=Edge.way, default=None)
         offsets = {} if edge is None else self._offsets_from(edge.arrivals)
         off = {topic: one for topic, one in offsets.items() if abs(one) >= MIN_CLOCK_OFFSET}
         if edge is None or not off:
@@ -278,12 +370,15 @@ class MotionCheck:
         offset, names = likely_offset(measured)
         total = seconds_text(offset + self._tree.clock_offset)
         of_whom = f', as {names} are' if names else ''
+        # That of a LiDAR odometry is received when it has been computed.
+        may_be_late = offset > 0 and _has_copies(edge.stamps, self._cloud_stamps)
         return (
             f'clocks: expected one for clouds and motion, got stamps of the clouds '
             f'{seconds_text(abs(offset))} s {"ahead of" if offset > 0 else "behind"} those of '
             f'{edge.parent} -> {edge.child} received at the same time{of_whom}: each cloud is '
             f'placed by the pose of another moment; correct the motion with '
             f'--clock-offset={total} (node: clock_offset:={total})'
+            f'{LATE_ODOMETRY if may_be_late else ""}'
         )
 
     @property
@@ -377,6 +472,20 @@ def registered_text(tree: TransformTree, fixed_frame: str, frame: str) -> str:
     )
 
 
+def _carried_text(tree: TransformTree, fixed_frame: str, frame: str) -> str:
+    """Return that the fixed frame is one of the vehicle, which moves with the sensor."""
+    top = tree.fixed_frame(fixed_frame) or fixed_frame
+    is_carried = all(edge.is_static for edge in tree.route(fixed_frame, frame))
+    way = max((edge.way() for edge in tree.route(top, fixed_frame)), default=0.0)
+    if not is_carried or way < MIN_CARRIED_WAY or registered_text(tree, fixed_frame, frame):
+        return ''
+    return (
+        f'the fixed frame {fixed_frame!r} moves by {way:.1f} m in {top!r}, and the sensor with '
+        f'it: parked objects move in it, and get headings of moving ones; leave it out, or set '
+        f'--fixed-frame {top} (node: fixed_frame:={top})'
+    )
+
+
 def _contradiction_text(route: Sequence[Edge]) -> str:
     """Return which transform has several positions at one stamp."""
     for edge in route:
@@ -431,27 +540,11 @@ def _once_text(constant: Sequence[Edge]) -> str:
     return ''
 
 
-def _way(edge: Edge) -> float:
-    """Return the way that the child of a pair has moved in its parent [m]."""
-    if len(edge.poses) < 2:
-        return 0.0
-    positions = np.array([pose[:3] for pose in edge.poses])
-    return float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0)))
+def _has_copies(stamps_ns: Sequence[int], of_ns: Sequence[int]) -> bool:
+    """Return whether most stamps are copies of others [ns]."""
+    away = np.abs(np.subtract.outer(stamps_ns, of_ns)).min(axis=1)
+    return bool(np.mean(away <= COPY_NS) >= MIN_COPIED)
 
 
 def _worst(steps: Iterable[FrameSteps]) -> FrameSteps:
     return max(steps, key=lambda one: one.largest)
-
-
-REASONS_OF = {
-    'jumps': Reason.FIXED_FRAME_JUMPS,
-    'publishers': Reason.TRANSFORM_FAULT,
-    'clock': Reason.CLOCK_OFFSET,
-    'boxes_clock': Reason.CLOCK_OFFSET,
-    'microseconds': Reason.CLOCK_OFFSET,
-    'sensor': Reason.SENSOR_POSITION,
-    'sparse': Reason.TRANSFORM_FAULT,
-    'parents': Reason.TRANSFORM_FAULT,
-    'once': Reason.TRANSFORM_FAULT,
-}
-"""Kind of a finding -> reason by which the node counts it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from boxreg_ros.io.pose_check import PairedCheck, POINT_MARGIN, SortedPoints
+from boxreg_ros.io.pose_check import PairedCheck, POINT_MARGIN, points_around
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, moved_boxes
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
@@ -20,6 +20,7 @@ from boxreg_ros.structures import (
 )
 from msg_adapters.convention import Convention
 import numpy as np
+from numpy.typing import NDArray
 
 ENOUGH_BOXES = 12
 """Boxes with points around them that a finding needs; chosen."""
@@ -65,6 +66,8 @@ MIN_UPRIGHT = 0.5
 """Cosine of the tilt below which a box is not upright; derived: 60 degrees."""
 MIN_TILTED = 0.3
 """Part of the boxes on their sides or backs; chosen: with w first, all but oncoming ones."""
+MOST_TILTED = 0.9
+"""Part of them that shows a fixed frame with another axis up; chosen: all but those that err."""
 MAX_TILTED = 0.05
 """Part of them that may be so where w is taken to come first; chosen."""
 NO_FRAMES: Mapping[str, Floats] = {}
@@ -96,12 +99,12 @@ class PlaceCheck(PairedCheck):
     A box of an object contains most of the points around it, whatever its size: those above the
     ground within twice its extents. `finding` says which setting of the `convention` would put the
     boxes there; it is empty if none does, or they are there. Sweeps and boxes arrive in any order,
-    in one frame, at most `tolerance` [s] apart.
+    in one frame, at most `AT_ONCE` [s] apart.
 
     """
 
-    def __init__(self, convention: Convention, tolerance: float) -> None:
-        super().__init__(tolerance)
+    def __init__(self, convention: Convention) -> None:
+        super().__init__()
         self._convention = convention
         scale = 2 * convention.size_scale
         self._meant = {
@@ -116,6 +119,8 @@ class PlaceCheck(PairedCheck):
         self._tilted: list[tuple[bool, bool]] = []  # as read, and with w first
         self._within: list[float] = []
         self._heights: list[float] = []  # in the frame of the messages
+        self._stands: list[float] = []  # cosine of z of each box with that of the fixed frame
+        self._fixed_frame = ''
         self._frames: dict[str, Floats] = {}
         self.finding = ''
 
@@ -146,6 +151,7 @@ class PlaceCheck(PairedCheck):
         if not self.is_open:
             return
         if isinstance(item, BoxArray):
+            self._fixed_frame = item.frame_id
             item = boxes_to_frame(item, inverse(T_fixed_item), '')
             self._frames = {'': T_fixed_item, **frames}
         pair = self._paired(item)
@@ -153,7 +159,7 @@ class PlaceCheck(PairedCheck):
             self._compare(*pair)
             self.finding = self._tilt_text() or self._place_text() or self._size_text()
 
-    def _compare(self, points: SortedPoints, array: BoxArray) -> None:
+    def _compare(self, points: NDArray[np.floating], array: BoxArray) -> None:
         """Add what boxes in the frame of their message contain of the points, in each place."""
         boxes = array.boxes[is_valid_box(array.boxes)][: MAX_COMPARED - len(self._tilted)]
         count = len(boxes)
@@ -164,6 +170,7 @@ class PlaceCheck(PairedCheck):
         self._tilted += [(bool(own), bool(other)) for own, other in tilted.T]
         T = self._frames.pop('')
         own = moved_boxes(boxes, T)
+        self._stands += np.cos(own[:, ROLL:YAW]).prod(axis=1).tolist()
         _add_coverages(self._own, points, own)
         self._within += [share for box in own if (share := _share_within(points, box)) is not None]
         self._heights += raw.boxes[:, BOX_CENTER][:, 2].tolist()
@@ -185,6 +192,22 @@ class PlaceCheck(PairedCheck):
             f'{own:.0%} of the boxes lie on their sides or backs: expected orientation '
             f"'wxyz', got {self._convention.orientation!r}; set orientation:=wxyz (boxreg "
             f'relabel: --orientation wxyz)'
+        )
+
+    @property
+    def fallen(self) -> str:
+        """Return that the boxes do not stand upright in the fixed frame; '' if they do."""
+        if len(self._stands) < ENOUGH_BOXES:
+            return ''
+        share = np.mean(np.array(self._stands) < MIN_UPRIGHT)
+        if share < MOST_TILTED or self.finding:
+            return ''
+        side = 'on their roofs' if np.median(self._stands) < -MIN_UPRIGHT else 'on their sides'
+        return (
+            f'{share:.0%} of the boxes stand {side} in {self._fixed_frame!r}: expected z up in '
+            f'the fixed frame and in boxes, got axes such as north, east and down: roads and '
+            f'roofs are looked for on the wrong side; choose a frame with z up, --fixed-frame '
+            f'FRAME (node: fixed_frame:=FRAME), or correct the orientations of the boxes'
         )
 
     @property
@@ -253,24 +276,25 @@ class PlaceCheck(PairedCheck):
         return place.total >= MIN_RATIO_OF_COVERAGE * own.total
 
 
-def _share_within(points: SortedPoints, box: Floats) -> float | None:
+def _share_within(points: NDArray[np.floating], box: Floats) -> float | None:
     """Return the share of the points in the upper half of a box that its inner part contains."""
     if not np.isfinite(box).all():
         return None
     limit = box[BOX_EXTENT] / 2
-    away = points.around(box[BOX_CENTER], float(np.linalg.norm(limit)))
+    away = points_around(points, box[BOX_CENTER], float(np.linalg.norm(limit)))
     local = away @ matrix_from_rpy(box[ROLL:])
     parts = np.abs(local / limit).max(axis=1)[local[:, 2] > 0]
     parts = parts[parts <= 1]
     return float(np.mean(parts <= MAX_FILLED)) if len(parts) >= MIN_POINTS_AROUND else None
 
 
-def _add_coverages(place: _Place, points: SortedPoints, boxes: Floats) -> None:
+def _add_coverages(place: _Place, points: NDArray[np.floating], boxes: Floats) -> None:
     """Add for each of n boxes (n, 9) with enough points around it the part that it contains."""
     for box in boxes:
         if not np.isfinite(box).all():
             continue
-        away = points.around(box[BOX_CENTER], 1.1 * float(np.linalg.norm(box[BOX_EXTENT])))
+        reach = 1.1 * float(np.linalg.norm(box[BOX_EXTENT]))
+        away = points_around(points, box[BOX_CENTER], reach)
         local = away @ matrix_from_rpy(box[ROLL:])
         limit = box[BOX_EXTENT] / 2
         local = local[local[:, 2] > GROUND_MARGIN - limit[2]]

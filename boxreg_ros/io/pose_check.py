@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
+from boxreg_ros.core.matching import AT_ONCE
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
     BOX_CENTER,
@@ -32,7 +33,17 @@ EQUIVALENT_SHARE = 0.85
 MIN_GAIN = 1.3
 """Factor by which another convention must exceed the points of the present one."""
 MIN_AGREEMENT = 0.7
-"""Share of the boxes in which the other convention must have more points."""
+"""Share of the boxes, equal for each object, in which the other one must have more points."""
+MAX_CLASSES = 100
+"""Classes that are looked at one by one; chosen: above all data sets, below one for each box."""
+MIN_OBJECTS = 4
+"""
+Objects that a finding about a reference before, behind or beside the present one needs.
+
+Chosen: of one to three objects one in ten has more points before or behind its boxes, such as
+those of a neighbour.
+
+"""
 DIRECTIONS = (
     ('length', 'behind', 'before'),
     ('width', 'right of', 'left of'),
@@ -40,29 +51,14 @@ DIRECTIONS = (
 )
 
 
-class SortedPoints:
-    """Points (N, 3) in the order of x: those around a place are found without the others."""
-
-    def __init__(self, points: NDArray[np.floating]) -> None:
-        self._points = points[np.argsort(points[:, 0])]
-
-    def around(self, center: Floats, reach: float) -> Floats:
-        """Return the points (n, 3) nearer than `reach` along each axis, relative to `center`."""
-        ends = np.searchsorted(self._points[:, 0], (center[0] - reach, center[0] + reach))
-        away = self._points[slice(*ends)] - center
-        found: Floats = away[(np.abs(away) < reach).all(axis=1)]
-        return found
-
-
 class PairedCheck:
     """A check of the first boxes and the sweeps of their stamps, which arrive in any order."""
 
-    def __init__(self, tolerance: float) -> None:
-        self._tolerance_ns = round(tolerance * 1e9)
+    def __init__(self) -> None:
         self._sweep: Sweep | None = None
         self._boxes: BoxArray | None = None
 
-    def _paired(self, item: Sweep | BoxArray) -> tuple[SortedPoints, BoxArray] | None:
+    def _paired(self, item: Sweep | BoxArray) -> tuple[NDArray[np.floating], BoxArray] | None:
         """Take the next sweep or boxes; return points and boxes if they are of one time."""
         if isinstance(item, Sweep):
             self._sweep = item
@@ -71,100 +67,231 @@ class PairedCheck:
         sweep, boxes = self._sweep, self._boxes
         if sweep is None or boxes is None:
             return None
-        if abs(sweep.stamp_ns - boxes.stamp_ns) > self._tolerance_ns:
+        if abs(sweep.stamp_ns - boxes.stamp_ns) > AT_ONCE * 1e9:
             return None
         self._sweep = self._boxes = None
-        return SortedPoints(sweep.in_frame().points), boxes
+        return sweep.in_frame().points, boxes
+
+
+@dataclass(slots=True)
+class _Evidence:
+    """Points in the first boxes of all classes, or of one, under each convention."""
+
+    is_above: NDArray[np.bool_]  # which conventions move boxes up or down, at most
+    counts: list[Ints] = field(default_factory=list)  # of each box; the present convention first
+    objects: list[str] = field(default_factory=list)  # of each of them
+    seen: int = 0
+
+    @property
+    def is_enough(self) -> bool:
+        """Return whether there are as many boxes as the result needs."""
+        return len(self.counts) >= DECISIVE_BOXES
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether no more boxes are needed, or looked at."""
+        return self.is_enough or self.seen >= MAX_BOXES
+
+    def add(self, counts: Ints, track_id: str) -> None:
+        """Add the points in a box under each convention."""
+        self.seen += 1
+        if counts.max() >= MIN_POINTS_OF_POSE:
+            self.counts.append(counts)
+            self.objects.append(track_id or f'box {self.seen}')  # without ids of one each
+
+    @property
+    def is_shown(self) -> NDArray[np.bool_]:
+        """Return which conventions the points of so many objects can show."""
+        return self.is_above | (len(set(self.objects)) >= MIN_OBJECTS)
+
+    @property
+    def shares(self) -> Floats:
+        """Return the points in each box under each convention, as shares of the most."""
+        counts = np.array(self.counts, dtype=float)  # (boxes, conventions)
+        return np.asarray(counts / counts.max(axis=1, keepdims=True))
+
+    @property
+    def weights(self) -> Floats:
+        """Return the weights of the boxes: each object counts the same."""
+        _, objects, boxes = np.unique(self.objects, return_inverse=True, return_counts=True)
+        return np.asarray(1 / (len(boxes) * boxes[objects]))
+
+    def best(self) -> int:
+        """Return the index of the convention that fits better than the present one; 0 for none."""
+        if not self.is_enough:
+            return 0
+        totals = (self.weights @ self.shares)[1:]
+        fits = self.is_shown[1:] & (totals >= EQUIVALENT_SHARE * totals.max())
+        # Of equal conventions the first: they are ordered by how common they are.
+        best = 1 + int(fits.argmax())
+        return best if fits.any() and self.prefers(best, 0) else 0
+
+    def prefers(self, one: int, other: int) -> bool:
+        """Return whether boxes have clearly more points under one convention than another."""
+        if not (self.is_enough and self.is_shown[[one, other]].all()):
+            return False
+        shares, weights = self.shares, self.weights
+        totals = weights @ shares
+        agreement = weights @ (shares[:, one] > shares[:, other])
+        return bool(totals[one] >= MIN_GAIN * totals[other] and agreement >= MIN_AGREEMENT)
 
 
 class PoseCheck(PairedCheck):
     """
-    Compare the first boxes with their points under every convention.
+    Compare the first boxes, of all classes and of each, with their points under every convention.
 
     All conventions give boxes of the same volume about the same pose, so the right one contains
-    most points. Sweeps and boxes arrive in any order, in one frame, at most `tolerance` [s] apart.
+    most points. Sweeps and boxes arrive in any order, in one frame, at most `AT_ONCE` [s] apart.
     `finding` says which setting of the `convention` they were read with is wrong and its right
-    value; it is empty if none is known to be wrong.
+    value; `class_finding` which classes are wrong where others are right. They are empty if none
+    is known to be wrong.
 
     """
 
-    def __init__(self, convention: Convention, tolerance: float) -> None:
-        super().__init__(tolerance)
+    def __init__(self, convention: Convention) -> None:
+        super().__init__()
         self._convention = convention
-        self._others = [
+        self._conventions = [
+            convention,
             *(replace(convention, pose_reference=name) for name in REFERENCES),
             *(replace(convention, size_order=order) for order in SIZE_ORDERS),
         ]
-        self._counts: list[Ints] = []
-        self._seen = 0
+        own = convention.reference[:2]
+        self._is_above = np.array([(c.reference[:2] == own).all() for c in self._conventions])
+        self._all = _Evidence(self._is_above)
+        self._decided = 0
+        self._classes: dict[str, _Evidence] = {}
         self.finding = ''
+        self.class_finding = ''
 
     def add(self, item: Sweep | BoxArray) -> None:
         """Add the next sweep or boxes."""
-        pair = None if self._is_over else self._paired(item)
+        if isinstance(item, BoxArray):
+            closed = {name for name in set(item.class_names) if self._is_over(name)}
+            if closed.issuperset(item.class_names):
+                return
+            if closed:
+                is_open = [name not in closed for name in item.class_names]
+                item = item.take(np.flatnonzero(is_open))
+        pair = self._paired(item)
         if pair is not None:
             self._count(*pair)
-            if len(self._counts) >= DECISIVE_BOXES:
-                self.finding = self._result()
+            decided = sum(one.is_enough for one in (self._all, *self._classes.values()))
+            if decided > self._decided:
+                self._decided = decided
+                self._judge()
 
-    @property
-    def _is_over(self) -> bool:
-        return len(self._counts) >= DECISIVE_BOXES or self._seen >= MAX_BOXES
+    def _is_over(self, class_name: str) -> bool:
+        """Return whether boxes of a class are not looked at any more."""
+        if not self._all.is_over:
+            return False
+        known = self._classes.get(class_name)
+        return len(self._classes) >= MAX_CLASSES if known is None else known.is_over
 
-    def _count(self, points: SortedPoints, boxes: BoxArray) -> None:
+    def _count(self, points: NDArray[np.floating], boxes: BoxArray) -> None:
         """Count the points in each box under each convention."""
-        valid = is_valid_box(boxes.boxes)
-        n = int(valid.sum())
-        kept = BoxArray(0, '', ('',) * n, ('',) * n, np.ones(n), boxes.boxes[valid])
-        raw = self._convention.from_centers(kept)
-        candidates = [kept.boxes, *(other.to_centers(raw).boxes for other in self._others)]
-        for rows in np.stack(candidates, axis=1):  # (boxes, conventions, 9)
-            if self._is_over:
-                break
-            self._seen += 1
-            center = rows[0, BOX_CENTER]
-            reach = 1.5 * float(np.linalg.norm(rows[0, BOX_EXTENT]))
-            counts = _inside(points.around(center, reach) + center, rows)
-            if counts.max() >= MIN_POINTS_OF_POSE:
-                self._counts.append(counts)
+        kept = boxes.take(np.flatnonzero(is_valid_box(boxes.boxes)))
+        candidates: Floats | None = None
+        for row, class_name in enumerate(kept.class_names):
+            if self._is_over(class_name):
+                continue
+            center, extent = kept.boxes[row, BOX_CENTER], kept.boxes[row, BOX_EXTENT]
+            away = points_around(points, center, 1.5 * float(np.linalg.norm(extent)))
+            counts = np.zeros(len(self._conventions), dtype=int)
+            if len(away) >= MIN_POINTS_OF_POSE:
+                candidates = self._candidates(kept) if candidates is None else candidates
+                counts = _inside(away + center, candidates[row])
+            own = self._classes.setdefault(class_name, _Evidence(self._is_above))
+            for evidence in (self._all, own):
+                if not evidence.is_over:
+                    evidence.add(counts, kept.track_ids[row])
 
-    def _result(self) -> str:
-        """Return the finding from the counts; the first convention is the present one."""
-        counts = np.array(self._counts, dtype=float)  # (boxes, conventions)
-        shares = counts / counts.max(axis=1, keepdims=True)
-        own, others = shares[:, 0], shares[:, 1:]
-        totals = others.sum(axis=0)
-        # Of equal conventions the first: they are ordered by how common they are.
-        best = int((totals >= EQUIVALENT_SHARE * totals.max()).argmax())
-        is_better = others[:, best] > own
-        if others[:, best].sum() < MIN_GAIN * own.sum() or is_better.mean() < MIN_AGREEMENT:
-            return ''
-        return self._text(self._others[best], float(own.mean()))
+    def _candidates(self, boxes: BoxArray) -> Floats:
+        """Return boxes read by each convention (boxes, conventions, 9)."""
+        raw = self._convention.from_centers(boxes)
+        return np.stack([c.to_centers(raw).boxes for c in self._conventions], axis=1)
 
-    def _text(self, other: Convention, share: float) -> str:
-        """Return the finding that the `other` convention is the right one."""
-        name, how = 'size_order', 'do not fit'
-        if other.pose_reference != self._convention.pose_reference:
+    def _judge(self) -> None:
+        """Update the findings."""
+        best = self._all.best()
+        of_classes: dict[int, list[str]] = {}
+        for class_name, evidence in self._classes.items():
+            of_classes.setdefault(evidence.best(), []).append(class_name)
+        of_classes.pop(0, None)
+        if best and not (best in of_classes and self._right(best)):
+            of_classes = {best: []}
+        of_all: list[str] = []
+        of_some: list[str] = []
+        for index, names in of_classes.items():
+            right = self._right(index) if names else []
+            texts = of_some if right else of_all
+            texts.append(self._text(index, names, right))
+        self.finding = ''.join(of_all[:1])
+        self.class_finding = '; '.join(of_some)
+
+    def _right(self, index: int) -> list[str]:
+        """Return the classes that the present convention fits, and another one does not."""
+        return [name for name, one in self._classes.items() if one.prefers(0, index)]
+
+    def _text(self, index: int, names: list[str], right: list[str]) -> str:
+        """Return that another convention fits: all classes, or `names` beside `right` ones."""
+        own, other = self._convention, self._conventions[index]
+        off = zip(other.reference - own.reference, DIRECTIONS, strict=True)
+        steps = [(part, axis, ways) for part, (axis, *ways) in off if part]
+        instead = ''
+        if steps:
             name = 'pose_reference'
-            # Offset of the present boxes from their points, in parts of the extents.
-            off = other.reference - self._convention.reference
             how = ' and '.join(
                 f'{"hover" if axis == "height" and part > 0 else "stand"} {abs(part):g} {axis}s '
                 f'{ways[int(part > 0)]}'
-                for part, (axis, *ways) in zip(off, DIRECTIONS, strict=True)
-                if part
+                for part, axis, ways in steps
             )
-        wanted = getattr(other, name)
-        instead = ''
-        if name == 'size_order' and wanted[:2] in ('wl', 'lw'):
-            # Points distinguish length from width, but not which axis points forward.
-            sideways = 'x+ or x-' if self._convention.forward_axis[0] == 'y' else 'y+ or y-'
-            instead = f', or forward_axis:={sideways} if it is that axis which points forward'
+            correction = f'move them by {" and ".join(f"{-p:g} {axis}s" for p, axis, _ in steps)}'
+            if [axis for _, axis, _ in steps] == ['height']:
+                instead = (
+                    '; if all are off by the same metres, they are of another frame, as that of '
+                    'the vehicle: name it by boxes_frame, its transform is needed'
+                )
+        else:
+            name, how = 'size_order', 'do not fit'
+            correction = f'put their sizes in the order {own.size_order}'
+            if other.size_order[:2] in ('wl', 'lw'):
+                # Points distinguish length from width, but not which axis points forward.
+                sideways = 'x+ or x-' if own.forward_axis[0] == 'y' else 'y+ or y-'
+                instead = f', or forward_axis:={sideways} if it is that axis which points forward'
+                correction += ' (or turn them by 90 degrees, if yaw is wrong)'
+        evidence = [self._classes[one] for one in names] or [self._all]
+        share = float(np.concatenate([one.shares[:, 0] for one in evidence]).mean())
+        whose = f'boxes of {_listed(names)}' if names else 'boxes'
+        seen = f'{whose} {how} their points, of which they contain {share:.0%}'
+        expected, got = getattr(other, name), getattr(own, name)
+        if right:
+            return (
+                f'{seen}, those of {_listed(right)} fit theirs: expected {name} {got!r} of all '
+                f'classes, got {expected!r} of these; an option is for all classes: {correction} '
+                f'where they are made, or in the boxes.csv that boxreg convert RECORDING#TOPIC '
+                f'--from recording --to csv writes and boxreg relabel --labels csv:FOLDER reads'
+            )
         return (
-            f'boxes {how} their points, of which they contain {share:.0%}: expected {name} '
-            f'{wanted!r}, got {getattr(self._convention, name)!r}; set {name}:={wanted}{instead} '
-            f'(boxreg relabel: --{name.replace("_", "-")} {wanted})'
+            f'{seen}: expected {name} {expected!r}, got {got!r}; set {name}:={expected} (boxreg '
+            f'relabel: --{name.replace("_", "-")} {expected}){instead}'
         )
+
+
+def _listed(names: list[str]) -> str:
+    """Return class names as part of a sentence."""
+    return ', '.join(map(repr, names))
+
+
+def points_around(points: NDArray[np.floating], center: Floats, reach: float) -> Floats:
+    """Return those of the points (N, 3) nearer than `reach` along each axis, from `center`."""
+    # Python floats: those of NumPy would make float64 of all float32.
+    x, y, z = (
+        np.abs(column - of_center) < reach
+        for column, of_center in zip(points.T, center.tolist(), strict=True)
+    )
+    found: Floats = points[np.flatnonzero(x & y & z)] - center
+    return found
 
 
 def _inside(points: NDArray[np.floating], boxes: Floats) -> Ints:

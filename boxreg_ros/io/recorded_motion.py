@@ -211,10 +211,12 @@ class RecordedMotion:
                 f'of {", ".join(alike)}, which differ by a prefix; choose one by its fixed frame: '
                 f'--fixed-frame {roots[0]}{" or ".join(["", *roots[1:]])}; {known}'
             )
+        is_alone = frame not in tree.frames() and bool(tree.edges())
+        first = 'give the first file of the drive too, which may alone have its static transform; '
         raise RecordingError(
             f'{origin}: neither /tf nor odometry has the motion of the frame of the clouds '
-            f'{frame!r}; {known}; if it does not move, set --fixed-frame '
-            f'{shlex.quote(tree.root(frame))}'
+            f'{frame!r}; {known}; {first if is_alone else ""}if it does not move, set '
+            f'--fixed-frame {shlex.quote(tree.root(frame))}'
         )
 
     @property
@@ -291,12 +293,8 @@ class RecordedMotion:
                 continue
             child = message.child_frame_id.lstrip('/')
             if not child:
-                path = tree.path(frame)
-                child = tree.odometry_child = path[-1].parent if path else frame
-                self.notes['child'] = (
-                    f'{topic}: expected the frame of the vehicle in child_frame_id, got none: it '
-                    f'is taken for {child!r}, the topmost frame of the clouds'
-                )
+                self.notes['child'] = f'{topic}: {tree.name_odometry_child(frame)}'
+                child = tree.odometry_child
             odometry.append(f'{topic} ({message.header.frame_id} -> {child})')
             if child == root or (root is None and tree.connects(child, frame)):
                 relevant[topic] = message

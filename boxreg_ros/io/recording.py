@@ -107,7 +107,9 @@ class Recording:
         self.data_topics = {*self.points_topics, self.boxes_topic}
         self._decoder = MessageDecoder(str(self))
         self.unreadable, self.first_errors = self._decoder.unreadable, self._decoder.first_errors
-        self._contents = MessageContents(self._decoder, self.placement, self.boxes_topic, adapter)
+        self._contents = MessageContents(
+            self._decoder, self.placement, self.boxes_topic, adapter, self.convention
+        )
         motion = topics.transforms | topics.of((ODOMETRY_TYPE,))
         chosen = map(self.choose_definition, topics.connections(self.data_topics | motion))
         self._chosen = list(filter(None, chosen))
@@ -344,9 +346,9 @@ class Recording:
         if connection.topic in self._topics.static_transforms:
             return None
         try:
-            message = self._decoder.message(Record(connection, 0, data))
             if connection.topic == self.boxes_topic:
-                return self._contents.of(connection.topic, message).stamp_ns or None
+                return self._contents.boxes(connection, data).stamp_ns or None
+            message = self._decoder.decoded(connection, data)
             stamped = getattr(message, 'transforms', [message])
             with malformed(f'topic {connection.topic!r}'):
                 header = clouds.header_of(stamped[0]) if len(stamped) else None

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.matching import AT_ONCE
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.axis_check import AxisCheck
 from boxreg_ros.io.cloud_check import CloudCheck
@@ -28,9 +27,11 @@ from boxreg_ros.io.motion_check import MotionCheck
 from boxreg_ros.io.place_check import PlaceCheck
 from boxreg_ros.io.pose_check import PoseCheck
 from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame, TransformTree
+from boxreg_ros.io.unit_check import UnitCheck
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention
+from msg_adapters.poses import turned_covariances
 import numpy as np
 
 if TYPE_CHECKING:  # it imports torch, which a process that only reads does not need
@@ -90,15 +91,16 @@ class Session:
         self._axis_check = AxisCheck(convention, config.drives)
         self._common_motion = CommonMotionCheck()
         self._boxes_without_frame = ''
+        self._odometry_lacks_child = False
         self._has_clouds_without_frame = False
         self._cloud_check = CloudCheck(is_merged=self._merger is not None)
-        self._pose_check = PoseCheck(self.convention, AT_ONCE)
-        self._place_check = PlaceCheck(self.convention, AT_ONCE)
+        self.restart()
 
     def restart(self) -> None:
         """Forget all but the transforms; ids that were assigned are not used again."""
-        self._pose_check = PoseCheck(self.convention, AT_ONCE)
-        self._place_check = PlaceCheck(self.convention, AT_ONCE)
+        self._pose_check = PoseCheck(self.convention)
+        self._place_check = PlaceCheck(self.convention)
+        self._unit_check = UnitCheck()
         parts = (self._motion_check, self._axis_check, self._common_motion, self._merger)
         for part in (*parts, self._id_check or self._tracker):
             if part is not None:
@@ -129,16 +131,19 @@ class Session:
         except TransformUnavailable as error:
             is_sweep = isinstance(given, Sweep)
             missing = Reason.SWEEP_WITHOUT_TRANSFORM if is_sweep else Reason.NO_TRANSFORM
+            self._name_odometry_child()
             return item._replace(reason=missing, detail=str(error))
         reason, detail = None, ''
         moved: Sweep | BoxArray
         if isinstance(given, Sweep):
             self._cloud_check.add(given)
+            self._motion_check.add_pose(given, fixed_frame, T_fixed_item)
             moved = sweep_to_frame(given, T_fixed_item, self.fixed_frame)
             moved, reason, detail = self.placement.placed(moved, self.tree)
         else:
             motion = self.tree.motion(self.fixed_frame, given.frame_id, given.stamp_ns)
             moved = boxes_to_frame(given, T_fixed_item, self.fixed_frame, motion, ticket)
+        self._unit_check.add(moved, T_fixed_item)
         self._pose_check.add(moved)
         self._place_check.add(moved, T_fixed_item, self._other_frames(given))
         if isinstance(moved, BoxArray):
@@ -149,10 +154,24 @@ class Session:
                 self._id_check.add(moved)
             if self.sensor_frame:
                 route = self.tree.route(self.fixed_frame, self.sensor_frame)
-                self._common_motion.add(moved.stamp_ns, self._tracker, route)
+                self._common_motion.add(moved.stamp_ns, self._tracker, route, self._pose_of_sensor)
             frame_yaw = float(np.arctan2(T_fixed_item[1, 0], T_fixed_item[0, 0]))
             self._axis_check.add(moved, frame_yaw)
         return item._replace(moved=moved, T_fixed_item=T_fixed_item, reason=reason, detail=detail)
+
+    def _pose_of_sensor(self, stamp_ns: int) -> Floats | None:
+        """Return the pose (4, 4) of the frame of the clouds at a stamp; None if it is unknown."""
+        try:
+            return self.tree.lookup(self.fixed_frame, self.sensor_frame, stamp_ns)
+        except TransformUnavailable:
+            return None
+
+    def _name_odometry_child(self) -> None:
+        """Take odometry without a child frame for that of the vehicle, if no motion is known."""
+        tree, frame = self.tree, self.sensor_frame
+        if tree.lacks_odometry_child and frame and tree.fixed_frame(frame) is None:
+            tree.name_odometry_child(frame)
+            self._odometry_lacks_child = True
 
     def _other_frames(self, item: Sweep | BoxArray) -> dict[str, Floats]:
         """Return the poses of the frames that boxes may be in, beside that of their message."""
@@ -224,16 +243,20 @@ class Session:
     def findings(self) -> list[Finding]:
         """Return the faults of the input, and guesses about it, that were found so far."""
         same = ', '.join(f'{a!r} and {b!r}' for a, b in sorted(self.tree.same_frames.items()))
-        # Points show which horizontal extent is which, motion also which axis points forward;
-        # boxes in another place show neither.
-        place = self._place_check
-        poses = place.finding or self._axis_check.finding or self._pose_check.finding or place.flat
+        # Points show which horizontal extent is which, motion also which axis points forward, but
+        # of all classes together; boxes in another place show neither.
+        place, pose = self._place_check, self._pose_check
+        of_axes = pose.class_finding or self._axis_check.finding or pose.finding
+        poses = self._unit_check.finding or place.finding or of_axes or place.flat
+        odometry = f'odometry: {self.tree.odometry_note}' if self._odometry_lacks_child else ''
         texts = [
             *((Reason.POINT_TIMES, text) for text in self.placement.normalised.values()),
             (Reason.TRANSFORM_FAULT, same and SAME_FRAMES.format(same)),
             *((Reason.CLOUD_FAULT, text) for text in self._cloud_check.findings),
             (Reason.TRANSFORM_FAULT, self._common_motion.finding),
+            (Reason.TRANSFORM_FAULT, place.fallen),
             (Reason.TRANSFORM_FAULT, self._boxes_without_frame),
+            (Reason.TRANSFORM_FAULT, odometry),
             (Reason.POSE_REFERENCE, poses),
             (Reason.TRACK_IDS_JUMP, self.jumping_ids and f'{self.jumping_ids}; {ASSOCIATE}'),
         ]
@@ -287,6 +310,17 @@ def is_placeholder(item: Sweep | BoxArray) -> bool:
     """Return whether this is an array without boxes that has no stamp or no frame either."""
     is_empty = isinstance(item, BoxArray) and not item.track_ids
     return is_empty and not (item.frame_id and item.stamp_ns)
+
+
+def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:
+    """Return refined boxes and their covariances in another frame; unchanged in the same."""
+    if frame_id == refined.boxes.frame_id:
+        return refined
+    return replace(
+        refined,
+        boxes=boxes_to_frame(refined.boxes, T_frame_boxes, frame_id),
+        covariances=turned_covariances(refined.covariances, T_frame_boxes),
+    )
 
 
 def covariances_to_write(refined: RefinedBoxes) -> Floats:

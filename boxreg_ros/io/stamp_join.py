@@ -12,9 +12,12 @@ from typing import NamedTuple
 
 from boxreg_ros.structures import Ints
 import numpy as np
+from numpy.typing import NDArray
 
 LARGEST_OFFSET_NS = 1_000_000
 """Stamps so close are the same one [ns]; derived: a stamp whose milliseconds were cut off."""
+MAX_FRAME_STEP = 1.5
+"""Frames further apart lack one between them [median periods]; derived: rounding to whole ones."""
 
 
 class JoinedStamps(NamedTuple):
@@ -92,3 +95,22 @@ def nearest_rows(stamps_ns: Ints, among_ns: Ints) -> Ints:
     before = (after - 1).clip(0)
     is_before = stamps_ns - among_ns[before] < among_ns[after] - stamps_ns
     return np.where(is_before, before, after)
+
+
+def between_stamps(stamps_ns: Ints, frames_ns: Ints) -> NDArray[np.bool_]:
+    """
+    Return which stamps (n,) lie between two frames that follow each other, or beside the ends.
+
+    Frames that were left out, or have nothing, are no such gap: it is at most `MAX_FRAME_STEP`
+    times the median period of the frames (m,), which are in any order, repeated.
+
+    """
+    frames = np.unique(frames_ns)
+    if len(frames) < 2:
+        return np.zeros(len(stamps_ns), bool)
+    period_ns = int(np.median(np.diff(frames)))
+    ends = np.array([frames[0] - period_ns, *frames, frames[-1] + period_ns])
+    after = np.searchsorted(ends, stamps_ns).clip(1, len(ends) - 1)
+    first, last = ends[after - 1], ends[after]
+    is_inside = (first < stamps_ns) & (stamps_ns < last)
+    return np.asarray(is_inside & (last - first <= MAX_FRAME_STEP * period_ns))

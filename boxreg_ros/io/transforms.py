@@ -55,6 +55,10 @@ Largest distance of a further sample, in parts of the gap that it helps to inter
 Chosen: the motion before a long stop, or before the next one, says little of that in the gap.
 
 """
+ODOMETRY_WITHOUT_CHILD = (
+    'expected the frame of the vehicle in child_frame_id, got none: it is taken for {!r}, the '
+    'topmost frame of the clouds'
+)
 POSES_SECONDS, POSES_PERIOD = 1.0, 0.1
 """
 Duration and steps of the motion of a frame that boxes were measured in [s].
@@ -117,7 +121,8 @@ class TransformTree:
     A sample whose stamp is far ahead of its pair, which its time of receipt does not explain,
     waits for the next one to confirm it. `clock_offset` [s] is added to the stamps of moving
     frames as they arrive. With `prefers_odometry` the odometry of a frame takes the place of its
-    transform. Odometry without a child frame is that of `odometry_child`.
+    transform. Odometry without a child frame is that of `odometry_child`; `lacks_odometry_child`
+    where there was some before it is known.
 
     """
 
@@ -126,6 +131,7 @@ class TransformTree:
         self.clock_offset = 0.0
         self.prefers_odometry = False
         self.odometry_child = ''
+        self.lacks_odometry_child = False
         self.clear()
 
     def clear(self) -> None:
@@ -166,8 +172,30 @@ class TransformTree:
         """Add a ``nav_msgs/Odometry``: the pose of its child frame in its header's frame."""
         pose = msg.pose.pose
         sample = self._sample(msg, numbers_of(pose.position, pose.orientation), received_ns)
+        if not sample.child:
+            self._raise_odometry_child()
         child = sample.child or self.odometry_child
+        self.lacks_odometry_child |= not child
         self._add(self._odometry, sample._replace(child=child))
+
+    def name_odometry_child(self, frame: str) -> str:
+        """Take odometry without a child frame for that of the root of `frame`; return which."""
+        self.odometry_child = self.root(frame)
+        self.lacks_odometry_child = False
+        return self.odometry_note
+
+    @property
+    def odometry_note(self) -> str:
+        """Return what odometry without a child frame is taken for."""
+        return ODOMETRY_WITHOUT_CHILD.format(self.odometry_child)
+
+    def _raise_odometry_child(self) -> None:
+        """Go up by one static transform, which has come after the odometry had been named."""
+        above = self._tf.get(self.odometry_child)
+        if above is not None and above.used.is_static:
+            self._odometry.pop(self.odometry_child, None)
+            self._forget_routes()
+            self.odometry_child = above.used.parent
 
     def rewind(self, stamp_ns: int) -> None:
         """Forget samples of moving frames that are later than a stamp that time went back to."""
@@ -536,6 +564,14 @@ class Edge:
     def is_holding(self) -> bool:
         """Return whether the last sample waits for the next one to confirm its stamp."""
         return self._ahead is not None
+
+    def way(self, since_ns: int = 0) -> float:
+        """Return the way that the child has moved in the parent since a stamp [m]."""
+        if not self.poses:
+            return 0.0
+        first = bisect_left(self.stamps, since_ns)
+        positions = [pose[:3] for pose in self.poses[first:] or self.poses[-1:]]
+        return float(np.linalg.norm(np.ptp(positions, axis=0)))
 
     def add(self, stamp_ns: int, pose: Pose, received_ns: int | None = None) -> None:
         """

@@ -5,9 +5,9 @@ from __future__ import annotations
 from itertools import combinations_with_replacement
 from pathlib import Path
 
-from boxreg_ros.io.box_table import cell, read_by_box
+from boxreg_ros.io.box_table import cell, number_cells, read_by_box
 from boxreg_ros.io.covariance_table import symmetric
-from boxreg_ros.structures import KINEMATICS, RefinedBoxes
+from boxreg_ros.structures import BoxArray, KINEMATICS
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,36 +23,30 @@ VELOCITY_COLUMNS = (
 )
 """Over ground, in the axes of ``boxes.csv`` [m/s, rad/s, m/s^2]; then the upper triangle of the
 covariance of each, row by row."""
-RATES_FORMAT = ','.join(['%.7g'] * 14)
-ACCELERATION_FORMAT = ','.join(['%.7g'] * 9)
+RATES_TRIANGLE = np.triu_indices(len(RATE_NAMES))
+ACCELERATION_TRIANGLE = np.triu_indices(len(ACCELERATION_NAMES))
 
 
-class VelocityWriter:
-    """Write velocities and accelerations with seven significant digits."""
+def velocity_lines(boxes: BoxArray) -> list[str]:
+    """
+    Return the line of each box with a velocity, in single precision.
 
-    def __init__(self, path: Path) -> None:
-        self._file = path.open('w', newline='', encoding='utf-8')
-        self._file.write(','.join(VELOCITY_COLUMNS) + '\n')
+    An unknown acceleration is empty cells.
 
-    def write(self, refined: RefinedBoxes) -> None:
-        """Add a row for each box with a velocity; an unknown acceleration is empty cells."""
-        found = refined.boxes.known_kinematics
-        four, three = np.triu_indices(4), np.triu_indices(3)
-        rates = np.hstack([found['velocity'], found['velocity_covariance'][:, *four]])
-        others = np.hstack([found['acceleration'], found['acceleration_covariance'][:, *three]])
-        columns = (refined.boxes.track_ids, rates.tolist(), others.tolist())
-        rows = zip(found['has_velocity'], found['has_acceleration'], *columns, strict=True)
-        lines = []
-        for has_velocity, has_acceleration, track_id, numbers, accelerations in rows:
-            if has_velocity:
-                text = ACCELERATION_FORMAT % tuple(accelerations) if has_acceleration else ',' * 8
-                begin = f'{refined.boxes.stamp_ns},{cell(track_id)}'
-                lines.append(f'{begin},{RATES_FORMAT % tuple(numbers)},{text}\n')
-        self._file.write(''.join(lines))
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+    """
+    found = boxes.known_kinematics
+    rates = np.hstack([found['velocity'], found['velocity_covariance'][:, *RATES_TRIANGLE]])
+    accelerations = np.hstack(
+        [found['acceleration'], found['acceleration_covariance'][:, *ACCELERATION_TRIANGLE]]
+    )
+    columns = boxes.track_ids, number_cells(rates), number_cells(accelerations)
+    rows = zip(found['has_velocity'], found['has_acceleration'], *columns, strict=True)
+    lines = []
+    for has_velocity, has_acceleration, track_id, rate, acceleration in rows:
+        if has_velocity:
+            begin = f'{boxes.stamp_ns},{cell(track_id)}'
+            lines.append(f'{begin},{rate},{acceleration if has_acceleration else "," * 8}\n')
+    return lines
 
 
 def read_velocities(path: Path) -> dict[tuple[int, str], NDArray[np.void]]:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from subprocess import DEVNULL, Popen
+import sys
 
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
-from boxreg_ros.core.observation import observe
+from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.point_labels import ObjectTrack, PointLabeller
-from boxreg_ros.core.registrar import BoxRegistrar, Submit
+from boxreg_ros.core.registrar import BoxRegistrar, GetEstimates, Submit
+from boxreg_ros.core.window import Estimate, Window
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 
@@ -19,21 +25,101 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
     Libraries are imported and kernels loaded, or compiled at the very first start, for the
     objective, estimate and mode of the stream to come. Six stamps of a window of four cover cold,
     warm and full windows, or two rounds of a whole track; a few iterations of the solver are
-    enough. The points of the last sweep have times.
+    enough. The points of the last sweep have times. The stream is long enough for sweeps to be
+    compared with boxes of each latency.
 
     """
-    quick = Config(
-        objective=config.objective, mode=config.mode, estimate=config.estimate,
-        window=4, lag=3, solver=SolverConfig(rounds=2),
-        paper=PaperConfig(iterations=2),
-    )  # fmt: skip
-    registrar = BoxRegistrar(quick, submit)
+    registrar = BoxRegistrar(_quick(config), submit)
     sweeps, arrays = _passing_car()
     sweeps[-1] = replace(sweeps[-1], times=np.full(len(sweeps[-1].points), 0.1))
     for sweep, boxes in zip(sweeps, arrays, strict=True):
         registrar.add_sweep(sweep)
         registrar.add_boxes(boxes)
     registrar.flush()
+
+
+def warm_up_estimation(config: Config) -> None:
+    """Estimate a cold and a warm window whose points are given: the kernels are loaded."""
+    from boxreg_ros.core.estimation import estimate_windows  # torch
+
+    sweeps, arrays = _passing_car()
+    boxes = np.concatenate([array.boxes for array in arrays])
+    n, m = len(boxes), len(sweeps[0].points)
+    points = np.concatenate([sweep.points - boxes[k, :3] for k, sweep in enumerate(sweeps)])
+    table = Observations(
+        stamps_ns=np.array([sweep.stamp_ns for sweep in sweeps]),
+        boxes=boxes,
+        points=points.astype(np.float32),
+        delays=np.zeros(n * m, np.float32),
+        counts=np.full(n, m),
+        origins=-boxes[:, None, :3],
+        ground=np.full(n, np.nan),
+        ring_heights=np.zeros(n),
+        num_points=np.full(n, m),
+        sights=np.zeros(n),
+        is_pinned=np.zeros(n, bool),
+    )
+    quick, model = _quick(config), InputModel(config.faces)
+    rows = [Observation(table, row) for row in range(n)]
+    window = Window('1', 'car', rows[: quick.window], quick.window, np.zeros((0, 9)))
+    for last in range(quick.window, n):
+        (estimate,) = estimate_windows([window], quick, model)
+        assert estimate is not None
+        start = estimate.table.boxes[estimate.begin + 1 : estimate.end]
+        observations = rows[last - len(start) : last + 1]
+        window = Window('1', 'car', observations, 1, start, estimate.prior)
+    estimate_windows([window], quick, model)
+
+
+@contextmanager
+def compiled_beside(config: Config) -> Iterator[None]:
+    """
+    Let a second process compile what a node needs but `warm_up_estimation`, if the block compiles.
+
+    The block waits for it at its end: the kernels are on disk then. Where none can be written,
+    this process has to compile them as well.
+
+    """
+    from numba.core import event  # it takes half a second
+
+    processes: list[Popen[bytes]] = []
+    settings = f'objective={config.objective!r}, mode={config.mode!r}'
+    code = f'from boxreg_ros.io import warm_up; warm_up.warm_up_observation({settings})'
+
+    class Start(event.Listener):
+        """Starts the process; kernels that are loaded from files cause no event."""
+
+        def on_start(self, event: object) -> None:
+            if not processes:
+                command = [sys.executable, '-P', '-c', code]  # -P: no modules of its folder
+                with suppress(OSError):  # no memory, or no more processes: it compiles all alone
+                    processes.append(Popen(command, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL))
+
+        def on_end(self, event: object) -> None:
+            """Do nothing."""
+
+    try:
+        with event.install_listener('numba:compile', Start()):
+            yield
+        for process in processes:
+            process.wait()
+    finally:
+        for process in processes:
+            process.kill()  # where this one is interrupted; kernels are written as a whole
+            process.wait()
+
+
+def warm_up_observation(objective: str, mode: str) -> None:
+    """Observe and follow the synthetic stream, without an estimate."""
+    config = Config.from_dict({'objective': objective, 'mode': mode, 'estimate': 'final'})
+    warm_up(config, _submit_to_nobody)
+    warm_up_followed(config)
+
+
+def _submit_to_nobody(windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
+    """Return a function that returns no estimates."""
+    estimates: list[Estimate | None] = [None] * len(windows)
+    return lambda: estimates
 
 
 def warm_up_follower(config: Config) -> None:
@@ -67,15 +153,25 @@ def warm_up_labels(config: Config) -> None:
     PointLabeller([track], stamps_ns, config, np.zeros((1, 6))).label(sweep)
 
 
+def _quick(config: Config) -> Config:
+    """Return settings of short windows, solved by few iterations."""
+    return Config(
+        objective=config.objective, mode=config.mode, estimate=config.estimate,
+        window=4, lag=3, solver=SolverConfig(rounds=2),
+        paper=PaperConfig(iterations=2),
+    )  # fmt: skip
+
+
 def _passing_car() -> tuple[list[Sweep], list[BoxArray]]:
     """Return six sweeps of a car, with points as recordings have them, and its boxes."""
     rng = np.random.default_rng(0)
     sweeps, boxes = [], []
     for k in range(6):
-        box = np.array([[10.0 + 0.5 * k, 0, 0, 4, 2, 1.5, 0, 0, 0]])
+        stamp_ns = k * 3 * 10**8
+        box = np.array([[10.0 + 1.0 * k, 0, 0, 4, 2, 1.5, 0, 0, 0]])
         points = rng.uniform(-1, 1, (64, 3)) * [2, 1, 0.7] + box[0, :3]
-        sweeps.append(Sweep(k * 10**8, 'map', points.astype(np.float32)))
-        boxes.append(BoxArray(k * 10**8, 'map', ('1',), ('car',), np.ones(1), box))
+        sweeps.append(Sweep(stamp_ns, 'map', points.astype(np.float32)))
+        boxes.append(BoxArray(stamp_ns, 'map', ('1',), ('car',), np.ones(1), box))
     return sweeps, boxes
 
 

@@ -5,11 +5,11 @@ import pytest
 from ros_messages import START
 
 
-def found_in(clouds, is_merged=False):
+def found_in(clouds, is_merged=False, stamps_ns=None):
     """Return what is found in clouds, in one text."""
     check = CloudCheck(is_merged)
     for k, points in enumerate(clouds):
-        check.add(Sweep(START + k, 'lidar', points))
+        check.add(Sweep(START + (k if stamps_ns is None else stamps_ns[k]), 'lidar', points))
     return ' '.join(check.findings)
 
 
@@ -33,7 +33,41 @@ def test_clouds_that_are_parts_of_a_sweep_are_named(parts, is_merged):
     assert (named in found_in(clouds, is_merged)) == (parts == 10 and not is_merged)
 
 
+@pytest.mark.parametrize('apart_ns', [0, 400_000, 10_000_000])
+@pytest.mark.parametrize('lidars', [1, 2, 4])
+def test_several_lidars_on_one_topic_are_named(apart_ns, lidars):
+    """As Livox publishes them by default: one after the other, each with stamps of its own."""
+    rng = np.random.default_rng(0)
+    clouds, stamps_ns = [], []
+    for k in range(40):
+        angles = rng.uniform(0, 1.5, 500) + 1.5 * (k % lidars)
+        clouds.append(9 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1))
+        jitter_ns = int(rng.integers(0, 5_000_000)) * (apart_ns > 0)
+        stamps_ns.append(k // lidars * 100_000_000 + k % lidars * apart_ns + jitter_ns)
+    text = found_in(clouds, stamps_ns=stamps_ns)
+    assert ('several LiDARs publish on one topic' in text) == (lidars > 1)
+    assert not found_in(clouds, is_merged=True, stamps_ns=stamps_ns)
+
+
+@pytest.mark.parametrize('is_recorded_twice', [True, False])
+def test_clouds_one_by_one_are_of_one_lidar(is_recorded_twice):
+    clouds = [np.random.default_rng(k).uniform(-9, 9, (5000, 3)) for k in range(40)]
+    stamps_ns = [k * 100_000_000 for k in range(40)]
+    stamps_ns[20:] = [stamp_ns + 10**12 for stamp_ns in stamps_ns[20:]]  # a jump
+    if is_recorded_twice:
+        clouds = [cloud for cloud in clouds for _ in range(2)]
+        stamps_ns = np.repeat(stamps_ns, 2).tolist()
+    assert not found_in(clouds, stamps_ns=stamps_ns)
+
+
+@pytest.mark.parametrize('kept', [range(0, 120, 3), [k for k in range(300) if k % 9 in (0, 1, 2)]])
+def test_clouds_of_one_lidar_may_be_lost(kept):
+    clouds = [np.random.default_rng(k).uniform(-9, 9, (5000, 3)) for k in kept]
+    assert not found_in(clouds, stamps_ns=[k * 100_000_000 for k in kept])
+
+
 def test_points_in_millimetres_are_named():
     points = np.random.default_rng(0).uniform(-80, 80, (1000, 3))
     assert not found_in([points + 5e6])
     assert 'they are in millimetres' in found_in([1000 * points])
+    assert 'or centimetres' in found_in([100 * points / 20])

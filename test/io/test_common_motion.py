@@ -1,9 +1,12 @@
-"""Objects that all move alike while the transforms stand still."""
+"""Objects that all move alike, by transforms that stand still or are inverse ones."""
+
+from functools import partial
 
 from boxreg_ros.config import Config
+from boxreg_ros.datasets.files import pose_rows
 from boxreg_ros.io.common_motion import CommonMotionCheck
 from boxreg_ros.io.id_assignment import IdCheck
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transforms import inverse, TransformTree
 from boxreg_ros.structures import BoxArray
 import numpy as np
 import pytest
@@ -11,12 +14,27 @@ import pytest
 S = 10**9
 
 
-def finding(velocities, ego=0.0, stands_from=np.inf, noise=0.2, seconds=5.0):
+def pose_of(heading, way):
+    """Return the pose (4, 4) of a sensor that has driven straight on."""
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
+    T[:2, 3] = way * T[:2, 0]
+    return T
+
+
+def known(tree, stamp_ns):
+    return tree.lookup('odom', 'lidar', stamp_ns) if stamp_ns >= S else None
+
+
+def finding(
+    velocities, ego=0.0, stands_from=np.inf, noise=0.2, seconds=5.0, heading=0.0, is_inverse=False
+):
     """
     Return what is found of objects with some velocities (K, 2) over ground [m/s].
 
-    The sensor drives along x with the speed `ego`; its transform repeats the pose of the time
-    `stands_from` [s] after it, and so do the boxes in the fixed frame.
+    The sensor drives along x with the speed `ego`, in a frame with the yaw `heading`; its
+    transform repeats the pose of the time `stands_from` [s] after it, or is the inverse one, and
+    the boxes are where the transform places them.
 
     """
     rng = np.random.default_rng(0)
@@ -28,12 +46,16 @@ def finding(velocities, ego=0.0, stands_from=np.inf, noise=0.2, seconds=5.0):
         t = k / 10
         true, stated = ego * t, ego * min(t, stands_from)
         stamp_ns = S + k * S // 10
-        tree.add_pose('odom', 'lidar', stamp_ns, np.array([stated, 0, 0, 0, 0, 0, 1]))
         boxes = np.tile([0, 0, 0.8, 4.5, 1.9, 1.6, 0, 0, 0.0], (count, 1))
         boxes[:, :2] = begin + t * np.array(velocities, float) + rng.normal(0, noise, (count, 2))
-        boxes[:, 0] += stated - true
+        T_stated = pose_of(heading, stated)
+        if is_inverse:
+            T_stated = inverse(T_stated)
+        placed = np.c_[boxes[:, :3], np.ones(count)] - [true, 0, 0, 0]  # in the sensor
+        boxes[:, :3] = (placed @ T_stated.T)[:, :3]
+        tree.add_pose('odom', 'lidar', stamp_ns, pose_rows([T_stated])[0])
         ids.add(BoxArray(stamp_ns, 'odom', names, ('car',) * count, np.ones(count), boxes))
-        check.add(stamp_ns, ids.tracker, tree.route('odom', 'lidar'))
+        check.add(stamp_ns, ids.tracker, tree.route('odom', 'lidar'), partial(known, tree))
     return check.finding
 
 
@@ -49,16 +71,29 @@ def test_a_transform_that_stands_still_while_the_vehicle_drives_is_named(stands_
     assert '--odometry TOPIC' in found
 
 
+@pytest.mark.parametrize('heading', [0.0, 1.5, -2.0])
+def test_inverse_poses_are_named(heading):
+    found = finding(STREET, ego=8.0, heading=heading, is_inverse=True)
+    assert '6 of 9 objects move alike, at ' in found
+    assert 'as parked objects do by inverse poses, and none stands still' in found
+
+
 @pytest.mark.parametrize(
     ('velocities', 'ego'),
     [
         (STREET, 8.0),
+        ([*PARKED[:3], *[(9, 0)] * 5], 9.0),  # a queue that the sensor drives in
+        ([(2.1, 0)] * 5, 1.5),  # a jam
+        ([*PARKED[:3], *[(-9, 0)] * 5], 9.0),
+        ([*PARKED[:3], *[(18, 0)] * 5], 9.0),
         (STREET, 0.0),
         ([*PARKED, *[(9, 0)] * 5], 0.0),  # a queue past a sensor that stands
         ([(27, 0), (29, 0), (31, 0), (33, 0), (-28, 0), (-30, 0)], 0.0),
         ([(9, 0)] * 3, 0.0),
     ],
-    ids=['driving', 'standing', 'queue', 'highway', 'few'],
+    ids=[
+        *('driving', 'within', 'jam', 'oncoming', 'faster', 'standing', 'queue', 'highway', 'few')
+    ],
 )
 def test_transforms_of_the_true_motion_are_no_finding(velocities, ego):
     assert finding(velocities, ego) == ''

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from contextlib import closing
+from io import BytesIO
 import json
 import os
 import random
@@ -12,9 +13,12 @@ import struct
 from boxreg_ros.cli import main
 from boxreg_ros.errors import BoxregError, RecordingError
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.storage import mcap
 from boxreg_ros.io.storage.files import opened
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Sweep
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap_files import rewritten
@@ -55,6 +59,14 @@ def chunk_places(path):
 
 
 # MCAP ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('known', [b'', b'\1\0'])
+def test_a_record_that_lacks_its_fields_is_not_made_of_the_bytes_behind(known):
+    length = len(known) + len(mcap.END)
+    head = struct.pack('<BQ', Opcode.MESSAGE, length)
+    with pytest.raises(EndOfFile):
+        mcap._records_in(BytesIO(head + known), len(head + known))
 
 
 @pytest.mark.parametrize('options', [
@@ -225,6 +237,29 @@ def test_a_missing_file_of_a_folder_is_listed(tmp_path, drive):
     sweeps, _, damages = read(folder)
     assert sweeps == drive.stamps
     assert [damage.file for damage in damages] == [str(folder / f'{name}.lost')]
+
+
+def test_a_file_that_the_metadata_does_not_list_is_named(tmp_path, drive):
+    folder = drive.write(tmp_path / 'drive', 'mcap-folder')
+    (name,) = [file.name for file in folder.glob('*.mcap')]
+    (folder / 'added.mcap').write_bytes((folder / name).read_bytes())
+    sweeps, _, damages = read(folder)
+    assert sweeps == drive.stamps
+    assert [damage.file for damage in damages] == [str(folder / 'added.mcap')]
+    assert 'metadata.yaml does not list this file' in damages[0].reason
+
+
+@pytest.mark.parametrize('keeps_compressed', [True, False])
+def test_a_file_that_a_player_has_unpacked_is_not_missing(tmp_path, drive, keeps_compressed):
+    """`ros2 bag play` unpacks the files of the mode FILE beside the compressed ones."""
+    folder = drive.write(tmp_path / 'drive', 'mcap-folder')
+    (file,) = folder.glob('*.mcap')
+    metadata = folder / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace(file.name, f'{file.name}.zstd'))
+    if keeps_compressed:
+        packed = zstandard.ZstdCompressor().compress(file.read_bytes())
+        (folder / f'{file.name}.zstd').write_bytes(packed)
+    assert read(folder) == (drive.stamps, drive.stamps, [])
 
 
 # rosbag2 databases -----------------------------------------------------------------------------

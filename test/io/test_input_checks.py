@@ -94,6 +94,15 @@ def test_an_id_that_two_boxes_have_in_one_message_is_no_finding():
     assert id_finding(arrays()).jumps <= 1
 
 
+def test_ids_of_a_second_message_with_the_same_stamp_are_no_finding():
+    def arrays():
+        for stamp, ids, boxes in street():
+            yield array(stamp, ids[::2], boxes[::2])
+            yield array(stamp, ids[1::2], boxes[1::2])
+
+    assert id_finding(arrays()).finding == ''
+
+
 def test_a_switch_of_a_tracker_is_no_finding():
     def arrays():
         for k, (stamp, ids, boxes) in enumerate(street()):
@@ -174,10 +183,15 @@ def test_what_does_not_move_along_its_length_is_no_evidence(frames, name):
     assert axes_of(street(**frames), convention, name=name).finding == ''
 
 
-def test_unresolved_headings_are_no_finding():
+@pytest.mark.parametrize('is_of_track', [True, False])
+def test_unresolved_headings_are_no_finding(is_of_track):
+    rng = np.random.default_rng(2)
+
     def frames():
         for stamp, ids, boxes in street(moving=6):
             boxes[::2, 8] += np.pi
+            if not is_of_track:
+                boxes[:, 8] += np.pi * rng.integers(0, 2, len(boxes))
             yield stamp, ids, boxes
 
     assert axes_of(frames(), STANDARD).finding == ''
@@ -197,6 +211,23 @@ def test_a_clockwise_yaw_is_named_with_its_option(frame_yaw):
     check = street_of(lambda yaw: 2 * frame_yaw - yaw, frame_yaw)
     assert check.wanted == Convention(orientation='clockwise')
     assert '--orientation clockwise' in check.finding
+
+
+@pytest.mark.parametrize('forward_axis', ['y+', 'y-'])
+@pytest.mark.parametrize('degrees', [35, 55, 145])
+def test_a_sideways_yaw_on_a_road_along_a_diagonal_is_no_clockwise_one(forward_axis, degrees):
+    """Mirrored, the yaw of its vehicles is less than 30 degrees off their way."""
+
+    def frames():
+        for stamp, ids, boxes in street(moving=4):
+            headings = np.radians(degrees) + np.pi * (np.arange(4) % 2)
+            along = 0.8 * stamp / S * 10 * np.stack([np.cos(headings), np.sin(headings)], axis=1)
+            boxes[6:, :2] = along + np.arange(4)[:, None] * 10
+            boxes[6:, 8] = headings
+            yield stamp, ids, boxes
+
+    convention = Convention(forward_axis=forward_axis)
+    assert axes_of(frames(), convention).wanted == convention
 
 
 def test_a_yaw_in_degrees_is_named():

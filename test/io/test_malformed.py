@@ -13,6 +13,7 @@ from foxglove_recordings import write_foxglove_mcap
 from mcap.reader import make_reader
 from msg_adapters import ADAPTERS, pointcloud, vision
 from msg_adapters.convention import Convention
+from msg_adapters.serialized import BoxReader
 import numpy as np
 import pytest
 from ros_messages import DETECTIONS, Drive, SCENE
@@ -124,12 +125,12 @@ def own_fault(kind):
 
 
 @pytest.mark.parametrize('kind', [AttributeError, TypeError, KeyError])
-@pytest.mark.parametrize('adapter', [vision, pointcloud])
+@pytest.mark.parametrize('reads', [(BoxReader, 'boxes_of'), (pointcloud, 'from_msg')])
 def test_an_error_in_an_adapter_is_raised_and_not_counted_as_unreadable(
-    tmp_path, monkeypatch, capsys, adapter, kind
+    tmp_path, monkeypatch, capsys, reads, kind
 ):
     path = Drive(sweeps=2).write(tmp_path / 'drive')
-    monkeypatch.setattr(adapter, 'from_msg', own_fault(kind))
+    monkeypatch.setattr(*reads, own_fault(kind))
     recording = Recording([path])
     with pytest.raises(kind), recording:
         list(recording.items(TransformTree()))

@@ -230,6 +230,19 @@ def test_the_clock_of_the_motion_alone_may_be_off(tmp_path):
     assert_true(origins, 30)
 
 
+@pytest.mark.parametrize('is_copied', [True, False])
+def test_motion_with_stamps_of_clouds_may_be_late_in_place_of_another_clock(tmp_path, is_copied):
+    drive = Drive(sweeps=30)
+    if not is_copied:
+        stamps_moved(drive, ('/tf',), 0.037)
+    late = SECOND // 2
+    drive.items = [(name, at + late * (name == '/tf'), one) for name, at, one in drive.items]
+    drive.items.sort(key=lambda item: item[1])
+    found = read(drive, tmp_path)[2]
+    assert '--clock-offset=0.' in found
+    assert ('computed from these clouds' in found) == is_copied
+
+
 @pytest.mark.parametrize('seconds', [0.6, 1.5, 37.0])
 def test_boxes_from_the_future_have_another_clock(tmp_path, seconds):
     drive = Drive(sweeps=30)
@@ -314,6 +327,23 @@ def with_map(drive, position_of, every=1):
     return drive
 
 
+def test_a_static_transform_that_is_repeated_on_tf_is_no_motion(tmp_path):
+    """As static_transform_publisher of ROS 1 does; the motion above it was taken for steps."""
+    drive = Drive(sweeps=20)
+    m = drive.messages
+    for topic, _, message in list(drive.items):
+        if topic == '/tf':
+            (one,) = message.transforms
+            sensor, one.child_frame_id = one.child_frame_id, 'above'
+    for stamp in drive.stamps:
+        message = m.tf(m.transform(stamp, 'above', sensor, (0, 0, 0)))
+        drive.items.append(('/tf', stamp, message))
+    drive.items.sort(key=lambda item: item[1])
+    origins, frame, found = read(drive, tmp_path)
+    assert frame == 'odom' and not found
+    assert_true(origins, 20)
+
+
 @pytest.mark.parametrize(
     'position_of, count',
     [
@@ -372,6 +402,87 @@ def test_clouds_registered_into_the_fixed_frame_need_the_frame_of_their_lidar(tm
     assert_true(origins, 12)
 
 
+@pytest.mark.parametrize('name', ['base', 'lidar'])
+def test_a_fixed_frame_of_the_vehicle_is_named(tmp_path, name):
+    found = read(Drive(sweeps=12), tmp_path, fixed_frame=name)[2]
+    assert f'the fixed frame {name!r} moves by 5.5 m in ' in found
+    assert 'leave it out, or set --fixed-frame odom (node: fixed_frame:=odom)' in found
+
+
+def test_a_fixed_frame_of_a_sensor_that_stands_is_not(tmp_path):
+    drive = Drive(sweeps=12)
+    m = drive.messages
+    drive.items = [item for item in drive.items if item[0] != '/tf']
+    for k, stamp in enumerate(drive.stamps):  # a localisation that corrects the place of `base`
+        place = (0.02 * k, 0, 0)
+        drive.items.append(('/tf', stamp, m.tf(m.transform(stamp, 'map', 'base', place))))
+    drive.items.sort(key=lambda item: item[1])
+    assert not read(drive, tmp_path, fixed_frame='base')[2]
+
+
+@pytest.mark.parametrize('deviation', [0.0, 0.01, 0.05])
+def test_motion_that_errs_from_cloud_to_cloud_is_named(tmp_path, deviation):
+    rng = np.random.default_rng(4)
+    drive = Drive(sweeps=50)
+    for number in range(50):
+        drive.replace('/tf', number, lambda message: shifted(message, rng.normal(0, deviation, 2)))
+    found = read(drive, tmp_path)[2]
+    assert ('errs by 0.05 m from cloud to cloud' in found) == (deviation > 0.03)
+    assert bool(found) == (deviation > 0.03)
+
+
+def shifted(message, offset):
+    place = message.transforms[0].transform.translation
+    place.x += offset[0]
+    place.y += offset[1]
+
+
+@pytest.mark.parametrize(('slope', 'is_camera'), [(0.0, False), (0.3, False), (0.0, True)])
+def test_poses_of_a_camera_are_named(tmp_path, slope, is_camera):
+    """KITTI odometry and visual SLAM state them with z ahead and y down."""
+    drive = Drive(sweeps=16)
+
+    def change(message):
+        place = message.transforms[0].transform.translation
+        place.z = slope * place.x
+        if is_camera:
+            place.x, place.z = 0.0, place.x
+
+    for number in range(16):
+        drive.replace('/tf', number, change)
+    found = read(drive, tmp_path)[2]
+    named = "'lidar' has moved by 6 m in 'odom', mostly along z: expected z up, got poses"
+    assert (named in found) == is_camera
+    assert bool(found) == is_camera
+
+
+def test_a_spiral_ramp_has_no_poses_of_a_camera(tmp_path):
+    """Ten levels, each of 3 m, around a circle of 7 m: the place in the plane stays the same."""
+    drive = Drive(sweeps=150)
+
+    def change(message):
+        place = message.transforms[0].transform.translation
+        turn = 5 * place.x / 7
+        place.x, place.y, place.z = 7 * np.sin(turn), 7 - 7 * np.cos(turn), 3 * turn / (2 * np.pi)
+
+    for number in range(150):
+        drive.replace('/tf', number, change)
+    assert 'mostly along z' not in read(drive, tmp_path)[2]
+
+
+@pytest.mark.parametrize('fixed_frame', [None, 'odom'])
+def test_a_fixed_frame_with_z_down_is_named(tmp_path, fixed_frame):
+    drive = Drive(sweeps=16)
+    m = drive.messages
+    down = m.tf(m.transform(START, 'ned', 'odom', (0, 0, 0), (1, 0, 0, 0)))
+    drive.items.insert(0, ('/tf_static', START, down))
+    _, frame, found = read(drive, tmp_path, fixed_frame=fixed_frame)
+    assert frame == (fixed_frame or 'ned')
+    named = "100% of the boxes stand on their roofs in 'ned': expected z up in the fixed frame"
+    assert (named in found) == (fixed_frame is None)
+    assert bool(found) == (fixed_frame is None)
+
+
 def test_two_publishers_of_one_motion_are_named(tmp_path):
     drive = robots(12, [2])
     drive.items = [(t.replace('/r2/', '/r1/'), *rest) for t, *rest in drive.items]
@@ -427,6 +538,18 @@ def test_a_static_transform_published_once_on_tf_is_used_at_all_times(tmp_path):
     origins, _, found = read(drive, tmp_path)
     assert_true(origins, 20)
     assert 'base -> lidar was published once on a topic of moving transforms' in found
+
+
+def test_motion_whose_poses_are_all_unset_is_no_motion(tmp_path):
+    """As of a localisation that publishes before it is initialised."""
+    drive = Drive(sweeps=20)
+    for index in range(20):
+        drive.replace('/tf', index, _unset)
+    assert read(drive, tmp_path, 'odom') == ({}, 'odom', '')
+
+
+def _unset(message):
+    message.transforms[0].transform.rotation.w = 0.0
 
 
 def test_a_frame_with_two_parents_is_named_and_either_may_be_chosen(tmp_path):

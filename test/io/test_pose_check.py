@@ -29,7 +29,8 @@ QUARTER = np.pi / 2
 
 def array_of(*boxes, stamp_ns=STAMP):
     n = len(boxes)
-    return BoxArray(stamp_ns, 'map', ('1',) * n, ('car',) * n, np.ones(n), np.array(boxes, float))
+    ids = tuple(str(row + 1) for row in range(n))
+    return BoxArray(stamp_ns, 'map', ids, ('car',) * n, np.ones(n), np.array(boxes, float))
 
 
 def rpy_of(*xyzw):
@@ -176,7 +177,7 @@ def scene(seed=3, count=16):
 def checked(true, points, taken, meant):
     """Return the finding about boxes written with `meant` and read with `taken`."""
     raw = meant.from_centers(array_of(*true))
-    check = PoseCheck(taken, tolerance=0.02)
+    check = PoseCheck(taken)
     for k in range(4):
         sweep = Sweep(STAMP + k * 10**8, 'map', points)
         boxes = taken.to_centers(array_of(*raw.boxes, stamp_ns=sweep.stamp_ns))
@@ -209,12 +210,124 @@ def test_conventions_that_contradict_the_points_are_reported(taken, meant, words
         assert word in finding
 
 
+def checked_classes(meant, names=('car', 'truck')):
+    """Return the check of boxes of classes in turn; those of the last are written with `meant`."""
+    boxes, points = scene()
+    raw = meant.from_centers(array_of(*boxes))
+    rows = np.arange(len(boxes)) % len(names)
+    given = np.where((rows == len(names) - 1)[:, None], raw.boxes, boxes)
+    classes = tuple(names[row] for row in rows)
+    check = PoseCheck(STANDARD)
+    for k in range(4):
+        check.add(Sweep(STAMP + k * 10**8, 'map', points))
+        check.add(replace(array_of(*given, stamp_ns=STAMP + k * 10**8), class_names=classes))
+    return check
+
+
+@pytest.mark.parametrize(
+    ('meant', 'words'),
+    [
+        ({}, ()),
+        (
+            {'pose_reference': 'bottom'},
+            (
+                "boxes of 'truck' stand 0.5 heights below their points",
+                "those of 'car' fit theirs: expected pose_reference 'center' of all classes, got "
+                "'bottom' of these",
+                'move them by 0.5 heights',
+            ),
+        ),
+        ({'pose_reference': 'top'}, ("boxes of 'truck' hover", 'move them by -0.5 heights')),
+        ({'pose_reference': 'rear_bottom'}, ('move them by 0.5 lengths and 0.5 heights',)),
+        (
+            {'size_order': 'wlh'},
+            ("'wlh' of these", 'in the order lwh (or turn them by 90 degrees'),
+        ),
+        ({'forward_axis': 'y+'}, ("'wlh' of these", 'in the order lwh (or turn them')),
+    ],
+)
+def test_classes_of_another_convention_than_the_others_are_named(meant, words):
+    check = checked_classes(Convention(**meant))
+    assert check.finding == ''
+    assert bool(check.class_finding) == bool(words), check.class_finding
+    for word in words:
+        assert word in check.class_finding
+
+
+def test_classes_without_evidence_against_a_convention_take_it():
+    """Boxes as long as wide do not show which size is which: the option is right for all."""
+    boxes, _ = scene()
+    boxes[:, 8] = 0
+    boxes[::2, 3:5] = 0.7
+    unit = np.random.default_rng(2).uniform(-0.5, 0.5, (16, 60, 3))
+    points = (boxes[:, None, :3] + unit * boxes[:, None, 3:6]).reshape(-1, 3)
+    names = ('pedestrian', 'truck') * 8
+    raw = Convention(size_order='wlh').from_centers(array_of(*boxes))
+    check = PoseCheck(STANDARD)
+    for k in range(4):
+        check.add(Sweep(STAMP + k * 10**8, 'map', points))
+        check.add(replace(array_of(*raw.boxes, stamp_ns=STAMP + k * 10**8), class_names=names))
+    assert check.class_finding == ''
+    assert check.finding.startswith("boxes of 'truck' do not fit their points")
+    assert 'set size_order:=wlh' in check.finding
+
+
+def test_all_classes_of_one_convention_are_not_told_apart():
+    boxes, points = scene()
+    raw = Convention('bottom').from_centers(array_of(*boxes))
+    check = PoseCheck(STANDARD)
+    for k in range(4):
+        check.add(Sweep(STAMP + k * 10**8, 'map', points))
+        names = ('car', 'truck') * 8
+        check.add(replace(array_of(*raw.boxes, stamp_ns=STAMP + k * 10**8), class_names=names))
+    assert check.class_finding == ''
+    assert check.finding.startswith('boxes stand 0.5 heights below their points')
+
+
+def test_a_class_that_arrives_later_is_checked_and_one_that_is_decided_is_not():
+    boxes, points = scene()
+    wrong = Convention('bottom').from_centers(array_of(*boxes))
+    check = PoseCheck(STANDARD)
+    arrays = [array_of(*boxes), wrong, replace(wrong, class_names=('van',) * 16)]
+    findings = []
+    for k, array in enumerate(arrays):
+        check.add(Sweep(STAMP + k * 10**8, 'map', points))
+        check.add(replace(array, stamp_ns=STAMP + k * 10**8))
+        findings.append((check.finding, check.class_finding.partition(' stand')[0]))
+    assert findings == [('', ''), ('', ''), ('', "boxes of 'van'")]
+
+
 def test_noisy_boxes_give_no_finding():
     boxes, points = scene()
     rng = np.random.default_rng(8)
     boxes[:, [0, 1, 2]] += rng.normal(0, 0.3, (len(boxes), 3))
     boxes[:, 8] += rng.normal(0, 0.1, len(boxes))
     assert not checked(boxes, points, STANDARD, STANDARD)
+
+
+@pytest.mark.parametrize(('place', 'is_found'), [('rear', False), ('bottom', True)])
+def test_boxes_of_one_object_show_no_place_along_it(place, is_found):
+    boxes, points = scene()
+    check = PoseCheck(STANDARD)
+    raw = Convention(place).from_centers(array_of(*boxes))
+    for k in range(DECISIVE_BOXES):
+        check.add(Sweep(STAMP + k * 10**8, 'map', points))
+        check.add(array_of(*raw.boxes[:1], stamp_ns=STAMP + k * 10**8))
+    assert (f'pose_reference:={place}' in check.finding) == is_found
+    assert bool(check.finding) == is_found
+
+
+@pytest.mark.parametrize('ahead', [-np.inf, 0.1])
+def test_one_object_before_its_boxes_gives_no_finding_of_another_kind(ahead):
+    boxes, points = scene()
+    points = points[points[:, 0] > boxes[0, 0] + ahead]
+    front = Convention('front')
+    check = PoseCheck(front)
+    read = front.to_centers(array_of(boxes[0]))
+    for k in range(DECISIVE_BOXES):
+        check.add(Sweep(STAMP + k * 10**8, 'map', points))
+        check.add(replace(read, stamp_ns=STAMP + k * 10**8))
+    assert not check.finding
 
 
 @pytest.mark.parametrize(('off', 'is_found'), [(6, False), (9, True)])
@@ -224,7 +337,7 @@ def test_most_boxes_must_fit_another_convention_better(off, is_found):
     heights = np.where(np.arange(12) < off, 0.8, 0.25)[:, None, None] * [0, 0, 1]
     unit = np.random.default_rng(1).uniform(-0.15, 0.15, (12, 30, 3)) + heights
     points = boxes[:, None, :3] + unit * boxes[:, None, 3:6]
-    check = PoseCheck(STANDARD, tolerance=0.02)
+    check = PoseCheck(STANDARD)
     check.add(Sweep(STAMP, 'map', points.reshape(-1, 3)))
     check.add(array_of(*boxes))
     assert ('pose_reference:=bottom' in check.finding) == is_found
@@ -232,7 +345,7 @@ def test_most_boxes_must_fit_another_convention_better(off, is_found):
 
 def test_the_check_pairs_equal_stamps_and_ends_after_enough_boxes():
     boxes, points = scene()
-    check = PoseCheck(Convention('bottom'), tolerance=0.02)
+    check = PoseCheck(Convention('bottom'))
     wrong = Convention('bottom').to_centers(array_of(*boxes))
     check.add(Sweep(STAMP + 10**8, 'map', points))
     check.add(wrong)
@@ -248,7 +361,7 @@ def test_the_check_pairs_equal_stamps_and_ends_after_enough_boxes():
         check.add(Sweep(STAMP + k, 'map', points))
     assert DECISIVE_BOXES == 12 and check.finding
     empty = np.full((2, 9), np.nan)
-    check = PoseCheck(STANDARD, tolerance=0.02)
+    check = PoseCheck(STANDARD)
     for _ in range(5):
         check.add(array_of(*empty))
         check.add(Sweep(STAMP, 'map', points))
@@ -265,7 +378,7 @@ def placed(meant=STANDARD, frame='lidar', taken=STANDARD):
     T_fixed_lidar = np.eye(4)
     T_fixed_lidar[:3, :3] = Rotation.from_euler('z', 0.4).as_matrix()
     T_fixed_lidar[:3, 3] = 3, -5, 0
-    check = PlaceCheck(taken, tolerance=0.02)
+    check = PlaceCheck(taken)
     for k in range(2):
         given = array_of(*true, stamp_ns=STAMP + k * 10**8)
         if frame == 'lidar':
@@ -304,7 +417,7 @@ def test_boxes_without_heights_are_named():
     T_map_lidar[:3, :3] = Rotation.from_euler('z', 0.4).as_matrix()
     for z, is_named in ((0.0, True), (0.1, False)):
         boxes[-1, 2] = z
-        check = PlaceCheck(STANDARD, tolerance=0.02)
+        check = PlaceCheck(STANDARD)
         check.add(Sweep(STAMP, 'map', np.zeros((3, 3))), T_map_lidar)
         check.add(boxes_to_frame(array_of(*boxes), T_map_lidar, 'map'), T_map_lidar)
         assert ('all of 100 boxes have z of 0' in check.flat) == is_named
@@ -317,7 +430,7 @@ def test_boxes_of_another_frame_than_their_messages_name_are_named():
 
 
 def test_arrays_without_valid_boxes_have_no_place():
-    check = PlaceCheck(STANDARD, tolerance=0.02)
+    check = PlaceCheck(STANDARD)
     for boxes in ([], [[np.nan] * 9]):
         check.add(Sweep(STAMP, 'map', np.zeros((3, 3))), np.eye(4))
         given = np.reshape(boxes, (-1, 9))

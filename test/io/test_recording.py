@@ -61,6 +61,22 @@ def test_split_recordings_are_merged_by_time(tmp_path):
     assert [array.stamp_ns for array in arrays] == drive.stamps
 
 
+def test_a_later_part_without_static_transforms_names_the_first(tmp_path):
+    drive = Drive(ros1=True, boxes='markers')
+    half = len(drive.items) // 2
+    parts = [
+        write_recording(tmp_path / f'drive_{i}.bag', part, 'rosbag1', drive.messages)
+        for i, part in enumerate([drive.items[:half], drive.items[half:]])
+    ]
+    text = error_of(parts[1])
+    assert 'give the first file of the drive too, which may alone have its static' in text
+    sweeps, _, fixed_frame = read(parts)
+    assert (len(sweeps), fixed_frame) == (8, 'odom')
+    drive.items = [item for item in drive.items if 'tf' not in item[0]]
+    text = error_of(drive.write(tmp_path / 'without', 'rosbag1'))
+    assert 'first file' not in text
+
+
 def test_parts_are_in_the_order_of_their_numbers(tmp_path):
     """As rosbag2 names them without padding: 10 behind 9."""
     folder = tmp_path / 'drive'

@@ -162,6 +162,7 @@ def boxes(out):
 def test_a_path_carries_a_url():
     assert url_of(Path('s3://bucket/a/b.mcap')) == 's3://bucket/a/b.mcap'
     assert url_of(Path('https://host:80/b.mcap')) == 'https://host:80/b.mcap'
+    assert url_of(Path('file:///a/b.mcap')) == 'file:///a/b.mcap'
     assert url_of(Path('/s3:/bucket')) is None
     assert url_of(Path('c:/drive')) is None
 
@@ -321,13 +322,25 @@ def test_an_object_store_in_and_out(whole, boxes_of_whole, scheme, fixture, requ
     out = f'{scheme}://drives/results/one'
     command = ['relabel', f'{scheme}://drives/one', '-o', out, *QUICK]
     assert main(command) == 0
-    capsys.readouterr()
+    printed = capsys.readouterr().out
+    assert printed.startswith(f'{out}: ') and f'next: copy {out} to this machine' in printed
     assert store.cat('drives/results/one/boxes.csv') == boxes_of_whole
     summary = json.loads(store.cat('drives/results/one/summary.json'))
     assert summary['boxes_in'] == 120
     store.pipe('drives/other/file', b'x')
     assert main(['relabel', str(whole), '-o', f'{scheme}://drives/other', *QUICK]) == 1
     assert 'expected a new folder or an earlier result' in capsys.readouterr().err
+    store.pipe('drives/results/one/decisions.csv', b'x')  # uploaded after a review elsewhere
+    assert main(command) == 1
+    assert "'decisions.csv' changed or added since" in capsys.readouterr().err
+    assert store.cat('drives/results/one/decisions.csv') == b'x'
+
+
+def test_urls_of_this_machine(whole, boxes_of_whole, tmp_path):
+    out = tmp_path / 'new' / 'out'
+    for _ in range(2):
+        assert main(['relabel', f'file://{whole}', '-o', f'file://{out}', *QUICK]) == 0
+        assert (out / 'boxes.csv').read_bytes() == boxes_of_whole
 
 
 def test_an_upload_that_is_killed_goes_on_at_the_next_run(whole, store, preloaded_python, capsys):

@@ -61,6 +61,45 @@ def test_items_are_moved_into_the_fixed_frame_with_their_transform():
             np.testing.assert_allclose(admitted.moved.boxes[:, :3], expected)
 
 
+@pytest.mark.parametrize('fixed_frame', ['', 'odom'])
+def test_odometry_without_a_child_frame_is_that_of_the_vehicle_from_the_next_one_on(fixed_frame):
+    drive = Drive(sweeps=4, motion='odometry')
+    session = Session(STANDARD, Config(), fixed_frame)
+    session.sensor_frame = 'lidar'
+    reasons = []
+    for topic, _, message in drive.items:
+        if topic == '/odom':
+            message.child_frame_id = ''
+            session.tree.add_odometry(message)
+        elif topic == '/tf_static':
+            session.tree.add_transforms(message.transforms, is_static=True)
+        elif topic == '/points':
+            reasons.append(session.admit(Item(0, pointcloud.from_msg(message))).reason)
+    assert reasons == ['sweep_without_transform', None, None, None]
+    assert session.tree.odometry_child == 'base'
+    assert 'odometry: expected the frame of the vehicle in child_frame_id' in session.finding
+
+
+def test_odometry_without_a_child_frame_is_that_of_the_vehicle_where_static_transforms_are_late():
+    drive = Drive(sweeps=6, motion='odometry')
+    session = Session(STANDARD, Config())
+    session.sensor_frame = 'lidar'
+    (static,) = [message for topic, _, message in drive.items if topic == '/tf_static']
+    heights = []
+    for topic, _, message in drive.items:
+        if topic == '/odom':
+            message.child_frame_id = ''
+            session.tree.add_odometry(message)
+        elif topic == '/points':
+            item = session.admit(Item(0, pointcloud.from_msg(message)))
+            heights.append(None if item.reason else item.T_fixed_item[2, 3])
+            if len(heights) == 2:
+                session.tree.add_transforms(static.transforms, is_static=True)
+    assert heights[0] is None
+    assert heights[-1] == heights[3] == static.transforms[0].transform.translation.z
+    assert "taken for 'base'" in session.finding
+
+
 def test_boxes_in_the_fixed_frame_keep_their_numbers_and_get_the_ticket():
     boxes = array_of(START)
     boxes.boxes[0, 6:] = 0.1, -0.2, 2.9
@@ -234,6 +273,28 @@ def test_the_pose_check_is_renewed_after_a_time_jump(tmp_path):
     assert len(jumps) == 1
     assert 'pose_reference' in findings[jumps[0] - 1][1]
     assert not any(finding for _, finding in findings[jumps[0] :])
+
+
+def test_a_class_that_is_turned_is_named_rather_than_the_axes_of_all():
+    """Only trucks move, along y of their boxes; parked cars show that the others are right."""
+    session = Session(STANDARD, Config(), 'map')
+    rng = np.random.default_rng(4)
+    unit = rng.uniform(-0.5, 0.5, (8, 80, 3))
+    true = np.tile([0, 0, 1, 6.0, 2, 2, 0, 0, 0], (8, 1))
+    true[:, 1] = 8 * np.arange(8)
+    for k in range(20):
+        true[4:, 0] = k
+        points = (true[:, None, :3] + unit * true[:, None, 3:6]).reshape(-1, 3)
+        stamp = START + k * SECOND // 10
+        boxes = true.copy()
+        boxes[4:, 8] = np.pi / 2
+        classes = ('car',) * 4 + ('truck',) * 4
+        ids = tuple('12345678')
+        session.admit(Item(0, Sweep(stamp, 'map', points)))
+        session.admit(Item(0, BoxArray(stamp, 'map', ids, classes, np.ones(8), boxes)))
+    assert "boxes of 'truck' do not fit their points" in session.finding
+    assert 'or turn them by 90 degrees' in session.finding
+    assert 'forward_axis' not in session.finding
 
 
 def test_boxes_of_a_recording_stamped_in_the_future_are_kept_and_said(tmp_path):

@@ -12,10 +12,10 @@ import re
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import YAML_ERRORS
-from boxreg_ros.errors import RecordingError, TransferError, unreadable
+from boxreg_ros.errors import one_line, RecordingError, TransferError, unreadable
 from boxreg_ros.io.foxglove import FOXGLOVE_ENCODINGS, ros_type, schema_as_definition
 from boxreg_ros.io.storage.mcap import McapFile
-from boxreg_ros.io.storage.record import Damage, one_line, Record, span_ns, StorageFile
+from boxreg_ros.io.storage.record import Damage, Record, span_ns, StorageFile
 from boxreg_ros.io.storage.rosbag1 import Rosbag1File
 from boxreg_ros.io.storage.sqlite import SqliteFile
 from boxreg_ros.io.storage.urls import entries_of, entry_of, url_of
@@ -42,11 +42,14 @@ SPARE_BYTES = 2**16
 
 
 class Part(NamedTuple):
-    """The files of one path of a recording, and those of them that do not exist."""
+    """The files of one path of a recording."""
 
     path: Path
     files: tuple[Path, ...]
     missing: tuple[Path, ...] = ()
+    """Those in its metadata that do not exist."""
+    unlisted: tuple[Path, ...] = ()
+    """Those beside them that its metadata does not have."""
 
 
 def part_of(path: Path) -> Part:
@@ -64,10 +67,13 @@ def part_of(path: Path) -> Part:
     if not path.is_dir():
         return Part(path, (path,))
     listed = _listed(path)
-    there = [file for file in path.iterdir() if file.is_file() and _kind(file) in OPENERS]
-    files = [file for file in listed if file.is_file()] or sorted(there, key=in_order)
+    found = [file for file in path.iterdir() if file.is_file() and _kind(file) in OPENERS]
+    there = sorted(found, key=in_order)
+    files = [file for file in listed if file.is_file()] or there
     missing = tuple(file for file in listed if not file.is_file())
-    return Part(path, tuple(_some(path, files)), missing)
+    read = {_unpacked(file) for file in files}
+    unlisted = tuple(file for file in there if _unpacked(file) not in read)
+    return Part(path, tuple(_some(path, files)), missing, unlisted)
 
 
 def in_order(path: Path) -> list[tuple[int, str]]:
@@ -136,6 +142,11 @@ class Files:
         self._damages = [
             Damage(str(file), f'file is missing; {METADATA} lists it') for file in part.missing
         ]
+        self._damages += [
+            Damage(str(file), f'{METADATA} does not list this file, which is left out: to read '
+                   f'it, run ros2 bag reindex, or delete {METADATA}')
+            for file in part.unlisted
+        ]  # fmt: skip
         first_error: RecordingError | None = None
         with ExitStack() as stack:
             for path in part.files:
@@ -248,7 +259,7 @@ def merged_streams(streams: Sequence[tuple[int, Iterator[Record]]]) -> Iterator[
 
 def _kind(path: Path) -> str:
     """Return the suffix of a file without that of its compression."""
-    return Path(path.stem).suffix if path.suffix in COMPRESSED else path.suffix
+    return _unpacked(path).suffix
 
 
 def _listed(folder: Path) -> list[Path]:
@@ -257,9 +268,20 @@ def _listed(folder: Path) -> list[Path]:
         metadata = yaml.safe_load((folder / METADATA).read_text(encoding='utf-8'))
         names = metadata['rosbag2_bagfile_information']['relative_file_paths']
         # The name alone: a recording must not refer to files elsewhere.
-        return [folder / PurePath(name).name for name in names]
+        listed = [folder / PurePath(name).name for name in names]
     except (OSError, KeyError, TypeError, *YAML_ERRORS):
         return []
+    return [file if file.is_file() else _unpacked_beside(file) for file in listed]
+
+
+def _unpacked(file: Path) -> Path:
+    """Return a file without the suffix of its compression."""
+    return file.with_suffix('') if file.suffix in COMPRESSED else file
+
+
+def _unpacked_beside(file: Path) -> Path:
+    """Return the file that a player has unpacked in place of a compressed one, if it is there."""
+    return _unpacked(file) if _unpacked(file).is_file() else file
 
 
 def _unpack(path: Path, plain: Path, origin: Path) -> Damage | None:

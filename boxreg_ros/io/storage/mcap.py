@@ -14,18 +14,18 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from io import BytesIO, SEEK_END
+from itertools import takewhile
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 import zlib
 
-from boxreg_ros.errors import RecordingError, TransferError
+from boxreg_ros.errors import one_line, RecordingError, TransferError
 from boxreg_ros.io.storage.byte_file import ByteFile
 from boxreg_ros.io.storage.record import (
     Damage,
     Damages,
     Definition,
-    one_line,
     Record,
     shown,
     span_ns,
@@ -381,7 +381,7 @@ class McapFile:
         """Return the messages of a part; none, and a damage is noted, if it is damaged."""
         try:
             self._file.seek(place.first_byte)
-            found = _records_in(self._file.read(place.end_byte - place.first_byte))
+            found = _records_in(self._file, place.end_byte - place.first_byte)
         except TransferError:
             raise
         except Exception as error:  # of the library, for any malformed content
@@ -398,8 +398,7 @@ class McapFile:
             if self.is_indexed and times != (place.start_ns, place.last_ns):
                 raise RecordingError('its times are not those of the index')
             _check_size(chunk)
-            stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-            content = _records_in(stream.read(size))
+            content = _records_in(*get_chunk_data_stream(chunk, validate_crc=True))
         except Exception as error:  # of the library or of a decompressor
             self._note_chunk(error, place)
             return []
@@ -451,20 +450,35 @@ def _check_size(chunk: records.Chunk) -> None:
         raise RecordingError(f'size of {size} bytes')
 
 
-def _records_in(content: bytes) -> list[records.McapRecord]:
-    """
-    Return the records of some bytes; EndOfFile if the last one is not whole.
+def _records_in(content: Any, size: int) -> list[records.McapRecord]:
+    """Return the records in `size` bytes of a stream; EndOfFile if the last one is not whole."""
+    stream: Any = _WholeReads(content, size)
+    reader = StreamReader(stream, skip_magic=True, emit_chunks=True)
+    return [*takewhile(lambda record: not isinstance(record, records.Footer), reader.records)]
 
-    The package takes the bytes that are left for the rest of a record. One that is too long thus
-    swallows the footer that is put behind the bytes here.
+
+class _WholeReads:
+    """
+    Bytes of a stream and a footer behind them, as a stream for the mcap package.
+
+    A read beyond the end of the bytes raises EndOfFile: the package would take those that are left
+    for the rest of a record. One that lacks all of its fields swallows the footer.
 
     """
-    found: list[records.McapRecord] = []
-    for record in StreamReader(BytesIO(content + END), skip_magic=True, emit_chunks=True).records:
-        if isinstance(record, records.Footer):
-            return found
-        found.append(record)
-    raise EndOfFile
+
+    def __init__(self, content: Any, size: int) -> None:
+        self._parts = [(BytesIO(END), len(END)), (content, size)]
+
+    def read(self, size: int) -> bytes:
+        """Return the next `size` bytes, first of the content, then of the footer."""
+        if len(self._parts) > 1 and not self._parts[-1][1]:
+            self._parts.pop()
+        content, left = self._parts[-1]
+        if size > left:
+            raise EndOfFile
+        self._parts[-1] = content, left - size
+        found: bytes = content.read(size)
+        return found
 
 
 def _size_of(record: Any) -> int:

@@ -7,9 +7,9 @@ from contextlib import closing, ExitStack
 from types import SimpleNamespace
 from typing import Any
 
-from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.errors import one_line, RecordingError, UnsupportedMessage
 from boxreg_ros.io.storage.files import encoding_of, Files, merged_streams, Part
-from boxreg_ros.io.storage.record import Damage, one_line, readable, Record
+from boxreg_ros.io.storage.record import Damage, readable, Record
 from rosbags.interfaces import Connection
 import zstandard
 

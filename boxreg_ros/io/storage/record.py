@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from boxreg_ros.errors import BoxregError, RecordingError, TransferError, unreadable
+from boxreg_ros.errors import BoxregError, one_line, RecordingError, TransferError, unreadable
 from rosbags.interfaces import Connection
 
 NO_MESSAGES_NS = (2**63 - 1, 0)
@@ -93,11 +93,6 @@ def span_ns(spans: Collection[tuple[int, int]]) -> tuple[int, int]:
 def shown(path: Path, origin: Path | None) -> str:
     """Return the file to name in messages: `path`, or the file it was unpacked from."""
     return str(origin or path)
-
-
-def one_line(error: Exception) -> str:
-    """Return the text of an error in one line."""
-    return ' '.join(str(error).split()).rstrip('.') or type(error).__name__
 
 
 @contextmanager

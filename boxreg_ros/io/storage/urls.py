@@ -15,10 +15,12 @@ import re
 import time
 from typing import Any, NamedTuple, TypeVar
 
-from boxreg_ros.errors import RecordingError, TransferError
+from boxreg_ros.errors import one_line, RecordingError, TransferError
 
 URL = re.compile(r'([a-z][a-z0-9+.-]+):/+(.+)')
 """A scheme has two letters or more."""
+THIS_MACHINE = 'file'
+"""Scheme of the files of this machine: its URLs have no server, and a third slash."""
 ANSWER_SECONDS = 60.0
 """Longest time for an answer [s]: 256 kB/s for the largest range, and ten times a slow listing."""
 REPEAT_SECONDS = (0.5, 2.0, 8.0)
@@ -47,7 +49,10 @@ class Entry(NamedTuple):
 def url_of(path: Path) -> str | None:
     """Return the URL that a path carries; None for a path of this machine."""
     match = URL.fullmatch(str(path))
-    return f'{match[1]}://{match[2]}' if match else None
+    if match is None:
+        return None
+    server = '' if match[1] != THIS_MACHINE else '/'
+    return f'{match[1]}://{server}{match[2]}'
 
 
 def entry_of(path: Path) -> Entry:
@@ -158,7 +163,8 @@ def system_of(path: Path) -> tuple[Any, str]:
 
     url = str(url_of(path))
     try:
-        system, name = fsspec.core.url_to_fs(url)
+        is_here = url.startswith(f'{THIS_MACHINE}:')
+        system, name = fsspec.core.url_to_fs(url, **({'auto_mkdir': True} if is_here else {}))
     except ImportError as error:
         raise RecordingError(
             f"{url}: needs another package: pip install 'boxreg_ros[remote]' ({error})"
@@ -233,5 +239,4 @@ def _is_refusal(error: BaseException | None) -> bool:
 
 def _reason(error: Exception) -> str:
     """Return the text of an error in one line, of the one that caused it where there is one."""
-    cause = error.__cause__ or error
-    return ' '.join(str(cause).split()) or type(cause).__name__
+    return one_line(error.__cause__ or error)
