@@ -25,7 +25,7 @@ from boxreg_ros.labels.argoverse2 import (
     xyz_xyzw,
 )
 from boxreg_ros.labels.arrow import read_rows, read_table
-from boxreg_ros.labels.files import frame_names
+from boxreg_ros.labels.files import frame_names, visible
 from boxreg_ros.structures import Floats
 import numpy as np
 
@@ -65,7 +65,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     require_lidar(lidars, [DATASET.lidar], DATASET.lidar)
     log = _logs(root)[name]
     clouds = require(log / 'sensors' / DATASET.lidar, 'the sweeps', DATASET.remedy)
-    stamps_ns = sorted(int(path.stem) for path in clouds.glob('*.feather'))
+    stamps_ns = sorted(int(path.stem) for path in visible(clouds, '*.feather'))
     if not stamps_ns:
         raise RecordingError(
             f'{clouds}: expected sweeps STAMP.feather, got none; {DATASET.remedy}'
@@ -129,6 +129,6 @@ def _origins(path: Path) -> Floats:
 
 def _logs(root: Path) -> dict[str, Path]:
     """Return the folders of all logs by name: the root itself, in it, or in its splits."""
-    found = [*root.glob(EGO_POSES_FILE), *root.glob(f'*/{EGO_POSES_FILE}')]
-    found += root.glob(f'*/*/{EGO_POSES_FILE}')
+    found = [*root.glob(EGO_POSES_FILE), *visible(root, f'*/{EGO_POSES_FILE}')]
+    found += visible(root, f'*/*/{EGO_POSES_FILE}')
     return {path.parent.absolute().name: path.parent for path in found}

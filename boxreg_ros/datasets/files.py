@@ -12,10 +12,13 @@ from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.transforms import inverse
 from boxreg_ros.labels.clouds import BIN_COLUMNS, read_pcd, SUFFIXES
 from boxreg_ros.rotations import matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix
-from boxreg_ros.structures import Floats, Ints
+from boxreg_ros.structures import Floats, Ints, on_lines
 from msg_adapters import pointcloud
 import numpy as np
 from numpy.typing import NDArray
+
+MISSING_SWEEP = ': expected a sweep, got: '
+"""Words of an error behind the path of a cloud that is not there."""
 
 
 def read_cloud(path: Path, stamp_ns: int, kind: str = '', columns: int = 5) -> Cloud:
@@ -178,7 +181,7 @@ def at_stamp(
     knots = inverse(T_fixed_frame[first]) @ T_fixed_frame[first:last]  # (K, 4, 4), small motions
     motion = np.hstack([knots[:, :3, 3], rpy_from_matrix(knots[:, :3, :3])])  # (K, 6)
     at = np.append(times, 0.0)
-    moved = np.stack([np.interp(at, after[first:last], column) for column in motion.T], axis=1)
+    moved = on_lines(after[first:last], motion, at)
     R = matrix_from_rpy(moved[:, 3:])  # (M + 1, 3, 3), the last is at the stamp
     placed = np.einsum('mij,mj->mi', R[:-1], points) + moved[:-1, :3]
     return np.asarray((placed - moved[-1, :3]) @ R[-1])
@@ -187,7 +190,7 @@ def at_stamp(
 def missing_sweep(path: Path, error: OSError) -> UnsupportedMessage:
     """Return the error of a sweep whose file cannot be read."""
     return UnsupportedMessage(
-        f'{path}: expected a sweep, got: {error.strerror}; download the archive that has it'
+        f'{path}{MISSING_SWEEP}{error.strerror}; download the archive that has it'
     )
 
 

@@ -18,7 +18,7 @@ from boxreg_ros.datasets.files import require, require_lidar
 from boxreg_ros.datasets.protocol import Dataset, Scene
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, SceneFrames
-from boxreg_ros.labels.files import frame_names
+from boxreg_ros.labels.files import frame_names, visible
 from boxreg_ros.labels.sidecar import filled_stamps, read_stamps, STAMPS_FILE
 from boxreg_ros.labels.tracklets import FILE
 from boxreg_ros.structures import Floats, Ints
@@ -89,7 +89,7 @@ def _oxts(drive: Path, name: str) -> tuple[Ints, Floats]:
     stamps = enumerate(_stamps(drive / 'oxts' / STAMPS_FILE, archive))
     stamp_of = {number: stamp_ns for number, stamp_ns in stamps if stamp_ns is not None}
     folder = require(drive / 'oxts' / 'data', 'the poses', f'unpack {archive}')
-    files = {int(path.stem): path for path in folder.glob('*.txt') if path.stem.isdigit()}
+    files = {int(path.stem): path for path in visible(folder, '*.txt') if path.stem.isdigit()}
     if files.keys() != stamp_of.keys():
         first = min(files.keys() ^ stamp_of.keys())
         raise RecordingError(
@@ -122,6 +122,6 @@ def _stamps(path: Path, archive: str) -> list[int | None]:
 
 def _drives(root: Path) -> dict[str, Path]:
     """Return the folders of all drives by name: of all days, of one day, or one export."""
-    found = [*root.glob(f'*{DRIVE_SUFFIX}'), *root.glob(f'*/*{DRIVE_SUFFIX}')]
+    found = [*visible(root, f'*{DRIVE_SUFFIX}'), *visible(root, f'*/*{DRIVE_SUFFIX}')]
     found += [root.absolute()] if (root / DATASET.lidar).is_dir() else []
     return {path.name.removesuffix(DRIVE_SUFFIX): path for path in found}

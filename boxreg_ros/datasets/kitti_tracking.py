@@ -18,7 +18,7 @@ from boxreg_ros.datasets.protocol import Dataset, Scene
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, SceneFrames
 from boxreg_ros.labels.camera import Camera
-from boxreg_ros.labels.files import frame_names
+from boxreg_ros.labels.files import frame_names, visible
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
 
@@ -41,7 +41,7 @@ TRACKING_DIGITS = 6
 
 def scene_names(root: Path) -> list[str]:
     """Return the names of the sequences with clouds."""
-    return sorted(path.name for path in (_split(root) / DATASET.lidar).glob('*') if path.is_dir())
+    return [path.name for path in visible(_split(root) / DATASET.lidar, '*') if path.is_dir()]
 
 
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
@@ -56,7 +56,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     require_lidar(lidars, [DATASET.lidar], DATASET.lidar)
     split = _split(root)
     clouds = split / DATASET.lidar / name
-    numbers = [int(path.stem) for path in clouds.glob('*.bin') if path.stem.isdigit()]
+    numbers = [int(path.stem) for path in visible(clouds, '*.bin') if path.stem.isdigit()]
     if not numbers:
         raise RecordingError(
             f'{clouds}: expected sweeps {0:0{TRACKING_DIGITS}d}.bin and so on, got none; unpack '

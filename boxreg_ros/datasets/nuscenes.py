@@ -20,7 +20,7 @@ from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.labels import frames_of, SceneFrames
 from boxreg_ros.labels.clouds import BIN_COLUMNS
-from boxreg_ros.labels.files import frame_names, from_json, json_items
+from boxreg_ros.labels.files import frame_names, from_json, json_items, visible
 from boxreg_ros.labels.nuscenes import own_values, pose_matrix
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
@@ -315,7 +315,7 @@ def _stamp_ns(row: dict[str, Any]) -> int:
 
 def _table_folders(root: Path) -> list[Path]:
     """Return the folders of the tables of all splits."""
-    return sorted(path.parent for path in root.glob('*/scene.json'))
+    return [path.parent for path in visible(root, '*/scene.json')]
 
 
 def tables_of(root: Path, name: str) -> tuple[Path, dict[str, Any]]:

@@ -23,8 +23,10 @@ from boxreg_ros.datasets.files import (
 from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.labels import frames_of, SceneFrames
+from boxreg_ros.labels.cuboids import in_order
+from boxreg_ros.labels.files import visible
 from boxreg_ros.labels.openpcdet import CLOUD_SUFFIXES
-from boxreg_ros.labels.sidecar import POSES_FILE, read_sidecar
+from boxreg_ros.labels.sidecar import named_frames, POSES_FILE, read_sidecar
 import numpy as np
 
 DATASET = Dataset(
@@ -58,10 +60,12 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     require_lidar(lidars, [DATASET.lidar], DATASET.lidar)
     paths = {path.stem: path for path in _clouds(root)}
     # As of `labels.openpcdet`: frames with labels or clouds have a stamp each.
-    names = sorted(paths.keys() | {path.stem for path in root.glob('labels/*.txt')})
+    labels = {path.stem for path in visible(root, 'labels/*.txt')}
+    names = named_frames(root, paths.keys() | labels)
     sidecar = read_sidecar(root, len(names), names=names)
-    stamps_ns = sidecar.stamps_ns[: len(names)]
-    with_clouds = [i for i, stem in enumerate(names) if stem in paths]
+    stamps_ns = sidecar.stamps_ns
+    name_of = in_order(root, names, stamps_ns, {})
+    with_clouds = [i for i, stem in name_of.items() if stem in paths]
     order = sorted(with_clouds, key=stamps_ns.__getitem__)
     poses = [sidecar.poses[i] for i in order]
     known = [i for i, pose in enumerate(poses) if pose is not None]
@@ -77,7 +81,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     ascending = np.array([stamps_ns[i] for i in order], np.int64)
     frames = SceneFrames(
         name,
-        dict(zip(names, stamps_ns, strict=True)),
+        {stem: stamps_ns[i] for i, stem in name_of.items()},
         sidecar.fixed_frame,
         sidecar.sensor_frame,
     )
@@ -86,7 +90,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
         frames,
         DATASET.lidar,
         ascending,
-        lambda: (SweepFile(stamps_ns[i], partial(_cloud, paths[names[i]])) for i in order),
+        lambda: (SweepFile(stamps_ns[i], partial(_cloud, paths[name_of[i]])) for i in order),
         ascending[known],
         pose_rows([pose for pose in poses if pose is not None]),
         partial(frames_of, 'openpcdet', root) if has_labels else None,
@@ -97,7 +101,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
 
 def _clouds(root: Path) -> list[Path]:
     """Return the files of the clouds, by name; RecordingError if two have one name."""
-    paths = sorted(path for path in root.glob('points/*') if path.suffix in CLOUD_SUFFIXES)
+    paths = [path for path in visible(root, 'points/*') if path.suffix in CLOUD_SUFFIXES]
     names = [path.stem for path in paths]
     for name in names:
         if names.count(name) > 1:

@@ -23,7 +23,7 @@ from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.transforms import inverse, matrix
 from boxreg_ros.labels import LabelFrame, SceneFrames
-from boxreg_ros.labels.files import from_json
+from boxreg_ros.labels.files import from_json, visible
 from boxreg_ros.labels.records import refined_boxes
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, YAW
@@ -64,7 +64,7 @@ DAMAGE = (
 
 def scene_names(root: Path) -> list[str]:
     """Return the names of the sequences with clouds."""
-    return sorted(path.parents[1].name for path in root.glob('*/lidar/poses.json'))
+    return [path.parents[1].name for path in visible(root, '*/lidar/poses.json')]
 
 
 def inputs(root: Path, name: str) -> tuple[Path, ...]:

@@ -50,7 +50,9 @@ def address_of(path: Path) -> Address | None:
     if not colon:
         return None
     if prefix in DATASETS:
-        root, _, scene = rest.partition('#')
+        root, mark, scene = rest.rpartition('#')
+        if not mark or Path(rest).expanduser().is_dir():
+            root, scene = rest, ''
         return Address(prefix, Path(root).expanduser(), scene)
     if '#' not in rest or path.exists():
         return None

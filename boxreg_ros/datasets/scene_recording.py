@@ -16,7 +16,7 @@ from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of, LabelFrame
 from boxreg_ros.labels.camera import Camera
-from boxreg_ros.labels.merging import keyframes_of, LabelMerger
+from boxreg_ros.labels.merging import LabelMerger
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
@@ -140,13 +140,10 @@ class SceneRecording:
         self.first_errors.clear()
         self._readable = 0
         tree.rewind(0)  # the pose that was read to choose a frame is read again
-        given = self._frames() if self.has_boxes else iter(())
-        frames: Iterator[LabelFrame] = (frame.labels() for frame in given)
-        if self._keyframes:
-            frames = keyframes_of(frames)
+        frames = self._frames() if self.has_boxes else iter(())
         is_part = self._start is not None or self._end is not None
         sensor_frame = self.sensor_frame()
-        merger = LabelMerger(frames, tree, sensor_frame, self.start_ns, is_part)
+        merger = LabelMerger(frames, tree, sensor_frame, self.start_ns, is_part, self._keyframes)
         num_poses = 0
         for sweep in self._scene.sweeps():
             stamp_ns = sweep.stamp_ns

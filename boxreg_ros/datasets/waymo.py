@@ -22,11 +22,11 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.datasets.files import finite_cloud, pose_rows, require, require_lidars
 from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
-from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.errors import one_line, RecordingError, UnsupportedMessage
 from boxreg_ros.io.transforms import inverse
 from boxreg_ros.labels import frames_of, SceneFrames
 from boxreg_ros.labels.arrow import read_rows
-from boxreg_ros.labels.files import frame_names
+from boxreg_ros.labels.files import frame_names, visible
 from boxreg_ros.labels.waymo import MICROSECONDS, VEHICLE_POSE
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats
@@ -61,7 +61,7 @@ READ_AHEAD_BYTES = 1 << 20
 
 def scene_names(root: Path) -> list[str]:
     """Return the names of the segments with clouds."""
-    return sorted(path.stem for path in (_split(root) / 'lidar').glob('*.parquet'))
+    return [path.stem for path in visible(_split(root) / 'lidar', '*.parquet')]
 
 
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
@@ -237,10 +237,10 @@ def _cloud(
     sensors = [np.zeros(0, np.uint8)]
     for number, (laser, calibration) in enumerate(calibrations.items()):
         if laser not in rows or (laser == TOP_LASER and laser not in pixel_poses):
-            what = 'poses' if laser in rows else 'points'
+            what, part = ('poses', 'lidar_pose') if laser in rows else ('points', 'lidar')
             raise UnsupportedMessage(
-                f'{clouds}: expected the {what} of the LiDAR {calibration.name} in a sweep, got '
-                f'none; {DATASET.remedy}'
+                f'{clouds.parents[1] / part / clouds.name}: expected the {what} of the LiDAR '
+                f'{calibration.name} in a sweep, got none; {DATASET.remedy}'
             )
         T_world_pixel = None
         if laser == TOP_LASER:
@@ -319,8 +319,8 @@ def _reading(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, KeyError, pyarrow.ArrowException) as error:
-        text = ' '.join(str(error).split())
-        raise RecordingError(f'{path}: cannot be read: {text}; {DATASET.remedy}') from None
+        reason = f'cannot be read: {one_line(error)}'
+        raise RecordingError(f'{path}: {reason}; {DATASET.remedy}') from None
 
 
 def _row(batch: Any, columns: list[str]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Public data sets as recordings: clouds, poses and boxes by hand-derived values."""
 
+import csv
 import itertools
 import json
 from pathlib import Path
@@ -8,11 +9,13 @@ import shutil
 from typing import NamedTuple
 
 from boxreg_ros.cli import main
-from boxreg_ros.datasets.registry import address_of
+from boxreg_ros.datasets.registry import address_of, scene_names
 from boxreg_ros.datasets.scene_recording import SceneRecording
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.items import EVERYTHING, ItemSource, Wanted
 from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame, TransformTree
+from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.structures import Sweep
 import layouts
@@ -391,6 +394,26 @@ def test_one_command_relabels_a_scene(tmp_path, name, capsys):
         assert main([*command, '--formats=csv']) == 0
 
 
+def test_boxes_out_of_the_labelled_image_are_no_ghosts(tmp_path, capsys):
+    """KITTI has labels of what the camera sees; detections of the LiDAR are all around."""
+    layouts.kitti_tracking(tmp_path / 'data')
+    address, out = f'kitti-tracking:{tmp_path / "data"}#0004', tmp_path / 'out'
+    assert main(['relabel', address, '-o', str(out), *QUICK]) == 0
+    rows = rows_of(out)
+    behind = [row | {'track_id': 'behind', 'x': str(float(row['x']) - 60)} for row in rows]
+    ahead = [row | {'track_id': 'ahead', 'x': str(float(row['x']) + 20)} for row in rows]
+    with (out / 'boxes.csv').open('w', newline='') as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows([*rows, *behind, *ahead])
+    capsys.readouterr()
+    assert main(['evaluate', str(out), address]) == 0
+    printed = capsys.readouterr()
+    assert f'{len(rows)} predicted boxes lie outside of the image' in printed.err
+    assert f'{len(rows)} predictions without a true box' in printed.out
+    assert f'({len(rows)} ghosts)' in printed.out
+
+
 def test_clouds_of_a_scene_are_labelled_but_not_copied(tmp_path, capsys):
     """A copy is refused before the work; labels of points and clouds of objects need none."""
     layouts.kitti_tracking(tmp_path / 'data')
@@ -577,6 +600,56 @@ def test_a_token_that_is_missing_is_named(tmp_path, table, lost):
         read(source_of('nuscenes', f'{tmp_path}#scene-0061'))
 
 
+def test_a_file_of_waymo_without_the_poses_of_a_sweep_is_named(tmp_path):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    layouts.waymo(tmp_path)
+    (path,) = tmp_path.glob('training/lidar_pose/*.parquet')
+    parquet.write_table(parquet.read_table(path).slice(0, 5), path)
+    source = source_of('waymo', str(tmp_path))
+    assert len(read(source)[0]) == 5
+    (error,) = source.first_errors.values()
+    assert f'{path}: expected the poses of the LiDAR TOP in a sweep, got none' in str(error)
+
+
+def test_labels_of_tables_with_several_lidars_are_in_the_frame_of_none(tmp_path, capsys):
+    """Each LiDAR has a frame: boxes for one of them need the recording, which names it."""
+    root = layouts.truckscenes(tmp_path / 'data')
+    out = tmp_path / 'out'
+    words = ['convert', str(root), '--from=nuscenes', '--to=openpcdet', '-o', str(out)]
+    assert main(words) == 1
+    assert 'give --recording' in capsys.readouterr().err
+    address = f'truckscenes:{root}#scene-a-1'
+    assert main([*words, f'--recording={address}']) == 0
+    frames = [frame.moved('fixed') for frame in frames_of('openpcdet', out / 'openpcdet')]
+    expected = [layouts.car_in_map(i) for i in range(0, FRAMES, 2)]
+    found = np.concatenate([frame.refined.boxes.boxes for frame in frames])
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize('folder', ['data', 'data/v1.0-mini'])
+def test_the_folder_of_nuscenes_has_labels_of_its_scenes(tmp_path, folder):
+    layouts.nuscenes(tmp_path / 'data')
+    labels = 'nuscenes', tmp_path / folder
+    _, boxes = read(source_of('nuscenes', f'{tmp_path}/data#scene-0061', labels=labels))
+    assert len(boxes) == FRAMES / 2
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_annotations_of_a_scene_are_converted(tmp_path, name, capsys):
+    case = CASES[name]
+    address = f'{name}:{case.write(tmp_path / "data")}#{case.scene}'
+    out = tmp_path / 'out'
+    words = ['convert', address, '--to=csv,openpcdet', '--with-points', '-o', str(out)]
+    assert main([*words, f'--from={name}']) == 2
+    assert 'expected --from recording alone' in capsys.readouterr().err
+    assert main([*words, '--from=recording']) == 0
+    found = BoxTable.read(out / 'boxes.csv')
+    assert found.stamps_ns.tolist() == case.stamps_ns()[:: case.step]
+    expected = [case.box(i) for i in range(0, FRAMES, case.step)]
+    np.testing.assert_allclose(found.boxes, expected, atol=1e-5)
+    assert len(list((out / 'openpcdet' / 'points').iterdir())) == len(expected)
+
+
 CLOUDS = {
     'nuscenes': 'samples/**/*.bin',
     'kitti-tracking': '**/*.bin',
@@ -600,6 +673,19 @@ def test_a_missing_or_damaged_sweep_is_counted_and_the_others_go_on(tmp_path, na
     # The list of sweeps of Argoverse 2 is that of its files.
     assert source.unreadable.total() == (1 if name == 'argoverse2' else 2)
     assert 'download' in str(next(iter(source.first_errors.values())))
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_hidden_files_are_neither_scenes_nor_sweeps(tmp_path, name):
+    """Archives that macOS has packed have a file ``._NAME`` beside each file."""
+    root = CASES[name].write(tmp_path)
+    for path in list(root.rglob('*')):
+        (path.parent / f'._{path.name}').write_bytes(bytes((0, 5, 22, 7)))
+    names = scene_names(address_of(Path(f'{name}:{root}')))
+    assert CASES[name].scene in names
+    assert not any(one.startswith('.') for one in names)
+    sweeps, _ = read(source_of(name, f'{root}#{CASES[name].scene}'))
+    assert len(sweeps) == FRAMES
 
 
 def test_a_scene_without_any_sweep_is_an_error(tmp_path):
@@ -684,11 +770,34 @@ def test_batch_relabels_every_scene_and_counts_those_that_fail(tmp_path, capsys)
     assert len(rows_of(out / '0004')) == FRAMES
 
 
+def test_a_scene_of_nuscenes_is_relabelled_again_once_its_clouds_are_there(tmp_path, capsys):
+    """The archives of its sweeps are unpacked one after the other."""
+    root = layouts.nuscenes(tmp_path / 'data')
+    (root / 'sweeps').rename(tmp_path / 'sweeps')
+    out = tmp_path / 'out'
+    words = ['batch', f'nuscenes:{root}#scene-0061', '-o', str(out), '--formats=csv', *QUICK]
+    for earlier, sweeps in ((0, FRAMES / 2), (1, FRAMES / 2), (0, FRAMES), (1, FRAMES)):
+        if (earlier, sweeps) == (0, FRAMES):
+            (tmp_path / 'sweeps').rename(root / 'sweeps')
+        assert main(words) == 0
+        assert f'1 of 1 drives done, {earlier} of them' in capsys.readouterr().out
+        summary = json.loads((out / 'scene-0061' / 'summary.json').read_text())
+        assert summary['sweeps'] == sweeps
+
+
 def test_formats_lists_the_data_sets(capsys):
     assert main(['formats']) == 0
     printed = capsys.readouterr().out
     assert 'nuscenes:FOLDER#scene-0061: nuScenes' in printed
     assert '--labels argoverse2:PATH' in printed
+
+
+def test_the_name_of_a_folder_may_have_the_mark_of_a_scene(tmp_path):
+    root = tmp_path / 'drive #1'
+    root.mkdir()
+    assert address_of(Path(f'argoverse2:{root}')) == ('argoverse2', root, '')
+    assert address_of(Path(f'argoverse2:{root}#log')) == ('argoverse2', root, 'log')
+    assert address_of(Path(f'argoverse2:{tmp_path}#log')) == ('argoverse2', tmp_path, 'log')
 
 
 def test_a_manifest_names_scenes(tmp_path):

@@ -1,6 +1,8 @@
 """Exports of our own, read back as recordings, give the result of their recording."""
 
 from boxreg_ros.cli import main
+from boxreg_ros.datasets.registry import Address, open_scene
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.recording import Recording
@@ -95,6 +97,22 @@ def test_clouds_of_openpcdet_without_poses_are_those_of_a_lidar_that_stands(tmp_
     _, statuses = relabelled(tmp_path / 'out', source, '--associate')
     assert len(statuses) == 6
     assert '1700000000.100000000.npy: expected an array of numbers' in capsys.readouterr().err
+
+
+def test_clouds_of_openpcdet_do_not_take_the_stamps_of_missing_ones(tmp_path):
+    """A download in parts: ``timestamps.txt`` has lines of clouds that are not there."""
+    stamps_ns = [1_700_000_000_000_000_000 + k * 100_000_000 for k in range(4)]
+    (tmp_path / 'timestamps.txt').write_text(''.join(f'{stamp_ns}\n' for stamp_ns in stamps_ns))
+    (tmp_path / 'points').mkdir()
+    for k in (2, 3):
+        np.save(tmp_path / 'points' / f'{k:06d}.npy', np.ones((5, 3)))
+    address = Address('openpcdet', tmp_path, '')
+    with pytest.raises(RecordingError, match='expected one stamp for each of 2 frames, got 4'):
+        open_scene(address)
+    for k in (2, 3):
+        path = tmp_path / 'points' / f'{k:06d}.npy'
+        path.rename(path.with_stem(str(stamps_ns[k])))
+    assert open_scene(address).sweep_stamps_ns.tolist() == stamps_ns[2:]
 
 
 def test_exports_of_argoverse2_keep_the_times_of_points(tmp_path):
