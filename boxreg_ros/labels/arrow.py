@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import one_line, RecordingError
 
 BATCH_ROWS = 10_000
 """Number of rows held in memory before they are written."""
@@ -80,8 +80,7 @@ def read_table(path: Path, required: Collection[str] = (), what: str = '') -> An
             else:
                 table = feather.read_table(file)
     except (OSError, pyarrow.ArrowException) as error:
-        text = ' '.join(str(error).split())
-        raise RecordingError(f'{path}: cannot be read: {text}') from None
+        raise RecordingError(f'{path}: cannot be read: {one_line(error)}') from None
     missing = [name for name in required if name not in table.column_names]
     if missing:
         raise RecordingError(

@@ -10,7 +10,12 @@ import struct
 from typing import NamedTuple
 import zlib
 
-from boxreg_ros.errors import ConfigError, RecordingError, TransformUnavailable
+from boxreg_ros.errors import (
+    ConfigError,
+    RecordingError,
+    TransformUnavailable,
+    UnsupportedMessage,
+)
 from boxreg_ros.io.images import Image, ImageCamera
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
@@ -18,6 +23,8 @@ from boxreg_ros.labels.camera import Camera
 from boxreg_ros.structures import Floats
 import numpy as np
 
+LOOKS_UP = 0.9
+"""Cosine between the optical axis of a camera and up, from which on nobody mounts one; chosen."""
 SUFFIXES_OF_IMAGES = {'image/jpeg': 'jpg', 'image/png': 'png', 'image/webp': 'webp'}
 
 
@@ -28,7 +35,7 @@ class LabelCamera(NamedTuple):
     """For names of files: its topic, with ``_`` for slashes."""
     image: ImageCamera
     T_camera_sensor: Floats
-    """Pose (4, 4) of the label frame in that of the camera."""
+    """Pose (4, 4) of the label frame in that of the images of the camera."""
 
     @property
     def topics(self) -> tuple[str, str]:
@@ -71,7 +78,8 @@ class LabelCameras:
         recording.choose_fixed_frame(self._tree)
         self._of_frame: dict[str, list[LabelCamera]] = {}
         self.counts: Counter[str] = Counter()
-        """Images written, and those that no message was near enough for, by topic."""
+        """Images written, and those that are missing or cannot be read, by topic."""
+        self._first_errors: dict[str, str] = {}
 
     def close(self) -> None:
         """Close the recording."""
@@ -121,23 +129,54 @@ class LabelCameras:
                 T = self._tree.lookup(image.frame_id, sensor_frame, stamp_ns)
             except TransformUnavailable:
                 continue  # it moves on the vehicle, or nobody says where it is
-            found.append(LabelCamera(image.topic.strip('/').replace('/', '_'), image, T))
+            name = image.topic.strip('/').replace('/', '_')
+            found.append(LabelCamera(name, image, image.T_image_camera @ T))
         return found
 
     def images(
-        self, cameras: Iterable[LabelCamera], stamp_ns: int
+        self, cameras: Iterable[LabelCamera], stamp_ns: int, needs_png: bool = False
     ) -> list[tuple[LabelCamera, Image]]:
         """Return the image of each camera nearest to a stamp; those without one are counted."""
         found = []
         for camera in cameras:
             topic = camera.image.topic
             try:
-                found.append((camera, self._images.nearest(camera.image, stamp_ns)))
-            except RecordingError:
+                image = self._images.nearest(camera.image, stamp_ns)
+                found.append((camera, as_png(topic, image) if needs_png else image))
+            except (RecordingError, UnsupportedMessage) as error:
                 self.counts[f'{topic} missing'] += 1
+                self._first_errors.setdefault(topic, str(error))
             else:
                 self.counts[topic] += 1
         return found
+
+    @property
+    def notes(self) -> list[str]:
+        """Return which images are missing, and why, in words."""
+        used = {one.image.topic: one for known in self._of_frame.values() for one in known}
+        others = [one.topic for one in self._images.cameras if one.topic not in used]
+        notes = [
+            f'{self.counts[f"{topic} missing"]:,} images are missing or cannot be read; first: '
+            f'{error}'
+            for topic, error in self._first_errors.items()
+        ]
+        notes += [
+            f'images of {topic}: by its transform the camera looks up: {one.image.frame_id!r} is '
+            f'no optical frame (x right, y down, z forward), which their header is to name'
+            for topic, one in used.items()
+            if one.T_camera_sensor[2, 2] > LOOKS_UP
+        ]
+        if others:
+            notes.append(
+                f'images of {", ".join(others)} are left out: expected a CameraInfo of their '
+                f'frame, or beside them, and a transform to the clouds that stands still, got '
+                f'none; record both'
+            )
+        elif not used:
+            notes.append(
+                'no image is written: expected a topic of images with a CameraInfo, got none'
+            )
+        return notes
 
 
 def cameras_of(recording: Recording | None) -> LabelCameras:
@@ -149,17 +188,20 @@ def cameras_of(recording: Recording | None) -> LabelCameras:
     return LabelCameras(recording)
 
 
-def as_png(image: Image) -> bytes:
-    """Return the content of an image as PNG, for formats that take no other."""
+def as_png(topic: str, image: Image) -> Image:
+    """Return an image as PNG, for formats that take no other."""
     if image.media_type == 'image/png':
-        return image.content
+        return image
     try:
         from PIL import Image as Picture
     except ImportError as error:
         raise ConfigError(f'images as PNG need Pillow: pip install pillow ({error})') from None
     file = BytesIO()
-    Picture.open(BytesIO(image.content)).save(file, 'PNG')
-    return file.getvalue()
+    try:
+        Picture.open(BytesIO(image.content)).save(file, 'PNG')
+    except OSError as error:
+        raise UnsupportedMessage(f'{topic}: expected a whole image, got: {error}') from None
+    return image._replace(media_type='image/png', content=file.getvalue())
 
 
 def black_png(width: int, height: int) -> bytes:

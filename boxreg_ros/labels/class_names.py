@@ -10,7 +10,7 @@ words stays as it is: an evaluation does not count it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,10 @@ VOCABULARIES = {
 }  # fmt: skip
 """By format."""
 TRANSLATIONS = (
+    (('rack',), 'static_object.bicycle_rack', '', 'Misc'),
+    (('sign', 'signs'), '', 'SIGN', 'Misc'),
+    (('depiction',), '', '', 'Misc'),
+    (('barrel', 'barrels'), '', 'CONSTRUCTION_BARREL', 'Misc'),
     (('motorcyclist',), 'vehicle.motorcycle', 'MOTORCYCLIST', 'Misc'),
     (('motorcycle', 'motorbike'), 'vehicle.motorcycle', 'MOTORCYCLE', 'Misc'),
     (('cyclist', 'bicyclist', 'rider'), 'vehicle.bicycle', 'BICYCLIST', 'Cyclist'),
@@ -55,12 +59,12 @@ TRANSLATIONS = (
     (('wheelchair',), 'human.pedestrian.wheelchair', 'WHEELCHAIR', 'Misc'),
     (('child',), 'human.pedestrian.child', 'PEDESTRIAN', 'Pedestrian'),
     (
-        ('pedestrian', 'person', 'adult', 'human'),
+        ('pedestrian', 'person', 'adult', 'human', 'signaler', 'worker', 'officer'),
         'human.pedestrian.adult', 'PEDESTRIAN', 'Pedestrian',
     ),
-    (('cone', 'trafficcone'), 'movable_object.trafficcone', 'CONSTRUCTION_CONE', 'Misc'),
-    (('barrier',), 'movable_object.barrier', '', 'Misc'),
-    (('animal', 'dog'), 'animal', 'ANIMAL', 'Misc'),
+    (('cone', 'cones', 'trafficcone'), 'movable_object.trafficcone', 'CONSTRUCTION_CONE', 'Misc'),
+    (('barrier', 'barriers'), 'movable_object.barrier', '', 'Misc'),
+    (('animal', 'animals', 'dog'), 'animal', 'ANIMAL', 'Misc'),
     (('articulated', 'bendy'), 'vehicle.bus.bendy', 'ARTICULATED_BUS', 'Misc'),
     (('bus',), 'vehicle.bus.rigid', 'BUS', 'Misc'),
     (('tram', 'railed', 'train'), '', 'RAILED_VEHICLE', 'Tram'),
@@ -160,14 +164,22 @@ def official(class_name: str, vocabulary: tuple[str, ...], default: str | None =
         return spelt[class_name.lower()]
     column = 1 + VOCABULARY_COLUMNS.index(vocabulary)
     words = words_of(class_name)
-    for row in TRANSLATIONS:
-        if row[column] and not words.isdisjoint(row[0]):
-            return str(row[column])
-    return class_name if default is None else default
+    names = (str(row[column]) for row in TRANSLATIONS if not words.isdisjoint(row[0]))
+    return next(names, '') or (class_name if default is None else default)
 
 
-def _stated(path: Path, form: str) -> dict[str, str]:
-    """Return the names that a file states for a format, by class name."""
+def check_sections(path: Path, forms: Sequence[str]) -> None:
+    """Raise ConfigError if a file states names for something else than one of some formats."""
+    for key, value in _content(path).items():
+        if isinstance(value, Mapping) and key not in forms:
+            raise ConfigError(
+                f'{path}: {key!r}: expected a format that uses it ({", ".join(forms)}), or a name '
+                f'for a class, got names for {key!r}; correct it'
+            )
+
+
+def _content(path: Path) -> Mapping[Any, Any]:
+    """Return the content of a file of class names."""
     try:
         content: Any = yaml.safe_load(path.read_text(encoding='utf-8'))
     except OSError as error:
@@ -176,8 +188,13 @@ def _stated(path: Path, form: str) -> dict[str, str]:
         raise ConfigError(f'{path}: not a map of class names: {error}') from None
     if not isinstance(content, Mapping):
         raise ConfigError(f'{path}: expected lines CLASS: NAME, got {content!r:.60}; correct it')
+    return content
+
+
+def _stated(path: Path, form: str) -> dict[str, str]:
+    """Return the names that a file states for a format, by class name."""
     found: dict[str, str] = {}
-    for key, value in content.items():
+    for key, value in _content(path).items():
         if not isinstance(value, Mapping):
             found[str(key)] = str(value)
         elif str(key) == form:

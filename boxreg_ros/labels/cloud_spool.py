@@ -5,13 +5,13 @@ from __future__ import annotations
 from bisect import bisect_left, insort
 from dataclasses import replace
 from pathlib import Path
+import pickle
 import shutil
 
 from boxreg_ros.config import Config
 from boxreg_ros.io.transforms import inverse, sweep_to_frame
 from boxreg_ros.labels.protocol import LabelFrame
 from boxreg_ros.structures import Floats, Sweep
-import numpy as np
 
 FOLDER = '.clouds'
 
@@ -28,20 +28,17 @@ class Spool:
     def __init__(self, folder: Path, config: Config) -> None:
         self._folder = folder / FOLDER
         self._max_offset_ns = round(config.reach * 1e9)
-        self._frames: dict[int, tuple[str, Floats]] = {}  # stamp -> frame id, T_fixed_sweep
         self._stamps: list[int] = []  # ascending
         self._folder.mkdir()
 
     def add(self, sweep: Sweep, T_fixed_sweep: Floats, intensities: Floats | None = None) -> None:
         """Store a sweep and the pose (4, 4) of its frame; a second one of its stamp is ignored."""
         stamp_ns = sweep.stamp_ns
-        if stamp_ns in self._frames:
+        if stamp_ns in self._stamps:
             return
         insort(self._stamps, stamp_ns)
-        self._frames[stamp_ns] = sweep.frame_id, T_fixed_sweep
-        columns = {'points': sweep.points, 'times': sweep.times, 'intensities': intensities}
-        known = {name: column for name, column in columns.items() if column is not None}
-        np.savez(self._file(stamp_ns), allow_pickle=False, **known)
+        own = Sweep(stamp_ns, sweep.frame_id, sweep.points, sweep.times)
+        self._file(stamp_ns).write_bytes(pickle.dumps((own, T_fixed_sweep, intensities), 5))
 
     def take(
         self, stamp_ns: int, frame_id: str, T_fixed_frame: Floats
@@ -58,11 +55,8 @@ class Spool:
         nearest = min(self._stamps, key=lambda stamp: abs(stamp - stamp_ns), default=None)
         if nearest is None or abs(nearest - stamp_ns) > self._max_offset_ns:
             return None, None
-        own_frame, T_fixed_sweep = self._frames[nearest]
-        with np.load(self._file(nearest)) as columns:
-            sweep = Sweep(nearest, own_frame, columns['points'], columns.get('times'))
-            intensities = columns.get('intensities')
-        if (nearest, own_frame) != (stamp_ns, frame_id):
+        sweep, T_fixed_sweep, intensities = pickle.loads(self._file(nearest).read_bytes())
+        if (nearest, sweep.frame_id) != (stamp_ns, frame_id):
             T_frame_sweep = inverse(T_fixed_frame) @ T_fixed_sweep
             sweep = sweep_to_frame(sweep, T_frame_sweep, frame_id).in_frame()
         return sweep, intensities
@@ -85,8 +79,7 @@ class Spool:
         first = bisect_left(self._stamps, stamp_ns - self._max_offset_ns)
         for stamp_ns in self._stamps[:first]:
             self._file(stamp_ns).unlink()
-            del self._frames[stamp_ns]
         del self._stamps[:first]
 
     def _file(self, stamp_ns: int) -> Path:
-        return self._folder / f'{stamp_ns}.npz'
+        return self._folder / str(stamp_ns)

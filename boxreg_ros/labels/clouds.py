@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from boxreg_ros.errors import ConfigError, UnsupportedMessage
+from boxreg_ros.errors import ConfigError, one_line, UnsupportedMessage
 import numpy as np
 from numpy.typing import NDArray
 
@@ -124,9 +124,9 @@ def read_pcd(path: Path) -> NDArray[Any]:
             header = _read_pcd_header(file)
             table = _read_pcd_points(file, header)
         except (KeyError, TypeError, ValueError) as error:
-            text = ' '.join(str(error).split())
             raise UnsupportedMessage(
-                f'{path}: expected a PCD file: {type(error).__name__} {text}; download it again'
+                f'{path}: expected a PCD file: {type(error).__name__} {one_line(error)}; download '
+                f'it again'
             ) from None
     names = [name for name in header.layout.names or () if not name.startswith('_')]
     return table[names]

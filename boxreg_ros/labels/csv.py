@@ -9,17 +9,26 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 import csv
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 from typing import IO
 
-from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.box_table import BoxTable, cell, COLUMNS, csv_row, protected, unprotected
-from boxreg_ros.io.covariance_table import COVARIANCES, CovarianceWriter
-from boxreg_ros.io.velocity_table import VELOCITIES, VelocityWriter
+from boxreg_ros.io.box_table import (
+    box_of,
+    BoxTable,
+    cell,
+    COLUMNS,
+    csv_row,
+    parsed_rows,
+    protected,
+    unprotected,
+)
+from boxreg_ros.io.covariance_table import COVARIANCE_COLUMNS, covariance_lines, COVARIANCES
+from boxreg_ros.io.velocity_table import VELOCITIES, VELOCITY_COLUMNS, velocity_lines
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import numbers_of, ReadBox, refined_of
 from boxreg_ros.structures import BoxArray, Floats, PROPOSED
@@ -56,20 +65,27 @@ class Writer:
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         self.dropped: Counter[str] = Counter()
-        self._path = folder / 'boxes.csv'
-        self._file = self._path.open('w', newline='', encoding='utf-8')
-        self._file.write(','.join(COLUMNS) + '\n')
-        self._covariances = CovarianceWriter(folder / COVARIANCES)
+        self._folder = folder
+        self._files = ExitStack()
+        self._boxes = self._begun('boxes.csv', COLUMNS)
+        self._covariances = self._begun(COVARIANCES, COVARIANCE_COLUMNS)
+        self._velocities = self._begun(VELOCITIES, VELOCITY_COLUMNS)
         self._attributes: IO[str] | None = None
-        self._velocities = VelocityWriter(folder / VELOCITIES)
         self._newest_ns: int | None = None
         self._is_sorted = True
+
+    def _begun(self, name: str, columns: Sequence[str]) -> IO[str]:
+        """Open a table and write its header."""
+        path = self._folder / name
+        file = self._files.enter_context(path.open('w', newline='', encoding='utf-8'))
+        file.write(csv_row(columns))
+        return file
 
     def write(self, frame: LabelFrame) -> None:
         """Add one row per box."""
         refined = frame.refined
-        self._covariances.write(refined, frame.T_fixed_sensor)
-        self._velocities.write(refined)
+        self._covariances.writelines(covariance_lines(refined, frame.T_fixed_sensor))
+        self._velocities.writelines(velocity_lines(refined.boxes))
         boxes = refined.boxes
         stamp_ns = boxes.stamp_ns
         if self._newest_ns is not None and stamp_ns < self._newest_ns:
@@ -82,34 +98,29 @@ class Writer:
             f'{begin},{cell(track_id)},{cell(class_name)},{texts},{cell(status)},{num_points}\n'
             for track_id, class_name, texts, status, num_points in rows
         ]
-        self._file.write(''.join(lines))
+        self._boxes.writelines(lines)
         self._write_attributes(boxes)
 
     def _write_attributes(self, boxes: BoxArray) -> None:
         if not any(boxes.attributes):
             return
         if self._attributes is None:
-            path = self._path.with_name(ATTRIBUTES)
-            self._attributes = path.open('w', newline='', encoding='utf-8')
-            self._attributes.write(csv_row(ATTRIBUTE_COLUMNS))
+            self._attributes = self._begun(ATTRIBUTES, ATTRIBUTE_COLUMNS)
         for track_id, attributes in zip(boxes.track_ids, boxes.attributes, strict=True):
             for name, value in attributes.items():
                 words = map(protected, (track_id, name, value))
                 self._attributes.write(csv_row((str(boxes.stamp_ns), *words)))
 
     def close(self) -> None:
-        """Close the file; sort it if boxes arrived late."""
-        self._file.close()
-        self._covariances.close()
-        if self._attributes is not None:
-            self._attributes.close()
-        self._velocities.close()
+        """Close the files; sort that of the boxes if some arrived late."""
+        self._files.close()
         if self._is_sorted:
             return
-        with self._path.open(newline='', encoding='utf-8') as file:
+        path = self._folder / 'boxes.csv'
+        with path.open(newline='', encoding='utf-8') as file:
             header, *rows = csv.reader(file)
         rows.sort(key=lambda row: int(row[0]))
-        with self._path.open('w', newline='', encoding='utf-8') as file:
+        with path.open('w', newline='', encoding='utf-8') as file:
             file.writelines(map(csv_row, [header, *rows]))
 
 
@@ -166,17 +177,12 @@ def read(path: Path) -> Iterator[LabelFrame]:
 def _read_attributes(path: Path) -> dict[tuple[int, str], dict[str, str]]:
     """Return the attributes of each box by stamp and track id; empty without the file."""
     found: dict[tuple[int, str], dict[str, str]] = {}
-    if not path.exists():
-        return found
-    try:
-        with path.open(newline='', encoding='utf-8-sig') as file:
-            for row in csv.DictReader(file):
-                key = int(row['stamp_ns']), unprotected(row['track_id'])
-                name, value = unprotected(row['name']), unprotected(row['value'])
-                found.setdefault(key, {})[name] = value
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
-        raise RecordingError(
-            f'{path}: expected the columns {", ".join(ATTRIBUTE_COLUMNS)}, got {error}; correct '
-            f'the file, or delete it'
-        ) from None
+    if path.exists():
+        for box, name, value in parsed_rows(path, _attribute):
+            found.setdefault(box, {})[name] = value
     return found
+
+
+def _attribute(row: dict[str, str]) -> tuple[tuple[int, str], str, str]:
+    """Return box, name and value of a row."""
+    return box_of(row), unprotected(row['name']), unprotected(row['value'])

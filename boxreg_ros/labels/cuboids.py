@@ -180,7 +180,7 @@ def read_frames(
 
     """
     sidecar = read_sidecar(folder, len(names), names=names)
-    names_in_order = _in_order(folder, names, sidecar.stamps_ns, numbers or {})
+    names_in_order = in_order(folder, names, sidecar.stamps_ns, numbers or {})
     for index in np.argsort(sidecar.stamps_ns, kind='stable').tolist():
         name = names_in_order.get(index)
         boxes, left_out = NO_FRAME_BOXES if name is None else cuboids_by_name(name)
@@ -189,10 +189,10 @@ def read_frames(
         yield frame.moved('fixed')
 
 
-def _in_order(
+def in_order(
     folder: Path, names: Sequence[str], stamps_ns: Sequence[int], numbers: Mapping[str, int]
 ) -> dict[int, str]:
-    """Return the name of the frame of each stamp, by the index of the stamp."""
+    """Return the frame of each stamp by its index; other parameters are as of `read_frames`."""
     if len(names) == len(stamps_ns):
         used: Counter[int] = Counter()
         by_stamp = [frame_name(stamp_ns, used) for stamp_ns in stamps_ns]
@@ -205,6 +205,6 @@ def _in_order(
     if not set(names) <= index_of.keys() or max(index_of.values(), default=0) >= len(stamps_ns):
         raise RecordingError(
             f'{folder / STAMPS_FILE}: expected one stamp for each of {len(names)} frames, got '
-            f'{len(stamps_ns)}; leave out the lines of frames without labels'
+            f'{len(stamps_ns)}; leave out the lines of frames without files'
         )
     return {index_of[name]: name for name in names}

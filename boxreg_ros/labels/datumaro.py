@@ -25,9 +25,10 @@ from boxreg_ros.labels.attributes import (
 )
 from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.cuboids import EVIDENCE_KEY
-from boxreg_ros.labels.files import at, following, from_json, JsonList, require_single
+from boxreg_ros.labels.files import at, following, from_json, JsonList, require_single, visible
 from boxreg_ros.labels.protocol import absolute, LabelFrame
 from boxreg_ros.labels.records import ReadBox, TrackNumbers
+from boxreg_ros.labels.sidecar import named_frames
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import INTERPOLATED
 
@@ -175,7 +176,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     """
     file = path
     if path.is_dir():
-        files = sorted((path / ANNOTATIONS_FILE).parent.glob('*.json'))
+        files = visible((path / ANNOTATIONS_FILE).parent, '*.json')
         file = require_single(files, path, f'file of annotations, such as {ANNOTATIONS_FILE}')
     folder = absolute(file).parent.parent
     content = from_json(file)
@@ -190,7 +191,9 @@ def read(path: Path) -> Iterator[LabelFrame]:
             with at(f'item {name!r}'):
                 items[name] = _cuboids(item.get('annotations') or (), labels, is_swapped)
                 numbers[name] = _order(item)[0]
-    yield from cuboids.read_frames(folder, list(items), items.__getitem__, numbers)
+    is_counted = len({*numbers.values()}) == len(items)
+    names = list(items) if is_counted else named_frames(folder, items)
+    yield from cuboids.read_frames(folder, names, items.__getitem__, numbers)
 
 
 def _order(item: dict[str, Any]) -> tuple[int, str]:

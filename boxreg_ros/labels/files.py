@@ -8,13 +8,28 @@ import json
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from boxreg_ros.errors import RecordingError, unreadable
+from boxreg_ros.errors import one_line, RecordingError, unreadable
 import orjson
 
 PROVENANCE_FILE = 'boxreg.json'
 CONTENT_ERRORS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 """Errors of reading content that does not follow a format."""
 JSON_OPTIONS = orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY
+
+
+def visible(folder: Path, pattern: str) -> list[Path]:
+    """
+    Return the sorted paths of a pattern in a folder, without hidden ones.
+
+    Other systems leave files such as ``._NAME.txt`` beside those that they copy or pack.
+
+    """
+    paths = sorted(folder.glob(pattern))
+    return [
+        path
+        for path in paths
+        if not any(part.startswith('.') for part in path.relative_to(folder).parts)
+    ]
 
 
 def require_single(found: Sequence[Path], path: Path, what: str) -> Path:
@@ -82,8 +97,7 @@ def _streamed(path: Path, parse: Callable[[BinaryIO], Iterator[Any]]) -> Iterato
     except OSError as error:
         raise RecordingError(unreadable(path, error)) from None
     except ijson.JSONError as error:
-        text = ' '.join(str(error).split())
-        raise RecordingError(f'{path}: not JSON: {text}; write it again') from None
+        raise RecordingError(f'{path}: not JSON: {one_line(error)}; write it again') from None
 
 
 class JsonList:

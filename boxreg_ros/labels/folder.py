@@ -11,13 +11,7 @@ from typing import Any, ClassVar, TextIO
 
 from boxreg_ros.io.images import Image
 from boxreg_ros.labels.arrow import Table
-from boxreg_ros.labels.cameras import (
-    as_png,
-    cameras_of,
-    LabelCamera,
-    LabelCameras,
-    SUFFIXES_OF_IMAGES,
-)
+from boxreg_ros.labels.cameras import cameras_of, LabelCamera, LabelCameras, SUFFIXES_OF_IMAGES
 from boxreg_ros.labels.class_names import ClassNames
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import write_provenance
@@ -96,7 +90,8 @@ class FolderWriter:
     def notes(self) -> list[str]:
         """Return what was assumed, and what programs that read the files leave out."""
         assumed = self.kitti_camera.notes if self.has_kitti_camera else []
-        return assumed + self.class_names.notes()
+        images = self.cameras.notes if self.cameras is not None else []
+        return assumed + images + self.class_names.notes()
 
     def write(self, frame: LabelFrame) -> None:
         """Add a frame."""
@@ -131,7 +126,8 @@ class FolderWriter:
             for camera in used:
                 self.add_camera(camera)
         images = []
-        for camera, image in cameras.images(used, stamp_ns):
+        needs_png = self.image_file.endswith('.png')
+        for camera, image in cameras.images(used, stamp_ns, needs_png):
             path = self.image_file.format(
                 camera=camera.name,
                 channel=f'CAM_{camera.name.upper()}',
@@ -141,8 +137,7 @@ class FolderWriter:
                 suffix=SUFFIXES_OF_IMAGES[image.media_type],
             )
             (self.folder / path).parent.mkdir(parents=True, exist_ok=True)
-            content = as_png(image) if path.endswith('.png') else image.content
-            (self.folder / path).write_bytes(content)
+            (self.folder / path).write_bytes(image.content)
             images.append((camera, image, path))
         self.add_images(images)
         self.about['images'] = dict(cameras.counts)

@@ -17,7 +17,7 @@ from pathlib import Path
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.attributes import FALSE, is_set, OCCLUDED, PARTLY, TRUE, TRUNCATED
 from boxreg_ros.labels.camera import Camera
-from boxreg_ros.labels.files import at, following, read_provenance, require_single
+from boxreg_ros.labels.files import at, following, read_provenance, require_single, visible
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import (
     absolute,
@@ -203,11 +203,11 @@ def read(path: Path) -> Iterator[LabelFrame]:
     Yield the frames of a label file, or of the only sequence of a folder.
 
     ``calib/NAME.txt`` is beside ``label_02/NAME.txt``; the files of `sidecar` are in the folder
-    that contains both. Regions of the class DontCare are counted.
+    that contains both. Regions of the class DontCare without extents are counted.
 
     """
     if path.is_dir():
-        found = sorted((path / 'label_02').glob('*.txt'))
+        found = visible(path, 'label_02/*.txt')
         path = require_single(found, path, 'sequence, label_02/NAME.txt')
     folder = absolute(path).parent.parent
     lines, left_out = _read_lines(path)
@@ -239,7 +239,7 @@ def _file_of_sequence(folder: Path, name: str) -> Path:
     for path in (folder / f'{name}.txt', folder / 'label_02' / f'{name}.txt'):
         if path.is_file():
             return path
-    there = ', '.join(sorted(path.name for path in folder.glob('*.txt'))) or 'none'
+    there = ', '.join(path.name for path in visible(folder, '*.txt')) or 'none'
     raise RecordingError(
         f'{folder}: expected {name}.txt or label_02/{name}.txt, got {there}; name the file'
     )
@@ -264,10 +264,10 @@ def _read_lines(path: Path) -> tuple[Lines, dict[int, Counter[str]]]:
                         f'got {len(words)} columns{OTHER_COLUMNS.get(len(words), "")}'
                     )
                 frame = int(words[0])
-                if words[2] == IGNORED_CLASS:
+                numbers = [float(word) for word in words[10:17]]
+                if words[2] == IGNORED_CLASS and numbers[0] <= 0:
                     left_out.setdefault(frame, Counter())[Reason.NO_BOX] += 1
                     continue
-                numbers = [float(word) for word in words[10:17]]
                 score = float(words[17]) if len(words) > 17 else np.nan
                 evidence = {'score': score, 'attributes': attributes_of(*words[3:5])}
                 box = ReadBox(words[1], words[2], numbers, evidence)

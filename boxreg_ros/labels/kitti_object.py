@@ -19,6 +19,7 @@ from boxreg_ros.labels import kitti
 from boxreg_ros.labels.attributes import TRUNCATED
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.cameras import black_png
+from boxreg_ros.labels.files import visible
 from boxreg_ros.labels.kitti import (
     attributes_of,
     boxes_of,
@@ -94,7 +95,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     Yield the frames of a split, or of a folder of results.
 
     Their stamps [ns] are those of ``timestamps.txt``, one per frame, or the names of the files.
-    Regions of the class DontCare are counted.
+    Regions of the class DontCare without extents are counted.
 
     Parameters
     ----------
@@ -118,8 +119,8 @@ def read(path: Path) -> Iterator[LabelFrame]:
     labels = next((part for part in parts if part.is_dir()), path)
     calibrations = _calibrations(labels)
     folder = calibrations.parent
-    names = {file.stem for file in labels.glob('*.txt')}
-    names |= {file.stem for file in folder.glob('velodyne/*.bin')}
+    names = {file.stem for file in visible(labels, '*.txt')}
+    names |= {file.stem for file in visible(folder, 'velodyne/*.bin')}
     cameras: dict[bytes, Camera] = {}
 
     def boxes_by_name(name: str, words: list[list[str]]) -> list[ReadBox | None]:
@@ -128,7 +129,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         found: list[ReadBox | None] = []
         for line, box in zip(words, boxes, strict=True):
             score = float(line[15]) if len(line) > 15 else None
-            is_region = line[0] == IGNORED_CLASS
+            is_region = line[0] == IGNORED_CLASS and float(line[8]) <= 0
             evidence = {'score': score, 'attributes': attributes_of(*line[1:3])}
             found.append(None if is_region else ReadBox('', line[0], box, evidence))
         return found

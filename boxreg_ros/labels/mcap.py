@@ -22,12 +22,11 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.definitions import known_store
 from boxreg_ros.io.markers import MarkerBoard
-from boxreg_ros.io.session import covariances_to_write
-from boxreg_ros.io.transforms import boxes_to_frame, inverse
+from boxreg_ros.io.session import covariances_to_write, refined_to_frame
+from boxreg_ros.io.transforms import inverse
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.recording_copy import RawMessage, RecordingCopy
 from boxreg_ros.structures import ADDED, BoxArray, RefinedBoxes
-from msg_adapters.poses import turned_covariances
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys.store import Typestore
@@ -131,12 +130,8 @@ class Writer:
         if not waiting:
             del self._waiting[given.stamp_ns]
         T = frame.T_fixed_given
-        if refined.boxes.frame_id != given.frame_id and T is not None:
-            refined = replace(
-                refined,
-                boxes=boxes_to_frame(refined.boxes, inverse(T), given.frame_id),
-                covariances=turned_covariances(refined.covariances, inverse(T)),
-            )
+        if T is not None:
+            refined = refined_to_frame(refined, inverse(T), given.frame_id)
         covariances = covariances_to_write(refined)
         data = self._recording.with_boxes(raw.connection, message, refined.boxes, covariances)
         markers = self._markers.encode(copied, given, refined)

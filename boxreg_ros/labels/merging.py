@@ -25,7 +25,8 @@ class LabelMerger:
 
     Boxes whose labels have poses in the sensor frame are taken in the frame of the clouds and move
     with the recording; the others are taken in the frame that the labels name. Boxes of the status
-    ``human`` are pinned. The stamps of `frames` ascend. Where only a part of the recording, from
+    ``human`` are pinned. The stamps of `frames` ascend; with `keyframes` boxes that no person made
+    are left out. Where only a part of the recording, from
     `start_ns` on, is read, boxes before and after it are left out, and `outside` counts them;
     `left_out` counts those that the frames lack, by reason; `notes` has what their reader assumed.
 
@@ -40,12 +41,14 @@ class LabelMerger:
         sensor_frame: str,
         start_ns: int,
         is_part: bool,
+        keyframes: bool,
     ) -> None:
         self.outside = 0
         self.left_out: Counter[str] = Counter()
         self.notes: list[str] = []
-        self._frames = frames
-        self._next = next(frames, None)
+        labels = (frame.labels() for frame in frames)
+        self._frames = keyframes_of(labels) if keyframes else labels
+        self._next = next(self._frames, None)
         self._tree = tree
         self._sensor_frame = sensor_frame
         self._received_ns = start_ns

@@ -352,13 +352,17 @@ def read(path: Path) -> Iterator[LabelFrame]:
     unless the annotations have the column ``stamp_ns``.
 
     """
-    path = absolute(path)
-    found = [path]
-    if not (path / 'sample.json').exists():
-        found = sorted(file.parent for file in path.glob('*/sample.json'))
-    tables = files.require_single(found, path, 'folder with the tables of nuScenes')
+    tables = _tables_in(absolute(path))
     with files.following(tables, 'the tables of nuScenes'):
         yield from _read_tables(tables)
+
+
+def _tables_in(path: Path) -> Path:
+    """Return the folder of the tables, which is `path` or in it."""
+    found = [path]
+    if not (path / 'sample.json').exists():
+        found = [file.parent for file in files.visible(path, '*/sample.json')]
+    return files.require_single(found, path, 'folder with the tables of nuScenes')
 
 
 def _read_tables(tables: Path) -> Iterator[LabelFrame]:
@@ -377,13 +381,13 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """
     Yield the samples of one scene; memory does not grow with the other scenes.
 
-    `path` is the folder of the tables, or results of the detection or the tracking task as they
-    are submitted: ``{"meta": ..., "results": {sample_token: [...]}}``.
+    `path` is the folder of the tables, or that which contains it, or results of the detection or
+    the tracking task as they are submitted: ``{"meta": ..., "results": {sample_token: [...]}}``.
 
     """
     with files.following(path, 'the tables or results of nuScenes'):
         if path.is_dir():
-            boxes = _annotations(path, files.json_items, scene.stamps_ns)
+            boxes = _annotations(_tables_in(path), files.json_items, scene.stamps_ns)
         else:
             boxes = _results(path, scene)
         for token, stamp_ns in scene.stamps_ns.items():
@@ -490,22 +494,24 @@ def _boxes_of(items: list[dict[str, Any]]) -> Floats:
 
 
 def _poses(tables: Path) -> dict[str, Floats]:
-    """Return the global pose (4, 4) of the LiDAR by sample."""
+    """Return the global pose (4, 4) of the LiDAR by sample; none where there are several."""
     sensors = files.from_json(tables / 'sensor.json')
     lidars = {sensor['token'] for sensor in sensors if sensor['modality'] == 'lidar'}
-    T_ego_lidar = {
-        item['token']: pose_matrix(item)
+    mounts = {
+        item['token']: (item['sensor_token'], pose_matrix(item))
         for item in files.from_json(tables / 'calibrated_sensor.json')
         if item['sensor_token'] in lidars
     }
     ego_poses = {item['token']: item for item in files.from_json(tables / 'ego_pose.json')}
     poses = {}
+    used = set()
     for item in files.from_json(tables / 'sample_data.json'):
-        calibration = item['calibrated_sensor_token']
-        if item['is_key_frame'] and calibration in T_ego_lidar:
+        if item['is_key_frame'] and item['calibrated_sensor_token'] in mounts:
+            sensor, T_ego_lidar = mounts[item['calibrated_sensor_token']]
+            used.add(sensor)
             T_global_ego = pose_matrix(_row_of(ego_poses, item['ego_pose_token'], 'ego_pose'))
-            poses[item['sample_token']] = T_global_ego @ T_ego_lidar[calibration]
-    return poses
+            poses[item['sample_token']] = T_global_ego @ T_ego_lidar
+    return poses if len(used) == 1 else {}
 
 
 def pose_matrix(item: dict[str, Any]) -> Floats:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.cuboids import UNKNOWN_CLASS
+from boxreg_ros.labels.files import visible
 from boxreg_ros.labels.per_frame import EVIDENCE_FOLDER, numbers_of, PerFrameWriter, read_lines
 from boxreg_ros.labels.protocol import Format, LabelFrame
 from boxreg_ros.labels.records import ReadBox, require_radians
@@ -94,9 +95,9 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
     """
     labels = path / 'labels' if (path / 'labels').is_dir() else path
-    names = {file.stem for file in labels.glob('*.txt') if file.name != 'timestamps.txt'}
+    names = {file.stem for file in visible(labels, '*.txt') if file.name != 'timestamps.txt'}
     names -= {'poses'} if labels == path else set()
-    names |= {file.stem for file in path.glob('points/*') if file.suffix in CLOUD_SUFFIXES}
+    names |= {file.stem for file in visible(path, 'points/*') if file.suffix in CLOUD_SUFFIXES}
     if not names and not (path / 'timestamps.txt').exists():
         raise RecordingError(
             f'{path}: expected labels/NAME.txt, got none; name the folder of them'

@@ -18,6 +18,7 @@ from boxreg_ros.labels.files import at, following, from_json, write_json
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import LabelFrame
 from boxreg_ros.labels.records import evidence_of, ReadBox
+from boxreg_ros.labels.sidecar import named_frames
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, Ints
 
@@ -127,7 +128,7 @@ def read_lines(
         left_out = Counter({Reason.NO_BOX.value: len(lines) - len(boxes)})
         return boxes, +left_out
 
-    yield from read_frames(folder, sorted(names), boxes_by_name)
+    yield from read_frames(folder, named_frames(folder, names), boxes_by_name)
 
 
 def numbers_of(words: Sequence[Sequence[str]], columns: slice, counts: Sequence[int]) -> list[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import count
+from math import isfinite
 from typing import Any, NamedTuple
 
 from boxreg_ros.io.covariance_table import symmetric
@@ -130,7 +131,7 @@ def evidence_of(refined: RefinedBoxes, row: int) -> dict[str, Any]:
 
 def finite_or_none(value: float) -> float | None:
     """Return `value` as a float, or None if it is not finite."""
-    return float(value) if np.isfinite(value) else None
+    return float(value) if isfinite(value) else None
 
 
 class TrackNumbers:

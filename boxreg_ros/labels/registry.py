@@ -12,7 +12,7 @@ from typing import Any, cast
 
 from boxreg_ros.errors import ConfigError, RecordingError, require_packages
 from boxreg_ros.labels.camera import Camera
-from boxreg_ros.labels.class_names import ClassNames
+from boxreg_ros.labels.class_names import check_sections, ClassNames
 from boxreg_ros.labels.protocol import (
     FormatModule,
     LabelFrame,
@@ -85,11 +85,13 @@ def check_options(names: Sequence[str], options: Options) -> None:
     used = {option for name in names for option in module_of(name).FORMAT.options}
     for option in COMMAND_LINE_OPTIONS:
         if getattr(options, option) and option not in used:
-            able = [name for name in FORMATS if option in import_format(name).FORMAT.options]
+            able = _formats_with(option)
             raise ConfigError(
                 f'--{option.replace("_", "-")}: expected a format that uses it '
                 f'({", ".join(able)}), got {", ".join(names)}; add one, or leave it out'
             )
+    if options.class_map is not None:
+        check_sections(options.class_map, _formats_with('class_map'))
     for name in names:
         if 'class_map' in module_of(name).FORMAT.options:
             ClassNames(name, options.class_map)  # raises for other names
@@ -98,6 +100,11 @@ def check_options(names: Sequence[str], options: Options) -> None:
         is_file = camera is not None and (camera.is_file() or not str(camera).startswith('/'))
         if is_file and 'camera' in module_of(name).FORMAT.options:
             Camera.read(camera, f'format {name}')
+
+
+def _formats_with(option: str) -> list[str]:
+    """Return the names of the formats that use an option."""
+    return [name for name in FORMATS if option in import_format(name).FORMAT.options]
 
 
 def writer_for(

@@ -37,6 +37,7 @@ SEQUENCE_FOLDER = 'sequences/00'
 UNLABELED, OTHER_OBJECT = 0, 99
 CLASSES = (
     # Words of class names; class of objects that never move, and of those that do.
+    (('rack', 'sign', 'signs', 'depiction', 'cone', 'barrier', 'barriers', 'barrel'), 99, 99),
     (('motorcyclist',), 32, 255),
     (('cyclist', 'bicyclist', 'rider'), 31, 253),
     (('motorcycle', 'motorbike'), 15, 255),

@@ -9,9 +9,10 @@ Three files: ``timestamps.txt`` with one stamp per frame [ns]; ``poses.txt`` wit
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+import re
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.files import following, frame_names
@@ -130,6 +131,27 @@ def whole_stamps(path: Path, count: int = 0, names: Sequence[str] = ()) -> list[
 
     """
     return filled_stamps(read_stamps(path, names), count)
+
+
+def named_frames(folder: Path, names: Iterable[str]) -> list[str]:
+    """
+    Return the names of the frames of a folder in the order of the lines of ``timestamps.txt``.
+
+    Names are counted, as 2, 10, where the stamps ascend. Others were written as a program lists
+    the files: 10, 2.
+
+    """
+    counted = sorted(names, key=lambda name: (_by_number(name), name))
+    path = folder / STAMPS_FILE
+    stamps_ns = read_stamps(path) if path.exists() else []
+    known = [stamp_ns for stamp_ns in stamps_ns if stamp_ns is not None]
+    return counted if known == sorted(known) else sorted(counted)
+
+
+def _by_number(name: str) -> tuple[str | int, ...]:
+    """Return the parts of a name, whose digits are numbers; every second part has digits."""
+    parts = re.split('([0-9]+)', name)
+    return tuple(int(part) if index % 2 else part for index, part in enumerate(parts))
 
 
 def filled_stamps(stamps_ns: Sequence[int | None], count: int = 0) -> list[int]:

@@ -19,9 +19,10 @@ from typing import Any
 from boxreg_ros.io.images import Image
 from boxreg_ros.labels import cuboids
 from boxreg_ros.labels.cameras import LabelCamera
-from boxreg_ros.labels.files import at, following, from_json, to_json, write_json
+from boxreg_ros.labels.files import at, following, from_json, to_json, visible, write_json
 from boxreg_ros.labels.protocol import LabelFrame
 from boxreg_ros.labels.records import ReadBox, TrackNumbers
+from boxreg_ros.labels.sidecar import named_frames
 from boxreg_ros.labels.supervisely import (
     boxes_of,
     figure_of,
@@ -151,7 +152,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     dataset, folder = cuboids.single_part(path, 'data set', [ANNOTATION_FOLDER])
     boxes: dict[str, list[ReadBox]] = {}
     clouds_of: Counter[str] = Counter()  # of each object that states no track
-    for file in sorted((dataset / ANNOTATION_FOLDER).glob('*.json')):
+    for file in visible(dataset / ANNOTATION_FOLDER, '*.json'):
         content = from_json(file)
         with following(file, 'cuboids of Supervisely'), at('annotation'):
             objects = objects_by_key(content)
@@ -165,4 +166,5 @@ def read(path: Path) -> Iterator[LabelFrame]:
             ]
             for name, found in boxes.items()
         }
-    yield from cuboids.read_frames(folder, list(boxes), lambda name: (boxes[name], {}))
+    names = named_frames(folder, boxes)
+    yield from cuboids.read_frames(folder, names, lambda name: (boxes[name], {}))

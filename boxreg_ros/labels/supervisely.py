@@ -18,7 +18,15 @@ from boxreg_ros.io.images import Image
 from boxreg_ros.labels import cuboids
 from boxreg_ros.labels.attributes import attributes_from, TRUE
 from boxreg_ros.labels.cameras import LabelCamera
-from boxreg_ros.labels.files import at, following, from_json, JsonList, to_json, write_json
+from boxreg_ros.labels.files import (
+    at,
+    following,
+    from_json,
+    JsonList,
+    to_json,
+    visible,
+    write_json,
+)
 from boxreg_ros.labels.protocol import (
     AUTOMATIC_STATUS,
     INPUT_STATUS,
@@ -143,7 +151,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         If a file is missing or does not follow the format.
 
     """
-    episodes = [*path.glob(ANNOTATION_FILE), *path.glob(f'*/{ANNOTATION_FILE}')]
+    episodes = [*path.glob(ANNOTATION_FILE), *visible(path, f'*/{ANNOTATION_FILE}')]
     if not episodes and [*path.glob('ann/*.json'), *path.glob('*/ann/*.json')]:
         raise RecordingError(
             f'{path}: expected an episode with {ANNOTATION_FILE}, got a project of single clouds; '

@@ -16,13 +16,14 @@ from typing import Any
 from boxreg_ros.labels import cuboids
 from boxreg_ros.labels.attributes import is_set, PARTLY, TRUE
 from boxreg_ros.labels.cameras import LabelCamera
-from boxreg_ros.labels.files import at, following, from_json, write_json
+from boxreg_ros.labels.files import at, following, from_json, visible, write_json
 from boxreg_ros.labels.protocol import (
     AUTOMATIC_STATUS,
     INPUT_STATUS,
     LabelFrame,
 )
 from boxreg_ros.labels.records import ReadBox
+from boxreg_ros.labels.sidecar import named_frames
 from boxreg_ros.structures import INTERPOLATED
 
 FORMAT = replace(
@@ -96,7 +97,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         with following(file, 'boxes of SUSTechPOINTS'):
             return _cuboids(content), {}
 
-    names = sorted(file.stem for file in path.glob('label/*.json'))
+    names = named_frames(path, [file.stem for file in visible(path, 'label/*.json')])
     yield from cuboids.read_frames(path, names, boxes_of)
 
 

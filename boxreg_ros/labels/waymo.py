@@ -15,7 +15,7 @@ from pathlib import Path
 
 from boxreg_ros.config import Config, words_of
 from boxreg_ros.labels.arrow import read_rows, read_table
-from boxreg_ros.labels.files import frame_names, require_single, to_json
+from boxreg_ros.labels.files import frame_names, require_single, to_json, visible
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame
 from boxreg_ros.labels.records import EVIDENCE_COLUMNS, evidence_of, refined_boxes
@@ -127,7 +127,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
     """
     if path.is_dir():
-        found = sorted((path / 'lidar_box').glob('*.parquet'))
+        found = visible(path, 'lidar_box/*.parquet')
         path = require_single(found, path, 'segment, lidar_box/NAME.parquet')
     folder = absolute(path).parent.parent
     rows = read_table(path, REQUIRED, 'lidar_box of Waymo').to_pylist()
@@ -165,16 +165,8 @@ def _stamp_ns(row: dict[str, int]) -> int:
 
 @lru_cache
 def _type(class_name: str) -> int:
-    """Return the number of the type whose class names share a word with `class_name`, else 0."""
+    """Return the number of the type of objects with a class name; 0 if it is unknown."""
+    if not words_of(class_name).isdisjoint(('sign', 'signs')):
+        return TYPE_NAMES.index('sign')
     config = Config()
-    names_by_type = {
-        'vehicle': config.vehicle.names,
-        'cyclist': config.cyclist.names,
-        'pedestrian': config.pedestrian.names,
-        'sign': ('sign',),
-    }
-    words = words_of(class_name)
-    for name, class_names in names_by_type.items():
-        if words.intersection(class_names):
-            return TYPE_NAMES.index(name)
-    return 0
+    return TYPE_NAMES.index(config.kind(class_name)) if config.knows_class(class_name) else 0

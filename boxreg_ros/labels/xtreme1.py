@@ -19,13 +19,14 @@ from boxreg_ros.io.images import Image
 from boxreg_ros.labels import cuboids
 from boxreg_ros.labels.attributes import attributes_from
 from boxreg_ros.labels.cameras import LabelCamera
-from boxreg_ros.labels.files import at, following, from_json, write_json
+from boxreg_ros.labels.files import at, following, from_json, visible, write_json
 from boxreg_ros.labels.protocol import (
     AUTOMATIC_STATUS,
     INPUT_STATUS,
     LabelFrame,
 )
 from boxreg_ros.labels.records import ReadBox
+from boxreg_ros.labels.sidecar import named_frames
 from boxreg_ros.reasons import Reason
 
 FORMAT = replace(
@@ -114,9 +115,9 @@ def read(path: Path) -> Iterator[LabelFrame]:
     """
     path, part = _parts(path)
     scene, folder = cuboids.single_part(path, 'scene', [RESULT_FOLDER, LIDAR_FOLDER])
-    names = {file.stem for file in scene.glob(f'{LIDAR_FOLDER}/*.pcd')}
+    names = {file.stem for file in visible(scene, f'{LIDAR_FOLDER}/*.pcd')}
     results: dict[str, list[_Result]] = {}
-    for file in sorted(scene.glob(f'{RESULT_FOLDER}/*.json')):
+    for file in visible(scene, f'{RESULT_FOLDER}/*.json'):
         content = from_json(file)
         with following(file, 'objects of Xtreme1'):
             results[file.stem] = _results(content)
@@ -134,7 +135,8 @@ def read(path: Path) -> Iterator[LabelFrame]:
                 left_out[Reason.OTHER_SOURCE] += len(result.boxes)
         return boxes, +left_out
 
-    yield from cuboids.read_frames(folder, sorted(names | results.keys()), boxes_of)
+    frames = named_frames(folder, names | results.keys())
+    yield from cuboids.read_frames(folder, frames, boxes_of)
 
 
 def _object(cuboid: cuboids.Cuboid, frame_name: str) -> dict[str, Any]:

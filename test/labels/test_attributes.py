@@ -4,6 +4,7 @@ from dataclasses import replace
 import json
 import shutil
 
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, Options, Provenance, writer_for
 from boxreg_ros.labels.attributes import is_set, of_nuscenes, to_nuscenes
 from boxreg_ros.labels.kitti import attributes_of, occlusion_of, truncation_of
@@ -82,6 +83,13 @@ def test_a_file_without_attributes_has_no_table_of_them(tmp_path):
     writer.write(frames()[1])
     writer.close()
     assert not (tmp_path / 'attributes.csv').exists()
+
+
+def test_a_row_of_attributes_that_is_cut_is_named(tmp_path):
+    path = written('csv', tmp_path) / 'attributes.csv'
+    path.write_text(path.read_text().rpartition(',')[0])
+    with pytest.raises(RecordingError, match=r'attributes\.csv: expected the columns'):
+        list(frames_of('csv', tmp_path))
 
 
 def test_nuscenes_devkit_reads_attributes(tmp_path):

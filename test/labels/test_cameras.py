@@ -8,9 +8,10 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.labels import frames_of, Options, Provenance, writer_for
-from camera_drives import with_cameras
+from camera_drives import COMPRESSED, IMAGE, info, with_cameras
 from consumers import consumer
 import numpy as np
+from paths import BAGS
 import pytest
 from ros_messages import Drive
 
@@ -181,6 +182,61 @@ def test_without_a_camera_one_is_assumed_and_said(tmp_path, capsys):
     assert behind[4:8] == ['-1.000000'] * 4
     (found,) = frames_of('kitti_object', folder)
     np.testing.assert_allclose(found.refined.boxes.boxes, boxes, atol=1e-6)
+
+
+def test_images_that_cannot_be_read_are_left_out_and_said(tmp_path, capsys):
+    drive = with_cameras(Drive())
+    m = drive.messages
+    first = next(item[2] for item in drive.items if item[0] == '/front/image_raw/compressed')
+    first.data = first.data[:50]  # of a JPEG file: its size can be read
+    for stamp in drive.stamps:
+        drive.items.append(('/depth/camera_info', stamp, info(m, stamp, 'ahead')))
+        depth = m.build(IMAGE, header=m.header(stamp, 'ahead'), height=1, width=1,
+                        encoding='32FC1', step=4, data=np.zeros(4, np.uint8))  # fmt: skip
+        drive.items.append(('/depth/image_rect_raw', stamp, depth))
+        image = m.build(COMPRESSED, header=m.header(stamp, 'nowhere'), format='jpeg',
+                        data=first.data)  # fmt: skip
+        drive.items.append(('/lost/image_raw/compressed', stamp, image))
+    drive.items.sort(key=lambda item: item[1])
+    recording = drive.write(tmp_path / 'drive')
+    words = ['relabel', str(recording), '--with-images', *QUICK, '-o']
+    assert main([*words, str(tmp_path / 'a'), '--formats=sustechpoints']) == 0
+    printed = capsys.readouterr().err
+    assert f'{len(drive.stamps)} images are missing or cannot be read; first: /depth' in printed
+    assert 'images of /lost/image_raw/compressed are left out: expected a CameraInfo' in printed
+    images = json_of(tmp_path / 'a/sustechpoints/boxreg.json')['images']
+    assert images['/rear/image_rect'] == images['/depth/image_rect_raw missing'] == 8
+    camera = ['--formats=kitti_object', '--camera=/front/camera_info']
+    assert main([*words, str(tmp_path / 'b'), *camera]) == 0
+    assert '2 images are missing or cannot be read; first: /front' in capsys.readouterr().err
+    assert (
+        main(
+            [
+                'relabel',
+                *words[2:],
+                str(tmp_path / 'c'),
+                str(BAGS / 'street.mcap'),
+                '--formats=t4',
+                '--end=1',
+            ]
+        )
+        == 0
+    )
+    assert 'no image is written' in capsys.readouterr().err
+
+
+def test_a_camera_in_a_frame_that_is_not_optical_is_named(tmp_path, capsys):
+    drive = with_cameras(Drive())
+    for _, _, message in drive.items:
+        for transform in getattr(message, 'transforms', ()):
+            if transform.child_frame_id == 'ahead':
+                turn = transform.transform.rotation
+                turn.x, turn.y, turn.z, turn.w = 0.0, 0.0, 0.0, 1.0
+    words = ['relabel', str(drive.write(tmp_path / 'drive')), '-o', str(tmp_path / 'out')]
+    assert main([*words, '--formats=sustechpoints', '--with-images', *QUICK]) == 0
+    printed = capsys.readouterr().err
+    assert "the camera looks up: 'ahead' is no optical frame" in printed
+    assert '/rear' not in printed
 
 
 def test_images_need_a_recording(tmp_path):

@@ -326,15 +326,22 @@ OFFICIAL_CLASSES = {
         'Car': 'vehicle.car', 'truck': 'vehicle.truck', 'VEHICLE.CAR': 'vehicle.car',
         'Pedestrian': 'human.pedestrian.adult', 'REGULAR_VEHICLE': 'vehicle.car',
         'CONSTRUCTION_CONE': 'movable_object.trafficcone', 'ufo': 'ufo',
-        'Van': 'vehicle.bus.rigid',
+        'Van': 'vehicle.bus.rigid', 'Construction Signs': 'Construction Signs',
+        'vehicle.train': 'vehicle.train', 'bicycle_rack': 'static_object.bicycle_rack',
+        'Temporary Construction Barriers': 'movable_object.barrier',
+        'MOBILE_PEDESTRIAN_CROSSING_SIGN': 'MOBILE_PEDESTRIAN_CROSSING_SIGN',
+        'CONSTRUCTION_BARREL': 'CONSTRUCTION_BARREL',
+        'OFFICIAL_SIGNALER': 'human.pedestrian.adult',
     },
     'argoverse2': {
         'Car': 'REGULAR_VEHICLE', 'vehicle.bus.bendy': 'ARTICULATED_BUS', 'bicycle': 'BICYCLE',
+        'static_object.bicycle_rack': 'static_object.bicycle_rack', 'traffic_sign': 'SIGN',
         'rider': 'BICYCLIST', 'box_truck': 'BOX_TRUCK', 'ufo': 'ufo', 'Van': 'BUS',
     },
     'kitti': {
         'vehicle.car': 'Car', 'PEDESTRIAN': 'Pedestrian', 'vehicle.bus.rigid': 'Misc',
-        'two words': 'two_words', 'Van': 'Truck',
+        'two words': 'two_words', 'Van': 'Truck', 'bicycle_rack': 'Misc',
+        'human_depiction': 'Misc', 'DontCare': 'DontCare',
     },
 }  # fmt: skip
 
@@ -367,6 +374,14 @@ def test_class_names_are_those_of_the_evaluation_and_ours_are_read_back(tmp_path
     assert about['Van'] == classes['Van'] and 'ufo' not in about
 
 
+def test_boxes_of_the_class_of_regions_are_read_back(tmp_path):
+    """By KITTI object, as by KITTI tracking above: what has extents is no region."""
+    frame = frame_of(class_name='DontCare')
+    _, folder = written('kitti_object', tmp_path, [frame])
+    (found,) = frames_of('kitti_object', folder)
+    assert found.refined.boxes.class_names == ('DontCare',)
+
+
 @pytest.mark.parametrize('name', ['nuscenes', 'argoverse2', 'kitti', 'kitti_object', 'waymo'])
 def test_classes_that_an_evaluation_does_not_count_are_said(tmp_path, name):
     frame = frame_of([IN_FIXED] * 3, ['a', 'b', 'c'])
@@ -387,6 +402,7 @@ def test_classes_that_an_evaluation_does_not_count_are_said(tmp_path, name):
     ('text', 'message'),
     [
         ('car: BUSS', "'car': expected a class of the format 'argoverse2' .*, got 'BUSS'"),
+        ('kiti: {car: Van}', "'kiti': expected a format that uses it .*kitti_object"),
         ('[car]', 'expected lines CLASS: NAME'),
         ('car: [', 'not a map of class names'),
         (None, 'No such file'),
@@ -693,6 +709,50 @@ def test_labels_by_a_path_relative_to_the_working_folder(tmp_path, monkeypatch, 
     (frame,) = frames_of(name, path)
     assert (frame.fixed_frame, frame.sensor_frame) == ('odom', 'lidar')
     np.testing.assert_allclose(frame.T_fixed_sensor, T_FIXED_SENSOR, atol=1e-9)
+
+
+@pytest.mark.parametrize('name', READABLE_FORMATS)
+def test_hidden_files_beside_the_labels_are_no_labels(tmp_path, name):
+    """Archives that macOS has packed have a file ``._NAME`` beside each file."""
+    _, folder = written(name, tmp_path)
+    expected = [sorted_by_track(frame) for frame in frames_of(name, folder)]
+    for path in [path for path in folder.rglob('*') if path.name != folder.name]:
+        (path.parent / f'._{path.name}').write_bytes(bytes((0, 5, 22, 7)))
+    found = [sorted_by_track(frame) for frame in frames_of(name, folder)]
+    assert len(found) == len(expected) == 1
+    np.testing.assert_array_equal(found[0].refined.boxes.boxes, expected[0].refined.boxes.boxes)
+
+
+@pytest.mark.parametrize(
+    'name',
+    ['kitti_object', 'openpcdet', 'sustechpoints', 'datumaro', 'sly_pointcloud', 'xtreme1'],
+)
+@pytest.mark.parametrize('is_ascending', [True, False])
+def test_frames_that_are_counted_without_zeros_have_the_stamps_of_their_numbers(
+    tmp_path, name, is_ascending
+):
+    """In alphabetical order 10 comes before 2; a program that lists files has it so."""
+    stamps_ns = [STAMP + i * 100_000_000 for i in range(12)]
+    boxes = [[*IN_SENSOR[:2], 0.1 * i, *IN_SENSOR[3:6], 0.0, 0.0, 0.0] for i in range(12)]
+    frames = [
+        frame_of([box], stamp_ns=stamp_ns, frame_id='lidar')
+        for box, stamp_ns in zip(boxes, stamps_ns, strict=True)
+    ]
+    _, folder = written(name, tmp_path, frames)
+    for i, stamp_ns in enumerate(stamps_ns):
+        for path in sorted(folder.rglob(f'{stamp_ns}.*')):
+            path.rename(path.with_name(path.name.replace(str(stamp_ns), str(i))))
+        for path in folder.rglob('default.json'):
+            text = path.read_text().replace(f'"{stamp_ns}"', f'"{i}"')
+            path.write_text(text.replace(f'"frame":{i}}}', '"frame":0}'))
+    order = range(12) if is_ascending else sorted(range(12), key=str)
+    lines = (folder / 'poses.txt').read_text().splitlines(keepends=True)
+    (folder / 'poses.txt').write_text(''.join(lines[i] for i in order))
+    (folder / 'timestamps.txt').write_text(''.join(f'{stamps_ns[i]}\n' for i in order))
+    found = [frame.moved('sensor').refined.boxes for frame in frames_of(name, folder)]
+    assert [array.stamp_ns for array in found] == stamps_ns
+    heights = [array.boxes[0, 2] for array in found]
+    np.testing.assert_allclose(heights, [box[2] for box in boxes], atol=1e-6)
 
 
 def test_several_sequences_of_kitti_are_refused(tmp_path):

@@ -5,6 +5,7 @@ from importlib import import_module
 import json
 
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.box_table import number_cells
 from boxreg_ros.io.covariance_table import read_covariances
 from boxreg_ros.labels import FORMATS, LabelFrame, Provenance, writer_for
 from boxreg_ros.labels.files import to_json
@@ -69,6 +70,16 @@ def test_columns_and_golden_values(tmp_path):
     assert numbers == TILTED[:6]
     quaternion = [float(row[name]) for name in ('qx', 'qy', 'qz', 'qw')]
     np.testing.assert_allclose(quaternion, TILTED_XYZW, atol=1e-9)
+
+
+def test_cells_in_single_precision_are_short_and_exact():
+    numbers = np.array([[0.1, 1 / 3, -2e-9], [np.nan, 1e300, 0.0]])
+    first, second = number_cells(numbers)
+    assert first.startswith('0.1,0.33333334,')
+    read = [float(text) for text in first.split(',')]
+    np.testing.assert_array_equal(np.float32(read), np.float32(numbers[0]))
+    assert second == 'nan,nan,0.0'
+    assert number_cells(numbers[:0]) == []
 
 
 def test_names_of_any_characters_are_read_again(tmp_path):
