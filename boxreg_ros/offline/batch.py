@@ -10,7 +10,7 @@ one drive is relabelled after another.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import fields
 from itertools import chain
 from pathlib import Path
@@ -90,7 +90,21 @@ def run(args: argparse.Namespace) -> int:
     done = sum(result.is_done for result in results)
     skipped = sum(result.status == UP_TO_DATE for result in results)
     print(f'{args.out}: {done:,} of {len(jobs):,} drives done, {skipped:,} of them earlier')
+    others = _other_results(out, {job.name for job in jobs})
+    if others:
+        print(
+            f'{others:,} other results in this folder are not in index.csv, summary.json and '
+            f'report.html, which are of the drives of this call: give all to have them there'
+        )
     return 0 if done == len(jobs) else 1
+
+
+def _other_results(out: Path, names: Collection[str]) -> int:
+    """Return how many results of other calls are in a folder; 0 of a URL, which is not listed."""
+    folders = out.iterdir() if url_of(out) is None else ()
+    # `boxreg review` writes NAME.corrected beside a result.
+    others = (path for path in folders if path.name.partition('.corrected')[0] not in names)
+    return sum(earlier_summary(path) is not None for path in others)
 
 
 def _check(args: argparse.Namespace) -> None:

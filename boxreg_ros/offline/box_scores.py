@@ -56,7 +56,7 @@ class Matches:
     jitter: Floats
     turn_jitter: Floats  # of yaw [rad/s^2]; NaN without boxes within `MAX_STEP` on both sides
     true_jitter: Floats  # that of the true centre, as a reference
-    unmatched: int  # predictions without a true box
+    unmatched: Ints  # rows of predictions without a true box
     invalid: int  # true boxes out of scope because of NaN or an extent that is not positive
 
 
@@ -164,7 +164,7 @@ def match(
         jitter=_spread(jitter, is_matched, np.nan),
         turn_jitter=_spread(turn_jitter, is_matched, np.nan),
         true_jitter=_spread(true_jitter, is_matched, np.nan),
-        unmatched=len(predicted.boxes) - int((paired_rows >= 0).sum()),
+        unmatched=np.setdiff1d(np.arange(len(predicted.boxes)), paired_rows),
         invalid=int((~is_valid).sum()),
     )
 
@@ -177,7 +177,7 @@ def summarise(matches: Matches, mask: Mask | None = None) -> Scores:
     return Scores(
         boxes=int(chosen.sum()),
         missing=int(chosen.sum() - rows.sum()),
-        unmatched=matches.unmatched if mask is None else 0,
+        unmatched=len(matches.unmatched) if mask is None else 0,
         iou_bev=_mean(matches.iou_bev[rows]),
         iou_3d=_mean(matches.iou_3d[rows]),
         iou_bev_median=_median(matches.iou_bev[rows]),

@@ -13,7 +13,6 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.io.compilation import announced_compilation
 from boxreg_ros.io.warm_up import warm_up, warm_up_followed, warm_up_follower, warm_up_labels
-from msg_adapters import cdr
 
 COMPILED_ESTIMATES = ('final', 'track')
 """Those of the node and of `boxreg relabel`; an early estimate is part of the final one."""
@@ -52,5 +51,4 @@ def _compile() -> int:
         warm_up_follower(Config.from_dict({'estimate': 'track'}))
         warm_up_followed(Config())
         warm_up_labels(Config())
-        cdr.walker()
     return done.functions

@@ -1,4 +1,4 @@
-"""`boxreg convert`: label files of one format, or a recording of the node, written in others."""
+"""`boxreg convert`: label files, a recording of the node, or a scene, written in other formats."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from boxreg_ros.offline.arguments import add_options, values_of
 from boxreg_ros.offline.notes import left_out_line
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
-from boxreg_ros.offline.sources import label_frame_of, writer_options
+from boxreg_ros.offline.sources import label_frame_of, scene_address, writer_options
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, is_valid_box, REJECTED, Sweep
 
@@ -49,9 +49,10 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
     """
     _check(request)
     source_format, source = _labels(request)
+    is_of_node = source_format == FORMAT_OF_NODE and request.labels is not None
     provenance = replace(
         Provenance.of(request.recordings or (source,)),
-        config_hash=config_hash(source) if source_format == FORMAT_OF_NODE else '',
+        config_hash=config_hash(source) if is_of_node else '',
     )
     counts: Counter[str] = Counter()
     not_read: Counter[str] = Counter()
@@ -98,7 +99,9 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
 
 
 def _labels(request: Request) -> tuple[str, Path]:
-    """Return format and path of the labels to convert."""
+    """Return format and path of the labels to convert; annotations are those of a scene."""
+    if request.labels is None and scene_address(request.recordings) is not None:
+        return FORMAT_OF_NODE, request.recordings[0]
     if request.labels is None:
         raise ConfigError('labels: expected label files to convert, got none; name them')
     return request.labels
@@ -201,7 +204,10 @@ def _with_clouds(
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `run`."""
     parser.add_argument(
-        'source', type=Path, metavar='SOURCE', help='labels, or a recording of the node'
+        'source',
+        type=Path,
+        metavar='SOURCE',
+        help='labels, or a recording of the node, or a scene of a data set: its annotations',
     )
     parser.add_argument(
         '-o',
@@ -236,11 +242,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Convert, and print one line with the counts."""
     recordings = tuple(args.recording)
-    if args.source_format == FORMAT_OF_NODE and not recordings:
+    labels: tuple[str, Path] | None = (args.source_format, args.source)
+    if scene_address([args.source]) is not None:
+        if args.source_format != FORMAT_OF_NODE or recordings:
+            raise ConfigError(
+                f'{args.source}: expected --from {FORMAT_OF_NODE} alone for the annotations of a '
+                f'scene, got --from {args.source_format}; the scene has poses and clouds, too'
+            )
+        recordings, labels = (args.source,), None
+    elif args.source_format == FORMAT_OF_NODE and not recordings:
         recordings = (files_of(args.source),)
     request = Request(
         recordings,
-        labels=(args.source_format, args.source),
+        labels=labels,
         formats=args.target_formats,
         **values_of(args, Request),
     )

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from itertools import islice
 import time
 from typing import Any, cast
 
@@ -19,13 +18,13 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.observation import Observation, Observations
 from boxreg_ros.core.registrar import GetEstimates, Submit, submit_locally
-from boxreg_ros.core.tables import joined
 from boxreg_ros.core.window import Estimate, Window
 from boxreg_ros.io.compilation import announced_compilation
 from boxreg_ros.io.warm_up import warm_up, warm_up_crop
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.reader import uses_one_core
 from boxreg_ros.offline.workers import Receive, run_in_worker, Send, WorkerProcess
+import numpy as np
 
 
 @contextmanager
@@ -102,20 +101,19 @@ def _estimated(packed: Any, config: Config, model: InputModel) -> tuple[Any, ...
 
 
 def _packed(windows: Sequence[Window]) -> tuple[Any, ...]:
-    """Return windows with the number of their observations, and the table of all of these."""
-    tables, rows = joined([item for window in windows for item in window.observations])
-    heads = [
-        window._replace(observations=cast(Any, len(window.observations))) for window in windows
+    """Return windows with the rows of their observations, and the table of all of these."""
+    table, rows = Observations.gathered([one for window in windows for one in window.observations])
+    ends = np.cumsum([len(window.observations) for window in windows])[:-1]
+    parts = np.split(rows, ends)
+    return table, [
+        window._replace(observations=cast(Any, part))
+        for window, part in zip(windows, parts, strict=True)
     ]
-    return heads, Observations.concatenated(tables).take(rows)
 
 
-def _unpacked(heads: list[Any], table: Observations) -> list[Window]:
+def _unpacked(table: Observations, heads: list[Any]) -> list[Window]:
     """Return the windows that `_packed` was given."""
-    rows = iter(range(len(table.boxes)))
     return [
-        head._replace(
-            observations=[Observation(table, row) for row in islice(rows, head.observations)]
-        )
+        head._replace(observations=[Observation(table, row) for row in head.observations.tolist()])
         for head in heads
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from dataclasses import asdict, replace
 import json
 import math
@@ -13,7 +14,7 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import COVARIANCES, read_covariances
-from boxreg_ros.io.stamp_join import joined_stamps
+from boxreg_ros.io.stamp_join import between_stamps, joined_stamps
 from boxreg_ros.io.times import time_range
 from boxreg_ros.io.velocity_table import read_velocities, VELOCITIES
 from boxreg_ros.offline.arguments import add_options, request_from, TOPICS, words_of
@@ -30,12 +31,13 @@ from boxreg_ros.offline.consistency import consistency
 from boxreg_ros.offline.consistency import table as consistency_table
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import earlier_summary
-from boxreg_ros.offline.sources import true_boxes
+from boxreg_ros.offline.sources import in_labelled_view, true_boxes
 from boxreg_ros.offline.track_scores import has_trackeval, LEAST_IOU, track_scores, TrackScores
 from boxreg_ros.offline.velocity_scores import beside, velocity_scores, VelocityScores
 from boxreg_ros.offline.velocity_scores import table as velocity_table
-from boxreg_ros.structures import is_valid_box, REJECTED
+from boxreg_ros.structures import is_valid_box
 import numpy as np
+from numpy.typing import NDArray
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,6 +77,8 @@ def run(args: argparse.Namespace) -> int:
     truth = _joined(args, predicted, truth)
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes, by_overlap)
+    is_unknown = _between(predicted, truth) | _out_of_view(args, predicted, matches)
+    matches = replace(matches, unmatched=matches.unmatched[~is_unknown[matches.unmatched]])
     if matches.invalid:
         _warn(
             f'{matches.invalid} of {len(truth.boxes)} true boxes are left out: NaN, or an extent '
@@ -88,8 +92,10 @@ def run(args: argparse.Namespace) -> int:
         )
     if len(predicted.boxes) and not matches.is_matched.any():
         _warn(_why_none_matches(predicted, truth))
+    elif not classes:
+        _warn_of_other_classes(predicted, truth, matches)
     overall = summarise(matches)
-    tracks = track_scores(predicted, truth, matches.rows)
+    tracks = track_scores(predicted.rows(~is_unknown), truth, matches.rows)
     if not has_trackeval():
         _warn('HOTA and IDF1 need the package trackeval: pip install trackeval')
     folder = _result_folder(args.predicted)
@@ -175,8 +181,7 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
                 f'{" ".join(unused)}: expected with a recording only, got the table '
                 f'{str(source)!r}; leave them out'
             )
-        found = _table_in_frame(BoxTable.read_frames(source), frame_id)
-        return found.rows(np.array([status != REJECTED for status in found.status], bool))
+        return _table_in_frame(BoxTable.read_frames(source), frame_id).without_rejected()
     return _of_recording(args, source)
 
 
@@ -234,6 +239,19 @@ def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:
     )
 
 
+def _warn_of_other_classes(predicted: BoxTable, truth: BoxTable, matches: Matches) -> None:
+    """Say which predicted classes the truth may lack: it has neither their name nor a box."""
+    rows = matches.predicted_rows[matches.is_matched].tolist()
+    known = {*truth.class_names, *(predicted.class_names[row] for row in rows)}
+    others = Counter(name for name in predicted.class_names if name not in known)
+    if others:
+        names = ', '.join(f'{name} {count}' for name, count in sorted(others.items()))
+        _warn(
+            f'no predicted box of these classes has a true one: {names}; they count as ghosts: '
+            f'if the truth has no such objects because nobody labelled them, leave them out'
+        )
+
+
 def _joined(args: argparse.Namespace, predicted: BoxTable, truth: BoxTable) -> BoxTable:
     """Return the true boxes at the stamps of the predicted ones; say what was not equal."""
     joined = joined_stamps(truth.stamps_ns, predicted.stamps_ns)
@@ -252,6 +270,31 @@ def _joined(args: argparse.Namespace, predicted: BoxTable, truth: BoxTable) -> B
             f'and {lonely} stamps of these no true ones: are both of the same clouds?'
         )
     return replace(truth, stamps_ns=joined.stamps_ns)
+
+
+def _between(predicted: BoxTable, truth: BoxTable) -> NDArray[np.bool_]:
+    """Return which predicted boxes (n,) lie between the stamps of sparser true ones; say so."""
+    is_between = between_stamps(predicted.stamps_ns, truth.stamps_ns)
+    if is_between.any():
+        _warn(
+            f'{is_between.sum()} predicted boxes lie between the stamps of the true boxes, which '
+            f'are further apart: nothing is known there, and they are not counted'
+        )
+    return is_between
+
+
+def _out_of_view(
+    args: argparse.Namespace, predicted: BoxTable, matches: Matches
+) -> NDArray[np.bool_]:
+    """Return which predicted boxes (n,) without a true one the labelled image lacks; say so."""
+    is_outside = np.zeros(len(predicted.boxes), bool)
+    is_outside[matches.unmatched] = ~in_labelled_view(args.truth, predicted)[matches.unmatched]
+    if is_outside.any():
+        _warn(
+            f'{is_outside.sum()} predicted boxes lie outside of the image of the camera that the '
+            f'true boxes were labelled in: nothing is known there, and they are not counted'
+        )
+    return is_outside
 
 
 def _check_same_drive(args: argparse.Namespace, predicted: BoxTable, truth: BoxTable) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 from uuid import uuid4
 
 from boxreg_ros.allocation import collect_rarely, keep_freed_memory
-from boxreg_ros.errors import ConfigError, description_of, RecordingError
+from boxreg_ros.errors import ConfigError, description_of, one_line, RecordingError
 from boxreg_ros.offline.arguments import request_from, values_of
 from boxreg_ros.offline.batch_results import DRIVE_DONE, Result, UP_TO_DATE
 from boxreg_ros.offline.relabel_command import arguments_of, Demands, unmet
@@ -134,7 +134,7 @@ def _client(workers: int, address: str | None) -> Iterator[Any]:
         try:
             client = stack.enter_context(Client(cluster, timeout=CONNECTION_SECONDS))
         except (OSError, ValueError) as error:
-            reason = ' '.join(str(error).split())[:200]
+            reason = one_line(error)[:200]
             raise RecordingError(
                 f'--address {address}: expected a Dask scheduler that answers, got: {reason}; '
                 f'start one with `dask scheduler`, or leave --address out to run on this machine'
@@ -178,7 +178,7 @@ def _on_workers(client: Any, commands: Mapping[str, Sequence[str]]) -> Iterator[
                 f'frequent cause is too little memory: use fewer --workers, or larger ones',
             )
         except (Exception, CancelledError) as error:
-            yield Result(name, last_line=f'lost by the cluster: {" ".join(str(error).split())}')
+            yield Result(name, last_line=f'lost by the cluster: {one_line(error)}')
         submit()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 
 from boxreg_ros.datasets.registry import DATASETS
 from boxreg_ros.datasets.registry import module_of as dataset_module
@@ -57,20 +58,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print a paragraph per label format and per data set."""
     for name, title, is_readable, *conventions, needs in rows():
-        is_broken = not any(conventions)
-        print(f'{name}: {title}' + ('' if is_readable or is_broken else ' (written only)'))
-        for column, text in zip(
-            FORMAT_COLUMNS[3:], [] if is_broken else conventions, strict=False
-        ):
-            print(f'    {column:9} {text}')
-        if needs:
-            print(f'    needs     pip install {needs}')
+        is_whole = is_readable or not any(conventions)
+        print(f'{name}: {title}' + ('' if is_whole else ' (written only)'))
+        _print_facts(dict(zip(FORMAT_COLUMNS[3:-1], conventions, strict=True)), needs)
     print('\ndata sets, as recordings:')
     for address, title, folder, labels, needs in dataset_rows():
         print(f'{address}: {title}')
-        print(f'    folder    {folder}')
-        if labels:
-            print(f'    labels    --labels {labels}')
-        if needs:
-            print(f'    needs     pip install {needs}')
+        _print_facts({'folder': folder, 'labels': f'--labels {labels}' if labels else ''}, needs)
     return 0
+
+
+def _print_facts(facts: Mapping[str, str], packages: str) -> None:
+    """Print what is known of a format or data set, a line each."""
+    for name, text in {**facts, 'needs': f'pip install {packages}' if packages else ''}.items():
+        if text:
+            print(f'    {name:9} {text}')

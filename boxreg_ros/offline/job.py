@@ -19,8 +19,12 @@ from boxreg_ros.io.storage.urls import entries_of, url_of
 from boxreg_ros.offline.result_folder import INPUT_MODEL
 
 MANIFESTS = ('.txt', '.lst')
-COMMENT = re.compile(r'(^|\s)#.*')
-"""A comment of a manifest; within a word, ``#`` begins the name of a scene."""
+COMMENT = re.compile(r"""(\\.|"[^"]*"|'[^']*')|(?:^|\s)#.*""")
+"""
+A comment of a manifest, or what may hold a ``#`` that begins none: within a word, ``#`` begins
+the name of a scene.
+
+"""
 SUFFIX = re.compile(r'(?<=.)\.(mcap|db3|bag|active)(\.zstd?)?$')
 """Suffixes of recordings; other dots belong to the name, as those of dates."""
 LEARNING = 'learning'
@@ -144,7 +148,7 @@ def _manifest(path: Path) -> Iterator[tuple[Path, ...]]:
         text = path.read_text(encoding='utf-8-sig')
         if '\0' in text:
             raise ValueError('a NUL character')
-        drives = [shlex.split(COMMENT.sub('', line)) for line in text.splitlines()]
+        drives = [shlex.split(COMMENT.sub(r'\1', line)) for line in text.splitlines()]
     except ValueError as error:  # UnicodeDecodeError, too
         raise ConfigError(
             f'{path}: expected a text in UTF-8 with the recordings of one drive per line, got '

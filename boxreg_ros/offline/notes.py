@@ -9,6 +9,7 @@ from typing import Any
 
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MERGED, CLOUD_MISSING
 from boxreg_ros.io.storage.record import Damage
+from boxreg_ros.io.storage.urls import url_of
 from boxreg_ros.io.times import time_range
 from boxreg_ros.offline.result_folder import SUMMARY
 from boxreg_ros.offline.summary import Summary
@@ -43,7 +44,7 @@ def closing_line(summary: Summary, out: Path) -> str:
         if word in status:
             parts.append(f'{status[word]:,} {word}')
     line = (
-        f'{out}: {", ".join(parts)} from {summary.sweeps:,} sweeps in '
+        f'{url_of(out) or out}: {", ".join(parts)} from {summary.sweeps:,} sweeps in '
         f'{summary.seconds["total"]:.1f} s, fixed frame {summary.fixed_frame}'
     )
     before, after = summary.sweeps_with_boxes.values()
@@ -59,6 +60,9 @@ def closing_line(summary: Summary, out: Path) -> str:
 
 def next_line(out: Path, has_report: bool) -> str:
     """Return the command to look at a result."""
+    url = url_of(out)
+    if url is not None:
+        return f'next: copy {url} to this machine, and open the copy by boxreg review'
     command = f'next: boxreg review {shlex.quote(str(out))}'
     return command if has_report else f'{command} (after the same run with --report)'
 
@@ -80,6 +84,12 @@ def notes(summary: Summary) -> Iterator[str]:
     yield from _keyframe_notes(summary)
     if summary.complete.get('unfilled'):
         yield _unfilled_line(summary.complete['unfilled'])
+    if summary.unused_decisions and summary.is_part:
+        yield (
+            f'decisions: {len(summary.unused_decisions):,} are about tracks and boxes that this '
+            f'part of the recording does not have: {", ".join(summary.unused_decisions)}; without '
+            f'--start and --end they are used'
+        )
     if summary.input_model.get('warning'):
         yield (
             f'input model: expected drives of one detector and labelling rule, got '
@@ -185,10 +195,10 @@ def _input_notes(summary: Summary) -> Iterator[str]:
     if summary.first_missing_transform:
         boxes = summary.reasons.get(Reason.NO_TRANSFORM, 0)
         sweeps = summary.dropped.get(Reason.SWEEP_WITHOUT_TRANSFORM, 0)
-        yield (
-            f'{boxes:,} boxes and {sweeps:,} clouds have no transform; first: '
-            f'{summary.first_missing_transform}'
-        )
+        what = f'{boxes:,} boxes and {sweeps:,} clouds'
+        if not boxes + sweeps:  # boxes of a person are written as they are, without a reason
+            what = 'boxes of a person'
+        yield f'{what} have no transform; first: {summary.first_missing_transform}'
 
 
 def _damage_line(damages: list[dict[str, Any]]) -> str:

@@ -195,8 +195,8 @@ class RecordingReader:
         if isinstance(item.content, BoxArray):
             return trimmed
         moved = item.moved
-        if isinstance(moved, Sweep) and not self._with_times:
-            moved = replace(moved, times=None)
+        if isinstance(moved, Sweep) and not (self._with_times and np.any(moved.times)):
+            moved = replace(moved, times=None)  # times of 0 say no more
         if not self._with_points:
             content = moved or Sweep(item.content.stamp_ns, '', np.zeros((0, 3)))
             return trimmed._replace(

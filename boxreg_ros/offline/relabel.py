@@ -13,21 +13,32 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.storage.urls import url_of
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.progress import Progress, Stopwatch
 from boxreg_ros.offline.reader import JumpingIds, ReadAhead, reader
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
+from boxreg_ros.offline.result_folder import (
+    claimed,
+    earlier_summary,
+    FILES,
+    SUMMARY,
+    whole_folder,
+    write_summary,
+)
 from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.offline.survey import Passes, survey
 from boxreg_ros.review.corrections import Corrections
-from boxreg_ros.review.decisions import read_decisions
+from boxreg_ros.review.decisions import Decision, DECISIONS, read_decisions
 
 if TYPE_CHECKING:
     from boxreg_ros.core.input_statistics import Drives
     from boxreg_ros.offline.stored_sweeps import StoredSweeps
+
+ASSOCIATED = 'associated_tracks'
+"""Field of the summary of a run that has associated its boxes."""
 
 
 def relabel(request: Request, out: Path, progress: Progress | None = None) -> Summary:
@@ -67,7 +78,7 @@ def _relabel(request: Request, out: Path, progress: Progress, fingerprint: str) 
 
     """
     clock = Stopwatch()
-    corrections = Corrections(read_decisions(request.decisions) if request.decisions else ())
+    corrections = Corrections(_decisions(request, out))
     # What cannot be read is refused before the work.
     truth = true_boxes(request.truth) if request.report and request.truth is not None else None
     drives = _other_drives(request)
@@ -90,8 +101,63 @@ def _relabel(request: Request, out: Path, progress: Progress, fingerprint: str) 
             with Sink(folder, request, recording.source, clock, corrections) as sink:
                 registrar = run.register(sink, submit, shown)
             summary = run.write(folder, out, registrar, sink, fingerprint)
+            _check_ids(request, summary.associated_tracks is not None)
             write_summary(folder, summary.as_json())
     return summary
+
+
+def _decisions(request: Request, out: Path) -> list[Decision]:
+    """
+    Return the decisions that a request names.
+
+    Ids of associated boxes count from the first box of a part: raises ConfigError if the decisions
+    were made on a part that begins elsewhere, where they are about other objects; or if there are
+    none, but the result in `out` has some.
+
+    """
+    path = request.decisions
+    if path is None:
+        if DECISIONS in (earlier_summary(out) or {}).get(FILES, {}):
+            raise ConfigError(
+                f'output {str(out)!r}: expected --decisions, which the result there was made '
+                f'with, got none: those of a person would be lost; choose another with -o, or '
+                f'delete this one'
+            )
+        return []
+    reviewed = earlier_summary(path.parent) or {}
+    start = reviewed.get('start', request.start) or 0.0
+    if ASSOCIATED in reviewed and start != (request.start or 0.0):
+        raise ConfigError(
+            f'--start: expected {start:g} s, as of the result that {str(path)!r} is about, got '
+            f'{request.start or 0.0:g} s: its boxes are associated, and their ids depend on the '
+            f'first one; relabel with the same start'
+        )
+    if request.convention.associate or request.jumping_ids:
+        _check_ids(request, is_associated=True)
+    return read_decisions(path)
+
+
+def _check_ids(request: Request, is_associated: bool) -> None:
+    """Raise ConfigError for decisions on ids of the input where boxes are associated, or back."""
+    path = request.decisions
+    if path is None:
+        return
+    reviewed = earlier_summary(path.parent)
+    if reviewed is None and is_associated:
+        raise ConfigError(
+            f'decisions {str(path)!r}: expected them in the folder of the result that they are '
+            f'about, got no {SUMMARY} beside them: ids of associated boxes depend on the first '
+            f'box and the options of that result, which cannot be compared; put the file there'
+        )
+    if reviewed is None or (ASSOCIATED in reviewed) == is_associated:
+        return
+    remedy = 'without --associate, and with --keep-ids' if is_associated else 'with --associate'
+    ids = ['those of the input', 'those of associated boxes']
+    expected, got = ids if is_associated else ids[::-1]
+    raise ConfigError(
+        f'decisions {str(path)!r}: expected ids as of the result that they are about, {expected}, '
+        f'got {got}, which name other objects; relabel {remedy}'
+    )
 
 
 def _stored_sweeps(request: Request, out: Path) -> StoredSweeps | None:

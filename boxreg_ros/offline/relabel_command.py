@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
 
 def unmet(summary: Summary, demands: Demands) -> str:
     """Return which demand the results of a run do not meet; empty if they meet all."""
-    if summary.unused_decisions:
+    if summary.unused_decisions and not summary.is_part:
         from boxreg_ros.offline.notes import unused_line
 
         return unused_line(summary.unused_decisions)

@@ -12,6 +12,7 @@ from pathlib import Path
 import shutil
 from typing import Any
 
+from boxreg_ros.datasets.files import MISSING_SWEEP
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.storage.urls import read_text, sizes_of, UPLOAD, upload, url_of
 from boxreg_ros.io.whole_files import DISK_ERRORS, store, store_folder, temporary_folder
@@ -43,7 +44,8 @@ def whole_summary(out: Path, fingerprint: str) -> dict[str, Any] | None:
     """
     Return the summary of an earlier run of the same request and files.
 
-    None if there is none, or if a file of the result is missing or empty.
+    None if there is none, if a file of the result is missing or empty, or if the first cloud that
+    was missing is there: the fingerprint of nuScenes is that of its tables alone.
 
     """
     summary = earlier_summary(out)
@@ -52,7 +54,9 @@ def whole_summary(out: Path, fingerprint: str) -> dict[str, Any] | None:
     found = _sizes(out) if url_of(out) is None else sizes_of(out)
     listed = summary.get(FILES, {}).items()
     lost = any(about['size'] and not found.get(name) for name, about in listed)
-    return None if lost else summary
+    missed = str(summary.get('first_unreadable', '')).partition(MISSING_SWEEP)
+    has_arrived = bool(missed[1]) and Path(missed[0]).exists()
+    return None if lost or has_arrived else summary
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:
@@ -172,7 +176,9 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
 @contextmanager
 def _uploaded_folder(out: Path) -> Iterator[Path]:
     """Yield a folder of this machine that is uploaded to the URL `out` on success."""
-    if earlier_summary(out) is None:
+    if earlier_summary(out) is not None:
+        _check_unchanged(out)
+    else:
         names = sizes_of(out)
         if names and UPLOAD not in names:
             raise _other_files(out)
@@ -204,9 +210,19 @@ def writing(out: Path) -> Iterator[None]:
 
 def _check_replaceable(out: Path) -> None:
     """Refuse a folder that is not the unchanged result of an earlier run."""
+    if out.exists() and Path.cwd().is_relative_to(out.resolve()):
+        raise ConfigError(
+            f'output {str(out)!r}: expected a folder that is not the current one nor contains '
+            f'it, which a result replaces; choose another with -o, or change the folder'
+        )
     is_empty = out.is_dir() and not any(out.iterdir())
     if out.exists() and earlier_summary(out) is None and not is_empty:
         raise _other_files(out)
+    _check_unchanged(out)
+
+
+def _check_unchanged(out: Path) -> None:
+    """Refuse an earlier result with files that were changed or added since."""
     changed = _changed_since(out)
     if changed is not None:
         raise RecordingError(
@@ -224,10 +240,20 @@ def _other_files(out: Path) -> RecordingError:
 
 
 def _changed_since(out: Path) -> str | None:
-    """Return the name of a file in a result whose content is not what the summary states."""
+    """
+    Return the name of a file in a result whose content is not what the summary states.
+
+    Behind a URL, whose size is not.
+
+    """
     listed = (earlier_summary(out) or {}).get(FILES, {})
-    for name, size in _sizes(out).items():
-        if size and listed.get(name) != {'size': size, 'sha256': _digest(out / name)}:
+    is_remote = url_of(out) is not None
+    for name, size in (sizes_of(out) if is_remote else _sizes(out)).items():
+        known = listed.get(name, {})
+        is_same = known.get('size') == size
+        if is_same and not is_remote:
+            is_same = known['sha256'] == _digest(out / name)
+        if size and not is_same and name != SUMMARY:
             return name
     return None
 

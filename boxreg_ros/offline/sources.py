@@ -15,13 +15,14 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.items import EVERYTHING, Item, ItemSource, Wanted
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import TransformTree
-from boxreg_ros.labels import frames_of, LabelFrame, module_of, Options
-from boxreg_ros.labels.merging import keyframes_of, LabelMerger
+from boxreg_ros.io.transforms import inverse, moved_boxes, TransformTree
+from boxreg_ros.labels import frames_of, module_of, Options
+from boxreg_ros.labels.merging import LabelMerger
 from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.structures import BoxArray
 from msg_adapters.convention import Convention
 import numpy as np
+from numpy.typing import NDArray
 
 
 class LabelledRecording(Recording):
@@ -45,11 +46,9 @@ class LabelledRecording(Recording):
 
     def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
         """Yield clouds and boxes; see `Recording.items`. Boxes have `Item.refined`."""
-        given = frames_of(*self._labels, convention=self._label_convention)
-        frames: Iterator[LabelFrame] = (frame.labels() for frame in given)
-        if self._keyframes:
-            frames = keyframes_of(frames)
-        merger = LabelMerger(frames, tree, self.sensor_frame(), self.start_ns, self._is_part)
+        frames = frames_of(*self._labels, convention=self._label_convention)
+        sensor_frame, is_part = self.sensor_frame(), self._is_part
+        merger = LabelMerger(frames, tree, sensor_frame, self.start_ns, is_part, self._keyframes)
         for cloud in super().items(tree, wanted._replace(clouds=True)):
             if wanted.clouds:
                 yield cloud
@@ -168,10 +167,10 @@ def _check_scene(address: Address, request: Request) -> None:
 
 
 def true_boxes(path: Path) -> BoxTable:
-    """Return true boxes: of a table, or the annotations of a scene of a data set."""
+    """Return true boxes: those of a table that are not rejected, or the annotations of a scene."""
     address = address_of(path)
     if address is None:
-        return BoxTable.read(path)
+        return BoxTable.read(path).without_rejected()
     arrays: list[BoxArray] = []
     num_points = [np.zeros(0, np.int64)]
     with SceneRecording(address) as scene:
@@ -183,3 +182,28 @@ def true_boxes(path: Path) -> BoxTable:
             arrays.append(item.moved)
             num_points.append(annotations.num_points)
     return replace(BoxTable.from_arrays(arrays), num_points=np.concatenate(num_points))
+
+
+def in_labelled_view(path: Path, predicted: BoxTable) -> NDArray[np.bool_]:
+    """
+    Return which boxes (n,), in the fixed frame of the true ones, these could contain.
+
+    Annotations that refer to a camera are of objects in its image, others of all around.
+
+    """
+    is_seen = np.ones(len(predicted.boxes), dtype=bool)
+    address = address_of(path)
+    if address is None:
+        return is_seen
+    with SceneRecording(address) as scene:
+        if scene.camera is None:
+            return is_seen
+        for item in FixedFrameItems(scene, Config()).read(with_clouds=False):
+            if item.moved is None or item.T_fixed_item is None:
+                continue
+            rows = np.flatnonzero(predicted.stamps_ns == item.moved.stamp_ns)
+            # The camera is calibrated to the LiDAR, whose frame annotations are in.
+            boxes = moved_boxes(predicted.boxes[rows], inverse(item.T_fixed_item))
+            rectangles, _ = scene.camera.project(boxes)
+            is_seen[rows] = np.isfinite(rectangles[:, 0])
+    return is_seen

@@ -73,6 +73,8 @@ class Summary:
     frames_without_cloud: int
     versions: dict[str, str]  # of everything that can change the results
     associated_tracks: int | None = None  # that the association has made; None without it
+    start: float | None = None  # of the part, as asked for [s]; here and below
+    end: float | None = None
     # tracks and boxes that each step changed
     complete: dict[str, int] = field(default_factory=dict)
     # ends of tracks of keyframes, and why
@@ -109,6 +111,8 @@ class Summary:
             recordings=[str(path) for path in request.recordings],
             command=list(request.command),
             folder=str(Path.cwd()),
+            start=request.start,
+            end=request.end,
             topics=source.topics,
             labels=_labels(request, findings),
             fixed_frame=source.fixed_frame,
@@ -154,6 +158,11 @@ class Summary:
     def is_complete(self) -> bool:
         """Return whether all messages of the recording were read, with usable stamps."""
         return not (self.damage or self.without_stamp or Reason.UNREADABLE in self.dropped)
+
+    @property
+    def is_part(self) -> bool:
+        """Return whether a part of the recording was asked for."""
+        return (self.start, self.end) != (None, None)
 
     @property
     def has_failed(self) -> bool:

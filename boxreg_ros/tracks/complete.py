@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.id_switches import by_id, id_switches
+from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import (
     BoxArray,
@@ -85,9 +86,8 @@ class PlannedArray:
         boxes = given.boxes.copy()
         for row, box in self.moved.items():
             boxes[row] = box
-        pinned = given.pinned
-        if pinned is None and any(one.status == HUMAN for one in self.added):
-            pinned = np.zeros(len(boxes), bool)
+        has_pins = any(one.status == HUMAN for one in self.added)
+        pinned = given.is_pinned if has_pins else given.pinned
         own = replace(self.renamed(given), boxes=boxes, pinned=pinned, attributes=())
         rows = [row for row in range(len(boxes)) if row not in self.rejected]
         return concatenated([own.take(rows), added])
@@ -265,16 +265,10 @@ class _Completer:
 
     def _exchanged(self, results: Sequence[RefinedBoxes]) -> Sequence[RefinedBoxes]:
         """Return results with the ids back that tracks have exchanged, but for named tracks."""
-        arrays = self._arrays()
-        if not arrays:
-            return results
-        boxes = np.concatenate([array.boxes for array in arrays])
-        names = [name for array in arrays for name in array.track_ids]
-        is_free = np.array([name not in self._decided.names for name in names], bool)
-        valid = np.flatnonzero(is_valid_box(boxes) & is_free)
-        stamps_ns = np.repeat([a.stamp_ns for a in arrays], [len(a.track_ids) for a in arrays])
-        tracks = by_id([names[row] for row in valid], stamps_ns[valid], boxes[valid, : Y + 1])
-        found = id_switches(tracks)
+        every = BoxTable.from_arrays(self._arrays())
+        is_free = np.array([name not in self._decided.names for name in every.track_ids], bool)
+        table = every.rows(is_valid_box(every.boxes) & is_free)
+        found = id_switches(by_id(table.track_ids, table.stamps_ns, table.boxes[:, : Y + 1]))
         exchanged = []
         for result in results:
             ids = result.boxes.track_ids
@@ -289,10 +283,8 @@ class _Completer:
 
     def _is_held(self, track: Tracklet) -> bool:
         """Return whether a person has accepted a track, or given it a box in the input."""
-        pinned = [(self._given[index].pinned, row) for index, row in track.places]
-        return DecidedTrack.of(track, self._given, self._decided).is_accepted() or any(
-            held is not None and bool(held[row]) for held, row in pinned
-        )
+        pinned = (self._given[index].is_pinned[row] for index, row in track.places)
+        return DecidedTrack.of(track, self._given, self._decided).is_accepted() or any(pinned)
 
     def _rejected(
         self, tracks: Sequence[Tracklet], names: set[str], reason: str

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from boxreg_ros.core.l_shape import closest_heading
+from boxreg_ros.core.l_shape import closest_heading, completed, span, turned
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, ROLL, WIDTH, YAW
 import numpy as np
@@ -202,7 +202,7 @@ def _clusters(
         sides = high - low
         if not _may_be_object(sides, top):
             continue
-        centre = _turned((low + high) / 2, yaw)
+        centre = turned((low + high) / 2, yaw)
         level = float(np.median(road[tuple(cells[part].T)]))
         found.append(_Cluster(stamp_ns, own, centre, np.sort(sides)[::-1], level, origin))
     return found
@@ -246,19 +246,7 @@ def _stands_free(cells: Ints, is_open: NDArray[np.bool_], seen: NDArray[np.bool_
 def _rectangle(points: Floats) -> tuple[float, Floats, Floats]:
     """Return yaw and limits (2,), (2,) of the rectangle whose sides are nearest to points."""
     yaw = closest_heading(points[:: 1 + len(points) // MANY_POINTS], YAWS)
-    turned = points @ _axes(yaw)
-    return yaw, turned.min(0), turned.max(0)
-
-
-def _axes(yaw: float) -> Floats:
-    """Return the axes of a box from above, the columns of (2, 2)."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, -s], [s, c]])
-
-
-def _turned(place: Floats, yaw: float) -> Floats:
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([c * place[0] - s * place[1], s * place[0] + c * place[1]])
+    return yaw, *span(points, yaw)
 
 
 def _proposal(clusters: Chain) -> Proposal | None:
@@ -327,18 +315,7 @@ def _box(cluster: _Cluster, class_name: str, heading: float | None) -> Floats:
         yaw = heading
     elif (high - low)[1] > (high - low)[0]:
         yaw += np.pi / 2
-    axes = _axes(yaw)
-    turned = cluster.points[:, :2] @ axes
-    low, high = turned.min(0), turned.max(0)
-    usual = np.array(USUAL[class_name])
-    sensor = cluster.origin[:2] @ axes
-    for axis in range(2):
-        missing = max(usual[axis] - (high[axis] - low[axis]), 0.0)
-        if sensor[axis] < (low[axis] + high[axis]) / 2:
-            high[axis] += missing
-        else:
-            low[axis] -= missing
-    height = max(float(cluster.points[:, 2].max()) - cluster.road, 0.7 * usual[2])
-    x, y = axes @ ((low + high) / 2)
-    length, width = high - low
-    return np.array([x, y, cluster.road + height / 2, length, width, height, 0, 0, yaw])
+    *usual, tall = USUAL[class_name]
+    centre, sides = completed(cluster.points[:, :2], yaw, cluster.origin[:2], np.array(usual))
+    height = max(float(cluster.points[:, 2].max()) - cluster.road, 0.7 * tall)
+    return np.array([*centre, cluster.road + height / 2, *sides, height, 0, 0, yaw])

@@ -18,7 +18,7 @@ from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.motion import EndMotion
 from boxreg_ros.core.support import is_owned
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import BOX_EXTENT, Floats, LENGTH, X, Y, YAW, Z
+from boxreg_ros.structures import BOX_EXTENT, Floats, LENGTH, on_lines, X, Y, YAW, Z
 from boxreg_ros.tracks.decided import Decided, NOTHING
 from boxreg_ros.tracks.fill import fill
 from boxreg_ros.tracks.prune import by_evidence
@@ -224,8 +224,8 @@ def _take_turns(first: Tracklet, second: Tracklet, config: Config) -> bool:
     is_apart = second.last_ns < first.first_ns or first.last_ns < second.first_ns
     if is_apart or first.model(config) is not second.model(config):
         return False
-    centers = [np.interp(second.stamps_ns, first.stamps_ns, first.boxes[:, i]) for i in (X, Y)]
-    away = np.linalg.norm(second.boxes[:, X : Y + 1] - np.stack(centers, axis=1), axis=1)
+    centers = on_lines(first.stamps_ns, first.boxes[:, X : Y + 1], second.stamps_ns)
+    away = np.linalg.norm(second.boxes[:, X : Y + 1] - centers, axis=1)
     if away.min() > max(first.boxes[0, LENGTH], second.boxes[0, LENGTH]):
         return False
     box_at = dict(zip(second.stamps_ns.tolist(), second.boxes, strict=True))

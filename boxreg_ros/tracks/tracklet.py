@@ -11,6 +11,7 @@ from typing import ClassVar, NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.core.motion import EndMotion, motion_at, UNKNOWN_SPEED_DEVIATION
+from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import (
     BOX_CENTER,
@@ -112,19 +113,18 @@ def tracklets_of(
     own = [(i, one) for i, one in enumerate(results) if one.boxes.frame_id == fixed_frame]
     if not own:
         return []
-    arrays = [one.boxes for _, one in own]
+    table = BoxTable.from_arrays([one.boxes for _, one in own])
     every = Tracklet(
         '',
         '',
         tuple(Place(index, row) for index, one in own for row in range(len(one.status))),
-        np.repeat([one.stamp_ns for one in arrays], [len(one.boxes) for one in arrays]),
-        np.concatenate([one.boxes for one in arrays]),
+        table.stamps_ns,
+        table.boxes,
         np.concatenate([one.covariances for _, one in own]),
-        np.concatenate([one.scores for one in arrays]),
+        table.scores,
         np.concatenate([num_points[index] for index, _ in own]),
     )
-    track_ids = [name for one in arrays for name in one.track_ids]
-    class_names = [name for one in arrays for name in one.class_names]
+    track_ids, class_names = table.track_ids, table.class_names
     is_kept = np.array([word == KEPT for _, one in own for word in one.status], bool)
     rows_of: dict[str, list[int]] = {}
     for row in np.flatnonzero(is_valid_box(every.boxes)).tolist():

@@ -78,6 +78,24 @@ def test_failures_are_apart_and_the_same_command_does_what_is_missing(tmp_path, 
     assert (out / 'two' / 'boxes.csv').stat().st_size
 
 
+def test_results_of_other_calls_are_said(tmp_path, capsys):
+    a, b = (str(Drive(sweeps=6).write(tmp_path / name)) for name in 'ab')
+    out = tmp_path / 'out'
+    command = ['-o', str(out), '--workers=1', *QUICK]
+    assert main(['batch', a, *command]) == 0
+    (out / 'a').rename(tmp_path / 'a.corrected')  # as `boxreg review` writes it
+    assert main(['batch', a, *command]) == 0
+    (tmp_path / 'a.corrected').rename(out / 'a.corrected')
+    assert main(['batch', a, *command]) == 0
+    assert 'other results' not in capsys.readouterr().out
+    (out / 'a.corrected').rename(tmp_path / 'a.corrected')
+    assert main(['batch', b, *command]) == 0
+    assert '1 other results in this folder are not in index.csv' in capsys.readouterr().out
+    assert list(index_of(out)) == ['b']
+    assert main(['batch', a, b, *command]) == 0
+    assert capsys.readouterr().out == f'{out}: 2 of 2 drives done, 2 of them earlier\n'
+
+
 def test_results_that_miss_a_demand_are_kept_and_not_done(tmp_path, capsys):
     path = Drive(sweeps=6).write(tmp_path / 'one')
     out = tmp_path / 'out'
@@ -209,6 +227,11 @@ def test_manifests_patterns_and_their_errors(tmp_path):
     jobs = jobs_of([manifest, tmp_path / '[c]*.mcap'])
     assert [job.name for job in jobs] == [f'{tmp_path.name}_a', 'x_a', 'c']
     assert jobs[0].recordings == (tmp_path / 'a.mcap', tmp_path / 'b.mcap')
+    (tmp_path / 'c #1.mcap').touch()
+    manifest.write_text('"c #1.mcap"  # it\'s quoted\nc\\ #1.mcap\n')
+    first, again = jobs_of([manifest])
+    assert (first.name, first.problem) == ('c #1', '')
+    assert 'got it a second time' in again.problem
     manifest.write_text('a.mcap\nmissing.mcap\n../' + tmp_path.name + '/a.mcap\n')
     first, missing, again = jobs_of([manifest])
     assert (first.name, first.problem) == ('a', '')

@@ -5,7 +5,12 @@ from pathlib import Path
 
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.covariance_table import CovarianceWriter, read_covariances
+from boxreg_ros.io.covariance_table import (
+    COVARIANCE_COLUMNS,
+    covariance_lines,
+    COVARIANCES,
+    read_covariances,
+)
 from boxreg_ros.offline.consistency import _over, table
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 import numpy as np
@@ -66,10 +71,9 @@ def test_evaluate_prints_coverage_and_nees(tmp_path, capsys):
     refined, truth = refined_with(np.array([0.1, -0.1, 0.1, 0.5]), 0.1)
     truth.write(tmp_path / 'truth.csv')
     BoxTable.from_arrays([refined.boxes]).write(tmp_path / 'boxes.csv')
-    writer = CovarianceWriter(tmp_path / 'covariances.csv')
-    writer.write(refined, np.eye(4))
-    writer.close()
-    known = read_covariances(tmp_path / 'covariances.csv')[0, '3']
+    lines = [','.join(COVARIANCE_COLUMNS) + '\n', *covariance_lines(refined, np.eye(4))]
+    (tmp_path / COVARIANCES).write_text(''.join(lines))
+    known = read_covariances(tmp_path / COVARIANCES)[0, '3']
     np.testing.assert_allclose(known.pose, 0.01 * np.eye(6))
     assert known.distance == pytest.approx(0.5)
     paths = [str(tmp_path / name) for name in ('boxes.csv', 'truth.csv')]

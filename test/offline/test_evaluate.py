@@ -55,6 +55,26 @@ def test_truth_has_perfect_scores():
     assert scores.jitter == pytest.approx(0, abs=1e-9)
 
 
+def test_boxes_of_true_ones_out_of_scope_are_not_outside_of_the_image(monkeypatch, capsys):
+    truth = truth_table()
+    predicted = replace(truth, track_ids=('ghost', *truth.track_ids[1:]))
+    matches = match(predicted, truth, min_points=100)  # without the pedestrian
+    monkeypatch.setattr(cli, 'in_labelled_view', lambda *_: np.zeros(20, bool))
+    is_outside = cli._out_of_view(argparse.Namespace(truth=None), predicted, matches)
+    assert np.flatnonzero(is_outside).tolist() == matches.unmatched.tolist() == [0]
+    assert '1 predicted boxes lie outside' in capsys.readouterr().err
+
+
+def test_boxes_that_a_person_has_deleted_are_no_true_ones(tmp_path, capsys):
+    reviewed = truth_table()
+    status = ['rejected' if name == '2' else 'refined' for name in reviewed.track_ids]
+    replace(reviewed, status=tuple(status)).write(tmp_path / 'boxes.csv')
+    assert run(tmp_path, tmp_path / 'boxes.csv', '--json') == 0
+    scores = json.loads(capsys.readouterr().out)
+    assert (scores['boxes'], scores['missing'], scores['iou_3d']) == (10, 0, pytest.approx(1))
+    assert scores['tracks']['recall'] == 1
+
+
 def test_scores_of_known_errors():
     truth = truth_table()
     boxes = truth.boxes.copy()
@@ -305,6 +325,39 @@ def test_other_stamps_on_both_sides_are_said(tmp_path, capsys):
     assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
     expected = '6 of 10 stamps of the true boxes have no predicted boxes, and 6 stamps of these'
     assert expected in capsys.readouterr().err
+
+
+def test_boxes_between_the_stamps_of_sparse_truth_are_no_ghosts(tmp_path, capsys):
+    """As keyframes at 2 Hz, and boxes of a result at each sweep."""
+    truth = truth_table(22)
+    truth.write(tmp_path / 'boxes.csv')
+    at = truth.stamps_ns // STEP
+    rows(truth, np.flatnonzero(np.isin(at, [5, 10, 15]))).write(tmp_path / 'truth.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--json') == 0
+    printed = capsys.readouterr()
+    report = json.loads(printed.out)
+    # Within 0.5 s of the keyframes nothing is known; the other four stamps are beyond them.
+    assert '32 predicted boxes lie between the stamps of the true boxes' in printed.err
+    assert report['unmatched'] == report['tracks']['ghosts'] == 6
+    # A frame without true boxes has none.
+    rows(truth, np.flatnonzero(at != 7)).write(tmp_path / 'truth.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--json') == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)['unmatched'] == 2
+    assert 'between' not in printed.err
+
+
+def test_classes_that_the_truth_may_lack_are_said(tmp_path, capsys):
+    """Where only cars were labelled, all other boxes lower the precision."""
+    truth = truth_table()
+    truth.write(tmp_path / 'boxes.csv')
+    rows(truth, np.arange(0, 20, 2)).write(tmp_path / 'truth.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
+    assert 'these classes has a true one: pedestrian 10; they count' in capsys.readouterr().err
+    renamed = replace(truth, class_names=tuple(map(str.upper, truth.class_names)))
+    renamed.write(tmp_path / 'truth.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
+    assert 'a true one' not in capsys.readouterr().err
 
 
 def test_invalid_true_boxes_are_left_out_with_a_warning(tmp_path, capsys):

@@ -154,6 +154,10 @@ def test_a_seed_in_an_unknown_frame_is_said(street, tmp_path, capsys):
     lines = capsys.readouterr().err
     assert "no transform from 'nowhere' to 'odom'" in lines
     assert '--keyframes' not in lines
+    assert '1 boxes and 0 clouds have no transform' in lines
+    seeds.write_text(seeds.read_text().replace(',truth,', ',human,'))
+    main(['follow', f'{street}/drive.mcap', str(seeds), '--formats', 'csv', '-o', out])
+    assert 'boxes of a person have no transform' in capsys.readouterr().err
 
 
 def test_one_box_of_each_object_is_no_fault_of_its_id(street, tmp_path, capsys):

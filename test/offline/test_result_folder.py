@@ -138,6 +138,18 @@ def test_outputs_that_cannot_be_written_are_named(tmp_path, capsys, monkeypatch)
             pass
 
 
+def test_the_current_folder_is_not_replaced(tmp_path, capsys, monkeypatch):
+    """A shell would go on in the folder that is deleted, where it sees no file."""
+    recording = Drive(sweeps=6).write(tmp_path / 'drive')
+    (tmp_path / 'out' / 'inner').mkdir(parents=True)
+    for name in ('out', 'out/inner'):
+        monkeypatch.chdir(tmp_path / name)
+        assert main(['relabel', str(recording), '-o', str(tmp_path / 'out'), *QUICK]) == 2
+        assert 'not the current one nor contains it' in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path / 'out')
+    assert main(['relabel', str(recording), '-o', '.', *QUICK]) == 2
+
+
 def test_a_full_disk_is_named_and_nothing_is_written(tmp_path):
     out = tmp_path / 'out'
     with pytest.raises(RecordingError, match=r"output '.*/out'.*No space left"):  # noqa: SIM117
