@@ -13,7 +13,7 @@ from boxreg_ros.review.risk import assess, evidence
 from boxreg_ros.review.scene import DriveScene
 from boxreg_ros.review.tables import TrackRow
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, Ints, ROLL, Z
+from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Z
 import numpy as np
 
 MAX_CLICKED = 400
@@ -32,15 +32,17 @@ def added_track(
 
     """
     track = scene.follow(seeds, grows)
-    points = _Near(scene, track)
-    changes = _changes(track, points)
-    near = points.points_of(changes)
+    stamps_ns = track.stamps_ns.tolist()
+    of_boxes = scene.near(stamps_ns, track.boxes)
+    changes = _changes(track, of_boxes)
+    poses = zip(of_boxes, matrix_from_rpy(track.boxes[:, ROLL:]), track.boxes, strict=True)
+    near = [local @ R.T + box[: Z + 1] for local, R, box in poses]
     faces = [evidence(*one)[0] for one in zip(near, changes.boxes, strict=True)]
     changes = replace(changes, face_distances=np.nan_to_num(np.array(faces).reshape(-1, 6)))
     row = TrackRow(changes, assess(changes), '')
     n = len(track.rows)
     unknown = TrackTruth(np.full((n, 9), np.nan), np.full(n, np.nan), np.full(n, np.nan))
-    part = TrackPart(row, points, unknown)
+    part = TrackPart(row, near, scene.sensors_at(stamps_ns), unknown)
     return {
         'row': part.row(track.stamps_ns),
         'part': part.part(begin_ns, MAX_CLICKED),
@@ -49,33 +51,12 @@ def added_track(
     }
 
 
-class _Near:
-    """The points of the sweeps near the boxes of a track."""
-
-    def __init__(self, scene: DriveScene, track: FollowedTrack) -> None:
-        stamps_ns = track.stamps_ns.tolist()
-        self._sensors = scene.sensors_at(stamps_ns)
-        self.local = scene.near(stamps_ns, track.boxes)
-
-    def sensor_at(self, _: Ints) -> Floats:
-        """Return the positions of the sensor (n, 3) [m]."""
-        return self._sensors
-
-    def points_of(self, track: TrackChanges) -> list[Floats]:
-        """Return the points near each box, n arrays (M_i, 3) [m]."""
-        R = matrix_from_rpy(track.boxes[:, ROLL:])
-        centers = track.boxes[:, : Z + 1]
-        return [
-            local @ turn.T + center
-            for local, turn, center in zip(self.local, R, centers, strict=True)
-        ]
-
-
-def _changes(track: FollowedTrack, points: _Near) -> TrackChanges:
+def _changes(track: FollowedTrack, near: Sequence[Floats]) -> TrackChanges:
+    """Return an added track; `near` has the points near each box, in its frame."""
     n = len(track.rows)
-    pairs = zip(points.local, track.boxes[:, BOX_EXTENT] / 2, strict=True)
+    pairs = zip(near, track.boxes[:, BOX_EXTENT] / 2, strict=True)
     inside = np.array([(np.abs(local) < half).all(1).sum() for local, half in pairs], np.int64)
-    totals = np.array([len(local) for local in points.local], np.int64)
+    totals = np.array([len(local) for local in near], np.int64)
     return TrackChanges(
         track_id=track.track_id,
         class_name=track.class_name,

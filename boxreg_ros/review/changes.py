@@ -154,7 +154,7 @@ class Changes:
                 status=np.array(refined.status, str),
                 reasons=np.array(refined.reasons, str),
                 num_points=refined.num_points,
-                attributes=tuple(boxes.attributes_of(row) for row in range(n)),
+                attributes=boxes.attributes or ({},) * n,
             )
         )
 

@@ -19,7 +19,6 @@ from boxreg_ros.structures import (
     with_rejected,
 )
 import numpy as np
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from boxreg_ros.core.follow import FollowedTrack
@@ -196,7 +195,7 @@ class Corrections:
         if not with_pins:
             return renamed
         boxes = renamed.boxes.copy()
-        pinned = _is_pinned(given)[rows]
+        pinned = given.is_pinned[rows]
         for i, row in enumerate(rows):
             if not pinned[i]:
                 boxes[i, BOX_EXTENT] = self._extents.get(
@@ -225,7 +224,7 @@ class Corrections:
         `refined` is that for the boxes of `to_register`, in their order, and for added ones.
 
         """
-        is_pinned = _is_pinned(given)
+        is_pinned = given.is_pinned
         if not (self._of_track or is_pinned.any()):
             return refined
         refined = self._with_deleted(given, refined)
@@ -272,6 +271,8 @@ class Corrections:
         are given in the order of stamps.
 
         """
+        if not (self._of_track or self._before or given.attributes):
+            return refined  # no box has had any so far
         found: list[Mapping[str, str]] = []
         for row, track_id in enumerate(refined.boxes.track_ids):
             if row < len(given.track_ids):
@@ -364,13 +365,6 @@ class Corrections:
             new_id = renames[-1].value if renames else one.track_id
             by_track.setdefault(new_id, []).append(one.box[BOX_EXTENT])
         return {track_id: np.mean(extents, axis=0) for track_id, extents in by_track.items()}
-
-
-def _is_pinned(boxes: BoxArray) -> NDArray[np.bool_]:
-    """Return which boxes of an array (n,) are pinned already, as those of label files."""
-    if boxes.pinned is None:
-        return np.zeros(len(boxes.track_ids), bool)
-    return boxes.pinned
 
 
 def _array_of(one: Decision, track_id: str, class_name: str) -> BoxArray:

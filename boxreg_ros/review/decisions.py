@@ -198,7 +198,9 @@ def held(decisions: Iterable[Decision]) -> list[Decision]:
 
 def read_decisions(path: Path) -> list[Decision]:
     """
-    Return the decisions of a file, in its order; a last row without an end is left out.
+    Return the decisions of a file, in its order; a last row that is cut is left out.
+
+    Files of several people may be joined by ``cat``: their first lines are left out.
 
     Raises RecordingError if the file cannot be read, is of a later version, lacks a column, or a
     row is no decision.
@@ -212,7 +214,7 @@ def read_decisions(path: Path) -> list[Decision]:
         raise RecordingError(
             f'{path}: expected decisions of boxreg review, got no text: {error}; give their file'
         ) from None
-    whole = text[: _end_of_rows(text)]
+    whole = _whole_rows(text)
     if not whole:
         return []
     version = _version_of(whole)
@@ -235,7 +237,11 @@ def read_decisions(path: Path) -> list[Decision]:
     for row in reader:
         line = reader.line_num + lines_before
         try:
-            decisions.append(_parsed(row, version))
+            is_version = row['track_id'].startswith(VERSION_LINE)
+            if is_version and _version_of(row['track_id']) != version:
+                raise RecordingError(f'expected a file of version {version}, as the first one')
+            if not is_version and row['decision'] != 'decision':  # first lines of another file
+                decisions.append(_parsed(row, version))
         except RecordingError as error:
             raise RecordingError(f'{path}: line {line}: {error}') from None
         except (ValueError, TypeError, AttributeError) as error:
@@ -276,8 +282,7 @@ class DecisionLog:
         """Write decisions behind the last whole row of the file that this log has locked."""
         self._read()
         rows = _encoded(new)
-        text = self._path.read_bytes().decode() if self._path.exists() else ''
-        text = text[: _end_of_rows(text)]
+        text = _whole_rows(self._path.read_bytes().decode()) if self._path.exists() else ''
         if not text or _version_of(text.removeprefix('\ufeff')) < VERSION:
             text = f'{VERSION_LINE}{VERSION}\n' + csv_row(DECISION_COLUMNS)
             text += _encoded(self.decisions)
@@ -339,12 +344,21 @@ def _version_of(text: str) -> int:
     return int(word) if word.isdecimal() else 0
 
 
-def _end_of_rows(text: str) -> int:
-    """Return the end of the last whole row: a line feed that is not in quotes."""
+def _whole_rows(text: str) -> str:
+    """
+    Return a text up to the end of its last whole row: a line feed that is not in quotes.
+
+    A last row with all cells is whole without one, as spreadsheets and editors save it.
+
+    """
     end = text.rfind('\n') + 1
     while text.count('"', 0, end) % 2:
         end = text.rfind('\n', 0, end - 1) + 1
-    return end
+    last = text[end:]
+    is_first = _version_of(text.removeprefix('\ufeff')) == 1
+    cells = next(csv.reader([last]), []) if last.count('"') % 2 == 0 else []
+    is_whole = len(cells) >= len(FIRST_COLUMNS if is_first else DECISION_COLUMNS)
+    return text + '\n' if is_whole else text[:end]
 
 
 def _parsed(row: dict[str, str], version: int) -> Decision:

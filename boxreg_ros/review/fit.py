@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from boxreg_ros.core.l_shape import closest_heading
+from boxreg_ros.core.l_shape import closest_heading, completed, span, turned
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.structures import Floats
 import numpy as np
@@ -97,16 +97,11 @@ def fitted(
     yaw, class_name, usual = _shape(cluster, bottom, extents or USUAL_EXTENTS)
     if np.cos(yaw - heading) < 0:
         yaw += np.pi
-    low, high = _span(cluster[:, :2], yaw)
-    # Of each axis, the side on the side of the sensor is seen.
-    away = _turned(sensor[None], -yaw)[0] < (low + high) / 2
-    size = np.append(high - low, cluster[:, 2].max() - bottom)
-    grown = np.maximum(size, usual)
-    low = np.where(away, low, high - grown[:2])
-    center = _turned((low + grown[:2] / 2)[None], yaw)[0]
-    z = bottom + grown[2] / 2
+    center, sides = completed(cluster[:, :2], yaw, sensor, usual[:2])
+    height = max(cluster[:, 2].max() - bottom, usual[2])
     angle = float(np.arctan2(np.sin(yaw), np.cos(yaw)))
-    return Fitted(np.array([*center, z, *grown, 0, 0, angle]), class_name, int(own.sum()))
+    box = np.array([*center, bottom + height / 2, *sides, height, 0, 0, angle])
+    return Fitted(box, class_name, int(own.sum()))
 
 
 def drawn(
@@ -128,7 +123,7 @@ def drawn(
     is_near = (np.abs(points[:, :2] - middle) < FIT_REACH + length / 2).all(1)
     near = points[is_near].astype(np.float64)
     road = _road_below(near)
-    local = _turned(near[:, :2] - middle, -yaw)
+    local = turned(near[:, :2] - middle, -yaw)
     beside = np.hypot(*(np.abs(local) - [length / 2, 0]).clip(0).T)
     bottom = float(road[beside.argmin()]) if len(near) else 0.0
     height = near[:, 2] - road
@@ -205,17 +200,6 @@ def _touching(points: Floats, place: Floats) -> NDArray[np.bool_]:
     return np.asarray((label == label[nearest]) & (away[nearest] < MAX_AWAY))
 
 
-def _span(points: Floats, yaw: float) -> tuple[Floats, Floats]:
-    """Return the least and the largest coordinates (2,) along the axes of a heading."""
-    local = _turned(points, -yaw)
-    return local.min(0), local.max(0)
-
-
-def _turned(points: Floats, yaw: float) -> Floats:
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]))
-
-
 def _shape(
     cluster: Floats, bottom: float, extents: Mapping[str, Floats]
 ) -> tuple[float, str, Floats]:
@@ -229,7 +213,7 @@ def _shape(
     found = []
     first = closest_heading(cluster[:, :2], ANGLES)
     for yaw in (first, first + np.pi / 2):
-        low, high = _span(cluster[:, :2], yaw)
+        low, high = span(cluster[:, :2], yaw)
         size = np.append(high - low, cluster[:, 2].max() - bottom)
         for name, usual in extents.items():
             ratio = np.log(size.clip(0.1) / usual)

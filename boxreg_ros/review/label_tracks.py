@@ -42,16 +42,10 @@ class LabelTrack:
         num_points: Ints,
     ) -> LabelTrack:
         """Return the track of labels in any order, without invalid boxes."""
-        group = config.class_config(class_name)
-        kind = VEHICLE
-        if group is config.cyclist:
-            kind = CYCLIST
-        elif group is config.pedestrian:
-            kind = PEDESTRIAN
         rows = np.flatnonzero(is_valid_box(boxes))
         rows = rows[np.argsort(stamps_ns[rows], kind='stable')]
         columns = stamps_ns[rows], boxes[rows], num_points[rows]
-        return cls(track_id, class_name, kind, *columns)
+        return cls(track_id, class_name, config.kind(class_name), *columns)
 
     def steps(self) -> Steps:
         """Return the steps between consecutive boxes, without those across gaps."""

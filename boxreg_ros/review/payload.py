@@ -6,7 +6,7 @@ from base64 import b64encode
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 import zlib
 
 from boxreg_ros.core.observation import GROUND_CLEARANCE
@@ -100,23 +100,19 @@ def true_boxes(tracks: Sequence[TrackChanges], truth: BoxTable | None) -> list[T
     return [TrackTruth(*found) for found in zip(*parts, strict=True)]
 
 
-class TrackPoints(Protocol):
-    """The points of a recording near the boxes of its tracks; see `PointCollector`."""
-
-    def points_of(self, track: TrackChanges) -> list[Floats]:
-        """Return the points near each box of a track, n arrays (M_i, 3) [m]."""
-
-    def sensor_at(self, stamps_ns: Ints) -> Floats:
-        """Return the position of the sensor (n, 3) at each stamp [m]."""
-
-
 class TrackPart:
-    """The points and figures of one track, as the report shows them: `before` and `after`."""
+    """
+    The points and figures of one track, as the report shows them: `before` and `after`.
+
+    `points` has those near each of its n boxes (M_i, 3), `sensor` where it was then (n, 3) [m].
+
+    """
 
     def __init__(
         self,
         row: TrackRow,
-        collector: TrackPoints,
+        points: list[Floats],
+        sensor: Floats,
         truth: TrackTruth,
         usual: Usual = UNKNOWN_USUAL,
     ) -> None:
@@ -126,8 +122,8 @@ class TrackPart:
         self._why = row.reasons
         self._truth = truth
         self._usual = usual
-        self._sensor = collector.sensor_at(track.stamps_ns)
-        self._points = collector.points_of(track)
+        self._sensor = sensor
+        self._points = points
         of_labels = np.where(track.is_label, 0.0, np.nan)  # NaN for rejected boxes
         given = track.given + of_labels[:, None]
         self.before = quality(track, given, self._points, truth.iou_before + of_labels)

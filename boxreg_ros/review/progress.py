@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-import csv
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import combinations
+from math import isfinite
 from pathlib import Path
 
 from boxreg_ros.core.metrics import iou_3d
-from boxreg_ros.errors import RecordingError, unreadable
-from boxreg_ros.io.box_table import BoxTable, unprotected
+from boxreg_ros.io.box_table import BoxTable, parsed_rows, unprotected
 from boxreg_ros.io.stamp_join import joined_stamps
 from boxreg_ros.review.decisions import Decision, DECISIONS, held, read_decisions
 from boxreg_ros.review.tables import REVIEW
@@ -160,18 +159,13 @@ def _cells(one: DriveProgress) -> str:
 
 def _risks(path: Path) -> dict[str, float]:
     """Return the risk of each track of a result by its id [m]."""
-    try:
-        with path.open(newline='', encoding='utf-8') as file:
-            rows = list(csv.DictReader(file))
-        tracks = [row for row in rows if row['risk_m']]  # proposals have no risk
-        return {unprotected(row['track_id']): float(row['risk_m']) for row in tracks}
-    except OSError as error:
-        raise RecordingError(unreadable(path, error)) from None
-    except (KeyError, ValueError) as error:
-        raise RecordingError(
-            f'{path}: expected the tracks of a result, got: {error}; give a folder of boxreg '
-            f'relabel --report'
-        ) from None
+    risks = dict(parsed_rows(path, _risk))
+    return {name: risk for name, risk in risks.items() if isfinite(risk)}  # proposals have none
+
+
+def _risk(row: dict[str, str]) -> tuple[str, float]:
+    """Return id and risk of a row."""
+    return unprotected(row['track_id']), float(row['risk_m'] or 'nan')
 
 
 def _pace(made: Sequence[Decision]) -> tuple[float, set[str]]:

@@ -80,7 +80,8 @@ def write_report(
     parts = []
     qualities = []
     for row, true in zip(found, true_boxes(tracks, truth), strict=True):
-        part = TrackPart(row, points, true, usual)
+        near, sensor = points.points_of(row.track), points.sensor_at(row.track.stamps_ns)
+        part = TrackPart(row, near, sensor, true, usual)
         rows.append(part.row(stamps_ns) | {'rules': violations.get(row.track.track_id, [])})
         parts.append(compressed(as_json(part.part(begin_ns, max_points))))
         qualities.append((part.before, part.after))

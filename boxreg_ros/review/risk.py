@@ -309,7 +309,10 @@ def _folded_mean(mean: Floats, deviation: Floats) -> Floats:
     deviation = deviation.clip(min=1e-9)
     ratio = mean / deviation
     of_noise = MEAN_OF_NORMAL * deviation * np.exp(-(ratio**2) / 2)
-    return np.asarray(of_noise + mean * _erf(ratio / np.sqrt(2)))
+    of_mean = np.zeros(mean.shape)
+    is_off = mean > 0
+    of_mean[is_off] = mean[is_off] * _erf(ratio[is_off] / np.sqrt(2))
+    return np.asarray(of_noise + of_mean)
 
 
 def _left_outside(track: TrackChanges, extents: Floats, usual: float) -> Floats:

@@ -231,14 +231,14 @@ class DriveImages:
                 'matrix': camera.matrix,
                 'distortion': camera.distortion,
                 'model': camera.model,
-                'pose': self._T_camera_fixed(camera, stamp_ns),
+                'pose': self._T_image_fixed(camera, stamp_ns),
             }
             for camera in self._known()
         ]
 
     def image(self, index: int, stamp_ns: int) -> tuple[Image, Floats | None]:
         """
-        Return the image of a camera nearest to a stamp, and T_camera_fixed (4, 4) at its stamp.
+        Return the image of a camera nearest to a stamp, and T_image_fixed (4, 4) at its stamp.
 
         Raises RecordingError if there is no such camera, or no image nearby.
 
@@ -249,7 +249,7 @@ class DriveImages:
         with self._lock:
             assert self._images is not None
             found = self._images.nearest(cameras[index], stamp_ns)
-        return found, self._T_camera_fixed(cameras[index], found.stamp_ns)
+        return found, self._T_image_fixed(cameras[index], found.stamp_ns)
 
     def _known(self) -> list[ImageCamera]:
         with self._lock:
@@ -260,9 +260,9 @@ class DriveImages:
                 self._is_open = True
             return [] if self._images is None else self._images.cameras
 
-    def _T_camera_fixed(self, camera: ImageCamera, stamp_ns: int) -> Floats | None:
+    def _T_image_fixed(self, camera: ImageCamera, stamp_ns: int) -> Floats | None:
         pose = self._scene.pose_of(camera.frame_id, stamp_ns)
-        return None if pose is None else inverse(pose)
+        return None if pose is None else camera.T_image_camera @ inverse(pose)
 
 
 def thinned(points: Sequence[Floats]) -> Floats:

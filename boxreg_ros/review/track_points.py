@@ -9,7 +9,7 @@ from boxreg_ros.core.observation import crop
 from boxreg_ros.io.stamp_join import nearest_rows
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import BoxArray, Floats, is_valid_box, ROLL, Sweep, X, Z
+from boxreg_ros.structures import BoxArray, Floats, is_valid_box, on_lines, ROLL, Sweep, X, Z
 import numpy as np
 from numpy.typing import NDArray
 
@@ -134,5 +134,4 @@ def _motion_to_stamp(track: TrackChanges, row: int, delays: NDArray[np.floating]
     is_known = np.isfinite(track.boxes[:, X])
     times = (track.stamps_ns[is_known] - track.stamps_ns[row]) * 1e-9
     centers = track.boxes[is_known, : Z + 1]
-    there = [np.interp(delays, times, coordinate) for coordinate in centers.T]
-    return np.asarray(track.boxes[row, : Z + 1] - np.column_stack(there))
+    return np.asarray(track.boxes[row, : Z + 1] - on_lines(times, centers, delays))

@@ -9,7 +9,20 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.server import review_server
 from browser import NEEDS_BROWSER, opened_page, press, serving
-from camera_drives import COMPRESSED, FOCAL, HEIGHT, IMAGE, LATE, MOUNT, WIDTH, with_cameras
+from camera_drives import (
+    as_file,
+    COMPRESSED,
+    FOCAL,
+    HEIGHT,
+    IMAGE,
+    INFO,
+    info,
+    LATE,
+    MOUNT,
+    picture,
+    WIDTH,
+    with_cameras,
+)
 import numpy as np
 import pytest
 from ros_messages import Drive, SCENE
@@ -166,6 +179,9 @@ def test_images_are_read_with_the_model_beside_them(tmp_path, ros1):
                               encoding='mono16', step=2 * WIDTH, data=grey.view(np.uint8))),
         ('/a/short', m.build(IMAGE, header=m.header(start, 'a'), height=HEIGHT, width=WIDTH,
                              encoding='mono8', step=WIDTH, data=np.zeros(9, np.uint8))),
+        ('/a/narrow', m.build(IMAGE, header=m.header(start, 'a'), height=HEIGHT, width=WIDTH,
+                              encoding='rgb8', step=WIDTH,  # in pixels
+                              data=np.zeros(3 * WIDTH * HEIGHT, np.uint8))),
         ('/a/other', m.build(IMAGE, header=m.header(start, 'a'), height=1, width=1,
                              encoding='64FC3', step=24, data=np.zeros(24, np.uint8))),
         ('/a/video', m.build(COMPRESSED, header=m.header(start, 'a'), format='h264',
@@ -189,8 +205,99 @@ def test_images_are_read_with_the_model_beside_them(tmp_path, ros1):
         found = images.nearest(by_topic['/a/mono16'], start)
         with Picture.open(BytesIO(found.content)) as shown:
             assert np.asarray(shown).astype(int)[-1, -1] > 245
-        for topic, text in (('/a/short', '9 bytes'), ('/a/other', '64FC3'), ('/a/video', 'h264')):
+        for topic, text in (
+            *(('/a/short', '9 bytes'), ('/a/narrow', f'pixels in {WIDTH} bytes')),
+            *(('/a/other', '64FC3'), ('/a/video', 'h264')),
+        ):
             with pytest.raises(UnsupportedMessage, match=text):
                 images.nearest(by_topic[topic], start)
         with pytest.raises(RecordingError, match='expected an image within'):
             images.nearest(front, start + 10**10)
+
+
+def cameras_with(tmp_path, *topics):
+    """Return the cameras of a recording with (topic, image, CameraInfo) each, by topic."""
+    drive = Drive(sweeps=1)
+    m, start = drive.messages, drive.stamps[0]
+    for topic, pixels, values in topics:
+        message = m.build(
+            COMPRESSED, header=m.header(start, values.pop('frame', 'ahead')), format='jpeg',
+            data=as_file(pixels, 'JPEG'),
+        )  # fmt: skip
+        model = info(m, start, message.header.frame_id)
+        fields = {name: getattr(model, name) for name in model.__dataclass_fields__}
+        fields.pop('__msgtype__')
+        arrays = {
+            name: np.array(values.pop(name), np.float64) for name in ('r', 'p') if name in values
+        }
+        drive.items.append((topic, start, message))
+        name = f'{topic.rpartition("/")[0]}/camera_info'
+        drive.items.append((name, start, m.build(INFO, **fields | arrays | values)))
+    with Recording([drive.write(tmp_path / 'drive')]) as recording:
+        return {camera.topic: camera for camera in recording.images().cameras}
+
+
+@pytest.mark.parametrize(
+    ('shape', 'values', 'pixel'),
+    [
+        ((120, 160), {'binning_x': 2, 'binning_y': 2}, (95, 52.5)),
+        ((120, 160), {}, (95, 52.5)),  # made smaller, which no CameraInfo states
+        ((240, 320), {'binning_x': 2, 'binning_y': 2}, (190, 105)),  # the model is of this size
+        (
+            (100, 200),
+            {'roi': {'x_offset': 40, 'y_offset': 20, 'width': 200, 'height': 100}},
+            (150, 85),
+        ),
+        (
+            (50, 100),
+            {
+                'binning_x': 2,
+                'binning_y': 2,
+                'roi': {'x_offset': 40, 'y_offset': 20, 'width': 200, 'height': 100},
+            },
+            (75, 42.5),
+        ),
+    ],
+)
+def test_the_model_is_that_of_the_pixels_of_the_image(tmp_path, shape, values, pixel):
+    pixels = np.zeros((*shape, 3), np.uint8)
+    camera = cameras_with(tmp_path, ('/cam/image_raw', pixels, values))['/cam/image_raw']
+    assert camera.size == shape[::-1]
+    # In the whole image (190, 105): the place is 0.2 to the right and 0.1 above, at a depth of 1
+    u, v, w = camera.matrix @ [0.2, -0.1, 1, 1]
+    assert (u / w, v / w) == pytest.approx(pixel)
+
+
+def test_a_model_that_is_no_number_is_none(tmp_path):
+    values = {'p': np.full(12, np.nan)}
+    found = cameras_with(tmp_path, ('/cam/image_rect', picture(9), values))
+    assert found['/cam/image_rect'].matrix is None
+
+
+def test_rectified_images_are_turned_and_share_a_frame(tmp_path):
+    angle, shift = 0.1, -30.0
+    cos, sin = np.cos(angle), np.sin(angle)
+    R = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+    P = np.array([[FOCAL, 0, 160, shift], [0, FOCAL, 120, 0], [0, 0, 1, 0]])
+    model = {'r': R.ravel(), 'p': P.ravel()}
+    found = cameras_with(
+        tmp_path,
+        ('/left/image_rect', picture(9), {'r': R.ravel()}),
+        ('/right/image_rect', picture(9), dict(model)),
+        ('/alone/image_rect', picture(9), {'frame': 'other', **model}),
+        ('/direction/image_raw', picture(9), {'frame': 'third', **model}),
+    )
+    place = np.array([0.5, -0.3, 4, 1])
+
+    def pixel(topic):
+        camera = found[topic]
+        u, v, w = camera.matrix @ camera.T_image_camera @ place
+        return u / w, v / w
+
+    u, v, w = P @ [*R @ place[:3], 1]
+    assert pixel('/right/image_rect') == pytest.approx((u / w, v / w))
+    # The frame of a camera that no other camera has is where it is: P is not to move it again
+    assert pixel('/alone/image_rect') == pytest.approx(((u - shift) / w, v / w))
+    assert pixel('/left/image_rect') == pytest.approx(((u - shift) / w, v / w))
+    raw = found['/direction/image_raw']  # is not rectified, by its name
+    assert (raw.T_image_camera == np.eye(4)).all()

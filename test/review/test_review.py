@@ -85,6 +85,20 @@ def test_a_crash_loses_no_earlier_row(tmp_path):
     assert [one.track_id for one in read_decisions(path)] == ['1', '3']
 
 
+@pytest.mark.parametrize('first', ['# boxreg decisions 2\n', '\ufeff# boxreg decisions 2,,\n', ''])
+def test_a_last_row_without_an_end_is_read_and_kept(tmp_path, first):
+    """Spreadsheets in the browser, and some editors, end no last line."""
+    path = tmp_path / DECISIONS
+    log = DecisionLog(path)
+    log.append([Decision('1', None, 'accept'), Decision('2', None, 'delete')])
+    lines = path.read_text().splitlines()[1:]
+    rows = [line if first else ','.join(line.split(',')[:15]) for line in lines]
+    path.write_text(first + '\n'.join(rows))
+    assert [one.track_id for one in read_decisions(path)] == ['1', '2']
+    DecisionLog(path).append([Decision('3', None, 'unsure')])
+    assert [one.track_id for one in read_decisions(path)] == ['1', '2', '3']
+
+
 def test_texts_of_any_kind_come_back(tmp_path):
     names = ['=1+1', '-7', '@a', "'q'", 'a\rb', 'c\r\nd', 'x' * 10**6, '\tz', '']
     path = tmp_path / DECISIONS
@@ -154,6 +168,25 @@ def test_decisions_of_earlier_versions_are_read_and_continued(tmp_path):
     path.write_text('')  # made by an earlier version, without a header
     DecisionLog(path).append([Decision('3', None, 'delete')])
     assert len(read_decisions(path)) == 1
+
+
+def test_decisions_of_two_people_are_joined_by_cat(tmp_path):
+    first, second = [Decision('1', None, 'delete')], [Decision('1', 5, 'accept', who='b')]
+    parts = []
+    for name, rows in (('a', first), ('b', second)):
+        DecisionLog(tmp_path / name).append(rows)
+        parts.append((tmp_path / name).read_bytes())
+    both = tmp_path / 'both'
+    both.write_bytes(b''.join(parts))
+    assert read_decisions(both) == [*first, *second]
+    other = tmp_path / 'other'
+    other.write_bytes(parts[0] + b'# boxreg decisions 9\n')
+    with pytest.raises(RecordingError, match='line 4: expected a file of version 2'):
+        read_decisions(other)
+    with both.open('a', encoding='utf-8') as file:
+        file.write('7,,maybe,,,,,,,,,,,,,,,,\n')
+    with pytest.raises(RecordingError, match=r'line 7: .*maybe'):
+        read_decisions(both)
 
 
 @pytest.mark.parametrize(
@@ -257,6 +290,19 @@ def test_pin_in_another_frame_is_refused():
 
 
 # The run -----------------------------------------------------------------------------------------
+
+
+def test_decisions_on_another_part_of_the_recording_are_kept_for_it(result, tmp_path, capsys):
+    recording, out = result
+    table = BoxTable.read(out / 'boxes.csv')
+    log = DecisionLog(tmp_path / DECISIONS)
+    for stamp_ns in (int(table.stamps_ns.min()), int(table.stamps_ns.max())):
+        log.append([Decision('1', stamp_ns, 'reject')])
+    options = ['--decisions', tmp_path / DECISIONS, '--end', 0.35, *QUICK]
+    assert boxreg('relabel', recording, '-o', tmp_path / 'part', *options) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if 'decisions' in line]
+    for word in ('1 are about tracks and boxes that this part', "'1' at ", 'without --start'):
+        assert word in line
 
 
 def test_rejected_tracks_stay_and_pinned_boxes_are_held(result, tmp_path, capsys):

@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 from zipfile import ZipFile
 
 from boxreg_ros.cli import main
@@ -33,8 +34,19 @@ def made(tmp_path_factory):
     return folder / 'out'
 
 
+@pytest.fixture
+def held_python(tmp_path, quick_python, monkeypatch):
+    """Let the page write labels in processes that end once the file returned exists."""
+    end, held = tmp_path / 'end', tmp_path / 'python'
+    wait = f'until [ -e {end} ]; do sleep 0.05; done'
+    held.write_text(f'#!/bin/sh\n{sys.executable} "$@"\nstatus=$?\n{wait}\nexit $status\n')
+    held.chmod(0o755)
+    monkeypatch.setattr(sys, 'executable', str(held))
+    return end
+
+
 @NEEDS_BROWSER
-def test_the_new_result_opens_with_what_changed_and_its_files(made, tmp_path, quick_python):
+def test_the_new_result_opens_with_what_changed_and_its_files(made, tmp_path, held_python):
     out = shutil.copytree(made, tmp_path / 'out')
     with (
         serving(review_server([(out, drive_of(out))], 0, 'anna')) as server,
@@ -44,20 +56,17 @@ def test_the_new_result_opens_with_what_changed_and_its_files(made, tmp_path, qu
         colleague.goto(server.address + '#track=2')
         colleague.wait_for_selector('html[data-ready]', timeout=60_000)
         press(page, 'd', 'isGone(current())')
-        page.evaluate("""(() => {
-          window.said = [];
-          new MutationObserver(() => said.push($('notice').textContent))
-            .observe($('notice'), { childList: true }); })()""")
         page.click('#files-button')
         page.wait_for_selector('#files[open]')
         assert not page.is_checked('#files-formats [value=openlabel]')
         page.check('#files-formats [value=openlabel]')
         page.click('#files-write')
-        page.wait_for_function("$('notice').textContent.includes('Writing')")
+        said = "$('notice').textContent.includes('1 of 1 s of the drive')"
+        page.wait_for_function(said, timeout=120_000)
         late = Decision('2', None, 'unsure', who='ben', when='2026-01-01T00:00:00+00:00')
         DecisionLog(out / DECISIONS).append([late])
+        held_python.touch()
         page.wait_for_function("$('notice').textContent.includes('boxes in')", timeout=120_000)
-        assert any('of 1 s of the drive' in text for text in page.evaluate('said'))
         # The page goes on in the new result, that of a colleague as well.
         new = tmp_path / 'out.corrected'
         assert server.log_paths == [new / DECISIONS]
@@ -181,3 +190,60 @@ def test_a_run_ends_with_the_next_command(made, tmp_path, capsys):
     assert main(['relabel', str(recording), '-o', str(out), *QUICK]) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     assert last == f"next: boxreg review '{out}' (after the same run with --report)"
+
+
+@pytest.mark.parametrize(('option', 'status'), [('--associate', 2), ('--keep-ids', 0)])
+def test_ids_of_associated_boxes_count_from_the_same_start(tmp_path, capsys, option, status):
+    """In a part that begins elsewhere, the decision would be about another object."""
+    recording = Drive(sweeps=10).write(tmp_path / 'drive')
+    command = ['relabel', str(recording), option, *QUICK]
+    assert main([*command, '-o', str(tmp_path / 'out'), '--end=0.8']) == 0
+    DecisionLog(tmp_path / 'out' / DECISIONS).append([Decision('2', None, 'delete')])
+    command += ['--decisions', str(tmp_path / 'out' / DECISIONS), '-o', str(tmp_path / 'new')]
+    assert main([*command, '--start=0']) == 0
+    assert main([*command, '--start=0.3']) == status
+    assert ('--start: expected 0 s, as of the result' in capsys.readouterr().err) == bool(status)
+
+
+@pytest.mark.parametrize(('made_by', 'run_by'), [('--associate', ''), ('', '--associate')])
+def test_decisions_on_associated_boxes_are_not_about_other_ids(tmp_path, capsys, made_by, run_by):
+    recording = Drive(sweeps=8).write(tmp_path / 'drive')
+    command = ['relabel', str(recording), *QUICK]
+    out, new = tmp_path / 'out', tmp_path / 'new'
+    assert main([*command, *filter(None, [made_by]), '-o', str(out)]) == 0
+    DecisionLog(out / DECISIONS).append([Decision('2', None, 'delete')])
+    command += ['--decisions', str(out / DECISIONS), '-o', str(new)]
+    assert main([*command, *filter(None, [run_by])]) == 2
+    remedy = 'with --associate' if made_by else 'without --associate, and with --keep-ids'
+    assert f'which name other objects; relabel {remedy}' in capsys.readouterr().err
+    assert not new.exists()
+    assert main([*command, *filter(None, [made_by])]) == 0
+
+
+def test_decisions_on_associated_boxes_are_beside_their_result(tmp_path, capsys):
+    """Elsewhere, nothing shows that the ids of this run are of the same objects."""
+    recording = Drive(sweeps=10).write(tmp_path / 'drive')
+    log = tmp_path / 'both.csv'
+    DecisionLog(log).append([Decision('2', None, 'delete')])
+    command = ['relabel', str(recording), '--associate', *QUICK, '--start=0.3']
+    assert main([*command, '--decisions', str(log), '-o', str(tmp_path / 'new')]) == 2
+    assert 'expected them in the folder of the result' in capsys.readouterr().err
+    out = tmp_path / 'out'
+    assert main([*command, '-o', str(out)]) == 0
+    log.rename(out / log.name)
+    assert main([*command, '--decisions', str(out / log.name), '-o', str(tmp_path / 'new')]) == 0
+
+
+def test_a_result_with_decisions_is_not_replaced_by_one_without(tmp_path, capsys):
+    recording = Drive(sweeps=8).write(tmp_path / 'drive')
+    made, out = tmp_path / 'made', tmp_path / 'out'
+    command = ['relabel', str(recording), *QUICK, '-o']
+    assert main([*command, str(made)]) == 0
+    DecisionLog(made / DECISIONS).append([Decision('2', None, 'delete')])
+    decisions = ['--decisions', str(made / DECISIONS)]
+    assert main([*command, str(out), *decisions]) == 0
+    before = (out / 'boxes.csv').read_bytes()
+    assert main([*command, str(out)]) == 2
+    assert 'those of a person would be lost' in capsys.readouterr().err
+    assert (out / 'boxes.csv').read_bytes() == before
+    assert main([*command, str(out), *decisions, '--set=lag=2']) == 0

@@ -42,6 +42,7 @@ async function openResult() {
   $('data').textContent = fresh.getElementById('data').textContent;
   document.querySelectorAll('script[id^=part-]').forEach(one => one.remove());
   document.body.append(...[...fresh.querySelectorAll('script[id^=part-]')].map(one => element('script', { type: 'text/plain', id: one.id }, one.textContent)));
+  clearTimeout(view.hashTimer);  // of a box that the new result may not have
   cached.clear();
   scene.slim.clear();
   additions.clear();
