@@ -57,23 +57,63 @@ FAILED = 1
 WRONG_USAGE = 2
 SIGNALLED = 128
 """Added to the number of the signal that ended a run, as shells do."""
-ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SOON = 0.01
+"""Longer than a destructor or a callback from C, and nothing to wait for at a terminal [s]."""
+
+
+class _Ended(KeyboardInterrupt):
+    """A signal ends the run, as an error does, so that files are removed."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
 
 
 def command() -> NoReturn:
     """Run a subcommand and end the process with its exit status."""
     if sys.argv[1:2] != ['node']:  # the node handles signals itself
         for number in ENDING_SIGNALS:
-            if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
+            if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
                 signal.signal(number, _end)
+        sys.unraisablehook = _end_again
     sys.exit(main())
 
 
-def _end(number: int, _: FrameType | None) -> NoReturn:
-    """End as an error does, so that files are removed, which a second signal does not stop."""
-    for one in ENDING_SIGNALS:
+def _end(number: int, frame: FrameType | None) -> None:
+    """
+    End the run. A second signal does not stop that, but for one from the keyboard.
+
+    An import goes on: extension modules may abort the process by what is raised within.
+
+    """
+    for one in ENDING_SIGNALS[1:]:
         signal.signal(one, signal.SIG_IGN)
-    sys.exit(_fail(_ended_by(number, sys.argv[1:]), SIGNALLED + number))
+    while frame is not None:
+        if frame.f_code.co_filename == '<frozen importlib._bootstrap>':
+            return _end_soon(number)
+        frame = frame.f_back
+    raise _Ended(number)
+
+
+def _end_soon(number: int) -> None:
+    """End the run from what is executed a moment later."""
+    signal.signal(signal.SIGALRM, lambda _, frame: _end(number, frame))
+    signal.setitimer(signal.ITIMER_REAL, SOON)
+
+
+def _end_again(lost: sys.UnraisableHookArgs) -> None:
+    """End the run once more if that came within a destructor or a callback from C: it is lost."""
+    if isinstance(lost.exc_value, _Ended):
+        _end_soon(lost.exc_value.number)
+    else:
+        sys.__unraisablehook__(lost)
+
+
+def _signal_in(error: BaseException | None) -> int | None:
+    """Return the signal that ended the run, of which a call from C may have made another error."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return None if error is None else getattr(error, 'number', signal.SIGINT)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -123,9 +163,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of the output has closed it. Python would fail again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
-    except KeyboardInterrupt:
-        return _fail(_ended_by(signal.SIGINT, arguments), SIGNALLED + signal.SIGINT)
-    except Exception as error:
+    except (Exception, KeyboardInterrupt) as error:
+        number = _signal_in(error)
+        if number is not None:
+            return _fail(_ended_by(number, arguments), SIGNALLED + number)
         if is_debug:
             raise
         status = WRONG_USAGE if isinstance(error, ConfigError) else FAILED

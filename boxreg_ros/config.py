@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
+from functools import lru_cache
 import hashlib
 import json
 from math import isnan, nan
@@ -19,7 +20,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
-from boxreg_ros.errors import ConfigError, unreadable
+from boxreg_ros.errors import ConfigError, one_line, unreadable
 import yaml
 
 _T = TypeVar('_T')
@@ -182,7 +183,7 @@ class ClassConfig:
     """Standard deviation of the input roll and pitch [rad]. Chosen: detectors set both to zero."""
 
     names: tuple[str, ...] = setting(
-        (), 'class names of this kind: any of these words, in any case'
+        (), 'class names of this kind: any of these names, all words of it, in any case'
     )
     acceleration: float = setting(
         1.5, 'standard deviation of the forward acceleration', 'm/s^2', 1e-3, 1e3
@@ -377,19 +378,23 @@ class Config:
     vehicle: ClassConfig = ClassConfig(
         names=(
             'car', 'van', 'truck', 'bus', 'vehicle', 'trailer', 'suv', 'pickup', 'tram', 'lorry',
-            'taxi', 'train',
+            'taxi', 'train', 'motor vehicle', 'bicycle rack', 'crossing sign', 'human depiction',
         )
     )  # fmt: skip
     cyclist: ClassConfig = ClassConfig(
         names=(
             'cyclist', 'bicyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'motorbike',
-            'rider', 'scooter',
+            'motorbiker', 'motor', 'moped', 'rider', 'ride', 'scooter', 'tricycle', 'pedicab',
+            'vulnerablevehicle', 'wheeled device', 'personal mobility',
         ),
         acceleration=1.5, cornering=1.5, turning=1.0, slip=0.4,
         shape=0.15, heading=0.08, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
     pedestrian: ClassConfig = ClassConfig(
-        names=('pedestrian', 'person', 'walker', 'people', 'child', 'adult', 'human'),
+        names=(
+            'pedestrian', 'person', 'walker', 'people', 'child', 'adult', 'human', 'worker',
+            'officer', 'signaler', 'stroller', 'wheelchair', 'animal', 'animals', 'dog',
+        ),
         acceleration=0.8, cornering=0.8, turning=1.0, slip=0.5,
         shape=0.2, heading=0.2, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
@@ -404,7 +409,7 @@ class Config:
                     f'Config.from_dict takes groups as dictionaries'
                 )
         for item, value in self.items():
-            item.check(_cast(item.name, value, item.default))
+            item.check(cast_value(item.name, value, item.default))
         if self.lag >= self.window and self.lag != DEFAULT_LAG:
             raise ConfigError(
                 f'lag: expected less than window ({self.window}), got {self.lag}: a final box '
@@ -429,11 +434,7 @@ class Config:
 
     def kind(self, class_name: str) -> str:
         """Return the one of `KINDS` that `class_name` is of; vehicle for unknown classes."""
-        words = words_of(class_name)
-        for kind in ('cyclist', 'pedestrian'):
-            if not words.isdisjoint(name.lower() for name in getattr(self, kind).names):
-                return kind
-        return 'vehicle'
+        return self._known_kind(class_name) or 'vehicle'
 
     def drives(self, class_name: str) -> bool:
         """Return whether objects of a class move along their length: all but pedestrians."""
@@ -445,10 +446,14 @@ class Config:
         return group
 
     def knows_class(self, class_name: str) -> bool:
-        """Return whether `class_name` has a word of some group; others are vehicles by default."""
-        words = words_of(class_name)
-        groups = (self.vehicle, self.cyclist, self.pedestrian)
-        return any(not words.isdisjoint(name.lower() for name in group.names) for group in groups)
+        """Return whether `class_name` has a name of some group; others are vehicles by default."""
+        return bool(self._known_kind(class_name))
+
+    def _known_kind(self, class_name: str) -> str:
+        """Return the kind that `class_name` has a name of; empty for unknown classes."""
+        return _kind_by_names(
+            class_name, self.cyclist.names, self.pedestrian.names, self.vehicle.names
+        )
 
     def updated(self, changes: Mapping[str, Any]) -> Config:
         """
@@ -504,8 +509,7 @@ class Config:
         except OSError as error:
             raise ConfigError(f'config file {unreadable(path, error)}') from None
         except (ConfigError, *YAML_ERRORS) as error:
-            reason = ' '.join(str(error).split())
-            raise ConfigError(f'config file {str(path)!r}: {reason}') from None
+            raise ConfigError(f'config file {str(path)!r}: {one_line(error)}') from None
 
 
 def _without_node_options(values: Any) -> Any:
@@ -528,6 +532,28 @@ def words_of(class_name: str) -> set[str]:
     return {*class_name.lower().translate(str.maketrans('_-./', '    ')).split()}
 
 
+@lru_cache(maxsize=4096)
+def _kind_by_names(
+    class_name: str,
+    cyclist: tuple[str, ...],
+    pedestrian: tuple[str, ...],
+    vehicle: tuple[str, ...],
+) -> str:
+    """
+    Return the kind with the name of most words, all of them in `class_name`; empty for none.
+
+    So ``bicycle_rack`` is not of the kind of ``bicycle``. Of equal numbers the first kind counts.
+
+    """
+    words = words_of(class_name)
+    found, most = '', 0
+    for kind, names in (('cyclist', cyclist), ('pedestrian', pedestrian), ('vehicle', vehicle)):
+        for name in map(words_of, names):
+            if name <= words and len(name) > most:
+                found, most = kind, len(name)
+    return found
+
+
 def settings() -> Iterator[Setting]:
     """Yield every setting of `Config`; names of groups are dotted."""
     for item in fields(Config):
@@ -545,7 +571,7 @@ def settings() -> Iterator[Setting]:
 def _filled(default: _T, value: Any, name: str) -> _T:
     """Return `value` as a setting like `default`, or as a group with `default` for absent ones."""
     if not is_dataclass(default):
-        return _cast(name, value, default)  # type: ignore[no-any-return]
+        return cast_value(name, value, default)  # type: ignore[no-any-return]
     if not isinstance(value, Mapping):
         raise ConfigError(f'{name or "config"}: expected a group of settings, got {value!r}')
     known = {item.name: getattr(default, item.name) for item in fields(default)}
@@ -569,7 +595,8 @@ def _unknown(prefix: str, key: str, known: Mapping[str, Any]) -> str:
     return f'{name}: no such setting; expected one of {names}{proposal}'
 
 
-def _cast(name: str, value: Any, default: Any) -> Any:
+def cast_value(name: str, value: Any, default: Any) -> Any:
+    """Return the value of a setting in the type of its default, or raise ConfigError."""
     if isinstance(default, float) and not isinstance(value, bool):
         with suppress(TypeError, ValueError):
             return float(value)  # YAML reads 1e-4, without a point, as text

@@ -1,20 +1,21 @@
 """
 Serialised messages: the places of their fields, read and written as arrays.
 
-A message of 1,000 boxes becomes 10,000 Python objects, which takes ROS 50 to 100 ms. Here a
-compiled loop walks once through its bytes; numbers are then copied to and from arrays.
+A message of 1,000 boxes becomes 10,000 Python objects, which takes ROS 50 to 100 ms, and Python
+more. Here one loop walks through the strings and sequences of a message, with all numbers between
+two of them in one step; numbers are then copied to and from arrays.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from importlib import import_module
 import re
-from typing import Any
-from warnings import warn
+from struct import error as ShortError
+from struct import Struct
+from typing import Any, NamedTuple
 
 from boxreg_ros.errors import UnsupportedMessage
 import numpy as np
@@ -22,97 +23,187 @@ from numpy.typing import NDArray
 
 HEADER = 4
 """Bytes before the first field; alignment counts from there."""
-LITTLE_ENDIAN = 1
-"""Second byte of the header, of the only encoding that is walked."""
-STEP_NUMBERS, STEP_TEXT, STEP_SEQUENCE, STEP_ITEMS, STEP_END = range(5)
-"""Steps of a walk: numbers, a string, a sequence of numbers; begin and end of repeated steps."""
+LITTLE_ENDIAN = b'\0\1'
+"""First bytes of the header, of the only encoding that is walked."""
+MOST_PADDING = 3
+"""Bytes behind the last field, which fill a message up to whole numbers of 4 bytes."""
+PREFIX = Struct('<I')
+"""Of strings and sequences, before their first element."""
 SIZES = {
-    **dict.fromkeys(('boolean', 'octet', 'char', 'int8', 'uint8'), 1),
+    **dict.fromkeys(('boolean', 'bool', 'octet', 'byte', 'char', 'int8', 'uint8'), 1),
     **dict.fromkeys(('int16', 'uint16'), 2),
-    **dict.fromkeys(('int32', 'uint32', 'float'), 4),
-    **dict.fromkeys(('int64', 'uint64', 'double'), 8),
+    **dict.fromkeys(('int32', 'uint32', 'float', 'float32'), 4),
+    **dict.fromkeys(('int64', 'uint64', 'double', 'float64'), 8),
 }
 """Size of each type of numbers, which is its alignment as well [bytes]."""
 FIELD_TYPE = re.compile(
     r'(?:sequence<(?P<of>[^,>]+).*>|(?P<one>[^\[<]+)(?:<=\d+)?(\[(?P<n>\d+)\])?)'
 )
-"""A field type of rclpy: ``double``, ``double[36]``, ``sequence<std_msgs/Header>``, ..."""
+"""A field type: ``double``, ``double[36]``, ``sequence<std_msgs/Header>``, ..."""
+
+Definitions = Callable[[str], Mapping[str, str]]
+"""Name of a message type -> its fields and their types, in order."""
+
+
+def installed_definition(name: str) -> Mapping[str, str]:
+    """Return the fields of a message type of rclpy, see `Definitions`."""
+    package, _, kind = name.partition('/')
+    message = getattr(import_module(f'{package}.msg'), kind.removeprefix('msg/'))
+    fields: Mapping[str, str] = message.get_fields_and_field_types()
+    return fields
 
 
 class Layout:
     """
-    Steps through the fields of a message type, and where to note the places of some of them.
+    Steps through the fields of a message type, and where some of them are found.
 
-    `kind` is the class of the messages, of rclpy. Fields to find are paths, as
-    ``items.pose.position.x``. Raises UnsupportedMessage if the type lacks one of the fields, or
-    has one of a type that is not walked.
+    Fields to find are paths, as ``items.pose.position.x``. Raises UnsupportedMessage if the type
+    lacks one of the fields, or has one of a type that is not walked. `kinds` has their types and
+    counts.
 
     """
 
-    def __init__(self, kind: Any, paths: Sequence[str]) -> None:
-        steps = list(self._steps_of(kind, ''))
-        self._paths = tuple(dict.fromkeys(paths))
-        missing = set(paths) - {path for *_, path in steps}
+    def __init__(self, type_name: str, definitions: Definitions, paths: Sequence[str]) -> None:
+        self._definitions = definitions
+        self._fields: dict[str, _Field] = {}
+        self.kinds: dict[str, tuple[str, int]] = {}
+        self._columns = 0
+        self._steps = self._steps_of(self._parts_of(type_name, ''))
+        missing = set(paths) - self._fields.keys()
         if missing:
             raise UnsupportedMessage(
-                f'{kind.__name__}: expected the fields {", ".join(sorted(missing))}, got a '
+                f'{type_name}: expected the fields {", ".join(sorted(missing))}, got a '
                 f'definition without; install the current definition'
             )
-        columns = {path: number for number, path in enumerate(self._paths)}
-        rows = [(step, size, count, columns.get(path, -1)) for step, size, count, path in steps]
-        self._steps = np.array(rows, np.int64)  # (steps, [step, size, count, column])
+        self._fields = {path: self._fields[path] for path in paths}
+        self.kinds = {path: self.kinds[path] for path in paths}
 
     def fields_of(self, data: bytes) -> Fields | None:
-        """Return the fields of a message; None if it is not one of this type, or without numba."""
-        walk_compiled = walker()
-        if walk_compiled is None or len(data) < HEADER or data[1] != LITTLE_ENDIAN:
+        """Return the fields of a message; None if it is not a whole one of this type."""
+        if data[: len(LITTLE_ENDIAN)] != LITTLE_ENDIAN:
+            return None
+        columns: list[list[Any]] = [[] for _ in range(self._columns)]
+        try:
+            end = HEADER + _walk(data, 0, self._steps, columns)
+        except ShortError:
+            return None
+        if not end <= len(data) <= end + MOST_PADDING:
             return None
         size = len(data) - HEADER
         body = np.zeros(-(-size // 8) * 8, np.uint8)  # whole numbers of 8 bytes
         body[:size] = np.frombuffer(data, np.uint8, size, HEADER)
-        counts = np.zeros(len(self._paths), np.int64)
-        places = np.zeros((len(self._paths), 0, 2), np.int64)
-        end = walk_compiled(body, size, self._steps, counts, places)
-        if end < 0:
-            return None
-        places = np.zeros((len(self._paths), int(counts.max(initial=0)), 2), np.int64)
-        counts[:] = 0
-        walk_compiled(body, size, self._steps, counts, places)
-        found = {path: places[i, : counts[i]] for i, path in enumerate(self._paths)}
-        return Fields(data, body, found)
+        places = {path: field.places(columns) for path, field in self._fields.items()}
+        return Fields(data, body, places)
 
-    def _steps_of(self, kind: Any, prefix: str) -> Iterator[tuple[int, int, int, str]]:
-        """Yield step, size [bytes], count and path for all fields of a class."""
-        for name, text in kind.get_fields_and_field_types().items():
-            yield from self._steps_of_field(text, prefix + name)
+    def _parts_of(self, type_name: str, prefix: str) -> Iterator[tuple[str, str, int]]:
+        """Yield path, type and count of all fields of a type and of messages in it; -1: any."""
+        for name, text in self._definitions(type_name).items():
+            match = FIELD_TYPE.fullmatch(text)
+            if match is None:
+                raise UnsupportedMessage(f'{prefix}{name}: expected a type of ROS, got {text}')
+            element = match['of'] or match['one']
+            count = -1 if match['of'] else int(match['n'] or 1)
+            if '/' in element and count == 1:
+                yield from self._parts_of(element, f'{prefix}{name}.')
+            else:
+                yield prefix + name, element, count
 
-    def _steps_of_field(self, text: str, path: str) -> Iterator[tuple[int, int, int, str]]:
-        match = FIELD_TYPE.fullmatch(text)
-        if match is None:
-            raise UnsupportedMessage(f'{path}: expected a field type of ROS, got {text}')
-        element = match['of'] or match['one']
-        count = -1 if match['of'] else int(match['n'] or 1)  # -1: the message has the length
+    def _steps_of(self, parts: Iterable[tuple[str, str, int]]) -> tuple[_Step, ...]:
+        """Return the steps through fields, whose places are noted in columns of their own."""
+        steps: list[_Step] = []
+        for path, element, count in parts:
+            self.kinds[path] = element, count
+            size = SIZES.get(element, 0)
+            if not size or count < 0:
+                steps.append(self._step_of(path, element, count))
+                self._fields[path] = _Field(steps[-1].column)
+                continue
+            if not steps or not steps[-1].is_block or steps[-1].alignment < size:
+                steps.append(_Step(True, size, 0, None, self._new_column()))
+            block = steps[-1]
+            offset = -(-block.size // size) * size
+            self._fields[path] = _Field(block.column, offset, count)
+            steps[-1] = block._replace(size=offset + size * count)
+        return tuple(steps)
+
+    def _step_of(self, path: str, element: str, count: int) -> _Step:
+        """Return the step through what begins with its length."""
         if element in SIZES:
-            yield (STEP_SEQUENCE if count < 0 else STEP_NUMBERS), SIZES[element], count, path
-            return
-        if element == 'string':
-            inner = [(STEP_TEXT, 1, 1, path)]
-        elif '/' in element:
-            inner = list(self._steps_of(_class_of(element), f'{path}.'))
+            return _Step(False, SIZES[element], SIZES[element], None, self._new_column())
+        if element == 'string' and count == 1:
+            return _Step(False, 1, 1, None, self._new_column())
+        if count < 0 and '/' in element:
+            items = self._steps_of(self._parts_of(element, f'{path}.'))
+        elif count < 0 and element == 'string':
+            items = (_Step(False, 1, 1, None, self._new_column()),)
         else:
-            raise UnsupportedMessage(f'{path}: expected numbers, strings or messages, got {text}')
-        if count == 1:
-            yield from inner
-            return
-        yield STEP_ITEMS, len(inner), count, path
-        yield from inner
-        yield STEP_END, 0, 0, ''
+            raise UnsupportedMessage(
+                f'{path}: expected numbers, strings, messages, or sequences of them, got {element}'
+            )
+        return _Step(False, 1, 0, items, self._new_column())
+
+    def _new_column(self) -> int:
+        self._columns += 1
+        return self._columns - 1
 
 
-def _class_of(name: str) -> Any:
-    """Return the class of rclpy of a message type."""
-    package, _, kind = name.partition('/')
-    return getattr(import_module(f'{package}.msg'), kind)
+class _Step(NamedTuple):
+    """A step of a walk: numbers that follow each other, or what begins with its length."""
+
+    is_block: bool
+    """Whether it is the former."""
+    alignment: int
+    size: int
+    """Of all numbers of a block; of a letter, or of a number of a sequence [bytes]."""
+    items: tuple[_Step, ...] | None
+    """Steps through each message of a sequence; None if it has letters or numbers."""
+    column: int
+    """In which its places are noted."""
+
+
+class _Field(NamedTuple):
+    """Where a field is noted: numbers of a block have an offset in it."""
+
+    column: int
+    offset: int = 0
+    numbers: int | None = None
+
+    def places(self, columns: Sequence[Sequence[Any]]) -> NDArray[np.int64]:
+        """Return offset and count of each, see `Fields`."""
+        if self.numbers is None:
+            return np.array(columns[self.column], np.int64).reshape(-1, 2)
+        begins = np.array(columns[self.column], np.int64) + self.offset
+        return np.column_stack([begins, np.full_like(begins, self.numbers)])
+
+
+def _walk(data: bytes, position: int, steps: Sequence[_Step], columns: list[list[Any]]) -> int:
+    """
+    Walk through fields that begin at `position` behind the header; return where the last ends.
+
+    Notes where blocks begin, and begin and count of all else. Raises ShortError if a length is
+    behind the end of the message, or states more items than it has bytes.
+
+    """
+    for is_block, alignment, size, items, column in steps:
+        if is_block:
+            position = -(-position // alignment) * alignment
+            columns[column].append(position)
+            position += size
+            continue
+        position = -(-position // PREFIX.size) * PREFIX.size
+        (count,) = PREFIX.unpack_from(data, HEADER + position)
+        position += PREFIX.size
+        if count > len(data) - HEADER - position:
+            raise ShortError
+        if count:
+            position = -(-position // alignment) * alignment
+        columns[column].append((position, count))
+        if items is None:
+            position += size * count
+            continue
+        for _ in range(count):
+            position = _walk(data, position, items, columns)
+    return position
 
 
 @dataclass(eq=False, repr=False)
@@ -182,92 +273,3 @@ class Fields:
         first = self.places[path][:, :1] // np.dtype(dtype).itemsize
         index: NDArray[np.int64] = first + np.arange(width)
         return index
-
-
-@cache
-def walker() -> Callable[..., int] | None:
-    """
-    Return `walk` compiled, or loaded from disk; None where numba does not work.
-
-    A warning names the reason.
-
-    """
-    try:
-        import numba
-
-        compiled = _compiled(numba)
-        nothing = np.zeros(0, np.int64)
-        bytes_, steps = np.zeros(0, np.uint8), np.zeros((0, 4), np.int64)
-        compiled(bytes_, 0, steps, nothing, np.zeros((0, 0, 2), np.int64))
-    except Exception as error:  # whatever a damaged cache or an unsupported processor raises
-        reason = ' '.join(f'{type(error).__name__}: {error}'.split())
-        warn(
-            f'numba: expected to compile the reader of box messages, got {reason}; they are read '
-            f'by rclpy, several times slower: delete __pycache__ beside {__file__}',
-            RuntimeWarning,
-            stacklevel=2,
-        )
-        return None
-    return compiled
-
-
-def _compiled(numba: Any) -> Callable[..., int]:
-    """Compile `walk` at its first call; kept on disk where a folder can be written."""
-    try:
-        compiled: Callable[..., int] = numba.njit(walk, cache=True, nogil=True)
-    except RuntimeError:
-        compiled = numba.njit(walk, nogil=True)
-    return compiled
-
-
-def walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> int:
-    """
-    Walk through a message and note the places of fields.
-
-    Of `body`, `size` bytes are the message. A row of `steps` is step, size, count and column.
-    `counts` (columns,), zeros at first, is set to the number of fields found, and `places`
-    (columns, capacity, 2) to offset and count of each, as far as there is room. Returns where the
-    last field ends; -1 if the message lacks fields.
-
-    """
-    firsts = np.zeros(len(steps), np.int64)  # first repeated step, by depth
-    lefts = np.zeros(len(steps), np.int64)  # repetitions left, by depth
-    depth = 0
-    position = 0
-    i = 0
-    while i < len(steps):
-        step, width, count, column = steps[i]
-        i += 1
-        if step == STEP_END:
-            lefts[depth] -= 1
-            if lefts[depth] > 0:
-                i = firsts[depth]
-            else:
-                depth -= 1
-            continue
-        if step == STEP_TEXT or count < 0:
-            position = (position + 3) // 4 * 4
-            if position + 4 > size:
-                return -1
-            low = np.int64(body[position]) | np.int64(body[position + 1]) << 8
-            high = np.int64(body[position + 2]) | np.int64(body[position + 3]) << 8
-            count = low | high << 16
-            position += 4
-        begin = position
-        if step == STEP_ITEMS and count > 0:
-            depth += 1
-            firsts[depth] = i
-            lefts[depth] = count
-        elif step == STEP_ITEMS:
-            i += width + 1
-        elif count > 0:
-            begin = (position + width - 1) // width * width
-            position = begin + width * count
-            if position > size:
-                return -1
-        if column >= 0:
-            if counts[column] < places.shape[1]:
-                place = places[column, counts[column]]
-                place[0], place[1] = begin, count  # a tuple takes numba seconds to compile
-            counts[column] += 1
-    return position

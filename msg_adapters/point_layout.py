@@ -137,7 +137,9 @@ def reading_of(
 def seconds_of(raw: NDArray[Any], stamp_ns: int, reading: TimeReading) -> Floats:
     """Return times (M,) relative to the stamp [s]; wild ones are 0, see `wild_times`."""
     times = _relative(raw, stamp_ns, reading)
-    times[wild_times(times)] = 0.0
+    first, last = _bounds(times)
+    if times.min() < first or times.max() > last:  # of few clouds
+        times[wild_times(times)] = 0.0
     return times
 
 
@@ -162,9 +164,15 @@ def wild_times(times: Floats) -> NDArray[np.bool_]:
     without a time, or with one of another sweep.
 
     """
+    first, last = _bounds(times)
+    return np.asarray((times < first) | (times > last))
+
+
+def _bounds(times: Floats) -> tuple[float, float]:
+    """Return the first and the last time that are none of `wild_times` [s]."""
     low, high = _usual_ends(times)
     margin = max(high - low, MIN_DURATION)
-    return np.asarray((times < low - margin) | (times > high + margin))
+    return low - margin, high + margin
 
 
 def _usual_ends(values: NDArray[Any]) -> tuple[float, float]:

@@ -81,12 +81,13 @@ def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
     for column, name in zip(columns, 'xyz', strict=True):
         column[:] = table[name].reshape(-1)
     is_finite = np.isfinite(columns).all(0)
+    are_finite = bool(is_finite.all())
     times = None
     if time_field:
         raw_times = table[time_field].ravel()  # contiguous: it is read several times
-        known_times = raw_times if is_finite.all() else raw_times[is_finite]
+        known_times = raw_times if are_finite else raw_times[is_finite]
         times = _seconds(known_times, stamp, point_layout.layout_of(kinds), time_unit)
-    if not is_finite.all():
+    if not are_finite:
         columns = columns[:, is_finite]
     return Sweep(stamp, msg.header.frame_id, columns.T, times)
 

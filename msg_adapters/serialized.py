@@ -16,7 +16,7 @@ from typing import Any
 
 from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, WIDTH, YAW
 from msg_adapters import autoware, derived, foxglove, markers, poses
-from msg_adapters.cdr import Fields, Layout, walker
+from msg_adapters.cdr import Definitions, Fields, installed_definition, Layout
 from msg_adapters.convention import Convention, STANDARD
 from msg_adapters.protocol import Adapter
 from msg_adapters.registry import adapter_for, ConvertingAdapter
@@ -77,6 +77,68 @@ class BoxFields:
     """Writes what depends on the box beside pose, size and covariance."""
 
 
+class BoxReader:
+    """
+    Reads the boxes of the serialised messages of a type, without an object for each.
+
+    Raises UnsupportedMessage if the type is an older one that lacks a field.
+
+    """
+
+    def __init__(self, type_name: str, definitions: Definitions) -> None:
+        at = self.at = BOX_FIELDS[type_name]
+        paths = (at.stamp, *at.frames, at.pose, at.size, at.covariance, *at.others)
+        self._layout = Layout(type_name, definitions, list(dict.fromkeys(filter(None, paths))))
+        self._walked = deque[Fields](maxlen=MOST_WALKED)
+
+    def reads_as(self, other: BoxReader) -> bool:
+        """Return whether the fields have the types that they have for another reader."""
+        return self._layout.kinds == other._layout.kinds
+
+    def ordinary(self, msg: bytes) -> Fields | None:
+        """Return the fields of a message with one frame and one stamp that has boxes, or None."""
+        fields = self._fields_of(msg)
+        if fields is None:
+            return None
+        at = self.at
+        frames = {text for path in at.frames for text in fields.distinct(path)}
+        stamps = fields.numbers(at.stamp, '<i4', 2)
+        # Where the stamp is 0, those of the boxes may be known.
+        is_stamped = bool((stamps == stamps[:1]).all() and stamps.any())
+        is_one = len(frames) == 1 and '' not in frames and is_stamped
+        has_boxes = len(fields.counts(at.pose)) > 0
+        return fields if is_one and has_boxes and at.is_ordinary(fields) else None
+
+    def boxes_of(self, fields: Fields) -> BoxArray:
+        """Return the boxes of an ordinary message."""
+        at = self.at
+        rows = self.rows(fields)
+        boxes = poses.boxes_from(
+            fields.numbers(at.pose, '<f8', POSE_WIDTH)[rows],
+            fields.numbers(at.size, '<f8', SIZE_WIDTH)[rows],
+        )
+        if at.has_angles is not None:
+            boxes[~at.has_angles(fields), ROLL : YAW + 1] = np.nan
+        ids, classes, scores = at.labels(fields)
+        sec, nanosec = fields.numbers(at.stamp, '<i4', 2)[0].tolist()
+        frame_id = fields.texts(at.frames[0])[0]
+        return BoxArray(sec * 10**9 + nanosec, frame_id, tuple(ids), tuple(classes), scores, boxes)
+
+    def rows(self, fields: Fields) -> Any:
+        """Return which of the poses are those of boxes, as an index."""
+        return slice(None) if self.at.rows is None else self.at.rows(fields)
+
+    def _fields_of(self, msg: bytes) -> Fields | None:
+        """Return the fields of a message, which is walked through once."""
+        for known in self._walked:
+            if known.data is msg:
+                return known
+        fields = self._layout.fields_of(msg)
+        if fields is not None:
+            self._walked.append(fields)
+        return fields
+
+
 @dataclass(eq=False, repr=False)
 class SerializedAdapter:
     """
@@ -94,32 +156,14 @@ class SerializedAdapter:
 
     def __post_init__(self) -> None:
         """Find the fields in the definition of the type."""
-        at = self._at = BOX_FIELDS[self.type_name]
-        paths = (at.stamp, *at.frames, at.pose, at.size, at.covariance, *at.others)
-        self._layout = Layout(self.kind, [path for path in dict.fromkeys(paths) if path])
-        self._walked = deque[Fields](maxlen=MOST_WALKED)
+        self._reader = BoxReader(self.type_name, installed_definition)
 
     def from_msg(self, msg: bytes) -> BoxArray:
         """Return the boxes of a message, see `Adapter`."""
-        fields = self._ordinary(msg)
+        fields = self._reader.ordinary(msg)
         if fields is None:
             return self.inner.from_msg(self.deserialize(msg, self.kind))
-        return self._boxes_of(fields)
-
-    def _boxes_of(self, fields: Fields) -> BoxArray:
-        """Return the boxes of a message that arrays can represent."""
-        at = self._at
-        rows = self._rows(fields)
-        boxes = poses.boxes_from(
-            fields.numbers(at.pose, '<f8', POSE_WIDTH)[rows],
-            fields.numbers(at.size, '<f8', SIZE_WIDTH)[rows],
-        )
-        if at.has_angles is not None:
-            boxes[~at.has_angles(fields), ROLL : YAW + 1] = np.nan
-        ids, classes, scores = at.labels(fields)
-        sec, nanosec = fields.numbers(at.stamp, '<i4', 2)[0].tolist()
-        frame_id = fields.texts(at.frames[0])[0]
-        return BoxArray(sec * 10**9 + nanosec, frame_id, tuple(ids), tuple(classes), scores, boxes)
+        return self._reader.boxes_of(fields)
 
     def to_msg(
         self,
@@ -131,13 +175,13 @@ class SerializedAdapter:
         """Return a copy with its boxes replaced, see `Adapter`: bytes, or a message."""
         if not isinstance(msg, bytes):
             return self.inner.to_msg(msg, boxes, covariances, T_out_in)
-        fields = self._ordinary(msg) if T_out_in is None else None
-        at = self._at
+        fields = self._reader.ordinary(msg) if T_out_in is None else None
+        at = self._reader.at
         if fields is None or fields.texts(at.frames[0])[0] != boxes.frame_id:
             given = self.deserialize(msg, self.kind)
             return self.inner.to_msg(given, boxes, covariances, T_out_in)
         fields = fields.copied()  # the final boxes are written into the same message
-        rows = self._rows(fields)
+        rows = self._reader.rows(fields)
         pose = fields.numbers(at.pose, '<f8', POSE_WIDTH)
         size = fields.numbers(at.size, '<f8', SIZE_WIDTH)
         old_pose, old_size = pose[rows].copy(), size[rows].copy()
@@ -161,41 +205,13 @@ class SerializedAdapter:
         earlier = [(self.deserialize(source, self.kind), row) for source, row in sources]
         return self.inner.with_added(self.deserialize(msg, self.kind), earlier)
 
-    def _ordinary(self, msg: bytes) -> Fields | None:
-        """Return the fields of a message with one frame and one stamp that has boxes."""
-        fields = self._fields_of(msg)
-        if fields is None:
-            return None
-        at = self._at
-        frames = {text for path in at.frames for text in fields.distinct(path)}
-        stamps = fields.numbers(at.stamp, '<i4', 2)
-        # Where the stamp is 0, those of the boxes may be known.
-        is_stamped = bool((stamps == stamps[:1]).all() and stamps.any())
-        is_one = len(frames) == 1 and '' not in frames and is_stamped
-        has_boxes = len(fields.counts(at.pose)) > 0
-        return fields if is_one and has_boxes and at.is_ordinary(fields) else None
-
-    def _fields_of(self, msg: bytes) -> Fields | None:
-        """Return the fields of a message, which is walked through once."""
-        for known in self._walked:
-            if known.data is msg:
-                return known
-        fields = self._layout.fields_of(msg)
-        if fields is not None:
-            self._walked.append(fields)
-        return fields
-
-    def _rows(self, fields: Fields) -> Any:
-        """Return which of the poses are those of boxes, as an index."""
-        return slice(None) if self._at.rows is None else self._at.rows(fields)
-
 
 def serialized_adapter_for(
     type_name: str, convention: Convention, kind: Any, deserialize: Callable[[bytes, Any], Any]
 ) -> Adapter | None:
     """Return the adapter of serialised messages, as `adapter_for`; None if there is none."""
     inner = adapter_for(type_name, replace(STANDARD, associate=convention.associate))
-    if type_name not in BOX_FIELDS or walker() is None:
+    if type_name not in BOX_FIELDS:
         return None
     adapter = SerializedAdapter(type_name, kind, inner, deserialize)
     return adapter if convention.is_standard else ConvertingAdapter(adapter, convention)

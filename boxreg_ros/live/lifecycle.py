@@ -9,7 +9,7 @@ from threading import Event
 from typing import Any
 from uuid import uuid4
 
-from boxreg_ros.errors import BoxregError, UnsupportedMessage
+from boxreg_ros.errors import BoxregError, one_line, UnsupportedMessage
 from boxreg_ros.live.diagnostics import diagnosis
 from boxreg_ros.live.node import BoxregNode, STATUS_PERIOD
 from boxreg_ros.live.topics import import_message
@@ -201,6 +201,6 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
             step()
         except Exception as error:  # rclpy would discard it without a log entry
             kind = '' if isinstance(error, BoxregError) else f'{type(error).__name__}: '
-            self.get_logger().error(f'{kind}{" ".join(str(error).split())}')
+            self.get_logger().error(f'{kind}{one_line(error)}')
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS

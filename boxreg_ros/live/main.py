@@ -8,7 +8,7 @@ import signal
 import sys
 
 from boxreg_ros.allocation import collect_rarely, keep_freed_memory
-from boxreg_ros.errors import BoxregError, ConfigError
+from boxreg_ros.errors import BoxregError, ConfigError, one_line
 
 NAME = 'boxreg_node'
 WITHOUT_ROS = "source a ROS 2 Jazzy installation, or pip install 'boxreg_ros[ros]'"
@@ -57,7 +57,7 @@ def lifecycle(args: Sequence[str] | None = None) -> int:
 def _fail(error: Exception, status: int) -> int:
     """Print an error in one line on stderr and return the status."""
     kind = '' if isinstance(error, BoxregError) else f'{type(error).__name__}: '
-    print(f'{NAME}: {kind}{" ".join(str(error).split())}', file=sys.stderr)
+    print(f'{NAME}: {kind}{one_line(error)}', file=sys.stderr)
     return status
 
 

@@ -16,7 +16,13 @@ from boxreg_ros.io.compilation import announced_compilation
 from boxreg_ros.io.label_messages import EARLY_TOPIC, LABELS_TOPIC, LABELS_TYPE
 from boxreg_ros.io.lidars import Lidars, SensorPlacement
 from boxreg_ros.io.session import Session
-from boxreg_ros.io.warm_up import warm_up, warm_up_followed, warm_up_labels
+from boxreg_ros.io.warm_up import (
+    compiled_beside,
+    warm_up,
+    warm_up_estimation,
+    warm_up_followed,
+    warm_up_labels,
+)
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.budget import TickBudget
@@ -31,7 +37,7 @@ from boxreg_ros.live.topics import Endpoint, FOLLOW_TOPIC, import_message, NodeT
 from boxreg_ros.live.transform_wait import TransformWait
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
-from msg_adapters import adapter_for, canonical, cdr
+from msg_adapters import adapter_for, canonical
 from msg_adapters.clouds import POINTS_TYPE
 from msg_adapters.concatenation import INFO_TYPE
 from msg_adapters.serialized import serialized_adapter_for
@@ -46,7 +52,6 @@ NAME = 'boxreg_node'
 BOXES_TOPICS = {False: 'refined_boxes', True: 'refined_boxes_final'}
 LABELS_TOPICS = {False: EARLY_TOPIC, True: LABELS_TOPIC}
 """Topics of early (False) and final (True) boxes, and of what label files hold of them."""
-COMPILING_READER = 'compiling the reader of messages, once after an installation: some seconds'
 GRAPH_PERIOD = 0.2
 """Time between two looks for the type of the boxes [s]."""
 STATUS_PERIOD = 1.0
@@ -98,8 +103,6 @@ class BoxregNode(PolledClockNode):
     def prepare(self) -> None:
         """Make a registrar without any track, and all that reading and passing boxes needs."""
         config, options = self._settings
-        with announced_compilation(lambda _: self.get_logger().info(COMPILING_READER)):
-            cdr.walker()
         self._budget = TickBudget(options.deadline)
         report = self._health.report
         placement = SensorPlacement(options.lidars)
@@ -117,6 +120,8 @@ class BoxregNode(PolledClockNode):
         config, options = self._settings
         begun = time.monotonic()
         with announced_compilation(announce) as done:
+            with compiled_beside(config):
+                warm_up_estimation(config)
             warm_up(config)
             warm_up_followed(config)
             if options.static_points:

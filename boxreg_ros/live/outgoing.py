@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import TransformUnavailable, UnsupportedMessage
-from boxreg_ros.io.session import covariances_to_write, Session
+from boxreg_ros.io.session import covariances_to_write, refined_to_frame, Session
 from boxreg_ros.io.transforms import boxes_to_frame
 from boxreg_ros.live.following import Following
 from boxreg_ros.live.static_points import StaticPoints
 from boxreg_ros.live.tickets import Detection, Ticket, ticket_of
 from boxreg_ros.reasons import Reason
-from boxreg_ros.structures import BoxArray, COASTED, Floats, kept, REFINED, RefinedBoxes
+from boxreg_ros.structures import BoxArray, COASTED, kept, REFINED, RefinedBoxes
 from msg_adapters import Adapter
-from msg_adapters.poses import turned_covariances
 
 
 class Outgoing(NamedTuple):
@@ -90,17 +88,6 @@ class OutgoingQueue:
             return Outgoing(ticket.message, refined.is_final)
         assert adapter is not None
         return _outgoing(refined, ticket, adapter, self._following.sources)
-
-
-def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:
-    """Return refined boxes and their covariances in another frame; unchanged in the same."""
-    if frame_id == refined.boxes.frame_id:
-        return refined
-    return replace(
-        refined,
-        boxes=boxes_to_frame(refined.boxes, T_frame_boxes, frame_id),
-        covariances=turned_covariances(refined.covariances, T_frame_boxes),
-    )
 
 
 def labels_passed_through(message: Any, adapter: Adapter, session: Session) -> RefinedBoxes | None:

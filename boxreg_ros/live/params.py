@@ -7,7 +7,7 @@ from dataclasses import dataclass, Field, fields, replace
 import json
 from typing import Any, cast
 
-from boxreg_ros.config import Config, Setting, setting, settings
+from boxreg_ros.config import cast_value, Config, Setting, setting, settings
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lidars import Lidars
 from msg_adapters import CLOUD_TYPES, POINTS_TYPE
@@ -281,15 +281,7 @@ def _values_of(parameters: Iterable[Parameter]) -> dict[str, Any]:
 
 def _checked(item: Setting, value: Any) -> Any:
     """Return the value of an option of the node in its type, or raise ConfigError."""
-    kind: Any = type(item.default)
-    if kind is tuple:
-        if not isinstance(value, list | tuple) or not all(type(name) is str for name in value):
-            raise ConfigError(f'{item.name}: expected a list of names, got {value!r}')
-        return tuple(value)
-    if kind is float and type(value) is int:
-        value = float(value)
-    if type(value) is not kind:
-        raise ConfigError(f'{item.name}: expected {kind.__name__} ({item.meaning}), got {value!r}')
+    value = cast_value(item.name, value, item.default)
     item.check(value)
     if item.name == 'deadline' and value == 0:
         raise ConfigError(

@@ -18,7 +18,6 @@ from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.following import Following
 from boxreg_ros.live.incoming import Incoming
 from boxreg_ros.live.outgoing import Outgoing, OutgoingQueue
-from boxreg_ros.live.silence import Silence
 from boxreg_ros.live.static_points import StaticPoints
 from boxreg_ros.live.tickets import passing, Ticket, ticket_of, Tickets
 from boxreg_ros.live.transform_wait import TransformWait
@@ -27,6 +26,11 @@ from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 from msg_adapters import Adapter
 import numpy as np
 
+BOXES_SILENCE = 3.0
+"""After this time without boxes, final boxes are published without further observations [s]."""
+CLOUD_SILENCE = 0.5
+"""After this time without clouds, boxes that have waited as long are published unrefined [s]. Five
+periods of a LiDAR of 10 Hz."""
 PASSED = 'passed'
 """Reason of messages that pass through; they have no boxes that it could be counted for."""
 
@@ -62,7 +66,7 @@ class MessagePipeline:
     ----------
     adapter : Adapter or None
         Of the boxes; to be set before the first ones.
-    incoming, registrar, following, static_points, silence
+    incoming, registrar, following, static_points
         The parts that the worker asks.
 
     """
@@ -87,7 +91,7 @@ class MessagePipeline:
         self.static_points: StaticPoints | None = None
         if static_patience is not None:
             self.static_points = StaticPoints(static_patience, self.registrar)
-        self.silence = Silence(self.registrar)
+        self._boxes_received = 0.0  # when boxes arrived last [s]
         self.incoming = Incoming()
         self._tickets = Tickets(session, wait)
         self._queue = OutgoingQueue(self.following, self.static_points)
@@ -148,11 +152,23 @@ class MessagePipeline:
         return self._messages(self.registrar.add_sweep(sweep))
 
     def lose_overdue(self, now: float, cloud_received: float) -> list[Outgoing]:
-        """Release boxes that wait for clouds if no clouds have arrived for long."""
-        overdue_ns = self.silence.overdue_ns(now, cloud_received)
-        if overdue_ns is None:
+        """Release boxes that wait for clouds if none has come for long since `cloud_received`."""
+        if now < cloud_received + CLOUD_SILENCE:
             return []
+        overdue = [
+            boxes.stamp_ns
+            for boxes in self.registrar.unpaired
+            if now >= ticket_of(boxes).received + CLOUD_SILENCE
+        ]
+        if not overdue:
+            return []
+        # Beyond the reach of these boxes: a cloud that arrived before them may still be theirs.
+        overdue_ns = max(overdue) + round(self.registrar.config.reach * 1e9) + 1
         return self._add_sweeps(self.session.unmerged()) + self.lose(overdue_ns)
+
+    def has_no_boxes(self, now: float) -> bool:
+        """Return whether no boxes have arrived for long."""
+        return now >= self._boxes_received + max(BOXES_SILENCE, self.registrar.config.max_gap)
 
     # ------------------------------------------------------------ all that is held
 
@@ -256,7 +272,7 @@ class MessagePipeline:
             if item.content.track_ids:
                 self._report(item.reason, item.detail, len(item.content.track_ids))
             return self.pass_through(item.message, item.content.stamp_ns)
-        self.silence.boxes_received = item.received
+        self._boxes_received = item.received
         return self._messages(self.registrar.add_boxes(item.moved))
 
     def _add_sweeps(self, complete: list[MergedSweep]) -> list[Outgoing]:

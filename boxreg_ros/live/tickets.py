@@ -15,10 +15,6 @@ from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.live.transform_wait import TransformWait
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats
-import numpy as np
-
-PASSING = BoxArray(0, '', (), (), np.zeros(0), np.zeros((0, 9)))
-"""In the place of a message that passes through."""
 
 
 class Detection(NamedTuple):
@@ -129,7 +125,7 @@ def passing(message: Any, stamp_ns: int = 0) -> BoxArray:
 
     """
     ticket = Ticket(message, received=inf, is_early_out=True)
-    return replace(PASSING, stamp_ns=stamp_ns, ticket=ticket)
+    return replace(BoxArray.empty(stamp_ns, ''), ticket=ticket)
 
 
 def ticket_of(boxes: BoxArray) -> Ticket:

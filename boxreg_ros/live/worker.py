@@ -284,10 +284,10 @@ class Worker:
         if self._confirmed or any(self._inbox.sizes().values()):
             return
         now = time.monotonic()
-        if self._live.registrar.num_held and self._live.silence.has_no_boxes(now):
+        if self._live.registrar.num_held and self._live.has_no_boxes(now):
             self._catch_up(self._live.registrar.num_waiting)
             self._publish(self._guarded(self._live.flush))
-        if self._board.is_showing and self._live.silence.has_no_boxes(now):
+        if self._board.is_showing and self._live.has_no_boxes(now):
             self._markers.publish(self._board.clear())
         self._waited = 0.0
         spare = self._budget.spare_windows()

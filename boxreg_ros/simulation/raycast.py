@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
-from boxreg_ros.structures import Floats, Ints
+from boxreg_ros.structures import Floats, Ints, on_lines
 import numpy as np
 from numpy.typing import NDArray
 
@@ -162,7 +162,7 @@ class Motion:
 
     def at(self, times: NDArray[Any]) -> Floats:
         """Return poses (n, 6) at `times` (n,) [s], by linear interpolation."""
-        return np.stack([np.interp(times, self.times, column) for column in self.poses.T], axis=1)
+        return on_lines(self.times, self.poses, times)
 
 
 @dataclass(frozen=True, slots=True)

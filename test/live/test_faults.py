@@ -158,7 +158,8 @@ def test_second_node_continues_after_the_first_was_killed(graph, tmp_path):
     node.kill()
     count = len(shown)
     left = graph.endpoints()
-    second = graph.start(*RELIABLE, *QUICK)
+    # The static transform is sent again, and may come behind the first clouds.
+    second = graph.start(*RELIABLE, *QUICK, '-p', 'transform_timeout:=20.0')
     graph.wait_until_connected(left)
     node.play(records[half:])
     graph.wait(lambda: len(shown) > count, 'markers')

@@ -114,7 +114,7 @@ def test_steps_for_whole_tracks_do_not_turn_coasting_off(make_node):
         ('mode', '4d', ('mode', 'bev', '4d')),
         ('transform_timeout', -1.0, ('transform_timeout', '0', '-1')),
         ('backlog', 'x', ('backlog', 'float', 'x')),
-        ('boxes_type', 3, ('boxes_type', 'str', '3')),
+        ('boxes_type', True, ('boxes_type', 'str', 'True')),
         ('faces.learn', 1, ('faces.learn', 'bool', '1')),
     ],
 )

@@ -13,8 +13,8 @@ import time
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.live.topics import import_message
 from boxreg_ros.structures import KINEMATICS
-from msg_adapters import adapter_for, ADAPTERS, cdr
-from msg_adapters.cdr import Layout
+from msg_adapters import adapter_for, ADAPTERS
+from msg_adapters.cdr import installed_definition, Layout
 from msg_adapters.convention import Convention, STANDARD
 from msg_adapters.serialized import BOX_FIELDS, serialized_adapter_for
 import numpy as np
@@ -223,9 +223,9 @@ def test_objects_without_orientation_or_class_are_ordinary():
 
 @pytest.mark.parametrize('type_name', [DETECTIONS, MARKERS])
 def test_bytes_that_were_cut_off_or_changed_are_no_fields(type_name):
-    kind = class_of(type_name)
+    class_of(type_name)
     at = BOX_FIELDS[type_name]
-    layout = Layout(kind, [at.pose, *at.frames])
+    layout = Layout(type_name, installed_definition, [at.pose, *at.frames])
     data = serialize_message(message_of(type_name))
     assert layout.fields_of(data) is not None
     for length in range(0, len(data) - 8, 7):
@@ -240,25 +240,11 @@ def test_bytes_that_were_cut_off_or_changed_are_no_fields(type_name):
 
 
 def test_a_definition_without_a_field_is_refused_by_name():
-    kind = class_of(JSK)
+    class_of(JSK)
     with pytest.raises(UnsupportedMessage, match=r'BoundingBoxArray.*boxes\.colour'):
-        Layout(kind, ['boxes.colour', 'boxes.value'])
+        Layout(JSK, installed_definition, ['boxes.colour', 'boxes.value'])
     with pytest.raises(UnsupportedMessage, match='have no ids'):
         serialized_adapter_for(BOXES, STANDARD, class_of(BOXES), deserialize_message)
-
-
-def test_a_compiler_that_fails_leaves_messages_to_rclpy_with_one_warning(monkeypatch):
-    def fail(*_, **__):
-        raise ValueError('no such processor')
-
-    kind = class_of(DETECTIONS)
-    cdr.walker.cache_clear()
-    with monkeypatch.context() as patched:
-        patched.setattr('numba.njit', fail)
-        with pytest.warns(RuntimeWarning, match=r'no such processor.*delete __pycache__'):
-            assert serialized_adapter_for(DETECTIONS, ASSOCIATE, kind, deserialize_message) is None
-    cdr.walker.cache_clear()
-    assert serialized_adapter_for(DETECTIONS, ASSOCIATE, kind, deserialize_message) is not None
 
 
 def milliseconds(task, repetitions=9):
@@ -274,7 +260,7 @@ def milliseconds(task, repetitions=9):
 def print_times(n):
     """Print the times of n boxes of each type, serialised and by objects [ms]."""
     print(f'{"":52}{"read":>8}{"write":>8}{"sum":>8}{"by objects":>12}')
-    for type_name in ADAPTERS:
+    for type_name in BOX_FIELDS:
         adapters = Adapters(type_name)
         kind, slow = adapters.kind, adapters.slow
         data = serialize_message(message_of(type_name, n))
