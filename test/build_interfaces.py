@@ -8,40 +8,27 @@ that use the originals. A package whose files have not changed since its build i
 
 """
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import redirect_stdout
 from hashlib import sha256
+from io import StringIO
+import logging
 import os
 from pathlib import Path
 import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 from tempfile import TemporaryDirectory
 
 HERE = Path(__file__).resolve().parent / 'interfaces'
 FOLDERS = (HERE, HERE.parents[1] / 'msg_adapters' / 'interfaces' / 'jazzy')
 PREFIX = Path(sys.prefix)
-MANIFEST = """<package format="3">
-  <name>{name}</name>
-  <version>0.0.0</version>
-  <description>Field lists, for tests</description>
-  <maintainer email="boxreg@example.com">boxreg_ros developers</maintainer>
-  <license>Apache-2.0</license>
-  <buildtool_depend>ament_cmake</buildtool_depend>
-  <member_of_group>rosidl_interface_packages</member_of_group>
-  <export><build_type>ament_cmake</build_type></export>
-</package>
-"""
-PROJECT = """cmake_minimum_required(VERSION 3.16)
-project({name})
-find_package(ament_cmake REQUIRED)
-find_package(rosidl_default_generators REQUIRED)
-foreach(package {depends})
-  find_package(${{package}} REQUIRED)
-endforeach()
-rosidl_generate_interfaces(${{PROJECT_NAME}} {files} DEPENDENCIES {depends})
-ament_package()
-"""
+SITE = Path(sysconfig.get_path('platlib'))
+MANIFEST = '<package format="3"><name>{}</name></package>'
+IMPLEMENTATIONS = ('fastrtps_c', 'introspection_c')
+"""Type supports that the middleware asks for: to read and write messages, to describe types."""
 
 
 def main() -> None:
@@ -55,21 +42,18 @@ def main() -> None:
         sys.exit(f'no C++ compiler {compiler!r} to build message types with: apt install g++')
     if packages:
         print(f'building message types of {", ".join(p.name for p in packages)} ...', flush=True)
-    with ThreadPoolExecutor(2) as pool:  # one compiles while the next one generates
-        for package, error in zip(packages, pool.map(build, packages), strict=True):
-            if error:
-                sys.exit(f'{package.name}: {error}')
-            stamp(package).write_text(digest(package))
+    with ProcessPoolExecutor() as pool:
+        list(pool.map(build, packages, [compiler] * len(packages)))
 
 
 def stamp(package: Path) -> Path:
     """Return the file with the digest of the files that a package was built from."""
-    return PREFIX / 'share' / package.name / 'test_interfaces.sha256'
+    return SITE / package.name / 'test_interfaces.sha256'
 
 
 def digest(package: Path) -> str:
     """Return a digest of the files that a package is built from."""
-    files = [*sorted(package.glob('msg/*.msg')), HERE / 'fix_wheel_paths.cmake', Path(__file__)]
+    files = [*sorted(package.glob('msg/*.msg')), Path(__file__)]
     return sha256(b''.join(path.name.encode() + path.read_bytes() for path in files)).hexdigest()
 
 
@@ -78,48 +62,92 @@ def is_built(package: Path) -> bool:
     return stamp(package).exists() and stamp(package).read_text() == digest(package)
 
 
-def build(package: Path) -> str:
-    """Configure, build and install one package; return an error message, or an empty one."""
-    # Variables that Python sets at its start for the ROS wheels break cmake and the generators.
-    foreign = {'LD_LIBRARY_PATH', '_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'PYTHONPATH'}
-    environment = {key: value for key, value in os.environ.items() if key not in foreign}
-    environment['PATH'] = f'{PREFIX / "bin"}{os.pathsep}{environment["PATH"]}'
-    environment['CMAKE_PREFIX_PATH'] = environment['AMENT_PREFIX_PATH'] = str(PREFIX)
-    with TemporaryDirectory() as folder:
-        source = Path(folder, 'source')
-        shutil.copytree(package, source)
-        write_project(source, package.name)
-        configure = ['cmake', '-S', source, '-B', f'{folder}/build', '-G', 'Ninja', '-Wno-dev']
-        settings = {
-            'CMAKE_BUILD_TYPE': 'None',  # no optimisation: the quickest to compile
-            'CMAKE_INSTALL_PREFIX': PREFIX,
-            'CMAKE_PROJECT_INCLUDE': HERE / 'fix_wheel_paths.cmake',
-            'Python3_EXECUTABLE': PREFIX / 'bin' / 'python',
-            'Python3_FIND_VIRTUALENV': 'ONLY',
-            'BUILD_TESTING': 'OFF',
-        }
-        configure += [f'-D{name}={value}' for name, value in settings.items()]
-        install = ['cmake', '--build', f'{folder}/build', '--target', 'install']
-        for command in (configure, install):
-            done = subprocess.run(
-                command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-            )
-            if done.returncode:
-                return f'{command[:2]} failed:\n{done.stdout.decode()[-5000:]}'
-    return ''
+def build(package: Path, compiler: str) -> None:
+    """Generate, compile and install one package."""
+    name = package.name
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        generate(package, folder)
+        module = folder / 'py' / name
+        library = f'{name}_s__rosidl_typesupport_c.so'
+        compile_package(package, folder, compiler, module / library)
+        (module / '__init__.py').touch()
+        shutil.rmtree(SITE / name, ignore_errors=True)
+        shutil.copytree(module, SITE / name, ignore=shutil.ignore_patterns('*.c'))
+    for implementation in IMPLEMENTATIONS:  # where the middleware looks for them
+        link = PREFIX / 'lib' / f'lib{name}__rosidl_typesupport_{implementation}.so'
+        link.unlink(missing_ok=True)
+        link.symlink_to(os.path.relpath(SITE / name / library, link.parent))
+    stamp(package).write_text(digest(package))
 
 
-def write_project(source: Path, name: str) -> None:
-    """Write the manifest and the CMake project for the field lists in ``source/msg``."""
-    files = sorted(source.glob('msg/*.msg'))
-    used = {u for f in files for u in re.findall(r'^(\w+)/', f.read_text(), re.MULTILINE)}
-    fields = {
-        'name': name,
-        'depends': ' '.join(sorted(used - {name})),
-        'files': ' '.join(f'msg/{path.name}' for path in files),
+def generate(package: Path, folder: Path) -> None:
+    """Generate the sources of a package: ``FOLDER/GENERATOR/PACKAGE/msg``."""
+    os.environ['AMENT_PREFIX_PATH'] = str(PREFIX)
+    logging.disable(logging.WARNING)  # each generator is registered twice in its wheel
+    from rosidl_adapter.cli import TranslateMsgToIDL
+    from rosidl_generator_c.cli import GenerateC
+    from rosidl_generator_py.cli import GeneratePython
+    from rosidl_typesupport_c.cli import GenerateCTypesupport
+    from rosidl_typesupport_fastrtps_c.cli import GenerateFastRTPSCTypesupport
+    from rosidl_typesupport_introspection_c.cli import GenerateIntrospectionCTypesupport
+
+    generators = (
+        GenerateC('c'),
+        GeneratePython('py'),
+        GenerateCTypesupport('typesupport'),
+        GenerateFastRTPSCTypesupport('fastrtps_c'),
+        GenerateIntrospectionCTypesupport('introspection_c'),
+    )
+    name = package.name
+    source = folder / 'source'
+    shutil.copytree(package, source)
+    (source / 'package.xml').write_text(MANIFEST.format(name))
+    included = [str(PREFIX / 'share')]
+    with redirect_stdout(StringIO()):
+        files = [f'{source}:msg/{path.name}' for path in sorted(source.glob('msg/*.msg'))]
+        translator = TranslateMsgToIDL('msg2idl')
+        files = list(translator.translate(name, files, included, folder / 'idl'))
+        for generator in generators:
+            generator.generate(name, files, included, folder / generator.name / name)
+
+
+def compile_package(package: Path, folder: Path, compiler: str, library: Path) -> None:
+    """
+    Compile the generated sources of a package into one library.
+
+    Most of the time goes into headers: files whose names do not clash are compiled as one.
+
+    """
+    import numpy
+
+    name = package.name
+    entry = library.with_name(f'_{name}_s.ep.rosidl_typesupport_c.c')
+    together = {
+        'python.c': [entry, *folder.glob('py/*/msg/*.c'), *folder.glob('introspection_c/**/*.c')],
+        'support.cpp': list(folder.glob('*/*/msg/**/*.cpp')),
     }
-    (source / 'package.xml').write_text(MANIFEST.format(**fields))
-    (source / 'CMakeLists.txt').write_text(PROJECT.format(**fields))
+    for file, paths in together.items():
+        (folder / file).write_text(''.join(f'#include "{path}"\n' for path in paths))
+    headers = [
+        *folder.iterdir(), PREFIX / 'include', *PREFIX.glob('include/*'),
+        sysconfig.get_path('include'), numpy.get_include(),
+    ]  # fmt: skip
+    texts = [path.read_text() for path in package.glob('msg/*.msg')]
+    used = {name for text in texts for name in re.findall(r'^(\w+)/', text, re.MULTILINE)}
+    kinds = ('generator_c', 'generator_py', *(f'typesupport_{kind}' for kind in IMPLEMENTATIONS))
+    libraries = [
+        *(f'{name}__rosidl_{kind}' for name in sorted(used - {package.name}) for kind in kinds),
+        *(f'rosidl_typesupport_{kind}' for kind in ('c', 'fastrtps_cpp', *IMPLEMENTATIONS)),
+        *('rosidl_runtime_c', 'rmw', 'rcutils', ':libfastcdr.so.2'),
+    ]
+    command = [
+        compiler, '-shared', '-fPIC', '-w', *(f'-I{path}' for path in headers),
+        '-x', 'c', folder / 'python.c', *folder.glob('c/**/*.c'),
+        '-x', 'c++', folder / 'support.cpp',
+        f'-L{PREFIX}/lib', *(f'-l{library}' for library in libraries), '-o', library,
+    ]  # fmt: skip
+    subprocess.run(command, check=True)
 
 
 if __name__ == '__main__':

@@ -22,6 +22,7 @@ BOXREG = 'boxreg_ros.cli:command'
 NODE = 'boxreg_ros.live.main:main'
 LIFECYCLE_NODE = 'boxreg_ros.live.main:lifecycle'
 IMPATIENT_NODE = 'preloaded:impatient_node'
+PATIENT_NODE = 'preloaded:patient_node'
 CODE = 'preloaded:run_code'
 """Runs its first argument, which may change the modules before it calls an entry point."""
 MODULES = (
@@ -172,6 +173,14 @@ def impatient_node():
     from boxreg_ros.live import boxes_type, main, topics
 
     boxes_type.PATIENCE = topics.PATIENCE = 1.0
+    return main.main()
+
+
+def patient_node():
+    """Run a node that waits for clouds and boxes from a process that is not scheduled."""
+    from boxreg_ros.live import main, pipeline
+
+    pipeline.BOXES_SILENCE = pipeline.CLOUD_SILENCE = 60.0
     return main.main()
 
 

@@ -7,7 +7,7 @@ import pytest
 def test_a_build_leaves_environments_alone_that_share_files_by_hard_links(tmp_path, monkeypatch):
     package = tmp_path / 'sources' / 'some_msgs'
     package.mkdir(parents=True)
-    monkeypatch.setattr(build_interfaces, 'PREFIX', tmp_path / 'environment')
+    monkeypatch.setattr(build_interfaces, 'SITE', tmp_path / 'environment')
     monkeypatch.setattr(build_interfaces, 'FOLDERS', (package.parent,))
     monkeypatch.setenv('CXX', 'no-such-compiler')
     stamp = build_interfaces.stamp(package)
