@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 from boxreg_ros.config import KINDS
+from boxreg_ros.core.estimation import estimate_windows
 from boxreg_ros.core.method.arrays import (
     ANCHOR,
     BIAS,
@@ -130,6 +131,34 @@ def fed(registrar, stream):
     return results
 
 
+class Seen(Observation):
+    """An observation that has all columns of its table."""
+
+    def __getattr__(self, name):
+        """Return its row of a column."""
+        return getattr(self.table, name)[self.row]
+
+
+class Solved:
+    """The columns of the estimate of one window."""
+
+    def __init__(self, estimate):
+        self.prior = estimate.prior
+        self._table = estimate.table
+        self._rows = slice(estimate.begin, estimate.end)
+
+    def __getattr__(self, name):
+        """Return its rows of a column, words as a tuple."""
+        rows = getattr(self._table, name)[self._rows]
+        return tuple(rows.tolist()) if name in ('status', 'reasons') else rows
+
+
+def solved(windows, config, model):
+    """Return what `estimate_windows` returns, with the columns of each estimate."""
+    found = estimate_windows(windows, config, model)
+    return [None if estimate is None else Solved(estimate) for estimate in found]
+
+
 def observation(**changes):
     """Return an observation of a box at the origin without points, with some columns changed."""
     blank = Observations(
@@ -142,20 +171,20 @@ def observation(**changes):
     columns['points'] = row.points.astype(np.float32)
     columns['delays'] = row.delays.astype(np.float32)
     columns['counts'] = np.array([len(row.points)])
-    return Observation(Observations(**columns), 0)
+    return Seen(Observations(**columns), 0)
 
 
 def changed(seen, **changes):
     """Return an observation with some columns changed."""
     table = seen.table.take(np.array([seen.row]))
     columns = {name: np.array([value]) for name, value in changes.items()}
-    return Observation(table._replace(**columns), 0)
+    return Seen(table._replace(**columns), 0)
 
 
 def window_of(track, config):
     """Return the window of all observations of `track`; all are new."""
     observations = [
-        Observation(observe(sweep, boxes.boxes, boxes.stamp_ns, config), 0)
+        Seen(observe(sweep, boxes.boxes, boxes.stamp_ns, config), 0)
         for sweep, boxes in stream_of([track])
     ]
     name, n = track.track_id, len(observations)
@@ -176,7 +205,7 @@ PARTS = {
     'BIAS': slice(BIAS, GAP),
     'GAP': slice(GAP, PIVOT),
     'PIVOT': PIVOT,
-    'ANCHOR': slice(ANCHOR, SIDESLIP),
+    'ANCHOR': slice(ANCHOR, SHARED),
     'SIDESLIP': SIDESLIP,
 }
 
@@ -316,12 +345,12 @@ def random_variables(N=6, seed=2):
 
 def dense(A, N):
     """Return the dense matrix (D, D) of an `Arrowhead` with a chain of N poses."""
-    D = POSE * N + SHARED
+    D = POSE * N + len(A.corner)
     whole = np.zeros((D, D))
     for n in range(N):
         rows, end = slice(POSE * n, POSE * (n + 1)), min(POSE * (n + 3), POSE * N)
-        whole[rows, POSE * n : end] = A.links[n][:, : end - POSE * n]
-        whole[rows, POSE * N :] = A.border[n]
+        whole[rows, POSE * n : end] = A.poses['links'][n][:, : end - POSE * n]
+        whole[rows, POSE * N :] = A.poses['border'][n][:, : len(A.corner)]
     whole[POSE * N :, POSE * N :] = A.corner
     upper = np.triu(whole)
     return upper + np.triu(upper, 1).T

@@ -191,6 +191,87 @@ def test_class_names_select_a_group(class_name, group):
     assert config.class_config(class_name) is getattr(config, group)
 
 
+PUBLISHED = {
+    'nuScenes and TruckScenes': {
+        'vehicle': """vehicle.bus.bendy vehicle.bus.rigid vehicle.car vehicle.construction
+            vehicle.emergency.ambulance vehicle.emergency.police vehicle.trailer vehicle.truck
+            vehicle.ego vehicle.train vehicle.other vehicle.ego_trailer movable_object.barrier
+            movable_object.debris movable_object.pushable_pullable movable_object.trafficcone
+            static_object.bicycle_rack static_object.traffic_sign car truck bus trailer
+            construction_vehicle traffic_cone barrier""",
+        'cyclist': """vehicle.bicycle vehicle.motorcycle bicycle motorcycle
+            human.pedestrian.personal_mobility""",
+        'pedestrian': """animal human.pedestrian.adult human.pedestrian.child
+            human.pedestrian.construction_worker human.pedestrian.police_officer
+            human.pedestrian.stroller human.pedestrian.wheelchair pedestrian""",
+    },
+    'Argoverse 2': {
+        'vehicle': """ARTICULATED_BUS BOLLARD BOX_TRUCK BUS CONSTRUCTION_BARREL CONSTRUCTION_CONE
+            LARGE_VEHICLE MESSAGE_BOARD_TRAILER MOBILE_PEDESTRIAN_CROSSING_SIGN RAILED_VEHICLE
+            REGULAR_VEHICLE SCHOOL_BUS SIGN STOP_SIGN TRAFFIC_LIGHT_TRAILER TRUCK TRUCK_CAB
+            VEHICULAR_TRAILER""",
+        'cyclist': 'BICYCLE BICYCLIST MOTORCYCLE MOTORCYCLIST WHEELED_DEVICE WHEELED_RIDER',
+        'pedestrian': 'ANIMAL DOG OFFICIAL_SIGNALER PEDESTRIAN STROLLER WHEELCHAIR',
+    },
+    'Waymo': {
+        'vehicle': 'TYPE_VEHICLE TYPE_SIGN',
+        'cyclist': 'TYPE_CYCLIST',
+        'pedestrian': 'TYPE_PEDESTRIAN',
+    },
+    'KITTI': {
+        'vehicle': 'Car Van Truck Tram Misc',
+        'cyclist': 'Cyclist',
+        'pedestrian': 'Pedestrian Person_sitting Person',
+    },
+    'PandaSet': {
+        'vehicle': """Car Pickup_Truck Medium-sized_Truck Semi-truck Towed_Object
+            Other_Vehicle_-_Construction_Vehicle Other_Vehicle_-_Uncommon Emergency_Vehicle Bus
+            Train Trolley Tram_/_Subway Pylons Road_Barriers Signs Cones Construction_Signs
+            Temporary_Construction_Barriers Rolling_Containers""",
+        'cyclist': """Motorcycle Other_Vehicle_-_Pedicab Personal_Mobility_Device
+            Motorized_Scooter Bicycle""",
+        'pedestrian': 'Pedestrian Pedestrian_with_Object Animals_-_Bird Animals_-_Other',
+    },
+    'Lyft': {
+        'vehicle': 'car other_vehicle bus truck emergency_vehicle',
+        'cyclist': 'motorcycle bicycle',
+        'pedestrian': 'pedestrian animal',
+    },
+    'ONCE': {'vehicle': 'Car Truck Bus', 'cyclist': 'Cyclist', 'pedestrian': 'Pedestrian'},
+    'ZOD': {
+        'vehicle': """Vehicle Vehicle_Car Vehicle_Van Vehicle_Truck Vehicle_Bus Vehicle_Trailer
+            Vehicle_TramTrain Vehicle_HeavyEquip Vehicle_Emergency Vehicle_Other PoleObject
+            TrafficSign TrafficSignal TrafficGuide DynamicBarrier""",
+        'cyclist': """VulnerableVehicle VulnerableVehicle_Bicycle VulnerableVehicle_Motorcycle
+            VulnerableVehicle_Scooter VulnerableVehicle_Other""",
+        'pedestrian': 'Pedestrian Animal',
+    },
+    'View of Delft': {
+        'vehicle': 'Car truck vehicle_other bicycle_rack human_depiction',
+        'cyclist': 'Cyclist bicycle rider moped_scooter motor ride_other ride_uncertain',
+        'pedestrian': 'Pedestrian',
+    },
+}
+"""Class names of data sets by kind; spaces in them are underscores here."""
+
+
+@pytest.mark.parametrize('dataset', PUBLISHED)
+def test_classes_of_published_data_sets_are_of_their_kind(dataset):
+    expected = PUBLISHED[dataset]
+    given = {name: kind for kind, names in expected.items() for name in names.split()}
+    for separator in ('_', ' '):
+        found = {name: Config().kind(name.replace('_', separator)) for name in given}
+        assert found == given
+
+
+def test_a_name_of_several_words_selects_classes_with_all_of_them():
+    config = Config().updated({'pedestrian.names': ['road_crew', 'bicycle courier']})
+    for name in ('road_crew', 'Road Crew', 'crew.road', 'bicycle-courier'):
+        assert config.kind(name) == 'pedestrian' and config.knows_class(name)
+    assert not config.knows_class('road')
+    assert config.kind('bicycle') == 'cyclist'
+
+
 def test_classes_that_are_numbers_are_named_as_text():
     with pytest.raises(ConfigError, match=r"a list of texts such as \[car, '2'\], got \[2\]"):
         Config().updated({'pedestrian.names': [2]})

@@ -72,7 +72,7 @@ def test_every_extra_is_explained():
     explained = set(re.findall(r'^\| `(\w+)` \|', text, re.MULTILINE))
     _, _, setup = (ROOT / 'setup.py').read_text(encoding='utf-8').partition('extras_require')
     extras = set(re.findall(r"^        '(\w+)': \[", setup, re.MULTILINE))
-    assert extras - {'interfaces', 'test'} == explained  # those two are for the tests here
+    assert extras - {'test'} == explained  # it is for the tests here
 
 
 def test_readme_has_commands():

@@ -44,7 +44,7 @@ def copy(tmp_path):
     insert(core / 'method' / 'weights.py', '@loop\ndef robustify', f'{weight}\n\n\n')
     insert(core / 'method' / 'residuals.py', '    slip_weight,\n', '    rise_weight,\n')
     row = re.search(r'`(Residual\(rise, .*\))`', PAGE.read_text(encoding='utf-8'))[1]
-    insert(core / 'method' / 'residuals.py', '    Residual(slip, ', f'    {row},\n')
+    insert(core / 'method' / 'residuals.py', ')\n"""All residuals of', f'    {row},\n')
     setting = block('python', '    rise: float = ')
     insert(tmp_path / 'boxreg_ros' / 'config.py', '    shape: float = setting(', setting)
     insert(core / 'problem.py', "    'extent': ('extent',),\n", "    'rise': ('rise',),\n")

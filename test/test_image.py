@@ -13,7 +13,7 @@ from paths import BAGS, ROOT
 import pytest
 from ros_graph import ended_cleanly, graph_in
 
-pytest.importorskip('numba')
+numba = pytest.importorskip('numba')
 pytest.importorskip('rclpy')
 
 COMPILED = r'compiled (\d+) functions in \d+ s; kept in '
@@ -74,14 +74,26 @@ def test_the_image_compiles_once_for_every_user_and_cpu(cache, tmp_path):
 def test_the_first_start_of_a_node_says_that_it_compiles(cache, tmp_path):
     with graph_in(tmp_path) as graph:
         node = graph.start(command=('-m', 'boxreg_ros.live.main'))
-        graph.wait(lambda: 'compiling the reader' in node.output(), 'the announcement')
+        graph.wait(lambda: 'compiling the solver' in node.output(), 'the announcement')
         assert ended_cleanly(node)
-    lines = [line for line in node.output().splitlines() if 'compiling the reader' in line]
+    lines = [line for line in node.output().splitlines() if 'compiling the solver' in line]
     assert lines and '[INFO]' in lines[0]
 
 
-FIRST_DRIVE = """\
+KERNELS = """\
 import sys
+from numba.core.dispatcher import Dispatcher
+
+def kernels():
+    modules = [m for name, m in sys.modules.items() if name.startswith('boxreg_ros.core.method')]
+    found = [(k, f) for m in modules for k, f in vars(m).items() if isinstance(f, Dispatcher)]
+    return {(name, str(one)) for name, function in found for one in function.signatures}
+
+"""
+
+FIRST_DRIVE = (
+    KERNELS
+    + """\
 from msg_adapters import vision
 from boxreg_ros.config import Config
 from boxreg_ros.io.items import Item
@@ -90,14 +102,8 @@ from boxreg_ros.io.session import Session
 from boxreg_ros.live.pipeline import MessagePipeline
 from boxreg_ros.live.transform_wait import TransformWait
 from msg_adapters.convention import STANDARD
-from numba.core.dispatcher import Dispatcher
 from pathlib import Path
 from rosbags.highlevel import AnyReader
-
-def kernels():
-    modules = [m for name, m in sys.modules.items() if name.startswith('boxreg_ros.core.method')]
-    found = [(k, f) for m in modules for k, f in vars(m).items() if isinstance(f, Dispatcher)]
-    return {(name, str(one)) for name, function in found for one in function.signatures}
 
 config = Config(estimate='final')
 warm_up(config)
@@ -120,6 +126,70 @@ with AnyReader([Path(sys.argv[1])]) as reader:
 assert live.registrar.counts['boxes'] > 100
 print(sorted(kernels() - before))
 """
+)
+
+TWO_PROCESSES = (
+    KERNELS
+    + """\
+from boxreg_ros.config import Config
+from boxreg_ros.io.warm_up import *
+config = Config(estimate='final')
+warm_up_estimation(config)
+before = kernels()
+warm_up_observation(config.objective, config.mode)
+assert before and kernels() - before
+before = kernels()
+warm_up(config)
+warm_up_followed(config)
+print(sorted(kernels() - before))
+"""
+)
+
+
+def test_the_two_processes_of_a_first_start_compile_what_a_node_needs():
+    command = [sys.executable, '-c', TWO_PROCESSES]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.split('\n')[-2] == '[]'
+
+
+def test_one_process_compiles_all_where_there_cannot_be_two(monkeypatch):
+    from boxreg_ros.config import Config
+    from boxreg_ros.io import warm_up
+
+    def refuse(*args, **options):
+        raise BlockingIOError('Resource temporarily unavailable')
+
+    monkeypatch.setattr(warm_up, 'Popen', refuse)
+    with warm_up.compiled_beside(Config()):
+        assert numba.njit(lambda: 8)() == 8
+
+
+def test_the_second_process_ends_with_an_interrupted_one(monkeypatch):
+    from boxreg_ros.config import Config
+    from boxreg_ros.io import warm_up
+
+    begun = []
+
+    def wait_long(*args, **options):
+        begun.append(subprocess.Popen(['sleep', '300']))
+        return begun[0]
+
+    monkeypatch.setattr(warm_up, 'Popen', wait_long)
+    with pytest.raises(KeyboardInterrupt), warm_up.compiled_beside(Config()):
+        numba.njit(lambda: 8)()
+        raise KeyboardInterrupt
+    assert begun[0].poll() is not None
+
+
+def test_the_second_process_takes_no_module_of_its_folder(tmp_path, monkeypatch):
+    from boxreg_ros.config import Config
+    from boxreg_ros.io.warm_up import compiled_beside
+
+    (tmp_path / 'boxreg_ros.py').write_text("open('taken', 'w').close()")
+    monkeypatch.chdir(tmp_path)
+    with compiled_beside(Config()):
+        numba.njit(lambda: 8)()
+    assert not (tmp_path / 'taken').exists()
 
 
 def test_the_first_drive_needs_no_kernel_beyond_those_of_the_start():

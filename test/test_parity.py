@@ -11,6 +11,7 @@ from msg_adapters import adapter_for, ADAPTERS, WITHOUT_IDS
 from msg_adapters.clouds import COMPRESSED_TYPE
 from msg_adapters.poses import quaternions_of
 import numpy as np
+from preloaded import NODE, PATIENT_NODE
 import pytest
 from ros_graph import ended_cleanly, graph_in, play, records_of, RELIABLE, ROOT, stamp_of
 from ros_messages import (
@@ -101,7 +102,9 @@ def final_of_node(tmp_path, records, *parameters, boxes=(DETECTIONS, '/boxes')):
     return boxes_of_node(tmp_path, records, *parameters, *options, boxes=boxes)[1]
 
 
-def boxes_of_node(tmp_path, records, *parameters, boxes=(DETECTIONS, '/boxes'), ahead=0):
+def boxes_of_node(
+    tmp_path, records, *parameters, boxes=(DETECTIONS, '/boxes'), ahead=0, program=PATIENT_NODE
+):
     """
     Return early and final boxes of the node for records, with boxes of a type on a topic.
 
@@ -116,7 +119,8 @@ def boxes_of_node(tmp_path, records, *parameters, boxes=(DETECTIONS, '/boxes'), 
     ]
     every = [part for option in options for part in ('-p', option)]
     with graph_in(tmp_path) as graph:
-        node = graph.run(records, *every, '-r', f'boxes:={boxes_topic}', kind=type_name)
+        every += ['-r', f'boxes:={boxes_topic}']
+        node = graph.run(records, *every, kind=type_name, command=[program])
         played = 0
         for record in records:
             play(graph, [record])
@@ -226,9 +230,12 @@ def test_early_and_final_boxes_are_those_of_relabel_by_default(tmp_path, case):
     path = late(drive, seconds, **more).write(tmp_path / 'drive')
     options = ['--points', '/front', '--points', '/rear'] if has_two else []
     parameters = ['points:=[/front, /rear]'] if has_two else []
-    if 'behind' in case:  # their transforms never come
+    program = PATIENT_NODE
+    if 'behind' in case:  # their transforms and clouds never come
         parameters.append('transform_timeout:=1.0')
-    early, final = boxes_of_node(tmp_path, records_of(path), *parameters, ahead=4)
+        program = NODE
+    records = records_of(path)
+    early, final = boxes_of_node(tmp_path, records, *parameters, ahead=4, program=program)
     for estimate, messages in (('early', early), ('final', final)):
         out = tmp_path / estimate
         relabelled(path, out, *options, f'--set=estimate={estimate}', settings={})

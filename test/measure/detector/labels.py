@@ -169,7 +169,7 @@ def errors_of(
                 of_source[kind] = _errors(found, matches[first], truths, masks)
                 of_source[kind] |= _with_true_parts(found, labels[source], truths, masks)
         of_source[''] |= _of_tracks(labels[source], truths)
-        unmatched = sum(one.unmatched for one in found)
+        unmatched = sum(len(one.unmatched) for one in found)
         of_source['']['false'] = unmatched / of_source['']['boxes']
     return result
 

@@ -150,10 +150,11 @@ def _tracks(apart: float) -> dict[str, Any]:
     boxes = np.array([[o.box for o in row] for row in rows])
     centers = boxes[:, :, :3].copy()
     boxes[:, :, :3] += shifts
+    origins = np.array([[o.table.origins[o.row, 0] for o in row] for row in rows])
     return {
         'stamps_ns': [o.stamp_ns for o in rows[0]],
         'boxes': boxes,
-        'origins': np.array([[o.origins[0] for o in row] for row in rows]) + centers + shifts,
+        'origins': origins + centers + shifts,
         'counts': [[len(o.points) for o in row] for row in rows],
         'points': np.concatenate(
             [

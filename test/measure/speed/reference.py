@@ -122,7 +122,8 @@ class _Fit:
         """Return the expected error of every variable, 0 for those held fixed; (1, D)."""
         problem, free, sums, _ = self.batch
         poses = np.tile(problem.of_class['pose'], problem.length)
-        errors = np.concatenate([poses, sums.common['deviation']], axis=1)
+        number = free.shape[1] - poses.shape[1]
+        errors = np.concatenate([poses, sums.common['deviation'][:, :number]], axis=1)
         return torch.from_numpy(free * np.where(errors > 0, errors, 1.0))
 
     def value(self, solution: Solution) -> float:
@@ -204,5 +205,5 @@ def _track(window: Window) -> Track:
         np.array([o.stamp_ns for o in observations]),
         boxes,
         [o.points + center for o, center in zip(observations, centers, strict=True)],
-        np.array([o.origins[0] for o in observations]) + centers,
+        np.array([o.table.origins[o.row, 0] for o in observations]) + centers,
     )
