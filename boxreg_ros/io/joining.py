@@ -1,7 +1,8 @@
-"""Arrays of boxes of one stamp in several messages: one per object, or one per class."""
+"""Messages that are one: arrays of one stamp, per object or class; those recorded twice."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -11,6 +12,22 @@ import numpy as np
 JOIN_NS = 20 * 10**6
 """Box arrays of one stamp that are received within this time are one array [ns]; chosen: they are
 published in a burst, and detectors are slower."""
+
+
+class Repeats:
+    """Messages that a recording has a second time, as where its files overlap in time."""
+
+    def __init__(self) -> None:
+        self._recent = deque[tuple[int, str, bytes]]()
+
+    def has(self, received_ns: int, topic: str, data: bytes) -> bool:
+        """Return whether a message, the next by receive time, is equal to one within `JOIN_NS`."""
+        while self._recent and received_ns - self._recent[0][0] > JOIN_NS:
+            self._recent.popleft()
+        is_repeated = any((topic, data) == one[1:] for one in self._recent)
+        if not is_repeated:
+            self._recent.append((received_ns, topic, data))
+        return is_repeated
 
 
 def are_parts(boxes: BoxArray, more: BoxArray) -> bool:

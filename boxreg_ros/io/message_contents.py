@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import Any, cast
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.definitions import fields_of, known_store
 from boxreg_ros.io.items import Item
-from boxreg_ros.io.joining import are_parts, JOIN_NS, joined
+from boxreg_ros.io.joining import are_parts, JOIN_NS, joined, Repeats
 from boxreg_ros.io.lidars import SensorPlacement
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder
 from boxreg_ros.io.storage.files import encoding_of
@@ -29,8 +30,9 @@ class MessageContents:
     """
     Read clouds and boxes of messages; box arrays of one stamp, received at once, are one array.
 
-    The adapter reads the messages on the topic of the boxes; there are none without it.
-    `decoded_topics` are those with messages that could be read since `reset`.
+    A message that is equal to one received at the same time is read once. The adapter reads the
+    messages on the topic of the boxes; there are none without it. `decoded_topics` are those with
+    messages that could be read since `reset`.
 
     """
 
@@ -45,34 +47,48 @@ class MessageContents:
         self.decoded_topics: set[str] = set()
         self._joined: set[int] = set()  # records whose boxes are in an array before them, by id
         self._joins = 0
+        self._repeats = Repeats()
+        self._repeated: Counter[str] = Counter()  # by topic
         self._readers: dict[Typestore, BoxReader | None] = {}
 
     def reset(self) -> None:
         """Forget which topics could be read: the recording is read again."""
         self.decoded_topics.clear()
+        self._repeats = Repeats()
+        self._repeated.clear()
 
     @property
     def finding(self) -> str:
-        """Return that messages with boxes were joined; empty if none were."""
-        if not self._joins:
-            return ''
-        return (
-            f'{self._boxes_topic}: {self._joins} messages have the stamp of the one before '
-            f'them and other boxes: they are read as one message per stamp'
-        )
+        """Return that messages were joined, or read once; empty if none were."""
+        found = []
+        if self._repeated:
+            counts = ', '.join(f'{topic} {count}' for topic, count in self._repeated.items())
+            found.append(
+                f'messages that are in the recording twice, as where its files overlap in time, '
+                f'are read once: {counts}'
+            )
+        if self._joins:
+            found.append(
+                f'{self._boxes_topic}: {self._joins} messages have the stamp of the one before '
+                f'them and other boxes: they are read as one message per stamp'
+            )
+        return '; '.join(found)
 
     def item(self, record: Record, later: Iterable[Record], with_intensities: bool) -> Item | None:
         """
-        Return a message decoded; None, and counted, if it cannot be.
+        Return a message decoded; None, and counted, if it cannot be, or is a repeated one.
 
         Boxes are joined with those of the same stamp among the `later` records, which have no
         item of their own then.
 
         """
+        topic = record.connection.topic
+        if self._repeats.has(record.received_ns, topic, record.data):
+            self._repeated[topic] += 1
+            return None
         if id(record) in self._joined:
             self._joined.remove(id(record))
             return None
-        topic = record.connection.topic
         intensities = None
         content: Sweep | BoxArray
         try:
@@ -139,10 +155,11 @@ class MessageContents:
 
     def _whole(self, boxes: BoxArray, record: Record, later: Iterable[Record]) -> BoxArray:
         """Return the boxes of a message, and of those behind it that have others of its stamp."""
+        read = [record.data]
         for other in later:
             if other.received_ns - record.received_ns > JOIN_NS:
                 break
-            if other.connection.topic != self._boxes_topic:
+            if other.connection.topic != self._boxes_topic or other.data in read:
                 continue
             try:
                 more = self.boxes(other.connection, other.data)
@@ -151,6 +168,7 @@ class MessageContents:
             if not are_parts(boxes, more):
                 break
             boxes = joined(boxes, more)
+            read.append(other.data)
             self._joined.add(id(other))
             self._joins += 1
         return boxes

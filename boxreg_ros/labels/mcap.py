@@ -21,6 +21,7 @@ from typing import Any
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.definitions import known_store
+from boxreg_ros.io.joining import Repeats
 from boxreg_ros.io.markers import MarkerBoard
 from boxreg_ros.io.session import covariances_to_write, refined_to_frame
 from boxreg_ros.io.transforms import inverse
@@ -71,7 +72,8 @@ class Writer:
         self._recording = copy(options.recording).__enter__()
         self._copied = RecordingCopy(folder / OVERLAY, self._recording, provenance)
         self._topic = self._recording.boxes_topic
-        self._messages = self._copied.messages()
+        self._repeats = Repeats()
+        self._messages = ((raw, self._has_boxes(raw)) for raw in self._copied.messages())
         self._next = next(self._messages, None)
         self._waiting: dict[int, deque[LabelFrame]] = {}
         self._refined_topic = self._topic + BOXES_SUFFIX
@@ -99,14 +101,19 @@ class Writer:
     def _copy(self, is_end: bool) -> None:
         """Copy messages up to the first whose boxes are not refined yet."""
         while self._next is not None:
-            raw = self._next
-            additional = self._refined(raw) if raw.topic == self._topic else []
+            raw, has_boxes = self._next
+            additional = self._refined(raw) if has_boxes else []
             if additional is None and not is_end:
                 return
             self._copied.add(raw)
             for item in additional or ():
                 self._copied.add(item)
             self._next = next(self._messages, None)
+
+    def _has_boxes(self, raw: RawMessage) -> bool:
+        """Return whether a message, the next one, has boxes that none before it had."""
+        is_of_boxes = raw.topic == self._topic
+        return is_of_boxes and not self._repeats.has(raw.log_time, raw.topic, raw.data)
 
     def _refined(self, raw: RawMessage) -> list[RawMessage] | None:
         """Return the message with refined boxes, and its markers; None if they are missing."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 import json
 import math
@@ -21,6 +22,7 @@ from boxreg_ros.offline.arguments import add_options, request_from, TOPICS, word
 from boxreg_ros.offline.box_scores import (
     by_overlap,
     groups,
+    has_word,
     match,
     Matches,
     RECALLS,
@@ -59,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--classes', nargs='+', default=[], metavar='WORD',
         help='compare only true boxes whose class name contains one of these words, as in '
-        'car,van,truck',
+        'car,van,truck; boxes of other classes without a true one are ignored',
     )  # fmt: skip
     parser.add_argument(
         '--input', type=Path, metavar='RECORDING',
@@ -78,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes, by_overlap)
     is_unknown = _between(predicted, truth) | _out_of_view(args, predicted, matches)
+    is_unknown |= _of_other_classes(predicted, matches, classes)
     matches = replace(matches, unmatched=matches.unmatched[~is_unknown[matches.unmatched]])
     if matches.invalid:
         _warn(
@@ -248,8 +251,19 @@ def _warn_of_other_classes(predicted: BoxTable, truth: BoxTable, matches: Matche
         names = ', '.join(f'{name} {count}' for name, count in sorted(others.items()))
         _warn(
             f'no predicted box of these classes has a true one: {names}; they count as ghosts: '
-            f'if the truth has no such objects because nobody labelled them, leave them out'
+            f'if the truth has no such objects because nobody labelled them, name the others by '
+            f'--classes'
         )
+
+
+def _of_other_classes(
+    predicted: BoxTable, matches: Matches, classes: Sequence[str]
+) -> NDArray[np.bool_]:
+    """Return which predicted boxes (n,) without a true one are of none of the `classes`."""
+    is_other = np.zeros(len(predicted.boxes), bool)
+    names = [predicted.class_names[row] for row in matches.unmatched.tolist()]
+    is_other[matches.unmatched] = [not has_word(name, classes) for name in names]
+    return is_other
 
 
 def _joined(args: argparse.Namespace, predicted: BoxTable, truth: BoxTable) -> BoxTable:

@@ -354,6 +354,11 @@ def test_classes_that_the_truth_may_lack_are_said(tmp_path, capsys):
     rows(truth, np.arange(0, 20, 2)).write(tmp_path / 'truth.csv')
     assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
     assert 'these classes has a true one: pedestrian 10; they count' in capsys.readouterr().err
+    for words, ghosts in (('car', 0), ('car,pedestrian', 10)):
+        chosen = '--classes', words, '--json'
+        assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', *chosen) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert report['unmatched'] == report['tracks']['ghosts'] == ghosts
     renamed = replace(truth, class_names=tuple(map(str.upper, truth.class_names)))
     renamed.write(tmp_path / 'truth.csv')
     assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0

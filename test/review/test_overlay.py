@@ -1,5 +1,7 @@
 """overlay.mcap: the whole recording and the refined boxes."""
 
+from collections import Counter
+
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.box_table import BoxTable
@@ -213,6 +215,24 @@ def test_overlay_of_a_part_has_all_static_transforms(tmp_path):
     assert times['/boxes_refined'] == times['/boxes'] == drive.stamps[3:8]
     assert times['/tf_static'] == [START]
     assert len(times['/points']) == 5
+
+
+@pytest.mark.parametrize('late_ns', [0, 10**6])
+def test_messages_of_files_that_overlap_are_read_once(tmp_path, late_ns):
+    """As of two recorders, or of one that keeps the time before each event."""
+    drive = Drive(sweeps=9)
+    whole = run(drive.write(tmp_path / 'whole'), tmp_path / 'once', ('csv', 'mcap'))
+    again = [(topic, at + late_ns, message) for topic, at, message in drive.items[7:]]
+    parts = drive.items[:-6], again
+    paths = tuple(write_recording(tmp_path / f'part{i}', part) for i, part in enumerate(parts))
+    summary = run(paths, tmp_path / 'out', ('csv', 'mcap'))
+    assert (summary.boxes_in, summary.sweeps) == (whole.boxes_in, whole.sweeps) == (18, 9)
+    assert 'are read once: /points 5, /boxes 5' in summary.warning
+    written = [(tmp_path / out / 'boxes.csv').read_text() for out in ('once', 'out')]
+    assert written[0] == written[1]
+    rows, _ = messages_of(tmp_path / 'out' / 'overlay.mcap')
+    counts = Counter(topic for topic, *_ in rows)
+    assert (counts['/boxes'], *(counts[topic] for topic in ADDED)) == (14, 9, 9)
 
 
 def test_several_recordings_give_one_overlay(tmp_path):
