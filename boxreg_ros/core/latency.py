@@ -229,7 +229,9 @@ class LatencyEvidence:
         """Compare the points of a sweep with the boxes of objects that move in their frame."""
         times_ns = sweep.stamp_ns + np.round(CANDIDATES * 1e9).astype(np.int64)
         compared = Counter(sample.track_id for sample in self._samples)
-        names = [name for name, track in tracks.by_id.items() if track.covers(times_ns)]
+        names = tracks.covering(times_ns)
+        if not names:
+            return
         centers = tracks.nearest_centers(names, times_ns[ENDS], ENDS)
         speeds = np.linalg.norm(_shift(centers), axis=-1).tolist()
         moving = [name for name, speed in zip(names, speeds, strict=True) if speed > MIN_SPEED]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right, insort
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import repeat
+from math import inf
 from operator import attrgetter
+from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.rotations import (
@@ -33,7 +35,7 @@ SMOOTHING = 0.35
 """Reach of the local lines through a track [s]: noise must not be motion; chosen."""
 
 
-def displacements(motion: FrameMotion, seconds: Floats) -> Floats:
+def displacements(motions: Sequence[FrameMotion | None], seconds: Floats) -> Floats:
     """
     Return how boxes move in the fixed frame if they were measured before their stamp.
 
@@ -42,84 +44,67 @@ def displacements(motion: FrameMotion, seconds: Floats) -> Floats:
 
     Parameters
     ----------
-    motion : FrameMotion
-        Poses of the frame that the boxes were measured in; the last is that at the stamp.
+    motions : sequence of A FrameMotion or None
+        Poses of the frame that the boxes of each array were measured in; the last is that at the
+        stamp. None for a frame that does not move.
     seconds : array, shape (C,)
         Times before the stamp [s]; outside of the known poses the motion is extrapolated.
 
     Returns
     -------
-    T : array, shape (C, 4, 4)
+    T : array, shape (A, C, 4, 4)
         Maps the fixed frame to itself; the identity if one pose is known only.
 
     """
-    found = np.tile(np.eye(4), (len(seconds), 1, 1))
-    if len(motion.stamps_ns) < 2:
+    found = np.tile(np.eye(4), (len(motions), len(seconds), 1, 1))
+    moves = [row for row, motion in enumerate(motions) if motion and len(motion.stamps_ns) > 1]
+    if not moves:
         return found
-    poses = motion.T_fixed_frame
+    known = [motion for motion in motions if motion and len(motion.stamps_ns) > 1]
+    poses = np.concatenate([motion.T_fixed_frame for motion in known])
     quaternions = quaternion_from_matrix(poses[:, :3, :3])
-    for before, after in pairwise(quaternions):
-        after *= np.sign(before @ after) or 1.0  # one of both signs is the shortest rotation
-    times = (motion.stamps_ns - motion.stamps_ns[-1]) * 1e-9
-    after = np.searchsorted(times, -seconds).clip(1, len(times) - 1)
-    share = ((-seconds - times[after - 1]) / (times[after] - times[after - 1]))[:, None]
+    # One of both signs is the shortest rotation from the pose before.
+    is_turned = (quaternions[:-1] * quaternions[1:]).sum(1) < 0
+    quaternions[1:] *= np.cumprod(np.where(is_turned, -1.0, 1.0))[:, None]
+    times = [(motion.stamps_ns - motion.stamps_ns[-1]) * 1e-9 for motion in known]
+    ends = np.cumsum([len(of_array) for of_array in times])
+    after = np.array([of.searchsorted(-seconds).clip(1, len(of) - 1) for of in times])
+    after += (ends - [len(of_array) for of_array in times])[:, None]  # (A, C)
+    stamp = np.concatenate(times)
+    share = ((-seconds - stamp[after - 1]) / (stamp[after] - stamp[after - 1]))[..., None]
     turned = (1 - share) * quaternions[after - 1] + share * quaternions[after]
     placed = (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3]
-    R_last, t_last = poses[-1, :3, :3], poses[-1, :3, 3]
-    found[:, :3, :3] = matrix_from_quaternion(turned) @ R_last.T
-    found[:, :3, 3] = placed - found[:, :3, :3] @ t_last
+    last = poses[ends - 1, None]  # (A, 1, 4, 4)
+    R = matrix_from_quaternion(turned) @ last[..., :3, :3].swapaxes(2, 3)
+    found[moves, :, :3, :3] = R
+    found[moves, :, :3, 3] = placed - (R @ last[..., :3, 3:])[..., 0]
     return found
 
 
 class MeasuredArray:
-    """The stamp of a box array, and where its boxes were for each latency."""
+    """The valid boxes of the tracks of a box array, and where they were for each latency."""
 
-    def __init__(self, boxes: BoxArray, candidates: Floats) -> None:
+    def __init__(self, boxes: BoxArray, row_of: dict[str, int]) -> None:
         self.stamp_ns = boxes.stamp_ns
-        self._motion = boxes.motion
-        self.of_candidates: Floats  # (C, 4, 4)
-        if boxes.motion is None:  # the frame does not move
-            self.of_candidates = np.broadcast_to(np.eye(4), (len(candidates), 4, 4))
-        else:
-            self.of_candidates = displacements(boxes.motion, candidates)
+        self.boxes = boxes.boxes
+        self.row_of = row_of
+        self.motion = boxes.motion
+        self.of_candidates: Floats | None = None
+        """(C, 4, 4), once it is needed."""
         self._known = (0.0, np.eye(4))
 
     def displacement(self, latency: float) -> Floats:
         """Return T (4, 4) from the boxes as given to where they were measured."""
-        if self._motion is not None and latency != self._known[0]:
-            self._known = latency, displacements(self._motion, np.array([latency]))[0]
-        return self._known[1] if self._motion is not None else np.eye(4)
+        if self.motion is not None and latency != self._known[0]:
+            self._known = latency, displacements([self.motion], np.array([latency]))[0, 0]
+        return self._known[1]
 
 
-class MeasuredTrack:
+class MeasuredTrack(NamedTuple):
     """The boxes of a track in the last seconds, as they were given, oldest first."""
 
-    def __init__(self) -> None:
-        self.arrays: list[MeasuredArray] = []
-        self.boxes: list[Floats] = []
-
-    @property
-    def newest_ns(self) -> int:
-        """Stamp of the newest box [ns]."""
-        return self.arrays[-1].stamp_ns
-
-    def add(self, array: MeasuredArray, box: Floats) -> None:
-        """Add a box; one that is not newer than the others is left out."""
-        if not self.arrays or array.stamp_ns > self.newest_ns:
-            self.arrays.append(array)
-            self.boxes.append(box)
-
-    def forget_before(self, oldest_ns: float) -> None:
-        """Remove the boxes with older stamps, but for the newest."""
-        old = 0
-        while old < len(self.arrays) - 1 and self.arrays[old].stamp_ns < oldest_ns:
-            old += 1
-        del self.arrays[:old], self.boxes[:old]
-
-    def covers(self, times_ns: Ints) -> bool:
-        """Return whether all times are within those of the boxes."""
-        first_ns = self.arrays[0].stamp_ns
-        return bool(first_ns <= times_ns[0] and times_ns[-1] <= self.newest_ns)
+    track_id: str
+    arrays: list[MeasuredArray]
 
     def at(self, stamp_ns: int, latency: float, box: Floats) -> Floats:
         """
@@ -130,9 +115,9 @@ class MeasuredTrack:
 
         """
         time_ns = stamp_ns + round(latency * 1e9)
-        stamps_ns = self._stamps_ns()
+        stamps_ns = np.array([array.stamp_ns for array in self.arrays])
         after = int(np.searchsorted(stamps_ns, time_ns))
-        if time_ns > self.newest_ns:
+        if after == len(stamps_ns):
             from boxreg_ros.core.motion import motion_at  # it imports numba
 
             boxes = self._measured(0, len(stamps_ns), latency)
@@ -149,20 +134,11 @@ class MeasuredTrack:
         found[YAW] = wrap_angle(found[YAW])
         return found
 
-    def nearest(self, time_ns: int) -> int:
-        """Return the row of the box nearest to a time within those of the track [ns]."""
-        after = bisect_left(self.arrays, time_ns, 1, len(self.arrays) - 1, key=_stamp)
-        middle = self.arrays[after - 1].stamp_ns + self.arrays[after].stamp_ns
-        return after - (2 * time_ns < middle)
-
-    def _stamps_ns(self) -> Ints:
-        return np.array([array.stamp_ns for array in self.arrays])
-
     def _measured(self, begin: int, end: int, latency: float) -> Floats:
         """Return some boxes (n, 9) where they were measured."""
-        boxes = np.array(self.boxes[begin:end])
-        T = np.array([array.displacement(latency) for array in self.arrays[begin:end]])
-        return displaced(boxes, T)
+        arrays = self.arrays[begin:end]
+        boxes = np.array([array.boxes[array.row_of[self.track_id]] for array in arrays])
+        return displaced(boxes, np.array([array.displacement(latency) for array in arrays]))
 
 
 _stamp = attrgetter('stamp_ns')
@@ -226,27 +202,40 @@ def _on_lines(
 
 
 class MeasuredTracks:
-    """Input boxes by track, and the box arrays that they are of."""
+    """Input boxes of the last seconds, by array; tracks are put together where they are used."""
 
     def __init__(self, candidates: Floats) -> None:
         self._candidates = candidates
-        self.by_id: dict[str, MeasuredTrack] = {}
+        self._arrays: list[MeasuredArray] = []  # by ascending stamps
+        self._newest_of: dict[str, int] = {}  # stamp of the newest box of each track [ns]
         self.newest_ns = -(2**62)
 
     def add(self, boxes: BoxArray, oldest_ns: float) -> None:
-        """Add the boxes of an array, and forget tracks and boxes that ended before a time."""
+        """
+        Add the boxes of an array, and forget tracks and boxes that ended before a time.
+
+        A box that is not newer than the others of its track is left out.
+
+        """
         self.newest_ns = max(self.newest_ns, boxes.stamp_ns)
-        array = MeasuredArray(boxes, self._candidates)
+        row_of = {}
         for row in rows_with_latency(boxes):
             name = boxes.track_ids[row]
-            if name not in self.by_id:
-                self.by_id[name] = MeasuredTrack()
-            self.by_id[name].add(array, boxes.boxes[row])
-        ended = [name for name, track in self.by_id.items() if track.newest_ns <= oldest_ns]
-        for name in ended:
-            del self.by_id[name]
-        for track in self.by_id.values():
-            track.forget_before(oldest_ns)
+            if self._newest_of.get(name, -inf) < boxes.stamp_ns:
+                self._newest_of[name] = boxes.stamp_ns
+                row_of[name] = row
+        if row_of:
+            insort(self._arrays, MeasuredArray(boxes, row_of), key=_stamp)
+        del self._arrays[: bisect_left(self._arrays, oldest_ns, key=_stamp)]
+        for name in [name for name, newest in self._newest_of.items() if newest <= oldest_ns]:
+            del self._newest_of[name]
+
+    def covering(self, times_ns: Ints) -> list[str]:
+        """Return the ids of the tracks whose boxes begin before all times and end after them."""
+        before = self._arrays[: bisect_right(self._arrays, times_ns[0], key=_stamp)]
+        begun = set[str]().union(*(array.row_of for array in before))
+        newest_of = self._newest_of.items()
+        return [name for name, newest in newest_of if newest >= times_ns[-1] and name in begun]
 
     def nearest_centers(self, names: Sequence[str], times_ns: Ints, candidates: Ints) -> Floats:
         """
@@ -255,15 +244,12 @@ class MeasuredTracks:
         Each of the C times has its own candidate of the latency, as in `smoothed`.
 
         """
-        centers, T = [], []
-        for name in names:
-            track = self.by_id[name]
-            for time_ns, candidate in zip(times_ns.tolist(), candidates.tolist(), strict=True):
-                row = track.nearest(time_ns)
-                centers.append(track.boxes[row][: Z + 1])
-                T.append(track.arrays[row].of_candidates[candidate])
-        found = _moved(np.array(T).reshape(-1, 4, 4), np.array(centers).reshape(-1, 3))
-        return found.reshape(len(names), len(times_ns), 3)
+        arrays, boxes, is_known = self._table(names)
+        gaps = np.array([array.stamp_ns for array in arrays])[:, None] - times_ns  # (A, C)
+        known_gaps = np.where(is_known[..., None], np.abs(gaps)[:, None], np.inf)
+        rows = len(arrays) - 1 - known_gaps[::-1].argmin(0)  # (K, C), of two the later one
+        centers = boxes[rows, np.arange(len(names))[:, None], : Z + 1]
+        return _moved(self._displacements(arrays)[rows, candidates], centers)
 
     def smoothed(self, names: Sequence[str], times_ns: Ints) -> tuple[Floats, Floats]:
         """
@@ -286,17 +272,8 @@ class MeasuredTracks:
             Slopes of the lines through the centres [m/s].
 
         """
-        tracks = [self.by_id[name] for name in names]
-        arrays = list({id(array): array for track in tracks for array in track.arrays}.values())
-        arrays.sort(key=_stamp)
-        row_of = {id(array): row for row, array in enumerate(arrays)}
-        boxes = np.zeros((len(arrays), len(tracks), 9))
-        is_known = np.zeros(boxes.shape[:2], bool)
-        for column, track in enumerate(tracks):
-            rows = [row_of[id(array)] for array in track.arrays]
-            boxes[rows, column] = track.boxes
-            is_known[rows, column] = True
-        T = np.array([array.of_candidates for array in arrays])  # (A, C, 4, 4)
+        arrays, boxes, is_known = self._table(names)
+        T = self._displacements(arrays)
         poses = np.zeros((*boxes.shape[:2], len(times_ns), 4))  # centre and yaw
         poses[..., : Z + 1] = _moved(T[:, None], boxes[:, :, None, : Z + 1])
         yaw = boxes[:, :, None, YAW] + np.arctan2(T[:, None, :, 1, 0], T[:, None, :, 0, 0])
@@ -312,10 +289,30 @@ class MeasuredTracks:
         """Return the boxes (n, 9) of an array where their objects are at its stamp."""
         moved = boxes.boxes.copy()
         for row in rows_with_latency(boxes):
-            track = self.by_id.get(boxes.track_ids[row])
-            if track is not None:
-                moved[row] = track.at(boxes.stamp_ns, latency, moved[row])
+            name = boxes.track_ids[row]
+            arrays = [array for array in self._arrays if name in array.row_of]
+            if arrays:
+                moved[row] = MeasuredTrack(name, arrays).at(boxes.stamp_ns, latency, moved[row])
         return moved
+
+    def _table(
+        self, names: Sequence[str]
+    ) -> tuple[list[MeasuredArray], Floats, NDArray[np.bool_]]:
+        """Return the arrays with boxes of K tracks, these boxes (A, K, 9), and which there are."""
+        arrays = [array for array in self._arrays if not array.row_of.keys().isdisjoint(names)]
+        rows = np.array([[*map(array.row_of.get, names, repeat(-1))] for array in arrays])
+        is_known = rows >= 0
+        boxes = np.array([array.boxes[own] for array, own in zip(arrays, rows, strict=True)])
+        boxes[~is_known] = 0
+        return arrays, boxes, is_known
+
+    def _displacements(self, arrays: Sequence[MeasuredArray]) -> Floats:
+        """Return T (A, C, 4, 4) from the boxes of arrays to where they were, by candidate."""
+        missing = [array for array in arrays if array.of_candidates is None]
+        found = displacements([array.motion for array in missing], self._candidates)
+        for array, T in zip(missing, found, strict=True):
+            array.of_candidates = T
+        return np.array([array.of_candidates for array in arrays])
 
 
 def rows_with_latency(boxes: BoxArray) -> list[int]:
