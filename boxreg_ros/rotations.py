@@ -172,15 +172,13 @@ def boxes_from_quaternions(
 def quaternion_from_rpy(rpy: ArrayLike) -> Floats:
     """Return unit quaternions (..., 4), x y z w with w >= 0, of roll, pitch, yaw (..., 3)."""
     half = np.asarray(rpy, float) / 2
-    cr, cp, cy = np.moveaxis(np.cos(half), -1, 0)
-    sr, sp, sy = np.moveaxis(np.sin(half), -1, 0)
-    parts = [
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-        cr * cp * cy + sr * sp * sy,
-    ]
-    quaternions = np.stack(parts, -1)
+    cos, sin = np.cos(half), np.sin(half)
+    (cr, cp, cy), (sr, sp, sy) = ([of[..., k] for k in range(3)] for of in (cos, sin))
+    quaternions = np.empty((*half.shape[:-1], 4))  # filled in place, as in `matrix_from_rpy`
+    quaternions[..., 0] = sr * cp * cy - cr * sp * sy
+    quaternions[..., 1] = cr * sp * cy + sr * cp * sy
+    quaternions[..., 2] = cr * cp * sy - sr * sp * cy
+    quaternions[..., 3] = cr * cp * cy + sr * sp * sy
     return np.where(quaternions[..., 3:] < 0, -quaternions, quaternions)
 
 

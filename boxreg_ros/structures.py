@@ -15,6 +15,7 @@ header.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any, ClassVar, Self, TypeVar
 
 from boxreg_ros.errors import ShapeError
@@ -346,7 +347,7 @@ def concatenated(records: Sequence[_Columns]) -> _Columns:
 
 def _joined(columns: Sequence[Any]) -> Any:
     if isinstance(columns[0], tuple):
-        return tuple(row for column in columns for row in column)
+        return tuple(chain.from_iterable(columns))
     if isinstance(columns[0], Columns):
         return concatenated(columns)
     return None if columns[0] is None else np.concatenate(columns)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from boxreg_ros.core.tables import rows_by_key
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
 
@@ -38,11 +39,13 @@ class Switch(NamedTuple):
 
 def by_id(track_ids: Sequence[str], stamps_ns: Ints, centers: Floats) -> dict[str, Centers]:
     """Return stamps and centres of each id, of boxes (n,) in any order; without an id of none."""
-    rows_of: dict[str, list[int]] = {}
-    for row in np.argsort(stamps_ns, kind='stable').tolist():
-        if track_ids[row]:
-            rows_of.setdefault(track_ids[row], []).append(row)
-    return {name: (stamps_ns[rows], centers[rows]) for name, rows in rows_of.items()}
+    in_time = np.argsort(stamps_ns, kind='stable')
+    rows_of = rows_by_key([track_ids[row] for row in in_time.tolist()])
+    return {
+        name: (stamps_ns[in_time[rows]], centers[in_time[rows]])
+        for name, rows in rows_of.items()
+        if name
+    }
 
 
 def id_switches(tracks: Mapping[str, Centers]) -> list[Switch]:

@@ -98,7 +98,7 @@ class PendingArray:
     def set_reasons(self, reason: str) -> None:
         """Set the reason of each box that cannot be refined; `reason`, if any, holds for all."""
         known = set[str]()
-        is_valid = is_valid_box(self.input.boxes)
+        is_valid = is_valid_box(self.input.boxes).tolist()
         for row, track_id in enumerate(self.input.track_ids):
             if not is_valid[row]:
                 self.reasons[row] = Reason.INVALID_BOX

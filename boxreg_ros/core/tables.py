@@ -29,6 +29,15 @@ def by_table(items: Sequence[tuple[Any, int]]) -> list[tuple[Any, Ints, Ints]]:
     return [(table, part, row[part]) for table, part in zip(of_id.values(), parts, strict=True)]
 
 
+def rows_by_key(keys: Sequence[str]) -> dict[str, Ints]:
+    """Return the rows of each key among n keys, ascending; the keys in the order they appear."""
+    number_of = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    number = np.fromiter(map(number_of.__getitem__, keys), int, len(keys))
+    ends = np.cumsum(np.bincount(number, minlength=len(number_of)))
+    parts = np.split(np.argsort(number, kind='stable'), ends[:-1])
+    return dict(zip(number_of, parts, strict=False))  # without keys there is one empty part
+
+
 def column(tables: Sequence[Any], name: str) -> Any:
     """Return the field `name` of the concatenation of `tables`; of one table, no copy."""
     parts = [getattr(table, name) for table in tables]

@@ -214,20 +214,27 @@ def csv_row(cells: Iterable[object]) -> str:
     return row.getvalue()[:-2] + '\n'
 
 
-def number_cells(numbers: Floats) -> list[str]:
+def number_cells(numbers: NDArray[Any], unknown: str) -> list[str]:
     """
-    Return the cells of each row of numbers (n, k) in single precision, with commas between them.
+    Return the cells of each row of numbers (n, k) with commas between them.
 
-    They have as few digits as state the number, nine at most; ``nan`` stands for all that are not
-    finite.
+    They have as few digits as state the number in its precision; `unknown` stands for all that
+    are not finite.
 
     """
     if not len(numbers):
         return []
-    with np.errstate(over='ignore'):
-        rows = np.ascontiguousarray(numbers, np.float32)
+    rows = np.ascontiguousarray(numbers)
     text = orjson.dumps(rows, option=orjson.OPT_SERIALIZE_NUMPY).decode()
-    return text[2:-2].replace('null', 'nan').split('],[')
+    if not np.isfinite(rows).all():
+        text = text.replace('null', unknown)
+    return [row[2:] for row in text.split(']')[:-2]]  # without '[[' or ',['
+
+
+def single_precision(numbers: Floats) -> NDArray[np.float32]:
+    """Return numbers with nine digits at most; those beyond its range are not finite."""
+    with np.errstate(over='ignore'):
+        return numbers.astype(np.float32)
 
 
 @lru_cache(1024)

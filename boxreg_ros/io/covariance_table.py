@@ -6,7 +6,7 @@ from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import NamedTuple
 
-from boxreg_ros.io.box_table import cell, number_cells, read_by_box
+from boxreg_ros.io.box_table import cell, number_cells, read_by_box, single_precision
 from boxreg_ros.structures import Floats, KEPT, RefinedBoxes, X, Y
 import numpy as np
 
@@ -39,7 +39,6 @@ class BoxCovariance(NamedTuple):
 def covariance_lines(refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> list[str]:
     """Return the line of each box with an estimate, in single precision; kept boxes have none."""
     boxes = refined.boxes
-    rows = [row for row, status in enumerate(refined.status) if status != KEPT]
     distances = [''] * len(refined.status)
     if T_fixed_sensor is not None:
         offset = boxes.boxes[:, [X, Y]] - T_fixed_sensor[:2, 3]
@@ -48,10 +47,12 @@ def covariance_lines(refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> li
         refined.covariances[:, *POSE_TRIANGLE],
         refined.extent_covariances[:, *EXTENT_TRIANGLE],
     )
-    numbers = number_cells(np.hstack(triangles)[rows])
+    numbers = number_cells(single_precision(np.hstack(triangles)), 'nan')
+    columns = boxes.track_ids, refined.status, distances, numbers
     return [
-        f'{boxes.stamp_ns},{cell(boxes.track_ids[row])},{distances[row]},{cells}\n'
-        for row, cells in zip(rows, numbers, strict=True)
+        f'{boxes.stamp_ns},{cell(track_id)},{distance},{cells}\n'
+        for track_id, status, distance, cells in zip(*columns, strict=True)
+        if status != KEPT
     ]
 
 

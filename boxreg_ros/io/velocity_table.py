@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import combinations_with_replacement
 from pathlib import Path
 
-from boxreg_ros.io.box_table import cell, number_cells, read_by_box
+from boxreg_ros.io.box_table import cell, number_cells, read_by_box, single_precision
 from boxreg_ros.io.covariance_table import symmetric
 from boxreg_ros.structures import BoxArray, KINEMATICS
 import numpy as np
@@ -35,18 +35,18 @@ def velocity_lines(boxes: BoxArray) -> list[str]:
 
     """
     found = boxes.known_kinematics
-    rates = np.hstack([found['velocity'], found['velocity_covariance'][:, *RATES_TRIANGLE]])
-    accelerations = np.hstack(
-        [found['acceleration'], found['acceleration_covariance'][:, *ACCELERATION_TRIANGLE]]
-    )
-    columns = boxes.track_ids, number_cells(rates), number_cells(accelerations)
-    rows = zip(found['has_velocity'], found['has_acceleration'], *columns, strict=True)
-    lines = []
-    for has_velocity, has_acceleration, track_id, rate, acceleration in rows:
-        if has_velocity:
-            begin = f'{boxes.stamp_ns},{cell(track_id)}'
-            lines.append(f'{begin},{rate},{acceleration if has_acceleration else "," * 8}\n')
-    return lines
+    cells = []
+    for name, triangle in (('velocity', RATES_TRIANGLE), ('acceleration', ACCELERATION_TRIANGLE)):
+        numbers = np.hstack([found[name], found[f'{name}_covariance'][:, *triangle]])
+        cells.append(number_cells(single_precision(numbers), 'nan'))
+    is_known = found['has_velocity'].tolist(), found['has_acceleration'].tolist()
+    return [
+        f'{boxes.stamp_ns},{cell(track_id)},{rates},{acceleration if accelerates else "," * 8}\n'
+        for track_id, moves, accelerates, rates, acceleration in zip(
+            boxes.track_ids, *is_known, *cells, strict=True
+        )
+        if moves
+    ]
 
 
 def read_velocities(path: Path) -> dict[tuple[int, str], NDArray[np.void]]:

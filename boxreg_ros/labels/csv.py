@@ -23,6 +23,7 @@ from boxreg_ros.io.box_table import (
     cell,
     COLUMNS,
     csv_row,
+    number_cells,
     parsed_rows,
     protected,
     unprotected,
@@ -31,14 +32,11 @@ from boxreg_ros.io.covariance_table import COVARIANCE_COLUMNS, covariance_lines,
 from boxreg_ros.io.velocity_table import VELOCITIES, VELOCITY_COLUMNS, velocity_lines
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import numbers_of, ReadBox, refined_of
-from boxreg_ros.structures import BoxArray, Floats, PROPOSED
+from boxreg_ros.structures import BoxArray, PROPOSED
 import numpy as np
-import orjson
 
 ATTRIBUTES = 'attributes.csv'
 ATTRIBUTE_COLUMNS = ('stamp_ns', 'track_id', 'name', 'value')
-PLAIN_RANGE = 1e-4, 1e16
-"""Python writes the magnitudes from the first to the second without an exponent."""
 
 FORMAT = Format(
     name='csv',
@@ -84,21 +82,22 @@ class Writer:
     def write(self, frame: LabelFrame) -> None:
         """Add one row per box."""
         refined = frame.refined
-        self._covariances.writelines(covariance_lines(refined, frame.T_fixed_sensor))
-        self._velocities.writelines(velocity_lines(refined.boxes))
+        self._covariances.write(''.join(covariance_lines(refined, frame.T_fixed_sensor)))
+        self._velocities.write(''.join(velocity_lines(refined.boxes)))
         boxes = refined.boxes
         stamp_ns = boxes.stamp_ns
         if self._newest_ns is not None and stamp_ns < self._newest_ns:
             self._is_sorted = False
         self._newest_ns = stamp_ns
         begin = f'{stamp_ns},{cell(boxes.frame_id)}'
-        columns = boxes.track_ids, boxes.class_names, _texts(numbers_of(boxes)), refined.status
-        rows = zip(*columns, refined.num_points.tolist(), strict=True)
+        names = boxes.track_ids, boxes.class_names
+        numbers = number_cells(numbers_of(boxes), ''), refined.num_points.tolist()
+        rows = zip(*names, *numbers, refined.status, strict=True)
         lines = [
             f'{begin},{cell(track_id)},{cell(class_name)},{texts},{cell(status)},{num_points}\n'
-            for track_id, class_name, texts, status, num_points in rows
+            for track_id, class_name, texts, num_points, status in rows
         ]
-        self._boxes.writelines(lines)
+        self._boxes.write(''.join(lines))
         self._write_attributes(boxes)
 
     def _write_attributes(self, boxes: BoxArray) -> None:
@@ -122,20 +121,6 @@ class Writer:
         rows.sort(key=lambda row: int(row[0]))
         with path.open('w', newline='', encoding='utf-8') as file:
             file.writelines(map(csv_row, [header, *rows]))
-
-
-def _texts(numbers: Floats) -> Iterator[str]:
-    """Yield the cells of rows (n, k) with commas, as of `repr`; not finite ones are empty."""
-    flat = numbers.ravel()
-    texts = orjson.dumps(flat, option=orjson.OPT_SERIALIZE_NUMPY)[1:-1].decode().split(',')
-    low, high = PLAIN_RANGE
-    size = np.abs(flat)
-    is_plain = (size == 0) | (low <= size) & (size < high)
-    for i in np.flatnonzero(~is_plain).tolist():
-        texts[i] = repr(float(flat[i])) if np.isfinite(flat[i]) else ''
-    width = numbers.shape[1]
-    for begin in range(0, len(flat), width):
-        yield ','.join(texts[begin : begin + width])
 
 
 def read(path: Path) -> Iterator[LabelFrame]:

@@ -17,6 +17,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from boxreg_ros.io.box_table import number_cells
 from boxreg_ros.io.transforms import inverse, moved_boxes
 from boxreg_ros.labels.attributes import attributes_from, plain
 from boxreg_ros.labels.files import at, following, from_json, to_json
@@ -36,7 +37,6 @@ from boxreg_ros.structures import (
 )
 from msg_adapters.poses import quaternions_of
 import numpy as np
-from numpy.typing import NDArray
 
 FORMAT = Format(
     name='openlabel',
@@ -167,10 +167,11 @@ class Writer:
             intervals[-1]['frame_end'] = self._frames
         else:
             intervals.append({'frame_start': self._frames, 'frame_end': self._frames})
-        pointers = item['object_data_pointers']['box']['attribute_pointers']
-        for kind, named in _by_kind(attributes).items():
-            for one in named:
-                pointers.setdefault(one['name'], kind)
+        if attributes:
+            pointers = item['object_data_pointers']['box']['attribute_pointers']
+            for kind, named in _by_kind(attributes).items():
+                for one in named:
+                    pointers.setdefault(one['name'], kind)
 
     def _new_object(self, track_id: str, class_name: str) -> int:
         """Add an object and return its number; the first of a track stands for the track."""
@@ -201,19 +202,21 @@ def _cuboids(refined: RefinedBoxes) -> Iterator[str]:
     frame = to_json(boxes.frame_id)
     words = {word: to_json(word) for word in {*refined.status, *refined.reasons}}
     places = boxes.boxes[:, BOX_CENTER], quaternions_of(boxes.boxes), boxes.boxes[:, BOX_EXTENT]
-    rows = zip(
-        _rows(np.hstack(places)),
-        _rows(refined.covariances.reshape(count, 36).round(COVARIANCE_DIGITS)),
-        _rows(refined.extent_covariances.reshape(count, 9).round(COVARIANCE_DIGITS)),
-        _rows(refined.num_points[:, None]),
-        _rows(boxes.scores[:, None]),
-        strict=True,
+    numbers = (
+        np.hstack(places),
+        refined.covariances.reshape(count, 36).round(COVARIANCE_DIGITS),
+        refined.extent_covariances.reshape(count, 9).round(COVARIANCE_DIGITS),
+        refined.num_points[:, None],
+        boxes.scores[:, None],
     )
-    for row, (values, covariance, extent_covariance, num_points, score) in enumerate(rows):
-        own = _by_kind(boxes.attributes_of(row))
-        more = ''.join(f',{to_json(one)}' for one in own['text'])
+    texts = zip(*(number_cells(of_boxes, 'null') for of_boxes in numbers), strict=True)
+    for row, (values, covariance, extent_covariance, num_points, score) in enumerate(texts):
+        more, booleans = '', ''
+        if boxes.attributes:
+            own = _by_kind(boxes.attributes[row])
+            more = ''.join(f',{to_json(one)}' for one in own['text'])
+            booleans = f',"boolean":{to_json(own["boolean"])}' if own['boolean'] else ''
         known = '' if score == 'null' else f',{{"name":"score","val":{score}}}'
-        booleans = f',"boolean":{to_json(own["boolean"])}' if own['boolean'] else ''
         yield (
             f'{{"name":"box","coordinate_system":{frame},"val":[{values}],"attributes":{{'
             f'"text":[{{"name":"status","val":{words[refined.status[row]]}}},'
@@ -222,11 +225,6 @@ def _cuboids(refined: RefinedBoxes) -> Iterator[str]:
             f'"vec":[{{"name":"covariance","val":[{covariance}]}},'
             f'{{"name":"extent_covariance","val":[{extent_covariance}]}}]{booleans}}}}}'
         )
-
-
-def _rows(numbers: NDArray[Any]) -> list[str]:
-    """Return the rows of numbers (n, k), n > 0, as JSON without brackets."""
-    return to_json(np.ascontiguousarray(numbers))[2:-2].split('],[')
 
 
 def _by_kind(attributes: Mapping[str, str]) -> dict[str, list[dict[str, Any]]]:

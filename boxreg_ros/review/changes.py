@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from boxreg_ros.core.metrics import iou_3d, pose_errors
+from boxreg_ros.core.tables import rows_by_key
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import (
     BoxArray,
@@ -105,8 +106,9 @@ class Changes:
 
     def __init__(self, fixed_frame: str) -> None:
         self._fixed_frame = fixed_frame
-        self._names: list[tuple[str, str]] = []  # track id and class of each box
-        self._parts: list[TrackChanges] = []  # one for each array
+        self._track_ids: list[str] = []
+        self._class_names: list[str] = []
+        self._parts: list[TrackChanges] = []  # one for each array, until they are one
         self._early: list[Floats] = []  # early estimates (n, 9) of each array
 
     def add(
@@ -135,7 +137,8 @@ class Changes:
         unknown = np.where(is_refined, 0.0, np.nan)[:, None]
         variances = np.diagonal(refined.extent_covariances, axis1=1, axis2=2)
         self._early.append(_refined_early(early, n))
-        self._names += zip(boxes.track_ids, boxes.class_names, strict=True)
+        self._track_ids += boxes.track_ids
+        self._class_names += boxes.class_names
         self._parts.append(
             TrackChanges(
                 track_id='',
@@ -160,9 +163,10 @@ class Changes:
 
     def tracks(self) -> list[TrackChanges]:
         """Return all tracks, by descending mean shift."""
-        if not self._names:
+        if not self._parts:
             return []
         every = concatenated(self._parts)
+        self._parts = [every]
         errors = pose_errors(every.given, every.boxes)  # of the input, in the axes of the result
         yaw_change = wrap_angle(2 * errors.rotation[:, 2]) / 2  # half turns removed
         early = np.concatenate(self._early)
@@ -172,13 +176,13 @@ class Changes:
             is_flipped=errors.is_flipped & every.is_refined,
             disagreement=np.nan_to_num(1 - ious(every.boxes, early)),
         )
-        rows_of: dict[str, list[int]] = {}
-        for row in np.argsort(every.stamps_ns, kind='stable').tolist():
-            rows_of.setdefault(self._names[row][0], []).append(row)
+        in_time = np.argsort(every.stamps_ns, kind='stable')
+        rows_of = rows_by_key([self._track_ids[row] for row in in_time.tolist()])
         found = []
         for track_id, rows in rows_of.items():
-            track = every.take(rows)
-            classes = Counter(self._names[row][1] for row in rows)
+            own = in_time[rows]
+            track = every.take(own)
+            classes = Counter(map(self._class_names.__getitem__, own.tolist()))
             found.append(
                 replace(
                     track,

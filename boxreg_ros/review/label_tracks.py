@@ -96,19 +96,19 @@ def _near_pairs(stamps_ns: Ints, boxes: Floats, owner: Ints) -> Pairs:
     radius = np.linalg.norm(boxes[:, BOX_EXTENT], axis=1) / 2
     reach = 2 * radius.max(initial=0.0)
     order = np.lexsort((boxes[:, X], stamps_ns))
+    stamps, x, radii, owners = stamps_ns[order], boxes[order, X], radius[order], owner[order]
+    centers = boxes[order][:, BOX_CENTER]
     found = [np.zeros((0, 2), np.int64)]
     # Each box is compared with the next one along x, then with the one after it, and so on.
-    first = np.arange(len(order))
     for step in range(1, len(order)):
-        first = first[first + step < len(order)]
-        i, j = order[first], order[first + step]
-        is_beside = (stamps_ns[i] == stamps_ns[j]) & (boxes[j, X] - boxes[i, X] < reach)
-        first, i, j = first[is_beside], i[is_beside], j[is_beside]
-        distance = np.linalg.norm(boxes[i, BOX_CENTER] - boxes[j, BOX_CENTER], axis=1)
-        is_near = (distance < radius[i] + radius[j]) & (owner[i] != owner[j])
-        found.append(np.sort(np.column_stack([i, j])[is_near], axis=1))
-        if not len(first):
+        is_beside = (stamps[step:] == stamps[:-step]) & (x[step:] - x[:-step] < reach)
+        i = np.flatnonzero(is_beside)
+        if not len(i):
             break
+        j = i + step
+        distance = np.linalg.norm(centers[i] - centers[j], axis=1)
+        is_near = (distance < radii[i] + radii[j]) & (owners[i] != owners[j])
+        found.append(np.sort(order[np.column_stack([i, j])[is_near]], axis=1))
     a, b = np.concatenate(found).T
     by_stamp = np.lexsort((b, a, stamps_ns[a]))
     a, b = a[by_stamp], b[by_stamp]
