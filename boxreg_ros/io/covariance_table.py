@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.io.box_table import cell, number_cells, read_by_box, single_precision
-from boxreg_ros.structures import Floats, KEPT, RefinedBoxes, X, Y
+from boxreg_ros.structures import Floats, RefinedBoxes, X, Y
 import numpy as np
 
 COVARIANCES = 'covariances.csv'
@@ -23,6 +23,8 @@ COVARIANCE_COLUMNS = ('stamp_ns', 'track_id', 'range', *COVARIANCE_NUMBERS)
 POSE_TRIANGLE = np.triu_indices(6)
 EXTENT_TRIANGLE = np.triu_indices(3)
 NUM_POSE = len(POSE_TRIANGLE[0])
+ROUNDING = 1e-9
+"""Largest deviation from the unit matrix of one that was moved to another frame; chosen."""
 
 
 class BoxCovariance(NamedTuple):
@@ -37,8 +39,14 @@ class BoxCovariance(NamedTuple):
 
 
 def covariance_lines(refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> list[str]:
-    """Return the line of each box with an estimate, in single precision; kept boxes have none."""
+    """
+    Return the line of each box with a covariance, in single precision.
+
+    Kept and rejected boxes, and those of label files that state none, have the unit matrix.
+
+    """
     boxes = refined.boxes
+    is_known = np.abs(refined.covariances - np.eye(6)).max(axis=(1, 2)) > ROUNDING
     distances = [''] * len(refined.status)
     if T_fixed_sensor is not None:
         offset = boxes.boxes[:, [X, Y]] - T_fixed_sensor[:2, 3]
@@ -48,11 +56,11 @@ def covariance_lines(refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> li
         refined.extent_covariances[:, *EXTENT_TRIANGLE],
     )
     numbers = number_cells(single_precision(np.hstack(triangles)), 'nan')
-    columns = boxes.track_ids, refined.status, distances, numbers
+    columns = boxes.track_ids, is_known.tolist(), distances, numbers
     return [
         f'{boxes.stamp_ns},{cell(track_id)},{distance},{cells}\n'
-        for track_id, status, distance, cells in zip(*columns, strict=True)
-        if status != KEPT
+        for track_id, has_covariance, distance, cells in zip(*columns, strict=True)
+        if has_covariance
     ]
 
 

@@ -15,6 +15,7 @@ from boxreg_ros.structures import (
     Floats,
     HUMAN,
     KEPT,
+    KINEMATICS,
     RefinedBoxes,
     with_rejected,
 )
@@ -232,6 +233,7 @@ class Corrections:
         status = list(refined.status)
         reasons = list(refined.reasons)
         covariances = refined.covariances.copy()
+        kinematics = refined.boxes.known_kinematics.copy()
         for row, track_id in enumerate(given.track_ids):
             if status[row] == KEPT:
                 boxes[row] = given.boxes[row]  # without the extents of a pin
@@ -246,6 +248,7 @@ class Corrections:
                 boxes[row] = given.boxes[row]
                 status[row], reasons[row] = KEPT, str(Reason.REJECTED)
                 covariances[row] = np.eye(6)
+                kinematics[row] = np.zeros((), KINEMATICS)
             elif is_pinned[row]:
                 boxes[row] = given.boxes[row]
                 status[row], reasons[row] = HUMAN, ''
@@ -257,7 +260,7 @@ class Corrections:
                 status[row] = HUMAN
         return replace(
             refined,
-            boxes=replace(refined.boxes, boxes=boxes, pinned=None),
+            boxes=replace(refined.boxes, boxes=boxes, pinned=None, kinematics=kinematics),
             status=tuple(status),
             reasons=tuple(reasons),
             covariances=covariances,

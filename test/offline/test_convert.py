@@ -8,6 +8,7 @@ from pathlib import Path
 from boxreg_ros import cli
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.covariance_table import COVARIANCES, read_covariances
 from boxreg_ros.io.fixed_frame import FixedFrameItems, input_boxes
 from boxreg_ros.labels import FORMATS, frames_of, Options
 from boxreg_ros.labels.registry import labels_points
@@ -257,6 +258,11 @@ def test_convert_with_poses_and_clouds_of_a_recording(tmp_path, drive, camera):
     assert (summary['frames'], summary['boxes'], summary['left_out_of_labels']) == (7, 14, {})
     truth = BoxTable.read(table)
     assert BoxTable.read(out / 'boxes.csv').boxes == pytest.approx(truth.boxes, abs=1e-6)
+    # Labels of a frame of the sensor that state no covariance.
+    again = Request((recording,), labels=('kitti', out / 'kitti'), formats=('csv',))
+    convert(again, tmp_path / 'again')
+    for folder in (out, tmp_path / 'again'):
+        assert read_covariances(folder / COVARIANCES) == {}
     assert len(list((out / 'nuscenes' / 'samples' / 'LIDAR_TOP').iterdir())) == 7
 
 

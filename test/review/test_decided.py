@@ -7,6 +7,8 @@ import shutil
 
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.covariance_table import COVARIANCES, read_covariances
+from boxreg_ros.io.velocity_table import read_velocities, VELOCITIES
 from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.changes import Changes
@@ -69,6 +71,12 @@ def words_of(rows, track_id, stamps):
     return [rows.get((track_id, stamp), {'status': ''})['status'] for stamp in stamps]
 
 
+def known_of(out):
+    """Return id and stamp of the boxes with a covariance, and of those with a velocity."""
+    tables = read_covariances(out / COVARIANCES), read_velocities(out / VELOCITIES)
+    return tuple({(name, stamp) for stamp, name in table} for table in tables)
+
+
 @pytest.fixture(scope='module')
 def completed(tmp_path_factory):
     """Return a run with --complete, its stamps, and its result without decisions."""
@@ -80,10 +88,12 @@ def completed(tmp_path_factory):
 
 
 def test_without_decisions_the_steps_do_all_of_this(completed):
-    _, stamps, rows, _ = completed
+    _, stamps, rows, out = completed
     assert [words_of(rows, '2', stamps)[k] for k in GAP] == ['interpolated'] * 3
     assert words_of(rows, '1', stamps)[-3:] == ['extended'] * 3
     assert words_of(rows, '9', stamps)[8:10] == ['rejected'] * 2
+    with_estimate = {key for key, row in rows.items() if row['status'] != 'rejected'}
+    assert known_of(out) == (with_estimate, with_estimate)
 
 
 def test_rejected_boxes_are_no_labels(completed, capsys):
@@ -170,6 +180,8 @@ def test_rejected_boxes_that_the_run_added_are_left_out(completed, tmp_path):
     words = words_of(rows, '1', stamps)
     of_input = {'refined': 'kept', 'kept': 'kept'}
     assert words == [of_input.get(word, '') for word in words_of(before, '1', stamps)]
+    with_covariance, with_velocity = known_of(tmp_path / 'out')
+    assert {name for name, _ in with_covariance} == {name for name, _ in with_velocity} == {'2'}
 
 
 def test_joined_tracks_stay_one_however_long_the_pause(completed, tmp_path, capsys):
