@@ -12,9 +12,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import fcntl
 import io
+from math import dist
 import os
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.io.box_table import csv_row, protected, unprotected
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.rotations import boxes_from_quaternions, quaternion_from_rpy
-from boxreg_ros.structures import BOX_EXTENT, Floats, is_valid_box, ROLL, Z
+from boxreg_ros.structures import BOX_EXTENT, Floats, is_valid_box, LENGTH, ROLL, Z
 import numpy as np
 
 DECISIONS = 'decisions.csv'
@@ -150,6 +151,12 @@ class Decision:
             return not self.attribute[1]
         return self.kind in ('none', 'restore', 'withdraw')
 
+    def is_of_object(self, other: Decision) -> bool:
+        """Return whether the boxes of two people are of one object: nearer than half a length."""
+        if self.box is None or other.box is None or self.stamp_ns != other.stamp_ns:
+            return False
+        return dist(self.box[:LENGTH], other.box[:LENGTH]) < other.box[LENGTH] / 2
+
     def covers(self, stamp_ns: int) -> bool:
         """Return whether a box of the track at a stamp is one of those decided about."""
         if self.stamp_ns is None:
@@ -200,7 +207,8 @@ def read_decisions(path: Path) -> list[Decision]:
     """
     Return the decisions of a file, in its order; a last row that is cut is left out.
 
-    Files of several people may be joined by ``cat``: their first lines are left out.
+    Files of several people may be joined by ``cat``: their first lines are left out, and what two
+    files add under one id are two objects, unless both have a box of it at the same place.
 
     Raises RecordingError if the file cannot be read, is of a later version, lacks a column, or a
     row is no decision.
@@ -233,14 +241,19 @@ def read_decisions(path: Path) -> list[Decision]:
             f'{path}: expected decisions of boxreg review, got a file without the columns '
             f'{", ".join(missing)}; give {DECISIONS} of a reviewed result'
         )
-    decisions = []
+    decisions: list[Decision] = []
+    first = 0  # of the file that a row is of
+    number = 1
     for row in reader:
         line = reader.line_num + lines_before
         try:
             is_version = row['track_id'].startswith(VERSION_LINE)
             if is_version and _version_of(row['track_id']) != version:
                 raise RecordingError(f'expected a file of version {version}, as the first one')
-            if not is_version and row['decision'] != 'decision':  # first lines of another file
+            if row['decision'] == 'decision':  # another file begins
+                decisions[first:] = _apart(decisions[:first], decisions[first:], number)
+                first, number = len(decisions), number + 1
+            elif not is_version:
                 decisions.append(_parsed(row, version))
         except RecordingError as error:
             raise RecordingError(f'{path}: line {line}: {error}') from None
@@ -249,7 +262,32 @@ def read_decisions(path: Path) -> list[Decision]:
                 f'{path}: line {line}: expected numbers, got: {error}; correct the line, or '
                 f'remove it'
             ) from None
-    return decisions
+    return decisions[:first] + _apart(decisions[:first], decisions[first:], number)
+
+
+def _apart(before: Sequence[Decision], own: Sequence[Decision], number: int) -> list[Decision]:
+    """
+    Return the decisions of a file with new ids for objects that files `before` it do not have.
+
+    Each person's page numbers those that are added from the last track of the result on.
+
+    """
+    added: dict[str, list[Decision]] = {}
+    for one in before:
+        if one.kind == 'add':
+            added.setdefault(one.track_id, []).append(one)
+    again = [one for one in own if one.kind == 'add' and one.track_id in added]
+    same = {one.track_id for one in again if any(map(one.is_of_object, added[one.track_id]))}
+    others = {one.track_id for one in again} - same
+    new_id = {name: f'{name}.{number}' for name in others}
+    return [
+        replace(
+            one,
+            track_id=new_id.get(one.track_id, one.track_id),
+            value=new_id.get(one.value, one.value) if one.kind == 'rename' else one.value,
+        )
+        for one in own
+    ]
 
 
 class DecisionLog:
@@ -283,7 +321,9 @@ class DecisionLog:
         self._read()
         rows = _encoded(new)
         text = _whole_rows(self._path.read_bytes().decode()) if self._path.exists() else ''
-        if not text or _version_of(text.removeprefix('\ufeff')) < VERSION:
+        # Ids of a file that was joined may have been changed.
+        is_joined = text.count(','.join(FIRST_COLUMNS[:3])) > 1
+        if not text or is_joined or _version_of(text.removeprefix('\ufeff')) < VERSION:
             text = f'{VERSION_LINE}{VERSION}\n' + csv_row(DECISION_COLUMNS)
             text += _encoded(self.decisions)
         with written_whole(self._path) as file:

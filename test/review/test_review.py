@@ -189,6 +189,35 @@ def test_decisions_of_two_people_are_joined_by_cat(tmp_path):
         read_decisions(both)
 
 
+def test_objects_that_two_people_have_added_under_one_id_stay_apart(tmp_path):
+    """Both pages count on from the last track of the result that they have a copy of."""
+
+    def added(name, x, stamp_ns=5, **of):
+        box = np.array([x, 0, 1, 4, 2, 1.5, 0, 0, 0.0])
+        return Decision(name, stamp_ns, 'add', frame_id='odom', box=box, value='car', **of)
+
+    common = added('20', 0)
+    first = [common, added('21', 10, who='a'), added('22', 40, who='a')]
+    about = [Decision('21', 7, 'delete'), Decision('3', None, 'rename', value='21')]
+    second = [common, added('21', 30, who='b'), *about, added('22', 40.5, who='b')]
+    both = tmp_path / DECISIONS
+    for name, rows in (('a', first), ('b', second)):
+        DecisionLog(tmp_path / name).append(rows)
+        both.write_bytes(
+            (both.read_bytes() if name == 'b' else b'') + (tmp_path / name).read_bytes()
+        )
+    log = DecisionLog(both)
+    expected = ['20', '21', '22', '20', '21.2', '21.2', '3', '22']
+    assert [one.track_id for one in log.decisions] == expected
+    assert log.decisions[6].value == '21.2'
+    # The review goes on with either object.
+    log.append([added('21', 11, 6), added('21.2', 31, 6)])
+    assert [one.track_id for one in read_decisions(both)] == [*expected, '21', '21.2']
+    seeds = Corrections(read_decisions(both)).seeds('odom')
+    at = sorted((seed.track_ids[0], round(seed.boxes[0, 0])) for seed in seeds)
+    assert at == [('20', 0), ('21', 10), ('21', 11), ('21.2', 30), ('21.2', 31), ('22', 40)]
+
+
 @pytest.mark.parametrize(
     ('row', 'word'),
     [
