@@ -155,7 +155,8 @@ class Decision:
         """Return whether the boxes of two people are of one object: nearer than half a length."""
         if self.box is None or other.box is None or self.stamp_ns != other.stamp_ns:
             return False
-        return dist(self.box[:LENGTH], other.box[:LENGTH]) < other.box[LENGTH] / 2
+        half_length = float(other.box[LENGTH]) / 2
+        return dist(self.box[:LENGTH], other.box[:LENGTH]) < half_length
 
     def covers(self, stamp_ns: int) -> bool:
         """Return whether a box of the track at a stamp is one of those decided about."""
