@@ -276,8 +276,8 @@ class Request:
     def inputs(self) -> tuple[Path, ...]:
         """Return the input files and folders."""
         paths = [part for path in self.recordings for part in _parts_of(path)]
-        if self.options.camera is not None and self.options.camera.is_file():
-            paths.append(self.options.camera)
+        of_formats = (self.options.camera, self.options.class_map)  # the camera may be a topic
+        paths += [path for path in of_formats if path is not None and path.is_file()]
         if self.labels is not None:
             paths.append(files_of(*self.labels))
         if self.truth is not None:

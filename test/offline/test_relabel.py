@@ -750,6 +750,13 @@ def test_fingerprint_differs_between_requests(tmp_path):
     assert Request((path,)).fingerprint() == first
     assert Request((path,), end=1.0).fingerprint() != first
     assert Request((path,), config=QUICK).fingerprint() != first
+    names = tmp_path / 'names.yaml'
+    found = set()
+    for name in ('Van', 'Truck'):
+        names.write_text(f'car: {name}\n')
+        named = Request((path,), formats=('kitti',), options=Options(class_map=names))
+        found.add(named.fingerprint())
+    assert len(found) == 2
     path.write_bytes(path.read_bytes() + b'x')
     assert Request((path,)).fingerprint() != first
 
