@@ -109,7 +109,6 @@ class Changes:
         self._track_ids: list[str] = []
         self._class_names: list[str] = []
         self._parts: list[TrackChanges] = []  # one for each array, until they are one
-        self._early: list[Floats] = []  # early estimates (n, 9) of each array
 
     def add(
         self,
@@ -136,7 +135,6 @@ class Changes:
         is_refined = np.isin(refined.status, (REFINED, HUMAN))
         unknown = np.where(is_refined, 0.0, np.nan)[:, None]
         variances = np.diagonal(refined.extent_covariances, axis1=1, axis2=2)
-        self._early.append(_refined_early(early, n))
         self._track_ids += boxes.track_ids
         self._class_names += boxes.class_names
         self._parts.append(
@@ -147,13 +145,13 @@ class Changes:
                 stamps_ns=np.full(n, boxes.stamp_ns),
                 given=before,
                 boxes=after,
-                change=np.zeros((n, 4)),
+                change=np.broadcast_to(0.0, (n, 4)),  # these two follow once all are known
                 deviations=_deviations(after, refined.covariances) + unknown,
                 extent_deviations=np.sqrt(variances.clip(0)) + unknown,
                 face_distances=refined.face_distances,
                 near_points=refined.near_points.astype(np.float64),
-                disagreement=np.zeros(n),
-                is_flipped=np.zeros(n, bool),
+                is_flipped=np.broadcast_to(False, n),
+                disagreement=_disagreement(after, early),
                 status=np.array(refined.status, str),
                 reasons=np.array(refined.reasons, str),
                 num_points=refined.num_points,
@@ -169,12 +167,10 @@ class Changes:
         self._parts = [every]
         errors = pose_errors(every.given, every.boxes)  # of the input, in the axes of the result
         yaw_change = wrap_angle(2 * errors.rotation[:, 2]) / 2  # half turns removed
-        early = np.concatenate(self._early)
         every = replace(
             every,
             change=-np.column_stack([errors.translation, yaw_change]),
             is_flipped=errors.is_flipped & every.is_refined,
-            disagreement=np.nan_to_num(1 - ious(every.boxes, early)),
         )
         in_time = np.argsort(every.stamps_ns, kind='stable')
         rows_of = rows_by_key([self._track_ids[row] for row in in_time.tolist()])
@@ -212,12 +208,12 @@ def known(values: ArrayLike) -> Floats:
     return np.asarray(values[np.isfinite(values)])
 
 
-def _refined_early(early: RefinedBoxes | None, count: int) -> Floats:
-    """Return the early estimates of `count` boxes (n, 9), NaN where they are not refined."""
-    found = np.full((count, 9), np.nan)
+def _disagreement(boxes: Floats, early: RefinedBoxes | None) -> Floats:
+    """Return 1 - 3D IoU of boxes (n, 9) with refined early estimates; 0 without one."""
+    found = np.zeros(len(boxes))
     if early is not None:
-        rows = [row for row, word in enumerate(early.status[:count]) if word == REFINED]
-        found[rows] = early.boxes.boxes[rows]
+        rows = [row for row, word in enumerate(early.status[: len(boxes)]) if word == REFINED]
+        found[rows] = np.nan_to_num(1 - ious(boxes[rows], early.boxes.boxes[rows]))
     return found
 
 
