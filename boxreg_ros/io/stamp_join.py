@@ -97,20 +97,22 @@ def nearest_rows(stamps_ns: Ints, among_ns: Ints) -> Ints:
     return np.where(is_before, before, after)
 
 
-def between_stamps(stamps_ns: Ints, frames_ns: Ints) -> NDArray[np.bool_]:
+def unknown_stamps(stamps_ns: Ints, frames_ns: Ints) -> NDArray[np.bool_]:
     """
-    Return which stamps (n,) lie between two frames that follow each other, or beside the ends.
+    Return which stamps (n,) lie between two frames that follow each other, or beyond all.
 
     Frames that were left out, or have nothing, are no such gap: it is at most `MAX_FRAME_STEP`
     times the median period of the frames (m,), which are in any order, repeated.
 
     """
     frames = np.unique(frames_ns)
-    if len(frames) < 2:
+    if not len(frames):
         return np.zeros(len(stamps_ns), bool)
-    period_ns = int(np.median(np.diff(frames)))
-    ends = np.array([frames[0] - period_ns, *frames, frames[-1] + period_ns])
-    after = np.searchsorted(ends, stamps_ns).clip(1, len(ends) - 1)
-    first, last = ends[after - 1], ends[after]
+    is_beyond = (stamps_ns < frames[0]) | (stamps_ns > frames[-1])
+    if len(frames) < 2:
+        return np.asarray(is_beyond)
+    after = np.searchsorted(frames, stamps_ns).clip(1, len(frames) - 1)
+    first, last = frames[after - 1], frames[after]
     is_inside = (first < stamps_ns) & (stamps_ns < last)
-    return np.asarray(is_inside & (last - first <= MAX_FRAME_STEP * period_ns))
+    is_step = last - first <= MAX_FRAME_STEP * np.median(np.diff(frames))
+    return np.asarray(is_beyond | is_inside & is_step)

@@ -15,7 +15,7 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import COVARIANCES, read_covariances
-from boxreg_ros.io.stamp_join import between_stamps, joined_stamps
+from boxreg_ros.io.stamp_join import joined_stamps, LARGEST_OFFSET_NS, unknown_stamps
 from boxreg_ros.io.times import time_range
 from boxreg_ros.io.velocity_table import read_velocities, VELOCITIES
 from boxreg_ros.offline.arguments import add_options, request_from, TOPICS, words_of
@@ -76,10 +76,10 @@ def run(args: argparse.Namespace) -> int:
     truth = true_boxes(args.truth)
     predicted = _predicted(args, truth.frame_id)
     _check_same_drive(args, predicted, truth)
-    truth = _joined(args, predicted, truth)
+    truth = _of_part(args, _joined(args, predicted, truth))
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes, by_overlap)
-    is_unknown = _between(predicted, truth) | _out_of_view(args, predicted, matches)
+    is_unknown = _at_other_times(predicted, truth) | _out_of_view(args, predicted, matches)
     is_unknown |= _of_other_classes(predicted, matches, classes)
     matches = replace(matches, unmatched=matches.unmatched[~is_unknown[matches.unmatched]])
     if matches.invalid:
@@ -286,15 +286,33 @@ def _joined(args: argparse.Namespace, predicted: BoxTable, truth: BoxTable) -> B
     return replace(truth, stamps_ns=joined.stamps_ns)
 
 
-def _between(predicted: BoxTable, truth: BoxTable) -> NDArray[np.bool_]:
-    """Return which predicted boxes (n,) lie between the stamps of sparser true ones; say so."""
-    is_between = between_stamps(predicted.stamps_ns, truth.stamps_ns)
-    if is_between.any():
+def _of_part(args: argparse.Namespace, truth: BoxTable) -> BoxTable:
+    """Return the true boxes of the time that a result is of, as by --start and --end; say so."""
+    folder = _result_folder(args.predicted)
+    summary = (earlier_summary(folder) if folder is not None else None) or {}
+    ends = [stamp for stamps in summary.get('time_ranges', {}).values() for stamp in stamps]
+    if not ends:
+        return truth
+    is_early = truth.stamps_ns < min(ends) - LARGEST_OFFSET_NS
+    is_outside = is_early | (truth.stamps_ns > max(ends) + LARGEST_OFFSET_NS)
+    if is_outside.any():
         _warn(
-            f'{is_between.sum()} predicted boxes lie between the stamps of the true boxes, which '
-            f'are further apart: nothing is known there, and they are not counted'
+            f'{is_outside.sum()} of {len(truth.boxes)} true boxes are not of the time of '
+            f'{args.predicted}, {time_range(min(ends), max(ends))}: they are not counted'
         )
-    return is_between
+    return truth.rows(~is_outside)
+
+
+def _at_other_times(predicted: BoxTable, truth: BoxTable) -> NDArray[np.bool_]:
+    """Return which predicted boxes (n,) are at stamps that no true ones are known of; say so."""
+    is_unknown = unknown_stamps(predicted.stamps_ns, truth.stamps_ns)
+    if is_unknown.any():
+        _warn(
+            f'{is_unknown.sum()} predicted boxes lie between the stamps of the true boxes, which '
+            f'are further apart, or before or after all of them: nothing is known there, and they '
+            f'are not counted'
+        )
+    return is_unknown
 
 
 def _out_of_view(

@@ -336,15 +336,45 @@ def test_boxes_between_the_stamps_of_sparse_truth_are_no_ghosts(tmp_path, capsys
     assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--json') == 0
     printed = capsys.readouterr()
     report = json.loads(printed.out)
-    # Within 0.5 s of the keyframes nothing is known; the other four stamps are beyond them.
-    assert '32 predicted boxes lie between the stamps of the true boxes' in printed.err
-    assert report['unmatched'] == report['tracks']['ghosts'] == 6
+    assert '38 predicted boxes lie between the stamps of the true boxes' in printed.err
+    assert report['unmatched'] == report['tracks']['ghosts'] == 0
     # A frame without true boxes has none.
     rows(truth, np.flatnonzero(at != 7)).write(tmp_path / 'truth.csv')
     assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--json') == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out)['unmatched'] == 2
     assert 'between' not in printed.err
+
+
+@pytest.mark.parametrize('labelled', [[4], [3, 4, 5, 6]])
+def test_truth_of_a_part_of_the_drive_says_nothing_about_the_rest(tmp_path, capsys, labelled):
+    truth = truth_table()
+    truth.write(tmp_path / 'boxes.csv')
+    at = truth.stamps_ns // STEP
+    rows(truth, np.flatnonzero(np.isin(at, labelled))).write(tmp_path / 'truth.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--json') == 0
+    printed = capsys.readouterr()
+    report = json.loads(printed.out)
+    assert report['unmatched'] == report['tracks']['ghosts'] == report['tracks']['misses'] == 0
+    assert f'{20 - 2 * len(labelled)} predicted boxes lie' in printed.err
+    assert 'before or after all of them' in printed.err
+
+
+def test_true_boxes_of_another_time_than_a_result_are_not_missing(tmp_path, capsys):
+    """As of a result with --start and --end, or of one file of several."""
+    truth = truth_table()
+    truth.write(tmp_path / 'truth.csv')
+    at = truth.stamps_ns // STEP
+    # At stamp 4 nothing was detected, at 3 and 8 there are clouds alone.
+    rows(truth, np.flatnonzero(np.isin(at, [5, 6, 7]))).write(tmp_path / 'boxes.csv')
+    ranges = {'clouds': [3 * STEP, 8 * STEP], 'boxes': [5 * STEP, 7 * STEP]}
+    summary = {'fingerprint': '', 'time_ranges': ranges}
+    (tmp_path / 'summary.json').write_text(json.dumps(summary))
+    assert run(tmp_path, tmp_path / 'truth.csv', '--json') == 0
+    printed = capsys.readouterr()
+    report = json.loads(printed.out)
+    assert (report['boxes'], report['missing'], report['tracks']['misses']) == (12, 6, 6)
+    assert '8 of 20 true boxes are not of the time of' in printed.err
 
 
 def test_classes_that_the_truth_may_lack_are_said(tmp_path, capsys):
