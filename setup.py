@@ -130,14 +130,11 @@ setup(
             'colcon-common-extensions',
             'distributed>=2024.1',
             'DracoPy>=2,<3',
+            # Of the plugins of ament_flake8 those whose rules ruff and ament_pep257 lack.
             'flake8-blind-except',
-            'flake8-builtins',
             'flake8-class-newline',
-            'flake8-comprehensions',
             'flake8-deprecated',
-            'flake8-docstrings',
             'flake8-import-order',
-            'flake8-quotes',
             'flask',
             'flask-cors',
             'foxglove-schemas-protobuf',
@@ -161,6 +158,7 @@ setup(
             'plotly',
             'pureini>=0.10',
             'pyarrow',
+            'pydocstyle',  # of ament_pep257
             'pytest',
             'pytest-cov',
             'pytest-xdist',
