@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     if len(predicted.boxes) and not matches.is_matched.any():
         _warn(_why_none_matches(predicted, truth))
     elif not classes:
-        _warn_of_other_classes(predicted, truth, matches)
+        _warn_of_other_classes(predicted, truth, matches, is_unknown)
     overall = summarise(matches)
     tracks = track_scores(predicted.rows(~is_unknown), truth, matches.rows)
     if not has_trackeval():
@@ -242,11 +242,14 @@ def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:
     )
 
 
-def _warn_of_other_classes(predicted: BoxTable, truth: BoxTable, matches: Matches) -> None:
+def _warn_of_other_classes(
+    predicted: BoxTable, truth: BoxTable, matches: Matches, is_unknown: NDArray[np.bool_]
+) -> None:
     """Say which predicted classes the truth may lack: it has neither their name nor a box."""
     rows = matches.predicted_rows[matches.is_matched].tolist()
     known = {*truth.class_names, *(predicted.class_names[row] for row in rows)}
-    others = Counter(name for name in predicted.class_names if name not in known)
+    counted = predicted.rows(~is_unknown).class_names
+    others = Counter(name for name in counted if name not in known)
     if others:
         names = ', '.join(f'{name} {count}' for name, count in sorted(others.items()))
         _warn(
