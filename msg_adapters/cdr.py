@@ -69,6 +69,7 @@ class Layout:
         self.kinds: dict[str, tuple[str, int]] = {}
         self._columns = 0
         self._steps = self._steps_of(self._parts_of(type_name, ''))
+        self._last: _Places | None = None
         missing = set(paths) - self._fields.keys()
         if missing:
             raise UnsupportedMessage(
@@ -82,18 +83,27 @@ class Layout:
         """Return the fields of a message; None if it is not a whole one of this type."""
         if data[: len(LITTLE_ENDIAN)] != LITTLE_ENDIAN:
             return None
-        columns: list[list[Any]] = [[] for _ in range(self._columns)]
+        if self._last is None or not self._last.fit(data):
+            self._last = self._places_of(data)
+        if self._last is None:
+            return None
+        size = len(data) - HEADER
+        body = np.zeros(-(-size // 8) * 8, np.uint8)  # whole numbers of 8 bytes
+        body[:size] = np.frombuffer(data, np.uint8, size, HEADER)
+        return Fields(data, body, self._last.of)
+
+    def _places_of(self, data: bytes) -> _Places | None:
+        """Return where the fields of a message are; None if it is not a whole one."""
+        columns: list[list[Any]] = [[] for _ in range(self._columns + 1)]
         try:
             end = HEADER + _walk(data, 0, self._steps, columns)
         except ShortError:
             return None
         if not end <= len(data) <= end + MOST_PADDING:
             return None
-        size = len(data) - HEADER
-        body = np.zeros(-(-size // 8) * 8, np.uint8)  # whole numbers of 8 bytes
-        body[:size] = np.frombuffer(data, np.uint8, size, HEADER)
         places = {path: field.places(columns) for path, field in self._fields.items()}
-        return Fields(data, body, places)
+        prefixes = np.array(columns[-1], np.int64) // PREFIX.size
+        return _Places(places, len(data), prefixes, _words(data)[prefixes])
 
     def _parts_of(self, type_name: str, prefix: str) -> Iterator[tuple[str, str, int]]:
         """Yield path, type and count of all fields of a type and of messages in it; -1: any."""
@@ -176,12 +186,35 @@ class _Field(NamedTuple):
         return np.column_stack([begins, np.full_like(begins, self.numbers)])
 
 
+class _Places(NamedTuple):
+    """Where the fields of a message are, and of all others of its length that `fit`."""
+
+    of: dict[str, NDArray[np.int64]]
+    """By path, see `Fields`."""
+    size: int
+    """Of the message [bytes]."""
+    prefixes: NDArray[np.int64]
+    """Where it states a length, among its numbers of 4 bytes."""
+    lengths: NDArray[np.uint32]
+
+    def fit(self, data: bytes) -> bool:
+        """Return whether all lengths are those of a message, so that a walk finds the same."""
+        is_as_long = len(data) == self.size
+        return is_as_long and np.array_equal(_words(data)[self.prefixes], self.lengths)
+
+
+def _words(data: bytes) -> NDArray[np.uint32]:
+    """Return the whole numbers of 4 bytes behind the header of a message."""
+    return np.frombuffer(data, '<u4', len(data) // PREFIX.size - 1, HEADER)
+
+
 def _walk(data: bytes, position: int, steps: Sequence[_Step], columns: list[list[Any]]) -> int:
     """
     Walk through fields that begin at `position` behind the header; return where the last ends.
 
-    Notes where blocks begin, and begin and count of all else. Raises ShortError if a length is
-    behind the end of the message, or states more items than it has bytes.
+    Notes where blocks begin, and begin and count of all else; in the last column, where lengths
+    are. Raises ShortError if a length is behind the end of the message, or states more items than
+    it has bytes.
 
     """
     for is_block, alignment, size, items, column in steps:
@@ -191,6 +224,7 @@ def _walk(data: bytes, position: int, steps: Sequence[_Step], columns: list[list
             position += size
             continue
         position = -(-position // PREFIX.size) * PREFIX.size
+        columns[-1].append(position)
         (count,) = PREFIX.unpack_from(data, HEADER + position)
         position += PREFIX.size
         if count > len(data) - HEADER - position:

@@ -221,6 +221,18 @@ def test_objects_without_orientation_or_class_are_ordinary():
     assert Adapters(DETECTIONS).check(message)
 
 
+def test_messages_of_one_length_with_longer_and_shorter_ids_are_read_each_by_its_own():
+    adapters = Adapters(DETECTIONS)
+    sizes = set()
+    for ids in (('1', '23456789', '5'), ('23456789', '1', '5'), ('98765432', '2', '5')):
+        message = message_of(DETECTIONS, n=3)
+        for detection, name in zip(message.detections, ids, strict=True):
+            detection.id = name
+        sizes.add(len(serialize_message(message)))
+        assert adapters.check(message)
+    assert len(sizes) == 1
+
+
 @pytest.mark.parametrize('type_name', [DETECTIONS, MARKERS])
 def test_bytes_that_were_cut_off_or_changed_are_no_fields(type_name):
     class_of(type_name)
