@@ -29,6 +29,13 @@ Derived: the elements of R that give roll and yaw have this magnitude and roundi
 
 """
 
+# Each element of R is made of two products of elements of the quaternion, all in one step for
+# few ones: ``1 - 2 (y y + z z)``, ``2 (x y - z w)``, ... -0.0 adds nothing, also to -0.0.
+LEFT = np.array([[[1, 0, 0], [0, 0, 1], [0, 1, 0]], [[2, 2, 1], [2, 2, 0], [1, 0, 1]]])
+RIGHT = np.array([[[1, 1, 2], [1, 0, 2], [2, 2, 0]], [[2, 3, 3], [3, 2, 3], [3, 3, 1]]])
+SIGNS = np.array([[1.0, -1.0, 1.0], [1.0, 1.0, -1.0], [-1.0, 1.0, 1.0]])
+OF_MATRIX, SCALES = np.where(np.eye(3), [[[1.0]], [[-2.0]]], [[[-0.0]], [[2.0]]])
+
 
 @overload
 def wrap_angle(angle: Tensor) -> Tensor: ...
@@ -106,17 +113,9 @@ def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:
         If the norm of a quaternion is zero.
 
     """
-    x, y, z, w = np.moveaxis(_unit(quaternion_xyzw), -1, 0)
-    R = np.empty((*x.shape, 3, 3))  # filled in place, as in `matrix_from_rpy`
-    R[..., 0, 0] = 1 - 2 * (y * y + z * z)
-    R[..., 0, 1] = 2 * (x * y - z * w)
-    R[..., 0, 2] = 2 * (x * z + y * w)
-    R[..., 1, 0] = 2 * (x * y + z * w)
-    R[..., 1, 1] = 1 - 2 * (x * x + z * z)
-    R[..., 1, 2] = 2 * (y * z - x * w)
-    R[..., 2, 0] = 2 * (x * z - y * w)
-    R[..., 2, 1] = 2 * (y * z + x * w)
-    R[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    quaternions = _unit(quaternion_xyzw)
+    products = quaternions.take(LEFT, -1) * quaternions.take(RIGHT, -1)  # (..., 2, 3, 3)
+    R: Floats = OF_MATRIX + SCALES * (products[..., 0, :, :] + SIGNS * products[..., 1, :, :])
     return R
 
 
@@ -206,15 +205,17 @@ def interpolate_quaternion(
     first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: ArrayLike
 ) -> Floats:
     """Return the same rotations as `interpolate_rotation` as quaternions (..., 4), x y z w."""
-    first, second = _unit(first_xyzw), _unit(second_xyzw)
+    first, second = _unit(np.array([first_xyzw, second_xyzw]))
     is_opposite = (first * second).sum(-1, keepdims=True) < 0
     second = np.where(is_opposite, -second, second)  # the same rotation, on the shortest path
-    distances = (np.linalg.norm(one, axis=-1) for one in (second - first, second + first))
-    angle = 2 * np.arctan2(*distances)
+    apart = np.array([second - first, second + first])
+    angle = 2 * np.arctan2(*np.sqrt((apart * apart).sum(-1)))
     # sin(part * angle) / sin(angle), with its limit for equal rotations
-    parts = np.stack([1 - np.asarray(share), np.asarray(share)])
-    weights = (parts * np.sinc(parts * angle / np.pi) / np.sinc(angle / np.pi))[..., None]
-    interpolated: Floats = weights[0] * first + weights[1] * second
+    whole = np.ones_like(share, float)
+    parts = np.array([whole - share, share, whole])
+    of_first, of_second, of_whole = parts * np.sinc(parts * angle / np.pi)
+    weights = of_first / of_whole, of_second / of_whole
+    interpolated: Floats = weights[0][..., None] * first + weights[1][..., None] * second
     return interpolated
 
 
@@ -222,11 +223,11 @@ def _unit(quaternion_xyzw: ArrayLike) -> Floats:
     """Return unit quaternions (..., 4); NaN where one is not finite."""
     q = np.asarray(quaternion_xyzw, float)
     largest = np.abs(q).max(-1, keepdims=True)
-    if np.any(largest == 0):
+    if not largest.all():
         raise ValueError('quaternion_xyzw: expected a rotation, got a quaternion of zero norm')
     with np.errstate(invalid='ignore'):
         scaled = q / largest  # so that no square overflows or vanishes
-    unit: Floats = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
+    unit: Floats = scaled / np.sqrt((scaled * scaled).sum(-1, keepdims=True))
     return unit
 
 

@@ -215,11 +215,12 @@ class TransformTree:
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Floats:
         """Return ``T_target_source`` (4, 4) at a stamp, or raise TransformUnavailable."""
-        T_target_source = np.eye(4)
+        T_target_source: Floats | None = None
         for edge, is_upward in self._route(target, source):
             T = edge.at(stamp_ns, self._is_once(edge, stamp_ns))
-            T_target_source = (T if is_upward else inverse(T)) @ T_target_source
-        return T_target_source
+            T = T if is_upward else inverse(T)
+            T_target_source = T if T_target_source is None else T @ T_target_source
+        return np.eye(4) if T_target_source is None else T_target_source.copy()
 
     def motion(self, target: str, source: str, stamp_ns: int) -> FrameMotion | None:
         """
@@ -242,12 +243,13 @@ class TransformTree:
             del stamps_ns[0]
         if stamps_ns and not self.covers(target, source, stamps_ns[-1]):
             stamps_ns = []
-        T_target_source = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
+        T_target_source = np.empty((len(stamps_ns) + 1, 4, 4))
+        T_target_source[:-1] = np.eye(4)
         for edge, is_upward in route if stamps_ns else ():
             T = edge.at_each(stamps_ns, self._is_once(edge))
-            T_target_source = (T if is_upward else inverse(T)) @ T_target_source
-        last = self.lookup(target, source, stamp_ns)
-        return FrameMotion(np.array([*stamps_ns, stamp_ns]), np.array([*T_target_source, last]))
+            T_target_source[:-1] = (T if is_upward else inverse(T)) @ T_target_source[:-1]
+        T_target_source[-1] = self.lookup(target, source, stamp_ns)
+        return FrameMotion(np.array([*stamps_ns, stamp_ns]), T_target_source)
 
     def connects(self, target: str, source: str) -> bool:
         """Return whether transforms connect `source` with `target`, at any stamp."""

@@ -190,7 +190,9 @@ class RecordingReader:
 
     def _trimmed(self, item: Item) -> Item:
         """Return an item without what nobody reads: it is copied to a process."""
-        pose = self._items.pose_of(self.source.sensor_frame, item.content.stamp_ns)
+        pose, frame = item.T_fixed_item, self.source.sensor_frame
+        if pose is None or item.content.frame_id != frame:
+            pose = self._items.pose_of(frame, item.content.stamp_ns)
         trimmed = item._replace(refined=None, parts=(), T_fixed_sensor=pose)
         if isinstance(item.content, BoxArray):
             return trimmed
