@@ -103,15 +103,18 @@ class _Tracks(Columns):
         return self.centers + seconds[:, None] * self.velocities, covariances
 
     def distances(
-        self, stamp_ns: int, boxes: Floats, columns: Ints | slice = slice(None)
+        self,
+        predicted: tuple[Floats, Floats],
+        boxes: Floats,
+        columns: Ints | slice = slice(None),
     ) -> Floats:
         """
         Return squared distances of boxes from tracks at a stamp, in standard deviations.
 
         Parameters
         ----------
-        stamp_ns : int
-            Stamp of the boxes [ns].
+        predicted : tuple of arrays (K, 3)
+            The tracks at the stamp of the boxes, see `predicted`.
         boxes : array, shape (n, 9) or (n, 1, 9)
             One for each of `columns`, or each for all of them.
         columns : array, shape (n,), or slice
@@ -123,16 +126,18 @@ class _Tracks(Columns):
             Of centres and extents together.
 
         """
-        centers, covariances = (values[columns] for values in self.predicted(stamp_ns))
+        centers, covariances = (values[columns] for values in predicted)
         away = np.square(boxes[..., BOX_CENTER] - centers).sum(axis=-1)
         ratios = boxes[..., BOX_EXTENT] / self.extents[columns]
         unlike = np.square(np.log(ratios)).sum(axis=-1)
         found: Floats = away / (covariances[:, 0] + CENTER_STD**2) + unlike / LOG_EXTENT_STD**2
         return found
 
-    def update(self, columns: Ints, stamp_ns: int, boxes: Floats) -> None:
-        """Update the filters of some tracks with their newest boxes (n, 9)."""
-        centers, covariances = (values[columns] for values in self.predicted(stamp_ns))
+    def update(
+        self, predicted: tuple[Floats, Floats], columns: Ints, stamp_ns: int, boxes: Floats
+    ) -> None:
+        """Update the filters of some tracks, `predicted` to a stamp, with their boxes (n, 9)."""
+        centers, covariances = (values[columns] for values in predicted)
         position, cross, speed = covariances.T
         gains = covariances[:, :2] / (position + CENTER_STD**2)[:, None]
         innovations = boxes[:, BOX_CENTER] - centers
@@ -207,16 +212,19 @@ class Tracker:
         is_late = self.is_late(boxes.stamp_ns)
         self._end_tracks(boxes.stamp_ns)
         rows = np.flatnonzero(is_valid_box(boxes.boxes))
-        costs = self._tracks.distances(boxes.stamp_ns, boxes.boxes[rows, None])
+        predicted = self._tracks.predicted(boxes.stamp_ns)
+        costs = self._tracks.distances(predicted, boxes.boxes[rows, None])
         self.costs = Costs(rows, self._tracks.ids, costs)
         # Costs are cut off at the gate: a pair beyond it costs as much as no pair.
         chosen, columns = linear_sum_assignment(np.minimum(costs, GATE))
         is_near = costs[chosen, columns] < GATE
-        return self._assign(boxes, rows, rows[chosen[is_near]], columns[is_near], is_late)
+        chosen, columns = rows[chosen[is_near]], columns[is_near]
+        ids = self._assign(boxes, rows, chosen, columns, None if is_late else predicted)
+        return replace(boxes, track_ids=ids)
 
-    def keep(self, boxes: BoxArray, track_of: Mapping[str, str]) -> BoxArray | None:
+    def keep(self, boxes: BoxArray, track_of: Mapping[str, str]) -> tuple[str, ...] | None:
         """
-        Return the boxes with the ids that were assigned to their own, or None if one is far off.
+        Return the ids that were assigned to those of boxes, or None if one is far off.
 
         Parameters
         ----------
@@ -227,7 +235,7 @@ class Tracker:
 
         Returns
         -------
-        BoxArray or None
+        tuple of n str, or None
             As of `identify`; None, and nothing is changed but that old tracks have ended, where a
             box is beyond the gate of its track, or two boxes have one.
 
@@ -241,9 +249,10 @@ class Tracker:
         kept, columns = rows[columns >= 0], columns[columns >= 0]
         if len(set(columns.tolist())) < len(columns):
             return None
-        if (self._tracks.distances(boxes.stamp_ns, boxes.boxes[kept], columns) >= GATE).any():
+        predicted = self._tracks.predicted(boxes.stamp_ns)
+        if (self._tracks.distances(predicted, boxes.boxes[kept], columns) >= GATE).any():
             return None
-        return self._assign(boxes, rows, kept, columns, is_late)
+        return self._assign(boxes, rows, kept, columns, None if is_late else predicted)
 
     def is_late(self, stamp_ns: int) -> bool:
         """Return whether an array is not newer than one before it, and of the same pass."""
@@ -265,9 +274,19 @@ class Tracker:
         return round(self.max_gap * 1e9)
 
     def _assign(
-        self, boxes: BoxArray, rows: Ints, chosen: Ints, columns: Ints, is_late: bool
-    ) -> BoxArray:
-        """Return boxes with ids: some of the valid `rows` continue tracks, others start one."""
+        self,
+        boxes: BoxArray,
+        rows: Ints,
+        chosen: Ints,
+        columns: Ints,
+        predicted: tuple[Floats, Floats] | None,
+    ) -> tuple[str, ...]:
+        """
+        Return ids of boxes: some of the valid `rows` continue tracks, others start one.
+
+        These are `predicted` to the stamp of the boxes; None of late ones, which change none.
+
+        """
         tracks = self._tracks
         ids = [''] * len(boxes.boxes)
         for row, column in zip(chosen.tolist(), columns.tolist(), strict=True):
@@ -280,13 +299,13 @@ class Tracker:
         self.count += len(new)
         for row, name in zip(new.tolist(), names, strict=True):
             ids[row] = name
-        if not is_late:
+        if predicted is not None:
             self._newest_ns = boxes.stamp_ns
-            tracks.update(columns, boxes.stamp_ns, boxes.boxes[chosen])
+            tracks.update(predicted, columns, boxes.stamp_ns, boxes.boxes[chosen])
             if names:
                 started = _Tracks.started(names, boxes.stamp_ns, boxes.boxes[new])
                 self._tracks = concatenated([tracks, started])
-        return replace(boxes, track_ids=tuple(ids))
+        return tuple(ids)
 
 
 class IdCheck:
@@ -335,14 +354,14 @@ class IdCheck:
         self.twice += len(boxes.track_ids) - len(set(boxes.track_ids))
         associated = self.tracker.keep(boxes, self._track_of)
         if associated is None:
-            associated = self.tracker.identify(boxes)
+            associated = self.tracker.identify(boxes).track_ids
             self.jumps += self._jumps(boxes, associated)
-        known = sum(track_id in self._track_of for track_id in boxes.track_ids)
+        known = sum(map(self._track_of.__contains__, boxes.track_ids))
         self.boxes += known
         if not set(self.tracker.track_ids).isdisjoint(self._track_of.values()):
             self.compared += len(boxes.track_ids)
             self.new += len(boxes.track_ids) - known
-        pairs = zip(boxes.track_ids, associated.track_ids, strict=True)
+        pairs = zip(boxes.track_ids, associated, strict=True)
         given = {track_id: name for track_id, name in pairs if name}
         # A track has the id that came with it last; where boxes lie on one another, another
         # track has it for a moment.
@@ -350,7 +369,7 @@ class IdCheck:
         kept = {track_id: name for track_id, name in self._track_of.items() if name in others}
         self._track_of = kept | given
 
-    def _jumps(self, boxes: BoxArray, associated: BoxArray) -> int:
+    def _jumps(self, boxes: BoxArray, associated: tuple[str, ...]) -> int:
         """Count the boxes that are far from the track of their id, and on that of another."""
         costs = self.tracker.costs
         column_of = {name: column for column, name in enumerate(costs.track_ids)}
@@ -358,7 +377,7 @@ class IdCheck:
         for row, cost in zip(costs.rows.tolist(), costs.values, strict=True):
             own = column_of.get(self._track_of.get(boxes.track_ids[row], ''))
             if own is not None and cost[own] >= GATE:
-                count += associated.track_ids[row] in column_of
+                count += associated[row] in column_of
         return count
 
     @property
