@@ -111,6 +111,7 @@ class ChannelDecoder:
 
     def __call__(self, data: bytes) -> Any:
         """Return a message as ROS has it where it is converted."""
+        data = bytes(data)  # of a part of a chunk
         if self._is_json:
             message = _from_json(data, self._name)
         else:

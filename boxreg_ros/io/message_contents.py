@@ -108,7 +108,7 @@ class MessageContents:
         """Return the boxes of a message; UnsupportedMessage if it is malformed."""
         reader = self._reader_of(connection)
         with malformed(f'topic {connection.topic!r}'):
-            fields = None if reader is None else reader.ordinary(decompressed(data))
+            fields = None if reader is None else reader.ordinary(bytes(decompressed(data)))
             if reader is not None and fields is not None:
                 boxes = reader.boxes_of(fields)
                 is_standard = self._convention.is_standard

@@ -63,6 +63,8 @@ The package skips both, and with them what a damaged length or kind makes of a c
 single message is larger.
 
 """
+LONG_READ = 2**20
+"""Messages from this size on are parts of their chunk [bytes]; chosen: clouds and images alone."""
 _end = RecordBuilder()
 records.Footer(0, 0, 0).write(_end)
 END = _end.end()
@@ -398,7 +400,8 @@ class McapFile:
             if self.is_indexed and times != (place.start_ns, place.last_ns):
                 raise RecordingError('its times are not those of the index')
             _check_size(chunk)
-            content = _records_in(*get_chunk_data_stream(chunk, validate_crc=True))
+            stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+            content = _records_in(_Parts(stream.read(size)), size)
         except Exception as error:  # of the library or of a decompressor
             self._note_chunk(error, place)
             return []
@@ -455,6 +458,18 @@ def _records_in(content: Any, size: int) -> list[records.McapRecord]:
     stream: Any = _WholeReads(content, size)
     reader = StreamReader(stream, skip_magic=True, emit_chunks=True)
     return [*takewhile(lambda record: not isinstance(record, records.Footer), reader.records)]
+
+
+class _Parts:
+    """Bytes as a stream for the mcap package; long reads, of clouds and images, are no copies."""
+
+    def __init__(self, content: bytes) -> None:
+        self._rest = memoryview(content)
+
+    def read(self, size: int) -> Any:
+        """Return the next `size` bytes."""
+        found, self._rest = self._rest[:size], self._rest[size:]
+        return found if size >= LONG_READ else bytes(found)
 
 
 class _WholeReads:
