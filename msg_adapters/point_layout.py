@@ -138,7 +138,8 @@ def seconds_of(raw: NDArray[Any], stamp_ns: int, reading: TimeReading) -> Floats
     """Return times (M,) relative to the stamp [s]; wild ones are 0, see `wild_times`."""
     times = _relative(raw, stamp_ns, reading)
     first, last = _bounds(times)
-    if times.min() < first or times.max() > last:  # of few clouds
+    low, high = _relative(np.array([raw.min(), raw.max()]), stamp_ns, reading)  # the ends of times
+    if low < first or high > last:  # of few clouds
         times[wild_times(times)] = 0.0
     return times
 

@@ -161,8 +161,11 @@ class SensorPlacement:
         times = sweep.times
         if times is None or not len(times):
             return sweep
-        low, high = float(times.min()), float(times.max())
-        if not (0 <= low < (1 - WHOLE_REVOLUTION) * high and high > LONG_SWEEP):
+        high = float(times.max())
+        if high <= LONG_SWEEP:
+            return sweep
+        low = float(times.min())
+        if not 0 <= low < (1 - WHOLE_REVOLUTION) * high:
             return sweep
         if len(stamps_ns) < 2:
             return replace(sweep, times=None)
