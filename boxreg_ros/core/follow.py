@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
@@ -342,8 +342,8 @@ def solved(
     origins: Floats | None,
 ) -> list[FollowedTrack]:
     """Return the tracks refined, the seeds as boxes of a person that evidence may move."""
-    usual = keyframe_deviations(tracks, points, config, origins)
-    given = [_track(track, points, origins) for track in tracks if len(track.rows)]
+    given = [with_points(track, points, origins) for track in tracks if len(track.rows)]
+    usual = keyframe_deviations(given, config)
     found = refined_tracks(given, config, person.numbers(usual))
     fits = _fits(given, found)
     steps = person.corrections(*fits, usual)
@@ -365,16 +365,21 @@ def solved(
     return [replace(track, boxes=boxes.get(track.track_id, track.boxes)) for track in tracks]
 
 
-def keyframe_deviations(
-    tracks: Sequence[FollowedTrack], points: Points, config: Config, origins: Floats | None
-) -> Floats:
-    """Return the deviations (9,) of keyframes: the usual ones, or larger ones that some show."""
+def keyframe_deviations(tracks: Iterable[Track], config: Config) -> Floats:
+    """
+    Return the deviations (9,) of keyframes: the usual ones, or larger ones that some show.
+
+    Those are the pinned boxes of the first `tracks` that have enough of them.
+
+    """
     some, count = [], 0
     for track in tracks:
-        seeds = track.status.count(HUMAN)
-        if count < FOLLOW.sample and seeds >= FOLLOW.min_seeds:
-            some.append(_track(track, points, origins))
+        seeds = 0 if track.pinned is None else int(track.pinned.sum())
+        if seeds >= FOLLOW.min_seeds:
+            some.append(track)
             count += seeds
+        if count >= FOLLOW.sample:
+            break
     usual = person.DEVIATIONS
     if count < FOLLOW.min_keyframes:
         return usual
@@ -403,7 +408,7 @@ def _fits(
     return np.concatenate(seeds), np.concatenate(fits), np.concatenate(variances)
 
 
-def _track(track: FollowedTrack, points: Points, origins: Floats | None) -> Track:
+def with_points(track: FollowedTrack, points: Points, origins: Floats | None) -> Track:
     """Return a track to be refined, with the points near its boxes."""
     near = [_nearby(points[row], box) for row, box in zip(track.rows, track.boxes, strict=True)]
     return Track(

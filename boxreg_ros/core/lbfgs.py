@@ -126,7 +126,7 @@ def minimize(
     status = np.where(_are_finite(at), int(Status.RUNNING), int(Status.FAILED))
     taken = np.zeros(len(start), int)
     pairs: list[CurvaturePair] = []
-    for _ in range(iterations):
+    for iteration in range(iterations):
         step = -_two_loop(at.gradient, pairs, metric)
         step, slope = _downhill(step, at.gradient, is_scaled=bool(pairs) or metric is not None)
         is_flat = -slope <= tolerance * (1 + np.abs(at.value.numpy()))
@@ -138,7 +138,8 @@ def minimize(
         before = at
         at, stuck = _line_search(function, before, rows, step, slope)
         status[stuck] = Status.STUCK
-        pairs = [*pairs, _pair(before, at)][-history:]
+        if iteration + 1 < iterations:
+            pairs = [*pairs, _pair(before, at)][-history:]
     return Minimum(at.x, at.value, status, taken)
 
 

@@ -349,7 +349,7 @@ def crop(sweep: Sweep, boxes: Floats, margin: float) -> Crop:
     columns = np.ascontiguousarray(sweep.points.T)
     shapes = shapes_of(sweep, boxes, margin)
     row, owner, offset, outside = crop_kernels.crop(columns, shapes, margin)
-    order = np.argsort(owner, kind='stable')
+    order = np.lexsort((row, owner))
     return Crop(row[order], owner[order], offset[order].T, outside[order].T)
 
 

@@ -7,7 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.follow import follow_points, FollowedTrack, keyframe_deviations
+from boxreg_ros.core.follow import (
+    follow_points,
+    FollowedTrack,
+    keyframe_deviations,
+    with_points,
+)
 from boxreg_ros.core.following.person import DEVIATIONS
 from boxreg_ros.io.stamp_join import LARGEST_OFFSET_NS
 from boxreg_ros.io.sweep_store import SweepStore
@@ -49,8 +54,11 @@ def keyframes(
         arrays = part.completed(fixed_frame)
         plan.append(followed_plan(arrays, found, decided=corrections))
         tracks += found
-        own = [replace(track, boxes=_from_store(track.boxes, store, -1)) for track in found]
-        of_part = keyframe_deviations(own, store, config, store.sensor_origins)
+        own = (replace(track, boxes=_from_store(track.boxes, store, -1)) for track in found)
+        of_tracks = (
+            with_points(track, store, store.sensor_origins) for track in own if track.boxes.size
+        )
+        of_part = keyframe_deviations(of_tracks, config)
         deviations = np.maximum(deviations, of_part)
     return plan, parts, tracks, deviations
 

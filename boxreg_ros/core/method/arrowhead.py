@@ -10,7 +10,7 @@ numba unrolls short loops into scalars.
 
 from math import sqrt
 
-from boxreg_ros.core.method.arrays import copy, PIVOT, POSE
+from boxreg_ros.core.method.arrays import copy, PIVOT, POSE, SPAN
 from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
 
@@ -85,9 +85,9 @@ def solve_corner(U, x):
 
 
 @loop
-def reduce(rows):
+def invert(rows):
     """
-    Reduce the matrix at the left of rows (m, m + k) to the identity, by Gauss and Jordan.
+    Replace the matrix at the left of rows (m, m + k) by its inverse, by Gauss and Jordan in place.
 
     What stands beside it is replaced by the inverse times that: a product with the inverse would
     have an error larger by the condition number of the matrix. Returns False if it is not
@@ -99,48 +99,29 @@ def reduce(rows):
         if not rows[k, k] > 0.0:
             return False
         scale = 1.0 / rows[k, k]
+        rows[k, k] = 1.0
         for j in range(width):
             rows[k, j] *= scale
         for i in range(size):
             if i != k:
                 factor = rows[i, k]
+                rows[i, k] = 0.0
                 for j in range(width):
                     rows[i, j] -= factor * rows[k, j]
     return True
 
 
 @loop
-def invert(S):
-    """Replace a matrix (m, m) by its inverse; return False if it is not positive definite."""
-    size = len(S)
-    for k in range(size):  # Gauss and Jordan, in place: half as long as beside the identity
-        if not S[k, k] > 0.0:
-            return False
-        scale = 1.0 / S[k, k]
-        S[k, k] = 1.0
-        for j in range(size):
-            S[k, j] *= scale
-        for i in range(size):
-            if i != k:
-                factor = S[i, k]
-                S[i, k] = 0.0
-                for j in range(size):
-                    S[i, j] -= factor * S[k, j]
-    return True
-
-
-@loop
 def fill_rows(block, S, rows):
-    """Write the block of a pose, the identity, and less what it is coupled to, (6, S + 24)."""
+    """Write the block of a pose, and less what it is coupled to, (6, S + 18)."""
     links, border = block.links, block.border
     for a in range(POSE):
         for c in range(POSE):
             rows[a, c] = links[min(a, c), max(a, c)]
-            rows[a, POSE + c] = 1.0 if a == c else 0.0
         for s in range(S):
-            rows[a, NEXT + s] = -border[a, s]
+            rows[a, POSE + s] = -border[a, s]
         for c in range(NEXT):
-            rows[a, NEXT + S + c] = -links[a, POSE + c]
+            rows[a, POSE + S + c] = -links[a, POSE + c]
 
 
 @loop
@@ -149,9 +130,9 @@ def keep(rows, block, own, coupling, after, border):
     rest = coupling.shape[1]
     for a in range(POSE):
         for c in range(POSE):
-            own[a, c] = rows[a, POSE + c]
+            own[a, c] = rows[a, c]
         for r in range(rest):
-            coupling[a, r] = rows[a, NEXT + r]
+            coupling[a, r] = rows[a, POSE + r]
         for c in range(NEXT):
             after[a, c] = block.links[a, POSE + c]
         for s in range(rest - NEXT):
@@ -180,12 +161,12 @@ def eliminate_poses(A, factor):
 
     """
     N, S = len(factor.own), len(A.corner)
-    rows, after = np.empty((POSE, 2 * NEXT + S)), np.empty((POSE, NEXT))
+    rows, after = np.empty((POSE, SPAN + S)), np.empty((POSE, NEXT))
     change, border = np.empty((NEXT, S + NEXT)), np.empty((N, POSE, S))
     for pose in range(N):
         block, own, coupling = A.poses[pose], factor.own[pose], factor.coupling[pose]
         fill_rows(block, S, rows)
-        if not reduce(rows):
+        if not invert(rows):
             return False
         keep(rows, block, own, coupling, after, border[pose])
         np.dot(after.T, coupling, change)

@@ -9,8 +9,12 @@ import numpy as np
 
 MIN_SIDE, MAX_SIDE = 16, 256
 """Cells of the raster along x and y; those of far places share a cell. Powers of two."""
-LARGEST = 1e9
-"""Coordinates are limited to this, so that they fit an integer [m]."""
+LARGEST = np.float32(1e9)
+"""Coordinates are limited to this, so that they fit an integer [m]; of the type of most points."""
+
+
+ROW_BITS = 31
+"""Bits of the row of a point; derived: those that 32 for its place leave."""
 
 
 class Shapes(NamedTuple):
@@ -58,7 +62,7 @@ class CropNumbers(NamedTuple):
 @kernel
 def metre(value):
     """Return a coordinate as whole metres, truncated: the order of coordinates is kept."""
-    return int(min(max(value, -LARGEST), LARGEST))
+    return np.int32(min(max(value, -LARGEST), LARGEST))
 
 
 @kernel
@@ -77,86 +81,148 @@ def cell_of(x, y, side):
 
 
 @kernel
-def raster(centers, reach, side):
+def cells_of_boxes(shapes, side):
     """
-    Return which boxes touch each cell of 1 m, as `first` and `boxes`.
+    Return the cells of 1 m that boxes touch, as `spans` (2, R): first, and after the last.
 
-    Those of cell c are boxes[first[c]:first[c + 1]]. `centers` and `reach` are (n, 3) [m], `reach`
-    half the upright bounding boxes. The raster has `side` cells along x and y.
+    The spans of box b are start[b] to start[b + 1] - 1; `start` is the other result. There are two
+    for each metre along x, since the cells along y may go on at the other side of the raster,
+    which has `side` cells along x and y.
 
     """
-    first = np.zeros(side * side + 1, np.int64)
-    boxes = np.empty(0, np.int64)
-    for is_counted in (False, True):
-        if is_counted:
-            for cell in range(side * side):
-                first[cell + 1] += first[cell]
-            boxes = np.empty(first[-1], np.int64)
-        for box in range(len(centers) - 1, -1, -1):
-            x = metre(centers[box, 0] - reach[box, 0])
-            y = metre(centers[box, 1] - reach[box, 1])
-            for i in range(min(side, metre(centers[box, 0] + reach[box, 0]) - x + 1)):
-                for j in range(min(side, metre(centers[box, 1] + reach[box, 1]) - y + 1)):
-                    cell = cell_of(x + i, y + j, side)
-                    if is_counted:
-                        first[cell] -= 1
-                        boxes[first[cell]] = box
-                    else:
-                        first[cell] += 1
-    return first, boxes
+    centers, reach = shapes.centers, shapes.reach
+    start = np.zeros(len(centers) + 1, np.int64)
+    for box in range(len(centers)):
+        x = metre(centers[box, 0] - reach[box, 0])
+        across = min(side, metre(centers[box, 0] + reach[box, 0]) - x + 1)
+        start[box + 1] = start[box] + 2 * across
+    spans = np.empty((2, start[-1]), np.int64)
+    for box in range(len(centers)):
+        x = metre(centers[box, 0] - reach[box, 0])
+        y = metre(centers[box, 1] - reach[box, 1])
+        along = min(side, metre(centers[box, 1] + reach[box, 1]) - y + 1)
+        y &= side - 1
+        rest = max(y + along - side, 0)
+        for k in range(start[box], start[box + 1], 2):
+            row = cell_of(x, 0, side)
+            spans[0, k], spans[1, k] = row + y, row + y + along - rest
+            spans[0, k + 1], spans[1, k + 1] = row, row + rest
+            x += 1
+    return spans, start
+
+
+class NearPoints(NamedTuple):
+    """
+    The points in the cells that n boxes touch, in the order of these cells.
+
+    Attributes
+    ----------
+    rows : array, shape (K,)
+        Of the points in the sweep.
+    at : array, shape (3, K)
+        Their coordinates [m].
+    spans, start : array, shapes (2, R) and (n + 1,)
+        Those of box b are `spans[:, start[b] : start[b + 1]]`: the first of each, and after it.
+    pairs, most : int
+        Points in the cells of each box, summed, and the most of one box.
+
+    """
+
+    rows: Any
+    at: Any
+    spans: Any
+    start: Any
+    pairs: int
+    most: int
+
+
+class Room(NamedTuple):
+    """
+    Arrays to work in, for the m points near one box.
+
+    Attributes
+    ----------
+    places : array, shape (M,)
+        Of these points in `NearPoints`.
+    at : array, shape (3, M)
+        Their coordinates [m].
+    x, depth, height, is_beside : array, shape (M,)
+        See `measure`.
+    level : array, shape (M,)
+        Heights of those that may be of the road.
+
+    """
+
+    places: Any
+    at: Any
+    x: Any
+    depth: Any
+    height: Any
+    is_beside: Any
+    level: Any
 
 
 @kernel
-def near_points(points, first, side):
+def near_points(points, shapes):
     """
-    Return the points (3, M) in cells that boxes touch, with their cells.
+    Return the `NearPoints` of boxes; the arguments are those of `crop`.
 
     The cells are found in a loop that is compiled to vector instructions, the points in one
     without a branch: a quarter of them, in no order, would be mispredicted.
 
     """
-    near = np.empty(points.shape[1], np.int32)
+    side = side_of(points.shape[1])
+    spans, start = cells_of_boxes(shapes, side)
+    is_touched = np.zeros(side * side, np.bool_)  # small enough for the processor's cache
+    for k in range(spans.shape[1]):
+        for cell in range(spans[0, k], spans[1, k]):
+            is_touched[cell] = True
+    rows = np.empty(points.shape[1], np.int32)
     cells = np.empty(points.shape[1], np.int32)
-    is_touched = np.empty(side * side, np.bool_)  # small enough for the processor's cache
-    for cell in range(side * side):
-        is_touched[cell] = first[cell + 1] > first[cell]
     for i in range(points.shape[1]):
         cells[i] = cell_of(metre(points[0, i]), metre(points[1, i]), np.int32(side))
-    count = 0
+    K = 0
     for i in range(points.shape[1]):
-        near[count] = i
-        cells[count] = cells[i]
-        count += is_touched[cells[i]]
-    return near[:count], cells[:count]
+        rows[K] = i
+        cells[K] = cells[i]
+        K += is_touched[cells[i]]
+    rows, first = grouped(rows[:K], cells[:K], side * side)
+    at = np.empty((3, K), points.dtype)
+    for axis in range(3):
+        for k in range(K):
+            at[axis, k] = points[axis, rows[k]]
+    pairs, most = 0, 0
+    for box in range(len(start) - 1):
+        before = pairs
+        for k in range(start[box], start[box + 1]):
+            spans[0, k], spans[1, k] = first[spans[0, k]], first[spans[1, k]]
+            pairs += spans[1, k] - spans[0, k]
+        most = max(most, pairs - before)
+    return NearPoints(rows, at, spans, start, pairs, most)
 
 
 @kernel
-def candidates(points, shapes):
-    """
-    Return the pairs of a point and a box that touches its cell, cell by cell.
+def empty_room(near):
+    """Return room for the points near any one box."""
+    most = near.most
+    return Room(
+        np.empty(most, np.int32), np.empty((3, most)), np.empty(most), np.empty(most),
+        np.empty(most), np.empty(most, np.bool_), np.empty(most),
+    )  # fmt: skip
 
-    Parameters
-    ----------
-    points, shapes
-        As for `crop`.
 
-    Returns
-    -------
-    near, cells : array, shape (K,)
-        Points in cells that boxes touch, and their cells.
-    first, boxes : array
-        The boxes of each cell, see `raster`.
-    count : int
-        Number of pairs.
-
-    """
-    side = side_of(points.shape[1])
-    first, boxes = raster(shapes.centers, shapes.reach, side)
-    near, cells = near_points(points, first, side)
-    count = 0
-    for cell in cells:
-        count += first[cell + 1] - first[cell]
-    return near, cells, first, boxes, count
+@loop
+def gather(box, near, room):
+    """Write the places of the points near a box and their coordinates; return their number m."""
+    spans, at = near.spans, near.at
+    m = 0
+    for k in range(near.start[box], near.start[box + 1]):
+        for i in range(spans[0, k], spans[1, k]):
+            room.places[m] = i
+            for axis in range(3):
+                room.at[axis, m] = at[axis, i]
+            m += 1
+    return m
 
 
 @kernel
@@ -181,7 +247,7 @@ def offset_of(points, i, shapes, box):
 @kernel
 def crop(points, shapes, margin):
     """
-    Find the pairs of a point and a box within `margin` of each other, ascending by point.
+    Find the pairs of a point and a box within `margin` of each other, ascending by box.
 
     Parameters
     ----------
@@ -200,24 +266,20 @@ def crop(points, shapes, margin):
         Point minus centre, and distance outside of the faces [m].
 
     """
-    near, cells, first, boxes, capacity = candidates(points, shapes)
-    half = shapes.half
-    row = np.empty(capacity, np.int64)
-    owner = np.empty(capacity, np.int64)
-    offset = np.empty((capacity, 3))
-    outside = np.empty((capacity, 3))
+    near = near_points(points, shapes)
+    room = empty_room(near)
+    row, owner = np.empty(near.pairs, np.int64), np.empty(near.pairs, np.int64)
+    offset, outside = np.empty((near.pairs, 3)), np.empty((near.pairs, 3))
     P = 0
-    for k in range(len(near)):
-        i = near[k]
-        for place in range(first[cells[k]], first[cells[k] + 1]):
-            box = boxes[place]
-            x, y, z = offset_of(points, i, shapes, box)
-            R = shapes.rotations[box]
-            u = abs(R[0, 0] * x + R[1, 0] * y + R[2, 0] * z) - half[box, 0]
-            v = abs(R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) - half[box, 1]
-            w = abs(R[0, 2] * x + R[1, 2] * y + R[2, 2] * z) - half[box, 2]
+    for box in range(len(shapes.half)):
+        half, R = shapes.half[box], shapes.rotations[box]
+        for j in range(gather(box, near, room)):
+            x, y, z = offset_of(room.at, j, shapes, box)
+            u = abs(R[0, 0] * x + R[1, 0] * y + R[2, 0] * z) - half[0]
+            v = abs(R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) - half[1]
+            w = abs(R[0, 2] * x + R[1, 2] * y + R[2, 2] * z) - half[2]
             if max(u, v, w) < margin:
-                row[P], owner[P] = i, box
+                row[P], owner[P] = near.rows[room.places[j]], box
                 offset[P, 0], offset[P, 1], offset[P, 2] = x, y, z
                 outside[P, 0], outside[P, 1], outside[P, 2] = u, v, w
                 P += 1
@@ -230,9 +292,10 @@ def flat_height(heights, quantiles, flatness, min_points):
     n = len(heights)
     if n < min_points:
         return np.nan
-    low = nth(heights, int(quantiles[0] * n))
-    high = nth(heights, int(quantiles[2] * n))
-    return nth(heights, int(quantiles[1] * n)) if high - low < flatness else np.nan
+    first, middle, last = int(quantiles[0] * n), int(quantiles[1] * n), int(quantiles[2] * n)
+    high = nth(heights, last)  # all before it are lower
+    low = nth(heights[: last + 1], first)
+    return nth(heights[first : last + 1], middle - first) if high - low < flatness else np.nan
 
 
 @kernel
@@ -243,74 +306,34 @@ def grouped(values, owner, n):
     Those of owner b are values[first[b]:first[b + 1]]; `first` is the other result.
 
     """
-    first = np.zeros(n + 1, np.int64)
+    first = np.zeros(n + 2, np.int64)
     for k in range(len(owner)):
-        first[owner[k] + 1] += 1
+        first[owner[k] + 2] += 1
     for b in range(n):
-        first[b + 1] += first[b]
-    place = first[:-1].copy()
+        first[b + 2] += first[b + 1]
     ordered = np.empty_like(values)
-    for k in range(len(owner)):
-        ordered[place[owner[k]]] = values[k]
-        place[owner[k]] += 1
-    return ordered, first
-
-
-@kernel
-def road_heights(owner, height, n, numbers):
-    """
-    Return the height of the road beside each of n boxes (n,); NaN where not found [m].
-
-    Points beside them are at `height` (P,) above the bottom of box `owner` (P,).
-
-    """
-    levels, first = grouped(height, owner, n)
-    road = np.empty(n)
-    for box in range(n):
-        road[box] = flat_height(
-            levels[first[box] : first[box + 1]], numbers.road_quantiles, numbers.road_flatness,
-            numbers.min_road_points,
-        )  # fmt: skip
-    return road
-
-
-@kernel
-def pairs_of_boxes(cells, first, boxes, count, n):
-    """
-    Return which points are near each of n boxes, in their order.
-
-    Those of box b are place[start[b]:start[b + 1]], indices of `cells` (K,), the cells of all
-    points; `first`, `boxes` and `count` are those of `candidates`.
-
-    """
-    point, box = np.empty(count, np.int32), np.empty(count, np.int32)
-    pair = 0
-    for i in range(len(cells)):
-        for k in range(first[cells[i]], first[cells[i] + 1]):
-            point[pair], box[pair] = i, boxes[k]
-            pair += 1
-    return grouped(point, box, n)
+    for k in range(len(owner)):  # the places after the next ones end as the first of the next
+        ordered[first[owner[k] + 1]] = values[k]
+        first[owner[k] + 1] += 1
+    return ordered, first[:-1]
 
 
 @loop
-def measure(points, near, place, shapes, box, numbers, offset, x, depth, height, is_beside):
+def measure(box, near, shapes, numbers, room):
     """
-    Write where the points `near[place]` (m,) are in and around a box.
+    Write where the m points near a box are in and around it; return m.
 
     Their offset from its centre along x of the fixed frame, their distance outside of the face
     that they are least inside of, their height above its bottom along its z axis, and whether
-    they may be of the road beside it, (m,) each. `offset` (3, m) is to work in.
+    they may be of the road beside it.
 
     """
-    center, half = shapes.centers[box], shapes.half[box]
-    turn, R = shapes.turn, shapes.rotations[box]
+    at, x, depth, height, is_beside = room.at, room.x, room.depth, room.height, room.is_beside
+    half, R = shapes.half[box], shapes.rotations[box]
     square = sqrt(half[0] ** 2 + half[1] ** 2) + numbers.road_width
-    for j in range(len(place)):  # the next loop is compiled to vector instructions
-        for k in range(3):
-            offset[k, j] = points[k, near[place[j]]]
-    for j in range(len(place)):
-        dx, dy, dz = offset[0, j] - center[0], offset[1, j] - center[1], offset[2, j] - center[2]
-        dx, dy, dz = turned(turn, dx, dy, dz)
+    m = gather(box, near, room)
+    for j in range(m):  # compiled to vector instructions
+        dx, dy, dz = offset_of(at, j, shapes, box)
         up = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
         u = abs(R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) - half[0]
         v = abs(R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) - half[1]
@@ -326,16 +349,29 @@ def measure(points, near, place, shapes, box, numbers, offset, x, depth, height,
             & (abs(dx) < square)
             & (abs(dy) < square)
         )
+    return m
 
 
 @kernel
-def sorted_by_x(owner, x, n):
-    """
-    Return the order of P pairs by `owner`, one of `n`, then by `x`, (P,).
+def road_height(m, numbers, room):
+    """Return the height of the road above the bottom of a box; NaN where not found [m]."""
+    level, count = room.level, 0
+    for j in range(m if numbers.has_road else 0):
+        level[count] = room.height[j]  # without a branch: the next one replaces one too far
+        count += room.is_beside[j]
+    return flat_height(
+        level[:count], numbers.road_quantiles, numbers.road_flatness, numbers.min_road_points
+    )
 
-    Both are packed into 32 bits, which a radix sort takes 8 at a time. Values closer than 2^-23 of
-    the largest one, with 64 boxes, may count as equal and keep their order: every machine sorts
-    them alike.
+
+@kernel
+def sorted_by_x(owner, x, rows, n):
+    """
+    Return the `rows` of P pairs by `owner`, one of `n`, then by `x`, then by row, (P,).
+
+    The first two are packed into 32 bits, which a radix sort takes 11 at a time. Values closer
+    than 2^-23 of the largest one, with 64 boxes, may count as equal: every machine sorts them
+    alike.
 
     """
     P = len(owner)
@@ -346,25 +382,30 @@ def sorted_by_x(owner, x, n):
     while n > 0:  # as many bits less as `n` has
         unit /= 2
         n //= 2
-    place = np.empty(P, np.uint32)
-    for k in range(P):
-        place[k] = np.uint32((owner[k] + 0.5 + x[k] / scale / 4) * unit)
     order, other = np.empty(P, np.int64), np.empty(P, np.int64)
+    count = np.zeros((3, 2048), np.int64)
     for k in range(P):
-        order[k] = k
-    count = np.empty(256, np.int64)
-    for shift in range(0, 32, 8):
-        count[:] = 0
+        place = np.int64((owner[k] + 0.5 + x[k] / scale / 4) * unit)
+        order[k] = place << ROW_BITS | rows[k]
+        for digit in range(3):
+            count[digit, (place >> (11 * digit)) & 2047] += 1
+    for digit in range(3):
+        of_digit, total = count[digit], 0
+        for value in range(2048):
+            of_digit[value], total = total, total + of_digit[value]
         for k in range(P):
-            count[(place[k] >> shift) & 255] += 1
-        total = 0
-        for digit in range(256):
-            count[digit], total = total, total + count[digit]
-        for k in range(P):
-            digit = (place[order[k]] >> shift) & 255
-            other[count[digit]] = order[k]
-            count[digit] += 1
+            value = (order[k] >> (ROW_BITS + 11 * digit)) & 2047
+            other[of_digit[value]] = order[k]
+            of_digit[value] += 1
         order, other = other, order
+    for k in range(1, P):  # the rows of equal ones
+        place, pair = k, order[k]
+        while place and order[place - 1] > pair:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = pair
+    for k in range(P):
+        order[k] &= 2**ROW_BITS - 1
     return order
 
 
@@ -391,46 +432,33 @@ def own_points(points, shapes, numbers):
 
     """
     n = len(shapes.half)
-    near, cells, first, boxes, P = candidates(points, shapes)
-    place, start = pairs_of_boxes(cells, first, boxes, P, n)
-    x, depth, height = np.empty(P), np.empty(P), np.empty(P)
-    most = 0
+    near = near_points(points, shapes)
+    room = empty_room(near)
+    own, owner = np.empty(near.pairs, np.int32), np.empty(near.pairs, np.int32)
+    x, depth, chosen = np.empty(near.pairs), np.empty(near.pairs), np.empty(near.most, np.int32)
+    road, num_inside = np.empty(n), np.zeros(n, np.int64)
+    deepest = np.full(len(near.rows), np.inf)  # of each point in any box
+    P = 0
     for box in range(n):
-        most = max(most, start[box + 1] - start[box])
-    offset, level, is_beside = np.empty((3, most)), np.empty(most), np.empty(most, np.bool_)
-    road, num_inside = np.full(n, np.nan), np.zeros(n, np.int64)
-    deepest = np.full(len(near), np.inf)  # of each point in any box
-    for box in range(n):
-        begin, end = start[box], start[box + 1]
-        measure(
-            points, near, place[begin:end], shapes, box, numbers, offset, x[begin:end],
-            depth[begin:end], height[begin:end], is_beside,
-        )  # fmt: skip
-        count, inside = 0, 0  # without branches: the next one replaces one too far
-        for k in range(begin, end):
-            level[count] = height[k]
-            count += is_beside[k - begin]
-            inside += depth[k] <= 0.0
-            if depth[k] < deepest[place[k]]:
-                deepest[place[k]] = depth[k]
-        num_inside[box] = inside
-        if numbers.has_road:
-            road[box] = flat_height(
-                level[:count], numbers.road_quantiles, numbers.road_flatness,
-                numbers.min_road_points,
-            )  # fmt: skip
-    own = np.empty(P, np.int32)
-    owner = np.empty(P, np.int32)
-    count = 0
-    for box in range(n):
+        m = measure(box, near, shapes, numbers, room)
+        road[box] = road_height(m, numbers, room)
         least = numbers.clearance + (road[box] if road[box] == road[box] else 0.0)
-        for k in range(start[box], start[box + 1]):
-            own[count], owner[count] = k, box
-            count += (
-                (depth[k] < numbers.own_margin)
-                & (height[k] > least)
-                & (depth[k] <= deepest[place[k]] + numbers.ownership_tolerance)
-            )
-    own, owner = own[:count], owner[:count]
-    order = sorted_by_x(owner, x[own], n)
-    return near[place[own[order]]], owner[order], road, num_inside
+        count, inside = 0, 0
+        for j in range(m):
+            chosen[count] = j
+            count += room.depth[j] < numbers.own_margin
+            inside += room.depth[j] <= 0.0
+        num_inside[box] = inside
+        for k in range(count):
+            j = chosen[k]
+            i = room.places[j]
+            deepest[i] = min(deepest[i], room.depth[j])
+            own[P], owner[P], x[P], depth[P] = i, box, room.x[j], room.depth[j]
+            P += room.height[j] > least
+    count = 0
+    for k in range(P):
+        limit = deepest[own[k]] + numbers.ownership_tolerance
+        own[count], owner[count], x[count] = near.rows[own[k]], owner[k], x[k]
+        count += depth[k] <= limit
+    owner = owner[:count]  # ascending, before and after
+    return sorted_by_x(owner, x[:count], own[:count], n), owner, road, num_inside

@@ -4,7 +4,14 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.constants import CONSTANTS
-from boxreg_ros.core.method.crop import candidates, grouped, offset_of, road_heights
+from boxreg_ros.core.method.crop import (
+    empty_room,
+    gather,
+    measure,
+    near_points,
+    offset_of,
+    road_height,
+)
 from boxreg_ros.core.method.selection import lower_median
 import numpy as np
 
@@ -86,18 +93,7 @@ def inside_out(shapes, box, x, y, z):
 
 
 @kernel
-def medians(owner, values, n):
-    """Return the lower median of the values (P,) of each of n owners; 0 for one without any."""
-    ordered, first = grouped(values, owner, n)
-    found = np.zeros(n)
-    for row in range(n):
-        if first[row] < first[row + 1]:
-            found[row] = lower_median(ordered[first[row] : first[row + 1]])
-    return found
-
-
-@kernel
-def surroundings(points, times, shapes, found, numbers):
+def surroundings(times, shapes, near, numbers, room):
     """
     Return the height of the road in each box, and when the sweep sees its object, (n,) each.
 
@@ -105,34 +101,19 @@ def surroundings(points, times, shapes, found, numbers):
     inside [s], 0 without any.
 
     """
-    near, cells, first, boxes, capacity = found
     n = len(shapes.half)
-    owner = np.empty(capacity, np.int32)
-    height = np.empty(capacity)
-    inner = np.empty(capacity, np.int32)
-    delays = np.empty(capacity if len(times) else 0, np.float32)
-    square = np.hypot(shapes.half[:, 0], shapes.half[:, 1]) + numbers.road_width
-    P, inside = 0, 0
-    for k in range(len(near)):
-        for place in range(first[cells[k]], first[cells[k] + 1]):
-            box = boxes[place]
-            x, y, z = offset_of(points, near[k], shapes, box)
-            u, v, w, high = inside_out(shapes, box, x, y, z)
-            aside = max(u, v)
-            owner[P], height[P] = box, high
-            P += (
-                (aside > numbers.road_gap)
-                & (max(aside, w) < numbers.road_width)
-                & (abs(high) < numbers.road_range)
-                & (max(abs(x), abs(y)) < square[box])
-            )
-            if len(delays):
-                inner[inside], delays[inside] = box, times[near[k]]
-                inside += max(aside, w) <= 0.0
-    road = np.full(n, np.nan)
-    if numbers.has_road:
-        road = road_heights(owner[:P], height[:P], n, numbers)
-    return road, medians(inner[:inside], delays[:inside], n)
+    road, seen = np.empty(n), np.zeros(n)
+    delays = np.empty(near.most if len(times) else 0, np.float32)
+    for box in range(n):
+        m = measure(box, near, shapes, numbers, room)
+        road[box] = road_height(m, numbers, room)
+        inside = 0
+        for j in range(m if len(times) else 0):
+            delays[inside] = times[near.rows[room.places[j]]]
+            inside += room.depth[j] <= 0.0
+        if inside:
+            seen[box] = lower_median(delays[:inside])
+    return road, seen
 
 
 @loop
@@ -199,36 +180,43 @@ def label(points, times, shapes, objects, limits, is_at_stamp, elsewhere, number
         These points in the frame of the box at their own time [m].
 
     """
-    found = candidates(points, shapes)
-    near, cells, first, boxes, _ = found
-    road, seen = surroundings(points, times, shapes, found, numbers)
-    track = np.full(points.shape[1], elsewhere, np.int32)
-    motion = np.zeros(points.shape[1], np.uint8)
-    rows = np.empty(len(near), np.int64)
-    owner = np.empty(len(near), np.int32)
-    local = np.empty((len(near), 3))
-    L = 0
-    for k in range(len(near)):
-        i = near[k]
-        best, is_on, least = -1, False, np.inf
-        for place in range(first[cells[k]], first[cells[k] + 1]):
-            box = boxes[place]
-            x, y, z = offset_of(points, i, shapes, box)
+    near = near_points(points, shapes)
+    room = empty_room(near)
+    road, seen = surroundings(times, shapes, near, numbers, room)
+    K = len(near.rows)
+    best, is_on, least = np.full(K, -1, np.int32), np.zeros(K, np.bool_), np.full(K, np.inf)
+    own = np.empty((K, 3))
+    for box in range(len(shapes.half)):
+        R = shapes.rotations[box]
+        for j in range(gather(box, near, room)):
+            k = room.places[j]
+            x, y, z = offset_of(room.at, j, shapes, box)
             if len(times):
-                delay = times[i] - (0.0 if is_at_stamp else seen[box])
+                delay = times[near.rows[k]] - (0.0 if is_at_stamp else seen[box])
                 x, y, z = moved_back(objects, box, delay, x, y, z)
             excess, is_sure = outside(shapes, objects, limits, road, box, x, y, z)
-            if is_sure < is_on or (is_sure == is_on and excess >= least):
+            if is_sure < is_on[k] or (is_sure == is_on[k] and excess >= least[k]):
                 continue
-            best, is_on, least = box, is_sure, excess
-            R = shapes.rotations[box]
+            best[k], is_on[k], least[k] = box, is_sure, excess
             for axis in range(3):
-                local[L, axis] = R[0, axis] * x + R[1, axis] * y + R[2, axis] * z
-        if best >= 0:
-            track[i] = objects.track[best] if is_on else UNKNOWN
-            motion[i] = objects.motion[best]
-        rows[L], owner[L] = i, best
-        L += is_on
+                own[k, axis] = R[0, axis] * x + R[1, axis] * y + R[2, axis] * z
+    track = np.full(points.shape[1], elsewhere, np.int32)
+    motion = np.zeros(points.shape[1], np.uint8)
+    place = np.full(points.shape[1], -1, np.int32)
+    for k in range(K):
+        place[near.rows[k]] = k
+    rows, owner, local = np.empty(K, np.int64), np.empty(K, np.int32), np.empty((K, 3))
+    L = 0
+    for i in range(points.shape[1]):
+        k = place[i]
+        if k < 0 or best[k] < 0:
+            continue
+        track[i] = objects.track[best[k]] if is_on[k] else UNKNOWN
+        motion[i] = objects.motion[best[k]]
+        rows[L], owner[L] = i, best[k]
+        for axis in range(3):
+            local[L, axis] = own[k, axis]
+        L += is_on[k]
     return track, motion, rows[:L], owner[:L], local[:L]
 
 

@@ -8,10 +8,9 @@ in point-to-plane ICP.
 
 """
 
-from math import sqrt
+from math import inf, sqrt
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import copy
 from boxreg_ros.core.method.arrowhead import factorise_corner, solve_corner
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.eigen import eigenvalues, eigenvector
@@ -29,23 +28,30 @@ ROOT_TOLERANCE = 1e-14
 
 
 @loop
-def cell_of(x, y, z, half, cells):
-    """Return the number of the cell that a point in box axes lies in."""
-    cell = 0
-    for k in range(3):
-        value = (x, y, z)[k]
-        place = int(np.floor((value / half[k] + 1) * (cells[k] / 2)))
-        cell = cell * cells[k] + min(max(place, 0), cells[k] - 1)
-    return cell
+def fill_cells(m, local, half, cells, cell):
+    """Write the cell that each of m points in box axes (3, M) lies in; the last one if outside."""
+    last = cells[0] * cells[1] * cells[2]
+    scale = (cells[0] / 2 / half[0], cells[1] / 2 / half[1], cells[2] / 2 / half[2])
+    for i in range(m):
+        number, is_near = 0.0, True
+        for k in range(3):
+            is_near &= abs(local[k, i]) - half[k] < SHAPE_MARGIN
+            place = min(max(local[k, i] * scale[k] + cells[k] / 2, 0.0), cells[k] - 1.0)
+            number = number * cells[k] + np.floor(place)
+        is_near &= number < last  # NaN, of a box without a size, is not
+        cell[i] = np.int32(number if is_near else last)
 
 
-@kernel
-def fill_planes(sums, roughness, constants, planes, thickness):
-    """Fit a plane (4,) to the moments (4, 4) of each cell; thickness 0 where there is none."""
-    covariance = np.empty((3, 3))
-    for cell in range(len(sums)):
-        thickness[cell] = 0.0
-        moment = sums[cell]
+@loop
+def fill_planes(roughness, constants, work):
+    """Fit a plane to the moments of each cell but the last; thickness inf where there is none."""
+    planes, thickness, covariance = work.planes, work.thickness, work.covariance
+    for cell in range(len(thickness)):
+        thickness[cell] = inf
+        planes[cell] = 0.0
+        if cell == len(thickness) - 1:
+            break
+        moment = work.sums[cell]
         number = moment[3, 3]
         if number < constants.min_cell_points:
             continue
@@ -72,28 +78,41 @@ class ShapeWork(NamedTuple):
     ----------
     moved, local : array, shapes (3, M) and (N, 3, M)
         Points at the stamp of their box, and in box axes [m].
-    sums : array, shape (C, 4, 4)
-        Second moments of the points in each cell.
-    planes, thickness : array, shapes (C, 4) and (C,)
+    cell : array, shape (N, M)
+        The cell of each; C for points outside of the box.
+    sums : array, shape (C + 1, 4, 4)
+        Second moments of the points in each cell, the upper triangle.
+    planes, thickness : array, shapes (C + 1, 4) and (C + 1,)
         See `fill_planes`.
+    lever, weighted : array, shapes (7, M) and (M,)
+        See `fill_agreement`.
+    covariance, factor : array, shapes (3, 3) and (6, 6)
+        Of a cell, and of the step of an observation.
 
     """
 
     moved: Any
     local: Any
+    cell: Any
     sums: Any
     planes: Any
     thickness: Any
+    lever: Any
+    weighted: Any
+    covariance: Any
+    factor: Any
 
 
 @kernel
 def empty_shape_work(begin, end, problem, N, cells):
     """Return arrays for the windows `begin` to `end`."""
     M = max(1, problem.counts[begin:end].max()) if end > begin else 1
-    C = cells[0] * cells[1] * cells[2]
+    C = cells[0] * cells[1] * cells[2] + 1
     return ShapeWork(
-        np.empty((3, M)), np.empty((N, 3, M)), np.empty((C, 4, 4)), np.empty((C, 4)), np.empty(C)
-    )
+        np.empty((3, M)), np.empty((N, 3, M)), np.empty((N, M), np.int32), np.empty((C, 4, 4)),
+        np.empty((C, 4)), np.empty(C), np.empty((7, M)), np.empty(M), np.empty((3, 3)),
+        np.empty((6, 6)),
+    )  # fmt: skip
 
 
 @kernel
@@ -113,56 +132,57 @@ def fill_sums(b, problem, poses, half, constants, work):
             fill_velocity(poses, problem.times[b], n, problem.lengths[b], velocity)
         fill_moved(b, n, problem, velocity, work.moved)
         to_box_axes(m, work.moved, shift, R, local)
+        fill_cells(m, local, half, constants.cells, work.cell[n])
         for i in range(m):
-            x, y, z = local[0, i], local[1, i], local[2, i]
-            if not is_near(x, y, z, half, SHAPE_MARGIN):
-                continue
-            moment = work.sums[cell_of(x, y, z, half, constants.cells)]
-            p = (x, y, z, 1.0)
+            moment = work.sums[work.cell[n, i]]
+            p = (local[0, i], local[1, i], local[2, i], 1.0)
             for a in range(4):
-                for c in range(4):
+                for c in range(a, 4):
                     moment[a, c] += p[a] * p[c]
 
 
-@kernel
-def fill_agreement(m, local, half, constants, work, total, wanted):
-    """Write information (6, 6) and wanted step (6,) of an observation of m points."""
-    lever = np.empty(6)
-    pull = np.zeros(6)
-    total[:] = 0.0
+@loop
+def fill_agreement(m, n, constants, work, total, wanted):
+    """
+    Write information (6, 6) and wanted step (6,) of observation n, of m points.
+
+    The rows of `lever` are the derivatives of the distances of points from their planes, and the
+    distances; `weighted` are their weights.
+
+    """
+    local, cell, lever, weighted, factor = (
+        work.local[n], work.cell[n], work.lever, work.weighted, work.factor
+    )  # fmt: skip
     used = 0
-    for i in range(m):
+    for i in range(m):  # without a branch: the next one replaces one too far
         x, y, z = local[0, i], local[1, i], local[2, i]
-        if not is_near(x, y, z, half, SHAPE_MARGIN):
-            continue
-        cell = cell_of(x, y, z, half, constants.cells)
-        if work.thickness[cell] == 0.0:
-            continue
-        used += 1
-        a, c, d = work.planes[cell, 0], work.planes[cell, 1], work.planes[cell, 2]
-        off = a * x + c * y + d * z + work.planes[cell, 3]
-        weight = 1 / (work.thickness[cell] + off**2)
-        lever[0], lever[1], lever[2] = a, c, d
-        lever[3] = y * d - z * c
-        lever[4] = z * a - x * d
-        lever[5] = x * c - y * a
-        for j in range(6):
-            weighted = weight * lever[j]
-            pull[j] += weighted * off
-            for k in range(j, 6):
-                total[j, k] += weighted * lever[k]
+        a, c, d, level = work.planes[cell[i]]
+        lever[0, used], lever[1, used], lever[2, used] = a, c, d
+        lever[3, used] = y * d - z * c
+        lever[4, used] = z * a - x * d
+        lever[5, used] = x * c - y * a
+        off = a * x + c * y + d * z + level
+        lever[6, used] = off
+        weighted[used] = 1 / (work.thickness[cell[i]] + off**2)
+        used += work.thickness[cell[i]] < inf
+    for j in range(6):
+        for k in range(j, 7):
+            product = 0.0
+            for i in range(used):
+                product += weighted[i] * lever[j, i] * lever[k, i]
+            if k < 6:
+                total[j, k] = product
+            else:
+                wanted[j] = product
     # So many points of one observation err on their own.
     scale = constants.effective_points / max(float(used), constants.effective_points)
     for j in range(6):
-        pull[j] *= scale
+        wanted[j] *= scale
         for k in range(j, 6):
             total[j, k] *= scale
-            total[k, j] = total[j, k]
-    factor = total.copy()
-    for j in range(6):
+            factor[j, k] = total[k, j] = total[j, k]
         factor[j, j] += STEP_RIDGE
     factorise_corner(factor)
-    copy(pull, wanted)
     solve_corner(factor, wanted)
 
 
@@ -214,17 +234,7 @@ def agree(b, problem, poses, extents, constants, work, terms):
     half = extents / 2
     information = np.empty((6, 6))
     fill_sums(b, problem, poses, half, constants, work)
-    fill_planes(work.sums, problem.of_class[b].roughness, constants, work.planes, work.thickness)
+    fill_planes(problem.of_class[b].roughness, constants, work)
     for n in range(len(poses)):
-        fill_agreement(
-            problem.counts[b, n], work.local[n], half, constants, work, information,
-            terms[n].wanted,
-        )  # fmt: skip
+        fill_agreement(problem.counts[b, n], n, constants, work, information, terms[n].wanted)
         fill_root(information, terms[n].root)
-
-
-@loop
-def is_near(x, y, z, half, margin):
-    """Return whether a point is within `margin` of a box."""
-    outside = max(abs(x) - half[0], abs(y) - half[1], abs(z) - half[2])
-    return outside < margin
