@@ -281,7 +281,9 @@ class MeasuredTracks:
         arrays, boxes, is_known = self._table(names)
         T = self._displacements(arrays)
         poses = np.zeros((*boxes.shape[:2], len(times_ns), 4))  # centre and yaw
-        poses[..., : Z + 1] = _moved(T[:, None], boxes[:, :, None, : Z + 1])
+        R = T[..., :3, :3].reshape(len(T), -1, 3)  # (A, 3 C, 3): one product for each array
+        turned = (boxes[..., : Z + 1] @ R.swapaxes(1, 2)).reshape(*poses.shape[:3], 3)
+        poses[..., : Z + 1] = turned + T[:, None, :, :3, 3]
         yaw = boxes[:, :, None, YAW] + np.arctan2(T[:, None, :, 1, 0], T[:, None, :, 0, 0])
         poses[..., Z + 1] = _unwrapped(yaw, is_known)
         seconds = (np.array([array.stamp_ns for array in arrays])[:, None] - times_ns) * 1e-9
