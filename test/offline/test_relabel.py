@@ -487,8 +487,11 @@ def test_stamps_of_another_clock_do_not_change_the_order(tmp_path):
 
 def test_boxes_of_one_stamp_in_two_messages(tmp_path):
     drive = Drive(sweeps=5)
-    extra = [item for item in drive.items if item[0] == '/boxes'][1]
-    drive.items.insert(drive.items.index(extra) + 1, extra)
+    first = [item for item in drive.items if item[0] == '/boxes'][1]
+    other = deepcopy(first[2])
+    for detection in other.detections:
+        detection.bbox.center.position.x += 0.1
+    drive.items.insert(drive.items.index(first) + 1, (*first[:2], other))
     for estimate in ('track', 'early', 'final'):
         rows = run(
             drive.write(tmp_path / estimate),
