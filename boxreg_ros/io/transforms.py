@@ -220,7 +220,7 @@ class TransformTree:
             T = edge.at(stamp_ns, self._is_once(edge, stamp_ns))
             T = T if is_upward else inverse(T)
             T_target_source = T if T_target_source is None else T @ T_target_source
-        return np.eye(4) if T_target_source is None else T_target_source.copy()
+        return np.eye(4) if T_target_source is None else T_target_source + 0.0  # not -0.0
 
     def motion(self, target: str, source: str, stamp_ns: int) -> FrameMotion | None:
         """
