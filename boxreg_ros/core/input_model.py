@@ -131,8 +131,8 @@ class InputModel:
             inputs = self.inputs(config, with_noise=False)
         terms = np.zeros(problem.counts.shape, TERMS)
         run(
-            observe_faces, 4, len(poses), problem, np.ascontiguousarray(poses),
-            problem.expected_shared(inputs), inputs,
+            observe_faces, 4, len(poses), np.arange(len(poses)), problem,
+            np.ascontiguousarray(poses), problem.expected_shared(inputs), inputs,
             self.constants.with_settings(config).record(), terms,
         )  # fmt: skip
         self._add(track_ids, problem, terms, inputs, is_input)

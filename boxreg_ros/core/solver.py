@@ -17,6 +17,8 @@ from boxreg_ros.core.lbfgs import HISTORY, minimize
 from boxreg_ros.core.method import round as method
 from boxreg_ros.core.method.arrays import ANCHOR, BIAS, EXTENT, Posterior, PRIOR, SHARED, Solution
 from boxreg_ros.core.method.constants import Constants
+from boxreg_ros.core.method.faces import observe_faces
+from boxreg_ros.core.method.rigid_shape import observe_shapes
 from boxreg_ros.core.problem import Problem
 from boxreg_ros.core.threads import run, shared_between
 from boxreg_ros.structures import Floats, Ints, KINEMATICS, POSE
@@ -152,7 +154,6 @@ def start(problem: Problem, config: Config, plan: SolverPlan, inputs: Inputs) ->
     return Batch(problem, free, method.empty_sums(B, N, number, *prior), solution)
 
 
-@torch.inference_mode()
 def run_round(
     batch: Batch,
     inputs: Inputs,
@@ -169,15 +170,40 @@ def run_round(
     those have covariances and, if they are full, a prior for the next window.
 
     """
-    problem, free, sums, solution = batch
     uses_shape = plan.uses_rigid_shape and turn > 0
     is_smooth = turn > 0 or plan.starts_from_fit
-    record = constants.in_round(uses_shape, is_smooth).record()
+    constants = constants.in_round(uses_shape, is_smooth)
+    observe(batch, inputs, rows, constants)
+    return fit(batch, inputs, rows, constants, turn + 1 >= plan.rounds, turn > 0)
+
+
+def observe(batch: Batch, inputs: Inputs, rows: Ints, constants: Constants) -> None:
+    """Write what the points show of the windows `rows` (b,) where the round begins."""
+    problem, _, sums, solution = batch
+    record, at = constants.record(), (solution.poses, solution.shared)
+    run(observe_faces, 40, len(rows), rows, problem, *at, inputs, record, sums.terms)
+    if constants.uses_shape:
+        thinned = problem.thinned(constants.shape_points)
+        run(observe_shapes, 20, len(rows), rows, thinned, *at, record, sums.terms)
+
+
+@torch.inference_mode()
+def fit(
+    batch: Batch,
+    inputs: Inputs,
+    rows: Ints,
+    constants: Constants,
+    is_last: bool,
+    may_settle: bool,
+) -> NDArray[np.bool_]:
+    """Search the minima of the windows `rows` (b,) after `observe`, and end their round."""
+    problem, free, sums, solution = batch
+    record = constants.record()
     b, D = len(rows), free.shape[1]
     x, value, gradient = np.empty((b, D)), np.empty(b), np.empty((b, D))
     run(
-        method.begin, 70, b, rows, problem, problem.thinned(constants.shape_points), inputs, free,
-        record, solution.poses, solution.shared, sums, x, value, gradient,
+        method.begin, 30, b, rows, problem, inputs, free, record, solution.poses, solution.shared,
+        sums, x, value, gradient,
     )  # fmt: skip
     objective = Objective(rows, free, sums)
     found = minimize(
@@ -187,8 +213,8 @@ def run_round(
     )  # fmt: skip
     is_done = np.empty(b, bool)
     run(
-        method.end, 30, b, rows, found.x.numpy(), problem, free, record, sums, solution,
-        turn + 1 >= plan.rounds, turn > 0, is_done,
+        method.end, 30, b, rows, found.x.numpy(), problem, free, record, sums, solution, is_last,
+        may_settle, is_done,
     )  # fmt: skip
     return is_done
 

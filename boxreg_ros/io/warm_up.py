@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from subprocess import DEVNULL, Popen
+from subprocess import DEVNULL, PIPE, Popen
 import sys
 
-from boxreg_ros.config import Config, PaperConfig, SolverConfig
+from boxreg_ros.config import Config, KINDS, PaperConfig, SolverConfig
 from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.method.arrays import INPUTS
+from boxreg_ros.core.method.residuals import TERMS
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.point_labels import ObjectTrack, PointLabeller
-from boxreg_ros.core.registrar import BoxRegistrar, GetEstimates, Submit
-from boxreg_ros.core.window import Estimate, Window
+from boxreg_ros.core.problem import stack_windows
+from boxreg_ros.core.registrar import BoxRegistrar, Submit
+from boxreg_ros.core.window import Window
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 
@@ -38,53 +41,51 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
     registrar.flush()
 
 
-def warm_up_estimation(config: Config) -> None:
-    """Estimate a cold and a warm window whose points are given: the kernels are loaded."""
-    from boxreg_ros.core.estimation import estimate_windows  # torch
+def warm_up_solver(config: Config) -> None:
+    """Fit a window without points: half of what a node needs is loaded or compiled."""
+    from boxreg_ros.core import solver  # torch
 
-    sweeps, arrays = _passing_car()
+    _, arrays = _passing_car()
     boxes = np.concatenate([array.boxes for array in arrays])
-    n, m = len(boxes), len(sweeps[0].points)
-    points = np.concatenate([sweep.points - boxes[k, :3] for k, sweep in enumerate(sweeps)])
+    n = len(boxes)
     table = Observations(
-        stamps_ns=np.array([sweep.stamp_ns for sweep in sweeps]),
+        stamps_ns=np.array([array.stamp_ns for array in arrays]),
         boxes=boxes,
-        points=points.astype(np.float32),
-        delays=np.zeros(n * m, np.float32),
-        counts=np.full(n, m),
+        points=np.zeros((0, 3), np.float32),
+        delays=np.zeros(0, np.float32),
+        counts=np.zeros(n, int),
         origins=-boxes[:, None, :3],
         ground=np.full(n, np.nan),
         ring_heights=np.zeros(n),
-        num_points=np.full(n, m),
+        num_points=np.zeros(n, int),
         sights=np.zeros(n),
         is_pinned=np.zeros(n, bool),
     )
     quick, model = _quick(config), InputModel(config.faces)
-    rows = [Observation(table, row) for row in range(n)]
-    window = Window('1', 'car', rows[: quick.window], quick.window, np.zeros((0, 9)))
-    for last in range(quick.window, n):
-        (estimate,) = estimate_windows([window], quick, model)
-        assert estimate is not None
-        start = estimate.table.boxes[estimate.begin + 1 : estimate.end]
-        observations = rows[last - len(start) : last + 1]
-        window = Window('1', 'car', observations, 1, start, estimate.prior)
-    estimate_windows([window], quick, model)
+    rows = [Observation(table, row) for row in range(quick.window)]
+    window = Window('1', 'car', rows, quick.window, np.zeros((0, 9)))
+    problem, _ = stack_windows([window], quick, model.constants.prior_decay)
+    inputs, constants = np.ones(len(KINDS), INPUTS), model.constants.with_settings(quick)
+    plan = solver.SolverPlan.choose(quick, is_warm=False)
+    batch = solver.start(problem, quick, plan, inputs)
+    batch.sums.terms[:] = np.zeros((), TERMS)
+    solver.fit(batch, inputs, np.zeros(1, int), constants, is_last=True, may_settle=False)
 
 
 @contextmanager
-def compiled_beside(config: Config) -> Iterator[None]:
+def compiled_beside(config: Config, has_labels: bool) -> Iterator[Callable[[], None]]:
     """
-    Let a second process compile what a node needs but `warm_up_estimation`, if the block compiles.
+    Let a second process compile what a node needs but `warm_up_solver`, if the block compiles.
 
-    The block waits for it at its end: the kernels are on disk then. Where none can be written,
-    this process has to compile them as well.
+    A function is yielded that waits until that is on disk. What follows objects is there at the
+    end of the block. Where nothing can be written, this process has to compile all of it as well.
 
     """
     from numba.core import event  # it takes half a second
 
     processes: list[Popen[bytes]] = []
-    settings = f'objective={config.objective!r}, mode={config.mode!r}'
-    code = f'from boxreg_ros.io import warm_up; warm_up.warm_up_observation({settings})'
+    settings = f'{config.objective!r}, {config.mode!r}, {has_labels}'
+    code = f'from boxreg_ros.io import warm_up; warm_up.warm_up_others({settings})'
 
     class Start(event.Listener):
         """Starts the process; kernels that are loaded from files cause no event."""
@@ -93,33 +94,38 @@ def compiled_beside(config: Config) -> Iterator[None]:
             if not processes:
                 command = [sys.executable, '-P', '-c', code]  # -P: no modules of its folder
                 with suppress(OSError):  # no memory, or no more processes: it compiles all alone
-                    processes.append(Popen(command, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL))
+                    processes.append(Popen(command, stdin=DEVNULL, stdout=PIPE, stderr=DEVNULL))
 
         def on_end(self, event: object) -> None:
             """Do nothing."""
 
+    def wait() -> None:
+        for process in processes:
+            assert process.stdout is not None  # a pipe
+            process.stdout.readline()  # empty if it has ended
+
     try:
         with event.install_listener('numba:compile', Start()):
-            yield
+            yield wait
         for process in processes:
-            process.wait()
+            process.communicate()
     finally:
         for process in processes:
             process.kill()  # where this one is interrupted; kernels are written as a whole
             process.wait()
 
 
-def warm_up_observation(objective: str, mode: str) -> None:
-    """Observe and follow the synthetic stream, without an estimate."""
+def warm_up_others(objective: str, mode: str, has_labels: bool) -> None:
+    """Do all but `warm_up_solver`, print a line, then follow."""
+    from boxreg_ros.core import solver
+
+    solver.fit = lambda _, __, rows, *___: np.ones(len(rows), bool)
     config = Config.from_dict({'objective': objective, 'mode': mode, 'estimate': 'final'})
-    warm_up(config, _submit_to_nobody)
+    warm_up(config)
+    if has_labels:
+        warm_up_labels(config)
+    print('ready', flush=True)
     warm_up_followed(config)
-
-
-def _submit_to_nobody(windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
-    """Return a function that returns no estimates."""
-    estimates: list[Estimate | None] = [None] * len(windows)
-    return lambda: estimates
 
 
 def warm_up_follower(config: Config) -> None:

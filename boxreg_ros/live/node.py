@@ -19,9 +19,9 @@ from boxreg_ros.io.session import Session
 from boxreg_ros.io.warm_up import (
     compiled_beside,
     warm_up,
-    warm_up_estimation,
     warm_up_followed,
     warm_up_labels,
+    warm_up_solver,
 )
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
@@ -36,6 +36,7 @@ from boxreg_ros.live.polling import PolledClockNode
 from boxreg_ros.live.topics import Endpoint, FOLLOW_TOPIC, import_message, NodeTopics
 from boxreg_ros.live.transform_wait import TransformWait
 from boxreg_ros.live.worker import Worker
+from boxreg_ros.reasons import Reason
 from diagnostic_msgs.msg import DiagnosticArray
 from msg_adapters import adapter_for, canonical
 from msg_adapters.clouds import POINTS_TYPE
@@ -93,6 +94,7 @@ class BoxregNode(PolledClockNode):
         self._inbox = Inbox(config.queue, max(1, len(options.lidars.topics)))
         self._opened = ExitStack()
         self._is_warm = Event()  # until then, boxes pass unchanged
+        self._can_follow = Event()  # until then, boxes to follow are refused
         self._failures: list[Exception] = []
 
     def configure(self) -> None:
@@ -116,23 +118,34 @@ class BoxregNode(PolledClockNode):
         )
 
     def warm_up(self, announce: Callable[[str], None]) -> None:
-        """Load or compile kernels, with announcements, and time a window; boxes may pass."""
+        """
+        Load or compile kernels, with announcements, and time a window; boxes may pass.
+
+        From the time that `_is_warm` is set, boxes may be refined; what follows objects is loaded
+        afterwards.
+
+        """
         config, options = self._settings
         begun = time.monotonic()
         with announced_compilation(announce) as done:
-            with compiled_beside(config):
-                warm_up_estimation(config)
-            warm_up(config)
+            with compiled_beside(config, options.static_points) as wait:
+                if config.objective != 'paper':
+                    warm_up_solver(config)
+                wait()
+                warm_up(config)
+                if options.static_points:
+                    warm_up_labels(config)
+                if done.functions:
+                    seconds = time.monotonic() - begun
+                    text = f'compiled {done.functions} functions in {seconds:.0f} s'
+                    self.get_logger().info(text)
+                # Once more, timed without imports and compilation.
+                warm_up(config, self._budget.submit)
+                gc.collect()
+                gc.freeze()  # a collection of imported objects takes 50 ms, several times a minute
+                self._is_warm.set()
             warm_up_followed(config)
-            if options.static_points:
-                warm_up_labels(config)
-        if done.functions:
-            seconds = time.monotonic() - begun
-            self.get_logger().info(f'compiled {done.functions} functions in {seconds:.0f} s')
-        warm_up(config, self._budget.submit)  # once more, timed without imports and compilation
-        gc.collect()
-        gc.freeze()  # a collection of imported objects would take 50 ms, several times a minute
-        self._is_warm.set()
+        self._can_follow.set()
 
     def warm_up_beside(self) -> None:
         """Warm up; where that is to compile, return at once and go on in a thread."""
@@ -304,9 +317,16 @@ class BoxregNode(PolledClockNode):
         receive = partial(self._receive, 'boxes')
         self._topics.subscribe(boxed('boxes', qos, receive, is_required=True))
         few = QoSProfile(depth=FOLLOW_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
-        follow = partial(self._inbox.put_event, self.worker.follow)
-        self._topics.subscribe(boxed(FOLLOW_TOPIC, few, follow))
+        self._topics.subscribe(boxed(FOLLOW_TOPIC, few, self._follow))
         self.get_logger().info(f'boxes are {type_name}; {self._topics.description()}')
+
+    def _follow(self, msg: Any) -> None:
+        if self._can_follow.is_set():
+            self._inbox.put_event(self.worker.follow, msg)
+        else:
+            self._health.report(
+                Reason.NOT_FOLLOWED, 'still compiling: publish the box again later'
+            )
 
     def _on_transforms(self, is_static: bool, msg: Any, received_ns: int) -> None:
         self._live.session.tree.add_transforms(msg.transforms, is_static, received_ns)

@@ -11,7 +11,7 @@ from boxreg_ros.core.method import round as method
 from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.paper import Observed, solve_paper
 from boxreg_ros.core.problem import stack_windows as stack
-from boxreg_ros.core.solver import Objective, run_round, SolverPlan, start
+from boxreg_ros.core.solver import Objective, observe, run_round, SolverPlan, start
 from boxreg_ros.core.threads import mapped, shared_between
 from boxreg_ros.structures import POSE
 import numpy as np
@@ -401,14 +401,15 @@ def test_minimum_of_the_default_objective_against_torch():
     # The sums of one round: torch gets them by automatic differentiation, one window at a time;
     # ours are compiled, with the Gauss-Newton curvature as metric, and all windows at once.
     problem, _ = stack_windows(windows(), ALONE)
-    constants = CONSTANTS.with_settings(ALONE).in_round(False, True).record()
+    constants = CONSTANTS.with_settings(ALONE).in_round(False, True)
     inputs = InputModel(ALONE.faces).inputs(ALONE)
     batch = start(problem, ALONE, SolverPlan.choose(ALONE, False), inputs)
     rows, (B, D) = np.arange(4), batch.free.shape
     x, value, gradient = np.empty((B, D)), np.empty(B), np.empty((B, D))
     batch.free[:] = 1.0
+    observe(batch, inputs, rows, constants)
     method.begin(
-        0, B, rows, problem, problem, inputs, batch.free, constants, batch.solution.poses,
+        0, B, rows, problem, inputs, batch.free, constants.record(), batch.solution.poses,
         batch.solution.shared, batch.sums, x, value, gradient,
     )  # fmt: skip
     function = Objective(rows, batch.free, batch.sums)

@@ -124,7 +124,7 @@ def supported(problem, gap=0.0, outermost=0.05, depths=0.0, distant=0.0, poses=N
     terms = np.zeros(problem.counts.shape, TERMS)
     B = len(problem.boxes)
     observe_faces(
-        0, B, problem,
+        0, B, np.arange(B), problem,
         np.ascontiguousarray(problem.boxes[..., BOX_POSE]) if poses is None else poses,
         shared_of(B=B, GAP=[gap] * 6), no_inputs(occlusion_inset=depths, range_inset=distant),
         constants.record(), terms,

@@ -344,9 +344,12 @@ def test_boxes_pass_unchanged_while_the_solver_is_compiled(graph, tmp_path):
     records = records_of(Drive(sweeps=8).write(tmp_path / 'drive'))
     compiled = tmp_path / 'compiled'
     code = FIRST_START.format(compiled=str(compiled))
+    follow = graph.publisher(DETECTIONS, '/boxreg_node/follow')
     node = graph.run(records, *QUICK, command=(CODE, code))
     passing = first_sweeps(records, 2)
     node.play(passing)
+    follow.publish(passing[-1].data)
+    graph.wait(lambda: 'still compiling: publish' in node.output(), 'an answer')
     assert 'once after an installation' in node.output()
     assert numbers_changed(node.early, passing) == [0, 0]
     graph.wait(lambda: node.values().get('compiling') == '2', 'the counter')

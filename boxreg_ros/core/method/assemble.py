@@ -288,7 +288,8 @@ def add_all(poses, shared, last, terms, at, room, first, gradient, A):
             if has_weight(W):
                 out.J[:] = 0.0
                 out.S[:] = 0.0
-                rows, columns = row.function(n, poses, shared, terms, at, out)
+                rows, known = row.function(n, poses, shared, terms, at, out)
+                columns = np.int64(known)  # each literal number would be compiled by itself
                 if row.is_combination:
                     value += add_combination(n, row.poses, columns, W, out, first, gradient, A)
                 else:

@@ -333,9 +333,9 @@ class FaceWork(NamedTuple):
 
 
 @kernel
-def empty_face_work(begin, end, problem, constants):
-    """Return arrays for the observations of the windows `begin` to `end`."""
-    M = max(1, problem.counts[begin:end].max()) if end > begin else 1
+def empty_face_work(problem, constants):
+    """Return arrays for the observations of a batch."""
+    M = max(1, problem.counts.max())
     size = ceil(max(constants.min_face_points, constants.outermost / constants.strips * M)) + 1
     return FaceWork(
         np.empty((3, M)), np.empty((3, M)), np.empty((3, M)), np.empty((2, M), np.int32),
@@ -439,9 +439,10 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
 
 
 @kernel
-def observe_faces(first, last, problem, poses, shared, inputs, constants, terms):
-    """Write the face observations of windows `first` to `last` (B, N), see `observe_window`."""
-    work = empty_face_work(first, last, problem, constants)
-    for b in range(first, last):
+def observe_faces(first, last, rows, problem, poses, shared, inputs, constants, terms):
+    """Write the face observations of the windows `rows[first:last]`, see `observe_window`."""
+    work = empty_face_work(problem, constants)
+    for row in range(first, last):
+        b = rows[row]
         kind = problem.kind[b]
         observe_window(b, problem, poses[b], shared[b], inputs[kind], constants, work, terms[b])

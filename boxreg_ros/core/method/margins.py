@@ -17,7 +17,7 @@ QUARTILES_TO_DEVIATION = 0.74
 """Standard deviation over interquartile range. Derived: 1 / 1.349 for a Gaussian."""
 MIDMEAN_FACTOR = 1.2
 """Variance of the mean of the middle half over that of the mean. Derived: for a Gaussian."""
-GAP, OCCLUSION, RANGE = 0, 1, 2
+GAP, OCCLUSION, RANGE = np.arange(3)  # of literals each would compile its functions again
 """Quantities that the faces of a track show."""
 
 

@@ -104,9 +104,9 @@ class ShapeWork(NamedTuple):
 
 
 @kernel
-def empty_shape_work(begin, end, problem, N, cells):
-    """Return arrays for the windows `begin` to `end`."""
-    M = max(1, problem.counts[begin:end].max()) if end > begin else 1
+def empty_shape_work(problem, N, cells):
+    """Return arrays for the observations of a batch."""
+    M = max(1, problem.counts.max())
     C = cells[0] * cells[1] * cells[2] + 1
     return ShapeWork(
         np.empty((3, M)), np.empty((N, 3, M)), np.empty((N, M), np.int32), np.empty((C, 4, 4)),
@@ -238,3 +238,12 @@ def agree(b, problem, poses, extents, constants, work, terms):
     for n in range(len(poses)):
         fill_agreement(problem.counts[b, n], n, constants, work, information, terms[n].wanted)
         fill_root(information, terms[n].root)
+
+
+@kernel
+def observe_shapes(first, last, rows, problem, poses, shared, constants, terms):
+    """Compare the windows `rows[first:last]` with the shapes of their tracks, see `agree`."""
+    work = empty_shape_work(problem, poses.shape[1], constants.cells)
+    for row in range(first, last):
+        b = rows[row]
+        agree(b, problem, poses[b], shared[b, :3], constants, work, terms[b])

@@ -1,10 +1,10 @@
 """
 One round of many windows, in the order of the paper's figure.
 
-    expect -> observe faces -> weigh -> linearise -> [ L-BFGS ] -> settled? -> covariances
+    [ observe faces ] -> expect -> weigh -> linearise -> [ L-BFGS ] -> settled? -> covariances
 
-The search between is `boxreg_ros.core.lbfgs`, for all windows at once; it calls `evaluate` and
-`precondition`.
+Faces are observed by `faces`. The search is `boxreg_ros.core.lbfgs`, for all windows at once; it
+calls `evaluate` and `precondition`.
 
 """
 
@@ -31,9 +31,7 @@ from boxreg_ros.core.method.assemble import (
 from boxreg_ros.core.method.compile import kernel
 from boxreg_ros.core.method.covariance import fill_posterior, Inverse
 from boxreg_ros.core.method.expectation import expect, fill_evidence, SIZE
-from boxreg_ros.core.method.faces import empty_face_work, observe_window
 from boxreg_ros.core.method.residuals import empty_linearised, TERMS
-from boxreg_ros.core.method.rigid_shape import agree, empty_shape_work
 import numpy as np
 
 
@@ -69,7 +67,7 @@ def empty_sums(B: int, N: int, S: int, prior_mean: Any, prior_information: Any) 
 
 
 @kernel
-def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, shared, sums,
+def begin(first, last, rows, problem, inputs, free, constants, poses, shared, sums,
           x, value, gradient):  # fmt: skip
     """
     Begin a round of the windows `rows[first:last]`.
@@ -80,8 +78,8 @@ def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, s
         First row, and the one after the last.
     rows : array, shape (b,)
         Windows of the batch that take part.
-    problem, thinned : Problem
-        Input of the batch, and the same with the points of the rigid shape.
+    problem : Problem
+        Input of the batch.
     inputs : array of `INPUTS`, shape (K,)
         Noise, margins and population of the input, by kind.
     free : array, shape (B, 6 N + S)
@@ -91,7 +89,7 @@ def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, s
     poses, shared : array, shapes (B, N, 6) and (B, S)
         Start of the round.
     sums : Sums
-        Of the batch: written.
+        Of the batch, with the face observations and the rigid shape: the rest is written.
     x, value, gradient : array, shapes (b, 6 N + S), (b,) and (b, 6 N + S)
         Written: variables of the windows, and the sum of the residuals there.
 
@@ -100,17 +98,11 @@ def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, s
     n = POSE * N
     at, out, A = empty_axes(N), empty_linearised(), empty_matrix(N, shared.shape[1])
     mean_extents = np.empty(SIZE)
-    of_faces = empty_face_work(0, len(problem.counts), problem, constants)
-    of_shape = empty_shape_work(0, len(thinned.counts), thinned, N, constants.cells)
     for row in range(first, last):
         b = rows[row]
-        kind = problem.kind[b]
         shared[b, ANCHOR:] = 0.0
         terms, common = sums.terms[b], sums.common[b]
-        expect(b, problem, inputs[kind], constants, mean_extents, common)
-        observe_window(b, problem, poses[b], shared[b], inputs[kind], constants, of_faces, terms)
-        if constants.uses_shape:
-            agree(b, thinned, poses[b], shared[b, :3], constants, of_shape, terms)
+        expect(b, problem, inputs[problem.kind[b]], constants, mean_extents, common)
         weigh(b, problem, poses[b], shared[b], constants, at, out, terms, common)
         copy(poses[b].ravel(), x[row, :n])
         copy(shared[b], x[row, n:])

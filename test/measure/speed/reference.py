@@ -19,7 +19,7 @@ from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.problem import Problem, stack_windows
 from boxreg_ros.core.refine import refine, Track
-from boxreg_ros.core.solver import Batch, Objective, solve, SolverPlan, start
+from boxreg_ros.core.solver import Batch, Objective, observe, solve, SolverPlan, start
 from boxreg_ros.core.window import Window
 from boxreg_ros.structures import BOX_EXTENT, Floats, POSE
 from measure.speed.streams import make_windows, shortest
@@ -101,8 +101,8 @@ class _Fit:
     def __init__(self, problem: Problem, config: Config) -> None:
         model = InputModel(config.faces)
         plan = SolverPlan.choose(config, False)
-        constants = CONSTANTS.with_settings(config).in_round(uses_shape=False, is_smooth=False)
-        self.constants = constants.record()
+        constants = CONSTANTS.with_settings(config)
+        self.constants = constants.in_round(uses_shape=False, is_smooth=False)
         self.inputs = model.inputs(config)
         self.batch: Batch = start(problem, config, plan, self.inputs)
         self.row = np.zeros(1, np.int64)
@@ -112,8 +112,9 @@ class _Fit:
         """Renew the sum where the solution is; return its variables (1, D) and its value."""
         problem, free, sums, solution = self.batch
         x, value, gradient = np.empty_like(free), np.empty(1), np.empty_like(free)
+        observe(self.batch, self.inputs, self.row, self.constants)
         method.begin(
-            0, 1, self.row, problem, problem, self.inputs, free, self.constants, solution.poses,
+            0, 1, self.row, problem, self.inputs, free, self.constants.record(), solution.poses,
             solution.shared, sums, x, value, gradient,
         )  # fmt: skip
         return torch.from_numpy(x), float(value[0])
