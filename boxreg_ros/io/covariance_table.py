@@ -23,7 +23,7 @@ COVARIANCE_COLUMNS = ('stamp_ns', 'track_id', 'range', *COVARIANCE_NUMBERS)
 POSE_TRIANGLE = np.triu_indices(6)
 EXTENT_TRIANGLE = np.triu_indices(3)
 NUM_POSE = len(POSE_TRIANGLE[0])
-ROUNDING = 1e-9
+UNIT_ROUNDING = 1e-9
 """Largest deviation from the unit matrix of one that was moved to another frame; chosen."""
 
 
@@ -46,7 +46,7 @@ def covariance_lines(refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> li
 
     """
     boxes = refined.boxes
-    is_known = np.abs(refined.covariances - np.eye(6)).max(axis=(1, 2)) > ROUNDING
+    is_known = np.abs(refined.covariances - np.eye(6)).max(axis=(1, 2)) > UNIT_ROUNDING
     distances = [''] * len(refined.status)
     if T_fixed_sensor is not None:
         offset = boxes.boxes[:, [X, Y]] - T_fixed_sensor[:2, 3]
