@@ -159,6 +159,12 @@ def solved(windows, config, model):
     return [None if estimate is None else Solved(estimate) for estimate in found]
 
 
+def row_of(item):
+    """Return a row of a table, given as a pair of both, as one named tuple."""
+    table, row = item
+    return table._make(column[row] for column in table)
+
+
 def observation(**changes):
     """Return an observation of a box at the origin without points, with some columns changed."""
     blank = Observations(

@@ -24,23 +24,22 @@ from boxreg_ros.core.method.arrays import BIAS, EXTENT, Solution
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.observation import SIDE_NOISE
 from boxreg_ros.core.paper import solve_paper
-from boxreg_ros.core.problem import group_windows, NO_RANGE, Problem, stack_windows
+from boxreg_ros.core.problem import group_windows, Problem, stack_windows
 from boxreg_ros.core.solver import solve
-from boxreg_ros.core.tables import stacked
 from boxreg_ros.core.threads import one_torch_thread, run, shared_between
 from boxreg_ros.core.window import Estimate, Estimates, MarginalisationPrior, Window
 from boxreg_ros.reasons import Reason
-from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import BOX_EXTENT, Floats, KEPT, KINEMATICS, REFINED, ROLL
+from boxreg_ros.structures import Floats, Ints, KEPT, KINEMATICS, REFINED, ROLL
 import numpy as np
-from numpy.typing import NDArray
 
 KEPT_REASONS = np.array(
     ['', Reason.NO_POINTS, Reason.NOT_FINITE, Reason.NO_GAIN, Reason.NOT_RIGID], np.str_
-)
+).astype(object)
 """Why a box is kept, by the results of the acceptance tests."""
-STATUS = np.array([REFINED, *[KEPT] * (len(KEPT_REASONS) - 1)], np.str_)
+STATUS = np.array([REFINED, *[KEPT] * (len(KEPT_REASONS) - 1)], object)
 """The status of a box by the same."""
+MARGIN_OBSERVATIONS = 30
+"""Observations of a window that give labelling margins; measured: 130 add nothing."""
 
 
 @one_torch_thread()
@@ -67,14 +66,14 @@ def estimate_windows(
             _update_margins(model, part, problem, config)
         # Whole tracks show their own noise.
         inputs = model.inputs(config, with_noise=config.estimate != 'track')
-        for rows, part, (problem, base) in zip(groups, parts, problems, strict=True):
+        for rows, part, (problem, priors) in zip(groups, parts, problems, strict=True):
             if config.objective == 'paper':
                 solution = solve_paper(problem, config)
             else:
                 observe = partial(_update_margins, model, part, problem, config)
                 solution = solve(problem, config, model, inputs, part[0].is_warm, observe)
                 _update_noise(model, part, problem, solution, config)
-            found = _accepted(part, problem, base, solution, config, model.constants)
+            found = _accepted(part, problem, priors, solution, config, model.constants)
             estimates.update(zip(rows, found, strict=True))
     return [estimates.get(i) for i in range(len(windows))]
 
@@ -94,18 +93,34 @@ def _update_margins(
     corners, further outside. Whole tracks have none: those of the input are replaced later.
 
     """
-    columns = [window.margin_columns() for window in windows]
-    new = [row for row, part in enumerate(columns) if part]
-    if not new:
+    first, step, counts = margin_columns(windows, problem.lengths)
+    new = np.flatnonzero(counts)
+    if not len(new):
         return
     is_input = poses is None and config.estimate == 'track'
     if poses is not None:
         start = np.concatenate([problem.start[..., :ROLL], poses[..., 3:]], axis=-1)
         problem = problem._replace(start=start)
-    problem = problem.part(new, [columns[row] for row in new])
+    problem = problem.part(new, first[new], step[new], counts[new])
     at = np.concatenate([problem.boxes[..., :3], problem.start[..., ROLL:]], axis=-1)
-    track_ids = [windows[row].track_id for row in new]
+    track_ids = [windows[row].track_id for row in new.tolist()]
     model.observe_margins(track_ids, problem, at, config, is_input)
+
+
+def margin_columns(windows: Sequence[Window], lengths: Ints) -> tuple[Ints, Ints, Ints]:
+    """
+    Return which observations give labelling margins; each does so in one window only.
+
+    Of each window of `lengths` (B,) the first one, every which one, and how many, (B,) each. The
+    newest is left to the next window, which has an estimate to start from. Of many, every n-th is
+    taken so that about `MARGIN_OBSERVATIONS` remain.
+
+    """
+    num_new = np.array([window.num_new for window in windows])
+    last = lengths - 1
+    first = np.maximum(0, last - num_new)
+    step = 1 + num_new // MARGIN_OBSERVATIONS
+    return first, step, -((first - last) // step)
 
 
 def _update_noise(
@@ -118,9 +133,10 @@ def _update_noise(
     """Update the noise with the best fit of each window, `lag` from its end, and its extents."""
     lag = min(config.lag, config.window - 1)
     best = problem.lengths - 1 - lag
+    row, column = np.arange(len(best))[:, None], best.clip(0)[:, None] + [-1, 0]
+    pair = problem._replace(boxes=problem.boxes[row, column], counts=problem.counts[row, column])
     extents = solution.shared[:, EXTENT:BIAS]
-    every = normalised_residuals(problem, solution.poses, extents)
-    residuals = every[np.arange(len(best)), best.clip(0)]
+    residuals = normalised_residuals(pair, solution.poses[row, column], extents)[:, 1]
     # Each box counts once. The first one stays the best of its window as long as this grows.
     residuals[best < 0] = np.nan
     track_ids = [window.track_id for window in windows]
@@ -130,7 +146,7 @@ def _update_noise(
 def _accepted(
     windows: Sequence[Window],
     problem: Problem,
-    base: Floats,
+    priors: MarginalisationPrior,
     solution: Solution,
     config: Config,
     constants: Constants,
@@ -138,7 +154,7 @@ def _accepted(
     """
     Return the estimate of each window in the fixed frame, after the acceptance tests (M27).
 
-    `base` (B, 3) is the origin of the centres of `problem` [m].
+    The base of its `priors` (B, 3) is the origin of the centres of `problem` [m].
 
     """
     poses, valid = solution.poses, problem.valid
@@ -147,24 +163,19 @@ def _accepted(
     if config.extent == 'track':
         extent = np.repeat(solution.shared[:, None, EXTENT:BIAS], problem.length, axis=1)
     tested = Tested(
-        np.empty(valid.shape, np.int8), np.empty(valid.shape, np.int64),
-        stacked([w.prior.extent_range if w.prior else NO_RANGE for w in windows]),
+        np.empty(valid.shape, np.int8), np.empty((*valid.shape, 9)),
+        np.empty((*valid.shape, 2), np.int64),
+        priors.extent_range,
         np.empty(len(valid), bool),
     )  # fmt: skip
     run(
-        accept, 5, len(valid), problem, np.ascontiguousarray(poses), np.ascontiguousarray(extent),
-        covariances, SIDE_NOISE, config.window, constants.record(), tested,
+        accept, 5, len(valid), problem, priors.base, np.ascontiguousarray(poses),
+        np.ascontiguousarray(extent), covariances, SIDE_NOISE, config.window, constants.record(),
+        tested,
     )  # fmt: skip
-    priors = _priors(base, problem, solution, tested.is_finite, tested.ranges)
     is_kept = tested.results != ACCEPTED
     reasons, status = KEPT_REASONS[tested.results], STATUS[tested.results]
-    found = np.empty((*valid.shape, 9))
-    found[..., :3] = poses[..., :3] + base[:, None]
-    found[..., BOX_EXTENT] = extent
-    found[..., ROLL:] = wrap_angle(poses[..., 3:])
-    near_points = np.empty((*valid.shape, 2), np.int64)
-    near_points[..., 0] = tested.held
-    near_points[..., 1] = problem.counts - tested.held
+    found, near_points = tested.boxes, tested.near_points
     extent_covariances = np.repeat(extent_covariances[:, None], problem.length, axis=1)
     for b, i in np.argwhere(is_kept).tolist():
         found[b, i] = windows[b].observations[i].box
@@ -180,25 +191,20 @@ def _accepted(
     flat = (part.reshape(-1, *part.shape[2:]) for part in columns)
     table = Estimates(*(flat if valid.all() else (part[valid.ravel()] for part in flat)))
     ends = np.cumsum(problem.lengths).tolist()
-    return list(map(Estimate, repeat(table), [0, *ends], ends, priors))
+    left = _priors_left(priors.base, problem, solution, tested)
+    return list(map(Estimate, repeat(table), [0, *ends], ends, left))
 
 
-def _priors(
-    base: Floats,
-    problem: Problem,
-    solution: Solution,
-    is_solved: NDArray[np.bool_],
-    ranges: Floats,
-) -> list[MarginalisationPrior | None]:
+def _priors_left(
+    base: Floats, problem: Problem, solution: Solution, tested: Tested
+) -> list[tuple[MarginalisationPrior, int] | None]:
     """Return the marginalisation prior that each window leaves, if it leaves one."""
     state, step, information = solution[-3:]
     if not len(state):
         return [None] * len(base)
-    first = np.concatenate([problem.boxes[:, 0, 3:6], np.ones((len(base), 1))], axis=1)
-    extents = problem.marginalised_extents + first
-    has_prior = is_solved & np.isfinite(step).all(1)
-    columns = zip(base, state, step, information, extents, ranges, strict=True)
-    return [
-        MarginalisationPrior(*column) if is_left else None
-        for column, is_left in zip(columns, has_prior.tolist(), strict=True)
-    ]
+    extents = problem.marginalised_extents.copy()
+    extents[:, :3] += problem.boxes[:, 0, 3:6]
+    extents[:, 3] += 1
+    table = MarginalisationPrior(base, state, step, information, extents, tested.ranges)
+    is_left = tested.is_finite & np.isfinite(step).all(1)
+    return [(table, row) if left else None for row, left in enumerate(is_left.tolist())]

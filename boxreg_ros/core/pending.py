@@ -222,7 +222,7 @@ class ObservedTrack:
     entries: list[PendingBox] = field(default_factory=list)
     starts: Floats = field(default_factory=lambda: np.zeros((0, 9)))
     """Boxes that the next window starts from, of the first entries."""
-    prior: MarginalisationPrior | None = None
+    prior: tuple[MarginalisationPrior, int] | None = None
     num_carried: int = 0
     """Newest observations that were in no window yet, because the budget was used up."""
     detected_ns: int = 0

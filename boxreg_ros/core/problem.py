@@ -8,7 +8,7 @@ numbers each and the shared variables s of `method.arrays`, the same for all obs
 
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import repeat
+from itertools import chain
 from typing import NamedTuple
 
 from boxreg_ros.config import Config, KINDS
@@ -17,7 +17,7 @@ from boxreg_ros.core.method.constants import CONSTANTS
 from boxreg_ros.core.method.expectation import fill_all_mean_extents
 from boxreg_ros.core.method.headings import align, correct_flips
 from boxreg_ros.core.observation import Observations
-from boxreg_ros.core.tables import stacked
+from boxreg_ros.core.tables import rows_of
 from boxreg_ros.core.window import MarginalisationPrior, Window
 from boxreg_ros.structures import Floats, Ints, YAW
 import numpy as np
@@ -31,15 +31,6 @@ VALUES_PER_POINT = 18
 """Values held per point while a batch is solved; estimated from the temporary arrays."""
 NO_RANGE = np.array([[np.inf] * 3, [-np.inf] * 3])
 """Range of the extents of a track before its first window is full."""
-NO_PRIOR = (
-    np.full(PRIOR, np.nan),
-    np.zeros(PRIOR),
-    np.zeros((PRIOR, PRIOR)),
-    np.zeros(4),
-    NO_RANGE,
-)
-"""State, step, information, extents and their range, of a prior without information."""
-
 
 SETTINGS_OF = {
     'motion': ('acceleration', 'cornering', 'turning'),
@@ -143,26 +134,23 @@ class Problem(NamedTuple):
         """Most returns of an observation, at least 1: M."""
         return max(1, int(self.counts.max()))
 
-    def part(self, windows: Sequence[int], columns: Sequence[Sequence[int]]) -> 'Problem':
+    def part(self, rows: Ints, first: Ints, step: Ints, lengths: Ints) -> 'Problem':
         """
-        Return some windows with some of their observations only, padded to the most that one has.
+        Return the windows `rows` (b,) with some of their observations, padded to the most of one.
 
-        `columns` are those of the observations of each of `windows`, ascending, at least one.
+        Of each these are so many (b,), at least one, from the `first` on, every `step`-th.
         Marginalised observations are left out, with their prior and their extents.
 
         """
-        lengths = np.array(list(map(len, columns)))
-        most = lengths.max()
-        padded = [[*part, *repeat(part[-1], most - len(part))] for part in columns]
-        column, valid = np.array(padded), np.arange(most) < lengths[:, None]
-        rows = np.array(windows)
-        row = rows[:, None]
+        row, last = rows[:, None], lengths[:, None] - 1
+        place = np.arange(lengths.max())
+        column = first[:, None] + step[:, None] * np.minimum(place, last)
         b = len(rows)
         return self._replace(
             boxes=self.boxes[row, column],
             start=self.start[row, column],
             lengths=lengths,
-            times=self.times[row, column] + PADDING_PERIOD * (~valid).cumsum(1),
+            times=self.times[row, column] + PADDING_PERIOD * np.maximum(place - last, 0),
             origins=self.origins[row, column],
             ground=self.ground[row, column],
             ring_heights=self.ring_heights[row, column],
@@ -234,17 +222,16 @@ def group_windows(windows: Sequence[Window], config: Config) -> list[list[int]]:
     Windows shorter than `min_observations` are in no group.
 
     """
-    lengths = [len(window.observations) for window in windows]
-    rows = [row for row, length in enumerate(lengths) if length >= config.min_observations]
-    is_warm = [window.is_warm for window in windows]
-    rows.sort(key=lambda row: (is_warm[row], lengths[row], row))
+    kinds = [(window.is_warm, len(window.observations)) for window in windows]
+    rows = [row for row, (_, length) in enumerate(kinds) if length >= config.min_observations]
+    rows.sort(key=kinds.__getitem__)
     groups: list[list[int]] = []
     for row in rows:
-        length = lengths[row]
+        is_warm, length = kinds[row]
         hessian = (6 * length + SHARED) ** 2
         points = length * config.sampling.points * VALUES_PER_POINT
         is_full = not groups or (len(groups[-1]) + 1) * max(hessian, points) > MAX_BATCH_VALUES
-        if is_full or is_warm[groups[-1][0]] != is_warm[row]:
+        if is_full or kinds[groups[-1][0]][0] != is_warm:
             groups.append([])
         groups[-1].append(row)
     return groups
@@ -252,16 +239,16 @@ def group_windows(windows: Sequence[Window], config: Config) -> list[list[int]]:
 
 def stack_windows(
     windows: Sequence[Window], config: Config, decay: float
-) -> tuple[Problem, Floats]:
+) -> tuple[Problem, MarginalisationPrior]:
     """
     Stack windows, each with at least one observation, to padded arrays.
 
-    The information of marginalisation priors is multiplied by `decay`. Positions of the problem
-    are relative to the second value, (B, 3): one origin per window in the fixed frame [m].
+    The information of marginalisation priors is multiplied by `decay`. The second value has the
+    priors as they are used; positions of the problem are relative to their `base`, (B, 3).
 
     """
     lengths = np.array([len(window.observations) for window in windows])
-    seen, rows = Observations.gathered([item for w in windows for item in w.observations])
+    seen, rows = Observations.gathered([*chain(*(w.observations for w in windows))])
     column, last = np.arange(lengths.max()), lengths[:, None] - 1
     valid = column <= last  # (B, N)
     first = (np.cumsum(lengths) - lengths)[:, None]
@@ -269,8 +256,8 @@ def stack_windows(
     boxes, pinned = seen.boxes[rows], seen.is_pinned[rows] & valid
     elapsed = (seen.stamps_ns[rows] - seen.stamps_ns[rows[:, :1]]) * 1e-9
     times = elapsed + PADDING_PERIOD * np.maximum(column - last, 0)
-    priors = [w.prior or _no_prior(w.observations[0].box[:3]) for w in windows]
-    base, state, step, information, extents = map(stacked, list(zip(*priors, strict=True))[:5])
+    priors = _priors(windows, boxes[:, 0, :3])
+    base, state, step, information, extents, _ = priors
     if config.ingredients.heading_sign:
         correct_flips(boxes, times, lengths, pinned, np.ascontiguousarray(state[:, 5]))
     else:
@@ -304,12 +291,25 @@ def stack_windows(
         kind=kind,
         of_class=of_class,
     )
-    return problem, base
+    return problem, priors
 
 
-def _no_prior(base: Floats) -> MarginalisationPrior:
-    """Return a prior without information, NaN as its linearisation point."""
-    return MarginalisationPrior(base, *NO_PRIOR)
+def _priors(windows: Sequence[Window], first: Floats) -> MarginalisationPrior:
+    """Return copies of the priors; those of others have no information, and the base `first`."""
+    given = [window.prior for window in windows]
+    if None in given:
+        B = len(given)
+        unknown = MarginalisationPrior(
+            first,
+            np.full((B, PRIOR), np.nan),
+            np.zeros((B, PRIOR)),
+            np.zeros((B, PRIOR, PRIOR)),
+            np.zeros((B, 4)),
+            np.repeat(NO_RANGE[None], B, axis=0),
+        )
+        given = [prior or (unknown, row) for row, prior in enumerate(given)]
+    priors: MarginalisationPrior = rows_of(given)
+    return priors
 
 
 def _delays(seen: Observations, config: Config) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
-from boxreg_ros.structures import Floats, Ints
+from boxreg_ros.structures import Ints
 import numpy as np
 
 
@@ -42,12 +42,6 @@ def column(tables: Sequence[Any], name: str) -> Any:
     """Return the field `name` of the concatenation of `tables`; of one table, no copy."""
     parts = [getattr(table, name) for table in tables]
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-
-def stacked(arrays: Sequence[Floats]) -> Floats:
-    """Return n arrays of one shape, at least one, as one (n, ...): faster than `np.stack`."""
-    whole: Floats = np.concatenate(arrays).reshape(len(arrays), *arrays[0].shape)
-    return whole
 
 
 def rows_of(items: Sequence[tuple[Any, int]]) -> Any:

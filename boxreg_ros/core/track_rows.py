@@ -1,6 +1,7 @@
 """A table with one row for each of a limited number of tracks."""
 
 from collections.abc import Sequence
+from itertools import repeat
 from typing import Any
 
 from boxreg_ros.structures import Ints
@@ -21,13 +22,16 @@ class TrackRows:
     def __init__(self, fresh: NDArray[Any], capacity: int) -> None:
         self._fresh = fresh[None]
         self._capacity = capacity
-        self._row_of = dict[str, int]()  # of each track, those seen last at the end
+        self._row_of = dict[str, int]()
+        self._track_ids: list[str] = []  # of each row
+        self._seen = np.zeros(capacity, int)  # when each row was seen last, by a count
+        self._count = 0
         self.arrays = self._fresh[:0]
 
     @property
     def in_order(self) -> NDArray[Any]:
         """Copy of the arrays of all tracks, (n, ...), those seen last at the end."""
-        copy: NDArray[Any] = self.arrays[list(self._row_of.values())]
+        copy: NDArray[Any] = self.arrays[np.argsort(self._seen[: len(self.arrays)])]
         return copy
 
     def seen(self, track_ids: Sequence[str]) -> tuple[Ints, Ints]:
@@ -37,32 +41,38 @@ class TrackRows:
         Returns which of `track_ids` are kept, (m,), and their rows in `arrays`, (m,).
 
         """
-        new_ids = []
+        places, rows = self._places(track_ids)
+        begin = self._count
+        self._seen[rows] = begin + places
+        self._count += len(track_ids)
+        if len(places) == len(track_ids):
+            return places, rows
         for track_id in track_ids:
-            row = self._row_of.pop(track_id, None)
-            if row is None:
-                new_ids.append(track_id)
-            else:
-                self._row_of[track_id] = row
-        together = set(track_ids) if new_ids else set[str]()
-        for track_id in new_ids:
-            if track_id not in self._row_of and not self._takes_row(track_id, together):
+            if track_id not in self._row_of and not self._takes_row(track_id, begin):
                 break  # nor do those after it
-        if len(self._row_of) > len(self.arrays):
-            new = np.repeat(self._fresh, len(self._row_of) - len(self.arrays), axis=0)
-            self.arrays = np.concatenate([self.arrays, new])
-        rows = np.array([self._row_of.get(track_id, -1) for track_id in track_ids], int)
+        new = np.repeat(self._fresh, len(self._row_of) - len(self.arrays), axis=0)
+        self.arrays = np.concatenate([self.arrays, new]) if len(new) else self.arrays
+        return self._places(track_ids)
+
+    def _places(self, track_ids: Sequence[str]) -> tuple[Ints, Ints]:
+        """Return which tracks have rows, (m,), and these, (m,)."""
+        rows = np.fromiter(map(self._row_of.get, track_ids, repeat(-1)), int, len(track_ids))
         places = np.flatnonzero(rows >= 0)
         return places, rows[places]
 
-    def _takes_row(self, track_id: str, together: set[str]) -> bool:
-        """Give a new track a row, unless all others are seen `together` with it; return if so."""
+    def _takes_row(self, track_id: str, begin: int) -> bool:
+        """Give a new track a row, unless all others were seen from `begin` on; return if so."""
         row = len(self._row_of)
-        if row == self._capacity:
-            longest_ago = next(iter(self._row_of))
-            if longest_ago in together:
+        if row < self._capacity:
+            self._track_ids.append(track_id)
+        else:
+            row = int(self._seen.argmin())
+            if self._seen[row] >= begin:
                 return False
-            row = self._row_of.pop(longest_ago)
+            del self._row_of[self._track_ids[row]]
+            self._track_ids[row] = track_id
             self.arrays[row] = self._fresh[0]
         self._row_of[track_id] = row
+        self._seen[row] = self._count
+        self._count += 1
         return True

@@ -14,33 +14,31 @@ from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from numpy.typing import NDArray
 
-MARGIN_OBSERVATIONS = 30
-"""Observations of a window that give labelling margins; measured: 130 add nothing."""
 PRIOR_POSES = 2
 """Poses that the marginalisation prior refers to: no residual spans more than three poses."""
 
 
 class MarginalisationPrior(NamedTuple):
     """
-    Quadratic prior on a window from observations that have been marginalised.
+    Quadratic priors on n windows from observations that have been marginalised, one row each.
 
-    Its variables are the poses of the two oldest observations and the parameters that all
+    Their variables are the poses of the two oldest observations and the parameters that all
     observations of a track share (29 in all).
 
     """
 
     base: Floats
-    """(3,), fixed origin of all positions of the track, in the fixed frame [m]."""
+    """(n, 3), fixed origin of all positions of the track, in the fixed frame [m]."""
     state: Floats
-    """(29,), linearisation point: the variables when the last observation was marginalised."""
+    """(n, 29), linearisation point: the variables when the last observation was marginalised."""
     step: Floats
-    """(29,), minimum of the quadratic form minus `state`."""
+    """(n, 29), minimum of the quadratic form minus `state`."""
     information: Floats
-    """(29, 29), Hessian of the quadratic form."""
+    """(n, 29, 29), Hessian of the quadratic form."""
     marginalised_extents: Floats
-    """(4,), sum of the input extents of marginalised observations [m], and their number."""
+    """(n, 4), sum of the input extents of marginalised observations [m], and their number."""
     extent_range: Floats
-    """(2, 3), range of the input extents of all observations, see `articulation.extent_ranges`."""
+    """(n, 2, 3), range of the input extents of all observations, see `extent_ranges`."""
 
 
 class Window(NamedTuple):
@@ -55,24 +53,13 @@ class Window(NamedTuple):
     start: Floats
     """(N - num_new, 9), boxes of the others as estimated in the window before; empty without
     one."""
-    prior: MarginalisationPrior | None = None
-    """From observations before the window."""
+    prior: tuple[MarginalisationPrior, int] | None = None
+    """From observations before the window: a table, and the row in it."""
 
     @property
     def is_warm(self) -> bool:
         """Return whether all observations but the newest have an estimate to start from."""
         return self.num_new == 1 and len(self.start) == len(self.observations) - 1 > 1
-
-    def margin_columns(self) -> range:
-        """
-        Return which observations give labelling margins; each does so in one window only.
-
-        The newest is left to the next window, which has an estimate to start from. Of many, every
-        n-th is taken so that about `MARGIN_OBSERVATIONS` remain.
-
-        """
-        last = len(self.observations) - 1
-        return range(max(0, last - self.num_new), last, 1 + self.num_new // MARGIN_OBSERVATIONS)
 
 
 class Estimates(NamedTuple):
@@ -105,5 +92,5 @@ class Estimate(NamedTuple):
     """First row of the window."""
     end: int
     """The row after its last."""
-    prior: MarginalisationPrior | None = None
-    """For the next window, if this one is full and was solved."""
+    prior: tuple[MarginalisationPrior, int] | None = None
+    """For the next window, if this one is full and was solved: a table, and the row in it."""

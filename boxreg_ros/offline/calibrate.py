@@ -151,11 +151,11 @@ def _errors_of_kind(
     given = [_bare([row[:2] for row in track]) for track in tracks]
     labelled = [_bare([row[::2] for row in track]) for track in tracks]
     decay = CONSTANTS.prior_decay
-    problem, base = stack_windows(given, config, decay)
-    true, true_base = stack_windows(labelled, config, decay)
+    problem, priors = stack_windows(given, config, decay)
+    true, true_priors = stack_windows(labelled, config, decay)
     problem = problem._replace(counts=problem.valid.astype(int))  # as if all boxes had points
     poses = true.boxes[..., POSE]
-    poses[..., :3] += (true_base - base)[:, None]
+    poses[..., :3] += (true_priors.base - priors.base)[:, None]
     # The input may have the opposite heading, for a whole track: yaw is compared modulo 180°.
     half_turns = np.array([2.0, 2.0, 1.0]) * np.pi
     off = problem.boxes[..., ROLL:] - poses[..., 3:]

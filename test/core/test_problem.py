@@ -1,6 +1,7 @@
 """Windows of observations, and batches of windows as padded arrays."""
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.estimation import margin_columns
 from boxreg_ros.core.method import headings
 from boxreg_ros.core.method.arrays import PRIOR as PRIOR_SIZE
 from boxreg_ros.core.method.constants import CONSTANTS
@@ -10,7 +11,7 @@ from boxreg_ros.core.window import MarginalisationPrior
 from boxreg_ros.structures import POSE, ROLL, YAW
 import numpy as np
 import pytest
-from scenes import changed, drive, track_of, window_of
+from scenes import changed, drive, row_of, track_of, window_of
 
 CONFIG = Config()
 
@@ -37,11 +38,11 @@ def with_prior(window, yaw=0.0):
     shared = [*boxes[0, 3:6], *np.zeros(PRIOR_SIZE - 15)]
     step = np.random.default_rng(3).normal(size=PRIOR_SIZE)
     information = np.diag(1.0 + np.arange(PRIOR_SIZE))
-    prior = MarginalisationPrior(
-        base, np.r_[pose.ravel(), shared], step, information, np.array([4, 2, 1, 1]), NO_RANGE
-    )
+    state, extents = np.r_[pose.ravel(), shared], np.array([4, 2, 1, 1])
+    columns = base, state, step, information, extents, NO_RANGE
+    prior = MarginalisationPrior(*(np.array([column]) for column in columns))
     start = boxes[:-1] + 0.01 * np.eye(9)[8]
-    return window._replace(num_new=1, start=start, prior=prior)
+    return window._replace(num_new=1, start=start, prior=(prior, 0))
 
 
 def flipped(window):
@@ -61,12 +62,12 @@ def resolve_headings(boxes, times, valid, known_yaw):
 def test_windows_are_padded():
     lengths = [10, 6, 8, 3]
     many = windows(lengths)
-    problem, base = stack_windows(many, CONFIG)
+    problem, priors = stack_windows(many, CONFIG)
     assert problem.valid.sum(1).tolist() == lengths
     np.testing.assert_allclose(problem.boxes[:, 0, :3], 0)
     assert (np.diff(problem.times) > 0).all()
     for b, (one, n) in enumerate(zip(many, lengths, strict=True)):
-        centers = problem.boxes[b, :n, :3] + base[b]
+        centers = problem.boxes[b, :n, :3] + priors.base[b]
         np.testing.assert_allclose(centers, given(one)[:, :3])
         np.testing.assert_allclose(problem.times[b, :n], 0.1 * np.arange(n), atol=1e-12)
         for i, observation in enumerate(one.observations):
@@ -168,9 +169,9 @@ def test_fast_objects_move_forward(speed, heading):
 
 def test_priors_are_stacked():
     one, other = windows([5, 4])
-    problem, base = stack_windows([with_prior(one), other], CONFIG)
-    prior = with_prior(one).prior
-    np.testing.assert_array_equal(base, [prior.base, given(other)[0, :3]])
+    problem, priors = stack_windows([with_prior(one), other], CONFIG)
+    prior = row_of(with_prior(one).prior)
+    np.testing.assert_array_equal(priors.base, [prior.base, given(other)[0, :3]])
     np.testing.assert_allclose(problem.boxes[:, 0, :3], [[1, 0, 0], [0, 0, 0]])
     np.testing.assert_allclose(problem.prior_mean[0], prior.state + prior.step, atol=1e-12)
     np.testing.assert_allclose(
@@ -216,15 +217,16 @@ def test_a_solved_window_starts_from_its_estimates():
     known[:3, 0] = 0.2
     np.testing.assert_allclose(problem.start[0] - problem.boxes[0], known, atol=1e-12)
     # The newest of the window before updates the margins now, at its estimate.
-    assert list(window.margin_columns()) == [2]
-    assert list(window._replace(num_new=4, start=solved[:0]).margin_columns()) == [0, 1, 2]
+    new = window._replace(num_new=4, start=solved[:0])
+    first, step, counts = margin_columns([window, new], np.array([4, 4]))
+    assert (first.tolist(), step.tolist(), counts.tolist()) == ([2, 0], [1, 1], [1, 3])
 
 
 def test_a_part_of_a_problem_has_the_observations_asked_for():
     # Of five and four boxes: two of the first window, one of the second, which is padded.
     one, other = windows([5, 4])
     problem, _ = stack_windows([with_prior(one), other], CONFIG)
-    part = problem.part([1, 0], [[2], [1, 3]])
+    part = problem.part(*map(np.array, ([1, 0], [2, 1], [1, 2], [1, 2])))
     np.testing.assert_array_equal(part.valid, [[True, False], [True, True]])
     for name in ('boxes', 'start', 'first', 'counts', 'origins', 'ground', 'pinned'):
         whole = getattr(problem, name)

@@ -411,9 +411,8 @@ def test_a_new_track_of_a_known_id_has_no_prior(estimate, no_extent_law):
     whole = stream_of([track_of(drive(30), np.random.default_rng(0), 'a')])
     registrar = BoxRegistrar(config)
     fed(registrar, whole[:8])
-    assert (
-        registrar._tracks['a'].prior.marginalised_extents[3] == 3
-    )  # of 8, five are still in the window
+    table, row = registrar._tracks['a'].prior
+    assert table.marginalised_extents[row, 3] == 3  # of 8, five are still in the window
     results = fed(registrar, whole[22:23])
     assert registrar._tracks['a'].prior is None
     results += fed(registrar, whole[23:]) + registrar.flush()

@@ -23,8 +23,10 @@ class Tested(NamedTuple):
     ----------
     results : array, shape (B, N)
         One of `ACCEPTED` and the others; padding is accepted.
-    held : array, shape (B, N)
-        Points in each refined box, or near it.
+    boxes : array, shape (B, N, 9)
+        The refined boxes, angles within [-pi, pi).
+    near_points : array, shape (B, N, 2)
+        Points in each refined box, or near it, and the others of its observation.
     ranges : array, shape (B, 2, 3)
         Of the input extents, see `extent_ranges`: those of the windows before, widened.
     is_finite : array, shape (B,)
@@ -33,7 +35,8 @@ class Tested(NamedTuple):
     """
 
     results: Any
-    held: Any
+    boxes: Any
+    near_points: Any
     ranges: Any
     is_finite: Any
 
@@ -78,8 +81,19 @@ def input_poses(boxes):
     return poses
 
 
+@loop
+def fill_box(pose, extent, base, box):
+    """Write a box (9,) by its pose relative to `base` (3,), its angles within [-pi, pi)."""
+    for k in range(3):
+        box[k] = pose[k] + base[k]
+        box[3 + k] = extent[k]
+        box[6 + k] = (pose[3 + k] + np.pi) % (2 * np.pi) - np.pi
+
+
 @kernel
-def accept(first, last, problem, poses, extents, covariances, margin, span, constants, found):
+def accept(
+    first, last, problem, base, poses, extents, covariances, margin, span, constants, found
+):
     """
     Test the refined boxes of windows `first` to `last`.
 
@@ -93,6 +107,8 @@ def accept(first, last, problem, poses, extents, covariances, margin, span, cons
         First window, and the one after the last.
     problem : Problem
         Input of the batch.
+    base : array, shape (B, 3)
+        Origin of its centres in the fixed frame [m].
     poses, extents : array, shapes (B, N, 6) and (B, N, 3)
         The refined boxes [m, rad].
     covariances : array, shape (B, N, 6, 6)
@@ -123,13 +139,15 @@ def accept(first, last, problem, poses, extents, covariances, margin, span, cons
             is_finite = are_finite(pose) and are_finite(covariances[b, n].ravel())
             is_finite &= are_finite(extent) and min(extent[0], extent[1], extent[2]) > 0.0
             found.is_finite[b] &= is_finite
-            found.results[b, n], found.held[b, n] = ACCEPTED, 0
+            fill_box(pose, extent, base[b], found.boxes[b, n])
+            found.results[b, n] = ACCEPTED
             if n >= length:
                 continue
             if problem.is_moving:
                 fill_velocity(poses[b], times, n, length, velocity)
             held = count_held(b, n, problem, velocity, pose, extent, margin, room)
-            found.held[b, n] = held
+            found.near_points[b, n, 0] = held
+            found.near_points[b, n, 1] = problem.counts[b, n] - held
             least = kept_part * problem.counts[b, n] - constants.min_face_points
             if held < least:  # at most: counting those of the input boxes takes time
                 if not len(given):

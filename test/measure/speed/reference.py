@@ -49,7 +49,7 @@ def compare(config: Config, count: int, references: int) -> dict[str, float]:
 
     """
     windows, truth = make_windows(count, config.window, 128, config)
-    problem, base = stack_windows(windows, config, CONSTANTS.prior_decay)
+    problem, priors = stack_windows(windows, config, CONSTANTS.prior_decay)
 
     def solved(problem: Problem, is_warm: bool) -> Solution:
         model = InputModel(config.faces)
@@ -87,7 +87,7 @@ def compare(config: Config, count: int, references: int) -> dict[str, float]:
         pairs = zip(single, found, strict=True)
         values = [_Fit(one, config).value(solution) for one, solution in pairs]
         result[f'value, {name}'] = float(np.mean(values))
-        rows = zip(single, found, base, truth, strict=False)
+        rows = zip(single, found, priors.base, truth, strict=False)
         iou[name] = np.array([_iou(p, s, b, t, name == 'input') for p, s, b, t in rows])
         result[f'IoU, {name}'] = float(iou[name].mean())
     # A window has several minima; in which of them a solver ends is chance.
