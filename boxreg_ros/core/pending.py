@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from math import dist, inf
+from math import hypot, inf
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.method.margins import MIN_HITS
@@ -292,15 +292,14 @@ class ObservedTrack:
             return None
         first, latest = recent[0], recent[-3]
         duration_ns = latest.stamp_ns - first.stamp_ns
-        first_x, first_y, *_ = first.place
+        first_x, first_y, _, _ = first.place
         latest_x, latest_y, _, length = latest.place
         for entry in (recent[-1], recent[-2]):
             elapsed_ns = entry.stamp_ns - latest.stamp_ns
             part = elapsed_ns / duration_ns
-            x = latest_x + part * (latest_x - first_x)
-            y = latest_y + part * (latest_y - first_y)
-            gate = length / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9
-            if dist(entry.place[:2], (x, y)) < gate:
+            off_x = entry.place[0] - latest_x - part * (latest_x - first_x)
+            off_y = entry.place[1] - latest_y - part * (latest_y - first_y)
+            if hypot(off_x, off_y) < length / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9:
                 return None
         moved = [copy(entry) for entry in self.entries[-2:]]
         del self.entries[-2:]
@@ -319,5 +318,6 @@ class ObservedTrack:
         first = max(begin, end - length)
         self.starts = table.boxes[first : min(first + len(self.entries), end)]
         for row, entry in enumerate(entries, begin):
-            if not entry.is_settled:
-                entry.array.estimates[entry.row] = table, row
+            array = entry.array
+            if array.num_unsettled > 0 and not entry.is_settled:
+                array.estimates[entry.row] = table, row

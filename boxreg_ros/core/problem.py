@@ -9,7 +9,7 @@ numbers each and the shared variables s of `method.arrays`, the same for all obs
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, GAP, PIVOT, POSE, PRIOR, SHARED
@@ -139,13 +139,12 @@ class Problem(NamedTuple):
         Return the windows `rows` (b,) with some of their observations, padded to the most of one.
 
         Of each these are so many (b,), at least one, from the `first` on, every `step`-th.
-        Marginalised observations are left out, with their prior and their extents.
+        Marginalised observations are left out: there are no priors, and no extents of theirs.
 
         """
         row, last = rows[:, None], lengths[:, None] - 1
         place = np.arange(lengths.max())
         column = first[:, None] + step[:, None] * np.minimum(place, last)
-        b = len(rows)
         return self._replace(
             boxes=self.boxes[row, column],
             start=self.start[row, column],
@@ -157,9 +156,9 @@ class Problem(NamedTuple):
             first=self.first[row, column],
             counts=self.counts[row, column],
             pinned=self.pinned[row, column],
-            prior_mean=np.zeros((b, PRIOR)),
-            prior_information=np.zeros((b, PRIOR, PRIOR)),
-            marginalised_extents=np.zeros((b, 4)),
+            prior_mean=self.prior_mean[:0],
+            prior_information=self.prior_information[:0],
+            marginalised_extents=np.zeros((len(rows), 4)),
             kind=self.kind[rows],
             of_class=self.of_class[rows],
         )
@@ -202,8 +201,9 @@ class Problem(NamedTuple):
 
         """
         B, N = self.counts.shape
-        pose = np.repeat(self.valid[..., None].astype(np.float64), POSE, axis=2)
-        shared = np.ones((B, number))
+        free = np.ones((B, POSE * N + number))
+        pose, shared = free[:, :-number].reshape(B, N, POSE), free[:, -number:]
+        pose[:] = self.valid[..., None]
         if config.mode == 'bev':
             pose[..., [2, 3, 4]] = 0.0
             shared[:, 2] = 0.0
@@ -211,7 +211,7 @@ class Problem(NamedTuple):
             shared[:, EXTENT:BIAS] = 0.0
         if not config.ingredients.input_bias:
             shared[:, BIAS:GAP] = 0.0
-        return np.concatenate([pose.reshape(B, POSE * N), shared], axis=1)
+        return free
 
 
 def group_windows(windows: Sequence[Window], config: Config) -> list[list[int]]:
@@ -296,7 +296,7 @@ def stack_windows(
 
 def _priors(windows: Sequence[Window], first: Floats) -> MarginalisationPrior:
     """Return copies of the priors; those of others have no information, and the base `first`."""
-    given = [window.prior for window in windows]
+    given: list[Any] = [window.prior for window in windows]
     if None in given:
         B = len(given)
         unknown = MarginalisationPrior(

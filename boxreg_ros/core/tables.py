@@ -19,10 +19,12 @@ def by_table(items: Sequence[tuple[Any, int]]) -> list[tuple[Any, Ints, Ints]]:
     owners, rows = zip(*items, strict=True) if items else ((), ())
     ids = list(map(id, owners))
     of_id = dict(zip(ids, owners, strict=True))
+    row = np.array(rows, int)
+    if len(of_id) == 1:
+        return [(owners[0], np.arange(len(row)), row)]
     numbers = dict(zip(of_id, range(len(of_id)), strict=True))
     kind = np.min_scalar_type(len(of_id))  # small numbers are fast to sort
     number = np.fromiter(map(numbers.__getitem__, ids), kind, len(ids))
-    row = np.fromiter(rows, int, len(ids))
     order = np.argsort(number, kind='stable')
     ends = np.cumsum(np.bincount(number, minlength=len(of_id))).tolist()
     parts = [order[begin:end] for begin, end in pairwise([0, *ends])]
