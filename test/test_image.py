@@ -132,14 +132,16 @@ TWO_PROCESSES = (
     KERNELS
     + """\
 from boxreg_ros.config import Config
+from boxreg_ros.core import solver
 from boxreg_ros.io.warm_up import *
 config = Config(estimate='final')
-warm_up_estimation(config)
-before = kernels()
-warm_up_observation(config.objective, config.mode)
+warm_up_solver(config)
+before, fit = kernels(), solver.fit
+warm_up_others(config.objective, config.mode, has_labels=True)
 assert before and kernels() - before
-before = kernels()
+before, solver.fit = kernels(), fit
 warm_up(config)
+warm_up_labels(config)
 warm_up_followed(config)
 print(sorted(kernels() - before))
 """
@@ -160,7 +162,7 @@ def test_one_process_compiles_all_where_there_cannot_be_two(monkeypatch):
         raise BlockingIOError('Resource temporarily unavailable')
 
     monkeypatch.setattr(warm_up, 'Popen', refuse)
-    with warm_up.compiled_beside(Config()):
+    with warm_up.compiled_beside(Config(), has_labels=False):
         assert numba.njit(lambda: 8)() == 8
 
 
@@ -175,7 +177,7 @@ def test_the_second_process_ends_with_an_interrupted_one(monkeypatch):
         return begun[0]
 
     monkeypatch.setattr(warm_up, 'Popen', wait_long)
-    with pytest.raises(KeyboardInterrupt), warm_up.compiled_beside(Config()):
+    with pytest.raises(KeyboardInterrupt), warm_up.compiled_beside(Config(), has_labels=False):
         numba.njit(lambda: 8)()
         raise KeyboardInterrupt
     assert begun[0].poll() is not None
@@ -187,7 +189,7 @@ def test_the_second_process_takes_no_module_of_its_folder(tmp_path, monkeypatch)
 
     (tmp_path / 'boxreg_ros.py').write_text("open('taken', 'w').close()")
     monkeypatch.chdir(tmp_path)
-    with compiled_beside(Config()):
+    with compiled_beside(Config(), has_labels=False):
         numba.njit(lambda: 8)()
     assert not (tmp_path / 'taken').exists()
 

@@ -65,10 +65,12 @@ def warm_up_solver(config: Config) -> None:
     rows = [Observation(table, row) for row in range(quick.window)]
     window = Window('1', 'car', rows, quick.window, np.zeros((0, 9)))
     problem, _ = stack_windows([window], quick, model.constants.prior_decay)
-    inputs, constants = np.ones(len(KINDS), INPUTS), model.constants.with_settings(quick)
+    # Deviations of 0 and correlations of 1 would end the search before it begins.
+    inputs, constants = np.full(len(KINDS), 0.5, INPUTS), model.constants.with_settings(quick)
     plan = solver.SolverPlan.choose(quick, is_warm=False)
     batch = solver.start(problem, quick, plan, inputs)
     batch.sums.terms[:] = np.zeros((), TERMS)
+    batch.solution.poses[0, -1, 0] += 0.1  # off its input, so that there is something to search
     solver.fit(batch, inputs, np.zeros(1, int), constants, is_last=True, may_settle=False)
 
 
