@@ -37,7 +37,7 @@ def main(case: str, path: Path, folder: Path) -> dict[str, float]:
     with np.load(path) as arrays:
         work = {'tick': _tick, 'refine': _refine, 'follow': _follow}[case.partition(' ')[0]]
         cpu = work(arrays)
-    return {'cpu': cpu, 'memory': _megabytes(resource.RUSAGE_SELF)}
+    return {'cpu': cpu, 'memory': _peak()}
 
 
 def _command(case: str, path: Path, folder: Path) -> dict[str, float]:
@@ -51,12 +51,15 @@ def _command(case: str, path: Path, folder: Path) -> dict[str, float]:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {
         'cpu': used.ru_utime + used.ru_stime,
-        'memory': _megabytes(resource.RUSAGE_CHILDREN),
+        'memory': used.ru_maxrss / 1024,
     }
 
 
-def _megabytes(who: int) -> float:
-    return resource.getrusage(who).ru_maxrss / 1024
+def _peak() -> float:
+    """Return the peak of this process [MB]; `getrusage` has that of its parent, if larger."""
+    lines = Path('/proc/self/status').read_text(encoding='ascii').splitlines()
+    (peak,) = (line.split()[1] for line in lines if line.startswith('VmHWM:'))
+    return int(peak) / 1024
 
 
 def _tick(arrays: Mapping[str, Any]) -> float:
