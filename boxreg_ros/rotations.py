@@ -29,13 +29,6 @@ Derived: the elements of R that give roll and yaw have this magnitude and roundi
 
 """
 
-# Each element of R is made of two products of elements of the quaternion, all in one step for
-# few ones: ``1 - 2 (y y + z z)``, ``2 (x y - z w)``, ... -0.0 adds nothing, also to -0.0.
-LEFT = np.array([[[1, 0, 0], [0, 0, 1], [0, 1, 0]], [[2, 2, 1], [2, 2, 0], [1, 0, 1]]])
-RIGHT = np.array([[[1, 1, 2], [1, 0, 2], [2, 2, 0]], [[2, 3, 3], [3, 2, 3], [3, 3, 1]]])
-SIGNS = np.array([[1.0, -1.0, 1.0], [1.0, 1.0, -1.0], [-1.0, 1.0, 1.0]])
-OF_MATRIX, SCALES = np.where(np.eye(3), [[[1.0]], [[-2.0]]], [[[-0.0]], [[2.0]]])
-
 
 @overload
 def wrap_angle(angle: Tensor) -> Tensor: ...
@@ -113,9 +106,17 @@ def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:
         If the norm of a quaternion is zero.
 
     """
-    quaternions = _unit(quaternion_xyzw)
-    products = quaternions.take(LEFT, -1) * quaternions.take(RIGHT, -1)  # (..., 2, 3, 3)
-    R: Floats = OF_MATRIX + SCALES * (products[..., 0, :, :] + SIGNS * products[..., 1, :, :])
+    x, y, z, w = np.moveaxis(_unit(quaternion_xyzw), -1, 0)
+    R = np.empty((*x.shape, 3, 3))  # filled in place, as in `matrix_from_rpy`
+    R[..., 0, 0] = 1 - 2 * (y * y + z * z)
+    R[..., 0, 1] = 2 * (x * y - z * w)
+    R[..., 0, 2] = 2 * (x * z + y * w)
+    R[..., 1, 0] = 2 * (x * y + z * w)
+    R[..., 1, 1] = 1 - 2 * (x * x + z * z)
+    R[..., 1, 2] = 2 * (y * z - x * w)
+    R[..., 2, 0] = 2 * (x * z - y * w)
+    R[..., 2, 1] = 2 * (y * z + x * w)
+    R[..., 2, 2] = 1 - 2 * (x * x + y * y)
     return R
 
 
