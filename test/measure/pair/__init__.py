@@ -33,6 +33,9 @@ TICK_POINTS = 130_000
 TICKS = 20
 """Ticks with full windows, after those that fill them."""
 WINDOWS = 64
+WINDOW_POINTS = 512
+"""Most points of a sweep in a window: half as many as cars have that are near, and as many as it
+takes for windows in one place to cost the code of 27 November five times those apart."""
 APART = 100.0
 """Distance of windows that share no point [m]."""
 SEEDS = 1000
@@ -143,7 +146,7 @@ def _stream(tracks: int) -> dict[str, Any]:
 def _tracks(apart: float) -> dict[str, Any]:
     """Return tracks of one window each, so far apart [m]."""
     config = Config()
-    windows, _ = make_windows(WINDOWS, config.window, config.sampling.points, config)
+    windows, _ = make_windows(WINDOWS, config.window, WINDOW_POINTS, config)
     shifts = np.zeros((WINDOWS, 1, 3))
     shifts[:, 0, 0] = apart * np.arange(WINDOWS)
     rows = [window.observations for window in windows]
