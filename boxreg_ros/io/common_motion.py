@@ -1,8 +1,10 @@
 """
 Check of the motion of the sensor by the objects: most of those that are parked move alike.
 
-With transforms that stand still they move as the sensor does, the other way. With inverse ones,
-those of the world in the frame of the LiDAR, they move with the sensor, about twice as fast.
+With transforms that stand still they move as the sensor does, the other way; with those of a
+motion at another scale by the part of it that is missing, or too much; with those whose axes are
+not the LiDAR's, across. With inverse ones, those of the world in the frame of the LiDAR, they
+move with the sensor, about twice as fast.
 
 """
 
@@ -14,6 +16,7 @@ from boxreg_ros.io.id_assignment import Tracker
 from boxreg_ros.io.transforms import Edge
 from boxreg_ros.structures import Floats
 import numpy as np
+from numpy.typing import NDArray
 
 # All of these are chosen.
 LOOK_PERIOD_NS = 5 * 10**8
@@ -34,17 +37,39 @@ MAX_RELATIVE_DIFFERENCE = 0.1
 """The same as a part of the velocity that inverse transforms give."""
 COMMON_SHARE = 0.5
 """Part of all objects that move alike: of the traffic past a sensor at the roadside it is less."""
+MOST_STANDING = 0.2
+"""Objects that stand still as a part of those that move alike: one may drive as the error is."""
+FEWEST_BESIDE = 2
+"""Objects that move alike on each side of the sensor: traffic that it passes is on one."""
+SCALES = (0.2, 0.8), (1.5, 4.0)
+"""Ranges of a scale that is named: slower traffic on both sides would have a larger one."""
+MIN_YAW_ERROR = 20.0
+"""Smallest error of a yaw that is named [deg]."""
 
+REMEDY = '--odometry TOPIC or --fixed-frame FRAME (node: fixed_frame:=FRAME)'
 STILL = (
-    'while {} stands still, as parked objects do where the vehicle drives: if it drives, boxes '
-    'are as wrong as this motion: name another source of it, --odometry TOPIC or --fixed-frame '
-    'FRAME (node: fixed_frame:=FRAME), or mend its publisher'
+    'while {names} stands still, as parked objects do where the vehicle drives: if it drives, '
+    f'boxes are as wrong as this motion: name another source of it, {REMEDY}, or mend its '
+    'publisher'
 )
 INVERSE = (
-    'as parked objects do by inverse poses, and none stands still: if they are parked, {} has the '
-    'poses of the world in the frame of the LiDAR, and boxes are as wrong as this motion: invert '
-    'each pose where they are written, or name another source of the motion, --odometry TOPIC or '
-    '--fixed-frame FRAME (node: fixed_frame:=FRAME)'
+    'as parked objects do by inverse poses, and hardly any stands still: if they are parked, '
+    '{names} has the poses of the world in the frame of the LiDAR, and boxes are as wrong as this '
+    'motion: invert each pose where they are written, or name another source of the motion, '
+    f'{REMEDY}'
+)
+SCALED = (
+    'on both sides, as parked objects do by a motion at {scale:.2g} times its size, and hardly '
+    'any stands still: if they are parked, {names} is not in metres, or of another scale, and '
+    'boxes are as wrong as this motion: mend its publisher, or name another source of it, '
+    f'{REMEDY}'
+)
+TURNED = (
+    'on both sides, as parked objects do by poses with a yaw that is off by {turn:.0f} degrees, '
+    'and hardly any stands still: if they are parked, {names} has poses of other axes than those '
+    'of the LiDAR, and boxes are as wrong as this motion: see whether the static transform from '
+    'the vehicle to the LiDAR is missing or wrong, or name another source of the motion, '
+    f'{REMEDY}'
 )
 
 
@@ -63,7 +88,7 @@ class CommonMotionCheck:
     def forget(self) -> None:
         """Forget the looks so far: time has gone back, or objects are new."""
         self._looks = 0
-        self._was_still = False
+        self._fault = ''
         self._looked_ns: int | None = None
 
     def add(
@@ -94,48 +119,93 @@ class CommonMotionCheck:
             return
         self._looked_ns = stamp_ns
         moving = [edge for edge in route if not edge.is_static]
-        is_still = all(edge.way(stamp_ns - STILL_NS) <= STILL_WAY for edge in moving)
-        velocities = tracker.known_velocities(MIN_SPEED / 2)
-        alike, common = _alike(velocities)
-        stand = bool((np.linalg.norm(velocities, axis=1) < MIN_SPEED / 2).any())
-        is_inverse = alike and not stand and _is_inverse(common, stamp_ns, pose_of)
-        if not moving or not ((is_still and alike) or is_inverse):
-            self._looks = 0
-            return
-        self._looks = self._looks + 1 if is_still == self._was_still else 1
-        self._was_still = is_still
-        if self._looks == MIN_LOOKS:
+        centers, velocities = tracker.known_motion(MIN_SPEED / 2)
+        is_alike = _are_alike(velocities)
+        fault, scale, turn = '', 1.0, 0.0
+        if moving and is_alike.any():
+            if all(edge.way(stamp_ns - STILL_NS) <= STILL_WAY for edge in moving):
+                fault = STILL
+            elif _standing(velocities) <= MOST_STANDING * is_alike.sum():
+                poses = pose_of(stamp_ns - LOOK_PERIOD_NS), pose_of(stamp_ns)
+                fault, scale, turn = _fault(centers[is_alike], velocities[is_alike], *poses)
+        self._looks = self._looks + 1 if fault == self._fault else 1
+        self._fault = fault
+        if fault and self._looks == MIN_LOOKS:
             names = ', '.join(f'{edge.parent} -> {edge.child}' for edge in moving)
+            speed = np.linalg.norm(np.median(velocities, axis=0))
             self.finding = (
-                f'{alike} of {len(velocities)} objects move alike, at '
-                f'{np.linalg.norm(common):.1f} m/s, '
-                f'{(STILL if is_still else INVERSE).format(names)}'
+                f'{is_alike.sum()} of {len(velocities)} objects move alike, at {speed:.1f} m/s, '
+                f'{fault.format(names=names, scale=scale, turn=turn)}'
             )
 
 
-def _is_inverse(common: Floats, stamp_ns: int, pose_of: Callable[[int], Floats | None]) -> bool:
-    """
-    Return whether parked objects would have a velocity (3,) [m/s] by the inverse of the poses.
-
-    Of a sensor with the velocity v and the rotation R as they are stated, that is v + R v. In a
-    queue with the sensor it is v, which differs by more than errors do unless the sensor is slow.
-
-    """
-    before, now = pose_of(stamp_ns - LOOK_PERIOD_NS), pose_of(stamp_ns)
-    if before is None or now is None:
-        return False
-    velocity = (now[:3, 3] - before[:3, 3]) / (LOOK_PERIOD_NS * 1e-9)
-    expected = velocity + now[:3, :3] @ velocity
-    allowed = MAX_DIFFERENCE + MAX_RELATIVE_DIFFERENCE * np.linalg.norm(expected)
-    return bool(np.linalg.norm(common - expected) < allowed < np.linalg.norm(velocity) / 2)
+def _standing(velocities: Floats) -> int:
+    """Return how many of the velocities (K, 3) are those of objects that stand still."""
+    return int((np.linalg.norm(velocities, axis=1) < MIN_SPEED / 2).sum())
 
 
-def _alike(velocities: Floats) -> tuple[int, Floats]:
-    """Return how many of the velocities (K, 3) are alike, 0 if few are, and that of these."""
+def _are_alike(velocities: Floats) -> NDArray[np.bool_]:
+    """Return which of the velocities (K, 3) are alike; none, if those are few or slow."""
     if len(velocities) < FEWEST_ALIKE:
-        return 0, np.zeros(3)
+        return np.zeros(len(velocities), bool)
     middle = np.median(velocities, axis=0)
-    count = int((np.linalg.norm(velocities - middle, axis=1) < MAX_DIFFERENCE).sum())
+    is_alike = np.linalg.norm(velocities - middle, axis=1) < MAX_DIFFERENCE
     is_fast = np.linalg.norm(middle) > MIN_SPEED
-    is_common = is_fast and count >= max(FEWEST_ALIKE, COMMON_SHARE * len(velocities))
-    return (count if is_common else 0), middle
+    is_common = is_fast and is_alike.sum() >= max(FEWEST_ALIKE, COMMON_SHARE * len(velocities))
+    return np.asarray(is_alike & is_common)
+
+
+def _fault(
+    centers: Floats, velocities: Floats, before: Floats | None, now: Floats | None
+) -> tuple[str, float, float]:
+    """
+    Return by which fault of the poses parked objects would have these velocities.
+
+    Parameters
+    ----------
+    centers, velocities : array, shape (K, 3)
+        Of the objects that move alike [m], [m/s].
+    before, now : array, shape (4, 4), or None
+        Poses of the sensor as they are stated, `LOOK_PERIOD_NS` apart; None where not known.
+
+    Returns
+    -------
+    fault : str
+        Its text; empty for none.
+    scale, turn : float
+        Of the stated motion to that by the objects; angle between both [deg].
+
+    Notes
+    -----
+    Let the sensor have the velocity v and the rotation R, as they are stated, and the objects the
+    velocity c. If they are parked, the velocity of the sensor is v - c. By inverse poses it is
+    -R v, at another scale it is along v, by other axes it is as fast as v. In a queue with the
+    sensor it is 0, which differs from all of these by more than errors do, unless the sensor is
+    slow.
+
+    """
+    if before is None or now is None:
+        return '', 1.0, 0.0
+    stated = (now[:3, 3] - before[:3, 3]) / (LOOK_PERIOD_NS * 1e-9)
+    speed = np.linalg.norm(stated)
+    common = np.median(velocities, axis=0)
+    expected = stated + now[:3, :3] @ stated
+    allowed = MAX_DIFFERENCE + MAX_RELATIVE_DIFFERENCE * np.linalg.norm(expected)
+    if np.linalg.norm(common - expected) < allowed < speed / 2:
+        return INVERSE, 1.0, 0.0
+    (sx, sy), (tx, ty) = stated[:2], (stated - common)[:2]
+    left = (centers - now[:3, 3]) @ (-ty, tx, 0.0)
+    is_beside = min((left > 0).sum(), (left < 0).sum()) >= FEWEST_BESIDE
+    shown = np.hypot(tx, ty)
+    if not is_beside or min(speed, shown) < MIN_SPEED / 2:
+        return '', 1.0, 0.0
+    scale, turn = (
+        float(speed / shown),
+        np.degrees(np.arctan2(sx * ty - sy * tx, sx * tx + sy * ty)),
+    )
+    is_along = abs(tx * sy - ty * sx) < MAX_DIFFERENCE * speed and abs(turn) < 90
+    if is_along and any(low <= scale <= high for low, high in SCALES):
+        return SCALED, scale, turn
+    if abs(turn) >= MIN_YAW_ERROR and abs(speed - shown) < MAX_DIFFERENCE:
+        return TURNED, scale, abs(turn)
+    return '', 1.0, 0.0

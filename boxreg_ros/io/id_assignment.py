@@ -193,10 +193,11 @@ class Tracker:
         """Return the ids of the tracks that may go on."""
         return self._tracks.ids
 
-    def known_velocities(self, max_deviation: float) -> Floats:
-        """Return the velocities (K, 3) of the tracks that err by less than this [m/s]."""
+    def known_motion(self, max_deviation: float) -> tuple[Floats, Floats]:
+        """Return centres and velocities (K, 3) of the tracks of which these err less [m/s]."""
         tracks = self._tracks
-        return tracks.velocities[tracks.covariances[:, 2] < max_deviation**2]
+        is_known = tracks.covariances[:, 2] < max_deviation**2
+        return tracks.centers[is_known], tracks.velocities[is_known]
 
     def identify(self, boxes: BoxArray) -> BoxArray:
         """

@@ -1,4 +1,4 @@
-"""Objects that all move alike, by transforms that stand still or are inverse ones."""
+"""Objects that all move alike, by transforms that stand still, are inverse, scaled or turned."""
 
 from functools import partial
 
@@ -27,28 +27,31 @@ def known(tree, stamp_ns):
 
 
 def finding(
-    velocities, ego=0.0, stands_from=np.inf, noise=0.2, seconds=5.0, heading=0.0, is_inverse=False
-):
+    velocities, ego=0.0, stands_from=np.inf, noise=0.2, seconds=5.0, heading=0.0, is_inverse=False,
+    scale=1.0, turn=0.0, sides=(-8.0, 8.0),
+):  # fmt: skip
     """
     Return what is found of objects with some velocities (K, 2) over ground [m/s].
 
     The sensor drives along x with the speed `ego`, in a frame with the yaw `heading`; its
-    transform repeats the pose of the time `stands_from` [s] after it, or is the inverse one, and
-    the boxes are where the transform places them.
+    transform repeats the pose of the time `stands_from` [s] after it, or is the inverse one, or
+    that of `scale` times the way, or with the yaw off by `turn` [rad], and the boxes are where the
+    transform places them.
 
     """
     rng = np.random.default_rng(0)
     tree, check, ids = TransformTree(), CommonMotionCheck(), IdCheck(Config().max_gap)
     count = len(velocities)
     names = tuple(map(str, range(count)))
-    begin = np.c_[np.linspace(-60, 60, count), np.tile([-8.0, 8.0], count)[:count]]
+    begin = np.c_[np.linspace(-60, 60, count), np.tile(sides, count)[:count]]
     for k in range(round(10 * seconds)):
         t = k / 10
-        true, stated = ego * t, ego * min(t, stands_from)
+        true, stated = ego * t, scale * ego * min(t, stands_from)
         stamp_ns = S + k * S // 10
         boxes = np.tile([0, 0, 0.8, 4.5, 1.9, 1.6, 0, 0, 0.0], (count, 1))
         boxes[:, :2] = begin + t * np.array(velocities, float) + rng.normal(0, noise, (count, 2))
         T_stated = pose_of(heading, stated)
+        T_stated[:3, :3] = T_stated[:3, :3] @ pose_of(turn, 0.0)[:3, :3]
         if is_inverse:
             T_stated = inverse(T_stated)
         placed = np.c_[boxes[:, :3], np.ones(count)] - [true, 0, 0, 0]  # in the sensor
@@ -75,7 +78,32 @@ def test_a_transform_that_stands_still_while_the_vehicle_drives_is_named(stands_
 def test_inverse_poses_are_named(heading):
     found = finding(STREET, ego=8.0, heading=heading, is_inverse=True)
     assert '6 of 9 objects move alike, at ' in found
-    assert 'as parked objects do by inverse poses, and none stands still' in found
+    assert 'as parked objects do by inverse poses, and hardly any stands still' in found
+
+
+@pytest.mark.parametrize('heading', [0.0, 2.5])
+@pytest.mark.parametrize('scale', [0.278, 0.5, 1.609, 2.237, 3.6])
+def test_a_motion_at_another_scale_is_named(scale, heading):
+    found = finding(STREET, ego=8.0, heading=heading, scale=scale)
+    assert '6 of 9 objects move alike, at ' in found
+    assert 'on both sides, as parked objects do by a motion at ' in found
+    named = float(found.split('by a motion at ')[1].split(' ')[0])
+    assert named == pytest.approx(scale, rel=0.1)
+
+
+@pytest.mark.parametrize('turn', [0.6, np.pi / 2, -2.2])
+@pytest.mark.parametrize('heading', [0.0, 1.9])
+def test_poses_of_other_axes_than_those_of_the_lidar_are_named(heading, turn):
+    found = finding(STREET, ego=8.0, heading=heading, turn=turn)
+    assert '6 of 9 objects move alike, at ' in found
+    assert 'on both sides, as parked objects do by poses with a yaw that is off by ' in found
+    named = float(found.split('that is off by ')[1].split(' ')[0])
+    assert named == pytest.approx(np.degrees(abs(turn)), abs=8)
+
+
+@pytest.mark.parametrize('velocity', [(-9, 0), (5, 0)])
+def test_traffic_on_one_side_shows_no_fault(velocity):
+    assert finding([velocity] * 5, 9.0, sides=(6.0, 9.0)) == ''
 
 
 @pytest.mark.parametrize(
