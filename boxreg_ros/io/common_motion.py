@@ -46,30 +46,30 @@ SCALES = (0.2, 0.8), (1.5, 4.0)
 MIN_YAW_ERROR = 20.0
 """Smallest error of a yaw that is named [deg]."""
 
-REMEDY = '--odometry TOPIC or --fixed-frame FRAME (node: fixed_frame:=FRAME)'
+OTHER_MOTION = '--odometry TOPIC or --fixed-frame FRAME (node: fixed_frame:=FRAME)'
 STILL = (
     'while {names} stands still, as parked objects do where the vehicle drives: if it drives, '
-    f'boxes are as wrong as this motion: name another source of it, {REMEDY}, or mend its '
+    f'boxes are as wrong as this motion: name another source of it, {OTHER_MOTION}, or mend its '
     'publisher'
 )
 INVERSE = (
     'as parked objects do by inverse poses, and hardly any stands still: if they are parked, '
     '{names} has the poses of the world in the frame of the LiDAR, and boxes are as wrong as this '
     'motion: invert each pose where they are written, or name another source of the motion, '
-    f'{REMEDY}'
+    f'{OTHER_MOTION}'
 )
 SCALED = (
     'on both sides, as parked objects do by a motion at {scale:.2g} times its size, and hardly '
     'any stands still: if they are parked, {names} is not in metres, or of another scale, and '
     'boxes are as wrong as this motion: mend its publisher, or name another source of it, '
-    f'{REMEDY}'
+    f'{OTHER_MOTION}'
 )
 TURNED = (
     'on both sides, as parked objects do by poses with a yaw that is off by {turn:.0f} degrees, '
     'and hardly any stands still: if they are parked, {names} has poses of other axes than those '
     'of the LiDAR, and boxes are as wrong as this motion: see whether the static transform from '
     'the vehicle to the LiDAR is missing or wrong, or name another source of the motion, '
-    f'{REMEDY}'
+    f'{OTHER_MOTION}'
 )
 
 
