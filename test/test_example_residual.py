@@ -79,7 +79,7 @@ POSES[1, :3] = 1.0, 2.0, 0.1  # 0.1 m up in 0.2 s: r = 0.5 m/s
 
 
 def constants_of(config):
-    return CONSTANTS.with_settings(config).in_round(False, False).record()
+    return CONSTANTS.with_settings(config).in_round(False, False).record()[0]
 
 
 def weight(config):

@@ -221,8 +221,8 @@ class InputModel:
             tracks = self._tracks_of(k)
             if len(tracks):
                 fill_margins(
-                    tracks, settings[k], GAP_DEVIATIONS[kind], self._occlusion_insets,
-                    self._estimates_margins, record, inputs[k],
+                    k, tracks, settings, GAP_DEVIATIONS[kind], self._occlusion_insets,
+                    self._estimates_margins, record, inputs,
                 )  # fmt: skip
         self.set_population(inputs, config, more, of_fits)
         return inputs

@@ -15,7 +15,7 @@ import numpy as np
 from scenes import drive, shared_of, simulated, track_of
 
 CONSTANTS = constants.CONSTANTS
-RECORD = CONSTANTS.with_settings(Config()).record()
+RECORD = CONSTANTS.with_settings(Config()).record()[0]
 
 
 def refined_tracks():

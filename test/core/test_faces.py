@@ -26,7 +26,7 @@ def visibility(problem):
 def insets(origins, tangent, ring_height=0.0):
     """Return the multiples of occlusion and range inset (2, 6), insets and weights, (6,) each."""
     shares, inset, weight = np.empty((2, 6)), np.empty(6), np.empty(6)
-    record = CONSTANTS.with_settings(CONFIG).record()
+    record = CONSTANTS.with_settings(CONFIG).record()[0]
     fill_insets(origins, ring_height, tangent, no_inputs()[0], record, shares, inset, weight)
     return shares, inset, weight
 

@@ -34,7 +34,7 @@ def problem(poses, seed=0):
 def agreement(seen, poses=None, b=0):
     """Return information (N, 6, 6) and wanted steps (N, 6) of window `b`."""
     poses = seen.boxes[b][:, BOX_POSE] if poses is None else poses
-    terms, record = np.zeros(len(poses), TERMS), CONSTANTS.record()
+    terms, record = np.zeros(len(poses), TERMS), CONSTANTS.record()[0]
     work = empty_shape_work(seen, len(poses), record['cells'])
     agree(b, seen, poses, np.array(BOX[3:6]), record, work, terms)
     return terms['root'] @ terms['root'].swapaxes(1, 2), terms['wanted']

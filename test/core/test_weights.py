@@ -12,7 +12,7 @@ import pytest
 from scenes import drive, no_inputs, problem_of, settings_of
 
 CONFIG = Config()
-RECORD = CONSTANTS.with_settings(CONFIG).record()
+RECORD = CONSTANTS.with_settings(CONFIG).record()[0]
 
 
 def expected_of(problem, inputs=None, b=0):
@@ -30,7 +30,7 @@ def weighed(problem, common, shared=None, **fields):
     for name, value in fields.items():
         terms[name] = value
     shared = common['shared'].copy() if shared is None else shared
-    record = CONSTANTS.with_settings(CONFIG).in_round(False, False).record()
+    record = CONSTANTS.with_settings(CONFIG).in_round(False, False).record()[0]
     holder = np.array([common], COMMON)
     weigh(0, problem, poses, shared, record, empty_axes(N), empty_linearised(), terms, holder[0])
     return terms, holder[0]

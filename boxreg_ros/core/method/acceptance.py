@@ -117,7 +117,7 @@ def accept(
         Points up to this far outside of a box are held [m].
     span : int
         Of `extent_ranges`.
-    constants : record of `Constants`
+    constants : array of one record of `Constants`, shape (1,)
         Of the method.
     found : Tested
         Written; the ranges of the windows before are given.
@@ -126,6 +126,7 @@ def accept(
     M = max(1, problem.counts[first:last].max()) if last > first else 1
     room = _Room(np.empty((3, M)), np.empty((3, M)), np.empty((3, 3)))
     velocity = np.zeros(3)
+    constants = constants[0]
     kept_part = 1 - constants.max_lost_part
     for b in range(first, last):
         length, boxes, times = problem.lengths[b], problem.boxes[b], problem.times[b]

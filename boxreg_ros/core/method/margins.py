@@ -42,12 +42,13 @@ def sum_faces(problem, terms, inputs, constants, sums, logarithms):
         Their face observations.
     inputs : array of `INPUTS`, shape (K,)
         What these were made with, by kind.
-    constants : record of `Constants`
+    constants : array of one record of `Constants`, shape (1,)
         Of the method.
     sums, logarithms : array, shapes (B, 3, 3, 6) and (B, 3)
         Written: see `TRACK`, and of the mean input extents.
 
     """
+    constants = constants[0]
     mean = np.empty(SIZE)
     sums[:] = 0.0
     for b in range(len(terms)):
@@ -130,26 +131,29 @@ def median_extent(tracks, axis, values):
 
 
 @kernel
-def fill_margins(tracks, settings, gap_deviations, occlusion_insets, learns, constants, inputs):
+def fill_margins(k, tracks, settings, gap_deviations, occlusion_insets, learns, constants, inputs):
     """
     Write margins and insets of one kind of objects.
 
     Parameters
     ----------
+    k : int
+        The kind.
     tracks : array of `TRACK`, shape (n,)
-        What at least one track shows.
-    settings : record `CLASS_SETTINGS`
-        Of the kind.
+        What at least one track of it shows.
+    settings : array of `CLASS_SETTINGS`, shape (K,)
+        Of all kinds.
     gap_deviations, occlusion_insets : array, shape (4,)
         Prior deviation of each margin from the one of the settings, and expected insets [m].
     learns : bool
         Whether margins and occlusion insets are estimated; the range inset always is.
-    constants : record of `Constants`
+    constants : array of one record of `Constants`, shape (1,)
         Of the method, with the settings.
-    inputs : record `INPUTS`
-        Of the kind, with its errors: written.
+    inputs : array of `INPUTS`, shape (K,)
+        Of all kinds, with their errors: that of the kind is written.
 
     """
+    constants, settings, inputs = constants[0], settings[k], inputs[k]
     values = np.empty(len(tracks))
     strength = constants.half_weight
     for group in range(GROUPS):

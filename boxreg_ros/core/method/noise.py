@@ -147,6 +147,7 @@ def estimate(residuals, constants, deviation, correlation):
     the labelling margin.
 
     """
+    constants = constants[0]
     B, N, J = residuals.shape
     valid = np.empty((B, N), np.bool_)
     fill_valid(residuals, constants.min_observations, valid)
@@ -182,13 +183,13 @@ def fill_errors(past, found, constants, inputs):
     ----------
     past, found : array of `NOISE`, shape (K,)
         Of other drives, and of this one.
-    constants : record of `Constants`
+    constants : array of one record of `Constants`, shape (1,)
         Of the method.
     inputs : array of `INPUTS`, shape (K,)
         Their errors are written.
 
     """
-    K = len(inputs)
+    constants, K = constants[0], len(inputs)
     for k in range(K):
         of_kind = inputs[k]
         deviation, correlation = of_kind.deviation, of_kind.correlation

@@ -29,13 +29,14 @@ def population_slopes(evidence, constants, median, slopes):
         Of the points of n tracks. Rows of length, width and height: logarithms of the input's;
         corrections to these, over the square of their expected error; the weights of these, 0
         without enough evidence.
-    constants : record of `Constants`
+    constants : array of one record of `Constants`, shape (1,)
         Of the method.
     median, slopes : array, shapes (3,) and (3, 3)
         Written: the medians of the logarithms of extents, and the slopes of the corrections, one
         row for each corrected extent.
 
     """
+    constants = constants[0]
     for m in range(SIZE):
         median[m] = lower_median(evidence[:, 0, m].copy())
     information = constants.slope_deviation**-2

@@ -243,6 +243,7 @@ def agree(b, problem, poses, extents, constants, work, terms):
 @kernel
 def observe_shapes(first, last, rows, problem, poses, shared, constants, terms):
     """Compare the windows `rows[first:last]` with the shapes of their tracks, see `agree`."""
+    constants = constants[0]
     work = empty_shape_work(problem, poses.shape[1], constants.cells)
     for row in range(first, last):
         b = rows[row]

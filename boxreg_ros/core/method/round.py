@@ -84,7 +84,7 @@ def begin(first, last, rows, problem, inputs, free, constants, poses, shared, su
         Noise, margins and population of the input, by kind.
     free : array, shape (B, 6 N + S)
         1 for variables that are estimated, 0 for those held fixed.
-    constants : record of `Constants`
+    constants : array of one record of `Constants`, shape (1,)
         Of the method, with the settings.
     poses, shared : array, shapes (B, N, 6) and (B, S)
         Start of the round.
@@ -94,6 +94,7 @@ def begin(first, last, rows, problem, inputs, free, constants, poses, shared, su
         Written: variables of the windows, and the sum of the residuals there.
 
     """
+    constants = constants[0]
     N = poses.shape[1]
     n = POSE * N
     at, out, A = empty_axes(N), empty_linearised(), empty_matrix(N, shared.shape[1])
@@ -171,6 +172,7 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
         Written.
 
     """
+    constants = constants[0]
     N, S = solution.poses.shape[1], solution.shared.shape[1]
     n = POSE * N
     oldest = np.int64(1)  # for a literal 1 all that sums residuals would be compiled once more
