@@ -2,7 +2,7 @@
 
 import time
 
-from boxreg_ros.core.method.rings import covering_gap, covering_gap_of_many, ring_heights
+from boxreg_ros.core.method.rings import covering_gap, MOST_RANKED, ring_heights, sort
 import numpy as np
 import pytest
 
@@ -69,13 +69,15 @@ def test_half_of_the_range_is_covered_by_smaller_gaps():
     # Gaps .1 .1 .1 .3 .4 of a range of 1: sorted, half of it is reached with the .3.
     values = np.cumsum([0, 0.4, 0.1, 0.3, 0.1, 0.1])
     values = np.random.default_rng(0).permutation(values)
-    assert covering_gap(values, *np.empty((2, 6))) == pytest.approx(0.3)
+    assert covering_gap(values, *np.empty((3, 6))) == pytest.approx(0.3)
 
 
-def test_gaps_of_many_points_are_those_of_all_pairs():
-    values = np.random.default_rng(0).normal(0, 1, 500).round(2)
-    by_pairs = covering_gap(values, *np.empty((2, 500)))
-    assert covering_gap_of_many(values, np.empty(500)) == pytest.approx(by_pairs, rel=1e-9)
+@pytest.mark.parametrize('number', [100, MOST_RANKED + 1])
+def test_equal_values_are_sorted_too(number):
+    values = np.random.default_rng(0).normal(0, 1, number).round(1)
+    ordered = np.empty(number)
+    sort(values, np.empty(number), ordered)
+    np.testing.assert_array_equal(ordered, np.sort(values))
 
 
 def test_the_time_of_many_points_grows_as_they_do():

@@ -37,7 +37,8 @@ def ring_heights(points, counts, origins):
     """
     heights = np.zeros(len(counts))
     most = max(counts.max(), 1) if len(counts) else 0
-    slopes, ordered, rest = np.empty(most), np.empty(most), np.empty(most)
+    slopes, gaps = np.empty(most), np.empty(most)
+    rank, ordered = np.empty(most), np.empty(most)
     first = 0
     for i in range(len(counts)):
         m = counts[i]
@@ -47,10 +48,7 @@ def ring_heights(points, counts, origins):
         for k in range(origins.shape[1]):
             if m > 1 and isfinite(origins[i, k, 0]):
                 fill_slopes(own, origins[i, k], known)
-                if m > MOST_RANKED:
-                    ring = covering_gap_of_many(known, ordered[:m])
-                else:
-                    ring = covering_gap(known, ordered[:m], rest[:m])
+                ring = covering_gap(known, gaps, rank, ordered[:m])
                 away = sqrt(origins[i, k, 0] ** 2 + origins[i, k, 1] ** 2)
                 height = min(height, away * ring, height_of_highest(own, known, ring))
         if isfinite(height):
@@ -99,55 +97,45 @@ def sort_by_rank(values, rank, ordered):
     half of its branches are predicted wrong.
 
     """
-    rank[:] = 0.0
     for j in range(len(values)):
-        for i in range(len(values)):
-            rank[i] += 1.0 if values[i] > values[j] else 0.0
+        before = 0.0
         for i in range(j):
-            rank[i] += 1.0 if values[i] == values[j] else 0.0
+            is_after = 1.0 if values[i] > values[j] else 0.0
+            rank[i] += is_after
+            before += 1.0 - is_after
+        rank[j] = before
     for i in range(len(values)):
         ordered[int(rank[i])] = values[i]
 
 
-@loop
-def covering_gap(values, ordered, gaps):
-    """
-    Return the gap between neighbours that covers the middle of all gaps in their order; 0 without.
-
-    Half of the range of the `values` (n,) is covered by gaps up to this one: neither the many
-    small ones within rings count, nor one large one where nothing returned. `ordered` and `gaps`
-    (n,) are to work in.
-
-    """
-    n = len(values) - 1
-    sort_by_rank(values, gaps, ordered)
-    for i in range(n):
-        gaps[i] = ordered[i + 1] - ordered[i]
-    covered = ordered  # by gaps up to each one
-    covered[:] = 0.0
-    total = 0.0
-    for j in range(n):
-        total += gaps[j]
-        for i in range(n):
-            covered[i] += gaps[j] if gaps[j] <= gaps[i] else 0.0
-    least = inf
-    for i in range(n):
-        if covered[i] >= total / 2:
-            least = min(least, gaps[i])
-    return least if n > 0 else 0.0
+@kernel
+def sort(values, rank, ordered):
+    """Write values (n,) in ascending order; `rank` (n,) is to work in."""
+    if len(values) <= MOST_RANKED:
+        sort_by_rank(values, rank, ordered)
+    else:
+        copy(values, ordered)
+        ordered.sort()
 
 
 @kernel
-def covering_gap_of_many(values, ordered):
-    """Return the same of so many `values` (n,) that all pairs of them take longer than a sort."""
-    copy(values, ordered)
-    ordered.sort()
-    gaps = ordered[1:] - ordered[:-1]
-    gaps.sort()
-    half = gaps.sum() / 2
-    covered = 0.0
-    for gap in gaps:
-        covered += gap
-        if covered >= half:
-            return gap
-    return 0.0
+def covering_gap(values, gaps, rank, ordered):
+    """
+    Return the gap between neighbours that covers the middle of all gaps in their order.
+
+    Half of the range of the `values` (n,), at least two, is covered by gaps up to this one:
+    neither the many small ones within rings count, nor one large one where nothing returned.
+    `gaps`, `rank` and `ordered` (n,) are to work in.
+
+    """
+    n = len(values)
+    sort(values, rank, ordered)
+    half = (ordered[n - 1] - ordered[0]) / 2
+    for i in range(n - 1):
+        gaps[i] = ordered[i + 1] - ordered[i]
+    sort(gaps[: n - 1], rank, ordered[: n - 1])
+    place, covered = 0, ordered[0]
+    while covered < half and place < n - 2:
+        place += 1
+        covered += ordered[place]
+    return ordered[place]
