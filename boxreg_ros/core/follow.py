@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from math import hypot
 from typing import ClassVar, NamedTuple
 
 from boxreg_ros.config import Config
@@ -16,6 +17,7 @@ from boxreg_ros.core.following.start_speed import POSE4, Seeds
 from boxreg_ros.core.following.sweeps import ascending, nearest, Points, SightLimits, Sweeps
 from boxreg_ros.core.following.tracker import Follower, Way
 from boxreg_ros.core.method.follow_numbers import FOLLOW
+from boxreg_ros.core.method.sweep_fit import within
 from boxreg_ros.core.observation import GOOD_POINTS, NEARBY
 from boxreg_ros.core.refine import refined_tracks, RefinedTrack, Track
 from boxreg_ros.errors import ShapeError
@@ -27,6 +29,7 @@ from boxreg_ros.structures import (
     Columns,
     EXTENDED,
     Floats,
+    HEIGHT,
     HUMAN,
     INTERPOLATED,
     Ints,
@@ -422,12 +425,8 @@ def with_points(track: FollowedTrack, points: Points, origins: Floats | None) ->
     )
 
 
-def _nearby(points: NDArray[np.floating], box: Floats) -> NDArray[np.floating]:
+def _nearby(points: NDArray[np.floating], box: Floats) -> Floats:
     """Return the points, which ascend by x, within `NEARBY` of a box."""
-    reach = np.hypot(box[LENGTH], box[WIDTH]) / 2 + NEARBY
-    first, last = np.searchsorted(points[:, 0], [box[0] - reach, box[0] + reach])
-    part: NDArray[np.floating] = points[first:last]
-    near = (np.abs(part[:, 1] - box[1]) < reach) & (
-        np.abs(part[:, 2] - box[2]) < box[5] / 2 + NEARBY
-    )
-    return part.compress(near, 0)
+    reach = hypot(box[LENGTH], box[WIDTH]) / 2 + NEARBY
+    found: Floats = within(points, box, reach, box[HEIGHT] / 2 + NEARBY)
+    return found.copy()  # of the room for many more

@@ -268,14 +268,20 @@ def fit(points, pose, target):
 def around(points, pose, half, margin):
     """Return the points (n, 3), which ascend by x, around a pose."""
     reach = np.hypot(half[0], half[1]) + FOLLOW.crop + margin
-    first = np.searchsorted(points[:, 0], pose[0] - reach)
-    last = np.searchsorted(points[:, 0], pose[0] + reach)
+    return within(points, pose, reach, half[2] + FOLLOW.crop)
+
+
+@kernel
+def within(points, center, reach, height):
+    """Return the points (n, 3), which ascend by x, within `reach` in x and y, `height` in z."""
+    first = np.searchsorted(points[:, 0], center[0] - reach)
+    last = np.searchsorted(points[:, 0], center[0] + reach)
     found = np.empty((last - first, 3))
     count = 0
     for n in range(first, last):
-        if abs(points[n, 1] - pose[1]) >= reach:
+        if abs(points[n, 1] - center[1]) >= reach:
             continue
-        if abs(points[n, 2] - pose[2]) < half[2] + FOLLOW.crop:
+        if abs(points[n, 2] - center[2]) < height:
             found[count, 0] = points[n, 0]
             found[count, 1] = points[n, 1]
             found[count, 2] = points[n, 2]
