@@ -94,7 +94,7 @@ def _update_margins(
 
     """
     first, step, counts = margin_columns(windows, problem.lengths)
-    new = np.flatnonzero(counts)
+    new = counts.nonzero()[0]
     if not len(new):
         return
     is_input = poses is None and config.estimate == 'track'
@@ -133,7 +133,8 @@ def _update_noise(
     """Update the noise with the best fit of each window, `lag` from its end, and its extents."""
     lag = min(config.lag, config.window - 1)
     best = problem.lengths - 1 - lag
-    row, column = np.arange(len(best))[:, None], best.clip(0)[:, None] + [-1, 0]
+    row, last = np.arange(len(best))[:, None], np.maximum(best, 0)[:, None]
+    column = np.concatenate([last - 1, last], axis=1)
     pair = problem._replace(boxes=problem.boxes[row, column], counts=problem.counts[row, column])
     extents = solution.shared[:, EXTENT:BIAS]
     residuals = normalised_residuals(pair, solution.poses[row, column], extents)[:, 1]
@@ -177,7 +178,7 @@ def _accepted(
     reasons, status = KEPT_REASONS[tested.results], STATUS[tested.results]
     found, near_points = tested.boxes, tested.near_points
     extent_covariances = np.repeat(extent_covariances[:, None], problem.length, axis=1)
-    for b, i in np.argwhere(is_kept).tolist():
+    for b, i in np.transpose(is_kept.nonzero()).tolist():
         found[b, i] = windows[b].observations[i].box
         covariances[b, i] = np.eye(6)
         extent_covariances[b, i] = np.eye(3)

@@ -297,6 +297,6 @@ def _kept(
     known: TrackRows, track_ids: Sequence[str], is_of_kind: NDArray[np.bool_]
 ) -> tuple[Ints, Ints]:
     """Return which tracks `is_of_kind` (B,) are kept, and their rows in the arrays of `known`."""
-    of_kind = np.flatnonzero(is_of_kind)
+    of_kind = is_of_kind.nonzero()[0]
     places, rows = known.seen([track_ids[i] for i in of_kind.tolist()])
     return of_kind[places], rows

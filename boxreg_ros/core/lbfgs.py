@@ -121,23 +121,26 @@ def minimize(
     evaluated.
 
     """
-    every = torch.from_numpy(np.arange(len(start)))
-    at = _Points(start, *(function(start, every) if first is None else first))
-    status = np.where(_are_finite(at), int(Status.RUNNING), int(Status.FAILED))
+    first = first or function(start, torch.from_numpy(np.arange(len(start))))
+    at = _Points(start, *first)
+    is_running = _are_finite(at)
+    status = np.where(is_running, int(Status.RUNNING), int(Status.FAILED))
     taken = np.zeros(len(start), int)
     pairs: list[CurvaturePair] = []
     for iteration in range(iterations):
         step = -_two_loop(at.gradient, pairs, metric)
         step, slope = _downhill(step, at.gradient, is_scaled=bool(pairs) or metric is not None)
         is_flat = -slope <= tolerance * (1 + np.abs(at.value.numpy()))
-        status[is_flat & (status == Status.RUNNING)] = Status.CONVERGED
-        rows = np.flatnonzero(status == Status.RUNNING)
+        status[is_running & is_flat] = int(Status.CONVERGED)
+        is_running &= ~is_flat
+        rows = is_running.nonzero()[0]
         if not len(rows):
             break
         taken[rows] += 1
         before = at
         at, stuck = _line_search(function, before, rows, step, slope)
-        status[stuck] = Status.STUCK
+        status[stuck] = int(Status.STUCK)
+        is_running[stuck] = False
         if iteration + 1 < iterations:
             pairs = [*pairs, _pair(before, at)][-history:]
     return Minimum(at.x, at.value, status, taken)
@@ -183,7 +186,7 @@ def _line_search(
         is_good = (value <= before_step + SUFFICIENT_DECREASE * slope) & _are_finite(trial)
         if is_good.all():
             return found.with_rows(rows, trial), rows[:0]
-        good, others = np.flatnonzero(is_good), np.flatnonzero(~is_good)
+        good, others = is_good.nonzero()[0], (~is_good).nonzero()[0]
         found = found.with_rows(rows[good], trial.of(good))
         part = _shorter(slope, value - before_step)[others]
         slope = part * slope[others]

@@ -7,7 +7,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.field_of_view import FieldOfView
 from boxreg_ros.core.method import crop as crop_kernels
 from boxreg_ros.core.method.rings import ring_heights
-from boxreg_ros.core.tables import by_table, column
+from boxreg_ros.core.tables import by_table
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, Ints, ROLL, Sweep, YAW
 import numpy as np
@@ -102,7 +102,9 @@ class Observations(NamedTuple):
             tables = [
                 table._replace(origins=_repeat_last(table.origins, most)) for table in tables
             ]
-        return cls(*(column(tables, name) for name in cls._fields))
+        if len(tables) == 1:
+            return tables[0]
+        return cls(*map(np.concatenate, zip(*tables, strict=True)))
 
     @classmethod
     def gathered(cls, items: Sequence[tuple['Observations', int]]) -> tuple['Observations', Ints]:

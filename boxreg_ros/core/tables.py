@@ -40,12 +40,6 @@ def rows_by_key(keys: Sequence[str]) -> dict[str, Ints]:
     return dict(zip(number_of, parts, strict=False))  # without keys there is one empty part
 
 
-def column(tables: Sequence[Any], name: str) -> Any:
-    """Return the field `name` of the concatenation of `tables`; of one table, no copy."""
-    parts = [getattr(table, name) for table in tables]
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-
 def rows_of(items: Sequence[tuple[Any, int]]) -> Any:
     """Return the rows of some items, at least one, as one table in their order."""
     parts = by_table(items)
@@ -53,7 +47,5 @@ def rows_of(items: Sequence[tuple[Any, int]]) -> Any:
     if len(parts) == 1:
         return table._make(part[rows] for part in table)
     back = np.argsort(np.concatenate([places for _, places, _ in parts]))
-    return table._make(
-        np.concatenate([getattr(owner, name)[rows] for owner, _, rows in parts])[back]
-        for name in table._fields
-    )
+    taken = [[part[rows] for part in owner] for owner, _, rows in parts]
+    return table._make(np.concatenate(column)[back] for column in zip(*taken, strict=True))

@@ -57,7 +57,7 @@ class TrackRows:
     def _places(self, track_ids: Sequence[str]) -> tuple[Ints, Ints]:
         """Return which tracks have rows, (m,), and these, (m,)."""
         rows = np.fromiter(map(self._row_of.get, track_ids, repeat(-1)), int, len(track_ids))
-        places = np.flatnonzero(rows >= 0)
+        places = (rows >= 0).nonzero()[0]
         return places, rows[places]
 
     def _takes_row(self, track_id: str, begin: int) -> bool:
