@@ -72,39 +72,39 @@ def fill_kinematics(length, times, poses, deviations, inverse, G, found):
         Written.
 
     """
-    C, factors, border = np.empty((4, 4)), np.empty(3), np.empty((4, PIVOT))
-    through = np.empty(PIVOT)
+    of_change, of_rate, factors = np.empty((4, 4)), np.empty((4, 4)), np.empty(3)
+    border, through = np.empty((4, PIVOT)), np.empty(PIVOT)
     prior = (deviations**2).sum()
     for n in range(length if length > 2 else 0):
         own = found[n]
         first = min(max(n - 1, 0), length - 3)
         last = first + 2
+        is_new = n == 0 or 1 < n < length - 1  # or the three are those of the box before
         before, after = times[first + 1] - times[first], times[last] - times[first + 1]
         duration = before + after
         elapsed = times[n] - (times[first] + times[last]) / 2
 
         factors[0], factors[2] = 2 / (before * duration), 2 / (after * duration)
         factors[1] = -factors[0] - factors[2]
-        fill_combination(first, factors, inverse, G, border, through, C)
-        for i in range(4):
-            for j in range(4):
-                own.velocity_covariance[i, j] = elapsed**2 * C[i, j]
+        if is_new:
+            fill_combination(first, factors, inverse, G, border, through, of_change)
         for i in range(3):
             middle = poses[first + 1, i]
             own.acceleration[i] = factors[0] * (poses[first, i] - middle)
             own.acceleration[i] += factors[2] * (poses[last, i] - middle)
             for j in range(3):
-                own.acceleration_covariance[i, j] = C[i, j]
-        gain = 1 - (C[0, 0] + C[1, 1] + C[2, 2]) / prior
+                own.acceleration_covariance[i, j] = of_change[i, j]
+        gain = 1 - (of_change[0, 0] + of_change[1, 1] + of_change[2, 2]) / prior
 
         factors[0], factors[1], factors[2] = -1 / duration, 0.0, 1 / duration
-        fill_combination(first, factors, inverse, G, border, through, C)
+        if is_new:
+            fill_combination(first, factors, inverse, G, border, through, of_rate)
         is_finite = True
         for i in range(4):
             rate = (poses[last, RATES[i]] - poses[first, RATES[i]]) / duration
             own.velocity[i] = rate
             for j in range(4):
-                own.velocity_covariance[i, j] += C[i, j]
+                own.velocity_covariance[i, j] = of_rate[i, j] + elapsed**2 * of_change[i, j]
             is_finite &= np.isfinite(rate) and np.isfinite(own.velocity_covariance[i, i])
         own.has_velocity = is_finite
         own.has_acceleration = is_finite and gain >= MIN_GAIN and n < length - 1
