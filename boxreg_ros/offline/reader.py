@@ -13,6 +13,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from mmap import mmap
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
@@ -22,16 +23,14 @@ from boxreg_ros.io.items import Item, ItemSource
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.request import NO_TOPIC, Request
+from boxreg_ros.offline.shared_arrays import Receiver, Sender, shared_memory
 from boxreg_ros.offline.sources import label_frame_of, scene_address
 from boxreg_ros.offline.stored_sweeps import StoredPlace, StoredSweeps
-from boxreg_ros.offline.workers import Background, Receive, run_in_worker, Send
+from boxreg_ros.offline.workers import Receive, run_in_worker, Send
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 from msg_adapters.clouds import POINTS_TYPE
 import numpy as np
 
-MESSAGES_AHEAD = 4
-"""Messages that are read before the receiver has taken those before them: two clouds, their boxes.
-Swept: with 1, 2, 8 and 32 a run took 8.2, 7.5, 7.8 and 8.4 s, and each message 1.5 MB."""
 IDS_SECONDS = 20.0
 """Boxes are checked for jumping ids this long, or to the end, before a run is begun again [s];
 chosen: 200 box arrays at 10 Hz, in which a tracker may switch now and then."""
@@ -240,8 +239,9 @@ def reader(request: Request, sweeps: StoredSweeps | None = None) -> Iterator[Rec
         with closing(messages()) as received:
             yield received.__next__
         return
-    with run_in_worker(partial(_read, messages), 'reads the recording') as process:
-        yield process.receive
+    memory = shared_memory()
+    with run_in_worker(partial(_read, messages, memory), 'reads the recording') as process:
+        yield Receiver(memory, process)
 
 
 def uses_one_core(config: Config) -> bool:
@@ -268,15 +268,15 @@ class ReadAhead:
 
 
 def _read(
-    messages: Callable[[], Iterator[Source | Item | Findings]], _: Receive, send: Send
+    messages: Callable[[], Iterator[Source | Item | Findings]],
+    memory: mmap,
+    receive: Receive,
+    send: Send,
 ) -> None:
-    """Send the messages, in a thread that waits for the receiver while others are read."""
-    background = Background(MESSAGES_AHEAD)
-    try:
-        for message in messages():
-            background(send, message)
-    finally:
-        background.complete()  # an error is sent after the messages before it
+    """Send the messages."""
+    send_shared = Sender(memory, receive, send)
+    for message in messages():
+        send_shared(message)
 
 
 def _messages(
