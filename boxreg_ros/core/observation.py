@@ -204,7 +204,7 @@ def observe(
     own = own_points(sweep, boxes, config)
     rows, owner = _thinned(own, sweep, n, config)
 
-    points = _offsets(sweep, centers, rows, owner).T.astype(np.float32, 'C')
+    points = _offsets(sweep, centers, rows, owner)
     counts = np.bincount(owner, minlength=n)
     delays = np.zeros(len(rows), np.float32)
     sights = np.zeros(n)
@@ -236,14 +236,14 @@ def observe(
     )
 
 
-def _offsets(sweep: Sweep, centers: Floats, rows: Ints, owner: Ints) -> Floats:
-    """Return points minus the `centers` (n, 3) of their boxes, axes of the sweep, (3, P) [m]."""
+def _offsets(sweep: Sweep, centers: Floats, rows: Ints, owner: Ints) -> NDArray[np.float32]:
+    """Return points minus the `centers` (n, 3) of their boxes, axes of the sweep, (P, 3) [m]."""
     at_points, turn = _among_points(sweep, centers)
-    offset = sweep.points.T.take(rows, 1) - at_points.T.take(owner, 1)
-    if sweep.T_frame_points is None:
-        return offset
-    x, y, z = offset
-    return np.stack([a * x + b * y + c * z for a, b, c in turn])
+    x, y, z = sweep.points.T.take(rows, 1) - at_points.T.take(owner, 1)
+    offsets = np.empty((len(rows), 3), np.float32)
+    for axis, (a, b, c) in enumerate(turn):
+        offsets[:, axis] = a * x + b * y + c * z
+    return offsets
 
 
 def _origins(sweep: Sweep, rows: Ints, owner: Ints, centers: Floats) -> Floats:
