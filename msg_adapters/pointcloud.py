@@ -43,9 +43,9 @@ def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
     Returns
     -------
     sweep : Sweep
-        `points` (M, 3) [m] in the frame of the message, `times` (M,) relative to the stamp [s] or
-        None. Points are float32; float64 if the coordinates are float64 or 32-bit integers, to
-        keep them exact.
+        `points` (M, 3) [m] in the frame of the message, `times` (M,) relative to the stamp [s];
+        None without times, or where all are that of the stamp. Points are float32; float64 if the
+        coordinates are float64 or 32-bit integers, to keep them exact.
 
     Raises
     ------
@@ -284,13 +284,13 @@ def _check_field(field: Any, point_step: int) -> None:
 def _seconds(
     raw: NDArray[Any], stamp: int, layout: point_layout.PointLayout | None, unit: str
 ) -> Floats | None:
-    """Return point times (M,) relative to the stamp [s]; see the notes of `from_msg`."""
+    """Return point times (M,) relative to the stamp [s], or None; see `from_msg`."""
     if not raw.size:
         return np.zeros(0)
     is_known = np.isfinite(raw)
     known = raw if is_known.all() else raw[is_known]
     reading = point_layout.reading_of(known, stamp, layout, unit) if known.size else None
-    if reading is None:
+    if reading is None or not (reading.is_absolute or known.any()):
         return None
     if known is raw:
         return point_layout.seconds_of(raw, stamp, reading)

@@ -55,6 +55,15 @@ def cloud(driver, factor=1.0, count=6000):
     return MESSAGES.cloud(START, 'lidar', columns), times
 
 
+def test_points_that_are_all_at_the_stamp_have_no_times():
+    times = np.zeros(100, np.float32)
+    columns = [*((name, kind, np.ones(100, kind)) for name, kind in XYZ), ('t', 'f4', times)]
+    assert pointcloud.from_msg(MESSAGES.cloud(START, 'lidar', columns)).times is None
+    times[50:] = 0.05
+    found = pointcloud.from_msg(MESSAGES.cloud(START, 'lidar', columns)).times
+    np.testing.assert_array_equal(found, times.astype(float))
+
+
 @pytest.mark.parametrize('driver', DRIVERS)
 def test_drivers_are_told_apart_and_their_times_are_read(driver):
     message, times = cloud(driver)
