@@ -17,6 +17,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import Options
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline import reader as reading
@@ -139,6 +140,25 @@ def test_a_recording_is_opened_once_for_each_pass(tmp_path, monkeypatch, complet
     monkeypatch.setattr(Recording, '__enter__', noted)
     run(path, tmp_path / 'out', settings={'solver.threads': 1, 'complete.fill': completes})
     assert len(opened) == passes
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'rosbag1'])
+def test_a_file_is_opened_once(tmp_path, storage):
+    path = Drive(sweeps=4, ros1=storage == 'rosbag1').write(tmp_path / 'drive', storage)
+    opened = []
+    is_listening = True
+
+    def note(event, arguments):
+        if is_listening and event == 'open' and str(arguments[0]) == str(path):
+            opened.append(arguments)
+
+    sys.addaudithook(note)
+    with Recording([path]) as recording:
+        tree = TransformTree()
+        recording.choose_fixed_frame(tree)
+        assert len(list(recording.items(tree))) == 8
+    is_listening = False
+    assert len(opened) == 1
 
 
 @pytest.mark.parametrize('setting', ['auto', 'stamp'])

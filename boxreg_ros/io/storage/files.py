@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, ExitStack
+import errno
 from heapq import merge
 from itertools import starmap
 from operator import itemgetter
+import os
 from pathlib import Path, PurePath
 import re
 from typing import Any, NamedTuple
@@ -107,12 +109,10 @@ def opened(path: Path) -> StorageFile:
         )
     is_remote, is_compressed = url_of(path) is not None, path.suffix in COMPRESSED
     if not is_remote:
-        try:
-            with path.open('rb') as stream:
-                is_empty = not stream.read(1)
-        except OSError as error:
-            raise TransferError(unreadable(path, error)) from None
-        if is_empty:
+        if not os.access(path, os.R_OK):
+            denied = PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            raise TransferError(unreadable(path, denied))
+        if not size_of(path):
             raise RecordingError(
                 f'{path}: expected a recording, got an empty file; copy it again, or leave it out'
             )
