@@ -10,7 +10,7 @@ the wrong pose, and a moving object has gone on. Both are mended where the box w
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from math import inf
@@ -21,7 +21,7 @@ from boxreg_ros.core.matching import Pair
 from boxreg_ros.core.measured_tracks import MeasuredTracks
 from boxreg_ros.core.method.path_costs import fill_costs, PATH_REACH
 from boxreg_ros.core.observation import crop
-from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, LENGTH, Sweep, X, Y, YAW, Z
+from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, Ints, LENGTH, Sweep, X, Y, YAW, Z
 import numpy as np
 
 # All of these are chosen, except where an origin stands beside them.
@@ -146,6 +146,29 @@ class _Sample(NamedTuple):
     costs: Floats
 
 
+class _Comparisons(NamedTuple):
+    """Samples (n) as columns."""
+
+    tracks: Ints
+    """(n,), a number for each track."""
+    speeds: Floats
+    costs: Floats
+    """(n, 2, C)."""
+
+    @classmethod
+    def of(cls, samples: Collection[_Sample]) -> _Comparisons:
+        """Return the columns of some samples."""
+        number_of: dict[str, int] = {}
+        tracks = [number_of.setdefault(one.track_id, len(number_of)) for one in samples]
+        speeds = np.array([one.speed for one in samples])
+        return cls(np.array(tracks, int), speeds, np.array([one.costs for one in samples]))
+
+    def part(self, first: int, end: int) -> _Comparisons:
+        """Return the columns of the samples between two rows."""
+        rows = slice(first, end)
+        return _Comparisons(self.tracks[rows], self.speeds[rows], self.costs[rows])
+
+
 class _Path(NamedTuple):
     """Where the boxes of a track were in a sweep, by latency."""
 
@@ -202,28 +225,18 @@ class LatencyEvidence:
         """Return the latency by the newest evidence; it changes in steps of `STEP` or more."""
         if self._has_new_samples:
             self._has_new_samples = False
-            drifts = self._latency.drifts or self._forget_other_latency()
-            found = _estimated([*self._samples])._replace(drifts=drifts)
+            known = _Comparisons.of(self._samples)
+            drifts = self._latency.drifts
+            half = len(self._samples) // 2
+            if not drifts and _differ(known.part(0, half), newer := known.part(half, MAX_SAMPLES)):
+                drifts, known = True, newer
+                for _ in range(half):
+                    self._samples.popleft()
+            found = _estimated(known)._replace(drifts=drifts)
             if abs(found.seconds - self._latency.seconds) < STEP:
                 found = found._replace(seconds=self._latency.seconds)
             self._latency = found
         return self._latency
-
-    def _forget_other_latency(self) -> bool:
-        """Forget the older half of the evidence if it shows another latency; return if so."""
-        samples = [*self._samples]
-        half = len(samples) // 2
-        older, newer = _estimated(samples[:half]), _estimated(samples[half:])
-        if older.finding or newer.finding:
-            return False
-        assert older.estimated is not None and newer.estimated is not None
-        assert older.deviation is not None and newer.deviation is not None
-        drift = abs(newer.estimated - older.estimated)
-        if drift < NOTABLE + SIGNIFICANCE * np.hypot(older.deviation, newer.deviation):
-            return False
-        self._samples.clear()
-        self._samples.extend(samples[half:])
-        return True
 
     def _compare(self, sweep: Sweep, tracks: MeasuredTracks) -> None:
         """Compare the points of a sweep with the boxes of objects that move in their frame."""
@@ -408,22 +421,29 @@ def _boxes_around(boxes: Floats) -> Floats:
     return found
 
 
-def _estimated(samples: Sequence[_Sample]) -> Latency:
+def _differ(older: _Comparisons, newer: _Comparisons) -> bool:
+    """Return whether the newer comparisons show another latency than the older ones."""
+    before, after = _estimated(older), _estimated(newer)
+    if before.finding or after.finding:
+        return False
+    assert before.estimated is not None and after.estimated is not None
+    assert before.deviation is not None and after.deviation is not None
+    drift = abs(after.estimated - before.estimated)
+    return drift >= NOTABLE + SIGNIFICANCE * float(np.hypot(before.deviation, after.deviation))
+
+
+def _estimated(known: _Comparisons) -> Latency:
     """Return the latency of least cost by some comparisons; each track has one weight."""
-    if not samples:
+    if not len(known.tracks):
         return Latency(finding=NOTHING_MOVES)
-    track_ids = [*dict.fromkeys(sample.track_id for sample in samples)]
-    row_of = {track_id: row for row, track_id in enumerate(track_ids)}
-    rows = np.array([row_of[sample.track_id] for sample in samples])
-    counts = np.bincount(rows)[:, None, None]
-    costs = np.zeros((len(track_ids), 2, len(CANDIDATES)))
-    np.add.at(costs, rows, np.array([sample.costs for sample in samples]))
+    order = np.argsort(known.tracks, kind='stable')
+    _, first, counts = np.unique(known.tracks[order], return_index=True, return_counts=True)
+    costs = np.add.reduceat(known.costs[order], first)  # (n, 2, C), the sums of n tracks
     # The mean of each track, less for one that was compared a few times only.
-    costs /= np.maximum(counts, FULL_WEIGHT)
+    costs /= np.maximum(counts, FULL_WEIGHT)[:, None, None]
     n = len(costs)
-    speed = np.mean([sample.speed for sample in samples])
-    constant = CONSTANT_ERROR / speed / np.sqrt(n)
-    ways = np.array([_minimum_and_jackknife(costs[:, way]) for way in (0, 1)])
+    constant = CONSTANT_ERROR / known.speeds.mean() / np.sqrt(n)
+    ways = _minima_and_jackknife(costs)
     ways[:, 1] = np.hypot(ways[:, 1], constant)
     way = _way(costs, ways)
     estimated, deviation = ways[way].tolist()
@@ -483,13 +503,13 @@ def _fits_better(costs: Floats) -> bool:
     return bool(gain.sum() > ratio * np.sqrt(np.square(gain).sum()))
 
 
-def _minimum_and_jackknife(costs: Floats) -> tuple[float, float]:
-    """Return the candidate of least cost of all tracks, (n, C), and its deviation [s]."""
+def _minima_and_jackknife(costs: Floats) -> Floats:
+    """Return the candidates of least cost of all tracks, (n, 2, C), and deviations [s]: (2, 2)."""
     n = len(costs)
     total = costs.sum(0)
-    others = _minima(total - costs)
-    spread = (n - 1) / n * np.square(others - others.mean()).sum()
-    return float(_minima(total[None])[0]), float(np.sqrt(spread))
+    others = _minima((total - costs).reshape(2 * n, -1)).reshape(n, 2)
+    spread = (n - 1) / n * np.square(others - others.mean(0)).sum(0)
+    return np.stack([_minima(total), np.sqrt(spread)], axis=1)
 
 
 def _minima(costs: Floats) -> Floats:

@@ -559,7 +559,7 @@ class Edge:
         self._ahead: tuple[int, Pose, int | None] | None = None
         self._was_forgotten = False
         self._last_added: tuple[int, Floats] | None = None
-        # A cloud, its boxes and its label files ask for the same stamp.
+        # A cloud, its boxes and its label files ask for the same stamp; of a static pair any.
         self._last_found: tuple[int, Floats] | None = None
 
     @property
@@ -678,9 +678,10 @@ class Edge:
         self._confirm(stamp_ns)
         if is_constant:
             return matrix(self.poses[0])
-        if self._last_found is None or self._last_found[0] != stamp_ns:
-            self._last_found = stamp_ns, self._at(stamp_ns)
-        return self._last_found[1]
+        found = self._last_found
+        if found is None or not (self.is_static or found[0] == stamp_ns):
+            found = self._last_found = stamp_ns, self._at(stamp_ns)
+        return found[1]
 
     def _at(self, stamp_ns: int) -> Floats:
         stamps = self.stamps
@@ -724,9 +725,9 @@ class Edge:
         return 'check that its stamps use the clock of the point cloud'
 
     def at_each(self, stamps_ns: Sequence[int], is_constant: bool) -> Floats:
-        """Return ``T_parent_child`` (n, 4, 4) at stamps that `covers` is true for."""
+        """Return ``T_parent_child`` (n, 4, 4), or (4, 4) for all, at stamps that are covered."""
         if self.is_static or is_constant:
-            return matrix(np.array([self.poses[0]] * len(stamps_ns)))
+            return self.at(stamps_ns[0], is_constant)
         known = self.stamps
         after = [min(max(bisect_left(known, one), 1), len(known) - 1) for one in stamps_ns]
         gaps_ns = [known[row] - known[row - 1] for row in after]

@@ -122,14 +122,18 @@ def parabolas(minima, depths=(1.0, 1.0), tracks=16):
     return samples
 
 
+def latency_by(samples):
+    return latency._estimated(latency._Comparisons.of(samples))
+
+
 def test_boxes_that_are_in_time_in_one_way_are_in_time():
     # They fit better at the stamp, by 4 deviations: by chance, if they were made where points are.
-    found = latency._estimated(parabolas([-0.01, 0.06], [1.0, 1.1]))
+    found = latency_by(parabolas([-0.01, 0.06], [1.0, 1.1]))
     assert found.seconds == 0
     assert found.estimated == pytest.approx(-0.01, abs=0.005)
-    found = latency._estimated(parabolas([0.07, 0.12], [1.0, 1.1]))
+    found = latency_by(parabolas([0.07, 0.12], [1.0, 1.1]))
     assert found.seconds == pytest.approx(0.12, abs=0.005)
-    found = latency._estimated(parabolas([0.07, 0.12], [1.1, 1.0]))
+    found = latency_by(parabolas([0.07, 0.12], [1.1, 1.0]))
     assert found.seconds == pytest.approx(0.07, abs=0.005)
 
 
@@ -137,7 +141,7 @@ def test_boxes_that_are_in_time_in_one_way_are_in_time():
 def test_a_row_of_parked_cars_that_fits_again_further_on_is_in_time(depth, corrected):
     in_time = depth * np.minimum(np.square(latency.CANDIDATES) / 0.01, 1) - depth
     samples = [sample._replace(costs=sample.costs + in_time) for sample in parabolas([0.6, 0.6])]
-    assert latency._estimated(samples).seconds == pytest.approx(corrected, abs=0.005)
+    assert latency_by(samples).seconds == pytest.approx(corrected, abs=0.005)
 
 
 def test_tracks_that_do_not_agree_correct_nothing():
@@ -146,7 +150,7 @@ def test_tracks_that_do_not_agree_correct_nothing():
         for name, least in zip('abcde', [0.65, 0.65, 0.65, 0.4, 0.4], strict=True)
         for sample in parabolas([least, least], tracks=1)
     ]
-    found = latency._estimated(samples)
+    found = latency_by(samples)
     assert abs(found.estimated) > latency.SIGNIFICANCE * found.deviation
     assert found.deviation > latency.USABLE_PART * found.estimated
     assert found.seconds == 0
