@@ -93,9 +93,8 @@ def run(args: argparse.Namespace) -> int:
             f'{args.truth}: expected true boxes in scope, got none of {len(truth.boxes)}; lower '
             f'--min-points or choose other --classes; the table has {names}'
         )
-    if len(predicted.boxes) and not matches.is_matched.any():
-        _warn(_why_none_matches(predicted, truth))
-    elif not classes:
+    _warn_of_predictions(predicted, truth, matches)
+    if matches.is_matched.any() and not classes:
         _warn_of_other_classes(predicted, truth, matches, is_unknown)
     overall = summarise(matches)
     tracks = track_scores(predicted.rows(~is_unknown), truth, matches.rows)
@@ -230,6 +229,8 @@ def _print_tables(overall: Scores, grouped: dict[str, dict[str, Scores]]) -> Non
 
 def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:
     """Return why no predicted box has a true one."""
+    if not len(predicted.boxes):
+        return 'there are no predicted boxes'
     if not is_valid_box(predicted.boxes).any():
         return (
             f'all {len(predicted.boxes)} predicted boxes are invalid: expected finite numbers and '
@@ -240,6 +241,26 @@ def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:
         f'no predicted box overlaps a true one: {len(stamps)} stamps are in both; compare boxes '
         f'of one recording in one frame'
     )
+
+
+def _warn_of_predictions(predicted: BoxTable, truth: BoxTable, matches: Matches) -> None:
+    """Say how many predicted boxes are invalid or have the id of another; or why none matches."""
+    if not matches.is_matched.any():
+        _warn(_why_none_matches(predicted, truth))
+        return
+    invalid = int((~is_valid_box(predicted.boxes)).sum())
+    if invalid:
+        _warn(
+            f'{invalid} of {len(predicted.boxes)} predicted boxes find no true box: NaN, an '
+            f'extent that is not positive, or a quaternion of 0 0 0 0'
+        )
+    keys = set(zip(predicted.stamps_ns.tolist(), predicted.track_ids, strict=True))
+    repeated = len(predicted.boxes) - len(keys)
+    if repeated:
+        _warn(
+            f'{repeated} of {len(predicted.boxes)} predicted boxes have the id of another one at '
+            f'their stamp: they count as other tracks'
+        )
 
 
 def _warn_of_other_classes(

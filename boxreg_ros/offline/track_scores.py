@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -140,12 +141,22 @@ def _trackeval_scores(
 
 
 def _codes(table: BoxTable, rows: Sequence[Ints]) -> tuple[list[Ints], int]:
-    """Return the track ids of the rows of each stamp as numbers from 0, and their number."""
-    code_of: dict[str, int] = {}
+    """
+    Return the track ids of the rows of each stamp as numbers from 0, and their number.
+
+    Boxes that have one id at a stamp are of different tracks: trackeval would count each as found.
+
+    """
+    code_of: dict[tuple[str, int], int] = {}
     codes = []
     for stamp_rows in rows:
-        names = [table.track_ids[row] for row in stamp_rows]
-        codes.append(np.array([code_of.setdefault(n, len(code_of)) for n in names], np.int64))
+        seen = Counter[str]()
+        own = []
+        for row in stamp_rows:
+            name = table.track_ids[row]
+            own.append(code_of.setdefault((name, seen[name]), len(code_of)))
+            seen[name] += 1
+        codes.append(np.array(own, np.int64))
     return codes, len(code_of)
 
 

@@ -426,6 +426,33 @@ def test_tables_with_invalid_predictions_only_are_explained(tmp_path, capsys):
     assert '10 true boxes, 10 missing' in printed.out
 
 
+def test_some_invalid_predictions_are_named(tmp_path, capsys):
+    truth = truth_table()
+    boxes = truth.boxes.copy()
+    boxes[2, 3], boxes[4, 0] = -4, np.nan
+    truth.write(tmp_path / 'truth.csv')
+    replace(truth, boxes=boxes).write(tmp_path / 'predicted.csv')
+    assert run(tmp_path / 'predicted.csv', tmp_path / 'truth.csv') == 0
+    assert '2 of 20 predicted boxes find no true box: NaN, an extent' in capsys.readouterr().err
+
+
+def test_predictions_of_one_id_at_a_stamp_are_named(tmp_path, capsys):
+    truth = truth_table()
+    truth.write(tmp_path / 'truth.csv')
+    header, *lines = (tmp_path / 'truth.csv').read_text().splitlines(keepends=True)
+    (tmp_path / 'predicted.csv').write_text(''.join([header, *lines, *lines]))
+    assert run(tmp_path / 'predicted.csv', tmp_path / 'truth.csv') == 0
+    assert '20 of 40 predicted boxes have the id of another one' in capsys.readouterr().err
+
+
+def test_a_table_without_boxes_is_named(tmp_path, capsys):
+    truth = truth_table()
+    truth.write(tmp_path / 'truth.csv')
+    rows(truth, []).write(tmp_path / 'predicted.csv')
+    assert run(tmp_path / 'predicted.csv', tmp_path / 'truth.csv') == 1
+    assert 'there are no predicted boxes' in capsys.readouterr().err
+
+
 def test_no_cell_of_a_table_is_a_formula_and_every_text_is_read_back(tmp_path):
     ids = ('=1+1', '@x', '+a', '-b', '-1', "'=x", "'", 'a\rb', '\tq', 'a,"b"\nc', 'x' * 10**6)
     truth = truth_table()

@@ -45,6 +45,14 @@ def test_perfect_tracks_may_have_other_ids():
     assert (scores.added, math.isnan(scores.added_iou)) == (0, True)
 
 
+def test_boxes_of_one_id_at_a_stamp_are_not_found_twice():
+    pytest.importorskip('trackeval')
+    scores = track_scores(table([[('a', 0), ('b', 20), ('a', 0), ('b', 20)]] * 4), TRUTH)
+    assert (scores.misses, scores.ghosts) == (0, 8)
+    assert scores.idf1 == pytest.approx(2 * 8 / (8 + 16))
+    assert scores.det_a == pytest.approx(8 / 16)
+
+
 def test_misses_ghosts_and_added_boxes_are_counted():
     # a is missing once, and once 3 m off: an IoU of 1 / 7; x is nothing.
     predicted = table([
