@@ -30,7 +30,26 @@ class PoseErrors(NamedTuple):
 
 
 def pose_errors(boxes: ArrayLike, truth: ArrayLike) -> PoseErrors:
-    """Return the errors of boxes (n, 9) against true ones, in one frame [m, rad], row by row."""
+    """
+    Return the errors of boxes against true ones.
+
+    Parameters
+    ----------
+    boxes, truth : array_like, shape (n, 9)
+        Pairs of boxes, row by row: x y z length width height roll pitch yaw, in one frame
+        [m, rad].
+
+    Returns
+    -------
+    errors : PoseErrors
+        Of n pairs.
+
+    Raises
+    ------
+    ShapeError
+        If an array has another shape.
+
+    """
     a, b = _rows(boxes, truth)
     difference = a - b
     rotation = wrap_angle(difference[:, ROLL:])
@@ -42,9 +61,25 @@ def pose_errors(boxes: ArrayLike, truth: ArrayLike) -> PoseErrors:
 
 def iou_bev(boxes: ArrayLike, truth: ArrayLike) -> Floats:
     """
-    Return the intersection over union of footprints, (n,), as `iou_3d`.
+    Return the intersection over union of footprints.
 
     A footprint is the rectangle length x width turned by yaw; roll and pitch are ignored.
+
+    Parameters
+    ----------
+    boxes, truth : array_like, shape (n, 9)
+        Pairs of boxes, row by row: x y z length width height roll pitch yaw, in one frame
+        [m, rad].
+
+    Returns
+    -------
+    iou : array, shape (n,)
+        From 0 to 1; 0 for boxes that are not finite or have no area.
+
+    Raises
+    ------
+    ShapeError
+        If an array has another shape.
 
     """
     # Footprints become upright boxes from z = -1/2 to 1/2.
@@ -56,10 +91,23 @@ def iou_bev(boxes: ArrayLike, truth: ArrayLike) -> Floats:
 
 def iou_3d(boxes: ArrayLike, truth: ArrayLike) -> Floats:
     """
-    Return the intersection over union of volumes, for boxes with any rotation, (n,), from 0 to 1.
+    Return the intersection over union of volumes, for boxes with any rotation.
 
-    Of boxes (n, 9) in one frame [m, rad], row by row; ShapeError for arrays of other shapes. 0 for
-    boxes that are not finite or have no volume.
+    Parameters
+    ----------
+    boxes, truth : array_like, shape (n, 9)
+        Pairs of boxes, row by row: x y z length width height roll pitch yaw, in one frame
+        [m, rad].
+
+    Returns
+    -------
+    iou : array, shape (n,)
+        From 0 to 1; 0 for boxes that are not finite or have no volume.
+
+    Raises
+    ------
+    ShapeError
+        If an array has another shape.
 
     """
     a, b = _rows(boxes, truth)
