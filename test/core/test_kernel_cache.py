@@ -97,6 +97,48 @@ def test_no_garbage_is_collected_while_a_kernel_is_compiled(tmp_path):
     assert goes_on == 'True'
 
 
+ROOM = """
+from collections import Counter
+from boxreg_ros.core.method.compile import kernel
+import numpy as np
+from numba.core import event
+
+compiled = Counter()
+
+
+class Watch(event.Listener):
+    def on_start(self, event):
+        function = event.data['dispatcher'].py_func
+        compiled[function.__module__, function.__qualname__, str(event.data['args'])] += 1
+
+    def on_end(self, event):
+        pass
+
+
+@kernel
+def inner(n):
+    return np.empty((n, 3))
+
+
+@kernel
+def outer(n):
+    return np.empty((n, 3)), inner(n)
+
+
+with event.install_listener('numba:compile', Watch()):
+    outer(2)
+print(*compiled.values())
+"""
+
+
+def test_a_function_of_numba_is_compiled_once_for_a_kernel_and_those_that_it_calls(tmp_path):
+    (tmp_path / 'room.py').write_text(ROOM)
+    command = [sys.executable, '-B', 'room.py']
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    # `outer`, `inner`, `empty` and what that calls.
+    assert run.stdout.split() == ['1'] * 4
+
+
 def test_the_digest_depends_on_every_source_that_is_imported(tmp_path):
     # a imports b, b imports c and a again; d is beside them.
     texts = {

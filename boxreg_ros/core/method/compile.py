@@ -76,6 +76,7 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     options |= {'nogil': True, 'error_model': 'numpy', 'fastmath': REORDER}
     options['pipeline_class'] = _KernelCompiler
     options['no_cfunc_wrapper'] = True  # for calls from C: a fifteenth of the time to compile
+    options['forceinline'] = False  # left unset, numba compiles functions of its own twice
     try:
         dispatcher = _with_linked_form(numba.njit(function, cache=True, **options), options)
     except RuntimeError as error:  # no folder for the cache can be written
