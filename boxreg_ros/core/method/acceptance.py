@@ -2,13 +2,14 @@
 
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import BOX_POSE, POSE
+from boxreg_ros.core.method.arrays import BOX_POSE, most_points, POSE
 from boxreg_ros.core.method.articulation import changes_shape, extent_ranges
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.expectation import SIZE
 from boxreg_ros.core.method.faces import fill_moved, fill_velocity, to_box_axes
 from boxreg_ros.core.method.noise import are_finite
 from boxreg_ros.core.method.rotation import fill_rotation
+from boxreg_ros.core.method.selection import sum_of
 import numpy as np
 
 ACCEPTED, NO_POINTS, NOT_FINITE, NO_GAIN, NOT_RIGID = range(5)
@@ -123,7 +124,7 @@ def accept(
         Written; the ranges of the windows before are given.
 
     """
-    M = max(1, problem.counts[first:last].max()) if last > first else 1
+    M = most_points(problem.counts[first:last])
     room = _Room(np.empty((3, M)), np.empty((3, M)), np.empty((3, 3)))
     velocity = np.zeros(3)
     constants = constants[0]
@@ -132,7 +133,7 @@ def accept(
         length, boxes, times = problem.lengths[b], problem.boxes[b], problem.times[b]
         extent_ranges(boxes, length, span, found.ranges[b])
         is_bent = changes_shape(found.ranges[b], problem.of_class[b].extent, constants.gate)
-        has_points = problem.counts[b].sum() > 0
+        has_points = sum_of(problem.counts[b]) > 0
         found.is_finite[b] = True
         given = np.empty((0, POSE))
         for n in range(len(boxes)):

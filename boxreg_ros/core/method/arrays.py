@@ -161,6 +161,16 @@ def copy(values, target):
         target[k] = values[k]
 
 
+@loop
+def most_points(counts):
+    """Return the most points of an observation, of `counts` (B, N); at least 1."""
+    most = 1
+    for b in range(len(counts)):
+        for n in range(counts.shape[1]):
+            most = max(most, counts[b, n])
+    return most
+
+
 @kernel
 def factor_of_window(b, factor):
     """Return the factor of window `b`."""

@@ -172,7 +172,8 @@ def eliminate_poses(A, factor):
         np.dot(after.T, coupling, change)
         subtract(change, S, A.poses[pose + 1], A.poses[pose + 2])
     columns = factor.coupling.reshape(POSE * N, S + NEXT)
-    change = np.dot(border.reshape(POSE * N, S).T, columns)
+    change = np.empty((S, S + NEXT))
+    np.dot(border.reshape(POSE * N, S).T, columns, change)
     for s in range(S):
         for t in range(s, S):
             A.corner[s, t] += change[s, t]
@@ -248,7 +249,9 @@ def solve(factor, x):
     rest, found = np.empty(factor.coupling.shape[2]), np.empty(POSE)
     first = POSE * len(factor.own)
     substitute_forward(factor, x, rest)
-    copy(np.dot(factor.corner, x[first:]), x[first:])
+    shared = rest[: len(factor.corner)]
+    np.dot(factor.corner, x[first:], shared)
+    copy(shared, x[first:])
     substitute_backward(factor, x, rest, found)
 
 

@@ -9,6 +9,7 @@ from math import exp, isfinite, log, sqrt
 
 from boxreg_ros.core.method.arrays import ANCHOR, BIAS, BOTTOM, EXTENT, GAP, PIVOT, POSE, SIDESLIP
 from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.selection import sum_of
 
 SIZE, FACES = 3, 6
 """Numbers of an extent, and of the faces of a box."""
@@ -26,7 +27,7 @@ PINNED_DEVIATION = 0.01
 @kernel
 def fill_mean_extents(b, problem, mean):
     """Write the mean input extents, marginalised ones included; of pinned boxes if there are."""
-    has_pin = problem.pinned[b].any()
+    has_pin = sum_of(problem.pinned[b]) > 0
     for k in range(SIZE):
         total, count = 0.0, 0.0
         if not has_pin:
@@ -87,7 +88,7 @@ def population_factor(k, mean, part, median, slopes, radius):
 def fill_poses(b, problem, inputs, constants, common):
     """Write the deviations of the errors of the input poses of window `b` (M17)."""
     of_class, interval = problem.of_class[b], interval_of(b, problem)
-    has_pin = problem.pinned[b].any()
+    has_pin = sum_of(problem.pinned[b]) > 0
     claimed = inputs.low_noise**2
     for j in range(POSE):
         correlation = inputs.correlation[j]
@@ -107,7 +108,7 @@ def fill_poses(b, problem, inputs, constants, common):
 def fill_shared(b, problem, inputs, constants, mean, common):
     """Write means and deviations of extents, margins and motion of window `b`."""
     of_class, interval = problem.of_class[b], interval_of(b, problem)
-    pins = problem.pinned[b].sum()
+    pins = sum_of(problem.pinned[b])
     count = problem.lengths[b] + problem.marginalised_extents[b, 3]
     shared, deviation = common.shared, common.deviation
     shared[:] = 0.0

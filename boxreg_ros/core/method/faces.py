@@ -8,7 +8,7 @@ This is the correspondence search of every round.
 from math import ceil, inf, isfinite, isnan, sqrt
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, TOP
+from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, most_points, TOP
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
@@ -335,7 +335,7 @@ class FaceWork(NamedTuple):
 @kernel
 def empty_face_work(problem, constants):
     """Return arrays for the observations of a batch."""
-    M = max(1, problem.counts.max())
+    M = most_points(problem.counts)
     size = ceil(max(constants.min_face_points, constants.outermost / constants.strips * M)) + 1
     return FaceWork(
         np.empty((3, M)), np.empty((3, M)), np.empty((3, M)), np.empty((2, M), np.int32),

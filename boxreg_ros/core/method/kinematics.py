@@ -74,7 +74,9 @@ def fill_kinematics(length, times, poses, deviations, inverse, G, found):
     """
     of_change, of_rate, factors = np.empty((4, 4)), np.empty((4, 4)), np.empty(3)
     border, through = np.empty((4, PIVOT)), np.empty(PIVOT)
-    prior = (deviations**2).sum()
+    prior = 0.0
+    for i in range(3):
+        prior += deviations[i] ** 2
     for n in range(length if length > 2 else 0):
         own = found[n]
         first = min(max(n - 1, 0), length - 3)

@@ -4,7 +4,7 @@ from math import exp, log
 
 from boxreg_ros.core.method.compile import kernel
 from boxreg_ros.core.method.expectation import constant_part, FACES, fill_mean_extents, SIZE
-from boxreg_ros.core.method.selection import nth
+from boxreg_ros.core.method.selection import nth, sum_of
 import numpy as np
 
 MIN_HITS = 3
@@ -99,7 +99,7 @@ def pooled(values, mean, variance, between, prior_tracks):
     power = n * (QUARTILES_TO_DEVIATION * (last - first)) ** 2
     between = (prior_tracks * between + power) / (prior_tracks + n)
     information = n / (MIDMEAN_FACTOR * between)
-    middle = values[quarter : n - quarter].sum() / (n - 2 * quarter)
+    middle = sum_of(values[quarter : n - quarter]) / (n - 2 * quarter)
     after = 1 / (1 / variance + information)
     return after * (mean / variance + information * middle), after, between
 

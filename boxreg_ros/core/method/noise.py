@@ -5,7 +5,7 @@ from math import exp, log, sqrt
 from boxreg_ros.core.method.compile import kernel
 from boxreg_ros.core.method.expectation import SIZE
 from boxreg_ros.core.method.rotation import fill_rotation
-from boxreg_ros.core.method.selection import lower_median
+from boxreg_ros.core.method.selection import lower_median, sum_of
 import numpy as np
 
 REPEATED_BOX_TOLERANCE = 1e-3
@@ -151,13 +151,14 @@ def estimate(residuals, constants, deviation, correlation):
     B, N, J = residuals.shape
     valid = np.empty((B, N), np.bool_)
     fill_valid(residuals, constants.min_observations, valid)
-    total, tracks = 0, 0
+    count, tracks = 0, 0
     for b in range(B):
-        total += valid[b].sum()
-        tracks += valid[b].any()
-    if total == 0:
+        of_track = sum_of(valid[b])
+        count += of_track
+        tracks += of_track > 0
+    if count == 0:
         return 0
-    errors, sizes = np.empty((B, N)), np.empty(total)
+    errors, sizes = np.empty((B, N)), np.empty(count)
     for j in range(J):
         fill_centred(residuals, valid, j, errors)
         scatter = MAD_TO_DEVIATION * median_size(errors, valid, sizes)
@@ -167,9 +168,9 @@ def estimate(residuals, constants, deviation, correlation):
         for _ in range(CORRELATION_ITERATIONS):
             whole = ratio + (1 - ratio) * removed if power > MIN_POWER else 1 - 2 / tracks
             correlation[j] = min(max(whole, 0.0), constants.max_correlation)
-            variance, removed = removed_by_means(correlation[j], total / tracks)
+            variance, removed = removed_by_means(correlation[j], count / tracks)
         deviation[j] = scatter / sqrt(max(1 - variance, constants.min_left))
-    return total
+    return count
 
 
 @kernel

@@ -3,6 +3,7 @@
 from math import cos, sin
 
 from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.selection import sum_of
 import numpy as np
 
 PATH_REACH = 0.3
@@ -48,7 +49,7 @@ def fill_costs(points, times, velocity, boxes, fewest, costs):
                 v = abs(along * y - across * x) - box[4] / 2
                 outside[c, i] = max(u, v)
                 is_near[i] |= outside[c, i] < PATH_REACH
-        count = is_near.sum()
+        count = sum_of(is_near)
         if count < fewest:
             return False
         most = float(fewest)

@@ -11,6 +11,7 @@ in point-to-plane ICP.
 from math import inf, sqrt
 from typing import Any, NamedTuple
 
+from boxreg_ros.core.method.arrays import most_points
 from boxreg_ros.core.method.arrowhead import factorise_corner, solve_corner
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.eigen import eigenvalues, eigenvector
@@ -106,7 +107,7 @@ class ShapeWork(NamedTuple):
 @kernel
 def empty_shape_work(problem, N, cells):
     """Return arrays for the observations of a batch."""
-    M = max(1, problem.counts.max())
+    M = most_points(problem.counts)
     C = cells[0] * cells[1] * cells[2] + 1
     return ShapeWork(
         np.empty((3, M)), np.empty((N, 3, M)), np.empty((N, M), np.int32), np.empty((C, 4, 4)),

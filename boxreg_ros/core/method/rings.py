@@ -4,6 +4,7 @@ from math import inf, isfinite, sqrt
 
 from boxreg_ros.core.method.arrays import copy
 from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.selection import sort_in_place
 import numpy as np
 
 LEAST_RUN = 1e-9
@@ -36,7 +37,9 @@ def ring_heights(points, counts, origins):
 
     """
     heights = np.zeros(len(counts))
-    most = max(counts.max(), 1) if len(counts) else 0
+    most = 0
+    for i in range(len(counts)):
+        most = max(most, counts[i])
     slopes, gaps = np.empty(most), np.empty(most)
     rank, ordered = np.empty(most), np.empty(most)
     first = 0
@@ -115,7 +118,7 @@ def sort(values, rank, ordered):
         sort_by_rank(values, rank, ordered)
     else:
         copy(values, ordered)
-        ordered.sort()
+        sort_in_place(ordered)
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""Selection of few numbers by rank: numba's own sort takes seconds to compile."""
+"""Ranks, sums and order of few numbers: numba's own functions take seconds to compile."""
 
 from boxreg_ros.core.method.compile import loop
 
@@ -39,6 +39,27 @@ def nth(values, rank):
             return pivot
         first = place + 1
     return values[rank]
+
+
+@loop
+def sort_in_place(values):
+    """Sort values (n,) without NaN: each half is less than the other, as are its own."""
+    size = 1
+    while size < len(values):
+        size *= 2
+    while size > 1:
+        for first in range(0, len(values) - size // 2, size):
+            nth(values[first : first + size], size // 2)
+        size //= 2
+
+
+@loop
+def sum_of(values):
+    """Return the sum of values (n,)."""
+    found = 0
+    for i in range(len(values)):
+        found += values[i]
+    return found
 
 
 @loop
