@@ -343,15 +343,16 @@ class IdCheck:
         ----------
         boxes : BoxArray
             In a fixed frame, with the ids of the input. Late ones, and those of a second message
-            with one stamp, are not compared: they are kept.
+            with one stamp, are not compared: they are kept. Invalid ones are on no track.
 
         """
         if self.tracker.is_late(boxes.stamp_ns):
             return
         self.count += len(boxes.track_ids)
-        if '' in boxes.track_ids:
-            self.nameless += boxes.track_ids.count('')
-            boxes = boxes.take([row for row, name in enumerate(boxes.track_ids) if name])
+        self.nameless += boxes.track_ids.count('')
+        is_compared = is_valid_box(boxes.boxes) & np.array([*map(bool, boxes.track_ids)], bool)
+        if not is_compared.all():
+            boxes = boxes.take(np.flatnonzero(is_compared).tolist())
         self.twice += len(boxes.track_ids) - len(set(boxes.track_ids))
         associated = self.tracker.keep(boxes, self._track_of)
         if associated is None:

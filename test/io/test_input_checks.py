@@ -83,6 +83,17 @@ def test_ids_of_which_some_are_rows_are_found():
     assert id_finding(arrays()).finding
 
 
+def test_invalid_boxes_are_no_new_ids():
+    """Boxes of an object whose quaternions are never normalised, or extents never known."""
+    for value in (np.nan, 0.0):
+        arrays = []
+        for stamp, ids, boxes in street():
+            boxes[:5, 3] = value
+            arrays.append(array(stamp, ids, boxes))
+        check = id_finding(arrays)
+        assert (check.finding, check.new, check.jumps) == ('', 0, 0)
+
+
 def test_an_id_that_two_boxes_have_in_one_message_is_no_finding():
     """The second box begins a track, which has no part in where the id is afterwards."""
 
