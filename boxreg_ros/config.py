@@ -596,7 +596,30 @@ def _unknown(prefix: str, key: str, known: Mapping[str, Any]) -> str:
 
 
 def cast_value(name: str, value: Any, default: Any) -> Any:
-    """Return the value of a setting in the type of its default, or raise ConfigError."""
+    """
+    Return the value of a setting in the type of its default.
+
+    Parameters
+    ----------
+    name : str
+        Of the setting, for the error message.
+    value : object
+        As YAML, JSON or a parameter of ROS has it. Numbers may be text where the default is a
+        float.
+    default : float, int, bool, str or tuple of str
+        Of the setting.
+
+    Returns
+    -------
+    value
+        Of the type of `default`. Its bounds are not checked here.
+
+    Raises
+    ------
+    ConfigError
+        If `value` is of another type, as 1.5 for an int or a number for a bool.
+
+    """
     if isinstance(default, float) and not isinstance(value, bool):
         with suppress(TypeError, ValueError):
             return float(value)  # YAML reads 1e-4, without a point, as text

@@ -78,9 +78,18 @@ def matrix_from_rpy(rpy: ArrayLike) -> Floats:
 
 def rpy_from_matrix(R: ArrayLike) -> Floats:
     """
-    Return roll, pitch and yaw (..., 3) of R (..., 3, 3) [rad].
+    Return the angles of rotation matrices.
 
-    Pitch is in [-pi/2, pi/2], roll and yaw in [-pi, pi].
+    Parameters
+    ----------
+    R : array_like, shape (..., 3, 3)
+        Rotation matrices.
+
+    Returns
+    -------
+    rpy : array, shape (..., 3)
+        Roll, pitch and yaw [rad]; pitch in [-pi/2, pi/2], roll and yaw in [-pi, pi]. Within
+        `GIMBAL_LOCK` of a pitch of pi/2 roll is 0.
 
     """
     R = np.asarray(R, float)
@@ -136,7 +145,25 @@ def quaternion_from_matrix(R: ArrayLike) -> Floats:
 
 
 def rpy_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:
-    """Return roll, pitch and yaw (..., 3) of quaternions (..., 4) [rad]."""
+    """
+    Return the angles of quaternions.
+
+    Parameters
+    ----------
+    quaternion_xyzw : array_like, shape (..., 4)
+        Of any norm but zero.
+
+    Returns
+    -------
+    rpy : array, shape (..., 3)
+        Roll, pitch and yaw, as of `rpy_from_matrix` [rad]; NaN of a quaternion that is not finite.
+
+    Raises
+    ------
+    ValueError
+        If the norm of a quaternion is zero.
+
+    """
     return rpy_from_matrix(matrix_from_quaternion(quaternion_xyzw))
 
 
@@ -205,7 +232,27 @@ def interpolate_rotation(first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: f
 def interpolate_quaternion(
     first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: ArrayLike
 ) -> Floats:
-    """Return the same rotations as `interpolate_rotation` as quaternions (..., 4), x y z w."""
+    """
+    Return the same rotations as `interpolate_rotation` as quaternions.
+
+    Parameters
+    ----------
+    first_xyzw, second_xyzw : array_like, shape (..., 4)
+        Quaternions of any norm but zero, of equal shapes.
+    share : array_like, shape (...)
+        0 for the first, 1 for the second; outside, extrapolated at constant angular velocity.
+
+    Returns
+    -------
+    quaternion_xyzw : array, shape (..., 4)
+        Unit quaternions.
+
+    Raises
+    ------
+    ValueError
+        If the norm of a quaternion is zero.
+
+    """
     first, second = _unit(np.array([first_xyzw, second_xyzw]))
     is_opposite = (first * second).sum(-1, keepdims=True) < 0
     second = np.where(is_opposite, -second, second)  # the same rotation, on the shortest path

@@ -165,7 +165,24 @@ def finite_points(points: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def on_lines(at: NDArray[Any], values: Floats, wanted: NDArray[Any]) -> Floats:
-    """Return rows (n, k) on the lines between values (m, k) at ascending places (m,)."""
+    """
+    Return rows interpolated linearly between those at ascending places.
+
+    Parameters
+    ----------
+    at : array, shape (m,)
+        Ascending places, as times [s] or stamps [ns].
+    values : array, shape (m, k)
+        Rows there. Angles are to be unwrapped before.
+    wanted : array, shape (n,)
+        Places to return rows at.
+
+    Returns
+    -------
+    array, shape (n, k)
+        Before the first place the first row, behind the last one the last row.
+
+    """
     return np.stack([np.interp(wanted, at, column) for column in values.T], axis=1)
 
 
@@ -321,7 +338,21 @@ class Columns:
     COLUMNS: ClassVar[tuple[str, ...]] = ()
 
     def take(self, rows: Sequence[int] | Ints) -> Self:
-        """Return the items `rows` only, in their order."""
+        """
+        Return some of the items.
+
+        Parameters
+        ----------
+        rows : sequence of int, or array of int, shape (k,)
+            Which ones, in any order; no mask.
+
+        Returns
+        -------
+        record
+            Of the same class, with a row for each of `rows`, in their order; the other fields are
+            shared.
+
+        """
         return replace(
             self, **{name: _rows_of(getattr(self, name), rows) for name in self.COLUMNS}
         )
@@ -339,7 +370,28 @@ _Columns = TypeVar('_Columns', bound=Columns)
 
 
 def concatenated(records: Sequence[_Columns]) -> _Columns:
-    """Return the items of several records, at least one, as those of the first of them."""
+    """
+    Return the items of several records as one record.
+
+    Parameters
+    ----------
+    records : sequence of records with `Columns`
+        At least one, of one class. A column that the first of them does not have (None) is left
+        out.
+
+    Returns
+    -------
+    record
+        The fields that are no columns are those of the first, as stamp and frame.
+
+    Raises
+    ------
+    ShapeError
+        If some of several `BoxArray` have attributes and others with boxes have none.
+    ValueError
+        If the first of them has an array and another has None in its place.
+
+    """
     first = records[0]
     parts = {name: [getattr(one, name) for one in records] for name in first.COLUMNS}
     return replace(first, **{name: _joined(columns) for name, columns in parts.items()})
@@ -507,13 +559,41 @@ class RefinedBoxes(Columns):
             object.__setattr__(self, 'near_points', np.zeros((n, 2), np.int64))
 
     def without(self, *words: str) -> 'RefinedBoxes':
-        """Return the boxes whose status is none of some words; itself if that is all of them."""
+        """
+        Return the boxes whose status is none of some words.
+
+        Parameters
+        ----------
+        *words : str
+            Statuses to leave out, as ``coasted``.
+
+        Returns
+        -------
+        refined : RefinedBoxes
+            The others in their order; itself if these are all.
+
+        """
         rows = [row for row, word in enumerate(self.status) if word not in words]
         return self if len(rows) == len(self.status) else self.take(rows)
 
 
 def kept(boxes: BoxArray, reason: str) -> RefinedBoxes:
-    """Return boxes as a result in which each is kept for the same reason."""
+    """
+    Return boxes as a result in which each is kept for the same reason.
+
+    Parameters
+    ----------
+    boxes : BoxArray
+        n boxes, in any frame; invalid ones too.
+    reason : str
+        Why, as one of `Reason`.
+
+    Returns
+    -------
+    refined : RefinedBoxes
+        Final, with the boxes as they are, no points, and unit covariances.
+
+    """
     n = len(boxes.track_ids)
     unknown = np.broadcast_to(np.eye(6), (n, 6, 6))
     return RefinedBoxes(boxes, (KEPT,) * n, (str(reason),) * n, np.zeros(n, np.int64), unknown)

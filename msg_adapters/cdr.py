@@ -268,12 +268,44 @@ class Fields:
         return self.places[path][:, 1]
 
     def numbers(self, path: str, dtype: str, width: int = 1) -> NDArray[Any]:
-        """Return a field and the numbers that follow it without a gap, as an array (k, width)."""
+        """
+        Return a field and the numbers that follow it without a gap.
+
+        Parameters
+        ----------
+        path : str
+            Of the first of them, one of those that the `Layout` was asked to find.
+        dtype : str
+            Of each number, as in ``'<f8'``; all of them have this one.
+        width : int
+            How many numbers there are for each of the k items that have the field.
+
+        Returns
+        -------
+        values : array, shape (k, width)
+            A copy; `put` writes it back.
+
+        Raises
+        ------
+        KeyError
+            If the `Layout` was not asked to find `path`.
+
+        """
         values: NDArray[Any] = self.body.view(dtype)[self._index(path, dtype, width)]
         return values
 
     def put(self, path: str, values: NDArray[Any]) -> None:
-        """Replace the numbers that `numbers` returns for `path` by an array (k, width)."""
+        """
+        Replace the numbers that `numbers` returns.
+
+        Parameters
+        ----------
+        path : str
+            As of `numbers`.
+        values : array, shape (k, width)
+            Of the dtype of the field: they are not converted.
+
+        """
         dtype = values.dtype.str
         self.body.view(dtype)[self._index(path, dtype, values.shape[1])] = values
 

@@ -14,7 +14,23 @@ from numpy.typing import NDArray
 
 
 def with_points(msg: Any, is_kept: NDArray[np.bool_]) -> Any:
-    """Return a cloud with some of its points, `is_kept` (height * width,), in the same layout."""
+    """
+    Return a cloud with some of its points in the same layout.
+
+    Parameters
+    ----------
+    msg : sensor_msgs/PointCloud2
+        One that `pointcloud.from_msg` reads. It is not modified.
+    is_kept : array of bool, shape (height * width,)
+        Which points remain, row by row.
+
+    Returns
+    -------
+    sensor_msgs/PointCloud2
+        `msg` itself if all remain; else a copy of its class, of one row, with all fields of the
+        points that remain.
+
+    """
     if is_kept.all():
         return msg
     kept = np.compress(is_kept, _bytes_of(msg), axis=0)  # a quarter of the time of an index
@@ -22,7 +38,28 @@ def with_points(msg: Any, is_kept: NDArray[np.bool_]) -> Any:
 
 
 def with_fields(msg: Any, columns: Mapping[str, NDArray[Any]]) -> Any:
-    """Return a cloud with more fields behind those it has: columns (height * width,) by name."""
+    """
+    Return a cloud with more fields behind those it has.
+
+    Parameters
+    ----------
+    msg : sensor_msgs/PointCloud2
+        One that `pointcloud.from_msg` reads. It is not modified.
+    columns : mapping of str to array, shape (height * width,)
+        Values of each new field, row by row, by its name: integers of up to 32 bits, float32 or
+        float64.
+
+    Returns
+    -------
+    sensor_msgs/PointCloud2
+        A copy of its class, with as many rows. The values are in the byte order of `is_bigendian`.
+
+    Raises
+    ------
+    KeyError
+        If a column has a type without a ``PointField.datatype``, as int64 or bool.
+
+    """
     points = _bytes_of(msg)
     make = type(msg.fields[0])
     order = '>' if msg.is_bigendian else '<'
@@ -39,7 +76,23 @@ def with_fields(msg: Any, columns: Mapping[str, NDArray[Any]]) -> Any:
 
 
 def with_positions(msg: Any, positions: Floats) -> Any:
-    """Return a cloud whose points are at `positions` (height * width, 3), in their types."""
+    """
+    Return a cloud whose points are elsewhere.
+
+    Parameters
+    ----------
+    msg : sensor_msgs/PointCloud2
+        One that `pointcloud.from_msg` reads. It is not modified.
+    positions : array, shape (height * width, 3)
+        New x, y and z of all its points, row by row, NaN for points that are not finite [m].
+
+    Returns
+    -------
+    sensor_msgs/PointCloud2
+        A copy of its class, in the same layout: x, y and z have the types that they have in `msg`,
+        and the byte order of `is_bigendian`.
+
+    """
     data = _bytes_of(msg).copy()
     order = '>' if msg.is_bigendian else '<'
     fields = {field.name: field for field in msg.fields}

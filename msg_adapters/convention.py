@@ -152,7 +152,22 @@ class Convention:
         return np.array(parts)
 
     def to_centers(self, boxes: BoxArray) -> BoxArray:
-        """Return boxes of this convention with the pose at their centre, as in `structures`."""
+        """
+        Return boxes of this convention with the pose at their centre, as in `structures`.
+
+        Parameters
+        ----------
+        boxes : BoxArray
+            n boxes as an adapter reads them: the pose of the reference point, the axes and the
+            sizes of the publisher.
+
+        Returns
+        -------
+        boxes : BoxArray
+            The centre, x forward, and the extents along x, y and z [m, rad], in `boxes_frame` if
+            that is set. `boxes_offset` is added to a stamp above 0. Angles that are NaN stay so.
+
+        """
         changed = self._rotated(self._oriented(boxes.boxes), FORWARD[self.forward_axis])
         changed[:, BOX_EXTENT] = boxes.boxes[:, self._columns] * self.size_scale
         changed[:, BOX_CENTER] -= self._offsets(changed)
@@ -166,7 +181,22 @@ class Convention:
         return replace(boxes, stamp_ns=boxes.stamp_ns + round(self.boxes_offset * 1e9))
 
     def from_centers(self, boxes: BoxArray) -> BoxArray:
-        """Return boxes with the pose at their centre in this convention."""
+        """
+        Return boxes with the pose at their centre in this convention.
+
+        Parameters
+        ----------
+        boxes : BoxArray
+            n boxes as of `to_centers` [m, rad].
+
+        Returns
+        -------
+        boxes : BoxArray
+            What an adapter writes: the pose of the reference point, axes and sizes of the
+            publisher. Kinematics are those of the reference point. Frame and stamp are not
+            changed.
+
+        """
         changed = self._rotated(boxes.boxes, -FORWARD[self.forward_axis])
         changed[:, BOX_CENTER] += self._offsets(boxes.boxes)
         changed[:, self._columns] = boxes.boxes[:, BOX_EXTENT] / self.size_scale
@@ -174,7 +204,22 @@ class Convention:
         return replace(boxes, boxes=changed, kinematics=self._kinematics(boxes))
 
     def covariances_from_centers(self, boxes: BoxArray, covariances: Floats) -> Floats:
-        """Return covariances (n, 6, 6) of centre poses as those of this convention."""
+        """
+        Return covariances of centre poses as those of this convention.
+
+        Parameters
+        ----------
+        boxes : BoxArray
+            The n boxes, as of `to_centers` [m, rad].
+        covariances : array, shape (n, 6, 6)
+            Of x y z roll pitch yaw of their centres [m, rad].
+
+        Returns
+        -------
+        covariances : array, shape (n, 6, 6)
+            Of the same of their reference points, in the axes of the publisher, to first order.
+
+        """
         axes = _rotation_axes(boxes.boxes)
         angle = FORWARD[self.forward_axis]
         J = np.tile(np.eye(6), (len(axes), 1, 1))  # (n, 6, 6) d(output pose) / d(centre pose)

@@ -105,10 +105,30 @@ def reading_of(
     raw: NDArray[Any], stamp_ns: int, layout: PointLayout | None, unit: str
 ) -> TimeReading | None:
     """
-    Return how finite times (M,), M > 0, of points are read; None if they are of no unit.
+    Return how the times of points are read.
 
-    They are as the message has them; `unit` is one of `TIME_UNIT_CHOICES`. Raises
-    UnsupportedMessage if the times of a known layout are in another unit than that of its driver.
+    Parameters
+    ----------
+    raw : array, shape (M,)
+        Times as the message has them, finite; M > 0.
+    stamp_ns : int
+        Stamp of the message [ns].
+    layout : PointLayout or None
+        That of the cloud; None if it is unknown.
+    unit : str
+        One of `TIME_UNIT_CHOICES`.
+
+    Returns
+    -------
+    reading : TimeReading or None
+        None if they are of no unit: in none of them do they lie within `MAX_TIME_OFFSET` of the
+        stamp, or, in an unknown layout, they are not of a sweep about the stamp.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If `unit` is `AUTO`, and the times of a known layout are in another unit than that of its
+        driver.
 
     """
     ends = _usual_ends(raw)
@@ -135,7 +155,24 @@ def reading_of(
 
 
 def seconds_of(raw: NDArray[Any], stamp_ns: int, reading: TimeReading) -> Floats:
-    """Return times (M,) relative to the stamp [s]; wild ones are 0, see `wild_times`."""
+    """
+    Return times relative to the stamp.
+
+    Parameters
+    ----------
+    raw : array, shape (M,)
+        Times as the message has them, finite; M > 0.
+    stamp_ns : int
+        Stamp of the message [ns].
+    reading : TimeReading
+        That of `reading_of`.
+
+    Returns
+    -------
+    times : array, shape (M,)
+        [s]; those of `wild_times` are 0.
+
+    """
     times = _relative(raw, stamp_ns, reading)
     first, last = _bounds(times)
     low, high = _relative(np.array([raw.min(), raw.max()]), stamp_ns, reading)  # the ends of times

@@ -93,7 +93,27 @@ def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
 
 
 def described(msg: Any, time_unit: str = AUTO) -> str:
-    """Return layout of a cloud and reading of its times in one line; raises as `from_msg`."""
+    """
+    Return the layout of a cloud and how its times are read, in one line.
+
+    Parameters
+    ----------
+    msg : sensor_msgs/PointCloud2
+        As of `from_msg`.
+    time_unit : str
+        As of `from_msg`.
+
+    Returns
+    -------
+    text : str
+        'empty' for a cloud without points; it contains `NOT_USED` if its times are of no unit.
+
+    Raises
+    ------
+    UnsupportedMessage
+        As `from_msg`.
+
+    """
     if not msg.width * msg.height:
         return 'empty'
     fields = _fields(msg)
@@ -125,7 +145,25 @@ def described(msg: Any, time_unit: str = AUTO) -> str:
 
 
 def finite_rows(msg: Any) -> Ints | None:
-    """Return the rows (M,) of the points of `from_msg` in the message; None if these are all."""
+    """
+    Return which points of a message are those of `from_msg`.
+
+    Parameters
+    ----------
+    msg : sensor_msgs/PointCloud2
+        As of `from_msg`.
+
+    Returns
+    -------
+    rows : array, shape (M,), or None
+        Their places in the message, counted row by row, ascending; None if these are all.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If x, y and z cannot be read, as in `from_msg`.
+
+    """
     if not msg.width * msg.height:
         return None
     is_finite = _is_finite(_table(msg, list(map(_fields(msg).__getitem__, 'xyz'))))
@@ -133,7 +171,25 @@ def finite_rows(msg: Any) -> Ints | None:
 
 
 def positions(msg: Any) -> Floats:
-    """Return x, y and z of all points of a cloud, (height * width, 3), not finite ones too."""
+    """
+    Return the positions of all points of a cloud, not finite ones too.
+
+    Parameters
+    ----------
+    msg : sensor_msgs/PointCloud2
+        As of `from_msg`.
+
+    Returns
+    -------
+    positions : array, shape (height * width, 3)
+        x, y and z in the frame of the message, row by row [m].
+
+    Raises
+    ------
+    UnsupportedMessage
+        If x, y and z cannot be read, as in `from_msg`.
+
+    """
     fields = _fields(msg)
     table = _table(msg, [fields[key] for key in 'xyz'])
     return np.column_stack([table[key].reshape(-1).astype(np.float64) for key in 'xyz'])

@@ -101,7 +101,29 @@ def common_header(kind: str, header: Any, items: Sequence[Any]) -> Any:
 
 
 def common_stamp_and_frame(kind: str, headers: Iterable[tuple[int, str]]) -> tuple[int, str]:
-    """Return the one stamp [ns] and frame of boxes, 0 and '' for none; else UnsupportedMessage."""
+    """
+    Return the one stamp and frame of boxes that have a header each.
+
+    Parameters
+    ----------
+    kind : str
+        Type of the message, for errors.
+    headers : iterable of (int, str)
+        Stamp [ns] and frame of each box.
+
+    Returns
+    -------
+    stamp_ns : int
+        [ns]; 0 without boxes.
+    frame_id : str
+        Empty without boxes.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If the boxes have several stamps or frames.
+
+    """
     found = set(headers)
     if len(found) > 1:
         names = ', '.join(f'{frame!r} at {stamp} ns' for stamp, frame in sorted(found))
@@ -150,7 +172,23 @@ def boxes_of(poses: Sequence[Any], sizes: Sequence[Any]) -> Floats:
 
 
 def boxes_from(poses: Floats, sizes: Floats) -> Floats:
-    """Return boxes (n, 9) of positions, quaternions (n, 7) and extents (n, 3); see `boxes_of`."""
+    """
+    Return boxes of numbers, as `boxes_of` does of messages.
+
+    Parameters
+    ----------
+    poses : array, shape (n, 7)
+        Positions of the centres [m], and quaternions x y z w.
+    sizes : array, shape (n, 3)
+        Full length, width and height [m].
+
+    Returns
+    -------
+    boxes : array, shape (n, 9)
+        x y z length width height roll pitch yaw [m, rad]; the angles of a quaternion that is not
+        of unit length are NaN.
+
+    """
     boxes = np.full((len(poses), 9), np.nan)
     boxes[:, BOX_CENTER] = poses[:, :3]
     boxes[:, BOX_EXTENT] = sizes
@@ -313,7 +351,22 @@ def rotated(vector: Any, T_out_in: Floats | None) -> Any:
 
 
 def moved_polygon(polygon: Any, T_out_in: Floats | None) -> Any:
-    """Return a polygon of the input frame in the output frame."""
+    """
+    Return a polygon of the input frame in the output frame.
+
+    Parameters
+    ----------
+    polygon : geometry_msgs/Polygon
+        With points in the input frame [m].
+    T_out_in : array, shape (4, 4), or None
+        Maps the input frame to the output frame; None if they are the same.
+
+    Returns
+    -------
+    geometry_msgs/Polygon
+        A copy; `polygon` itself without a transform.
+
+    """
     if T_out_in is None:
         return polygon
     points = [T_out_in[:3, :3] @ [p.x, p.y, p.z] + T_out_in[:3, 3] for p in polygon.points]
@@ -328,8 +381,20 @@ def rotated_motion(motion: Any, name: str, T_out_in: Floats | None) -> Any:
     """
     Return a twist or an accel of the input frame in the output frame.
 
-    `motion` may be stamped with a covariance; `name` is then the field of the twist or accel in
-    it. Only the rotation is applied.
+    Parameters
+    ----------
+    motion : message
+        ``Twist`` or ``Accel``, or one of these with a covariance.
+    name : str
+        ``twist`` or ``accel``: the field that has it where there is a covariance.
+    T_out_in : array, shape (4, 4), or None
+        Maps the input frame to the output frame; None if they are the same. Only its rotation is
+        applied: velocities are over ground.
+
+    Returns
+    -------
+    message
+        A copy of the class of `motion`. Both parts of the covariance are rotated.
 
     """
     if not hasattr(motion, 'covariance'):
@@ -423,7 +488,20 @@ def with_kinematics(own: Floats, kinematics: NDArray[np.void] | None, name: str)
 
 
 def kinematics_of_axes(boxes: BoxArray) -> NDArray[np.void] | None:
-    """Return the kinematics of boxes in the axes of each box, none for those without angles."""
+    """
+    Return the kinematics of boxes in the axes of each box.
+
+    Parameters
+    ----------
+    boxes : BoxArray
+        n boxes, with kinematics in the axes of their frame.
+
+    Returns
+    -------
+    kinematics : array, shape (n,), or None
+        Records `KINEMATICS`, unknown for boxes whose angles are NaN; None if `boxes` have none.
+
+    """
     if boxes.kinematics is None:
         return None
     R = matrix_from_rpy(np.nan_to_num(boxes.boxes[:, ROLL:]))
@@ -435,7 +513,23 @@ def kinematics_of_axes(boxes: BoxArray) -> NDArray[np.void] | None:
 
 
 def moved(pose: Any, T_out_in: Floats | None) -> Any:
-    """Return a pose of the input frame in the output frame."""
+    """
+    Return a pose of the input frame in the output frame.
+
+    Parameters
+    ----------
+    pose : geometry_msgs/Pose
+        In the input frame [m].
+    T_out_in : array, shape (4, 4), or None
+        Maps the input frame to the output frame; None if they are the same.
+
+    Returns
+    -------
+    geometry_msgs/Pose
+        A copy; `pose` itself without a transform. An orientation that is not of unit length is
+        copied as it is.
+
+    """
     if T_out_in is None:
         return pose
     p = pose.position

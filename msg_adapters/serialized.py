@@ -172,7 +172,27 @@ class SerializedAdapter:
         covariances: Floats | None = None,
         T_out_in: Floats | None = None,
     ) -> Any:
-        """Return a copy with its boxes replaced, see `Adapter`: bytes, or a message."""
+        """
+        Return a copy with its boxes replaced, see `Adapter`.
+
+        Parameters
+        ----------
+        msg : bytes or message
+            As `from_msg` has read it, or as `with_added` returns it.
+        boxes : BoxArray
+            As of `Adapter.to_msg`.
+        covariances : array, shape (n, 6, 6), optional
+            As there.
+        T_out_in : array, shape (4, 4), optional
+            As there.
+
+        Returns
+        -------
+        bytes or message
+            Bytes where `msg` is bytes that `BoxReader.ordinary` reads, and `boxes` are in its
+            frame; else a message.
+
+        """
         if not isinstance(msg, bytes):
             return self.inner.to_msg(msg, boxes, covariances, T_out_in)
         fields = self._reader.ordinary(msg) if T_out_in is None else None
@@ -209,7 +229,31 @@ class SerializedAdapter:
 def serialized_adapter_for(
     type_name: str, convention: Convention, kind: Any, deserialize: Callable[[bytes, Any], Any]
 ) -> Adapter | None:
-    """Return the adapter of serialised messages, as `adapter_for`; None if there is none."""
+    """
+    Return the adapter of serialised messages of a type.
+
+    Parameters
+    ----------
+    type_name : str
+        As ``package/msg/Type``.
+    convention : Convention
+        As of `adapter_for`.
+    kind : class
+        That of the message in rclpy.
+    deserialize : callable
+        Returns a message of bytes and its class, as ``rclpy.serialization.deserialize_message``.
+
+    Returns
+    -------
+    adapter : Adapter or None
+        Reads bytes; None if messages of this type are read by attribute only.
+
+    Raises
+    ------
+    UnsupportedMessage
+        As of `adapter_for`, or if the installed definition of the type lacks a field.
+
+    """
     inner = adapter_for(type_name, replace(STANDARD, associate=convention.associate))
     if type_name not in BOX_FIELDS:
         return None
