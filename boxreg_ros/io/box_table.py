@@ -61,7 +61,27 @@ class BoxTable(Columns):
 
     @classmethod
     def from_arrays(cls, arrays: Sequence[BoxArray], status: str = 'input') -> BoxTable:
-        """Return the rows of box arrays in order; RecordingError if they are in several frames."""
+        """
+        Return the rows of box arrays in order.
+
+        Parameters
+        ----------
+        arrays : sequence of BoxArray
+            All in one frame; may be empty.
+        status : str
+            Of all rows.
+
+        Returns
+        -------
+        table : BoxTable
+            One row per box, with no points counted; attributes, pins and kinematics are left out.
+
+        Raises
+        ------
+        RecordingError
+            If the arrays are in several frames.
+
+        """
         frame_ids = {array.frame_id for array in arrays}
         if len(frame_ids) > 1:
             raise RecordingError(
@@ -181,7 +201,27 @@ class BoxTable(Columns):
 
 
 def parsed_rows(path: Path, parsed: Callable[[dict[str, str]], _T]) -> Iterator[_T]:
-    """Yield what is `parsed` of each row of a table; RecordingError if it is damaged."""
+    """
+    Yield what is parsed of each row of a table.
+
+    Parameters
+    ----------
+    path : Path
+        A CSV file with a header, in UTF-8.
+    parsed : callable
+        Returns the value of a row, which is a mapping of columns to texts.
+
+    Yields
+    ------
+    value
+        Of each row, in order.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read, or a row lacks a column or has no number in its place.
+
+    """
     try:
         with path.open(newline='', encoding='utf-8-sig') as file:
             yield from map(parsed, csv.DictReader(file))
@@ -216,10 +256,19 @@ def csv_row(cells: Iterable[object]) -> str:
 
 def number_cells(numbers: NDArray[Any], unknown: str) -> list[str]:
     """
-    Return the cells of each row of numbers (n, k) with commas between them.
+    Return the cells of each row of numbers, with commas between them.
 
-    They have as few digits as state the number in its precision; `unknown` stands for all that
-    are not finite.
+    Parameters
+    ----------
+    numbers : array, shape (n, k)
+        They are written with as few digits as state them in their precision.
+    unknown : str
+        Stands for all that are not finite.
+
+    Returns
+    -------
+    list of n str
+        Without the ends of the lines.
 
     """
     if not len(numbers):

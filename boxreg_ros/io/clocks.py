@@ -63,10 +63,21 @@ class ReceiveTimes:
 
 def clock_offset(first: ReceiveTimes, second: ReceiveTimes) -> float | None:
     """
-    Return the seconds to add to stamps of the `second` stream to get those of the first clock.
+    Return the offset between the clocks of two streams.
 
     The messages that were received about the same time are compared, so that both streams may be
-    played faster or slower. None if too few were, or the offset is not constant.
+    played faster or slower.
+
+    Parameters
+    ----------
+    first, second : ReceiveTimes
+        Times of receipt and stamps of some messages of each stream.
+
+    Returns
+    -------
+    offset : float or None
+        To be added to stamps of the second stream to get those of the first clock [s]. None if too
+        few messages were received together, or the offset is not constant.
 
     """
     if not (first.received_ns and second.received_ns):

@@ -40,9 +40,20 @@ class BoxCovariance(NamedTuple):
 
 def covariance_lines(refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> list[str]:
     """
-    Return the line of each box with a covariance, in single precision.
+    Return the lines of ``covariances.csv``, in single precision.
 
-    Kept and rejected boxes, and those of label files that state none, have the unit matrix.
+    Parameters
+    ----------
+    refined : RefinedBoxes
+        Boxes and covariances in the fixed frame [m, rad].
+    T_fixed_sensor : array, shape (4, 4), or None
+        Pose of the sensor, for the horizontal distance of each box; None leaves it empty.
+
+    Returns
+    -------
+    list of str
+        One line per box with a covariance, with its end. Kept and rejected boxes, and those of
+        label files that state none, have the unit matrix, and no line.
 
     """
     boxes = refined.boxes

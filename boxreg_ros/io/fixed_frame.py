@@ -80,7 +80,25 @@ class FixedFrameItems:
         self.first_ahead = ''
 
     def read(self, *, with_clouds: bool = True, with_intensities: bool = False) -> Iterator[Item]:
-        """Yield clouds and boxes in the order they were received; see `Recording.items`."""
+        """
+        Yield clouds and boxes in the order they were received; see `Recording.items`.
+
+        Parameters
+        ----------
+        with_clouds : bool
+            False leaves the clouds out, and saves decoding them.
+        with_intensities : bool
+            Whether items of clouds have the intensities of their points.
+
+        Yields
+        ------
+        item : Item
+            `moved` is its sweep or its boxes in the fixed frame; None, with a `reason`, without a
+            transform or with a stamp ahead of all others, and None for an array without boxes that
+            has no stamp or frame. The clouds of several LiDARs are one item with `parts`;
+            `restarts` where time went back before it.
+
+        """
         wanted = Wanted(with_clouds, with_intensities, self._stage)
         for item in self._source.items(self.tree, wanted):
             confirmed = Confirmed([item])
@@ -109,7 +127,23 @@ class FixedFrameItems:
             return None
 
     def stored_cloud(self, item: Item, frame_id: str) -> StoredCloud:
-        """Return a cloud for label files, a merged one in `frame_id`, with its times as moved."""
+        """
+        Return a cloud for label files, with its times as moved.
+
+        Parameters
+        ----------
+        item : Item
+            Of a cloud, or of several that were merged, as of `read`.
+        frame_id : str
+            Frame of a merged cloud; a single one is in that of its message.
+
+        Returns
+        -------
+        StoredCloud
+            Its pose in the fixed frame is None where it is unknown: a merged cloud is then in the
+            fixed frame. Intensities are None unless all of its parts have them.
+
+        """
         moved = item.moved
         given = item.content
         assert isinstance(given, Sweep)
@@ -218,10 +252,26 @@ def input_boxes(
     source: AbstractContextManager[ItemSource], fixed_frame: str | None = None
 ) -> tuple[list[BoxArray], str]:
     """
-    Return the input boxes of a recording, not open yet, in the frame that `relabel` would choose.
+    Return the input boxes of a recording in the frame that `relabel` would choose.
 
-    Those that could not be decoded or transformed are counted, with the reason, in the text; it is
-    empty if there are none.
+    Parameters
+    ----------
+    source : context manager of ItemSource
+        The recording, not open yet; it is closed at the end.
+    fixed_frame : str, optional
+        Frame to bring the boxes to, instead of the one that is chosen.
+
+    Returns
+    -------
+    boxes : list of BoxArray
+        In the order they were received, in the fixed frame [m, rad].
+    left_out : str
+        How many could not be decoded or transformed, and why; empty if there are none.
+
+    Raises
+    ------
+    RecordingError
+        If no motion of the sensor is known, or no transforms lead to `fixed_frame`.
 
     """
     with source as recording:

@@ -201,11 +201,19 @@ class Tracker:
 
     def identify(self, boxes: BoxArray) -> BoxArray:
         """
-        Return boxes in a fixed frame with ids; invalid boxes get the id ``''``.
+        Return boxes with the ids of their objects.
 
-        Boxes with an older stamp than others before are assigned to tracks but do not change them;
-        without a track they get an id that is not used again. If stamps go back further than
-        `max_gap`, all tracks end.
+        Parameters
+        ----------
+        boxes : BoxArray
+            In a fixed frame; their own ids are not used. Those with an older stamp than others
+            before are assigned to tracks but do not change them; without a track they get an id
+            that is not used again. If stamps go back further than `max_gap`, all tracks end.
+
+        Returns
+        -------
+        boxes : BoxArray
+            The same, in their order; invalid boxes have the id ``''``.
 
         """
         from scipy.optimize import linear_sum_assignment  # slow, and only association needs it

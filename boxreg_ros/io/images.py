@@ -105,7 +105,31 @@ class RecordedImages:
         return found
 
     def nearest(self, camera: ImageCamera, stamp_ns: int) -> Image:
-        """Return the image of a camera nearest to a stamp; RecordingError if none is in `NEAR`."""
+        """
+        Return the image of a camera nearest to a stamp.
+
+        Parameters
+        ----------
+        camera : ImageCamera
+            One of `cameras`.
+        stamp_ns : int
+            In the clock of the stamps of the images [ns].
+
+        Returns
+        -------
+        image : Image
+            With its own stamp; raw images are converted to JPEG.
+
+        Raises
+        ------
+        RecordingError
+            If there is none within the larger of `NEAR`.
+        UnsupportedMessage
+            If it has an encoding that is not known, or is damaged.
+        ConfigError
+            If a raw image needs a package that is not installed.
+
+        """
         middle_ns = stamp_ns + self._delays[camera.topic]
         for seconds in NEAR:
             reach_ns = round(seconds * 1e9)

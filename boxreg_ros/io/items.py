@@ -84,7 +84,29 @@ EVERYTHING = Wanted()
 def requested_part(
     source: str, begin_ns: int, end_ns: int, start: float | None, end: float | None
 ) -> tuple[int, int]:
-    """Return begin and end [ns] of the part from `start` to `end` [s]; RecordingError if empty."""
+    """
+    Return the part of a source that was asked for.
+
+    Parameters
+    ----------
+    source : str
+        Its name, for the error message.
+    begin_ns, end_ns : int
+        Of the whole source [ns].
+    start, end : float or None
+        Of the part, from the begin of the source [s]; None for the whole.
+
+    Returns
+    -------
+    begin_ns, end_ns : int
+        Of the part [ns]; its end is no later than that of the source.
+
+    Raises
+    ------
+    RecordingError
+        If the part is empty.
+
+    """
     first_ns = begin_ns + round((start or 0.0) * 1e9)
     behind_ns = end_ns if end is None else min(end_ns, begin_ns + round(end * 1e9))
     if first_ns >= behind_ns:

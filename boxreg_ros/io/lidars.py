@@ -193,8 +193,24 @@ class SensorPlacement:
         """
         Return the sweep of a cloud, with its topic if there are several.
 
-        Raises UnsupportedMessage if it cannot be read, or its points are not in the order of the
-        infos.
+        Parameters
+        ----------
+        msg : message
+            Of a type of `CLOUD_TYPES`.
+        topic : str
+            That it was received on.
+
+        Returns
+        -------
+        sweep : Sweep
+            Finite points in the frame of the message [m], or in that named for the LiDAR where the
+            message has none; times relative to the stamp [s]. With info messages `rows` has the
+            places of the points in the message.
+
+        Raises
+        ------
+        UnsupportedMessage
+            If it cannot be read, or its points are not in the order of the infos.
 
         """
         if self.lidars.info and clouds.is_reordered(msg):
@@ -242,10 +258,25 @@ class SensorPlacement:
         """
         Return a cloud with the positions of its LiDARs, each at the stamp of its own part.
 
-        The cloud is in the fixed frame; it is unchanged where nothing is known of its LiDARs, and
-        then reason and detail say what is missing. Points of a concatenated cloud without an info
-        message are attributed to the nearest of the LiDARs that are named: the one with the
-        densest points, and rarely blocked by the vehicle.
+        Points of a concatenated cloud without an info message are attributed to the nearest of the
+        LiDARs that are named: the one with the densest points, and rarely blocked by the vehicle.
+
+        Parameters
+        ----------
+        sweep : Sweep
+            In the fixed frame, as of `sweep_of` before.
+        tree : TransformTree
+            Has the poses of the LiDARs.
+
+        Returns
+        -------
+        sweep : Sweep
+            With `origin`, or with `origins` and `sensors` of several LiDARs [m]; unchanged where
+            nothing is known of them.
+        reason : Reason or None
+            Why nothing is known; None if all is well.
+        detail : str
+            The info message or the transform that is missing; empty if all is well.
 
         """
         if self.lidars.info and not sweep.is_dropped:
@@ -367,9 +398,20 @@ class SweepMerger:
 
     def add(self, sweep: Sweep, extra: Any = None) -> list[MergedSweep]:
         """
-        Add a cloud in the fixed frame, with its topic; return the complete sweeps by their stamps.
+        Add a cloud of one LiDAR.
 
-        `extra` is returned with the merged sweep.
+        Parameters
+        ----------
+        sweep : Sweep
+            In the fixed frame, with its topic.
+        extra : object
+            Returned with the merged sweep.
+
+        Returns
+        -------
+        list of MergedSweep
+            Those that are complete now, by their stamps. A cloud that comes after the others of
+            its time were merged is reported and left out.
 
         """
         group = self._group_for(sweep)

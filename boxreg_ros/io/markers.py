@@ -106,10 +106,22 @@ class MarkerBoard:
         """
         Return the markers that bring what is shown of early boxes up to date.
 
-        Both are in one frame; coasted boxes stand behind those of the input. Boxes that are not
-        finite, or have no volume, are not shown. Green is refined, violet coasted, orange is kept,
-        yellow is kept because there was no time; grey is the input. The blue ellipse is the
-        covariance of x and y of a refined box, 2 standard deviations.
+        Green is refined, violet coasted, orange is kept, yellow is kept because there was no time;
+        grey is the input. The blue ellipse is the covariance of x and y of a refined box, 2
+        standard deviations.
+
+        Parameters
+        ----------
+        given : BoxArray
+            The input.
+        refined : RefinedBoxes
+            Its result, in the same frame; coasted boxes stand behind those of the input. Boxes
+            that are not finite, or have no volume, are not shown.
+
+        Returns
+        -------
+        visualization_msgs/MarkerArray
+            In the frame and with the stamp of `given`, with the deletion of those that are gone.
 
         """
         m = self._messages

@@ -76,10 +76,23 @@ class MessageContents:
 
     def item(self, record: Record, later: Iterable[Record], with_intensities: bool) -> Item | None:
         """
-        Return a message decoded; None, and counted, if it cannot be, or is a repeated one.
+        Return the item of a message.
 
-        Boxes are joined with those of the same stamp among the `later` records, which have no
-        item of their own then.
+        Parameters
+        ----------
+        record : Record
+            The message. Boxes are joined with those of the same stamp among the later ones.
+        later : iterable of Record
+            Those behind it, as far as they are known; those that were joined have no item of their
+            own.
+        with_intensities : bool
+            Whether those of the points of a cloud are read.
+
+        Returns
+        -------
+        item : Item or None
+            Its sweep or boxes are in the frame of the message. None, and counted, if it cannot be
+            decoded, is repeated, or was joined with one before.
 
         """
         topic = record.connection.topic

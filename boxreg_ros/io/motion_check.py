@@ -284,7 +284,19 @@ class MotionCheck:
             self._look(fixed_frame, item.frame_id)
 
     def add_pose(self, cloud: Sweep, fixed_frame: str, T_fixed_cloud: Floats) -> None:
-        """Add the pose (4, 4) of the frame of a cloud at its stamp."""
+        """
+        Add the pose of the frame of a cloud.
+
+        Parameters
+        ----------
+        cloud : Sweep
+            In the frame of its message; frame and stamp are used.
+        fixed_frame : str
+            For the text of a finding.
+        T_fixed_cloud : array, shape (4, 4)
+            Pose of its frame in the fixed frame at its stamp [m].
+
+        """
         jitter = self._jitters.setdefault(cloud.frame_id, PoseJitter())
         jitter.add(cloud.stamp_ns, T_fixed_cloud[:2, 3])
         if jitter.deviation >= MIN_JITTER and 'publishers' not in self.findings:

@@ -169,12 +169,27 @@ class RecordedMotion:
         """
         Choose between TF and odometry, and return the fixed frame.
 
-        It is `wanted`, or the topmost frame that the `frame` of a LiDAR moves smoothly in: frames
-        that a localisation corrects in steps are left out, which `notes` say. The empty `tree`
-        then holds the static and the first moving transforms.
+        Parameters
+        ----------
+        tree : TransformTree
+            Empty before; then it holds the static and the first moving transforms.
+        frame : str
+            That of a LiDAR.
+        wanted : str or None
+            The fixed frame that was asked for. None: the topmost frame that `frame` moves smoothly
+            in is chosen; frames that a localisation corrects in steps are left out, which `notes`
+            say.
 
-        Raises RecordingError if no motion is known, or no transforms connect `wanted` with
-        `frame`.
+        Returns
+        -------
+        fixed_frame : str
+            The frame to refine in.
+
+        Raises
+        ------
+        RecordingError
+            If `frame` is empty, no motion is known, or no transforms connect `wanted` with
+            `frame`.
 
         """
         for record in self._read(self._static, None, None):

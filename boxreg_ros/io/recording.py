@@ -140,9 +140,26 @@ class Recording:
         """
         Yield clouds and box arrays in the order they were received.
 
-        Messages that cannot be decoded are counted in `unreadable` and left out. At each item
-        `tree` holds the transforms received up to `LOOKAHEAD_NS` later. Older ones are forgotten,
-        so that memory does not grow with the recording.
+        Messages that cannot be decoded are counted in `unreadable` and left out.
+
+        Parameters
+        ----------
+        tree : TransformTree
+            As `choose_fixed_frame` has left it. At each item it holds the transforms received up
+            to `LOOKAHEAD_NS` later; older ones are forgotten, so that memory does not grow with
+            the recording.
+        wanted : Wanted
+            What is decoded, and how the time it takes is measured.
+
+        Yields
+        ------
+        item : Item
+            A sweep or a box array in the frame of its message [m, rad].
+
+        Raises
+        ------
+        RecordingError
+            If a file is damaged so that the rest of it cannot be read.
 
         """
         self._decoder.reset()
@@ -180,7 +197,26 @@ class Recording:
     def with_boxes(
         self, connection: Connection, message: Any, boxes: BoxArray, covariances: Floats
     ) -> bytes:
-        """Return the bytes of a message of the boxes' topic with its boxes replaced."""
+        """
+        Return the bytes of a message of the boxes' topic with its boxes replaced.
+
+        Parameters
+        ----------
+        connection : Connection
+            Of the topic of the boxes.
+        message : message
+            As `box_message` returns it; it is not modified.
+        boxes : BoxArray
+            As many boxes, in the order and the frame of the message [m, rad].
+        covariances : array, shape (n, 6, 6)
+            Of x y z roll pitch yaw [m, rad]; where one is NaN, that of the message remains.
+
+        Returns
+        -------
+        bytes
+            In the encoding of the connection.
+
+        """
         replaced = self._contents.with_boxes(message, boxes, covariances)
         store = self.store_of(connection)
         if store is None:
@@ -267,12 +303,24 @@ class Recording:
         Choose the source of the sensor's motion, and return the fixed frame.
 
         TF is used where it connects the frames, else odometry; odometry that was asked for comes
-        before TF. The default is the topmost frame
-        that the frame of the clouds moves in. The empty `tree` then holds the static and the first
-        moving transforms.
+        before TF.
 
-        Raises RecordingError if no motion is known, or no transforms connect `fixed_frame` with
-        the clouds.
+        Parameters
+        ----------
+        tree : TransformTree
+            Empty before; then it holds the static and the first moving transforms.
+        fixed_frame : str, optional
+            Frame to refine in; default: the topmost frame that the frame of the clouds moves in.
+
+        Returns
+        -------
+        fixed_frame : str
+            The frame to refine in.
+
+        Raises
+        ------
+        RecordingError
+            If no motion is known, or no transforms connect `fixed_frame` with the clouds.
 
         """
         tree.clock_offset = self.clock_offset

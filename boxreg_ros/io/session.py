@@ -189,9 +189,19 @@ class Session:
 
     def merged(self, sweep: Sweep, extra: object = None) -> list[MergedSweep]:
         """
-        Return the sweeps that a cloud in the fixed frame completes: itself for a single topic.
+        Return the sweeps that a cloud completes: itself for a single topic.
 
-        `extra` is returned with the sweep that the cloud is part of.
+        Parameters
+        ----------
+        sweep : Sweep
+            A cloud in the fixed frame, with its topic if there are several.
+        extra : object
+            Returned with the sweep that the cloud is part of.
+
+        Returns
+        -------
+        list of MergedSweep
+            In the order of their stamps; empty while clouds of other LiDARs are waited for.
 
         """
         if self._merger is None:
@@ -211,8 +221,21 @@ class Session:
         """
         Return the fixed frame; choose it among the known transforms if it is not known yet.
 
-        Raises TransformUnavailable if no motion of `sensor_frame` is known, no cloud has arrived,
-        or the clouds have no frame.
+        Parameters
+        ----------
+        item : Sweep or BoxArray
+            In the frame of its message. A sweep chooses by its own frame, boxes by `sensor_frame`.
+
+        Returns
+        -------
+        fixed_frame : str
+            The same from then on.
+
+        Raises
+        ------
+        TransformUnavailable
+            If no motion of the frame of the clouds is known, no cloud has arrived, or the clouds
+            have no frame.
 
         """
         lacks_frame = isinstance(item, Sweep) and not item.frame_id
@@ -287,10 +310,28 @@ def hand_to_registrar(
     registrar: BoxRegistrar, moved: Sweep | BoxArray | None, restarts: bool, reason: str = ''
 ) -> list[RefinedBoxes]:
     """
-    Hand a sweep or boxes in the fixed frame to the registrar; return results that are ready now.
+    Hand a sweep or boxes to the registrar; return results that are ready now.
 
-    If time went back before it, tracks are flushed and the registrar is reset first. With a
-    `reason` boxes are kept.
+    Parameters
+    ----------
+    registrar : BoxRegistrar
+        Takes them.
+    moved : Sweep, BoxArray or None
+        In the fixed frame; None if there is nothing to hand over.
+    restarts : bool
+        Whether time went back before it: tracks are flushed and the registrar is reset first.
+    reason : str
+        Why boxes are kept; empty for boxes to refine.
+
+    Returns
+    -------
+    list of RefinedBoxes
+        In the fixed frame, in the order of `BoxRegistrar`.
+
+    Raises
+    ------
+    ShapeError
+        If boxes and their sweep are in different frames.
 
     """
     ready: list[RefinedBoxes] = []
@@ -313,7 +354,25 @@ def is_placeholder(item: Sweep | BoxArray) -> bool:
 
 
 def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:
-    """Return refined boxes and their covariances in another frame; unchanged in the same."""
+    """
+    Return refined boxes and their covariances in another frame.
+
+    Parameters
+    ----------
+    refined : RefinedBoxes
+        In any frame.
+    T_frame_boxes : array, shape (4, 4)
+        Maps their frame to the other one, at their stamp.
+    frame_id : str
+        The other frame; if it is theirs, `refined` is returned.
+
+    Returns
+    -------
+    refined : RefinedBoxes
+        Boxes as of `boxes_to_frame`, covariances as of `turned_covariances`; those of the extents
+        are the same in any frame.
+
+    """
     if frame_id == refined.boxes.frame_id:
         return refined
     return replace(

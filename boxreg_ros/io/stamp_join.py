@@ -90,7 +90,22 @@ def joined_stamps(stamps_ns: Ints, others_ns: Ints) -> JoinedStamps:
 
 
 def nearest_rows(stamps_ns: Ints, among_ns: Ints) -> Ints:
-    """Return the row of the nearest of ascending stamps (m,) to each stamp (n,)."""
+    """
+    Return the row of the nearest stamp to each of some others.
+
+    Parameters
+    ----------
+    stamps_ns : array, shape (n,)
+        In any order [ns].
+    among_ns : array, shape (m,)
+        Ascending, m > 0 [ns].
+
+    Returns
+    -------
+    rows : array, shape (n,)
+        Rows of `among_ns`; of two that are as near the later one.
+
+    """
     after = np.searchsorted(among_ns, stamps_ns).clip(0, len(among_ns) - 1)
     before = (after - 1).clip(0)
     is_before = stamps_ns - among_ns[before] < among_ns[after] - stamps_ns

@@ -73,11 +73,30 @@ class Topics:
 
     def find(self, role: str, content: str, types: Sequence[str], asked: str | None) -> str:
         """
-        Return the topic that was asked for, or the only one of these types with messages.
+        Return the topic that was asked for, or the only one of some types with messages.
 
-        `role` is the option that chooses the topic, `content` the name of what it has, in errors.
-        Raises RecordingError if there is no such topic, or more than one, and UnsupportedMessage
-        if the one asked for has another type.
+        Parameters
+        ----------
+        role : str
+            Option that chooses the topic, for errors.
+        content : str
+            Name of what it has, for errors.
+        types : sequence of str
+            As ``package/msg/Type``.
+        asked : str or None
+            The topic that was asked for.
+
+        Returns
+        -------
+        topic : str
+            One of the recording.
+
+        Raises
+        ------
+        RecordingError
+            If there is no such topic, or, with none asked for, more than one has messages.
+        UnsupportedMessage
+            If the topic that was asked for has another type.
 
         """
         candidates = self.filled(types)

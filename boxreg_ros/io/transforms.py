@@ -164,12 +164,36 @@ class TransformTree:
             self._add(self._tf, self._sample(item, pose, received_ns, is_static))
 
     def add_pose(self, parent: str, child: str, stamp_ns: int, pose: Floats) -> None:
-        """Add the pose of `child` in `parent` at a stamp: x y z qx qy qz qw."""
+        """
+        Add the pose of a moving frame in another at a stamp.
+
+        Parameters
+        ----------
+        parent, child : str
+            Frames; a leading slash is left out. With an empty one nothing is added.
+        stamp_ns : int
+            In the clock of `lookup` [ns]: `clock_offset` is not added.
+        pose : array, shape (7,)
+            x y z qx qy qz qw of `child` in `parent` [m]. One that is not finite, or whose
+            quaternion is zero, is not used.
+
+        """
         sample = Sample(_name(parent), _name(child), stamp_ns, tuple(pose.tolist()))
         self._add(self._tf, sample)
 
     def add_odometry(self, msg: Any, received_ns: int | None = None) -> None:
-        """Add a ``nav_msgs/Odometry``: the pose of its child frame in its header's frame."""
+        """
+        Add the pose of an odometry message.
+
+        Parameters
+        ----------
+        msg : nav_msgs/Odometry
+            Its pose is that of the child frame in the frame of the header; its twist is not used.
+            Without a child frame it counts for `odometry_child`.
+        received_ns : int or None
+            When it was received [ns], for the comparison of clocks.
+
+        """
         pose = msg.pose.pose
         sample = self._sample(msg, numbers_of(pose.position, pose.orientation), received_ns)
         if not sample.child:
@@ -214,7 +238,28 @@ class TransformTree:
         return Counter({f'{e.parent} -> {e.child}': e.num_ahead for e in self.edges()})
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Floats:
-        """Return ``T_target_source`` (4, 4) at a stamp, or raise TransformUnavailable."""
+        """
+        Return the transform between two frames at a stamp.
+
+        Parameters
+        ----------
+        target, source : str
+            Frames, with a leading slash or without.
+        stamp_ns : int
+            [ns].
+
+        Returns
+        -------
+        T_target_source : array, shape (4, 4)
+            Maps points in `source` to `target` [m]; the unit matrix for one and the same frame.
+
+        Raises
+        ------
+        TransformUnavailable
+            If no transforms connect the frames, or one on the way has no valid pose, or none
+            within `MAX_EXTRAPOLATION` of the stamp.
+
+        """
         T_target_source: Floats | None = None
         for edge, is_upward in self._route(target, source):
             T = edge.at(stamp_ns, self._is_once(edge, stamp_ns))
@@ -224,11 +269,26 @@ class TransformTree:
 
     def motion(self, target: str, source: str, stamp_ns: int) -> FrameMotion | None:
         """
-        Return the motion of `source` in `target` up to a stamp that `lookup` can answer.
+        Return the motion of a frame in another up to a stamp.
 
-        Poses of the last `POSES_SECONDS`, `POSES_PERIOD` apart, as far back as they are known: a
-        pose before the first one would depend on how many later ones have arrived. None if all
-        transforms between both frames are static.
+        Parameters
+        ----------
+        target, source : str
+            Frames: the motion of `source` in `target` is returned.
+        stamp_ns : int
+            One that `lookup` can answer [ns].
+
+        Returns
+        -------
+        motion : FrameMotion or None
+            Poses of the last `POSES_SECONDS`, `POSES_PERIOD` apart, as far back as they are known,
+            and that at the stamp: a pose before the first one would depend on how many later ones
+            have arrived. None if all transforms between both frames are static.
+
+        Raises
+        ------
+        TransformUnavailable
+            As `lookup`.
 
         """
         route = self._route(target, source)
@@ -260,7 +320,22 @@ class TransformTree:
         return True
 
     def covers(self, target: str, source: str, stamp_ns: int) -> bool:
-        """Return whether `lookup` would neither fail nor extrapolate."""
+        """
+        Return whether `lookup` would neither fail nor extrapolate.
+
+        Parameters
+        ----------
+        target, source : str
+            As of `lookup`.
+        stamp_ns : int
+            [ns].
+
+        Returns
+        -------
+        bool
+            False too where no transforms connect the frames.
+
+        """
         return self.connects(target, source) and all(
             self._is_once(edge) or edge.covers(stamp_ns) for edge, _ in self._route(target, source)
         )
@@ -577,10 +652,19 @@ class Edge:
 
     def add(self, stamp_ns: int, pose: Pose, received_ns: int | None = None) -> None:
         """
-        Add x y z qx qy qz qw; a second one of the same stamp replaces the first.
+        Add the pose of the child in the parent at a stamp.
 
-        One with a time of receipt whose stamp is ahead of all others is held, until the next
-        sample confirms it, or a cloud of its time asks for it.
+        Parameters
+        ----------
+        stamp_ns : int
+            [ns]. A second pose of the same stamp replaces the first; any pose of a static pair
+            does.
+        pose : tuple of 7 float
+            x y z qx qy qz qw [m].
+        received_ns : int or None
+            When it was received [ns]. A sample whose stamp is ahead of all others, which this time
+            does not explain, is held until the next sample confirms it, or a cloud of its time
+            asks for it. None: it is used at once.
 
         """
         if received_ns is None or self.is_static:
@@ -674,7 +758,27 @@ class Edge:
         return bool(self.stamps) and self.stamps[0] <= stamp_ns <= self.stamps[-1]
 
     def at(self, stamp_ns: int, is_constant: bool = False) -> Floats:
-        """Return ``T_parent_child`` at a stamp; at any if its only sample is `is_constant`."""
+        """
+        Return the pose of the child in the parent at a stamp.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            [ns]; of no effect for a static pair.
+        is_constant : bool
+            Whether the first sample counts at any stamp.
+
+        Returns
+        -------
+        T_parent_child : array, shape (4, 4)
+            Interpolated between samples, or extrapolated by up to `MAX_EXTRAPOLATION` [m].
+
+        Raises
+        ------
+        TransformUnavailable
+            If the stamp is farther from all samples, or there is no valid one.
+
+        """
         self._confirm(stamp_ns)
         if is_constant:
             return matrix(self.poses[0])
@@ -725,7 +829,22 @@ class Edge:
         return 'check that its stamps use the clock of the point cloud'
 
     def at_each(self, stamps_ns: Sequence[int], is_constant: bool) -> Floats:
-        """Return ``T_parent_child`` (n, 4, 4), or (4, 4) for all, at stamps that are covered."""
+        """
+        Return the poses of the child in the parent at some stamps.
+
+        Parameters
+        ----------
+        stamps_ns : sequence of n int
+            Stamps between the first and the last sample, n > 0 [ns].
+        is_constant : bool
+            Whether the first sample counts at any stamp.
+
+        Returns
+        -------
+        T_parent_child : array, shape (n, 4, 4) or (4, 4)
+            The latter if the pair is static or constant [m].
+
+        """
         if self.is_static or is_constant:
             return self.at(stamps_ns[0], is_constant)
         known = self.stamps
@@ -835,7 +954,25 @@ def _between(first: Floats, second: Floats, share: float | Floats) -> Floats:
 
 
 def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
-    """Return the sweep in another frame; its points stay, but `T_frame_points` changes."""
+    """
+    Return a sweep in another frame without moving its points.
+
+    Parameters
+    ----------
+    sweep : Sweep
+        In any frame.
+    T_frame_sweep : array, shape (4, 4)
+        Maps its `frame_id` to the other frame.
+    frame_id : str
+        The other frame.
+
+    Returns
+    -------
+    sweep : Sweep
+        With the same arrays `points` and `times`; `origin`, `origins` and `T_frame_points` are of
+        the other frame. `in_frame` moves the points.
+
+    """
     R = T_frame_sweep[:3, :3]
     t = T_frame_sweep[:3, 3]
     known = sweep.T_frame_points
@@ -856,11 +993,27 @@ def boxes_to_frame(
     ticket: object = None,
 ) -> BoxArray:
     """
-    Return the boxes in another frame, with the `motion` of their own, and a ticket.
+    Return boxes in another frame.
 
-    NaN stays NaN. In the same frame the numbers are the same: to convert angles changes their
-    last digits. Their kinematics are in its axes, but over ground: a moving frame takes nothing
-    off.
+    Parameters
+    ----------
+    boxes : BoxArray
+        n boxes in any frame; NaN stays NaN.
+    T_frame_boxes : array, shape (4, 4)
+        Maps their `frame_id` to the other frame, at their stamp.
+    frame_id : str
+        The other frame. If it is their own, the numbers are the same: to convert angles changes
+        their last digits.
+    motion : FrameMotion, optional
+        That of their own frame in the other one.
+    ticket : object, optional
+        Of the result; default: theirs.
+
+    Returns
+    -------
+    boxes : BoxArray
+        Their kinematics are in the axes of the other frame, but over ground: a moving frame takes
+        nothing off.
 
     """
     moved, kinematics = boxes.boxes, boxes.kinematics

@@ -28,7 +28,18 @@ class UnitCheck:
         self._distances: list[float] = []
 
     def add(self, item: Sweep | BoxArray, T_fixed_item: Floats) -> None:
-        """Add the next sweep or boxes, in the fixed frame, and the pose of their message's."""
+        """
+        Add the next sweep or boxes.
+
+        Parameters
+        ----------
+        item : Sweep or BoxArray
+            In the fixed frame; numbers that are not finite are left out.
+        T_fixed_item : array, shape (4, 4)
+            Pose of the frame of its message in the fixed frame: that of a sweep is the place that
+            distances are counted from.
+
+        """
         if len(self._lengths) >= MAX_COMPARED:
             return
         if isinstance(item, Sweep):

@@ -67,7 +67,30 @@ class StorageFile(Protocol):
     def messages(
         self, connections: Collection[Connection], start: int | None, stop: int | None
     ) -> Iterator[Record]:
-        """Yield the messages on `connections`, ordered by receive time from start to stop [ns]."""
+        """
+        Yield the messages on some connections, ordered by receive time.
+
+        Parameters
+        ----------
+        connections : collection of Connection
+            Some of those of the file; none yield nothing.
+        start, stop : int or None
+            Receive times of the part to read [ns]: from `start` on, before `stop`; None for no
+            limit.
+
+        Yields
+        ------
+        record : Record
+            Still encoded. A part that cannot be read is left out and added to `damages`.
+
+        Raises
+        ------
+        RecordingError
+            If the rest of the file cannot be read since its content is damaged.
+        TransferError
+            If its bytes cannot be read from their disk or server.
+
+        """
 
     def spans(self) -> Iterator[tuple[int, int, int]]:
         """Yield connection id, first and last receive time [ns] of each part with messages."""

@@ -124,8 +124,20 @@ def upload(folder: Path, target: Path, last: str) -> None:
     """
     Replace a folder behind a URL by one of this machine.
 
-    `last` marks a whole result: it is deleted first, and written when all others are. `UPLOAD` is
-    there from before the first change until then.
+    Parameters
+    ----------
+    folder : Path
+        On this machine.
+    target : Path
+        Stands for the URL. `UPLOAD` is in it from before the first change until the end.
+    last : str
+        Name of the file that marks a whole result: it is deleted first, and written when all
+        others are.
+
+    Raises
+    ------
+    TransferError
+        If a file cannot be written or deleted.
 
     """
     system, name = system_of(target)
@@ -176,10 +188,28 @@ def system_of(path: Path) -> tuple[Any, str]:
 
 def answer_of(path: Path, request: Callable[[], _T], missing_is_error: bool = True) -> _T:
     """
-    Return the answer to a request for a file behind a URL, or raise TransferError.
+    Return the answer to a request for a file behind a URL.
 
     It is repeated after errors that may pass, once if there was no answer in `ANSWER_SECONDS`.
-    File systems raise errors of any class.
+
+    Parameters
+    ----------
+    path : Path
+        Stands for the URL, for the error message.
+    request : callable
+        Asks the file system, which raises errors of any class.
+    missing_is_error : bool
+        False leaves FileNotFoundError as it is, for a file that may be missing.
+
+    Returns
+    -------
+    answer
+        What `request` returns.
+
+    Raises
+    ------
+    TransferError
+        If there is no answer, or it is an error that does not pass.
 
     """
     begin = time.monotonic()
