@@ -31,10 +31,23 @@ MIN_MAJORITY = 0.6
 
 def motion_to_sight(sweep: Sweep, boxes: Floats, velocities: Floats) -> Floats:
     """
-    Return how far each object moves from the stamp until the sweep sees it, (n, 3) [m].
+    Return how far each object moves from the stamp until the sweep sees it.
 
-    Of `boxes` (n, 9) with `velocities` (n, 3) [m/s]. Zero without times of the points, and
-    without points near a box.
+    Parameters
+    ----------
+    sweep : Sweep
+        In the fixed frame.
+    boxes : array, shape (n, 9)
+        Valid boxes in the fixed frame, at its stamp [m, rad].
+    velocities : array, shape (n, 3)
+        Of their centres [m/s].
+
+    Returns
+    -------
+    motion : array, shape (n, 3)
+        By the median time of the points near each box [m]. Zero without times of the points,
+        without points near it, and for an object that moves by `FACE_TOLERANCE` or less within the
+        sweep.
 
     """
     motion = np.zeros((len(boxes), 3))
@@ -74,8 +87,14 @@ class BoxTimeEvidence:
         Compare boxes with their points, moved to the time of sight and to the stamp.
 
         The points are on the surface of the object: near the faces of a box of their own time.
-        Each is moved by its own delay, since two LiDARs may see an object at different times. The
-        n observations `seen` are of one table; `velocities` (n, 3) are those of the objects [m/s].
+        Each is moved by its own delay, since two LiDARs may see an object at different times.
+
+        Parameters
+        ----------
+        seen : sequence of n Observation
+            All of one table.
+        velocities : array, shape (n, 3)
+            Of their objects, in the fixed frame [m/s]. Slow ones give no vote.
 
         """
         if not (seen and velocities.any()):

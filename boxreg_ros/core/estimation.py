@@ -49,9 +49,21 @@ def estimate_windows(
     """
     Refine the boxes of many windows, each of its own track.
 
-    The labelling margins and the noise of the input in `model` are updated: first with the new
-    observations, then with the fits. Returned in the order of `windows`; None for those with fewer
-    than `min_observations`.
+    Parameters
+    ----------
+    windows : list of Window
+        In the fixed frame.
+    config : Config
+        Settings.
+    model : InputModel
+        Its labelling margins and its noise of the input are updated: first with the new
+        observations, then with the fits.
+
+    Returns
+    -------
+    estimates : list of Estimate or None
+        In the order of `windows`, boxes in the fixed frame [m, rad]; None for those with fewer
+        than `min_observations`.
 
     """
     estimates: dict[int, Estimate] = {}

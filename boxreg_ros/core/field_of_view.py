@@ -35,15 +35,29 @@ class FieldOfView:
         ring_heights: Floats,
     ) -> NDArray[np.bool_]:
         """
-        Return which of n objects reach up to the highest ring of the LiDAR, (n,).
+        Return which objects reach up to the highest ring of the LiDAR.
 
         That is, no ray of this sweep or those before it is higher, and rays to other objects end
         at the same ring: a single high object is no evidence of an edge. With several LiDARs at
         once no top is hidden.
 
-        The sensor `origin` (3,) and the `centers` (n, 3) of boxes of `extents` (n, 3) are in the
-        frame of the points [m]; `row` and `owner` (P,) are point and object of each pair that
-        belongs together, `ring_heights` (n,) those between two rings at each object [m].
+        Parameters
+        ----------
+        sweep : Sweep
+            Its points, in the frame that they are stored in, are used.
+        origin : array, shape (3,)
+            Position of the sensor in this frame [m].
+        centers, extents : array, shape (n, 3)
+            Of the boxes: centres in this frame, and length, width and height [m].
+        row, owner : array, shape (P,)
+            Point and object of each pair that belongs together, ascending by object.
+        ring_heights : array, shape (n,)
+            Between two rings at each object [m]; 0 if unknown.
+
+        Returns
+        -------
+        is_hidden : array of bool, shape (n,)
+            False too where the height of the rings is unknown.
 
         """
         is_hidden = np.zeros(len(centers), bool)

@@ -138,9 +138,32 @@ def follow_points(
     grows: bool = True,
 ) -> list[FollowedTrack]:
     """
-    Follow as `follow` does, without the solve; `points` are those of `ascending`.
+    Follow as `follow` does, without the solve.
 
-    A single seed grows to the points that are seen of its object, unless `grows` is False.
+    Parameters
+    ----------
+    stamps_ns : array, shape (S,)
+        Strictly increasing stamps of the sweeps [ns].
+    points : Points
+        Those of each sweep (M_i, 3) in one frame, finite, as of `ascending` [m].
+    seeds : sequence of BoxArray
+        Boxes of a person in this frame, one or more of each track id.
+    config : Config
+        The groups of object classes are used.
+    origins : array, shape (S, 3), optional
+        Positions of the sensor, NaN where unknown [m].
+    grows : bool
+        Whether a single seed takes the size of the points that are seen of its object.
+
+    Returns
+    -------
+    tracks : list of FollowedTrack
+        In the order of the first seeds.
+
+    Raises
+    ------
+    ShapeError
+        If a seed has no track id.
 
     """
     times = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
@@ -344,7 +367,26 @@ def solved(
     config: Config,
     origins: Floats | None,
 ) -> list[FollowedTrack]:
-    """Return the tracks refined, the seeds as boxes of a person that evidence may move."""
+    """
+    Return followed tracks with refined boxes.
+
+    Parameters
+    ----------
+    tracks : sequence of FollowedTrack
+        As of `follow_points`. Their seeds are boxes of a person, which evidence may move.
+    points : Points
+        As there.
+    config : Config
+        Settings of the solve.
+    origins : array, shape (S, 3), or None
+        As there.
+
+    Returns
+    -------
+    tracks : list of FollowedTrack
+        In their order, with as many boxes; those without boxes as they are.
+
+    """
     given = [with_points(track, points, origins) for track in tracks if len(track.rows)]
     usual = keyframe_deviations(given, config)
     found = refined_tracks(given, config, person.numbers(usual))
@@ -370,9 +412,20 @@ def solved(
 
 def keyframe_deviations(tracks: Iterable[Track], config: Config) -> Floats:
     """
-    Return the deviations (9,) of keyframes: the usual ones, or larger ones that some show.
+    Return the deviations of keyframes: the usual ones, or larger ones that some show.
 
-    Those are the pinned boxes of the first `tracks` that have enough of them.
+    Parameters
+    ----------
+    tracks : iterable of Track
+        Their pinned boxes are the keyframes; of the first tracks that have enough of them.
+    config : Config
+        Settings of the solve that they are compared with.
+
+    Returns
+    -------
+    deviations : array, shape (9,)
+        Of the columns of a box, as `person.DEVIATIONS`; these themselves if there are fewer than
+        ``FOLLOW.min_keyframes`` keyframes.
 
     """
     some, count = [], 0

@@ -23,11 +23,21 @@ def set_noise(
     constants: Constants,
 ) -> None:
     """
-    Set the errors of each of `KINDS` in records `INPUTS` (K,) (M16), (M17).
+    Set the errors of the input in records (M16), (M17).
 
-    Of `normalised_residuals` of the tracks of each kind (B, N, 9), NaN is left out, and of other
-    drives, records `NOISE` (K,). The settings are the prior of all kinds together, and these of
-    each: a kind that was seen in few boxes errs as the others do, in proportion to its settings.
+    The settings are the prior of all kinds together, and these of each: a kind that was seen in
+    few boxes errs as the others do, in proportion to its settings.
+
+    Parameters
+    ----------
+    inputs : array, shape (K,)
+        Records `INPUTS` of each of `KINDS`; changed in place.
+    residuals : sequence of K arrays, shape (B, N, 9)
+        `normalised_residuals` of the tracks of each kind; NaN is left out.
+    past : array, shape (K,)
+        Records `NOISE` of other drives.
+    constants : Constants
+        Of the method.
 
     """
     found = np.zeros(len(inputs), NOISE)

@@ -57,9 +57,25 @@ def span(points: Floats, yaw: float) -> tuple[Floats, Floats]:
 
 def completed(points: Floats, yaw: float, sensor: Floats, usual: Floats) -> tuple[Floats, Floats]:
     """
-    Return centre and sides (2,) of the rectangle of points (M, 2) along the axes of a heading.
+    Return the rectangle of points along the axes of a heading.
 
-    Sides that are shorter than `usual` (2,) grow away from the sensor at (2,).
+    Parameters
+    ----------
+    points : array, shape (M, 2)
+        M > 0 [m].
+    yaw : float
+        The heading [rad].
+    sensor : array, shape (2,)
+        Its position [m].
+    usual : array, shape (2,)
+        Usual length and width [m]. Sides that are shorter grow away from the sensor.
+
+    Returns
+    -------
+    center : array, shape (2,)
+        [m].
+    sides : array, shape (2,)
+        Along the heading and across it [m].
 
     """
     low, high = span(points, yaw)

@@ -85,8 +85,23 @@ class StampMatcher:
         """
         Add a box array; return the pairs completed by it, which are taken from here one by one.
 
-        With a `reason` it is kept: it waits for no sweep, but for the arrays before it. One
-        without a stamp stands behind the newest.
+        Parameters
+        ----------
+        boxes : BoxArray
+            In the frame of the sweeps.
+        reason : str
+            Why it is kept: it then waits for no sweep, but for the arrays before it, and one
+            without a stamp stands behind the newest. Empty for boxes to register.
+
+        Returns
+        -------
+        iterator of Pair
+            By their stamps.
+
+        Raises
+        ------
+        ShapeError
+            If a sweep is in another frame than its boxes; raised by the iterator.
 
         """
         order_ns = boxes.stamp_ns

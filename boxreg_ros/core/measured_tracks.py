@@ -111,10 +111,22 @@ class MeasuredTrack(NamedTuple):
 
     def at(self, stamp_ns: int, latency: float, box: Floats) -> Floats:
         """
-        Return the box (9,) of the object at a stamp, if its boxes have a latency [s].
+        Return the box of the object at a stamp, if its boxes have a latency.
 
-        Between two boxes, or beyond the last on a circle at constant speed; it heads as `box`
-        does.
+        Parameters
+        ----------
+        stamp_ns : int
+            [ns].
+        latency : float
+            Of the boxes [s]: one at a stamp shows the object so long before.
+        box : array, shape (9,)
+            The result heads as it does, within 90 degrees.
+
+        Returns
+        -------
+        box : array, shape (9,)
+            Interpolated between two boxes; beyond the last on a circle at constant speed; before
+            the first that one [m, rad].
 
         """
         time_ns = stamp_ns + round(latency * 1e9)
@@ -245,9 +257,21 @@ class MeasuredTracks:
 
     def nearest_centers(self, names: Sequence[str], times_ns: Ints, candidates: Ints) -> Floats:
         """
-        Return the centres of the boxes of tracks that are nearest to some times, (K, C, 3).
+        Return the centres of the boxes of tracks that are nearest to some times.
 
-        Each of the C times has its own candidate of the latency, as in `smoothed`.
+        Parameters
+        ----------
+        names : sequence of K str
+            Ids of tracks that have boxes here.
+        times_ns : array, shape (C,)
+            Times [ns].
+        candidates : array, shape (C,)
+            Which candidate of the latency each of them is of, as in `smoothed`.
+
+        Returns
+        -------
+        centers : array, shape (K, C, 3)
+            Where they were measured, in the fixed frame [m].
 
         """
         arrays, boxes, is_known = self._table(names)

@@ -43,7 +43,20 @@ class EndMotion:
     """Accelerations of its kind of object."""
 
     def predict(self, stamp_ns: int) -> Floats:
-        """Return the box (9,) at a stamp, on a circle at constant speed."""
+        """
+        Return the box at a stamp, on a circle at constant speed.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Before or after that of `box` [ns].
+
+        Returns
+        -------
+        box : array, shape (9,)
+            With the extents, roll and pitch of `box` [m, rad]; yaw in [-pi, pi).
+
+        """
         seconds = (stamp_ns - self.stamp_ns) * 1e-9
         half_turn = self.turn_rate * seconds / 2
         chord = self.velocity * seconds
@@ -78,7 +91,27 @@ class EndMotion:
 
 
 def motion_at(stamps_ns: Ints, boxes: Floats, row: int, model: ClassConfig) -> EndMotion:
-    """Return the motion at the first (row 0) or last (-1) of the boxes (n, 9) of one object."""
+    """
+    Return the motion at the first or last of the boxes of one object.
+
+    Parameters
+    ----------
+    stamps_ns : array, shape (n,)
+        Ascending [ns].
+    boxes : array, shape (n, 9)
+        Finite boxes in the fixed frame [m, rad]; their headings may be flipped.
+    row : int
+        0 for the first, -1 for the last.
+    model : ClassConfig
+        Of the kind of object; returned with the motion.
+
+    Returns
+    -------
+    motion : EndMotion
+        By the boxes within `MOTION_SECONDS`; of a single one the velocity is 0, with the deviation
+        `UNKNOWN_SPEED_DEVIATION`. A slow object, or one of three boxes or fewer, does not turn.
+
+    """
     seconds = (stamps_ns - stamps_ns[row]) * 1e-9
     is_near = np.abs(seconds) <= MOTION_SECONDS
     seconds = seconds[is_near]

@@ -187,16 +187,30 @@ def observe(
     view: FieldOfView | None = None,
 ) -> Observations:
     """
-    Return the observations of valid `boxes` (n, 9) in a sweep, one row each; none is pinned.
+    Return the observations of boxes in a sweep.
 
     A point near several boxes belongs to the box it is deepest inside of, or least outside. It
     also belongs to boxes it is nearly as deep inside of: two boxes of one object do not take
     points from each other (M10a). Points less than `GROUND_CLEARANCE` above the road beside the
     box are left out; the height of the road is kept.
 
-    The sweep is in the fixed frame; its points may be in their own, see `Sweep.T_frame_points`.
-    The boxes are at its stamp, the observations at `stamp_ns`. Without the `view` of the LiDAR,
-    known from the sweeps before, all tops are in view.
+    Parameters
+    ----------
+    sweep : Sweep
+        In the fixed frame; its points may be in their own, see `Sweep.T_frame_points` [m].
+    boxes : array, shape (n, 9)
+        Valid boxes in the fixed frame, at the stamp of the sweep [m, rad].
+    stamp_ns : int
+        Of the observations [ns].
+    config : Config
+        `sampling`, `ingredients` and `objective` are used.
+    view : FieldOfView, optional
+        Of the LiDAR, known from the sweeps before; without it all tops are in view.
+
+    Returns
+    -------
+    observations : Observations
+        One row per box, in their order; none is pinned.
 
     """
     n = len(boxes)
@@ -347,7 +361,24 @@ def shapes_of(sweep: Sweep, boxes: Floats, margin: float) -> crop_kernels.Shapes
 
 
 def crop(sweep: Sweep, boxes: Floats, margin: float) -> Crop:
-    """Return all pairs of a point and a valid box (n, 9), in one frame, within `margin` [m]."""
+    """
+    Return all pairs of a point and a box that are near each other.
+
+    Parameters
+    ----------
+    sweep : Sweep
+        In the frame of the boxes; its points may be in their own, see `Sweep.T_frame_points` [m].
+    boxes : array, shape (n, 9)
+        Valid boxes [m, rad].
+    margin : float
+        Largest distance of a point outside of a face [m].
+
+    Returns
+    -------
+    pairs : Crop
+        Ascending by box, then by the row of the point.
+
+    """
     columns = np.ascontiguousarray(sweep.points.T)
     shapes = shapes_of(sweep, boxes, margin)
     row, owner, offset, outside = crop_kernels.crop(columns, shapes, margin)
@@ -388,9 +419,20 @@ def _runs(first: Ints, counts: Ints) -> Ints:
 
 def farthest_point_sample(points: Floats, count: int) -> Ints:
     """
-    Return the rows of `count` different ones of points (M, 3) that cover a cloud; `count` <= M.
+    Return rows of points that cover a cloud.
 
-    The first one is farthest from the mean, each next one farthest from all before.
+    Parameters
+    ----------
+    points : array, shape (M, 3)
+        Finite points [m].
+    count : int
+        How many to choose, 1 to M.
+
+    Returns
+    -------
+    rows : array, shape (count,)
+        Different ones. The first is farthest from the mean, each next one farthest from all
+        before.
 
     """
     gaps = np.square(points - points.mean(0)).sum(1)

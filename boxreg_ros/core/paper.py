@@ -100,10 +100,20 @@ def closeness(boxes: Tensor, points: Tensor, mask: Tensor, nearest: int) -> Tens
 
 def enclosure(boxes: Tensor, points: Tensor, mask: Tensor) -> Tensor:
     """
-    Return the mean L1 distance from the points to the six faces, shape (B,) [m] [Eq. 5].
+    Return the mean L1 distance from the points to the six faces [Eq. 5].
 
-    It is constant while a point is inside and grows once it leaves: only points outside have a
-    gradient.
+    Parameters
+    ----------
+    boxes : Tensor, shape (B, N, 9)
+        Boxes [m, rad].
+    points, mask : Tensor, shapes (B, N, M, 3) and (B, N, M)
+        As of `closeness`.
+
+    Returns
+    -------
+    loss : Tensor, shape (B,)
+        [m]. It is constant while a point is inside and grows once it leaves: only points outside
+        have a gradient.
 
     """
     weight = mask.to(boxes)
@@ -113,11 +123,21 @@ def enclosure(boxes: Tensor, points: Tensor, mask: Tensor) -> Tensor:
 
 def smoothness(boxes: Tensor, valid: Tensor, rounding: float = EPSILON) -> Tensor:
     """
-    Return the mean change of the pose's step from box to box, shape (B,) [Eq. 6].
+    Return the mean change of the pose's step from box to box [Eq. 6].
 
-    Notes
-    -----
-    Steps of the angles are wrapped; `rounding` inside the root gives equal steps a gradient.
+    Parameters
+    ----------
+    boxes : Tensor, shape (B, N, 9)
+        Boxes [m, rad].
+    valid : Tensor, shape (B, N)
+        False for padding.
+    rounding : float
+        Added inside the root, which gives equal steps a gradient.
+
+    Returns
+    -------
+    loss : Tensor, shape (B,)
+        [m, rad]; steps of the angles are wrapped.
 
     """
     pose = boxes[..., POSE]
@@ -129,12 +149,26 @@ def smoothness(boxes: Tensor, valid: Tensor, rounding: float = EPSILON) -> Tenso
 
 def alignment(boxes: Tensor, valid: Tensor, rounding: float = EPSILON) -> Tensor:
     """
-    Return the mean distance between heading and direction of motion, shape (B,) [Eq. 7].
+    Return the mean distance between heading and direction of motion [Eq. 7].
+
+    Parameters
+    ----------
+    boxes : Tensor, shape (B, N, 9)
+        Boxes [m, rad].
+    valid : Tensor, shape (B, N)
+        False for padding.
+    rounding : float
+        Added inside the roots.
+
+    Returns
+    -------
+    loss : Tensor, shape (B,)
+        Of unit vectors, so without a unit.
 
     Notes
     -----
-    The direction of a step of length zero is undefined: the weight of a step grows linearly up
-    to `FULL_STEP`. A window whose mean motion is against its headings is taken for a reversing
+    The direction of a step of length zero is undefined: the weight of a step grows linearly up to
+    `FULL_STEP`. A window whose mean motion is against its headings is taken for a reversing
     object: its direction of motion is reversed. The paper also wraps its alpha, the roll, into
     [-pi/2, pi/2]; this term does not depend on it.
 

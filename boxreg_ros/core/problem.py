@@ -195,9 +195,21 @@ class Problem(NamedTuple):
 
     def free_variables(self, config: Config, number: int = SHARED) -> Floats:
         """
-        Return 1 for every variable (B, 6 N + S) that is estimated, 0 for those held fixed.
+        Return which variables are estimated.
 
-        `number` is that of the shared variables, S.
+        Parameters
+        ----------
+        config : Config
+            With `mode` 'bev' z, roll, pitch and height are held, with `extent` 'fixed' all
+            extents, without the ingredient `input_bias` the bias of the input.
+        number : int
+            S, number of the shared variables.
+
+        Returns
+        -------
+        free : array, shape (B, 6 N + S)
+            1 for variables that are estimated, 0 for those held fixed, and for the poses of
+            padding.
 
         """
         B, N = self.counts.shape
@@ -216,10 +228,20 @@ class Problem(NamedTuple):
 
 def group_windows(windows: Sequence[Window], config: Config) -> list[list[int]]:
     """
-    Return groups of rows of `windows` to solve together.
+    Return groups of windows to solve together.
 
-    A group is either all warm or all cold, of similar lengths, and within `MAX_BATCH_VALUES`.
-    Windows shorter than `min_observations` are in no group.
+    Parameters
+    ----------
+    windows : sequence of Window
+        Of any length.
+    config : Config
+        `min_observations` and ``sampling.points`` are used.
+
+    Returns
+    -------
+    groups : list of list of int
+        Rows of `windows`. A group is either all warm or all cold, of similar lengths, and within
+        `MAX_BATCH_VALUES`. Windows shorter than `min_observations` are in none.
 
     """
     kinds = [(window.is_warm, len(window.observations)) for window in windows]
@@ -241,10 +263,23 @@ def stack_windows(
     windows: Sequence[Window], config: Config, decay: float
 ) -> tuple[Problem, MarginalisationPrior]:
     """
-    Stack windows, each with at least one observation, to padded arrays.
+    Stack windows to padded arrays.
 
-    The information of marginalisation priors is multiplied by `decay`. The second value has the
-    priors as they are used; positions of the problem are relative to their `base`, (B, 3).
+    Parameters
+    ----------
+    windows : sequence of B Window
+        Each with at least one observation, in the fixed frame.
+    config : Config
+        `ingredients`, `sampling` and the groups of object classes are used.
+    decay : float
+        Factor on the information of marginalisation priors.
+
+    Returns
+    -------
+    problem : Problem
+        Positions are relative to the `base` of each window [m].
+    priors : MarginalisationPrior
+        As they are used, with `base` (B, 3) in the fixed frame [m].
 
     """
     lengths = np.array([len(window.observations) for window in windows])

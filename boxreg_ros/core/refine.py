@@ -228,7 +228,29 @@ def refine(tracks: Iterable[Track], config: Config | None = None) -> list[Refine
 def refined_tracks(
     tracks: Sequence[Track], config: Config, constants: Constants | None = None
 ) -> list[RefinedTrack]:
-    """Refine tracks as `refine`, but pinned boxes as well; `constants` as of `BoxRegistrar`."""
+    """
+    Refine tracks as `refine`, but pinned boxes as well.
+
+    Parameters
+    ----------
+    tracks : sequence of Track
+        As of `refine`, all of class Track.
+    config : Config
+        Settings.
+    constants : Constants, optional
+        As of `BoxRegistrar`.
+
+    Returns
+    -------
+    refined : list of RefinedTrack
+        In the order of `tracks`, rows as in the input.
+
+    Raises
+    ------
+    ShapeError
+        If one has no valid box, or two have the same id.
+
+    """
     names = [track.track_id for track in tracks]
     if len(set(names)) < len(names):
         raise ShapeError(f'tracks: expected different track ids, got {sorted(map(str, names))}')

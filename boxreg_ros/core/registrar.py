@@ -191,7 +191,26 @@ class BoxRegistrar:
             self._num_unsettled = config.window
 
     def add_sweep(self, sweep: Sweep) -> list[RefinedBoxes]:
-        """Add a sweep; return the box arrays that are completed by it."""
+        """
+        Add a sweep; return the box arrays that are completed by it.
+
+        Parameters
+        ----------
+        sweep : Sweep
+            In the fixed frame; its points may be in their own, see `Sweep.T_frame_points` [m]. One
+            that was dropped has no points, and boxes of its stamp do not wait for another.
+
+        Returns
+        -------
+        list of RefinedBoxes
+            In the fixed frame, by their stamps.
+
+        Raises
+        ------
+        ShapeError
+            If boxes of its stamp are in another frame.
+
+        """
         sweep = sweep.in_columns()
         self.counts['sweeps'] += not sweep.is_dropped
         self.followed.add_sweep(sweep)
@@ -199,7 +218,26 @@ class BoxRegistrar:
         return self._process(self._matcher.add_sweep(sweep))
 
     def add_boxes(self, boxes: BoxArray) -> list[RefinedBoxes]:
-        """Add a box array; return the box arrays that are completed by it."""
+        """
+        Add a box array; return the box arrays that are completed by it.
+
+        Parameters
+        ----------
+        boxes : BoxArray
+            In the fixed frame [m, rad]. An id is that of one object over time. Invalid boxes,
+            those without an id, and further ones of an id in the array are kept.
+
+        Returns
+        -------
+        list of RefinedBoxes
+            In the fixed frame, by their stamps.
+
+        Raises
+        ------
+        ShapeError
+            If their sweep is in another frame.
+
+        """
         self.counts['boxes'] += len(boxes.track_ids)
         return self._process(self._matcher.add_boxes(boxes))
 
@@ -219,7 +257,16 @@ class BoxRegistrar:
         return self._process(self._matcher.add_boxes(boxes, reason))
 
     def follow(self, boxes: BoxArray) -> None:
-        """Follow the object of each box, with `estimate` 'early' or 'final', see the notes."""
+        """
+        Follow the object of each box, with `estimate` 'early' or 'final', see the notes.
+
+        Parameters
+        ----------
+        boxes : BoxArray
+            Boxes of a person in the fixed frame [m, rad]. The object of an id that is followed
+            starts anew; a box without an id, or an invalid one, is listed in ``followed.refused``.
+
+        """
         self.followed.add(boxes)
 
     def flush(self) -> list[RefinedBoxes]:
@@ -233,7 +280,20 @@ class BoxRegistrar:
         return self._returned()
 
     def abandon(self, reason: str) -> list[RefinedBoxes]:
-        """Return all box arrays held, kept for a reason, after an error; reset everything else."""
+        """
+        Return all box arrays held, kept for a reason, after an error; reset everything else.
+
+        Parameters
+        ----------
+        reason : str
+            Why their boxes are kept, as one of `Reason`.
+
+        Returns
+        -------
+        list of RefinedBoxes
+            Final ones, by their stamps.
+
+        """
         unpaired = [*self._correction.waiting, *self._matcher.unpaired]
         self._pending.extend(PendingArray(boxes) for boxes in unpaired)
         for array in self._pending:
@@ -636,7 +696,24 @@ class _SubmittedTrack(NamedTuple):
 
 
 def submit_locally(windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
-    """Return a function that runs `estimate_windows` in this process, which imports torch."""
+    """
+    Return a function that runs `estimate_windows` in this process, which imports torch.
+
+    Parameters
+    ----------
+    windows : list of Window
+        Of one track each.
+    config : Config
+        Settings.
+    model : InputModel
+        Updated when the function is called.
+
+    Returns
+    -------
+    callable
+        Without arguments; returns the estimates as `estimate_windows` does.
+
+    """
     from boxreg_ros.core.estimation import estimate_windows
 
     return partial(estimate_windows, windows, config, model)

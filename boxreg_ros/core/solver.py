@@ -94,14 +94,31 @@ def solve(
     """
     Minimise the robust objective (M1) of a batch: rounds until every window is settled.
 
-    The B windows are all warm, with all boxes but the newest starting from an earlier fit, or all
-    cold. `model` has the constants of the method, and what it estimates of the errors of the
-    `inputs`. Of whole tracks `observe_margins` adds what their first round (B, N, 6) shows.
-    Returned are poses, shared variables and covariances; for sliding windows also the prior of the
-    next ones.
-
     Settled windows take no part in further rounds. Within a round windows do not depend on each
     other: threads share them.
+
+    Parameters
+    ----------
+    problem : Problem
+        B windows, all warm or all cold.
+    config : Config
+        Settings.
+    model : InputModel
+        Has the constants of the method, and what it estimates of the errors of the input. That is
+        updated with the noise of whole tracks.
+    inputs : Inputs
+        These errors, where the rounds begin.
+    is_warm : bool
+        Whether all boxes but the newest start from an earlier fit.
+    observe_margins : callable, optional
+        Called with the poses (B, N, 6) of whole tracks after their first round: it adds what these
+        show of the labelling margins.
+
+    Returns
+    -------
+    solution : Solution
+        Poses, shared variables and covariances; for sliding windows also the prior of the next
+        ones.
 
     """
     constants = model.constants.with_settings(config)

@@ -60,7 +60,24 @@ class Inbox:
         self.wake_up.set()
 
     def put(self, topic: str, content: Any, lidar: str = '') -> Message | None:
-        """Add a cloud or box array; return the oldest one of its kind if the queue is full."""
+        """
+        Add a cloud or box array to its queue.
+
+        Parameters
+        ----------
+        topic : str
+            ``points`` or ``boxes``.
+        content : object
+            The message.
+        lidar : str
+            Topic of a cloud, where those of several are merged.
+
+        Returns
+        -------
+        dropped : Message or None
+            The oldest one of its queue if that has more than its `capacity`.
+
+        """
         dropped = None
         with self._lock:
             self._number += 1

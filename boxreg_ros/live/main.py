@@ -18,10 +18,20 @@ def main(args: Sequence[str] | None = None, is_managed: bool = False) -> int:
     """
     Run the node until SIGINT or SIGTERM, then end the process.
 
-    Return the exit status if the node could not start: 2 if an argument or a parameter is wrong,
-    else 1. Once started the process ends here, with status 0 after a signal and 1 after a
-    failure. Failures are printed in one line on stderr. The arguments are by default those of
-    the process.
+    Once started the process ends here, with status 0 after a signal and 1 after a failure.
+    Failures are printed in one line on stderr.
+
+    Parameters
+    ----------
+    args : sequence of str, optional
+        Arguments, those of ROS too; default: those of the process.
+    is_managed : bool
+        Whether the node has the states of a lifecycle node.
+
+    Returns
+    -------
+    status : int
+        If the node could not start: 2 if an argument or a parameter is wrong, else 1.
 
     """
     for number in (signal.SIGINT, signal.SIGTERM):

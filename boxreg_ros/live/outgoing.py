@@ -44,7 +44,22 @@ class OutgoingQueue:
         self._made: list[Outgoing] = []
 
     def messages(self, results: list[RefinedBoxes], adapter: Adapter | None) -> list[Outgoing]:
-        """Return the messages to publish for results; `adapter` has read those of the input."""
+        """
+        Return the messages to publish for results of the registrar.
+
+        Parameters
+        ----------
+        results : list of RefinedBoxes
+            In the fixed frame, with the tickets of their input.
+        adapter : Adapter or None
+            That has read the messages of the input; None before the first of them.
+
+        Returns
+        -------
+        list of Outgoing
+            In the order of `results`, of the type of the input.
+
+        """
         self._results += results
         self._following.report()
         while self._results:
@@ -62,9 +77,20 @@ class OutgoingQueue:
 
     def abandoned(self, results: list[RefinedBoxes]) -> tuple[list[Outgoing], list[Any]]:
         """
-        Return the messages made before an error, and all others passed through.
+        Return what is to be published after an error while messages were made.
 
-        Also return the input messages of `results` and of those before them, which are these.
+        Parameters
+        ----------
+        results : list of RefinedBoxes
+            Further ones, with the tickets of their input.
+
+        Returns
+        -------
+        ready : list of Outgoing
+            Those made before the error; all others pass through.
+        inputs : list of message
+            Input messages of the results that were not turned into messages, `results` behind
+            those before them.
 
         """
         lost = [*self._results, *results]
@@ -91,7 +117,25 @@ class OutgoingQueue:
 
 
 def labels_passed_through(message: Any, adapter: Adapter, session: Session) -> RefinedBoxes | None:
-    """Return the boxes of a message that passed through as kept; None for unreadable ones."""
+    """
+    Return the boxes of a message that passed through as kept.
+
+    Parameters
+    ----------
+    message : message
+        Of the boxes.
+    adapter : Adapter
+        That reads it.
+    session : Session
+        Has the transforms and the fixed frame.
+
+    Returns
+    -------
+    refined : RefinedBoxes or None
+        In the fixed frame, or in that of the message where no transform is known; None if the
+        message cannot be read.
+
+    """
     try:
         boxes = adapter.from_msg(message)
     except UnsupportedMessage:

@@ -200,7 +200,31 @@ def numbers_as_declared(node: Node, parameters: list[Parameter]) -> list[Paramet
 def changed(
     config: Config, options: NodeOptions, parameters: Iterable[Parameter]
 ) -> tuple[Config, NodeOptions]:
-    """Return the settings with some parameters changed; raise ConfigError as `declare`."""
+    """
+    Return the settings with some parameters changed.
+
+    Parameters
+    ----------
+    config : Config
+        The settings before.
+    options : NodeOptions
+        Those of the node before.
+    parameters : iterable of Parameter
+        Those to change, by their names as declared; others are not used.
+
+    Returns
+    -------
+    config : Config
+        New settings.
+    options : NodeOptions
+        New settings of the node.
+
+    Raises
+    ------
+    ConfigError
+        For a value of the wrong type or out of its bounds, by name.
+
+    """
     return _updated(config, options, _values_of(parameters))
 
 
@@ -208,8 +232,18 @@ def parameters_yaml(config: Config, options: NodeOptions | None = None) -> str:
     """
     Return all settings as a ROS parameter file with a comment per setting.
 
-    The file applies to nodes of any name in any namespace. ``boxreg relabel --config`` reads it
-    too and ignores the options of the node. `estimate` is left out: the node ignores it.
+    Parameters
+    ----------
+    config : Config
+        `estimate` is left out: the node ignores it.
+    options : NodeOptions, optional
+        Those of the node; default: as they are by default.
+
+    Returns
+    -------
+    text : str
+        YAML for nodes of any name in any namespace. ``boxreg relabel --config`` reads it too and
+        ignores the options of the node.
 
     """
     options = options or NodeOptions()

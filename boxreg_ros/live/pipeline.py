@@ -137,14 +137,46 @@ class MessagePipeline:
     def pass_through(
         self, message: Any, stamp_ns: int = 0, is_early_out: bool = False
     ) -> list[Outgoing]:
-        """Return an input message as early boxes and, once those before it are, as final."""
+        """
+        Return an input message as early boxes and, once those before it are, as final.
+
+        Parameters
+        ----------
+        message : message
+            Of the boxes; published as it is.
+        stamp_ns : int
+            Its stamp [ns]; 0 if unknown: it then stands behind the newest boxes.
+        is_early_out : bool
+            Whether it has been published as early boxes.
+
+        Returns
+        -------
+        list of Outgoing
+            Ready to be published, those of boxes before it too.
+
+        """
         early = [] if is_early_out else [Outgoing(message, False)]
         return early + self._messages(self.registrar.add_kept(passing(message, stamp_ns), PASSED))
 
     # ------------------------------------------------------------ messages that do not arrive
 
     def lose(self, stamp_ns: int, lidar: str = '') -> list[Outgoing]:
-        """Release the boxes that wait for a cloud that was dropped, of one of several LiDARs."""
+        """
+        Release the boxes that wait for a cloud that was dropped.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Its stamp [ns].
+        lidar : str
+            Its topic, where the clouds of several LiDARs are merged.
+
+        Returns
+        -------
+        list of Outgoing
+            Ready to be published.
+
+        """
         nothing = np.zeros((0, 3))
         sweep = Sweep(stamp_ns, self.session.fixed_frame, nothing, is_dropped=True, topic=lidar)
         if lidar:

@@ -22,7 +22,31 @@ ENDING_TIME = 0.9
 
 
 def make_node(program: str, arguments: list[str], is_managed: bool = False) -> BoxregNode:
-    """Initialise ROS and return the node: open, or unconfigured if it is managed."""
+    """
+    Initialise ROS and return the node.
+
+    Parameters
+    ----------
+    program : str
+        Name for help texts.
+    arguments : list of str
+        Of the command line, those of ROS too.
+    is_managed : bool
+        Whether it is a lifecycle node.
+
+    Returns
+    -------
+    node : BoxregNode
+        With its topics open, or unconfigured if it is managed.
+
+    Raises
+    ------
+    ConfigError
+        If a parameter is wrong.
+    SystemExit
+        If an argument is unknown, or help was asked for.
+
+    """
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     parser = argparse.ArgumentParser(
         program, description='Refine boxes live. Parameters: --ros-args -p NAME:=VALUE ...'

@@ -106,9 +106,19 @@ class NodeTopics:
         Create a subscription.
 
         With reliability ``BEST_AVAILABLE``, rclpy chooses by the publishers that exist when it
-        subscribes. The subscription is created anew when one comes that offers less. Raises
-        ConfigError for a wrong QoS override and for a topic that the node uses with another type,
-        UnsupportedMessage if the message package is missing.
+        subscribes. The subscription is created anew when one comes that offers less.
+
+        Parameters
+        ----------
+        endpoint : Endpoint
+            Type, topic, QoS profile and callback; parameters may override its QoS profile.
+
+        Raises
+        ------
+        ConfigError
+            For a wrong QoS override and for a topic that the node uses with another type.
+        UnsupportedMessage
+            If the message package is missing.
 
         """
         self._name(endpoint)
@@ -116,7 +126,29 @@ class NodeTopics:
         self._endpoints.append(endpoint)
 
     def publish(self, type_name: str, topic: str, depth: int) -> Publisher:
-        """Create a publisher; parameters may override its QoS profile. Raises as `subscribe`."""
+        """
+        Create a publisher.
+
+        Parameters
+        ----------
+        type_name : str
+            As ``package/msg/Type``.
+        topic : str
+            Before namespace and remaps.
+        depth : int
+            Messages in its queue; parameters may override this QoS profile.
+
+        Returns
+        -------
+        publisher : Publisher
+            Of rclpy.
+
+        Raises
+        ------
+        ConfigError, UnsupportedMessage
+            As of `subscribe`.
+
+        """
         kind = import_message(type_name)
         endpoint = Endpoint(type_name, topic, QoSProfile(depth=depth))
         self._name(endpoint)

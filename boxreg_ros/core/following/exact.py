@@ -35,16 +35,30 @@ class Keyframes(NamedTuple):
 
 def between_exact(stamps_ns: Ints, boxes: Floats, keyframes: Keyframes) -> Floats:
     """
-    Return `boxes` (N, 9) with a spline or line between keyframes, but where the fits err less.
+    Return boxes with a spline or line between keyframes, but where the fits err less.
 
     Each is judged at the keyframes, without the one that it is compared with. An interpolation
     between keyframes errs by at most a h^2 / 8 with the acceleration a and the time h between
     them, and by a s t / 2 at one that is left out, s after the last and t before the next. That of
     a spline, whose errors are of the fourth order, grows with the square of the ratio of both from
-    evenly spaced keyframes on: small errors of close ones bend it far in a long gap. Fits,
-    from which the residuals of these neighbours are removed, err as between them; where one of
-    them has no fit, it is not known by how much, and they are not taken. Two keyframes show
-    nothing.
+    evenly spaced keyframes on: small errors of close ones bend it far in a long gap. Fits, from
+    which the residuals of these neighbours are removed, err as between them; where one of them has
+    no fit, it is not known by how much, and they are not taken. Two keyframes show nothing.
+
+    Parameters
+    ----------
+    stamps_ns : array, shape (N,)
+        Strictly increasing stamps of the boxes [ns].
+    boxes : array, shape (N, 9)
+        Fits of one track in one frame [m, rad].
+    keyframes : Keyframes
+        Those of this track, in the same frame.
+
+    Returns
+    -------
+    boxes : array, shape (N, 9)
+        A copy. Boxes at keyframes and beyond them are not changed, and none with fewer than three
+        keyframes.
 
     """
     found = boxes.copy()
