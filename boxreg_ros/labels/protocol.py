@@ -96,10 +96,22 @@ class LabelFrame:
 
     def boxes_in(self, frame: str, dropped: Counter[str]) -> tuple[Ints, Floats]:
         """
-        Return rows (k,) and boxes (k, 9) of the valid ones in the 'fixed' or 'sensor' frame.
+        Return the boxes that a format can write in a frame.
 
-        Boxes left out are added to `dropped`: ``invalid_box`` (not finite, or an extent that is
-        not positive) and ``no_transform`` (no transform to `frame`).
+        Parameters
+        ----------
+        frame : str
+            'fixed' or 'sensor'.
+        dropped : Counter
+            Boxes left out are added to it: ``invalid_box`` (of `is_valid_box`) and
+            ``no_transform`` (no transform to `frame`).
+
+        Returns
+        -------
+        rows : array, shape (k,)
+            Rows of `refined`, ascending.
+        boxes : array, shape (k, 9)
+            x y z length width height roll pitch yaw in this frame [m, rad].
 
         """
         boxes = self.moved(frame).refined.boxes
@@ -111,7 +123,21 @@ class LabelFrame:
         return rows, boxes.boxes[rows]
 
     def moved(self, frame: str) -> LabelFrame:
-        """Return it with its boxes in the 'fixed' or 'sensor' frame, if a transform is known."""
+        """
+        Return it with its boxes in another frame, if a transform is known.
+
+        Parameters
+        ----------
+        frame : str
+            'fixed' or 'sensor'.
+
+        Returns
+        -------
+        frame : LabelFrame
+            Itself if its boxes are there, or no transform leads there. Covariances remain in the
+            axes of the fixed frame.
+
+        """
         boxes = self.refined.boxes
         if frame == 'fixed':
             source, target = self.sensor_frame, self.fixed_frame
