@@ -137,7 +137,28 @@ def finite_cloud(
     origins: Floats | None = None,
     sensors: NDArray[np.uint8] | None = None,
 ) -> Cloud:
-    """Return a cloud without the points that are not finite."""
+    """
+    Return a cloud without the points that are not finite.
+
+    Parameters
+    ----------
+    points : array, shape (M, 3)
+        In the frame of the clouds of the scene [m].
+    intensities : array, shape (M,), or None
+        In the unit of the data set.
+    times : array, shape (M,), or None
+        Of measurement relative to the stamp [s].
+    origins : array, shape (K, 3), or None
+        Positions of the sensors [m]; None for one at the origin of the frame.
+    sensors : array of uint8, shape (M,), or None
+        Row of `origins` of each point; None for one sensor.
+
+    Returns
+    -------
+    cloud : Cloud
+        The same arrays, not copied, if all points are finite.
+
+    """
     is_finite = np.isfinite(points).all(axis=1)
     if not is_finite.all():
         points = points[is_finite]
@@ -202,7 +223,29 @@ def require(path: Path, what: str, remedy: str) -> Path:
 
 
 def require_lidars(asked: Sequence[str], names: Sequence[str], main: str = '') -> list[str]:
-    """Return the LiDARs that are asked for, else the main one, else the only one, or refuse."""
+    """
+    Return the LiDARs to read.
+
+    Parameters
+    ----------
+    asked : sequence of str
+        Names that are asked for; none for the default.
+    names : sequence of str
+        Those of the data set or scene.
+    main : str
+        The default; if empty, it is the only one of `names`.
+
+    Returns
+    -------
+    lidars : list of str
+        One or more of `names`, in the order in which they are asked for.
+
+    Raises
+    ------
+    RecordingError
+        If a name is none of `names`, or none is asked for and there is no default.
+
+    """
     default = [main] if main else list(names)[: len(names) == 1]
     found = list(asked) or default
     unknown = [name for name in found if name not in names]

@@ -28,7 +28,25 @@ OXTS_COLUMNS = 30
 
 
 def oxts_rows(path: Path) -> Floats:
-    """Return the rows (n, 30) of a file of OXTS; raises RecordingError if it has others."""
+    """
+    Return the rows of a file of OXTS.
+
+    Parameters
+    ----------
+    path : Path
+        A line of 30 numbers per frame.
+
+    Returns
+    -------
+    rows : array, shape (n, 30)
+        Their first six columns are finite: see the docstring of the module.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read, or has other lines.
+
+    """
     try:
         rows = np.loadtxt(path, ndmin=2)
     except OSError as error:
@@ -45,9 +63,19 @@ def oxts_rows(path: Path) -> Floats:
 
 def oxts_poses(rows: Floats, T_velo_imu: Floats) -> Floats:
     """
-    Return the poses (n, 7) of the LiDAR, relative to the position of the first row (n, 30).
+    Return the poses of the LiDAR in a map whose origin is the first position of the GPS/IMU unit.
 
-    They are x y z qx qy qz qw; x is east, y is north, z is up.
+    Parameters
+    ----------
+    rows : array, shape (n, 30)
+        As of `oxts_rows`; at least one.
+    T_velo_imu : array, shape (4, 4)
+        Pose of the GPS/IMU unit in the frame of the LiDAR [m].
+
+    Returns
+    -------
+    poses : array, shape (n, 7)
+        x y z qx qy qz qw [m]; x is east, y is north, z is up.
 
     """
     latitude, longitude = np.radians(rows[:, 0]), np.radians(rows[:, 1])
@@ -61,7 +89,31 @@ def oxts_poses(rows: Floats, T_velo_imu: Floats) -> Floats:
 
 
 def exported_poses(folder: Path, count: int) -> tuple[Ints, Floats] | None:
-    """Return stamps and known poses of our own exports, without OXTS; None for other folders."""
+    """
+    Return the poses of our own exports, which have no OXTS.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the sequence or drive.
+    count : int
+        Number of frames that need a stamp.
+
+    Returns
+    -------
+    stamps_ns : array, shape (P,)
+        Of the known poses [ns].
+    poses : array, shape (P, 7)
+        x y z qx qy qz qw of the LiDAR in the fixed frame [m]. None instead of both if the folder
+        is no export.
+
+    Raises
+    ------
+    RecordingError
+        If a file does not follow its format, no pose is known, or there are less than `count`
+        stamps.
+
+    """
     if not (folder / POSES_FILE).is_file():
         return None
     stamps_ns = np.array(whole_stamps(folder / STAMPS_FILE), np.int64)
@@ -81,8 +133,22 @@ def sweep_files(
     """
     Yield the sweeps of a folder; the file name is the number of the frame.
 
-    Frames `without_stamp` have none in the data set, which left them out; their `stamps_ns` are
-    interpolated. One of them that has a file is yielded, and cannot be read.
+    Parameters
+    ----------
+    folder : Path
+        Of the ``.bin`` files.
+    digits : int
+        Of the numbers in their names, with leading zeros.
+    stamps_ns : sequence of int
+        Of each frame [ns].
+    without_stamp : container of int
+        Frames that have no stamp in the data set, which left them out; theirs are interpolated.
+        One that has a file is yielded, and its `read` raises UnsupportedMessage.
+
+    Yields
+    ------
+    sweep : SweepFile
+        One per frame, in the order of the numbers; missing files are noticed on reading.
 
     """
     for number, stamp_ns in enumerate(stamps_ns):
@@ -110,7 +176,27 @@ def rigid_transform(numbers: Sequence[float], path: Path) -> Floats:
 
 
 def calibration_lines(path: Path, archive: str) -> dict[str, list[float]]:
-    """Return the numbers of each line of a calibration by the name before them."""
+    """
+    Return the numbers of each line of a calibration.
+
+    Parameters
+    ----------
+    path : Path
+        Lines of a name, with or without a colon, and numbers.
+    archive : str
+        Name of the archive that has the file, for the error.
+
+    Returns
+    -------
+    values : dict of str to list of float
+        By the name. Lines with words that are no numbers, as the date, are left out.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such file.
+
+    """
     require(path, 'the calibration', f'unpack {archive}')
     values = {}
     for line in path.read_text(encoding='utf-8').splitlines():

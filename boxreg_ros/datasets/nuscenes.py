@@ -319,7 +319,29 @@ def _table_folders(root: Path) -> list[Path]:
 
 
 def tables_of(root: Path, name: str) -> tuple[Path, dict[str, Any]]:
-    """Return the tables of a scene, and its row; the mini split comes before the others."""
+    """
+    Return the tables of a scene, and its row; the mini split comes before the others.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the data set.
+    name : str
+        Of the scene, as in ``scene.json``.
+
+    Returns
+    -------
+    tables : Path
+        Folder of the JSON tables.
+    row : dict
+        Of the table ``scene``.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such scene, or a table cannot be read.
+
+    """
     for tables in _table_folders(root):
         for row in _rows(tables, 'scene'):
             if row['name'] == name:

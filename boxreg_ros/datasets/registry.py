@@ -141,7 +141,30 @@ def all_scenes(address: Address) -> list[Address]:
 
 
 def open_scene(address: Address, lidars: Sequence[str] = ()) -> Scene:
-    """Return a scene with these LiDARs; raises as `resolved` and as its module."""
+    """
+    Return a scene, without reading its clouds.
+
+    Parameters
+    ----------
+    address : Address
+        Its scene may be empty if the folder has one only.
+    lidars : sequence of str
+        Names of the LiDARs to read; none for the main one.
+
+    Returns
+    -------
+    scene : Scene
+        See `protocol.DatasetModule.open_scene`.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such scene or LiDAR, several scenes and none is named, or a file is missing
+        or does not follow the layout.
+    ConfigError
+        If the data set needs a package that is not installed.
+
+    """
     address = resolved(address)
     return module_of(address.dataset).open_scene(address.root, address.scene, lidars)
 

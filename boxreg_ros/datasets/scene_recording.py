@@ -119,9 +119,25 @@ class SceneRecording:
 
     def choose_fixed_frame(self, tree: TransformTree, fixed_frame: str | None = None) -> str:
         """
-        Return the fixed frame of the scene, and add its first pose to `tree`.
+        Return the fixed frame of the scene, and add its first pose to a tree.
 
-        Raises RecordingError if `fixed_frame` is neither this frame nor that of the clouds.
+        Parameters
+        ----------
+        tree : TransformTree
+            Is given the pose of the frame of the clouds at the first stamp.
+        fixed_frame : str, optional
+            That is asked for, with or without a leading slash: that of the scene, or of the
+            clouds.
+
+        Returns
+        -------
+        frame : str
+            Without a leading slash; by default that of the scene.
+
+        Raises
+        ------
+        RecordingError
+            If `fixed_frame` is another one.
 
         """
         frames = self._scene.frames

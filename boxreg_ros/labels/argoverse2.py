@@ -126,8 +126,24 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """
     Yield the frames of one log.
 
-    `path` has annotations of the log, or detections of many logs as they are submitted, with the
-    column ``log_id``.
+    Parameters
+    ----------
+    path : Path
+        Annotations of the log, or the folder that has them; or detections of many logs as they are
+        submitted, with the column ``log_id``.
+    scene : SceneFrames
+        Its name is the id of the log.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per stamp with boxes, ascending; boxes in the frame of the ego vehicle, which is the
+        sensor frame.
+
+    Raises
+    ------
+    RecordingError
+        If the table cannot be read, lacks columns, or has boxes of other logs only.
 
     """
     from pyarrow import compute

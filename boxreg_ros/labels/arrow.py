@@ -65,9 +65,26 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 def read_table(path: Path, required: Collection[str] = (), what: str = '') -> Any:
     """
-    Return the pyarrow table of a Parquet or Feather file.
+    Return the table of a Parquet or Feather file.
 
-    Raises RecordingError if it cannot be read, or lacks some of the `required` columns of `what`.
+    Parameters
+    ----------
+    path : Path
+        Parquet if its name ends in ``.parquet``, else Feather.
+    required : collection of str
+        Columns that must be there.
+    what : str
+        Origin of these columns, for the error.
+
+    Returns
+    -------
+    table : pyarrow.Table
+        With all columns of the file, in memory.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read, or lacks some of `required`.
 
     """
     import pyarrow

@@ -52,9 +52,24 @@ class Camera:
         """
         Read a calibration file of KITTI, or YAML with the keys of ``camera_info`` of ROS.
 
-        YAML holds ``projection_matrix``, ``T_camera_sensor`` (12 or 16 numbers, row by row) and
-        optionally ``rectification_matrix``, ``image_width`` and ``image_height``. Raises
-        ConfigError if `path` is None, cannot be read, or a part is missing or has the wrong size.
+        Parameters
+        ----------
+        path : Path or None
+            YAML, if its name ends in ``.yaml`` or ``.yml``, holds ``projection_matrix``,
+            ``T_camera_sensor`` (12 or 16 numbers, row by row) and optionally
+            ``rectification_matrix``, ``image_width`` and ``image_height``.
+        needed_by : str
+            What needs the camera, for the error without a path.
+
+        Returns
+        -------
+        camera : Camera
+            Without a rectification it is the identity, without a size that of KITTI.
+
+        Raises
+        ------
+        ConfigError
+            If `path` is None or cannot be read, or a part is missing or has the wrong size.
 
         """
         if path is None:
@@ -89,11 +104,19 @@ class Camera:
 
     def project(self, boxes: Floats) -> tuple[Floats, Mask]:
         """
-        Return the rectangles of boxes (n, 9) of the LiDAR frame, and which are in the image.
+        Return the rectangles of boxes in the image.
 
-        Rectangles (n, 4) are left, top, right and bottom [px], clipped to the image; NaN for boxes
-        outside of it. A box is inside (n,) if all of it is in the image and in front of the
-        camera.
+        Parameters
+        ----------
+        boxes : array, shape (n, 9)
+            In the frame of the LiDAR [m, rad].
+
+        Returns
+        -------
+        rectangles : array, shape (n, 4)
+            Left, top, right and bottom [px], clipped to the image; NaN for boxes outside of it.
+        is_inside : array, shape (n,)
+            Whether all of a box is in the image and in front of the camera.
 
         """
         T = self.T_rect_sensor
@@ -118,10 +141,20 @@ class Camera:
 
     def to_upright(self, boxes: Floats) -> tuple[Floats, Floats]:
         """
-        Return the pose of boxes (n, 9), in the LiDAR frame, as KITTI states it.
+        Return the pose of boxes as KITTI states it; roll and pitch are lost.
 
-        Centres (n, 3) are in the rectified camera frame [m]; angles (n,) are about y of the camera
-        from its x axis to the heading [rad]; roll and pitch are lost.
+        Parameters
+        ----------
+        boxes : array, shape (n, 9)
+            In the frame of the LiDAR [m, rad].
+
+        Returns
+        -------
+        centres : array, shape (n, 3)
+            Geometric centres in the frame of the rectified camera [m]. KITTI has that of the
+            bottom.
+        rotation_y : array, shape (n,)
+            About y of the camera, from its x axis to the heading [rad].
 
         """
         T = self.T_rect_sensor
@@ -131,7 +164,24 @@ class Camera:
         return centres, np.arctan2(-headings[:, 2], headings[:, 0])
 
     def from_upright(self, centres: Floats, rotation_y: Floats, extents: Floats) -> Floats:
-        """Return upright boxes (n, 9) in the LiDAR frame; the inverse of `to_upright`."""
+        """
+        Return boxes in the frame of the LiDAR; the inverse of `to_upright`.
+
+        Parameters
+        ----------
+        centres : array, shape (n, 3)
+            Geometric centres in the frame of the rectified camera [m].
+        rotation_y : array, shape (n,)
+            About y of the camera, from its x axis to the heading [rad].
+        extents : array, shape (n, 3)
+            Length, width and height [m].
+
+        Returns
+        -------
+        boxes : array, shape (n, 9)
+            Upright in the frame of the camera [m, rad].
+
+        """
         cos = np.cos(rotation_y)
         sin = np.sin(rotation_y)
         zero = np.zeros(len(rotation_y))

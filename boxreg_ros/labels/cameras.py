@@ -87,10 +87,28 @@ class LabelCameras:
 
     def only(self, sensor_frame: str, topic: str, needed_by: str) -> LabelCamera | None:
         """
-        Return the only camera, or that of a topic of images or of its CameraInfo.
+        Return the only camera, or that of a topic.
 
-        Cameras without images count where no camera has any. None if there is no camera and no
-        topic; ConfigError if there are several and no topic, or none of the topic.
+        Cameras without images count where no camera has any.
+
+        Parameters
+        ----------
+        sensor_frame : str
+            Frame of the labels.
+        topic : str
+            Of the images, or of their CameraInfo; empty for the only camera.
+        needed_by : str
+            What needs the camera, for the error.
+
+        Returns
+        -------
+        camera : LabelCamera or None
+            None if there is no camera and no topic.
+
+        Raises
+        ------
+        ConfigError
+            If there are several cameras and no topic, or none of the topic.
 
         """
         start_ns = self._recording.start_ns
@@ -136,7 +154,30 @@ class LabelCameras:
     def images(
         self, cameras: Iterable[LabelCamera], stamp_ns: int, needs_png: bool = False
     ) -> list[tuple[LabelCamera, Image]]:
-        """Return the image of each camera nearest to a stamp; those without one are counted."""
+        """
+        Return the image of each camera nearest to a stamp.
+
+        Parameters
+        ----------
+        cameras : iterable of LabelCamera
+            Some of `known`.
+        stamp_ns : int
+            Of the labels [ns].
+        needs_png : bool
+            Whether the format takes no images but PNG; others are converted.
+
+        Returns
+        -------
+        images : list of (LabelCamera, Image)
+            Without cameras that have no image nearby, or one that cannot be read; `counts` has
+            their number, by topic.
+
+        Raises
+        ------
+        ConfigError
+            If an image has to be converted, and Pillow is not installed.
+
+        """
         found = []
         for camera in cameras:
             topic = camera.image.topic

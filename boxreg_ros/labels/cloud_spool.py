@@ -32,7 +32,19 @@ class Spool:
         self._folder.mkdir()
 
     def add(self, sweep: Sweep, T_fixed_sweep: Floats, intensities: Floats | None = None) -> None:
-        """Store a sweep and the pose (4, 4) of its frame; a second one of its stamp is ignored."""
+        """
+        Store a sweep; a second one of the same stamp is ignored.
+
+        Parameters
+        ----------
+        sweep : Sweep
+            In its own frame.
+        T_fixed_sweep : array, shape (4, 4)
+            Pose of that frame at the stamp of the sweep.
+        intensities : array, shape (M,), or None
+            Of its points, in the unit of the sensor.
+
+        """
         stamp_ns = sweep.stamp_ns
         if stamp_ns in self._stamps:
             return
@@ -46,9 +58,21 @@ class Spool:
         """
         Return the cloud nearest to a stamp, and delete the clouds that are too old for it.
 
-        The points are returned in a frame whose pose (4, 4) at the stamp is known; None for a
-        cloud where none lies within the maximum time offset, and for intensities (M,) where it has
-        none. Stamps [ns] of box arrays are not smaller than in the call before.
+        Parameters
+        ----------
+        stamp_ns : int
+            Of a box array [ns]; not smaller than in the call before.
+        frame_id : str
+            Frame that the points are returned in.
+        T_fixed_frame : array, shape (4, 4)
+            Pose of that frame at `stamp_ns`.
+
+        Returns
+        -------
+        sweep : Sweep or None
+            With its own stamp; None if no sweep lies within the maximum time offset.
+        intensities : array, shape (M,), or None
+            As they were added; None without them or without a sweep.
 
         """
         self._delete_before(stamp_ns)

@@ -43,11 +43,23 @@ def write_cloud(
     """
     Write a cloud in the format of its file name, as little-endian float32.
 
-    The name ends in ``.pcd`` (binary), ``.ply`` (binary), ``.pcd.bin`` (nuScenes: x y z intensity
-    ring), ``.bin`` (KITTI: x y z intensity) or ``.npy`` (OpenPCDet: likewise). Points (M, 3) are
-    in the sensor frame [m], intensities (M,) in the unit of the sensor. Without these, PCD and
-    PLY files have no such field, and the others have zeros. The ring is always zero. Raises
-    ConfigError if the name has another suffix.
+    Parameters
+    ----------
+    path : Path
+        Its name ends in ``.pcd`` (binary), ``.ply`` (binary), ``.pcd.bin`` (nuScenes: x y z
+        intensity ring), ``.bin`` (KITTI: x y z intensity) or ``.npy`` (OpenPCDet: likewise).
+    points : array, shape (M, 3)
+        In the sensor frame [m].
+    intensities : array, shape (M,), or None
+        In the unit of the sensor. Without them PCD and PLY files have no such field, and the
+        others have zeros. The ring is always zero.
+
+    Raises
+    ------
+    ConfigError
+        If the name has another suffix.
+    OSError
+        If the file cannot be written.
 
     """
     suffix = next((s for s in SUFFIXES if path.name.endswith(s)), '')

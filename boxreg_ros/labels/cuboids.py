@@ -56,7 +56,29 @@ def xyz_angles(boxes: Floats) -> Floats:
 
 
 def box_from_cuboid(position: ArrayLike, angles: ArrayLike, extent: ArrayLike) -> Floats:
-    """Return a box (9,) from its centre, angles x y z and extents; ValueError for others."""
+    """
+    Return a box from the cuboid of a labelling tool.
+
+    Parameters
+    ----------
+    position : array_like, 3 numbers
+        Geometric centre [m].
+    angles : array_like, 3 numbers
+        About x, y and z, with R = Rx(x) Ry(y) Rz(z) [rad].
+    extent : array_like, 3 numbers
+        Length, width and height [m].
+
+    Returns
+    -------
+    box : array, shape (9,)
+        In the same frame [m, rad].
+
+    Raises
+    ------
+    ValueError
+        If one of them has not three numbers.
+
+    """
     centre, turn, size = (
         np.reshape(np.asarray(part, float), 3) for part in (position, angles, extent)
     )
@@ -132,11 +154,28 @@ class CuboidWriter(FolderWriter):
 
 def single_part(path: Path, what: str, members: Collection[str]) -> tuple[Path, Path]:
     """
-    Return the folder of the only scene or episode of a project, and that of its sidecar files.
+    Return the only scene or episode of a project.
 
-    The sidecar files are in the part itself, or beside it; `path` may be the part, too. Every part
-    contains one of `members`; `what` names it in messages. Raises RecordingError if there is no
-    part, or several.
+    Parameters
+    ----------
+    path : Path
+        Folder of the project, or of the part itself.
+    what : str
+        Name of such a part, for the error.
+    members : collection of str
+        Files or folders of which every part contains one.
+
+    Returns
+    -------
+    part : Path
+        The folder of the part.
+    sidecar : Path
+        The folder of its sidecar files: the part itself, or the one that contains it.
+
+    Raises
+    ------
+    RecordingError
+        If there is no part, or several.
 
     """
     folders = [path]

@@ -56,9 +56,24 @@ def write_json(path: Path, value: Any) -> None:
 
 def from_json(path: Path, parse_float: Callable[[str], Any] = float) -> Any:
     """
-    Return the content of a JSON file; RecordingError if it cannot be read or is not JSON.
+    Return the content of a JSON file.
 
-    `parse_float` makes numbers of their text: a float has too few digits for a stamp.
+    Parameters
+    ----------
+    path : Path
+        In UTF-8, with or without a byte order mark.
+    parse_float : callable
+        Makes numbers with a decimal point of their text: a float has too few digits for a stamp.
+
+    Returns
+    -------
+    content : object
+        Of the types that `json` has for it.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read or is not JSON.
 
     """
     try:

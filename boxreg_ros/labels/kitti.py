@@ -219,8 +219,24 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """
     Yield the frames of a sequence, by the stamps and the camera of the data set.
 
-    `path` is a label file as the benchmark has it and trackers submit it, or a folder with
-    ``NAME.txt`` or ``label_02/NAME.txt`` of the sequence.
+    Parameters
+    ----------
+    path : Path
+        A label file as the benchmark has it and trackers submit it, or a folder with ``NAME.txt``
+        or ``label_02/NAME.txt`` of the sequence.
+    scene : SceneFrames
+        Its `camera` is needed, its `stamps_ns` are by the number of the frame.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per frame of the scene, with or without boxes; boxes in the frame of the LiDAR.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing, does not follow the format or has frames that the scene lacks, or
+        the scene has no camera.
 
     """
     if path.is_dir():
@@ -302,7 +318,20 @@ def write_calibration(
     """
     Write the calibration as the benchmark has it, the same for all four cameras.
 
-    `names` are those of the rectification and of the poses of LiDAR and IMU.
+    Parameters
+    ----------
+    camera : Camera
+        The pose of the LiDAR is in the frame of camera 0; that of the IMU is written as the
+        identity.
+    path : Path
+        The file; an old one is replaced.
+    names : tuple of 3 str
+        Of the rectification, and of the poses of LiDAR and IMU.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
 
     """
     parts = {f'P{i}': camera.projection for i in range(4)}

@@ -59,7 +59,27 @@ class LabelMerger:
         self._longest_ns = LONGEST_DRIVE_NS if is_part else LARGEST_LAG_NS
 
     def after(self, received_ns: int, stamp_ns: int) -> Iterator[Item]:
-        """Yield the boxes up to the stamp of a sweep [ns], which is the next of the recording."""
+        """
+        Yield the boxes up to the stamp of a sweep, which is the next of the recording.
+
+        Parameters
+        ----------
+        received_ns : int
+            Time at which the sweep was received [ns]; that of the boxes, too.
+        stamp_ns : int
+            Of the sweep [ns].
+
+        Yields
+        ------
+        item : Item
+            An array of boxes per label frame, in the order of the frames.
+
+        Raises
+        ------
+        RecordingError
+            If the labels are of another time than the recording, or do not follow their format.
+
+        """
         self._received_ns = received_ns
         self._newest_ns = max(self._newest_ns, stamp_ns)
         if self._first_ns is None:

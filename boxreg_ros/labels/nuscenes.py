@@ -381,8 +381,24 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """
     Yield the samples of one scene; memory does not grow with the other scenes.
 
-    `path` is the folder of the tables, or that which contains it, or results of the detection or
-    the tracking task as they are submitted: ``{"meta": ..., "results": {sample_token: [...]}}``.
+    Parameters
+    ----------
+    path : Path
+        The folder of the tables, or that which contains it; or results of the detection or the
+        tracking task as they are submitted:
+        ``{"meta": ..., "results": {sample_token: [...]}}``.
+    scene : SceneFrames
+        Its `stamps_ns` are by the token of the sample.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per sample of the scene, with or without boxes; boxes in the fixed frame.
+
+    Raises
+    ------
+    RecordingError
+        If a file is missing or does not follow the format.
 
     """
     with files.following(path, 'the tables or results of nuScenes'):

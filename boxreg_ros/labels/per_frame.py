@@ -132,7 +132,29 @@ def read_lines(
 
 
 def numbers_of(words: Sequence[Sequence[str]], columns: slice, counts: Sequence[int]) -> list[Any]:
-    """Return columns of the words of lines as numbers; ValueError names the line of a fault."""
+    """
+    Return some columns of lines of text as numbers.
+
+    Parameters
+    ----------
+    words : sequence of sequences of str
+        The words of each line.
+    columns : slice
+        Columns that are numbers.
+    counts : sequence of int
+        Numbers of words that a line may have.
+
+    Returns
+    -------
+    rows : list of list of float
+        One per line.
+
+    Raises
+    ------
+    ValueError
+        If a line has another number of words, or a word is no number; with the line, from 1.
+
+    """
     rows = []
     for number, line in enumerate(words, 1):
         with at(f'box {number}'):

@@ -44,11 +44,27 @@ def refined_boxes(
     evidence: Sequence[Mapping[str, Any]] = (),
 ) -> RefinedBoxes:
     """
-    Return the n boxes (n, 9) of one stamp [ns] as read from a file.
+    Return the boxes of one stamp as read from a file.
 
-    `evidence` has the values of a box by the names of `evidence_of`, ``num_points`` and
-    ``attributes``; others are ignored. Of a value that is missing or None the default is taken:
-    score NaN, status `INPUT_STATUS`, 0 points, unit matrices, no reason, no attributes.
+    Parameters
+    ----------
+    stamp_ns : int
+        Of the boxes [ns].
+    frame_id : str
+        Frame of the boxes.
+    track_ids, class_names : sequence of n str
+        The id is empty for boxes without one.
+    boxes : array_like, shape (n, 9)
+        In `frame_id` [m, rad].
+    evidence : sequence of n mappings, or empty
+        Values of a box by the names of `evidence_of`, ``num_points`` and ``attributes``; others
+        are ignored. Covariances are matrices row by row, or their upper triangle.
+
+    Returns
+    -------
+    refined : RefinedBoxes
+        For a value that is missing or None with the default: score NaN, status `INPUT_STATUS`, 0
+        points, unit matrices, no reason, no attributes.
 
     """
     n = len(track_ids)
@@ -119,7 +135,24 @@ EVIDENCE_COLUMNS = {
 
 
 def evidence_of(refined: RefinedBoxes, row: int) -> dict[str, Any]:
-    """Return the values of `EVIDENCE_COLUMNS` of a box."""
+    """
+    Return the values of `EVIDENCE_COLUMNS` of a box.
+
+    Parameters
+    ----------
+    refined : RefinedBoxes
+        The boxes of a stamp.
+    row : int
+        Of the box.
+
+    Returns
+    -------
+    evidence : dict
+        ``status`` and ``reason`` (empty for none); ``score``, None where unknown; ``covariance``
+        of x y z roll pitch yaw, 36 numbers row by row [m^2, m rad, rad^2]; ``extent_covariance``
+        of length width height, 9 numbers [m^2].
+
+    """
     return {
         'status': refined.status[row],
         'reason': refined.reasons[row],

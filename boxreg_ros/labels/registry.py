@@ -75,10 +75,21 @@ def require_boxes(names: Sequence[str]) -> None:
 
 def check_options(names: Sequence[str], options: Options) -> None:
     """
-    Raise ConfigError for options that no format uses, and for the lack of those that one needs.
+    Check that the options fit the formats, before a recording is read.
 
-    The message lists the formats that use the option. Also if the camera that a format needs is
-    not given or cannot be read, if a format labels points, and as `module_of`.
+    Parameters
+    ----------
+    names : sequence of str
+        Of the formats to write.
+    options : Options
+        Of all of them together.
+
+    Raises
+    ------
+    ConfigError
+        If no format uses an option that is set, with the formats that use it; if the camera or the
+        class names that a format uses cannot be read; if a format does not exist, lacks a package,
+        labels points, or can only be read.
 
     """
     require_boxes(names)
@@ -110,7 +121,32 @@ def _formats_with(option: str) -> list[str]:
 def writer_for(
     name: str, out: Path, provenance: Provenance, options: Options | None = None
 ) -> LabelWriter:
-    """Return a writer of this format for the folder of results `out`; raises as `module_of`."""
+    """
+    Return a writer of a format.
+
+    Parameters
+    ----------
+    name : str
+        Of the format.
+    out : Path
+        The folder of results, which exists. The writer has a folder of its own in it, except for
+        the formats of `IN_RESULT_FOLDER`.
+    provenance : Provenance
+        Origin of the labels.
+    options : Options, optional
+        Settings of the writer.
+
+    Returns
+    -------
+    writer : LabelWriter
+        To be closed by the caller.
+
+    Raises
+    ------
+    ConfigError
+        If the format does not exist or lacks a package, or an option does not fit it.
+
+    """
     module = module_of(name)
     folder = _folder_of(name, out)
     folder.mkdir(exist_ok=True)
@@ -126,13 +162,30 @@ def frames_of(
     """
     Yield the frames of a label file or folder.
 
-    Files whose boxes follow another `convention` than their format are read by that.
+    Parameters
+    ----------
+    name : str
+        Of the format.
+    path : Path
+        The file or folder; for some formats ``PATH#PART``, see `files_of`.
+    scene : SceneFrames, optional
+        Scene of a data set, whose boxes are read. It states stamps and calibration for formats
+        with ``read_scene``; others ignore it.
+    convention : Convention
+        Of the boxes, where they follow another than that of their format.
 
-    Boxes whose file states no status or covariance have the status ``input`` and the unit matrix.
-    A scene of a data set, whose boxes are then read, completes the facts of the files.
+    Yields
+    ------
+    frame : LabelFrame
+        One per stamp. Boxes whose file states no status or covariance have the status ``input``
+        and the unit matrix.
 
-    Raises ConfigError as `module_of`, or if the format cannot be read, and RecordingError if the
-    files do not exist or do not follow the format.
+    Raises
+    ------
+    ConfigError
+        At the call, if the format does not exist, lacks a package or cannot be read.
+    RecordingError
+        At the call, if the files do not exist; at a frame, if they do not follow the format.
 
     """
     module = module_of(name)

@@ -97,8 +97,17 @@ def point_numbers(points: PointLabels) -> NDArray[np.uint32]:
     """
     Return the number of the points of each track, of any sweep: all have the same tracks.
 
-    The class, and in the upper 16 bits the instance: the row of the track, from 1; 0 for points on
-    none, and beyond `MAX_INSTANCE`. The last two are those of the track numbers -2 and -1.
+    Parameters
+    ----------
+    points : PointLabels
+        Labels of a sweep; its t tracks and whether they move are used.
+
+    Returns
+    -------
+    numbers : array of uint32, shape (t + 2,)
+        By the track of a point; the last two are those of -2 (unknown) and -1 (on no object). In
+        the lower 16 bits the class, in the upper ones the instance: the row of the track, from 1;
+        0 for points on none, and beyond `MAX_INSTANCE`.
 
     """
     from boxreg_ros.core.point_labels import BACKGROUND, UNKNOWN  # numba, which reading needs not

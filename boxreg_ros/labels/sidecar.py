@@ -38,7 +38,29 @@ class Sidecar:
     def frame(
         self, index: int, boxes: Sequence[ReadBox], left_out: Mapping[str, int]
     ) -> LabelFrame:
-        """Return a frame of boxes in the sensor frame, and of the count of those left out."""
+        """
+        Return a frame of boxes in the sensor frame.
+
+        Parameters
+        ----------
+        index : int
+            Of the stamp and the pose, from 0.
+        boxes : sequence of ReadBox
+            In the sensor frame [m, rad].
+        left_out : mapping of str to int
+            Number of boxes of the file that `boxes` lacks, by `Reason`.
+
+        Returns
+        -------
+        frame : LabelFrame
+            With the pose of the sensor, if it is known.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If a box or its evidence does not have the numbers that it should.
+
+        """
         refined = refined_of(self.stamps_ns[index], self.sensor_frame, boxes)
         pose = self.poses[index]
         return LabelFrame(
@@ -91,9 +113,30 @@ def numbered_frames(
     names: Sequence[str] = (),
 ) -> Iterator[LabelFrame]:
     """
-    Yield the frames of a folder whose boxes, and the counts left out, have their number.
+    Yield the frames of a folder whose labels have the number of their frame.
 
-    Other parameters and errors are those of `read_sidecar`.
+    Parameters
+    ----------
+    folder : Path
+        Of the sidecar files.
+    boxes_by_frame : mapping of int to sequence of ReadBox
+        By the number of the frame, from 0; in the sensor frame [m, rad].
+    left_out : mapping of int to mapping of str to int
+        Number of boxes that are not read, by frame and `Reason`.
+    stamps : Path, optional
+        File of the stamps, instead of that of the folder.
+    names : sequence of str
+        Of the frames in order; without a file of stamps these are used, if they state one each.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per stamp, in the order of the numbers, with or without boxes.
+
+    Raises
+    ------
+    RecordingError
+        If the sidecar files are missing, do not follow their format, or have too few frames.
 
     """
     count = 1 + max((*boxes_by_frame, *left_out), default=-1)
@@ -108,7 +151,31 @@ def numbered_scene(
     left_out: Mapping[int, Mapping[str, int]],
     scene: SceneFrames,
 ) -> Iterator[LabelFrame]:
-    """Yield the frames of a scene; the boxes of `path`, and counts left out, have their number."""
+    """
+    Yield the frames of a scene of a data set whose labels have the number of their frame.
+
+    Parameters
+    ----------
+    path : Path
+        The label file, for the error.
+    boxes_by_frame : mapping of int to sequence of ReadBox
+        By the number of the frame; in the sensor frame of the scene [m, rad].
+    left_out : mapping of int to mapping of str to int
+        Number of boxes that are not read, by frame and `Reason`.
+    scene : SceneFrames
+        Its `stamps_ns` are by the number of the frame, as text.
+
+    Yields
+    ------
+    frame : LabelFrame
+        One per stamp of the scene, in its order, with or without boxes.
+
+    Raises
+    ------
+    RecordingError
+        If there are boxes of a frame that the scene does not have.
+
+    """
     unknown = [number for number in boxes_by_frame if str(number) not in scene.stamps_ns]
     if unknown:
         raise RecordingError(
@@ -124,10 +191,29 @@ def numbered_scene(
 
 def whole_stamps(path: Path, count: int = 0, names: Sequence[str] = ()) -> list[int]:
     """
-    Return a stamp for each frame of a file [ns]; its format and errors are those of `read_stamps`.
+    Return a stamp for each frame of a file.
 
     A frame whose line is blank keeps its number. Its stamp is interpolated between those of its
-    neighbours, and extrapolated at an end. Blank lines at the end are frames up to `count`.
+    neighbours, and extrapolated at an end.
+
+    Parameters
+    ----------
+    path : Path
+        In the format of `read_stamps`.
+    count : int
+        Blank lines at the end are frames up to this number.
+    names : sequence of str
+        Of frames, which state no stamps; for the error.
+
+    Returns
+    -------
+    stamps_ns : list of int
+        Of each frame [ns]; they may be fewer than `count`.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read, or a line is no stamp.
 
     """
     return filled_stamps(read_stamps(path, names), count)
@@ -155,7 +241,22 @@ def _by_number(name: str) -> tuple[str | int, ...]:
 
 
 def filled_stamps(stamps_ns: Sequence[int | None], count: int = 0) -> list[int]:
-    """Return stamps [ns] with those of blank lines, as `whole_stamps` has them."""
+    """
+    Return stamps with those of blank lines, as `whole_stamps` has them.
+
+    Parameters
+    ----------
+    stamps_ns : sequence of int or None
+        One per line [ns]; None for a blank one.
+    count : int
+        Blank lines at the end are frames up to this number.
+
+    Returns
+    -------
+    stamps_ns : list of int
+        Of each frame [ns]. Of less than two stamps there is no period: these alone are returned.
+
+    """
     known = [number for number, stamp_ns in enumerate(stamps_ns) if stamp_ns is not None]
     given_ns = [stamp_ns for stamp_ns in stamps_ns if stamp_ns is not None]
     if len(known) < 2:
@@ -216,9 +317,25 @@ def read_stamps(path: Path, names: Sequence[str] = ()) -> list[int | None]:
 
 def read_poses(path: Path, count: int) -> list[Floats | None]:
     """
-    Return ``T_fixed_sensor`` (4, 4) of `count` frames; None where the pose is unknown.
+    Return the poses of the sensor in the fixed frame.
 
-    Raises RecordingError if the file exists but is not `count` lines of twelve numbers.
+    Parameters
+    ----------
+    path : Path
+        The upper three rows of a matrix (4, 4) per line, row by row; NaN where it is unknown.
+    count : int
+        Number of frames.
+
+    Returns
+    -------
+    poses : list of array, shape (4, 4), or None
+        ``T_fixed_sensor`` of each frame [m]; None where the pose is unknown, and for all frames
+        without the file.
+
+    Raises
+    ------
+    RecordingError
+        If the file exists but is not `count` lines of twelve numbers.
 
     """
     if not path.exists() or not count:

@@ -194,9 +194,26 @@ def boxes_of(
     figures: Iterable[dict[str, Any]], objects: dict[Any, dict[str, Any]], index: int = 0
 ) -> list[ReadBox]:
     """
-    Return the cuboids of figures in the frame `index`.
+    Return the cuboids of the figures of a frame; figures of other shapes are left out.
 
-    Raises ValueError or KeyError for those of another layout.
+    Parameters
+    ----------
+    figures : iterable of dict
+        As in the annotation.
+    objects : dict of dict
+        The objects of the figures, by key or id.
+    index : int
+        Of the frame, for tags that hold in a range of frames.
+
+    Returns
+    -------
+    boxes : list of ReadBox
+        In the frame of the cloud [m, rad].
+
+    Raises
+    ------
+    ValueError
+        If a figure has another layout; with its number.
 
     """
     boxes = []
