@@ -74,10 +74,29 @@ def break_tracks(
     """
     Return box arrays with missed boxes, gaps, changed ids and ghosts.
 
-    The arrays are one per sweep, in the order of stamps, in one fixed frame. `ghosts` is the
-    mean number of boxes per sweep that belong to no object. `origins` (n, 3) are the positions
-    of the sensor, for ghosts. The boxes that are left have exactly the input poses and extents.
-    Raises ConfigError if `ghosts` is negative, or needs `origins` that are not given.
+    Parameters
+    ----------
+    arrays : sequence of BoxArray
+        One per sweep, in the order of stamps, in one fixed frame.
+    rng : numpy.random.Generator
+        Source of all random numbers.
+    ghosts : float
+        Mean number of boxes per sweep that belong to no object.
+    origins : array, shape (n, 3), or None
+        Positions of the sensor in the fixed frame at each of the n arrays [m]; needed for ghosts.
+    misses : callable
+        See `Misses`; by default they do not depend on each other.
+
+    Returns
+    -------
+    arrays : list of BoxArray
+        One for each of the input. The boxes that are left have exactly the input poses and
+        extents.
+
+    Raises
+    ------
+    ConfigError
+        If `ghosts` is negative, or needs `origins` that are not given.
 
     """
     if ghosts < 0 or (ghosts and origins is None):

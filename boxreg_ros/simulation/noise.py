@@ -28,11 +28,25 @@ Noise = Callable[[Floats, Floats, np.random.Generator], Floats]
 
 def detector_noise(boxes: Floats, origins: Floats, rng: np.random.Generator) -> Floats:
     """
-    Return the boxes (n, 9) of one track as a detector at `origins` (n, 3) reports them.
+    Return the boxes of one track as a detector reports them.
 
     An error is a constant of the track plus an autoregressive, heavy-tailed part. The end that
     faces the sensor is the most accurate: a wrong length moves the other end. Some boxes are
     flipped.
+
+    Parameters
+    ----------
+    boxes : array, shape (n, 9)
+        True ones of each sweep, in the fixed frame [m, rad]; at least one.
+    origins : array, shape (n, 3)
+        Positions of the sensor in the same frame [m].
+    rng : numpy.random.Generator
+        Source of all random numbers.
+
+    Returns
+    -------
+    noisy : array, shape (n, 9)
+        In the same frame; yaw is not wrapped.
 
     """
     errors = _detector_errors(len(boxes), rng)

@@ -117,7 +117,22 @@ def box_planes(extent: Floats) -> Floats:
 
 
 def body(shape: str, extent: Floats) -> list[Floats]:
-    """Return the parts of a body of an `extent` (3,): half-spaces n.x <= d as rows (P, 4) [m]."""
+    """
+    Return the convex parts of a body.
+
+    Parameters
+    ----------
+    shape : str
+        A name of `BODIES`.
+    extent : array, shape (3,)
+        Length, width and height of the whole body [m].
+
+    Returns
+    -------
+    parts : list of array, shape (P, 4)
+        Half-spaces n.x <= d as rows of the outward normal n and d [m], from the centre of the box.
+
+    """
     length, width, height = extent
     scales = {(0, 2): (length, height), (0, 1): (length, width), (1, 2): (width, height)}
     parts = []
@@ -138,7 +153,22 @@ def body(shape: str, extent: Floats) -> list[Floats]:
 
 
 def cast(parts: list[Floats], origins: NDArray[Any], directions: Floats) -> Floats:
-    """Return the distance (R,) at which rays (R, 3) enter the first of `parts`; inf without."""
+    """
+    Return the distance at which rays enter a body.
+
+    Parameters
+    ----------
+    parts : list of array, shape (P, 4)
+        Half-spaces of its convex parts, as of `body`.
+    origins, directions : array, shape (R, 3)
+        In the frame of the body [m]; directions of length 1.
+
+    Returns
+    -------
+    distance : array, shape (R,)
+        To the first of the parts [m]; inf for a ray that hits none, or begins inside.
+
+    """
     nearest = np.full(len(origins), np.inf)
     for planes in parts:
         clearance = planes[:, 3] - origins @ planes[:, :3].T  # (R, P), negative outside
@@ -202,11 +232,31 @@ def revolution(
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats, Ints]:
     """
-    Return the first hits of one revolution of a sensor on `ego`, above a flat road at z = 0.
+    Return the first hits of one revolution of a sensor above a flat road at z = 0.
 
-    `parts` are those of the bodies of the actors, `stamp` is that of the revolution, see
-    `Sensor` [s]. Returned are points (M, 3) in the fixed frame, the time (M,) of each ray
-    relative to the stamp, and the row of the actor (M,) that it hit, or `ROAD`.
+    Parameters
+    ----------
+    actors : sequence of Actor
+        The road users.
+    parts : sequence of list of array, shape (P, 4)
+        Those of the body of each actor, as of `body`.
+    ego : Motion
+        Of the sensor, in the fixed frame.
+    sensor : Sensor
+        Its beams, reach and noise.
+    stamp : float
+        Of the revolution, in the time of the motions [s]; where in it, see `Sensor`.
+    rng : numpy.random.Generator
+        Of the noise and the lost points.
+
+    Returns
+    -------
+    points : array, shape (M, 3)
+        In the fixed frame [m].
+    times : array, shape (M,)
+        Of each ray relative to the stamp [s].
+    owner : array, shape (M,)
+        Row of the actor that it hit, or `ROAD`.
 
     """
     columns = sensor.columns

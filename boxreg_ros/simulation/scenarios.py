@@ -319,8 +319,21 @@ def drive(
     """
     Return the motion of a body on a plane whose rear axle does not slip sideways.
 
-    It starts at time 0 with its centre at `start`; speed along the heading and yaw rate are
-    functions of times (G,). The rear axle is `axle` behind the centre [m].
+    Parameters
+    ----------
+    duration : float
+        From time 0 on [s]; the motion is known for one sweep more at both ends.
+    start : tuple of 3 float
+        x, y and yaw of the centre at time 0 [m, rad].
+    speed, yaw_rate : callable
+        Of the rear axle along the heading [m/s], and of the yaw [rad/s]: (G,) at times (G,) [s].
+    axle : float
+        Distance of the rear axle behind the centre [m].
+
+    Returns
+    -------
+    motion : Motion
+        Of the centre; z, roll and pitch are 0.
 
     """
     times = np.arange(-SWEEP_PERIOD, duration + SWEEP_PERIOD, INTEGRATION_STEP)

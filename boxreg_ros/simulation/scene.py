@@ -51,8 +51,29 @@ def make_scene(
     """
     Return a scene with its truth and its detections; sequences as in `SimulatedScene`.
 
-    `true_boxes` (a, n, 9) are per actor and sweep, in the fixed frame. `noise` makes the noisy
-    boxes of one track; a part `miss_probability` of them is not detected.
+    Parameters
+    ----------
+    actors : sequence of Actor, length a
+        The road users.
+    true_boxes : array, shape (a, n, 9)
+        Per actor and sweep, in the fixed frame [m, rad].
+    sweeps : sequence of n Sweep
+        In the sensor frame.
+    owners : sequence of n arrays, shape (M,)
+        Row of the actor of each point, or `raycast.ROAD`.
+    T_fixed_sensor : array, shape (n, 4, 4)
+        Poses of the sensor at the stamps.
+    noise : callable
+        Makes the noisy boxes of one track, see `noise.Noise`.
+    miss_probability : float
+        Part of the boxes that are not detected, beside those with too few returns.
+    rng : numpy.random.Generator
+        Source of all random numbers.
+
+    Returns
+    -------
+    scene : SimulatedScene
+        The truth of an actor is from its first to its last return.
 
     """
     returns = np.array([[np.sum(owner == a) for owner in owners] for a in range(len(actors))])

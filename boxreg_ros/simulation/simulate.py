@@ -31,7 +31,24 @@ def simulate(scenario: str = 'street', seed: int = 0, sweeps: int | None = None)
     """
     Return a scene that depends on its arguments only: one sweep every 0.1 s.
 
-    Raises ConfigError for an unknown scenario, fewer than one sweep, or a seed below 0.
+    Parameters
+    ----------
+    scenario : str
+        A name of `SCENARIOS`.
+    seed : int
+        Of the random numbers, 0 or more.
+    sweeps : int, optional
+        Number of sweeps; by default that of the scenario.
+
+    Returns
+    -------
+    scene : SimulatedScene
+        Sweeps, noisy boxes and the truth.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such scenario, `sweeps` is below 1, or `seed` below 0.
 
     """
     if scenario not in SCENARIOS:
@@ -44,7 +61,29 @@ def simulate(scenario: str = 'street', seed: int = 0, sweeps: int | None = None)
 
 
 def broken(scene: SimulatedScene, seed: int, ghosts: float = 0.0) -> SimulatedScene:
-    """Return a scene with broken detections and its truth; `ghosts` is their number per sweep."""
+    """
+    Return a scene with the detections of a tracker that loses objects; see `break_tracks`.
+
+    Parameters
+    ----------
+    scene : SimulatedScene
+        Of `simulate`.
+    seed : int
+        Of the random numbers, 0 or more.
+    ghosts : float
+        Mean number of boxes per sweep that belong to no object.
+
+    Returns
+    -------
+    scene : SimulatedScene
+        With other detections; the truth is the same.
+
+    Raises
+    ------
+    ConfigError
+        If `ghosts` is negative.
+
+    """
     rng = np.random.default_rng([seed, BREAK_STREAM])
     origins = scene.T_fixed_sensor[:, :3, 3]
     arrays = break_tracks(scene.fixed_detections(), rng, ghosts, origins)

@@ -38,9 +38,29 @@ def write_recording(
     """
     Write ``/points``, ``/detections``, ``/odom`` and ``/tf``; an old file is replaced at the end.
 
-    There is one sweep, with intensities, and one array of boxes per stamp, all in the sensor
-    frame, whose poses (4, 4) are those of the odometry. Compression is by zstd, which `ros2 bag
-    record` does only on request. Raises as `write_messages`.
+    Parameters
+    ----------
+    path : Path
+        Of the recording; its name ends in ``.mcap``.
+    sweeps : iterable of n Sweep
+        In the sensor frame. Their stamps are those of all messages.
+    intensities : iterable of n arrays, shape (M,)
+        Of the points of each sweep.
+    detections : iterable of n BoxArray
+        With the stamp and in the frame of each sweep.
+    T_fixed_sensor : iterable of n arrays, shape (4, 4)
+        Poses of the sensor, written as transform and odometry.
+    fixed_frame : str
+        Parent of the sensor frame.
+    is_compressed : bool
+        Whether by zstd, which `ros2 bag record` does only on request.
+
+    Raises
+    ------
+    RecordingError
+        As of `write_messages`.
+    ValueError
+        If the iterables have different lengths.
 
     """
     make = LidarMessages()
@@ -63,9 +83,21 @@ def write_messages(
     path: Path, messages: Iterable[tuple[str, Any, int]], is_compressed: bool = False
 ) -> None:
     """
-    Write messages of `LidarMessages` with topic and receive time [ns], at the end in one step.
+    Write messages as an MCAP recording, at the end in one step.
 
-    Raises RecordingError if `path` does not end in ``.mcap`` or cannot be written.
+    Parameters
+    ----------
+    path : Path
+        Its name ends in ``.mcap``, its folder exists; an old file is replaced.
+    messages : iterable of (str, object, int)
+        Topic, message of `LidarMessages`, and time of reception [ns].
+    is_compressed : bool
+        Whether by zstd.
+
+    Raises
+    ------
+    RecordingError
+        If `path` has another name or cannot be written.
 
     """
     if path.suffix != '.mcap':
@@ -123,7 +155,24 @@ class LidarMessages:
         return self.make('geometry_msgs/PoseWithCovariance', pose=pose, covariance=np.zeros(36))
 
     def transform(self, stamp_ns: int, parent: str, child: str, T: Floats) -> Any:
-        """Return a TFMessage of T_parent_child (4, 4)."""
+        """
+        Return a transform as ``/tf`` has it.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Of the transform [ns].
+        parent, child : str
+            Names of the frames.
+        T : array, shape (4, 4)
+            T_parent_child: pose of the child in the parent [m].
+
+        Returns
+        -------
+        message : tf2_msgs/TFMessage
+            With this one transform.
+
+        """
         pose = self.pose(T[:3, 3], T[:3, :3]).pose
         transform = self.make(
             'geometry_msgs/Transform',
@@ -153,7 +202,23 @@ class LidarMessages:
         )
 
     def cloud(self, sweep: Sweep, intensity: NDArray[Any]) -> Any:
-        """Return a PointCloud2 with intensities (M,) and the times of the points."""
+        """
+        Return a cloud with the fields x y z intensity t, as float32.
+
+        Parameters
+        ----------
+        sweep : Sweep
+            Its points are written as they are, in its frame [m]; times relative to its stamp [s],
+            zeros without any.
+        intensity : array, shape (M,)
+            Of its points.
+
+        Returns
+        -------
+        message : sensor_msgs/PointCloud2
+            Unorganised, little-endian.
+
+        """
         names = ('x', 'y', 'z', 'intensity', 't')
         times = np.zeros(len(intensity)) if sweep.times is None else sweep.times
         table = np.column_stack([sweep.points, intensity, times]).astype('<f4')

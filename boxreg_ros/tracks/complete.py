@@ -137,8 +137,20 @@ class CompletionPlan:
         """
         Return the results with rejected boxes, and without extensions that no points support.
 
-        `registered` are the results of `PlannedArray.to_register` of the arrays `given`,
-        `num_points` the points above the road in each box that was registered.
+        Parameters
+        ----------
+        given : sequence of BoxArray
+            Those that the plan was made for, in its order.
+        registered : sequence of RefinedBoxes
+            The results of `PlannedArray.to_register` of each.
+        num_points : sequence of array, shape (m,)
+            Points above the road in each of the m boxes of an array that were registered.
+
+        Returns
+        -------
+        results : list of RefinedBoxes
+            One per array: the boxes of the input in their order, rejected ones with the status
+            ``rejected``, then the added ones.
 
         """
         supported = self._supported(given, num_points)
@@ -209,10 +221,27 @@ def complete(
     """
     Plan the completed tracks of a recording: the boxes to register in the second pass.
 
-    What a person has `decided` binds each step.
+    What a person has decided binds each step.
 
-    `results` are the registration of the boxes `given`, `num_points` (n,) the points above the
-    road in each; arrays outside of the fixed frame stay as they are.
+    Parameters
+    ----------
+    given : sequence of BoxArray
+        All arrays of the input, one per stamp. Those outside of the fixed frame stay as they are.
+    results : sequence of RefinedBoxes
+        The registration of each of them.
+    num_points : sequence of array, shape (n,)
+        Points above the road in each of the n boxes of an array.
+    fixed_frame : str
+        Frame of the tracks.
+    config : Config
+        Its group `complete` says which steps are taken.
+    decided : Decided
+        The decisions of a person, by default none.
+
+    Returns
+    -------
+    plan : CompletionPlan
+        For the arrays `given`, in their order.
 
     """
     return _Completer(given, fixed_frame, config, decided).completed(results, num_points)

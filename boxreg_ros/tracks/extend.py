@@ -24,7 +24,25 @@ for a second. Literature: MS3D extends parked objects by 4 s."""
 
 
 def extend(tracklet: Tracklet, array_stamps_ns: Ints, config: Config) -> list[AddedBoxes]:
-    """Return the candidates before and after a track, at stamps (a,) of the input, ascending."""
+    """
+    Return the candidates before and after a track.
+
+    Parameters
+    ----------
+    tracklet : Tracklet
+        The track; one of less than `CONFIRMED_BOXES` boxes has no candidates.
+    array_stamps_ns : array, shape (a,)
+        Stamps of the input, ascending [ns].
+    config : Config
+        Settings of the kinds of objects.
+
+    Returns
+    -------
+    candidates : list of AddedBoxes
+        One for each end with stamps within reach, that of the first box before the other; in the
+        fixed frame, from the track outwards.
+
+    """
     if len(tracklet.stamps_ns) < CONFIRMED_BOXES:
         return []
     reach_ns = (PARKED_REACH if is_parked(tracklet.boxes) else MOVING_REACH) * 1e9
@@ -41,10 +59,19 @@ def extend(tracklet: Tracklet, array_stamps_ns: Ints, config: Config) -> list[Ad
 
 def num_supported(num_points: Ints, at_end: Ints) -> int:
     """
-    Return how many boxes of an extension are supported, from the track outwards.
+    Return how many boxes of an extension are supported.
 
-    `num_points` (n,) are the points above the road in each box, from the track outwards, `at_end`
-    (m,) the same of the boxes at that end of the track.
+    Parameters
+    ----------
+    num_points : array, shape (n,)
+        Points above the road in each box of the extension, from the track outwards.
+    at_end : array, shape (m,)
+        The same of the boxes at that end of the track.
+
+    Returns
+    -------
+    count : int
+        Boxes up to the first one with too few points.
 
     """
     is_supported = num_points >= least_support(at_end)
@@ -74,7 +101,22 @@ def points_at_end(tracklet: Tracklet, is_last: bool) -> Ints:
 
 
 def num_free(candidates: AddedBoxes, owned: dict[int, list[Floats]]) -> int:
-    """Return how many boxes of an extension are free of the boxes (9,) of others, by stamp."""
+    """
+    Return how many boxes of an extension are free of the boxes of other objects.
+
+    Parameters
+    ----------
+    candidates : AddedBoxes
+        From the track outwards, in the fixed frame.
+    owned : dict of int to list of array, shape (9,)
+        Boxes of the other objects by stamp [ns], in the same frame [m, rad].
+
+    Returns
+    -------
+    count : int
+        Boxes up to the first one that overlaps another object.
+
+    """
     for count, (stamp_ns, box) in enumerate(
         zip(candidates.stamps_ns.tolist(), candidates.boxes, strict=True)
     ):

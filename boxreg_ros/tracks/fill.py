@@ -31,8 +31,21 @@ def rarely_detected(tracklets: Sequence[Tracklet], detected_ns: Ints, config: Co
     A bush is detected now and then, an object about as often as other objects: boxes between
     those of a bush would be as false as these. How often an object is detected depends on the
     detector, and is the median over the tracks of `CONFIRMED_BOXES` or more; without such tracks
-    it is not known, and no track is rarely detected. `detected_ns` (a,) are the stamps of arrays
-    with boxes, ascending: detectors may be slower than the LiDAR.
+    it is not known, and no track is rarely detected.
+
+    Parameters
+    ----------
+    tracklets : sequence of Tracklet
+        All tracks of the recording.
+    detected_ns : array, shape (a,)
+        Stamps of the arrays with boxes, ascending [ns]: detectors may be slower than the LiDAR.
+    config : Config
+        Settings of the kinds of objects.
+
+    Returns
+    -------
+    track_ids : set of str
+        Gaps of these tracks are not filled.
 
     """
     rates = {one.track_id: _rate(one, detected_ns, config) for one in tracklets}
@@ -57,7 +70,24 @@ def _rate(tracklet: Tracklet, detected_ns: Ints, config: Config) -> float:
 
 
 def fill(tracklet: Tracklet, array_stamps_ns: Ints, config: Config) -> list[AddedBoxes]:
-    """Return the boxes of each gap of a track, at stamps (a,) of the input, ascending."""
+    """
+    Return the boxes for the gaps of a track.
+
+    Parameters
+    ----------
+    tracklet : Tracklet
+        The track.
+    array_stamps_ns : array, shape (a,)
+        Stamps of the input, ascending [ns].
+    config : Config
+        Longer gaps than `complete.fill_gap` [s] are filled only where the object is parked.
+
+    Returns
+    -------
+    added : list of AddedBoxes
+        One for each gap that is filled, with a box at each stamp in it, in the fixed frame.
+
+    """
     added = []
     max_gap_ns = config.complete.fill_gap * 1e9
     for row in range(len(tracklet.stamps_ns) - 1):

@@ -40,8 +40,22 @@ def followed_plan(
     """
     Return the plan that adds the boxes of followed tracks; none is rejected or renamed.
 
-    `given` has the keyframes, and an empty array for each sweep without one. If `has_seeds` is
-    false, it lacks those of the tracks, and they are added too.
+    Parameters
+    ----------
+    given : sequence of BoxArray
+        The keyframes, and an empty array for each sweep without one, in the fixed frame; at least
+        one.
+    tracks : sequence of FollowedTrack
+        In the same frame. Each box is added to the array with the nearest stamp.
+    has_seeds : bool
+        Whether `given` has the keyframes of these tracks; else they are added, too.
+    decided : Decided
+        The decisions of a person, by default none.
+
+    Returns
+    -------
+    plan : CompletionPlan
+        For the arrays `given`, in their order.
 
     """
     plan = unchanged_plan(given)
@@ -92,9 +106,22 @@ def with_evidence(
     Return results that are nearer to the keyframes if these show it, see `person.corrections`.
 
     Boxes between keyframes are moved by the steps of these, interpolated in time; between exact
-    ones, a line or spline takes their place where it errs less, see `between_exact`. `given` has
-    the keyframes as they were registered with `deviations` (9,); `results` have added boxes
-    behind them.
+    ones, a line or spline takes their place where it errs less, see `between_exact`.
+
+    Parameters
+    ----------
+    given : sequence of BoxArray
+        The keyframes as they were registered.
+    results : sequence of RefinedBoxes
+        That of each array, in the same frame: the boxes of `given` in their order, then added
+        ones.
+    deviations : array, shape (9,)
+        With which the keyframes were registered, of the columns of a box [m, rad].
+
+    Returns
+    -------
+    results : list of RefinedBoxes
+        With other boxes; status and covariances are the same.
 
     """
     keyframes = [

@@ -115,7 +115,21 @@ class Proposer:
     def add(
         self, stamp_ns: int, points: NDArray[np.floating], origin: Floats, boxes: Floats
     ) -> None:
-        """Add a sweep: points (M, 3), sensor position (3,), boxes (n, 9) of known objects."""
+        """
+        Add a sweep, all in the fixed frame.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Of the sweep [ns]; larger than in the call before.
+        points : array, shape (M, 3)
+            Of the sweep [m].
+        origin : array, shape (3,)
+            Position of the sensor [m].
+        boxes : array, shape (n, 9)
+            Of the known objects at the stamp [m, rad]: their points are of no proposal.
+
+        """
         if stamp_ns - self._known_ns >= SECOND_NS:
             self._known = np.concatenate([self._known, boxes])
             self._known_ns = stamp_ns

@@ -74,9 +74,21 @@ def _mean_acceleration(tracklet: Tracklet) -> float:
 
 def duplicates(tracklets: list[Tracklet], config: Config) -> set[str]:
     """
-    Return the ids of tracks of few boxes that overlap those of tracks with more evidence.
+    Find tracks of few boxes that overlap those of tracks with more evidence.
 
     Only tracks of one kind of object: a rider and a bicycle are no duplicates.
+
+    Parameters
+    ----------
+    tracklets : list of Tracklet
+        All of them, in the fixed frame.
+    config : Config
+        Assigns class names to kinds of objects.
+
+    Returns
+    -------
+    track_ids : set of str
+        Of the duplicates. Tracks of `CONFIRMED_BOXES` or more are none.
 
     """
     rejected: set[str] = set()

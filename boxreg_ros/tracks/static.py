@@ -23,7 +23,24 @@ SAME_PLACE = 0.5
 def join_static(
     tracklets: list[Tracklet], config: Config, decided: Decided = NOTHING
 ) -> list[Tracklet]:
-    """Join parked tracklets at one place; all are in the order of their start."""
+    """
+    Join parked tracklets at one place.
+
+    Parameters
+    ----------
+    tracklets : list of Tracklet
+        In the order of their start, in the fixed frame.
+    config : Config
+        Assigns class names to kinds of objects: only tracklets of one kind are joined.
+    decided : Decided
+        The decisions of a person, by default none.
+
+    Returns
+    -------
+    tracklets : list of Tracklet
+        In the order of their start.
+
+    """
     parked = [i for i, tracklet in enumerate(tracklets) if is_parked(tracklet.boxes)]
     places = {i: np.median(tracklets[i].boxes, axis=0) for i in parked}
     pairs: list[tuple[int, int]] = []

@@ -63,9 +63,22 @@ def join_links(
     tracklets: list[Tracklet], pairs: list[tuple[int, int]], decided: Decided = NOTHING
 ) -> list[Tracklet]:
     """
-    Return tracklets with those of each chain of pairs joined, in the order of their start.
+    Join the tracklets of each chain of pairs.
 
-    A chain has at most one of the tracks that a person has named, and its id.
+    Parameters
+    ----------
+    tracklets : list of Tracklet
+        In the order of their start.
+    pairs : list of (int, int)
+        Index of a tracklet, and of the one that continues it. Each is at most once in either
+        place.
+    decided : Decided
+        A chain has at most one of the tracks that a person has named, and its id.
+
+    Returns
+    -------
+    tracklets : list of Tracklet
+        In the order of their start.
 
     """
     successor = dict(allowed(tracklets, pairs, decided))
@@ -118,9 +131,23 @@ def stitch(
     tracklets: list[Tracklet], config: Config, decided: Decided = NOTHING
 ) -> tuple[list[Tracklet], list[tuple[str, str]]]:
     """
-    Join tracklets that continue each other, at most over `complete.fill_gap`.
+    Join tracklets that continue each other.
 
-    They are in the order of their start. Also return the ids of pairs that were left alone.
+    Parameters
+    ----------
+    tracklets : list of Tracklet
+        In the order of their start, in the fixed frame.
+    config : Config
+        Gaps up to `complete.fill_gap` [s] are bridged.
+    decided : Decided
+        The decisions of a person, by default none.
+
+    Returns
+    -------
+    tracklets : list of Tracklet
+        In the order of their start.
+    ambiguous : list of (str, str)
+        Ids of pairs that may be one object, but were left alone.
 
     """
     n = len(tracklets)
@@ -188,9 +215,24 @@ def join_turns(
     Join tracklets that take turns at one place.
 
     A detector that loses an object and finds it again under a new id, then under the old one,
-    leaves tracks of which each would be filled over the boxes of the other. Also return what is
-    left over: of the boxes at one stamp those of the track with less evidence, under the id that
-    the joined track does not have.
+    leaves tracks of which each would be filled over the boxes of the other.
+
+    Parameters
+    ----------
+    tracklets : list of Tracklet
+        In any order, in the fixed frame.
+    config : Config
+        Settings of the kinds of objects.
+    decided : Decided
+        The decisions of a person, by default none.
+
+    Returns
+    -------
+    whole : list of Tracklet
+        In the order of their start.
+    left : list of Tracklet
+        Of the boxes at one stamp those of the track with less evidence, under the id that the
+        joined track does not have.
 
     """
     whole: list[Tracklet] = []

@@ -79,7 +79,23 @@ class Tracklet(Columns):
 
 
 def joined_tracklets(tracklets: Sequence[Tracklet], names: Collection[str] = ()) -> Tracklet:
-    """Return tracklets of one object as one, under an id of `names`, else that of the longest."""
+    """
+    Return tracklets of one object as one.
+
+    Parameters
+    ----------
+    tracklets : sequence of Tracklet
+        At least one, without a stamp in common.
+    names : collection of str
+        Ids that a person gave.
+
+    Returns
+    -------
+    tracklet : Tracklet
+        In the order of stamps, under an id of `names` if one has it, else that of the longest; the
+        class is the most frequent one, by boxes.
+
+    """
     longest = max(tracklets, key=lambda one: (one.track_id in names, len(one.stamps_ns)))
     votes: Counter[str] = Counter()
     for tracklet in tracklets:
@@ -104,10 +120,25 @@ def tracklets_of(
     Return the boxes of a recording, as its results have them, as tracklets in one frame.
 
     An id is split where it names two objects: at one stamp, after `max_gap` without a box, or
-    where the next box is out of reach. The longest part keeps the id. Each of `names` is of one
-    object, and split only where it has two boxes at one stamp. Invalid boxes, those
-    without an id and those in another frame are in no tracklet. `num_points` has the points (n,)
-    above the road in each box of each array.
+    where the next box is out of reach. The longest part keeps the id.
+
+    Parameters
+    ----------
+    results : sequence of RefinedBoxes
+        One per array.
+    num_points : sequence of array, shape (n,)
+        Points above the road in each of the n boxes of an array.
+    fixed_frame : str
+        Boxes in another frame are in no tracklet, nor are invalid ones and those without an id.
+    config : Config
+        `max_gap` [s], and the settings of the kinds of objects.
+    names : collection of str
+        Ids that are of one object each, and split only where they have two boxes at one stamp.
+
+    Returns
+    -------
+    tracklets : list of Tracklet
+        In the order of their start. Kept boxes have the covariance of an input box of their class.
 
     """
     own = [(i, one) for i, one in enumerate(results) if one.boxes.frame_id == fixed_frame]
@@ -222,10 +253,23 @@ def is_parked(boxes: Floats) -> bool:
 
 def between(before: EndMotion, after: EndMotion, stamps_ns: Ints) -> Floats:
     """
-    Return the boxes (n, 9) of an object at stamps between two of its boxes.
+    Return the boxes of an object at stamps between two of its boxes.
 
     The centre follows the cubic Hermite curve of positions and velocities at both ends. Heading
     and extents are interpolated linearly; a half turn is no rotation of the object.
+
+    Parameters
+    ----------
+    before, after : EndMotion
+        Box and velocity at both ends, in one frame. Where the velocity is not known, that of the
+        straight line between them is used.
+    stamps_ns : array, shape (n,)
+        Between theirs [ns].
+
+    Returns
+    -------
+    boxes : array, shape (n, 9)
+        In the same frame [m, rad]; roll and pitch are those of `before`.
 
     """
     duration_ns = after.stamp_ns - before.stamp_ns
