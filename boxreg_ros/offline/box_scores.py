@@ -86,10 +86,21 @@ class Scores:
 
 def by_id(predicted: BoxTable, truth: BoxTable) -> Ints:
     """
-    Return the row of the prediction with the stamp and track id of each true box, or -1.
+    Return the prediction with the stamp and track id of each true box.
 
     For boxes that follow from the true ones, such as the results of several methods for one
-    input: a box that is far off counts with its error. Of two predictions the first one counts.
+    input: a box that is far off counts with its error.
+
+    Parameters
+    ----------
+    predicted, truth : BoxTable
+        In one frame.
+
+    Returns
+    -------
+    rows : array, shape (n,)
+        Row in `predicted` for each of the n true boxes, the first of several; -1 without one that
+        is finite.
 
     """
     row_of: dict[tuple[int, str], int] = {}
@@ -101,7 +112,20 @@ def by_id(predicted: BoxTable, truth: BoxTable) -> Ints:
 
 
 def by_overlap(predicted: BoxTable, truth: BoxTable) -> Ints:
-    """Return the row of the prediction of each true box, by the greatest sum of 3D IoU, or -1."""
+    """
+    Return the prediction of each true box by the greatest sum of 3D IoU at each stamp.
+
+    Parameters
+    ----------
+    predicted, truth : BoxTable
+        In one frame; invalid boxes are paired with none.
+
+    Returns
+    -------
+    rows : array, shape (n,)
+        Row in `predicted` for each of the n true boxes; -1 without an overlap.
+
+    """
     rows = np.full(len(truth.boxes), -1, np.int64)
     for stamp in overlaps(predicted, truth):
         true, found = best_pairs(stamp.iou)
@@ -119,10 +143,28 @@ def match(
     """
     Compare predictions with true boxes of the same stamp and frame.
 
-    True boxes with fewer points, or whose class name has none of the words `classes` (empty:
-    all; case is ignored), are out of scope; their predictions are ignored. `pair` says which
-    prediction belongs to a true box: `by_id` or `by_overlap`. Raises RecordingError if the
-    frames differ, or the truth has a track id twice at one stamp.
+    Parameters
+    ----------
+    predicted : BoxTable
+        Boxes to judge. Those whose true box is out of scope are ignored.
+    truth : BoxTable
+        True boxes; invalid ones are out of scope, and counted.
+    min_points : int
+        True boxes with fewer points are out of scope.
+    classes : sequence of str
+        So are true boxes whose class name has none of these words; case is ignored, none for all.
+    pair : callable
+        Says which prediction belongs to a true box: `by_id` or `by_overlap`.
+
+    Returns
+    -------
+    matches : Matches
+        All true boxes in scope, and the errors of their predictions.
+
+    Raises
+    ------
+    RecordingError
+        If the frames differ, or the truth has a track id twice at one stamp.
 
     """
     if len(predicted.boxes) and len(truth.boxes) and predicted.frame_id != truth.frame_id:
@@ -313,10 +355,21 @@ def best_pairs(
     iou: Floats, least: float = 0.0, is_preferred: NDArray[np.bool_] | None = None
 ) -> tuple[Ints, Ints]:
     """
-    Return the rows and columns of the one-to-one pairs with the greatest sum of IoU (t, p).
+    Return the one-to-one pairs with the greatest sum of IoU.
 
-    Pairs need more than 0 and at least `least`. Those that are preferred (t, p) count as one more
-    IoU of 1: more than any other pair of one of the boxes.
+    Parameters
+    ----------
+    iou : array, shape (t, p)
+        Of each pair.
+    least : float
+        Pairs need at least this, and more than 0.
+    is_preferred : array of bool, shape (t, p), optional
+        Pairs that count as one more IoU of 1: more than any other pair of one of the boxes.
+
+    Returns
+    -------
+    rows, columns : array, shape (k,)
+        Of the k pairs.
 
     """
     gains = np.where(iou >= least, iou, 0.0)

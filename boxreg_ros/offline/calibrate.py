@@ -68,10 +68,20 @@ class Measured:
 
 def labelling_margins(drive: Drive, config: Config) -> dict[str, Measured]:
     """
-    Estimate the labelling margins and insets of faces at the true boxes of a drive [m].
+    Estimate the labelling margins and insets of faces at the true boxes of a drive.
 
-    Its input boxes are not used; `config` has the margins to begin with. Margins and their spread
-    are by the kinds of objects there are, insets of all kinds together; NaN without evidence.
+    Parameters
+    ----------
+    drive : Drive
+        Its sweeps and true boxes are used, its input boxes are not.
+    config : Config
+        Has the margins to begin with.
+
+    Returns
+    -------
+    measured : dict of str to Measured
+        By the name of the setting [m]: margins and their spread by the kinds of objects there are,
+        insets of all kinds together; NaN without evidence.
 
     """
     kinds: dict[str, list[Window]] = {}
@@ -118,7 +128,23 @@ def _means_of_tracks(
 
 
 def input_errors(drive: Drive, config: Config) -> dict[str, Measured]:
-    """Return the errors of a drive's boxes by name of the setting, for its kinds of objects."""
+    """
+    Estimate the errors of the boxes of a drive.
+
+    Parameters
+    ----------
+    drive : Drive
+        Its input boxes are compared with the true ones of the same stamp and track id.
+    config : Config
+        Assigns class names to kinds of objects.
+
+    Returns
+    -------
+    measured : dict of str to Measured
+        By the name of the setting, in its unit, for the kinds of objects with such pairs; NaN
+        without tracks that are long enough.
+
+    """
     given = {
         (array.stamp_ns, name): box
         for array in reversed(drive.boxes)

@@ -168,7 +168,22 @@ NO_COUNTS = np.zeros(0, np.int64)
 
 
 def points_above_road(sweep: Sweep | None, boxes: Floats) -> Ints:
-    """Return the number of points (n,) in boxes (n, 9), without the lowest part; 0 if invalid."""
+    """
+    Return the number of points in boxes, without the lowest part of each.
+
+    Parameters
+    ----------
+    sweep : Sweep or None
+        In the frame of the boxes; None for no points.
+    boxes : array, shape (n, 9)
+        In this frame [m, rad].
+
+    Returns
+    -------
+    num_points : array, shape (n,)
+        0 for invalid boxes.
+
+    """
     counts = np.zeros(len(boxes), np.int64)
     valid = np.flatnonzero(is_valid_box(boxes))
     if sweep is None or not len(valid):

@@ -55,7 +55,25 @@ def consistency(
     truth: BoxTable,
     covariances: Mapping[tuple[int, str], BoxCovariance],
 ) -> dict[str, Consistency]:
-    """Return the consistency by group; `covariances` of predictions are by stamp and track id."""
+    """
+    Compare the covariances of predictions with their errors.
+
+    Parameters
+    ----------
+    matches : Matches
+        Of `predicted` and `truth`; heading flips are left out.
+    predicted, truth : BoxTable
+        The boxes that were matched.
+    covariances : mapping of (int, str) to BoxCovariance
+        By stamp [ns] and track id of a prediction; predictions without one are left out.
+
+    Returns
+    -------
+    found : dict of str to Consistency
+        By group: ``all``, kinds of objects, classes, and ranges from the sensor; empty without
+        covariances.
+
+    """
     known = []
     for i in np.flatnonzero(matches.is_matched & ~matches.is_flipped).tolist():
         row = matches.predicted_rows[i]

@@ -39,12 +39,29 @@ FORMAT_OF_NODE = 'recording'
 
 def convert(request: Request, out: Path) -> dict[str, Any]:
     """
-    Write the labels of a request in its formats; return the content of ``summary.json``.
+    Write the labels of a request in its formats.
 
     Boxes are written in the fixed frame if the labels or the recording have the sensor poses.
     Recordings, for these poses and the clouds, are needed only where the label files lack them.
-    Raises ConfigError for formats that do not exist, cannot be read, or lack an option, and
-    RecordingError if the labels cannot be read, or a format can represent none of them.
+
+    Parameters
+    ----------
+    request : Request
+        Labels to read, and formats to write.
+    out : Path
+        The folder of results; it appears complete or not at all.
+
+    Returns
+    -------
+    summary : dict
+        The content of ``summary.json``.
+
+    Raises
+    ------
+    ConfigError
+        If a format does not exist, cannot be read, or lacks an option.
+    RecordingError
+        If the labels cannot be read, or a format can represent none of them.
 
     """
     _check(request)

@@ -40,10 +40,29 @@ class Drive:
         """
         Read a recording that is not open yet, in the frame of its true boxes.
 
-        Messages that cannot be decoded or have no transform are left out; clouds of several
-        LiDARs are merged by `config`. Sweeps are held in memory: all of them, or those within
-        `within` [s] of the stamp of a true box. Raises RecordingError if it has no sweeps,
-        cannot be read, or no transforms connect it with that frame.
+        Messages that cannot be decoded or have no transform are left out.
+
+        Parameters
+        ----------
+        recording : Recording or SceneRecording
+            Is opened, read and closed.
+        truth : BoxTable
+            True boxes.
+        within : float, optional
+            Only sweeps so near to the stamp of a true box are held in memory [s]; by default all.
+        config : Config
+            Settings by which clouds of several LiDARs are merged.
+
+        Returns
+        -------
+        drive : Drive
+            The stamps of its truth are those of the boxes or clouds that they are meant for.
+
+        Raises
+        ------
+        RecordingError
+            If the recording has no sweeps, cannot be read, or no transforms connect it with the
+            frame of `truth`.
 
         """
         sweeps: list[Sweep] = []

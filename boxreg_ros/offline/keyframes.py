@@ -32,12 +32,30 @@ def keyframes(
     corrections: Corrections,
 ) -> tuple[CompletionPlan, list[Arrivals], list[FollowedTrack], Floats]:
     """
-    Follow the boxes of a recording through its sweeps, both in the fixed frame.
+    Follow the boxes of a recording through its sweeps.
 
-    Items come with whether time went back before them. Pins of a person where the input has no
-    box are keyframes, too. Return what is added, for the arrays of
-    `Arrivals.completed`, the parts between time jumps, the tracks of all parts, and the
-    deviations (9,) of the keyframes, see `person.DEVIATIONS`.
+    Parameters
+    ----------
+    items : iterable of (Sweep, BoxArray or None, bool)
+        In the fixed frame, and whether time went back before the item; None for one without a
+        transform.
+    fixed_frame : str
+        Name of this frame.
+    config : Config
+        Settings of the kinds of objects.
+    corrections : Corrections
+        Pins of a person where the input has no box are keyframes, too.
+
+    Returns
+    -------
+    plan : CompletionPlan
+        What is added, for the arrays of `Arrivals.completed` of all parts.
+    parts : list of Arrivals
+        What arrived between time jumps, with the sweeps.
+    tracks : list of FollowedTrack
+        Of all parts.
+    deviations : array, shape (9,)
+        Of the columns of a keyframe [m, rad], see `person.DEVIATIONS`.
 
     """
     # A keyframe beside the stamp of a sweep does not take the place of the boxes of that.

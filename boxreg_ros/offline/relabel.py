@@ -45,15 +45,32 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> Su
     """
     Refine all boxes of a recording and write ``boxes.csv``, ``summary.json`` and other files.
 
-    The folder `out` appears complete or not at all; an earlier result is replaced. `progress`
-    shows the duration of the recording that has been read and its whole duration [s]; both count
-    once for each time that it is read: with completed tracks once more. Returned is the
-    content of ``summary.json``. A run begins again, with boxes that are associated, where the ids
-    of their topic turn out not to identify objects over time.
+    A run begins again, with boxes that are associated, where the ids of their topic turn out not
+    to identify objects over time.
 
-    Raises RecordingError if the recording lacks something, or `out` is not an earlier result or
-    cannot be written, and UnsupportedMessage if none of its clouds, or none of its messages of
-    boxes, can be read.
+    Parameters
+    ----------
+    request : Request
+        The recording and all settings.
+    out : Path
+        The folder of results: it appears complete or not at all; an earlier result is replaced.
+    progress : Progress, optional
+        Shows the duration of the recording that has been read and its whole duration [s]; both
+        count once for each time that it is read: with completed tracks once more.
+
+    Returns
+    -------
+    summary : Summary
+        The content of ``summary.json``.
+
+    Raises
+    ------
+    RecordingError
+        If the recording lacks something, or `out` is not an earlier result or cannot be written.
+    UnsupportedMessage
+        If none of the clouds, or none of the messages of boxes, can be read.
+    ConfigError
+        If `out` contains an input, or an option of a format does not fit the recording.
 
     """
     progress = progress or Progress()

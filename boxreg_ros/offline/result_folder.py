@@ -142,11 +142,28 @@ def _locked(lock: Path, out: Path) -> Iterator[None]:
 @contextmanager
 def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path]:
     """
-    Yield a temporary folder that replaces `out` on success and is deleted on failure.
+    Yield a temporary folder that replaces a result folder on success, and is deleted on failure.
 
-    On success all of it is on the disk itself. The caller has `claimed` the output. Raises
-    ConfigError if one of `inputs` is in `out`, and RecordingError if that exists and is not the
-    unchanged result of an earlier run, or cannot be written.
+    On success all of it is on the disk itself.
+
+    Parameters
+    ----------
+    out : Path
+        The result folder; the caller has `claimed` it.
+    inputs : iterable of Path or None
+        Files and folders that the results may not replace.
+
+    Yields
+    ------
+    folder : Path
+        The temporary folder, empty.
+
+    Raises
+    ------
+    ConfigError
+        If one of `inputs` is in `out`.
+    RecordingError
+        If `out` exists and is not the unchanged result of an earlier run, or cannot be written.
 
     """
     if url_of(out) is not None:

@@ -76,7 +76,31 @@ class UnlabelledRecording(Recording):
 def label_frame_of(
     recording: ItemSource, tree: TransformTree, fixed_frame: str, wish: str | None
 ) -> str:
-    """Return the sensor frame of label files: the frame of the clouds, or `wish`."""
+    """
+    Return the sensor frame of label files.
+
+    Parameters
+    ----------
+    recording : ItemSource
+        Its clouds state the frame.
+    tree : TransformTree
+        With the transforms read so far.
+    fixed_frame : str
+        The frame has to be connected with it.
+    wish : str or None
+        Another frame; None for that of the clouds.
+
+    Returns
+    -------
+    frame : str
+        Without a leading slash.
+
+    Raises
+    ------
+    RecordingError
+        If the frame is not connected with the fixed one.
+
+    """
     frame = (wish or recording.sensor_frame()).lstrip('/')
     if not tree.connects(fixed_frame, frame):
         raise RecordingError(
@@ -186,9 +210,26 @@ def true_boxes(path: Path) -> BoxTable:
 
 def in_labelled_view(path: Path, predicted: BoxTable) -> NDArray[np.bool_]:
     """
-    Return which boxes (n,), in the fixed frame of the true ones, these could contain.
+    Return which boxes the annotations of a data set could contain.
 
     Annotations that refer to a camera are of objects in its image, others of all around.
+
+    Parameters
+    ----------
+    path : Path
+        Of the true boxes: an address of a scene, or a file, which could contain all boxes.
+    predicted : BoxTable
+        n boxes, in the fixed frame of the true ones.
+
+    Returns
+    -------
+    is_seen : array of bool, shape (n,)
+        Whether a box is in the image, at least in part; True for all without a camera.
+
+    Raises
+    ------
+    RecordingError
+        If the scene cannot be read.
 
     """
     is_seen = np.ones(len(predicted.boxes), dtype=bool)

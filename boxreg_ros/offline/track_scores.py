@@ -50,10 +50,20 @@ def has_trackeval() -> bool:
 
 def track_scores(predicted: BoxTable, truth: BoxTable, scope: Ints | None = None) -> TrackScores:
     """
-    Return the scores of tracks in one frame; invalid boxes are ignored.
+    Return the scores of tracks.
 
-    Only the true boxes in the rows of `scope` (n,) count, by default all. A predicted box that
-    finds one of the others is ignored.
+    Parameters
+    ----------
+    predicted, truth : BoxTable
+        In one frame; invalid boxes are ignored.
+    scope : array of int, shape (k,), optional
+        Rows of the true boxes that count, by default all. A predicted box that finds one of the
+        others is ignored.
+
+    Returns
+    -------
+    scores : TrackScores
+        A box finds another at a 3D IoU of `LEAST_IOU`.
 
     """
     is_in_scope = np.ones(len(truth.boxes), bool)

@@ -43,15 +43,24 @@ def velocity_scores(
     """
     Return the scores by the way a velocity is found, over boxes that have one in each way.
 
-    ``difference``
-        Of the boxes of a track over `DIFFERENCE_SECONDS`, up to the newest.
-    ``smoother``
-        By a parabola through the boxes of a track around each: it needs later ones.
-    ``estimate``
-        The velocity in `known`, if that is given.
-
     Boxes with a heading flip are left out of the rates of yaw. A true velocity is the central
     difference of true boxes.
+
+    Parameters
+    ----------
+    matches : Matches
+        Of `predicted` and `truth`.
+    predicted, truth : BoxTable
+        The boxes that were matched.
+    known : mapping of (int, str) to record, optional
+        `KINEMATICS` of predictions by stamp [ns] and track id.
+
+    Returns
+    -------
+    scores : dict of str to VelocityScores
+        ``difference``: of the boxes of a track over `DIFFERENCE_SECONDS`, up to the newest;
+        ``smoother``: by a parabola through the boxes of a track around each, later ones included;
+        ``estimate``: the velocity in `known`, if that is given.
 
     """
     rows = np.flatnonzero(matches.is_matched)

@@ -68,13 +68,24 @@ class WorkerProcess:
 @contextmanager
 def run_in_worker(serve: Serve, purpose: str) -> Iterator[WorkerProcess]:
     """
-    Run a function in a worker process for the duration of the block, and yield its connection.
+    Run a function in a worker process for the duration of the block.
 
     The process is forked: it starts at once and sees a copy of all data of this one. No other
     thread may hold a lock that the function needs. The worker ends with the block, and also if
-    this process is killed. `serve` is called with a function that waits for the next item sent to
-    the worker, and one that sends an item back; an exception it raises is sent back. `purpose` is
-    its work as a verb phrase, as in 'reads the recording', for errors.
+    this process is killed.
+
+    Parameters
+    ----------
+    serve : callable
+        Called in the worker with a function that waits for the next item sent to it, and one that
+        sends an item back; an exception it raises is sent back.
+    purpose : str
+        Its work as a verb phrase, as in 'reads the recording', for errors.
+
+    Yields
+    ------
+    process : WorkerProcess
+        The connection to the worker.
 
     """
     parent_end, worker_end = socket.socketpair()

@@ -26,9 +26,27 @@ def added_track(
     """
     Follow an added object from its boxes; return its track as the page shows it.
 
-    ``row`` and ``part`` are as of the tracks of a report; ``ends`` stamp and reason before the
-    first box and after the last; ``problems`` the seeds that could not be used, and why. Raises
-    RecordingError if the recording cannot be read, or no seed can be followed.
+    Parameters
+    ----------
+    scene : DriveScene
+        The recording.
+    seeds : sequence of BoxArray
+        Boxes of one object in the fixed frame, an array each.
+    begin_ns : int
+        Stamp from which the times of the page are counted [ns].
+    grows : bool
+        Whether a single box may grow to the points of the track.
+
+    Returns
+    -------
+    track : dict
+        ``row`` and ``part`` are as of the tracks of a report; ``ends`` stamp and reason before the
+        first box and after the last; ``problems`` the seeds that could not be used, and why.
+
+    Raises
+    ------
+    RecordingError
+        If the recording cannot be read, or no seed can be followed.
 
     """
     track = scene.follow(seeds, grows)

@@ -118,10 +118,19 @@ class Changes:
         added_ids: Sequence[str] = (),
     ) -> None:
         """
-        Add the boxes of one array before and after; added boxes stand behind those of the input.
+        Add the boxes of one array before and after registration.
 
-        `early` is the early estimate of the same boxes, where the result is another; `added_ids`
-        are those that a person gave the objects of the added boxes, empty for others.
+        Parameters
+        ----------
+        given : BoxArray
+            Of the input, in the fixed frame if there is a transform to it.
+        refined : RefinedBoxes
+            The boxes of `given` in their order, then those that were added.
+        early : RefinedBoxes, optional
+            The early estimate of the same boxes, where `refined` is another.
+        added_ids : sequence of str
+            Ids that a person gave the objects of the added boxes, empty for others; none if there
+            are no such objects.
 
         """
         boxes = refined.boxes

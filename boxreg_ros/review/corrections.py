@@ -61,7 +61,25 @@ class Corrections:
         return [_text_of(scope) for scope in sorted(self._unused, key=str)]
 
     def seeds(self, frame_id: str) -> list[BoxArray]:
-        """Return boxes of added objects, an array each; RecordingError for another frame."""
+        """
+        Return the boxes of added objects.
+
+        Parameters
+        ----------
+        frame_id : str
+            The fixed frame of the run.
+
+        Returns
+        -------
+        seeds : list of BoxArray
+            An array each, in the order of the decisions.
+
+        Raises
+        ------
+        RecordingError
+            If a box was added in another frame.
+
+        """
         found = []
         for one in self._of_kind('add'):
             if one.frame_id != frame_id:
@@ -153,9 +171,19 @@ class Corrections:
 
     def keyframes(self, arrays: Sequence[BoxArray], frame_id: str) -> list[BoxArray]:
         """
-        Return the pins where the input has no box, an array each: further keyframes.
+        Return the pins where the input has no box: further keyframes.
 
-        `arrays` are the boxes of the input as they are to be registered.
+        Parameters
+        ----------
+        arrays : sequence of BoxArray
+            The boxes of the input as they are to be registered.
+        frame_id : str
+            The fixed frame; pins in others are left out.
+
+        Returns
+        -------
+        arrays : list of BoxArray
+            An array each, of tracks that are in `arrays`.
 
         """
         class_of = {
@@ -184,8 +212,24 @@ class Corrections:
 
         Without deleted boxes, with new ids and classes, and with pinned boxes in the place of
         theirs. A pin shows the extents of the object: the other boxes of its track have them too,
-        in windows without a pin as well. Raises RecordingError if a box is pinned in another
-        frame.
+        in windows without a pin as well.
+
+        Parameters
+        ----------
+        given : BoxArray
+            Of the input, in the fixed frame.
+        with_pins : bool
+            Whether pins are used; without them only deletions, ids and classes are.
+
+        Returns
+        -------
+        boxes : BoxArray
+            A subset of the rows of `given`, in their order; without attributes.
+
+        Raises
+        ------
+        RecordingError
+            If a box is pinned in another frame.
 
         """
         given = given.plain()  # `with_attributes` gives the result its own
@@ -220,9 +264,21 @@ class Corrections:
 
     def apply(self, given: BoxArray, refined: RefinedBoxes) -> RefinedBoxes:
         """
-        Return the result for all input boxes, in their order, and then for the added ones.
+        Return the result for all input boxes.
 
-        `refined` is that for the boxes of `to_register`, in their order, and for added ones.
+        Parameters
+        ----------
+        given : BoxArray
+            Of the input, as for `to_register`.
+        refined : RefinedBoxes
+            For the boxes of `to_register`, in their order, then for added ones.
+
+        Returns
+        -------
+        result : RefinedBoxes
+            The boxes of `given` in their order, then the added ones. Deleted boxes have the status
+            ``rejected``; those that a person has rejected are kept as in the input; pinned ones
+            have the status ``human``.
 
         """
         is_pinned = given.is_pinned

@@ -15,10 +15,19 @@ SAME = 1e-3
 
 def differences(before: BoxTable, after: BoxTable) -> list[dict[str, Any]]:
     """
-    Return what changed, a row for each track, the most boxes first.
+    Return what changed between two results.
 
-    ``id``; ``added`` and ``removed`` boxes; ``changed`` ones, and the largest ``shift`` of a
-    centre [m]; ``class`` where that is another one. Rejected boxes are none.
+    Parameters
+    ----------
+    before, after : BoxTable
+        In one frame; rejected boxes are none.
+
+    Returns
+    -------
+    rows : list of dict
+        One for each track that changed, the most boxes first: ``id``; number of ``added``,
+        ``removed`` and ``changed`` boxes; the largest ``shift`` of a centre [m]; ``class`` where
+        that is another one, else empty.
 
     """
     old, new = _labels(before), _labels(after)

@@ -68,14 +68,35 @@ def fitted(
     extents: Mapping[str, Floats],
 ) -> Fitted:
     """
-    Return the box of the object at a place (2,) that a person points at.
+    Return the box of the object at a place that a person points at.
 
-    The points (M, 3) around it that are above the road and touch each other are the object. The
-    heading is that whose sides are nearest to the points (the closeness of L-shapes), and the half
-    of it that is nearer to the heading of the sensor [rad]. Sides that the sensor, at (2,), does
-    not see are completed by the size of the class, one of `extents` or of `USUAL_EXTENTS`. Fewer
-    than `MIN_POINTS` points get a box of the usual size around their middle, of the first class.
-    Raises RecordingError if there is no point of an object at the place.
+    The points around it that are above the road and touch each other are the object. The heading
+    is that whose sides are nearest to the points (the closeness of L-shapes). Sides that the
+    sensor does not see are completed by the size of the class. Fewer than `MIN_POINTS` points get
+    a box of the usual size around their middle, of the first class.
+
+    Parameters
+    ----------
+    points : array, shape (M, 3)
+        Of a sweep, z up [m].
+    place : array, shape (2,)
+        x and y, in the frame of the points [m].
+    sensor : array, shape (2,)
+        x and y of the sensor [m].
+    heading : float
+        Of the sensor [rad]; of both directions of the box the one that is nearer to it is taken.
+    extents : mapping of str to array, shape (3,)
+        Length, width and height by class [m]; if empty, `USUAL_EXTENTS`.
+
+    Returns
+    -------
+    found : Fitted
+        Box in the frame of the points, class and number of points.
+
+    Raises
+    ------
+    RecordingError
+        If there is no point of an object at the place.
 
     """
     near = points[(np.abs(points[:, :2] - place) < FIT_REACH).all(1)].astype(np.float64)
@@ -111,10 +132,25 @@ def drawn(
     extents: Mapping[str, Floats],
 ) -> Fitted:
     """
-    Return the box that a person draws from the middle of the rear (2,) to that of the front (2,).
+    Return the box that a person draws from the middle of its rear to that of its front.
 
-    The class is that of `extents` whose length and height are nearest. Width and height are those
-    of the points (M, 3) inside, within `DRAWN_RANGE` of the class.
+    The class is that whose length and height are nearest. Width and height are those of the
+    points inside, within `DRAWN_RANGE` of the class; of fewer than `MIN_POINTS` the width is that
+    of the class.
+
+    Parameters
+    ----------
+    points : array, shape (M, 3)
+        Of a sweep, z up [m].
+    rear, front : array, shape (2,)
+        x and y, in the frame of the points [m].
+    extents : mapping of str to array, shape (3,)
+        Length, width and height by class [m]; at least one class.
+
+    Returns
+    -------
+    found : Fitted
+        Box in the frame of the points, class and number of points.
 
     """
     along = front - rear

@@ -41,7 +41,28 @@ class LabelTrack:
         boxes: Floats,
         num_points: Ints,
     ) -> LabelTrack:
-        """Return the track of labels in any order, without invalid boxes."""
+        """
+        Return a track of labels, without invalid boxes.
+
+        Parameters
+        ----------
+        track_id, class_name : str
+            Of the track.
+        config : Config
+            Assigns the class name to a kind of object.
+        stamps_ns : array, shape (m,)
+            In any order [ns].
+        boxes : array, shape (m, 9)
+            In one fixed frame [m, rad]; NaN for no box.
+        num_points : array, shape (m,)
+            In each box; -1 where unknown.
+
+        Returns
+        -------
+        track : LabelTrack
+            In the order of stamps.
+
+        """
         rows = np.flatnonzero(is_valid_box(boxes))
         rows = rows[np.argsort(stamps_ns[rows], kind='stable')]
         columns = stamps_ns[rows], boxes[rows], num_points[rows]

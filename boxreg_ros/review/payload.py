@@ -76,7 +76,22 @@ class TrackTruth(NamedTuple):
 
 
 def true_boxes(tracks: Sequence[TrackChanges], truth: BoxTable | None) -> list[TrackTruth]:
-    """Return the true boxes of each track by stamp and track id of the input."""
+    """
+    Return the true boxes of each track, by stamp and track id of the input.
+
+    Parameters
+    ----------
+    tracks : sequence of TrackChanges
+        In the fixed frame.
+    truth : BoxTable or None
+        In the same frame, with the stamps and track ids of the input; None for no truth.
+
+    Returns
+    -------
+    truth : list of TrackTruth
+        One per track; NaN for boxes without a true one.
+
+    """
     if not tracks:
         return []
     row_of: dict[tuple[int, str], int] = {}

@@ -37,10 +37,23 @@ class Quality:
 
 def quality(track: TrackChanges, boxes: Floats, points: list[Floats], iou: Floats) -> Quality:
     """
-    Return the figures of the input boxes or of the refined boxes (n, 9) of a track.
+    Return the figures of the input boxes or of the refined boxes of a track.
 
-    `points` are near each box in the fixed frame, n arrays (M_i, 3) [m]; `iou` (n,) with true
-    boxes is NaN where unknown, as are boxes.
+    Parameters
+    ----------
+    track : TrackChanges
+        Has the stamps.
+    boxes : array, shape (n, 9)
+        `given` or `boxes` of the track [m, rad]; NaN where unknown.
+    points : list of n arrays, shape (M_i, 3)
+        Near each box, in the fixed frame [m].
+    iou : array, shape (n,)
+        3D IoU with true boxes; NaN where unknown.
+
+    Returns
+    -------
+    figures : Quality
+        NaN where they are unknown.
 
     """
     known = np.asarray(np.isfinite(boxes).all(axis=1))

@@ -64,9 +64,29 @@ def write_report(
     """
     Write the report of a run as one HTML file into the result folder.
 
-    `line` is the closing line of the run; `summary` the content of ``summary.json``; `found` are
-    all tracks with their risks, in the order of the list; `violated` has what violates each rule
-    after the run, by its id; true boxes are in the fixed frame, by the same stamps and track ids.
+    Parameters
+    ----------
+    folder : Path
+        The result folder.
+    line : str
+        The closing line of the run.
+    summary : mapping
+        The content of ``summary.json``.
+    config : Config
+        Settings of the run; those that are not the defaults are shown.
+    found : sequence of TrackRow
+        All tracks with their risks, in the order of the list.
+    violated : mapping of str to sequence of Violation
+        What violates each rule after the run, by the id of the rule.
+    points : PointCollector
+        Points near the boxes, and positions of the sensor.
+    truth : BoxTable, optional
+        True boxes in the fixed frame, by the same stamps and track ids.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
 
     """
     tracks = [row.track for row in found]

@@ -210,12 +210,28 @@ def risks_of_box(
     part: Mapping[str, Any], row: int, box: Floats, class_name: str, points: Floats
 ) -> tuple[float, float]:
     """
-    Return the risk of a box of a report as it is and as `box` would have it [m].
+    Return the risk of a box of a report as it is and as another box would have it.
 
     What follows from the points changes by what the points of the report show: where the outermost
-    ones are from each face, and how many of them are outside. The deviations stay. `part` is as of
-    `TrackPart.part`; the box (9,) [m, rad] and the points (M, 3) near it [m] are relative to its
-    origin.
+    ones are from each face, and how many of them are outside. The deviations stay.
+
+    Parameters
+    ----------
+    part : mapping
+        The track, as of `TrackPart.part`.
+    row : int
+        Of the box in the track.
+    box : array, shape (9,)
+        The other box, relative to the origin of the part [m, rad].
+    class_name : str
+        Of the track.
+    points : array, shape (M, 3)
+        Near the box, relative to the same origin [m].
+
+    Returns
+    -------
+    before, after : float
+        Risks of the box of the report and of `box` [m].
 
     """
     outside, sizes = part['usual']
@@ -236,7 +252,25 @@ def risks_of_box(
 
 
 def evidence(points: Floats, box: Floats) -> tuple[Floats, float]:
-    """Return how far the outermost points are off each face (6,) [m], and the part outside."""
+    """
+    Return what points show about the faces of a box; those near the road are left out.
+
+    Parameters
+    ----------
+    points : array, shape (M, 3)
+        Near the box [m].
+    box : array, shape (9,)
+        In the same frame [m, rad].
+
+    Returns
+    -------
+    distances : array, shape (6,)
+        Mean distance of the outermost points from the faces at front, rear, left, right, top and
+        bottom [m], positive outside; NaN with too few points near a face.
+    outside : float
+        Part of the points in and near the box that are outside of it; 0 without points.
+
+    """
     local = (points - box[: Z + 1]) @ matrix_from_rpy(box[None, ROLL:])[0]
     half = box[BOX_EXTENT] / 2
     is_above_road = local[:, 2] > 0.3 - half[2]

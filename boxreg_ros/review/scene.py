@@ -69,10 +69,28 @@ class DriveScene:
 
     def sweep(self, stamp_ns: int) -> tuple[int, Floats, NDArray[np.float32], Floats]:
         """
-        Return the sweep nearest to a stamp: its stamp [ns], origin, points and sensor.
+        Return the sweep nearest to a stamp.
 
-        The points (M, 3) are in the fixed frame, relative to the origin (3,) [m]; the sensor (4,)
-        is position and heading [m, rad]. Raises RecordingError if the recording cannot be read.
+        Parameters
+        ----------
+        stamp_ns : int
+            Of a box array [ns].
+
+        Returns
+        -------
+        stamp_ns : int
+            Of the sweep [ns].
+        origin : array, shape (3,)
+            In the fixed frame [m]; the points are relative to it.
+        points : array of float32, shape (M, 3)
+            Along the axes of the fixed frame [m].
+        sensor : array, shape (4,)
+            Position and heading of the sensor in the fixed frame [m, rad].
+
+        Raises
+        ------
+        RecordingError
+            If the recording cannot be read.
 
         """
         with self._changed:
@@ -84,9 +102,24 @@ class DriveScene:
 
     def follow(self, seeds: Sequence[BoxArray], grows: bool = False) -> FollowedTrack:
         """
-        Follow an object from its boxes, and solve its track; RecordingError if that fails.
+        Follow an object from its boxes, and solve its track.
 
-        With `grows`, a single box may grow to the points of the track.
+        Parameters
+        ----------
+        seeds : sequence of BoxArray
+            Boxes of one object in the fixed frame, an array each.
+        grows : bool
+            Whether a single box may grow to the points of the track.
+
+        Returns
+        -------
+        track : FollowedTrack
+            In the fixed frame.
+
+        Raises
+        ------
+        RecordingError
+            If the recording cannot be read, or no seed can be followed.
 
         """
         with self._changed:
@@ -105,7 +138,28 @@ class DriveScene:
         return replace(found, boxes=found.boxes + offset)
 
     def near(self, stamps_ns: Sequence[int], boxes: Floats) -> list[Floats]:
-        """Return the points near each box (n, 9) in the frame of the box, n arrays (M_i, 3)."""
+        """
+        Return the points near each box of a track.
+
+        Parameters
+        ----------
+        stamps_ns : sequence of n int
+            Of the boxes [ns]; at least one.
+        boxes : array, shape (n, 9)
+            In the fixed frame [m, rad].
+
+        Returns
+        -------
+        points : list of n arrays, shape (M_i, 3)
+            Of the sweep nearest to each stamp, up to `SHOWN_MARGIN` outside of the box, in the
+            frame of the box [m].
+
+        Raises
+        ------
+        RecordingError
+            If the recording cannot be read.
+
+        """
         with self._changed:
             self._wait(max(stamps_ns))
             rows = [self._row(stamp_ns) for stamp_ns in stamps_ns]
@@ -130,9 +184,24 @@ class DriveScene:
 
     def pose_of(self, frame_id: str, stamp_ns: int) -> Floats | None:
         """
-        Return the pose (4, 4) of the frame of a camera in the fixed frame; None if unknown.
+        Return the pose of the frame of a camera in the fixed frame.
 
-        Between the poses at the two sweeps around the stamp, it is interpolated.
+        Parameters
+        ----------
+        frame_id : str
+            Of the camera.
+        stamp_ns : int
+            Between the poses at the two sweeps around it, the pose is interpolated [ns].
+
+        Returns
+        -------
+        T_fixed_camera : array, shape (4, 4), or None
+            None if it is known at neither of them.
+
+        Raises
+        ------
+        RecordingError
+            If the recording cannot be read.
 
         """
         with self._changed:
@@ -238,9 +307,27 @@ class DriveImages:
 
     def image(self, index: int, stamp_ns: int) -> tuple[Image, Floats | None]:
         """
-        Return the image of a camera nearest to a stamp, and T_image_fixed (4, 4) at its stamp.
+        Return the image of a camera nearest to a stamp.
 
-        Raises RecordingError if there is no such camera, or no image nearby.
+        Parameters
+        ----------
+        index : int
+            Of the camera in the list of the page.
+        stamp_ns : int
+            Of a sweep or box array [ns].
+
+        Returns
+        -------
+        image : Image
+            With its own stamp.
+        T_image_fixed : array, shape (4, 4), or None
+            Pose of the fixed frame in that of the camera, at the stamp of the image; None if
+            unknown.
+
+        Raises
+        ------
+        RecordingError
+            If there is no such camera, or no image nearby.
 
         """
         cameras = self._known()

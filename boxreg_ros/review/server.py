@@ -138,8 +138,28 @@ def review_server(
     """
     Return a server, bound to loopback, for result folders and their recordings.
 
-    Raises RecordingError if a folder has no finished report, or its decisions cannot be read, and
-    ConfigError if the port is in use, or a package is missing.
+    Parameters
+    ----------
+    results : sequence of (Path, DriveSource or None)
+        Result folders, each with its recording; without this there are no whole clouds.
+    port : int
+        To listen on; 0 for any free one.
+    who : str
+        Person who decides, where the page sends none; by default the user.
+    classes : sequence of str
+        Class names to choose from on the page; none for those of the result.
+
+    Returns
+    -------
+    server : ReviewServer
+        Serves after `serve_forever` is called.
+
+    Raises
+    ------
+    RecordingError
+        If a folder has no finished report, or its decisions cannot be read.
+    ConfigError
+        If the port is in use, or a package is missing.
 
     """
     from boxreg_ros.review.report import REPORT

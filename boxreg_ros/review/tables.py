@@ -94,9 +94,23 @@ def write_tables(
     """
     Write ``tracks.csv`` and ``review.csv`` into a folder of results.
 
-    `rows` are as of `assessed`. ``tracks.csv`` has `more_columns`, whose cells by track id are
-    empty for other tracks; ``review.csv`` ends with `proposals`, as in ``summary.json``: objects
-    that no box covers.
+    Parameters
+    ----------
+    folder : Path
+        The folder, which exists.
+    rows : sequence of TrackRow
+        As of `assessed`, in this order.
+    more_columns : sequence of str
+        Further columns of ``tracks.csv``.
+    more_cells : mapping of str to sequence, optional
+        Their cells by track id; empty for other tracks.
+    proposals : sequence of mappings
+        Objects that no box covers, as in ``summary.json``: the last rows of ``review.csv``.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be written.
 
     """
     found = more_cells or {}

@@ -98,7 +98,17 @@ class PointCollector:
         return self.origins[nearest_rows(stamps_ns, known)]
 
     def gather(self, boxes: BoxArray, sweep: Sweep | None) -> None:
-        """Gather the points of a sweep around its boxes, both in the fixed frame."""
+        """
+        Gather the points of a sweep around its boxes; of two boxes with one id the first counts.
+
+        Parameters
+        ----------
+        boxes : BoxArray
+            In the fixed frame; invalid ones have no points.
+        sweep : Sweep or None
+            In the same frame; None where the boxes have none.
+
+        """
         rows = np.flatnonzero(is_valid_box(boxes.boxes))
         if sweep is None or not len(rows):
             return
