@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from boxreg_ros.structures import Floats
-from msg_adapters.pointcloud import DTYPES, NUMBERS
+from msg_adapters.pointcloud import byte_order, bytes_of, DTYPES, NUMBERS
 from msg_adapters.poses import replaced
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +52,7 @@ def with_fields(msg: Any, columns: Mapping[str, NDArray[Any]]) -> Any:
     Returns
     -------
     sensor_msgs/PointCloud2
-        A copy of its class, with as many rows. The values are in the byte order of `is_bigendian`.
+        A copy of its class, with as many rows. The values are in the byte order of the others.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def with_fields(msg: Any, columns: Mapping[str, NDArray[Any]]) -> Any:
     """
     points = _bytes_of(msg)
     make = type(msg.fields[0])
-    order = '>' if msg.is_bigendian else '<'
+    order = byte_order(msg)
     fields = list(msg.fields)
     parts = [points]
     step = msg.point_step
@@ -90,11 +90,11 @@ def with_positions(msg: Any, positions: Floats) -> Any:
     -------
     sensor_msgs/PointCloud2
         A copy of its class, in the same layout: x, y and z have the types that they have in `msg`,
-        and the byte order of `is_bigendian`.
+        and the same byte order.
 
     """
     data = _bytes_of(msg).copy()
-    order = '>' if msg.is_bigendian else '<'
+    order = byte_order(msg)
     fields = {field.name: field for field in msg.fields}
     for name, column in zip('xyz', positions.T, strict=True):
         first = fields[name].offset
@@ -106,7 +106,7 @@ def with_positions(msg: Any, positions: Floats) -> Any:
 def _bytes_of(msg: Any) -> NDArray[np.uint8]:
     """Return the bytes of each point, (height * width, point_step)."""
     step = msg.point_step
-    data = np.frombuffer(msg.data, np.uint8)
+    data = np.frombuffer(bytes_of(msg.data), np.uint8)
     row_step = msg.row_step if msg.height > 1 else msg.width * step
     rows = np.lib.stride_tricks.as_strided(
         data, (msg.height, msg.width, step), (row_step, step, 1), writeable=False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.structures import Floats, Ints, Sweep
@@ -120,7 +120,7 @@ def described(msg: Any, time_unit: str = AUTO) -> str:
     kinds = _kinds(fields)
     layout = point_layout.layout_of(kinds)
     name = f'unknown layout ({", ".join(fields)})' if layout is None else layout.name
-    if _table(msg, [fields[key] for key in 'xyz']).dtype['x'].str[0] != '<>'[msg.is_bigendian]:
+    if byte_order(msg) != '<>'[msg.is_bigendian]:
         name += f' in the other byte order than is_bigendian = {bool(msg.is_bigendian)} states'
     time_field = point_layout.time_field_of(kinds)
     if not time_field:
@@ -238,6 +238,36 @@ def bytes_of(data: Any) -> Any:
     return data.to_bytes() if hasattr(data, 'to_bytes') else data
 
 
+def byte_order(msg: Any) -> Literal['<', '>']:
+    """
+    Return the byte order of the numbers of a cloud, as ``dtype.newbyteorder`` takes it.
+
+    Parameters
+    ----------
+    msg : sensor_msgs/PointCloud2
+        Any layout with fields x, y and z.
+
+    Returns
+    -------
+    str
+        ``'<'`` or ``'>'``, as `is_bigendian` states unless the coordinates contradict it.
+
+    Raises
+    ------
+    UnsupportedMessage
+        As `from_msg`.
+
+    """
+    fields = _fields(msg)
+    table = _rows(msg, [fields[key] for key in 'xyz'])
+    orders: tuple[Literal['<', '>'], ...] = ('<', '>')
+    stated, other = orders[:: -1 if msg.is_bigendian else 1]
+    if _likely_share(table.view(table.dtype.newbyteorder(stated))) >= 0.5:
+        return stated
+    share = _likely_share(table.view(table.dtype.newbyteorder(other)))
+    return other if share >= LIKELY_POINTS else stated
+
+
 def _fields(msg: Any) -> dict[str, Any]:
     """Return the fields of a message by name; x, y and z are among them."""
     fields = {field.name: field for field in msg.fields}
@@ -262,6 +292,12 @@ def _is_finite(table: NDArray[Any]) -> NDArray[np.bool_]:
 
 def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
     """Return a structured view (height, width) of the raw bytes, with these fields only."""
+    rows = _rows(msg, fields)
+    return rows.view(rows.dtype.newbyteorder(byte_order(msg)))
+
+
+def _rows(msg: Any, fields: list[Any]) -> NDArray[Any]:
+    """Return the same as if the byte order were that of this machine."""
     data = np.frombuffer(bytes_of(msg.data), np.uint8)
     row_step = _checked_row_step(msg, len(data))
     for field in fields:
@@ -269,19 +305,15 @@ def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
     layout = np.dtype(
         {
             'names': [field.name for field in fields],
-            'formats': ['<' + DTYPES[field.datatype] for field in fields],
+            'formats': [DTYPES[field.datatype] for field in fields],
             'offsets': [field.offset for field in fields],
             'itemsize': msg.point_step,
         }
     )
-    table: NDArray[Any] = np.ndarray(
+    rows: NDArray[Any] = np.ndarray(
         (msg.height, msg.width), layout, data.data, strides=(row_step, msg.point_step)
     )
-    stated, other = table, table.view(layout.newbyteorder('>'))
-    if msg.is_bigendian:
-        stated, other = other, stated
-    is_wrong = _likely_share(stated) < 0.5 and _likely_share(other) >= LIKELY_POINTS
-    return other if is_wrong else stated
+    return rows
 
 
 def _likely_share(table: NDArray[Any]) -> float:
@@ -295,7 +327,8 @@ def _likely_share(table: NDArray[Any]) -> float:
     if not names or table.dtype[names[0]].kind != 'f' or table.size < MIN_POINTS_OF_ORDER:
         return 1.0
     some = table.reshape(-1)[:: -(-table.size // MAX_POINTS_OF_ORDER)]
-    values = np.abs(np.array([some[name] for name in names], dtype=np.float64))
+    with np.errstate(invalid='ignore'):  # of NaNs that signal
+        values = np.abs(np.array([some[name] for name in names], dtype=np.float64))
     is_likely = (values == 0) | ((values > NEXT_TO_NOTHING) & (values < MAX_COORDINATE))
     is_known = np.isfinite(values).all(axis=0)
     return float(is_likely.all(axis=0)[is_known].mean()) if is_known.any() else 0.0

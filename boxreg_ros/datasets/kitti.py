@@ -121,8 +121,8 @@ def exported_poses(folder: Path, count: int) -> tuple[Ints, Floats] | None:
     known = [i for i, pose in enumerate(poses) if pose is not None]
     if not known or len(stamps_ns) < count:
         raise RecordingError(
-            f'{folder / POSES_FILE}: expected poses of {count} frames, got {len(known)}; export '
-            f'again'
+            f'{folder / POSES_FILE}: expected poses of {count} frames, got {len(known)} and '
+            f'{len(stamps_ns)} stamps; export again'
         )
     return stamps_ns[known], pose_rows([pose for pose in poses if pose is not None])
 
@@ -199,7 +199,7 @@ def calibration_lines(path: Path, archive: str) -> dict[str, list[float]]:
     """
     require(path, 'the calibration', f'unpack {archive}')
     values = {}
-    for line in path.read_text(encoding='utf-8').splitlines():
+    for line in path.read_text(encoding='utf-8', errors='replace').splitlines():
         name, *words = line.replace(':', ' ', 1).split() or ['']
         try:
             values[name] = [float(word) for word in words]

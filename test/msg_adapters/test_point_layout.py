@@ -1,7 +1,7 @@
 """Layouts of clouds by LiDAR drivers, and the units of their times."""
 
 from boxreg_ros.errors import UnsupportedMessage
-from msg_adapters import pointcloud
+from msg_adapters import cloud_edits, pointcloud
 import numpy as np
 import pytest
 from ros_messages import Messages, START
@@ -140,3 +140,21 @@ def test_a_wrong_byte_order_is_corrected_and_said(order):
         np.testing.assert_allclose(pointcloud.from_msg(message).points, xyz, rtol=1e-6)
         is_wrong = stated != (order == '>')
         assert ('in the other byte order' in pointcloud.described(message)) == is_wrong
+
+
+@pytest.mark.parametrize('order', '<>')
+@pytest.mark.parametrize('is_wrong', [False, True])
+def test_edited_copies_have_the_byte_order_of_the_points(order, is_wrong):
+    xyz = np.random.default_rng(2).uniform(-60, 60, (300, 3)).astype('f4')
+    times = np.linspace(0, 0.1, 300, dtype='f4')
+    columns = [(name, 'f4', xyz[:, i]) for i, name in enumerate('xyz')] + [('t', 'f4', times)]
+    message = MESSAGES.cloud(START, 'lidar', columns, order=order)
+    message.is_bigendian ^= is_wrong
+    more = cloud_edits.with_fields(message, {'intensity': np.full(300, 7.0, 'f4')})
+    np.testing.assert_array_equal(pointcloud.intensities(more), 7)
+    moved = cloud_edits.with_positions(more, xyz + np.float32(1))
+    kept = cloud_edits.with_points(moved, np.arange(300) < 250)
+    found = pointcloud.from_msg(kept)
+    np.testing.assert_allclose(found.points, xyz[:250] + 1, rtol=1e-6)
+    np.testing.assert_allclose(found.times, times[:250], atol=1e-6)
+    np.testing.assert_array_equal(pointcloud.intensities(kept), 7)

@@ -117,7 +117,10 @@ def opened(path: Path) -> StorageFile:
                 f'{path}: expected a recording, got an empty file; copy it again, or leave it out'
             )
     if not is_compressed and (not is_remote or opener is McapFile):  # MCAP is read by blocks
-        return opener(path, None)
+        try:
+            return opener(path, None)
+        except OSError as error:  # as by the limit of open files: nothing is known of the file
+            raise TransferError(unreadable(path, error)) from None
     with temporary_folder() as folder:
         file, damage = path, None
         if is_remote:
