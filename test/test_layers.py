@@ -114,7 +114,7 @@ def test_the_rule_can_fail(module, imported):
 
 
 def test_core_imports_numbers_only():
-    allowed = {'boxreg_ros', 'llvmlite', 'numba', 'numpy', 'scipy', 'torch', 'yaml'}
+    allowed = {'boxreg_ros', 'numba', 'numpy', 'scipy', 'torch', 'yaml'}
     clocks = {'time', 'datetime', 'os', 'subprocess', 'threading'}
     for path in (path for path in FILES if room_of(module_of(path)) == 'core'):
         tops = {name.split('.')[0] for name, _ in imports_of(path)}

@@ -77,10 +77,10 @@ def test_rosdep_keys_cover_the_imports():
     manifest = ElementTree.parse(ROOT / 'package.xml')
     keys = {item.text for item in manifest.iter('exec_depend')}
     # mcap has no rosdep key; the README describes its installation. It installs zstandard, rosbags
-    # installs apsw, numba llvmlite, torch filelock. fsspec is that of an extra; torch needs it.
+    # installs apsw, and torch filelock. fsspec is that of an extra, and torch needs it.
     # Starlette has none either; `boxreg review` imports its server when it is asked to.
     server = {'anyio', 'starlette', 'uvicorn'}
-    others = {'apsw', 'filelock', 'fsspec', 'llvmlite', 'mcap', 'zstandard'}
+    others = {'apsw', 'filelock', 'fsspec', 'mcap', 'zstandard'}
     names = imported_distributions() - others - server
     other_keys = {'torch': 'python3-pytorch-pip', 'rosbags': 'python3-rosbags-pip'}
     wanted = {other_keys.get(name, name) for name in names}

@@ -9,7 +9,6 @@ import re
 from typing import Any
 from warnings import warn
 
-from llvmlite.binding import set_option
 import numba
 from numba.core import event
 from numba.core.codegen import JITCodeLibrary
@@ -18,18 +17,11 @@ from numba.core.compiler import Compiler, Flags
 REORDER = {'contract', 'reassoc'}
 """Sums may be reordered for vector instructions; NaN and infinity are handled as usual."""
 
-UNROLLED = 60
-"""Most instructions of a loop that LLVM writes out; 300 by itself. Measured: the solver takes 8 %
-less time to compile, a tick no more."""
-
 IMPORTED = re.compile(r'^from [\w.]*?(\w+) import', re.MULTILINE)
 """The last name of a module that a source imports from."""
 
 DIGEST_LENGTH = 12
 """Letters of the digest of the sources. Chosen: 48 bits."""
-
-
-set_option('boxreg_ros', f'-unroll-threshold={UNROLLED}')
 
 
 class _CollectionsAfterwards(event.Listener):
