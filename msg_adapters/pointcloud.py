@@ -120,7 +120,7 @@ def described(msg: Any, time_unit: str = AUTO) -> str:
     kinds = _kinds(fields)
     layout = point_layout.layout_of(kinds)
     name = f'unknown layout ({", ".join(fields)})' if layout is None else layout.name
-    if byte_order(msg) != '<>'[msg.is_bigendian]:
+    if byte_order(msg) != ('>' if msg.is_bigendian else '<'):
         name += f' in the other byte order than is_bigendian = {bool(msg.is_bigendian)} states'
     time_field = point_layout.time_field_of(kinds)
     if not time_field:
@@ -260,8 +260,8 @@ def byte_order(msg: Any) -> Literal['<', '>']:
     """
     fields = _fields(msg)
     table = _rows(msg, [fields[key] for key in 'xyz'])
-    orders: tuple[Literal['<', '>'], ...] = ('<', '>')
-    stated, other = orders[:: -1 if msg.is_bigendian else 1]
+    stated: Literal['<', '>'] = '>' if msg.is_bigendian else '<'
+    other: Literal['<', '>'] = '<' if msg.is_bigendian else '>'
     if _likely_share(table.view(table.dtype.newbyteorder(stated))) >= 0.5:
         return stated
     share = _likely_share(table.view(table.dtype.newbyteorder(other)))
@@ -318,17 +318,16 @@ def _rows(msg: Any, fields: list[Any]) -> NDArray[Any]:
 
 def _likely_share(table: NDArray[Any]) -> float:
     """
-    Return the part of the points whose coordinates may be those of a LiDAR; 1 if unknown.
+    Return the part of the points with x, y, z that may be those of a LiDAR; 1 if unknown.
 
     Floats of the other byte order are mostly huge or next to nothing.
 
     """
-    names = [name for name in 'xyz' if name in (table.dtype.names or ())]
-    if not names or table.dtype[names[0]].kind != 'f' or table.size < MIN_POINTS_OF_ORDER:
+    if table.dtype['x'].kind != 'f' or table.size < MIN_POINTS_OF_ORDER:
         return 1.0
     some = table.reshape(-1)[:: -(-table.size // MAX_POINTS_OF_ORDER)]
     with np.errstate(invalid='ignore'):  # of NaNs that signal
-        values = np.abs(np.array([some[name] for name in names], dtype=np.float64))
+        values = np.abs(np.array([some[key] for key in 'xyz'], dtype=np.float64))
     is_likely = (values == 0) | ((values > NEXT_TO_NOTHING) & (values < MAX_COORDINATE))
     is_known = np.isfinite(values).all(axis=0)
     return float(is_likely.all(axis=0)[is_known].mean()) if is_known.any() else 0.0

@@ -228,8 +228,10 @@ class LatencyEvidence:
             known = _Comparisons.of(self._samples)
             drifts = self._latency.drifts
             half = len(self._samples) // 2
-            if not drifts and _differ(known.part(0, half), newer := known.part(half, MAX_SAMPLES)):
-                drifts, known = True, newer
+            older, newer = known.part(0, half), known.part(half, MAX_SAMPLES)
+            if not drifts and _differ(older, newer):
+                drifts = True
+                known = newer
                 for _ in range(half):
                     self._samples.popleft()
             found = _estimated(known)._replace(drifts=drifts)

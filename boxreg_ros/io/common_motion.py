@@ -59,18 +59,19 @@ INVERSE = (
     f'{OTHER_MOTION}'
 )
 SCALED = (
-    'on both sides, as parked objects do by a motion at {scale:.2g} times its size, and hardly '
+    'on both sides, as parked objects do by a motion at {value:.2g} times its size, and hardly '
     'any stands still: if they are parked, {names} is not in metres, or of another scale, and '
     'boxes are as wrong as this motion: mend its publisher, or name another source of it, '
     f'{OTHER_MOTION}'
 )
 TURNED = (
-    'on both sides, as parked objects do by poses with a yaw that is off by {turn:.0f} degrees, '
+    'on both sides, as parked objects do by poses with a yaw that is off by {value:.0f} degrees, '
     'and hardly any stands still: if they are parked, {names} has poses of other axes than those '
     'of the LiDAR, and boxes are as wrong as this motion: see whether the static transform from '
     'the vehicle to the LiDAR is missing or wrong, or name another source of the motion, '
     f'{OTHER_MOTION}'
 )
+NO_FAULT = '', 0.0
 
 
 class CommonMotionCheck:
@@ -121,13 +122,13 @@ class CommonMotionCheck:
         moving = [edge for edge in route if not edge.is_static]
         centers, velocities = tracker.known_motion(MIN_SPEED / 2)
         is_alike = _are_alike(velocities)
-        fault, scale, turn = '', 1.0, 0.0
+        fault, value = NO_FAULT
         if moving and is_alike.any():
             if all(edge.way(stamp_ns - STILL_NS) <= STILL_WAY for edge in moving):
                 fault = STILL
             elif _standing(velocities) <= MOST_STANDING * is_alike.sum():
                 poses = pose_of(stamp_ns - LOOK_PERIOD_NS), pose_of(stamp_ns)
-                fault, scale, turn = _fault(centers[is_alike], velocities[is_alike], *poses)
+                fault, value = _fault(centers[is_alike], velocities[is_alike], *poses)
         self._looks = self._looks + 1 if fault == self._fault else 1
         self._fault = fault
         if fault and self._looks == MIN_LOOKS:
@@ -135,7 +136,7 @@ class CommonMotionCheck:
             speed = np.linalg.norm(np.median(velocities, axis=0))
             self.finding = (
                 f'{is_alike.sum()} of {len(velocities)} objects move alike, at {speed:.1f} m/s, '
-                f'{fault.format(names=names, scale=scale, turn=turn)}'
+                f'{fault.format(names=names, value=value)}'
             )
 
 
@@ -157,7 +158,7 @@ def _are_alike(velocities: Floats) -> NDArray[np.bool_]:
 
 def _fault(
     centers: Floats, velocities: Floats, before: Floats | None, now: Floats | None
-) -> tuple[str, float, float]:
+) -> tuple[str, float]:
     """
     Return by which fault of the poses parked objects would have these velocities.
 
@@ -172,8 +173,9 @@ def _fault(
     -------
     fault : str
         Its text; empty for none.
-    scale, turn : float
-        Of the stated motion to that by the objects; angle between both [deg].
+    value : float
+        Of `SCALED` the stated motion over that by the objects, of `TURNED` the angle between both
+        [deg]; else 0.
 
     Notes
     -----
@@ -185,27 +187,28 @@ def _fault(
 
     """
     if before is None or now is None:
-        return '', 1.0, 0.0
+        return NO_FAULT
     stated = (now[:3, 3] - before[:3, 3]) / (LOOK_PERIOD_NS * 1e-9)
     speed = np.linalg.norm(stated)
     common = np.median(velocities, axis=0)
     expected = stated + now[:3, :3] @ stated
     allowed = MAX_DIFFERENCE + MAX_RELATIVE_DIFFERENCE * np.linalg.norm(expected)
     if np.linalg.norm(common - expected) < allowed < speed / 2:
-        return INVERSE, 1.0, 0.0
-    (sx, sy), (tx, ty) = stated[:2], (stated - common)[:2]
+        return INVERSE, 0.0
+    shown = stated - common
+    (sx, sy), (tx, ty) = stated[:2], shown[:2]
     left = (centers - now[:3, 3]) @ (-ty, tx, 0.0)
     is_beside = min((left > 0).sum(), (left < 0).sum()) >= FEWEST_BESIDE
-    shown = np.hypot(tx, ty)
-    if not is_beside or min(speed, shown) < MIN_SPEED / 2:
-        return '', 1.0, 0.0
-    scale, turn = (
-        float(speed / shown),
-        np.degrees(np.arctan2(sx * ty - sy * tx, sx * tx + sy * ty)),
-    )
-    is_along = abs(tx * sy - ty * sx) < MAX_DIFFERENCE * speed and abs(turn) < 90
+    shown_speed = np.hypot(tx, ty)
+    if not is_beside or min(speed, shown_speed) < MIN_SPEED / 2:
+        return NO_FAULT
+    across = abs(sx * ty - sy * tx)
+    along = sx * tx + sy * ty
+    scale = float(speed / shown_speed)
+    turn = float(np.degrees(np.arctan2(across, along)))
+    is_along = across < MAX_DIFFERENCE * speed and along > 0
     if is_along and any(low <= scale <= high for low, high in SCALES):
-        return SCALED, scale, turn
-    if abs(turn) >= MIN_YAW_ERROR and abs(speed - shown) < MAX_DIFFERENCE:
-        return TURNED, scale, abs(turn)
-    return '', 1.0, 0.0
+        return SCALED, scale
+    if turn >= MIN_YAW_ERROR and abs(speed - shown_speed) < MAX_DIFFERENCE:
+        return TURNED, turn
+    return NO_FAULT

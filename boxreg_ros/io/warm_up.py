@@ -118,7 +118,7 @@ def compiled_beside(config: Config, has_labels: bool) -> Iterator[Callable[[], N
 
 
 def warm_up_others(objective: str, mode: str, has_labels: bool) -> None:
-    """Do all but `warm_up_solver` and a kernel of that, print a line, then follow."""
+    """Do what `warm_up_solver` leaves out, and one kernel of it; print a line, then follow."""
     from boxreg_ros.core import solver
     from boxreg_ros.core.method.round import empty_sums
     import torch
