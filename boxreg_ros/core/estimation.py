@@ -212,12 +212,11 @@ def _priors_left(
     base: Floats, problem: Problem, solution: Solution, tested: Tested
 ) -> list[tuple[MarginalisationPrior, int] | None]:
     """Return the marginalisation prior that each window leaves, if it leaves one."""
-    state, step, information = solution[-3:]
-    if not len(state):
+    if not len(solution.left.state):
         return [None] * len(base)
     extents = problem.marginalised_extents.copy()
     extents[:, :3] += problem.boxes[:, 0, 3:6]
     extents[:, 3] += 1
-    table = MarginalisationPrior(base, state, step, information, extents, tested.ranges)
-    is_left = tested.is_finite & np.isfinite(step).all(1)
+    table = MarginalisationPrior(base, *solution.left, extents, tested.ranges)
+    is_left = tested.is_finite & np.isfinite(solution.left.step).all(1)
     return [(table, row) if left else None for row, left in enumerate(is_left.tolist())]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from boxreg_ros.config import Config, KINDS, PaperConfig
 from boxreg_ros.core.geometry import face_distances, rotation_from_rpy
 from boxreg_ros.core.lbfgs import HISTORY, minimize
-from boxreg_ros.core.method.arrays import INPUTS, Posterior, PRIOR, Solution
+from boxreg_ros.core.method.arrays import INPUTS, no_priors, Posterior, Solution
 from boxreg_ros.core.problem import Problem
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, KINEMATICS, POSE
@@ -260,9 +260,8 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
     of_extents[...] = _diagonal((mean * problem.of_class['extent'][:, None]) ** 2)
     unknown = np.zeros((B, length), KINEMATICS)  # its terms have no scale
     posterior = Posterior(of_poses, of_extents, np.zeros((B, length, 6)), unknown)
-    no_prior = np.zeros((0, PRIOR)), np.zeros((0, PRIOR)), np.zeros((0, PRIOR, PRIOR))
     poses = x.numpy().reshape(B, length, 6)
-    return Solution(poses, shared, np.zeros((B, 3, 3)), posterior, *no_prior)
+    return Solution(poses, shared, np.zeros((B, 3, 3)), posterior, no_priors(0))
 
 
 def _diagonal(values: Floats) -> Floats:

@@ -15,7 +15,16 @@ from boxreg_ros.core.input_model import InputModel, Inputs
 from boxreg_ros.core.input_noise import normalised_residuals
 from boxreg_ros.core.lbfgs import HISTORY, minimize
 from boxreg_ros.core.method import round as method
-from boxreg_ros.core.method.arrays import ANCHOR, BIAS, EXTENT, Posterior, PRIOR, SHARED, Solution
+from boxreg_ros.core.method.arrays import (
+    ANCHOR,
+    BIAS,
+    EXTENT,
+    no_priors,
+    Posterior,
+    Quadratic,
+    SHARED,
+    Solution,
+)
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.method.faces import observe_faces
 from boxreg_ros.core.method.rigid_shape import observe_shapes
@@ -164,8 +173,7 @@ def start(problem: Problem, config: Config, plan: SolverPlan, inputs: Inputs) ->
             np.zeros((B, N, 6, 6)), np.zeros((B, 3, 3)), np.zeros((B, N, 6)),
             np.zeros((B, N), KINEMATICS),
         ),
-        np.full((leaving, PRIOR), np.nan), np.full((leaving, PRIOR), np.nan),
-        np.full((leaving, PRIOR, PRIOR), np.nan),
+        no_priors(leaving),
     )  # fmt: skip
     prior = problem.prior_mean, problem.prior_information
     return Batch(problem, free, method.empty_sums(B, N, number, *prior), solution)
@@ -216,23 +224,26 @@ def fit(
     """Search the minima of the windows `rows` (b,) after `observe`, and end their round."""
     problem, free, sums, solution = batch
     record = constants.record()
-    b, D = len(rows), free.shape[1]
-    x, value, gradient = np.empty((b, D)), np.empty(b), np.empty((b, D))
+    b = len(rows)
+    x = np.empty((b, free.shape[1]))
     run(
-        method.begin, 30, b, rows, problem, inputs, free, record, solution.poses, solution.shared,
-        sums, x, value, gradient,
+        method.begin, 10, b, rows, problem, inputs, record, solution.poses, solution.shared, sums,
+        x,
     )  # fmt: skip
-    objective = Objective(rows, free, sums)
+    objective = Objective(rows, free, sums, solution.left)
+    first = objective.sum(x, method.CURVATURE)
     found = minimize(
-        objective.value_and_gradient, torch.from_numpy(x), ITERATIONS, HISTORY,
-        TOLERANCE, objective.metric,
-        (torch.from_numpy(value), torch.from_numpy(gradient)),
+        objective.value_and_gradient, torch.from_numpy(x), ITERATIONS, HISTORY, TOLERANCE,
+        objective.metric, first,
     )  # fmt: skip
-    is_done = np.empty(b, bool)
+    x, is_done = found.x.numpy(), np.empty(b, bool)
     run(
-        method.end, 30, b, rows, found.x.numpy(), problem, free, record, sums, solution, is_last,
-        may_settle, is_done,
+        method.end, 20, b, rows, x, problem, free, record, sums, solution, is_last, may_settle,
+        is_done,
     )  # fmt: skip
+    if len(solution.left.state):
+        is_leaving = is_done & (problem.lengths[rows] == problem.length)
+        Objective(rows[is_leaving], free, sums, solution.left).sum(x[is_leaving], method.OLDEST)
     return is_done
 
 
@@ -242,13 +253,18 @@ class Objective(NamedTuple):
     rows: Ints
     free: Floats
     sums: method.Sums
+    left: Quadratic
 
     def value_and_gradient(self, x: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
         """Return values (p,) and gradients (p, D) of the windows `rows[part]` at x (p, D)."""
+        return self._replace(rows=self.rows[part.numpy()]).sum(x.contiguous().numpy())
+
+    def sum(self, x: Floats, wanted: int = method.VALUE) -> tuple[Tensor, Tensor]:
+        """Return values (b,) and gradients (b, D) at x (b, D), and write what else is `wanted`."""
         value, gradient = np.empty(len(x)), np.empty(x.shape)
         run(
-            method.evaluate, 8, len(x), self.rows[part.numpy()], x.contiguous().numpy(), self.free,
-            self.sums, value, gradient,
+            method.evaluate, 8, len(x), self.rows, x, self.free, self.sums, wanted, value,
+            gradient, self.left,
         )  # fmt: skip
         return torch.from_numpy(value), torch.from_numpy(gradient)
 

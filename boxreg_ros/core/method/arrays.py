@@ -201,6 +201,30 @@ class Posterior(NamedTuple):
     kinematics: Any
 
 
+class Quadratic(NamedTuple):
+    """
+    The quadratic form that replaces an observation (M13), in two poses and shared variables.
+
+    Attributes
+    ----------
+    state, step : array, shape (B, 29)
+        Where the residuals were linearised, and the step from there to the minimum.
+    information : array, shape (B, 29, 29)
+        Curvature.
+
+    """
+
+    state: Any
+    step: Any
+    information: Any
+
+
+def no_priors(B: int) -> Quadratic:
+    """Return room for what B windows leave."""
+    shapes = (B, PRIOR), (B, PRIOR), (B, PRIOR, PRIOR)
+    return Quadratic(*(np.full(shape, np.nan) for shape in shapes))
+
+
 class Solution(NamedTuple):
     """
     A batch that is being solved: the start of a round, then its end.
@@ -214,9 +238,8 @@ class Solution(NamedTuple):
         corrections by the points alone; their weights.
     posterior : Posterior
         Of windows that are done.
-    prior_state, prior_step, prior_information : array, shapes (B, 29), (B, 29), (B, 29, 29)
-        What full windows leave to the next ones (M13): linearisation point, step from there to
-        the minimum, information; NaN for others, no rows if it is not wanted.
+    left : Quadratic
+        What full windows leave to the next ones; NaN for others, no rows if it is not wanted.
 
     """
 
@@ -224,6 +247,4 @@ class Solution(NamedTuple):
     shared: Any
     evidence: Any
     posterior: Any
-    prior_state: Any
-    prior_step: Any
-    prior_information: Any
+    left: Quadratic

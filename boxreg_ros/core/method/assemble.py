@@ -422,22 +422,18 @@ def squared_norm(rows, W, r):
 
 
 @kernel
-def linearise(x, terms, common, free, at, out, gradient, A, factor):
+def factorise_free(A, free, factor):
     """
-    Return the value of the terms of one window; write gradient and factor of the curvature.
+    Write the factor of a matrix in the `free` variables (6 N + S,).
 
-    In the `free` variables. The factor of a matrix that is not positive definite is NaN.
+    That of one that is not positive definite is NaN.
 
     """
-    value = accumulate(x, len(terms), terms, common, at, out, gradient, A)
-    for k in range(len(x)):
-        gradient[k] *= free[k]
     fix_variables(A, free)
     if not factorise(A, factor):
         factor.own[:] = np.nan
         factor.coupling[:] = np.nan
         factor.corner[:] = np.nan
-    return value
 
 
 @loop

@@ -2,9 +2,11 @@
 One round of many windows, in the order of the paper's figure.
 
     [ observe faces ] -> expect -> weigh -> linearise -> [ L-BFGS ] -> settled? -> covariances
+                                                                               -> marginalise
 
 Faces are observed by `faces`. The search is `boxreg_ros.core.lbfgs`, for all windows at once; it
-calls `evaluate` and `precondition`.
+calls `evaluate` and `precondition`. Whatever sums residuals is one kernel, `evaluate`: it would be
+compiled once more for each other one.
 
 """
 
@@ -23,7 +25,7 @@ from boxreg_ros.core.method.assemble import (
     accumulate,
     empty_axes,
     empty_matrix,
-    linearise,
+    factorise_free,
     marginalise,
     no_matrix,
     weigh,
@@ -67,10 +69,9 @@ def empty_sums(B: int, N: int, S: int, prior_mean: Any, prior_information: Any) 
 
 
 @kernel
-def begin(first, last, rows, problem, inputs, free, constants, poses, shared, sums,
-          x, value, gradient):  # fmt: skip
+def begin(first, last, rows, problem, inputs, constants, poses, shared, sums, x):
     """
-    Begin a round of the windows `rows[first:last]`.
+    Begin a round of the windows `rows[first:last]`: expect and weigh.
 
     Parameters
     ----------
@@ -82,23 +83,20 @@ def begin(first, last, rows, problem, inputs, free, constants, poses, shared, su
         Input of the batch.
     inputs : array of `INPUTS`, shape (K,)
         Noise, margins and population of the input, by kind.
-    free : array, shape (B, 6 N + S)
-        1 for variables that are estimated, 0 for those held fixed.
     constants : array of one record of `Constants`, shape (1,)
         Of the method, with the settings.
     poses, shared : array, shapes (B, N, 6) and (B, S)
         Start of the round.
     sums : Sums
-        Of the batch, with the face observations and the rigid shape: the rest is written.
-    x, value, gradient : array, shapes (b, 6 N + S), (b,) and (b, 6 N + S)
-        Written: variables of the windows, and the sum of the residuals there.
+        Of the batch, with the face observations and the rigid shape: data and weights are written.
+    x : array, shape (b, 6 N + S)
+        Written: variables of the windows.
 
     """
     constants = constants[0]
     N = poses.shape[1]
     n = POSE * N
-    at, out, A = empty_axes(N), empty_linearised(), empty_matrix(N, shared.shape[1])
-    mean_extents = np.empty(SIZE)
+    at, out, mean_extents = empty_axes(N), empty_linearised(), np.empty(SIZE)
     for row in range(first, last):
         b = rows[row]
         shared[b, ANCHOR:] = 0.0
@@ -107,27 +105,51 @@ def begin(first, last, rows, problem, inputs, free, constants, poses, shared, su
         weigh(b, problem, poses[b], shared[b], constants, at, out, terms, common)
         copy(poses[b].ravel(), x[row, :n])
         copy(shared[b], x[row, n:])
-        value[row] = linearise(
-            x[row], terms, common, free[b], at, out, gradient[row], A,
-            factor_of_window(b, sums.factor),
-        )  # fmt: skip
+
+
+VALUE, CURVATURE, OLDEST = range(3)
+"""What `evaluate` writes beside value and gradient: nothing; the factor of the curvature; what the
+oldest observation leaves."""
 
 
 @kernel
-def evaluate(first, last, rows, x, free, sums, value, gradient):
+def evaluate(first, last, rows, x, free, sums, wanted, value, gradient, left):
     """
-    Write value (b,) and gradient (b, 6 N + S) of the windows `rows[first:last]` at `x`.
+    Sum the residuals of the windows `rows[first:last]`.
 
-    `free` and `sums` are as in `begin`.
+    Parameters
+    ----------
+    first, last, rows, sums
+        As in `begin`; the factor is written if the `CURVATURE` is wanted.
+    x : array, shape (b, 6 N + S)
+        Variables of the windows.
+    free : array, shape (B, 6 N + S)
+        1 for variables that are estimated, 0 for those held fixed.
+    wanted : int
+        `VALUE`, `CURVATURE`; or `OLDEST`: only the residuals of the oldest observation, which
+        become a prior (M13).
+    value, gradient : array, shapes (b,) and (b, 6 N + S)
+        Written; those of the oldest observation are only to work in.
+    left : Quadratic
+        Of the batch: written by the oldest observations.
 
     """
     D, N = x.shape[1], sums.terms.shape[1]
-    at, out, matrix = empty_axes(N), empty_linearised(), no_matrix()
+    at, out, A = empty_axes(N), empty_linearised(), no_matrix()
+    if wanted != VALUE:  # residuals of the oldest observation depend on three poses
+        A = empty_matrix(N if wanted == CURVATURE else 3, D - POSE * N)
     for row in range(first, last):
-        terms, common = sums.terms[rows[row]], sums.common[rows[row]]
-        value[row] = accumulate(x[row], N, terms, common, at, out, gradient[row], matrix)
+        b = rows[row]
+        terms, common = sums.terms[b], sums.common[b]
+        observations = 1 if wanted == OLDEST else N
+        value[row] = accumulate(x[row], observations, terms, common, at, out, gradient[row], A)
+        if wanted == OLDEST:
+            marginalise(x[row], gradient[row], A, left.state[b], left.step[b], left.information[b])
+            continue
         for k in range(D):
-            gradient[row, k] *= free[rows[row], k]
+            gradient[row, k] *= free[b, k]
+        if wanted == CURVATURE:
+            factorise_free(A, free[b], factor_of_window(b, sums.factor))
 
 
 @kernel
@@ -155,13 +177,12 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
     """
     End the round of the windows `rows[first:last]`.
 
-    Those that are done, since they are settled or the round `is_last`, have covariances and, if
-    they are full, leave a prior to the next window.
+    Those that are done, since they are settled or the round `is_last`, have covariances.
 
     Parameters
     ----------
     first, last, rows, problem, free, constants, sums
-        As in `begin`.
+        As in `begin` and `evaluate`.
     x : array, shape (b, 6 N + S)
         Minimum of each sum.
     solution : Solution
@@ -175,9 +196,6 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
     constants = constants[0]
     N, S = solution.poses.shape[1], solution.shared.shape[1]
     n = POSE * N
-    oldest = np.int64(1)  # for a literal 1 all that sums residuals would be compiled once more
-    at, out, gradient = empty_axes(N), empty_linearised(), np.empty(n + S)
-    first_three = empty_matrix(3, S)  # poses that residuals of the oldest observation depend on
     inverse = Inverse(np.empty((N, POSE, POSE)), np.empty((N, POSE, S + NEXT)))
     for row in range(first, last):
         b = rows[row]
@@ -199,9 +217,3 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
             b, problem, found, solution.shared[b], terms, common, free[b], inverse, factor.corner,
             constants, solution.posterior,
         )  # fmt: skip
-        if len(solution.prior_state) and problem.lengths[b] == N:
-            accumulate(x[row], oldest, terms, common, at, out, gradient, first_three)
-            marginalise(
-                x[row], gradient, first_three, solution.prior_state[b], solution.prior_step[b],
-                solution.prior_information[b],
-            )  # fmt: skip

@@ -106,17 +106,20 @@ class _Fit:
         self.inputs = model.inputs(config)
         self.batch: Batch = start(problem, config, plan, self.inputs)
         self.row = np.zeros(1, np.int64)
-        self.objective = Objective(self.row, self.batch.free, self.batch.sums)
+        self.objective = Objective(
+            self.row, self.batch.free, self.batch.sums, self.batch.solution.left
+        )
 
     def linearise(self) -> tuple[Tensor, float]:
         """Renew the sum where the solution is; return its variables (1, D) and its value."""
         problem, free, sums, solution = self.batch
-        x, value, gradient = np.empty_like(free), np.empty(1), np.empty_like(free)
+        x = np.empty_like(free)
         observe(self.batch, self.inputs, self.row, self.constants)
         method.begin(
-            0, 1, self.row, problem, self.inputs, free, self.constants.record(), solution.poses,
-            solution.shared, sums, x, value, gradient,
+            0, 1, self.row, problem, self.inputs, self.constants.record(), solution.poses,
+            solution.shared, sums, x,
         )  # fmt: skip
+        value, _ = self.objective.sum(x, method.CURVATURE)
         return torch.from_numpy(x), float(value[0])
 
     def deviations(self) -> Tensor:
