@@ -75,6 +75,8 @@ def _switches_of(first: str, second: str, tracks: Mapping[str, Centers]) -> list
     both = np.stack([centers[rows], other_centers[other_rows]], 1)  # (n, 2 tracks, 2)
     at = np.arange(NUM_BOXES, len(common) - NUM_BOXES + 1)  # first rows after a switch
     at = at[np.linalg.norm(both[at, 0] - both[at, 1], axis=1) < MOST_APART]
+    if not len(at):
+        return []
     seconds = (common - common[0]) * 1e-9
     middle = (seconds[at - 1] + seconds[at]) / 2
     before = _lines(seconds, both, at - NUM_BOXES, middle)

@@ -16,7 +16,7 @@ MAX_STEP = 1.0
 """Rates of change are not computed across longer gaps [s]."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class LabelTrack:
     """The valid labels of one track, by stamp."""
 
@@ -68,6 +68,7 @@ class LabelTrack:
         columns = stamps_ns[rows], boxes[rows], num_points[rows]
         return cls(track_id, class_name, config.kind(class_name), *columns)
 
+    @cached_property
     def steps(self) -> Steps:
         """Return the steps between consecutive boxes, without those across gaps."""
         seconds = np.diff(self.stamps_ns) * 1e-9

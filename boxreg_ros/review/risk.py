@@ -170,10 +170,11 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN_USUAL) -> Risk:
     losses['kept as in the input'] = np.where(is_kept, KEPT_LOSS, 0.0)
     losses['size unlike its class'] = _unlike(track, extents, usual)
     losses['id switch'] = np.full(len(is_kept), SWITCH_LOSS * _has_id_switch(track))
-    losses = {reason: _with_added(loss, track) for reason, loss in losses.items()}
-    parts = {reason: np.nan_to_num(loss) * REFERENCE_LENGTH / 2 for reason, loss in losses.items()}
-    total = np.sum(list(parts.values()), axis=0)
-    return Risk(total.clip(max=MAX_LOSS * REFERENCE_LENGTH / 2), parts)
+    parts = np.nan_to_num(_with_added(np.array([*losses.values()]), track)) * REFERENCE_LENGTH / 2
+    total = parts.sum(axis=0)
+    return Risk(
+        total.clip(max=MAX_LOSS * REFERENCE_LENGTH / 2), dict(zip(losses, parts, strict=True))
+    )
 
 
 def typical_parts(risks: Sequence[Risk]) -> dict[str, float]:
@@ -315,11 +316,12 @@ def _changes_of(part: Mapping[str, Any], class_name: str) -> TrackChanges:
 
 
 def _with_added(losses: Floats, track: TrackChanges) -> Floats:
-    """Return `losses` (n,) with the mean of the others for boxes that the input does not have."""
+    """Return `losses` (k, n) with the means of the others for boxes that the input lacks."""
     is_added = np.isin(track.status, ADDED)
-    if is_added.all():
+    if is_added.all() or not is_added.any():
         return losses
-    return np.where(is_added, losses[~is_added].mean(), losses)
+    known = np.compress(~is_added, losses, axis=1)
+    return np.where(is_added, known.mean(axis=1, keepdims=True), losses)
 
 
 def _extents(track: TrackChanges) -> Floats:

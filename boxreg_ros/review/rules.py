@@ -144,7 +144,7 @@ MIN_JUMP = 0.5
 )
 def _jump(track: LabelTrack) -> tuple[int, str] | None:
     """Find the largest jump."""
-    steps = track.steps()
+    steps = track.steps
     if len(steps.rows) < 2:
         return None
     change = np.linalg.norm(np.diff(steps.velocity[:, :2], axis=0), axis=1)
@@ -168,7 +168,7 @@ MIN_TURN = 0.1
 )
 def _spin(track: LabelTrack) -> tuple[int, str] | None:
     """Find the fastest turn of a vehicle or cyclist."""
-    steps = track.steps()
+    steps = track.steps
     if track.kind == PEDESTRIAN or not len(steps.rows):
         return None
     turn = np.abs(wrap_angle(np.diff(track.boxes[:, YAW])[steps.rows]))
@@ -193,7 +193,7 @@ SLIDING_STEPS = 5
 )
 def _sliding(track: LabelTrack) -> tuple[int, str] | None:
     """Find the place where a vehicle or cyclist slides fastest."""
-    steps = track.steps()
+    steps = track.steps
     if track.kind == PEDESTRIAN or len(steps.rows) < SLIDING_STEPS:
         return None
     yaw = track.boxes[steps.rows, YAW]
@@ -201,6 +201,8 @@ def _sliding(track: LabelTrack) -> tuple[int, str] | None:
     forward = np.abs(x * np.cos(yaw) + y * np.sin(yaw))
     sideways = np.abs(y * np.cos(yaw) - x * np.sin(yaw))
     excess = sideways - MAX_SLOPE * forward
+    if np.count_nonzero(excess > MAX_SIDEWAYS) <= SLIDING_STEPS // 2:
+        return None  # so that no median is, as in most tracks
     windows = np.lib.stride_tricks.sliding_window_view(excess, SLIDING_STEPS)
     medians = np.median(windows, axis=1)
     row = int(np.argmax(medians))
@@ -228,10 +230,13 @@ def _floating(tracks: Labels) -> Iterator[Violation]:
     bottom = boxes[:, Z] - boxes[:, HEIGHT] / 2
     reported: set[int] = set()
     order = np.argsort(stamps_ns, kind='stable')
-    starts = np.flatnonzero(np.diff(stamps_ns[order])) + 1
-    for rows in np.split(order, starts):
-        if len(rows) <= MIN_NEIGHBOURS or np.ptp(bottom[rows]) <= MAX_GROUND_OFFSET:
-            continue  # none can be off the median of the others
+    _, first = np.unique(stamps_ns[order], return_index=True)
+    groups = np.split(order, first[1:])
+    low, high = (end.reduceat(bottom[order], first) for end in (np.minimum, np.maximum))
+    # In others none can be off the median of its neighbours.
+    for rows in map(groups.__getitem__, np.flatnonzero(high - low > MAX_GROUND_OFFSET)):
+        if len(rows) <= MIN_NEIGHBOURS:
+            continue
         x, y = boxes[rows][:, [X, Y]].T
         near = np.hypot(np.subtract.outer(x, x), np.subtract.outer(y, y)) < NEIGHBOURHOOD
         np.fill_diagonal(near, False)
@@ -339,7 +344,7 @@ MIN_STEPS = 5
 )
 def _backward(track: LabelTrack) -> tuple[int, str] | None:
     """Find that a vehicle or cyclist moves backward most of the time."""
-    steps = track.steps()
+    steps = track.steps
     if track.kind == PEDESTRIAN or len(steps.rows) < MIN_STEPS:
         return None
     yaw = track.boxes[steps.rows, YAW]
