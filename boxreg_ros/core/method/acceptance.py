@@ -54,9 +54,9 @@ class _Room(NamedTuple):
 def count_held(b, n, problem, velocity, pose, extent, margin, room):
     """Return how many points of an observation are in a box, or less than `margin` outside."""
     moved, local, R = room
-    m, box = problem.counts[b, n], problem.boxes[b, n]
+    box = problem.boxes[b, n]
     fill_rotation(pose[3], pose[4], pose[5], R)
-    fill_moved(b, n, problem, velocity, moved)
+    m = fill_moved(b, n, problem, velocity, moved)
     shift = (pose[0] - box[0], pose[1] - box[1], pose[2] - box[2])
     to_box_axes(m, moved, shift, R, local)
     reach_x, reach_y, reach_z = (

@@ -25,6 +25,9 @@ TOP, BOTTOM = 4, 5
 """The face that is observed by the road, not by points of the object."""
 SPAN = 3 * POSE
 """Variables of the poses that a residual depends on at most."""
+LANES = 16
+"""Points of an observation are padded to a multiple of this. Derived: four vectors of 256 bits, as
+loops are compiled, which then leave no points to be taken one by one."""
 BOX_POSE = (0, 1, 2, 6, 7, 8)
 """Places of the pose in a box x y z length width height roll pitch yaw."""
 
@@ -163,12 +166,12 @@ def copy(values, target):
 
 @loop
 def most_points(counts):
-    """Return the most points of an observation, of `counts` (B, N); at least 1."""
+    """Return the most points of an observation, of `counts` (B, N), as a multiple of `LANES`."""
     most = 1
     for b in range(len(counts)):
         for n in range(counts.shape[1]):
             most = max(most, counts[b, n])
-    return most
+    return (most + LANES - 1) & -LANES
 
 
 @kernel

@@ -8,7 +8,7 @@ This is the correspondence search of every round.
 from math import ceil, inf, isfinite, isnan, sqrt
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, most_points, TOP
+from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, LANES, most_points, TOP
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
@@ -17,14 +17,14 @@ FACES = 5
 """Front, back, left, right, top: the bottom is observed by the road."""
 STRIP_AXIS = (1, 1, 0, 0, 1)
 """Box axis along which the strips of each of these lie side by side."""
-INDEX_BITS = 17
-"""Bits of the index of a point, below those of its depth. Derived: `sampling.points` is less."""
-DEPTH_UNITS = 2.0**40
-"""Units of a depth per metre. Derived: with the index and the sign, depths are within +-64 m."""
-NOWHERE = np.iinfo(np.int64).max
-"""Depth of points that are not on a face."""
+INDICES = 2**17
+"""Indices of points, below the units of a depth. Derived: `sampling.points` is less."""
+DEPTH_UNITS = 2.0**35
+"""Units of a depth per metre. Derived: with the index in 53 bits, those of a float, within 1 m."""
 ALWAYS_VISIBLE = 9.0
 """Tangent of the roof; that of the bottom is its negative."""
+FAR = 1e6
+"""Coordinates of padding [m]. Derived: near no box."""
 FAR_SENSOR = 1e6
 """Distance of an unknown sensor, over that of the centre of the points."""
 MIN_ALONG = 0.5
@@ -39,10 +39,11 @@ def fill_candidates(depth, m, constants, candidates):
     Those further behind the outermost one than `max_depth` are on another surface.
 
     """
-    limit = packed(constants.deepest - constants.max_depth, 0)
+    behind = packed(constants.max_depth)
+    limit = packed(constants.deepest) - behind
     for i in range(m):
         limit = min(limit, depth[i])
-    limit += packed(constants.max_depth, 0)
+    limit += behind
     count = 0
     for i in range(m):
         candidates[count] = depth[i]
@@ -51,9 +52,9 @@ def fill_candidates(depth, m, constants, candidates):
 
 
 @loop
-def packed(depth, index):
-    """Return a depth [m] and the index of a point as one integer: points are ordered by depth."""
-    return (np.int64(depth * DEPTH_UNITS) << INDEX_BITS) | index
+def packed(depth):
+    """Return a depth [m] as a whole number, to which the index of a point is added."""
+    return np.floor(depth * DEPTH_UNITS) * INDICES
 
 
 @loop
@@ -61,8 +62,9 @@ def fill_depths(m, half, level, constants, work):
     """
     Write how far inside of the expected surface of each face each of m points is, (5, M).
 
-    `packed` with their indices. Points that are beside a face, or too deep to be on it, are at
-    `NOWHERE`. Writes the strips (2, M) too; returns how many points are in and near the box.
+    `packed` with their indices: points are ordered by depth. Points that are beside a face, or too
+    deep to be on it, are at infinity. Writes the strips (2, M) too; returns how many points are in
+    and near the box.
 
     """
     local, excess, strip, depth = work.local, work.excess, work.strip, work.depth
@@ -83,8 +85,8 @@ def fill_depths(m, half, level, constants, work):
     for k in range(2):
         scale = strips / 2 / half[k]
         for i in range(m):
-            place = min(max((local[k, i] + half[k]) * scale, 0.0), strips - 1.0)
-            strip[k, i] = int(place)
+            place = (local[k, i] + half[k]) * scale
+            strip[k, i] = np.int32(min(max(0.0, place), strips - 1.0))  # 0 for NaN
     for face in range(FACES):
         axis = face // 2
         one = 1 if axis == 0 else 0
@@ -95,7 +97,7 @@ def fill_depths(m, half, level, constants, work):
             d = surface - sign * local[axis, i]
             counts = (excess[one, i] <= edge_margin) & (excess[other, i] <= edge_margin)
             counts &= (d >= -outside_margin) & (d < deepest)
-            depth[face, i] = packed(d, i) if counts else NOWHERE
+            depth[face, i] = packed(d) + work.index[i] if counts else inf
     return near
 
 
@@ -107,44 +109,47 @@ def outermost_points(m, wanted, constants, work, moments):
     Writes their second moments (5, 4, 4), how many stand for each face, and their mean depth.
 
     """
-    points, candidates = work.moved, work.candidates
-    best, mask = work.best, (1 << INDEX_BITS) - 1
+    points, candidates, best = work.moved, work.candidates, work.best
     for face in range(FACES):
         own_strip, depth = work.strip[STRIP_AXIS[face]], work.depth[face]
         count = fill_candidates(depth, m, constants, candidates)
-        best[:, :wanted] = NOWHERE
+        for s in range(len(best)):
+            for rank in range(wanted):
+                best[s, rank] = inf
         for candidate in range(count):
             point = candidates[candidate]
-            own = best[own_strip[point & mask]]
+            own = best[own_strip[np.int64(point) & (INDICES - 1)]]
             for place in range(wanted):  # without a branch: half would be predicted wrong
                 here = own[place]
                 own[place] = min(here, point)
                 point = max(here, point)
-        number = 0
-        total = 0.0
-        moment = moments[face]
-        moment[:] = 0.0
+        number, total = 0, 0.0
+        x, y, z, xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for s in range(len(best)):
             for rank in range(wanted):
                 point = best[s, rank]
-                if point == NOWHERE:
+                if point == inf:
                     break
                 number += 1
-                total += (point >> INDEX_BITS) / DEPTH_UNITS
-                i = point & mask
-                for a in range(3):
-                    for b in range(a, 3):
-                        moment[a, b] += points[a, i] * points[b, i]
-                    moment[a, 3] += points[a, i]
-        if number:
-            share = 1 / number
-            for a in range(3):
-                for b in range(a, 4):
-                    moment[a, b] *= share
-                    moment[b, a] = moment[a, b]
-            moment[3, 3] = 1.0
+                total += point
+                i = np.int64(point) & (INDICES - 1)
+                px, py, pz = points[0, i], points[1, i], points[2, i]
+                x += px
+                y += py
+                z += pz
+                xx += px * px
+                xy += px * py
+                xz += px * pz
+                yy += py * py
+                yz += py * pz
+                zz += pz * pz
+        share = 1 / max(number, 1)
+        rows = ((xx, xy, xz, x), (xy, yy, yz, y), (xz, yz, zz, z), (x, y, z, float(number)))
+        for a in range(4):
+            for b in range(4):
+                moments[face, a, b] = rows[a][b] * share
         work.number[face] = number
-        work.mean_depth[face] = total / max(number, 1)
+        work.mean_depth[face] = total * share / (DEPTH_UNITS * INDICES)
 
 
 @loop
@@ -263,7 +268,12 @@ def fill_velocity(poses, times, n, length, velocity):
 
 @loop
 def fill_moved(b, n, problem, velocity, moved):
-    """Write the points of one observation at the stamp of its box (M12), (3, M) [m]."""
+    """
+    Write the points of one observation at the stamp of its box (M12), (3, M) [m].
+
+    Returns their number with those that are `FAR`, which make it a multiple of `LANES`.
+
+    """
     first, stride, m = problem.first[b, n], problem.stride, problem.counts[b, n]
     for i in range(m):
         for k in range(3):
@@ -272,6 +282,11 @@ def fill_moved(b, n, problem, velocity, moved):
         for i in range(m):
             for k in range(3):
                 moved[k, i] -= velocity[k] * problem.delays[first + i * stride]
+    padded = (m + LANES - 1) & -LANES
+    for i in range(m, padded):
+        for k in range(3):
+            moved[k, i] = FAR
+    return padded
 
 
 @loop
@@ -311,6 +326,8 @@ class FaceWork(NamedTuple):
         Strip that each point lies in, along x and along y.
     depth : array, shape (5, M)
         See `fill_depths`.
+    index : array, shape (M,)
+        Of the points: 0, 1, 2 ...
     candidates : array, shape (M + 1,)
         Depths of the points that may be outermost on one face; the last place is for one that may
         not.
@@ -326,6 +343,7 @@ class FaceWork(NamedTuple):
     excess: Any
     strip: Any
     depth: Any
+    index: Any
     candidates: Any
     best: Any
     number: Any
@@ -337,10 +355,13 @@ def empty_face_work(problem, constants):
     """Return arrays for the observations of a batch."""
     M = most_points(problem.counts)
     size = ceil(max(constants.min_face_points, constants.outermost / constants.strips * M)) + 1
+    index = np.empty(M)
+    for i in range(M):
+        index[i] = i
     return FaceWork(
         np.empty((3, M)), np.empty((3, M)), np.empty((3, M)), np.empty((2, M), np.int32),
-        np.empty((FACES, M), np.int64), np.empty(M + 1, np.int64),
-        np.empty((constants.strips, size), np.int64), np.empty(FACES, np.int64), np.empty(FACES),
+        np.empty((FACES, M)), index, np.empty(M + 1), np.empty((constants.strips, size)),
+        np.empty(FACES, np.int64), np.empty(FACES),
     )  # fmt: skip
 
 
@@ -403,7 +424,6 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
     for k in range(3):
         half[k] = shared[EXTENT + k] / 2
     for n in range(length):
-        m = problem.counts[b, n]
         box, pose, origins = problem.boxes[b, n], poses[n], problem.origins[b, n]
         ground = problem.ground[b, n]
         term = terms[n]
@@ -421,7 +441,7 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
         if problem.is_moving:
             fill_velocity(poses, problem.times[b], n, length, velocity)
         fill_rotation(pose[3], pose[4], pose[5], R)
-        fill_moved(b, n, problem, velocity, work.moved)
+        m = fill_moved(b, n, problem, velocity, work.moved)
         to_box_axes(m, work.moved, shift, R, work.local)
         near = fill_depths(m, half, level, constants, work)
         share = constants.outermost / constants.strips

@@ -124,17 +124,16 @@ def fill_sums(b, problem, poses, half, constants, work):
     shift = np.empty(3)
     work.sums[:] = 0.0
     for n in range(len(poses)):
-        m = problem.counts[b, n]
         local = work.local[n]
         fill_rotation(poses[n, 3], poses[n, 4], poses[n, 5], R)
         for k in range(3):
             shift[k] = poses[n, k] - problem.boxes[b, n, k]
         if problem.is_moving:
             fill_velocity(poses, problem.times[b], n, problem.lengths[b], velocity)
-        fill_moved(b, n, problem, velocity, work.moved)
+        m = fill_moved(b, n, problem, velocity, work.moved)
         to_box_axes(m, work.moved, shift, R, local)
         fill_cells(m, local, half, constants.cells, work.cell[n])
-        for i in range(m):
+        for i in range(problem.counts[b, n]):
             moment = work.sums[work.cell[n, i]]
             p = (local[0, i], local[1, i], local[2, i], 1.0)
             for a in range(4):
