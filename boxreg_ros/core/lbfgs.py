@@ -20,7 +20,8 @@ SUFFICIENT_DECREASE = 1e-4
 """Part of the predicted decrease that a step must reach: c1 of Armijo's condition. Literature:
 Nocedal and Wright, Numerical Optimization, 2nd edition, section 3.1."""
 MIN_CURVATURE = 1e-10
-"""A pair with s'y below this part of |s||y| is left out of the history. Chosen: rounding."""
+"""A pair with s'y below this part of the predicted decrease is left out of the history. Chosen:
+rounding."""
 STEP_BOUNDS = (0.1, 0.5)
 """Bounds of a shortened step over the one before. Literature: Dennis and Schnabel, Numerical
 Methods for Unconstrained Optimization, section 6.3.2."""
@@ -64,19 +65,14 @@ class _Points(NamedTuple):
     value: Tensor
     gradient: Tensor
 
-    def of(self, rows: Ints) -> '_Points':
-        """Return those of `rows`, ascending."""
-        if len(rows) == len(self.x):
-            return self
-        index = torch.from_numpy(rows)
-        return _Points(*(part.index_select(0, index) for part in self))
+    def copy(self) -> '_Points':
+        """Return copies."""
+        return _Points(*(part.clone() for part in self))
 
-    def with_rows(self, rows: Ints, others: '_Points') -> '_Points':
-        """Return these with `others` in place of those of `rows`, ascending."""
-        if len(rows) == len(self.x):
-            return others
-        index, parts = torch.from_numpy(rows), zip(self, others, strict=True)
-        return _Points(*(part.index_copy(0, index, other) for part, other in parts))
+    def set_rows(self, rows: Ints, others: '_Points', chosen: Ints) -> None:
+        """Replace those of `rows` by those of `others` that are `chosen`."""
+        for part, other in zip(self, others, strict=True):
+            part.numpy()[rows] = other.numpy()[chosen]
 
 
 @np.errstate(all='ignore')  # numbers that are not finite have a status, or a shorter step
@@ -121,44 +117,47 @@ def minimize(
     evaluated.
 
     """
-    first = first or function(start, torch.from_numpy(np.arange(len(start))))
-    at = _Points(start, *first)
-    is_running = _are_finite(at)
-    status = np.where(is_running, int(Status.RUNNING), int(Status.FAILED))
+    at = _Points(start, *(first or function(start, torch.arange(len(start)))))
+    is_running = np.ones(len(start), bool)
+    status = np.full(len(start), int(Status.RUNNING))
     taken = np.zeros(len(start), int)
     pairs: list[CurvaturePair] = []
     for iteration in range(iterations):
-        step = -_two_loop(at.gradient, pairs, metric)
+        step = _two_loop(at.gradient, pairs, metric)
         step, slope = _downhill(step, at.gradient, is_scaled=bool(pairs) or metric is not None)
-        is_flat = -slope <= tolerance * (1 + np.abs(at.value.numpy()))
-        status[is_running & is_flat] = int(Status.CONVERGED)
-        is_running &= ~is_flat
+        value = at.value.numpy()
+        goes_on = slope > tolerance * (1 + np.abs(value))  # neither is NaN
+        ended = (is_running & ~goes_on).nonzero()[0]
+        if len(ended):
+            is_finite = np.isfinite(slope[ended] + value[ended])
+            status[ended] = np.where(is_finite, int(Status.CONVERGED), int(Status.FAILED))
+            is_running[ended] = False
         rows = is_running.nonzero()[0]
         if not len(rows):
             break
-        taken[rows] += 1
+        taken += is_running
         before = at
         at, stuck = _line_search(function, before, rows, step, slope)
         status[stuck] = int(Status.STUCK)
         is_running[stuck] = False
         if iteration + 1 < iterations:
-            pairs = [*pairs, _pair(before, at)][-history:]
+            pairs = [*pairs, _pair(before, at, slope)][-history:]
     return Minimum(at.x, at.value, status, taken)
 
 
 def _downhill(step: Tensor, gradient: Tensor, is_scaled: bool) -> tuple[Tensor, Floats]:
     """
-    Return steps (B, D), and the predicted changes of the values (B,).
+    Return steps (B, D) that are to be subtracted, and the predicted decreases of the values (B,).
 
     A step uphill is replaced by that along the gradient. Where the scale is unknown, a step has a
     length of 1 at most.
 
     """
     slope = _product(gradient, step)
-    is_downhill = slope < 0
+    is_downhill = slope > 0
     if not is_downhill.all():  # uphill, or not a number
-        step = torch.where(_column(is_downhill), step, -gradient)
-        slope = np.where(is_downhill, slope, -_product(gradient, gradient))
+        step = torch.where(_column(is_downhill), step, gradient)
+        slope = np.where(is_downhill, slope, _product(gradient, gradient))
     if not is_scaled:
         size = gradient.abs().sum(1).clamp(min=1.0)
         step = step / size[:, None]
@@ -175,31 +174,36 @@ def _line_search(
     The steps (B, D) and `slope` (B,), as those `before`, are of all rows; the others stay.
 
     """
-    found = before
-    if len(rows) < len(slope):
-        step, slope = step.index_select(0, torch.from_numpy(rows)), slope[rows]
+    found, x, value = before, before.x, before.value.numpy()
+    remaining = rows
     for _ in range(MAX_BACKTRACKS):
-        start = before.of(rows)
-        x = start.x + step
-        trial = _Points(x, *function(x, torch.from_numpy(rows)))
-        value, before_step = trial.value.numpy(), start.value.numpy()
-        is_good = (value <= before_step + SUFFICIENT_DECREASE * slope) & _are_finite(trial)
-        if is_good.all():
-            return found.with_rows(rows, trial), rows[:0]
-        good, others = is_good.nonzero()[0], (~is_good).nonzero()[0]
-        found = found.with_rows(rows[good], trial.of(good))
-        part = _shorter(slope, value - before_step)[others]
-        slope = part * slope[others]
-        step = _column(part) * step.index_select(0, torch.from_numpy(others))
-        rows = rows[others]
+        if len(remaining) < len(x):
+            index = torch.from_numpy(remaining)
+            x, step = x.index_select(0, index), step.index_select(0, index)
+            value, slope = value[remaining], slope[remaining]
+        reached = x - step
+        trial = _Points(reached, *function(reached, torch.from_numpy(rows)))
+        is_good = trial.value.numpy() <= value - SUFFICIENT_DECREASE * slope
+        good = is_good.nonzero()[0]
+        if len(good) == len(before.x):
+            return trial, rows[:0]
+        if found is before:
+            found = before.copy()
+        found.set_rows(rows[good], trial, good)
+        if len(good) == len(rows):
+            return found, rows[:0]
+        remaining = (~is_good).nonzero()[0]
+        rows = rows[remaining]
+        part = _shorter(slope, trial.value.numpy() - value)
+        step, slope = _column(part) * step, part * slope
     return found, rows
 
 
-def _pair(before: _Points, after: _Points) -> CurvaturePair:
+def _pair(before: _Points, after: _Points, slope: Floats) -> CurvaturePair:
     """Return the curvature pair of a step; of a row that did not move, one without effect."""
     s, y = after.x - before.x, after.gradient - before.gradient
     s_y = _product(s, y)
-    is_curved = s_y > MIN_CURVATURE * np.sqrt(_product(s, s) * _product(y, y))
+    is_curved = s_y > MIN_CURVATURE * slope
     return s, y, _column(np.divide(1, s_y, out=np.zeros(len(s_y)), where=is_curved))
 
 
@@ -214,15 +218,9 @@ def _column(numbers: NDArray[Any]) -> Tensor:
     return torch.from_numpy(numbers[:, None])
 
 
-def _are_finite(points: _Points) -> NDArray[np.bool_]:
-    """Return which points (b,) have a finite value and gradient; a sum of finite numbers is."""
-    total = points.value + points.gradient.sum(1)
-    return np.asarray(np.isfinite(total.numpy()))
-
-
 def _shorter(slope: Floats, rise: Floats) -> Floats:
     """Return parts (b,) of steps, by the parabola through the slope and the `rise` at the step."""
-    parabola = -slope / (2 * (rise - slope))
+    parabola = slope / (2 * (rise + slope))
     shortest, longest = STEP_BOUNDS
     part: Floats = np.fmin(np.fmax(parabola, shortest), longest)  # the shortest of NaN
     return part
@@ -234,7 +232,7 @@ def _two_loop(gradient: Tensor, pairs: list[CurvaturePair], metric: Metric | Non
     alphas = []
     for s, y, rho in reversed(pairs):
         alpha = rho * (s * q).sum(1, keepdim=True)
-        q = q - alpha * y
+        q = q.addcmul(alpha, y, value=-1)
         alphas.append(alpha)
     if metric is not None:
         q = metric(q)
@@ -243,5 +241,5 @@ def _two_loop(gradient: Tensor, pairs: list[CurvaturePair], metric: Metric | Non
         scale = 1 / (rho * y.square().sum(1, keepdim=True))
         q = q * torch.where(scale.isfinite(), scale, 1.0)
     for (s, y, rho), alpha in zip(pairs, reversed(alphas), strict=True):
-        q = q + s * (alpha - rho * (y * q).sum(1, keepdim=True))
+        q = q.addcmul(s, alpha - rho * (y * q).sum(1, keepdim=True))
     return q
