@@ -4,8 +4,10 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.method import constants
 from boxreg_ros.core.method.arrays import COMMON, EXTENT, GAP, PIVOT
 from boxreg_ros.core.method.covariance import (
+    empty_inverse,
     fill_extent_covariance,
     fill_face_distances,
+    fill_shared_covariance,
     fill_unclaimed,
 )
 from boxreg_ros.core.method.residuals import TERMS
@@ -64,8 +66,9 @@ def covariance_of(columns, free=1.0, G=None, deviation=0.0, variance=0.0):
     """Return the covariance of the extents by columns (23, 23) of the inverse curvature."""
     common, found = np.zeros((), COMMON)[()], np.empty((3, 3))
     common['deviation'], common['unclaimed'] = deviation, variance
-    G = np.zeros((PIVOT, PIVOT)) if G is None else G
-    fill_extent_covariance(columns, np.full(23, free), common, G, found)
+    G, inverse = np.zeros((PIVOT, PIVOT)) if G is None else G, empty_inverse(1, len(columns))
+    fill_shared_covariance(columns, G, inverse)
+    fill_extent_covariance(inverse.shared, np.full(23, free), common, found)
     return found
 
 

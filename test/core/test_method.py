@@ -5,6 +5,7 @@ from boxreg_ros.core.method.arrays import (
     Arrowhead,
     BLOCK,
     Factor,
+    LANES,
     PIVOT,
     POSE,
     PRIOR,
@@ -20,7 +21,7 @@ from boxreg_ros.core.method.arrowhead import (
 )
 from boxreg_ros.core.method.assemble import accumulate, empty_axes, marginalise, no_matrix
 from boxreg_ros.core.method.constants import RESIDUAL_NAMES
-from boxreg_ros.core.method.covariance import Inverse
+from boxreg_ros.core.method.covariance import empty_inverse, fill_shared_covariance
 from boxreg_ros.core.method.kinematics import fill_combination, RATES
 from boxreg_ros.core.method.residuals import (
     empty_linearised,
@@ -44,7 +45,8 @@ def matrix(N, S=SHARED):
 
 def empty_factor(N):
     """Return room for the factor of a window of N observations."""
-    shapes = (N, POSE, POSE), (N, POSE, SHARED + NEXT), (SHARED, SHARED)
+    width = -(-(SHARED + NEXT) // LANES) * LANES
+    shapes = (N, POSE, POSE), (N, POSE, width), (SHARED, SHARED)
     return Factor(*(np.empty(shape) for shape in shapes))
 
 
@@ -130,21 +132,24 @@ def test_the_factor_solves_and_inverts(is_held):
     solve(factor, found)
     np.testing.assert_allclose(whole @ found, right, atol=1e-6)
     inverse = np.linalg.inv(whole)
-    blocks, beside = np.empty((N, POSE, POSE)), np.empty((N, POSE, SHARED + NEXT))
-    invert_poses(factor, blocks, beside)
-    border, links = beside[:, :, :SHARED], beside[:, :, SHARED:]
-    np.testing.assert_allclose(factor.corner, inverse[6 * N :, 6 * N :], rtol=1e-6, atol=1e-9)
+    parts = empty_inverse(N, SHARED)
+    invert_poses(factor, parts.poses, parts.links, parts.response)
+    C, response = factor.corner, parts.response
+    np.testing.assert_allclose(C, inverse[6 * N :, 6 * N :], rtol=1e-6, atol=1e-9)
     for n in range(N):
         rows = slice(6 * n, 6 * n + 6)
-        np.testing.assert_allclose(blocks[n], inverse[rows, rows], rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(border[n], inverse[rows, 6 * N :], rtol=1e-6, atol=1e-9)
+        own = parts.poses[n] + response[n] @ C @ response[n].T
+        np.testing.assert_allclose(own, inverse[rows, rows], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(response[n] @ C, inverse[rows, 6 * N :], rtol=1e-6, atol=1e-9)
     for n in range(N - 2):
-        after = inverse[6 * n : 6 * n + 6, 6 * n + 6 : 6 * n + 18]
-        np.testing.assert_allclose(links[n], after, rtol=1e-6, atol=1e-9)
+        known = inverse[6 * n : 6 * n + 6, 6 * n + 6 : 6 * n + 18]
+        after = parts.links[n] + response[n] @ C @ response[n + 1 : n + 3].reshape(-1, SHARED).T
+        np.testing.assert_allclose(after, known, rtol=1e-6, atol=1e-9)
     # The covariance of a sum of three poses, with that of the gradient by shared variables.
     factors, G = np.array([2.0, -3.0, 0.5]), np.diag(np.linspace(0.1, 1.0, PIVOT))
-    found, rooms = np.empty((4, 4)), (np.empty((4, PIVOT)), np.empty(PIVOT))
-    fill_combination(2, factors, Inverse(blocks, beside), G, *rooms, found)
+    found = np.empty((4, 4))
+    fill_shared_covariance(C, G, parts)
+    fill_combination(2, factors, parts, np.empty((2, 4, SHARED)), found)
     J = np.hstack([factor * np.eye(6) for factor in factors])
     rows = slice(12, 30)
     through = (J @ inverse[rows, 6 * N :])[:, :PIVOT]
@@ -161,9 +166,10 @@ def test_a_weak_direction_of_a_strong_link_is_not_lost():
     A.poses['links'][0, :, : 2 * POSE] = np.hstack([link + np.eye(POSE), -link])
     A.poses['links'][1, :, :POSE] = link
     A.corner[:] = np.eye(SHARED)
-    factor, blocks = empty_factor(N), np.empty((N, POSE, POSE))
+    factor, inverse = empty_factor(N), empty_inverse(N, SHARED)
     assert factorise(A, factor)
-    invert_poses(factor, blocks, np.empty((N, POSE, SHARED + NEXT)))
+    invert_poses(factor, inverse.poses, inverse.links, inverse.response)
+    blocks = inverse.poses  # the shared variables have no part in them
     np.testing.assert_allclose(blocks[0], np.eye(POSE), atol=1e-6)
     np.testing.assert_allclose(blocks[1], np.eye(POSE) + axes * variances @ axes.T, atol=1e-6)
 

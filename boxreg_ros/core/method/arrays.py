@@ -26,8 +26,8 @@ TOP, BOTTOM = 4, 5
 SPAN = 3 * POSE
 """Variables of the poses that a residual depends on at most."""
 LANES = 16
-"""Points of an observation are padded to a multiple of this. Derived: four vectors of 256 bits, as
-loops are compiled, which then leave no points to be taken one by one."""
+"""Points of an observation, and columns of a coupling, are padded to a multiple of this. Derived:
+four vectors of 256 bits, as loops are compiled: then none are left to be taken one by one."""
 BOX_POSE = (0, 1, 2, 6, 7, 8)
 """Places of the pose in a box x y z length width height roll pitch yaw."""
 
@@ -141,7 +141,8 @@ class Factor(NamedTuple):
     own : array, shape (B, N, 6, 6)
         Inverse of the block of each pose, without the poses before it.
     coupling : array, shape (B, N, 6, S + 12)
-        Regression of each pose on the variables after it: the shared ones, and two poses.
+        Regression of each pose on the variables after it: the shared ones, and two poses. Padded
+        with zeros to a multiple of `LANES`.
     corner : array, shape (B, S, S)
         Inverse of the block of the shared variables, without the poses.
 

@@ -10,7 +10,7 @@ numba unrolls short loops into scalars.
 
 from math import sqrt
 
-from boxreg_ros.core.method.arrays import copy, PIVOT, POSE, SPAN
+from boxreg_ros.core.method.arrays import copy, LANES, PIVOT, POSE
 from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
 
@@ -112,36 +112,92 @@ def invert(rows):
 
 
 @loop
-def fill_rows(block, S, rows):
-    """Write the block of a pose, and less what it is coupled to, (6, S + 18)."""
-    links, border = block.links, block.border
+def factorise_block(links, triangle):
+    """
+    Write the factor L D L' of the block of a pose, from its `links` (6, 18).
+
+    L without its ones, and 1 / D, (6, 6). Returns False if it is not positive definite.
+
+    """
     for a in range(POSE):
-        for c in range(POSE):
-            rows[a, c] = links[min(a, c), max(a, c)]
-        for s in range(S):
-            rows[a, POSE + s] = -border[a, s]
-        for c in range(NEXT):
-            rows[a, POSE + S + c] = -links[a, POSE + c]
+        for b in range(a + 1):
+            triangle[a, b] = links[b, a]
+    for k in range(POSE):
+        if not triangle[k, k] > 0.0:
+            return False
+        triangle[k, k] = 1.0 / triangle[k, k]
+        for a in range(k + 1, POSE):
+            factor = triangle[a, k] * triangle[k, k]
+            for b in range(k + 1, a + 1):
+                triangle[a, b] -= factor * triangle[b, k]
+        for a in range(k + 1, POSE):
+            triangle[a, k] *= triangle[k, k]
+    return True
 
 
 @loop
-def keep(rows, block, own, coupling, after, border):
-    """Write the factor of a pose from its `rows`, and what it is coupled to, from its block."""
-    rest = coupling.shape[1]
+def divide(x, triangle):
+    """
+    Replace right sides `x` (6, m) by the solutions of L D L' x = b, see `factorise_block`.
+
+    Written out, since loops within that over the right sides would keep it from being compiled to
+    vector instructions. A product with the inverse would have an error larger by the condition
+    number of the matrix.
+
+    """
+    L10 = triangle[1, 0]
+    L20, L21 = triangle[2, 0], triangle[2, 1]
+    L30, L31, L32 = triangle[3, 0], triangle[3, 1], triangle[3, 2]
+    L40, L41, L42, L43 = triangle[4, 0], triangle[4, 1], triangle[4, 2], triangle[4, 3]
+    L50, L51, L52, L53, L54 = (
+        triangle[5, 0], triangle[5, 1], triangle[5, 2], triangle[5, 3], triangle[5, 4]
+    )  # fmt: skip
+    d0, d1, d2 = triangle[0, 0], triangle[1, 1], triangle[2, 2]
+    d3, d4, d5 = triangle[3, 3], triangle[4, 4], triangle[5, 5]
+    for j in range(x.shape[1]):
+        x0 = x[0, j]
+        x1 = x[1, j] - L10 * x0
+        x2 = x[2, j] - L20 * x0 - L21 * x1
+        x3 = x[3, j] - L30 * x0 - L31 * x1 - L32 * x2
+        x4 = x[4, j] - L40 * x0 - L41 * x1 - L42 * x2 - L43 * x3
+        x5 = x[5, j] - L50 * x0 - L51 * x1 - L52 * x2 - L53 * x3 - L54 * x4
+        x5 = d5 * x5
+        x4 = d4 * x4 - L54 * x5
+        x3 = d3 * x3 - L43 * x4 - L53 * x5
+        x2 = d2 * x2 - L32 * x3 - L42 * x4 - L52 * x5
+        x1 = d1 * x1 - L21 * x2 - L31 * x3 - L41 * x4 - L51 * x5
+        x0 = d0 * x0 - L10 * x1 - L20 * x2 - L30 * x3 - L40 * x4 - L50 * x5
+        x[0, j], x[1, j], x[2, j], x[3, j], x[4, j], x[5, j] = x0, x1, x2, x3, x4, x5
+
+
+@loop
+def fill_sides(block, S, own, coupling):
+    """Write the right sides of a pose: the identity, and less what it is coupled to."""
     for a in range(POSE):
-        for c in range(POSE):
-            own[a, c] = rows[a, c]
-        for r in range(rest):
-            coupling[a, r] = rows[a, POSE + r]
+        for b in range(POSE):
+            own[a, b] = 1.0 if a == b else 0.0
+        for s in range(S):
+            coupling[a, s] = -block.border[a, s]
         for c in range(NEXT):
-            after[a, c] = block.links[a, POSE + c]
-        for s in range(rest - NEXT):
-            border[a, s] = block.border[a, s]
+            coupling[a, S + c] = -block.links[a, POSE + c]
+        for r in range(S + NEXT, coupling.shape[1]):
+            coupling[a, r] = 0.0
+
+
+@loop
+def fill_change(links, coupling, change):
+    """Write the product of what the next poses are coupled to, and of their `coupling`."""
+    for c in range(NEXT):
+        for r in range((coupling.shape[1] + LANES - 1) & -LANES):
+            total = 0.0
+            for a in range(POSE):
+                total += links[a, POSE + c] * coupling[a, r]
+            change[c, r] = total
 
 
 @loop
 def subtract(change, S, first, second):
-    """Add the `change` (12, S + 12) of the two poses after one."""
+    """Add the `change` (12, S + 12 or more) of the two poses after one."""
     for a in range(POSE):
         for c in range(NEXT):
             first.links[a, c] += change[a, S + c]
@@ -161,22 +217,25 @@ def eliminate_poses(A, factor):
 
     """
     N, S = len(factor.own), len(A.corner)
-    rows, after = np.empty((POSE, SPAN + S)), np.empty((POSE, NEXT))
-    change, border = np.empty((NEXT, S + NEXT)), np.empty((N, POSE, S))
+    triangle, change = np.empty((POSE, POSE)), np.empty((NEXT, factor.coupling.shape[2]))
+    border, columns = np.empty((POSE * N, S)), np.empty((POSE * N, S))
     for pose in range(N):
         block, own, coupling = A.poses[pose], factor.own[pose], factor.coupling[pose]
-        fill_rows(block, S, rows)
-        if not invert(rows):
+        if not factorise_block(block.links, triangle):
             return False
-        keep(rows, block, own, coupling, after, border[pose])
-        np.dot(after.T, coupling, change)
+        fill_sides(block, S, own, coupling)
+        divide(own, triangle)
+        divide(coupling, triangle)
+        fill_change(block.links, coupling, change)
         subtract(change, S, A.poses[pose + 1], A.poses[pose + 2])
-    columns = factor.coupling.reshape(POSE * N, S + NEXT)
-    change = np.empty((S, S + NEXT))
-    np.dot(border.reshape(POSE * N, S).T, columns, change)
+        for a in range(POSE):
+            copy(block.border[a], border[POSE * pose + a])
+            copy(coupling[a], columns[POSE * pose + a])
+    of_corner = np.empty((S, S))
+    np.dot(border.T, columns, of_corner)
     for s in range(S):
         for t in range(s, S):
-            A.corner[s, t] += change[s, t]
+            A.corner[s, t] += of_corner[s, t]
     return True
 
 
@@ -197,19 +256,20 @@ def substitute_forward(factor, x, rest):
     """
     Eliminate the poses of a factor from a right side (6 N + S,).
 
-    The last poses are coupled to one pose after them or none. `rest` (S + 12,) is to work in: what
-    a pose is coupled to.
+    The last poses are coupled to one pose after them or none. `rest`, as long as a coupling is
+    wide, is to work in: what a pose is coupled to.
 
     """
     S = len(factor.corner)
     end = len(x) - S
+    rest[:] = 0.0
     for s in range(S):
         rest[s] = x[end + s]
     for pose in range(len(factor.own)):
         coupling, own, after = factor.coupling[pose], x[POSE * pose :], POSE * (pose + 1)
         for c in range(NEXT):
             rest[S + c] = x[after + c] if after + c < end else 0.0
-        for r in range(len(rest)):  # loops of unknown length are not unrolled into scalars
+        for r in range((len(rest) + LANES - 1) & -LANES):
             total = 0.0
             for a in range(POSE):
                 total += coupling[a, r] * own[a]
@@ -235,7 +295,7 @@ def substitute_backward(factor, x, rest, found):
             total = 0.0
             for b in range(POSE):
                 total += own[a, b] * right[b]
-            for r in range(len(rest)):
+            for r in range((len(rest) + LANES - 1) & -LANES):
                 total += coupling[a, r] * rest[r]
             found[a] = total
         for a in range(POSE):
@@ -256,55 +316,68 @@ def solve(factor, x):
 
 
 @loop
-def shift_known(known, own, beside):
+def shift_known(known, own, links, response):
     """
-    Move the known part of the inverse (S + 12, S + 12) to the pose before.
+    Move what is known of two poses (12, 12 + S or more) to the pose before.
 
-    Its own block is (6, 6), that with the variables after it (6, S + 12).
+    Their covariances, where the shared variables are held, and their `response` to these.
 
     """
-    S = len(known) - NEXT
-    second = S + POSE
     for a in range(POSE):
         for c in range(POSE):
-            known[second + a, second + c] = known[S + a, S + c]
-            known[S + a, S + c] = own[a, c]
-            known[S + a, second + c] = beside[a, S + c]
-            known[second + c, S + a] = beside[a, S + c]
-        for s in range(S):
-            known[second + a, s] = known[S + a, s]
-            known[s, second + a] = known[S + a, s]
-            known[S + a, s] = beside[a, s]
-            known[s, S + a] = beside[a, s]
+            known[POSE + a, POSE + c] = known[a, c]
+            known[a, c] = own[a, c]
+            known[a, POSE + c] = known[POSE + c, a] = links[a, c]
+        for s in range(response.shape[1]):
+            known[POSE + a, NEXT + s] = known[a, NEXT + s]
+            known[a, NEXT + s] = response[a, s]
 
 
 @kernel
-def invert_poses(factor, blocks, beside):
+def invert_poses(factor, blocks, links, response):
     """
-    Write the blocks of the poses in the inverse.
+    Write the blocks of the poses in the inverse, where the shared variables are held.
 
-    Their own, (N, 6, 6), and those with the shared variables and the two poses after,
-    (N, 6, S + 12).
+    Their own, (N, 6, 6), and those with the two poses after, (N, 6, 12); and the `response` of
+    each pose to the shared variables, (N, 6, S). With C, the covariance of these, the covariance
+    of two poses is their block and T C T' of their responses T, that with the shared ones is T C.
 
-    The blocks of the inverse Z within the pattern of A follow from the last pose backward
-    (Takahashi), beginning with that of the shared variables. With r those and the two poses after
-    p, and the coupling W: Z_pr = W Z_rr, and Z_pp is the inverse of its own block + Z_pr W'.
+    The blocks Z within the pattern of A follow from the last pose backward (Takahashi). With r the
+    two poses after p, and its couplings W to them, B to the shared: Z_pr = W Z_rr, Z_pp is the
+    inverse of its own block + Z_pr W', and T_p = B + W T_r.
 
     """
     S = len(factor.corner)
-    known = np.zeros((S + NEXT, S + NEXT))  # Z_rr
-    for s in range(S):
-        for t in range(S):
-            known[s, t] = factor.corner[s, t]
-    own = np.empty((POSE, POSE))
+    known = np.zeros((NEXT, (NEXT + S + LANES - 1) & -LANES))  # Z_rr, T_r
+    after, product = np.empty((POSE, NEXT)), np.empty((POSE, known.shape[1]))
     for pose in range(len(blocks) - 1, -1, -1):
-        coupling = factor.coupling[pose]
-        np.dot(coupling, known, beside[pose])
-        np.dot(beside[pose], coupling.T, own)
+        coupling, own = factor.coupling[pose], factor.own[pose]
         for a in range(POSE):
-            for b in range(POSE):
-                blocks[pose, a, b] = factor.own[pose, a, b] + (own[a, b] + own[b, a]) / 2
-        shift_known(known, blocks[pose], beside[pose])
+            for c in range(NEXT):
+                after[a, c] = coupling[a, S + c]
+        multiply(after, known, product)
+        for a in range(POSE):
+            for c in range(NEXT):
+                links[pose, a, c] = product[a, c]
+            for s in range(S):
+                response[pose, a, s] = coupling[a, s] + product[a, NEXT + s]
+            for b in range(a, POSE):
+                total = own[a, b]
+                for c in range(NEXT):
+                    total += product[a, c] * after[b, c]
+                blocks[pose, a, b] = blocks[pose, b, a] = total
+        shift_known(known, blocks[pose], links[pose], response[pose])
+
+
+@loop
+def multiply(after, known, product):
+    """Write the product of a matrix (6, 12) and one whose width is a multiple of `LANES`."""
+    for a in range(POSE):
+        for r in range((known.shape[1] + LANES - 1) & -LANES):
+            total = 0.0
+            for c in range(NEXT):
+                total += after[a, c] * known[c, r]
+            product[a, r] = total
 
 
 @loop

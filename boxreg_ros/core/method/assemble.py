@@ -14,6 +14,7 @@ from boxreg_ros.core.method.arrays import (
     EXTENT,
     Factor,
     GAP,
+    LANES,
     POSE,
     PRIOR,
 )
@@ -471,10 +472,11 @@ def marginalise(x, gradient, A, mean, step, information):
     copy(x[n:], mean[NEXT:])
     for a in range(POSE):
         A.poses[0].links[a, a] += RIDGE
-    oldest = Factor(np.empty((1, POSE, POSE)), np.empty((1, POSE, S + NEXT)), np.empty((S, S)))
+    width = (S + NEXT + LANES - 1) & -LANES
+    oldest = Factor(np.empty((1, POSE, POSE)), np.empty((1, POSE, width)), np.empty((S, S)))
     is_definite = eliminate_poses(A, oldest)
     fill_dense(A, information)
-    substitute_forward(oldest, gradient, np.empty(S + NEXT))
+    substitute_forward(oldest, gradient, np.empty(width))
     for k in range(PRIOR):
         step[k] = -gradient[POSE + k if k < NEXT else n + k - NEXT]
     triangle = information.copy()

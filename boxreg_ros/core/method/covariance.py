@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.arrays import copy, EXTENT, GAP, PIVOT, POSE
-from boxreg_ros.core.method.arrowhead import add_sandwich
+from boxreg_ros.core.method.arrowhead import add_sandwich, NEXT
 from boxreg_ros.core.method.compile import kernel
 from boxreg_ros.core.method.expectation import FACES, HEADING, SIZE
 from boxreg_ros.core.method.kinematics import fill_kinematics
@@ -17,19 +17,33 @@ MIN_DURATION = 1e-3
 
 class Inverse(NamedTuple):
     """
-    Blocks of the inverse curvature of one window.
+    The inverse curvature of one window.
 
     Attributes
     ----------
-    poses : array, shape (N, 6, 6)
-        Of each pose.
-    beside : array, shape (N, 6, S + 12)
-        Of each pose with the shared variables and the two poses after it.
+    poses, links, response : array, shapes (N, 6, 6), (N, 6, 12) and (N, 6, S)
+        See `arrowhead.invert_poses`.
+    shared : array, shape (S, S)
+        Covariance of the shared variables, with the errors that no weight claims (M28).
+    beside : array, shape (N, 6, S)
+        That of each pose with them: its response times `shared`.
 
     """
 
     poses: Any
+    links: Any
+    response: Any
+    shared: Any
     beside: Any
+
+
+@kernel
+def empty_inverse(N, S):
+    """Return room for the inverse of a window of N observations."""
+    return Inverse(
+        np.empty((N, POSE, POSE)), np.empty((N, POSE, NEXT)), np.empty((N, POSE, S)),
+        np.empty((S, S)), np.empty((N, POSE, S)),
+    )  # fmt: skip
 
 
 @kernel
@@ -83,14 +97,26 @@ def fill_unclaimed(length, marginalised, terms, common, shape, constants, G):
 
 
 @kernel
-def fill_pose_covariances(length, times, poses, inverse, G, constants, found):
+def fill_shared_covariance(corner, G, inverse):
+    """Write covariances of the shared variables, by their block (S, S) of the inverse and `G`."""
+    S = len(corner)
+    copy(corner.ravel(), inverse.shared.ravel())
+    add_sandwich(corner, G, np.empty(PIVOT), inverse.shared)
+    np.dot(inverse.response.reshape(-1, S), inverse.shared, inverse.beside.reshape(-1, S))
+
+
+@kernel
+def fill_pose_covariances(length, times, poses, inverse, constants, found):
     """Write the covariances of the poses, (N, 6, 6)."""
-    shift, through = np.zeros(3), np.empty(PIVOT)
+    shift = np.zeros(3)
     for n in range(len(poses)):
+        beside, response = inverse.beside[n], inverse.response[n]
         for i in range(POSE):
-            for j in range(POSE):
-                found[n, i, j] = inverse.poses[n, i, j]
-        add_sandwich(inverse.beside[n], G, through, found[n])
+            for j in range(i, POSE):
+                total = inverse.poses[n, i, j]
+                for s in range(beside.shape[1]):
+                    total += beside[i, s] * response[j, s]
+                found[n, i, j] = found[n, j, i] = total
         found[n, HEADING, HEADING] += constants.heading_deviation**2
         if n >= length:
             continue
@@ -106,15 +132,11 @@ def fill_pose_covariances(length, times, poses, inverse, G, constants, found):
 
 
 @kernel
-def fill_extent_covariance(corner, free, common, G, found):
+def fill_extent_covariance(covariance, free, common, found):
     """Write the covariance of the extents, (3, 3); held ones have the errors of the input."""
-    rows = corner[EXTENT : EXTENT + SIZE]
-    for i in range(SIZE):
-        copy(rows[i, EXTENT:], found[i])
-    add_sandwich(rows, G, np.empty(PIVOT), found)
     for i in range(SIZE):
         for j in range(SIZE):
-            found[i, j] *= free[EXTENT + i] * free[EXTENT + j]
+            found[i, j] = covariance[EXTENT + i, EXTENT + j] * free[EXTENT + i] * free[EXTENT + j]
         variance = common.deviation[EXTENT + i] ** 2 + common.unclaimed[EXTENT + i]
         found[i, i] += (1 - free[EXTENT + i]) * variance
 
@@ -138,7 +160,7 @@ def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, corn
     free : array, shape (6 N + S,)
         1 for variables that are estimated, 0 for those held fixed.
     inverse : Inverse
-        Blocks of its inverse curvature.
+        Of its curvature; what depends on the shared variables is written.
     corner : array, shape (S, S)
         That of the shared variables.
     constants : record of `Constants`
@@ -153,8 +175,9 @@ def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, corn
     fill_face_distances(problem.boxes[b], poses, shared, common.shared, terms, R, distances)
     marginalised = problem.marginalised_extents[b, 3]
     fill_unclaimed(length, marginalised, terms, common, shape, constants, G)
-    fill_pose_covariances(length, problem.times[b], poses, inverse, G, constants, found.poses[b])
-    fill_extent_covariance(corner, free_shared, common, G, found.extents[b])
+    fill_shared_covariance(corner, G, inverse)
+    fill_pose_covariances(length, problem.times[b], poses, inverse, constants, found.poses[b])
+    fill_extent_covariance(inverse.shared, free_shared, common, found.extents[b])
     forward, sideways, _ = problem.of_class[b].motion
     deviations = np.array((forward, sideways, constants.vertical))
-    fill_kinematics(length, problem.times[b], poses, deviations, inverse, G, found.kinematics[b])
+    fill_kinematics(length, problem.times[b], poses, deviations, inverse, found.kinematics[b])

@@ -1,7 +1,6 @@
 """Velocity (M26a) and acceleration (M26b) of the boxes of one window, and their covariances."""
 
-from boxreg_ros.core.method.arrays import PIVOT, POSE
-from boxreg_ros.core.method.arrowhead import add_sandwich, NEXT
+from boxreg_ros.core.method.arrays import POSE
 from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
 
@@ -17,38 +16,46 @@ Measured: with less, final accelerations err by more than zero does.
 
 
 @loop
-def fill_combination(first, factors, inverse, G, border, through, found):
+def fill_combination(first, factors, inverse, rows, found):
     """
     Write the covariance (4, 4) of the sum of `factors` times three poses, from `first` on.
 
-    Of their variables `RATES`. `border` (4, 15) and `through` (15,) are to work in.
+    Of their variables `RATES`. `rows` (2, 4, S) are to work in.
 
     """
-    first_link = inverse.beside.shape[2] - NEXT
+    for i in range(len(RATES)):
+        combine(first, factors, inverse.beside, RATES[i], rows[0, i])
+        combine(first, factors, inverse.response, RATES[i], rows[1, i])
     for i in range(len(RATES)):
         k = RATES[i]
-        for s in range(PIVOT):
-            border[i, s] = (
-                factors[0] * inverse.beside[first, k, s]
-                + factors[1] * inverse.beside[first + 1, k, s]
-                + factors[2] * inverse.beside[first + 2, k, s]
-            )
         for j in range(i, len(RATES)):
             m = RATES[j]
             total = 0.0
+            for s in range(rows.shape[2]):
+                total += rows[0, i, s] * rows[1, j, s]
             for a in range(3):
                 total += factors[a] ** 2 * inverse.poses[first + a, k, m]
-                beside = inverse.beside[first + a]
+                links = inverse.links[first + a]
                 for b in range(a + 1, 3):
-                    of_other = first_link + POSE * (b - a - 1)
-                    both = beside[k, of_other + m] + beside[m, of_other + k]
+                    of_other = POSE * (b - a - 1)
+                    both = links[k, of_other + m] + links[m, of_other + k]
                     total += factors[a] * factors[b] * both
             found[i, j] = found[j, i] = total
-    add_sandwich(border, G, through, found)
+
+
+@loop
+def combine(first, factors, values, k, row):
+    """Write the sum of `factors` times the rows (S,) of variable `k` of three poses."""
+    for s in range(len(row)):
+        row[s] = (
+            factors[0] * values[first, k, s]
+            + factors[1] * values[first + 1, k, s]
+            + factors[2] * values[first + 2, k, s]
+        )
 
 
 @kernel
-def fill_kinematics(length, times, poses, deviations, inverse, G, found):
+def fill_kinematics(length, times, poses, deviations, inverse, found):
     """
     Write velocity and acceleration of the boxes of a window, (N,) records `KINEMATICS`.
 
@@ -65,15 +72,13 @@ def fill_kinematics(length, times, poses, deviations, inverse, G, found):
     deviations : array, shape (3,)
         Of accelerations forward, sideways and upward (M23) [m/s^2].
     inverse : Inverse
-        Blocks of the inverse curvature.
-    G : array, shape (15, 15)
-        As of `covariance.fill_unclaimed`.
+        The inverse curvature.
     found : array, shape (N,)
         Written.
 
     """
     of_change, of_rate, factors = np.empty((4, 4)), np.empty((4, 4)), np.empty(3)
-    border, through = np.empty((4, PIVOT)), np.empty(PIVOT)
+    rows = np.empty((2, len(RATES), inverse.response.shape[2]))
     prior = 0.0
     for i in range(3):
         prior += deviations[i] ** 2
@@ -89,7 +94,7 @@ def fill_kinematics(length, times, poses, deviations, inverse, G, found):
         factors[0], factors[2] = 2 / (before * duration), 2 / (after * duration)
         factors[1] = -factors[0] - factors[2]
         if is_new:
-            fill_combination(first, factors, inverse, G, border, through, of_change)
+            fill_combination(first, factors, inverse, rows, of_change)
         for i in range(3):
             middle = poses[first + 1, i]
             own.acceleration[i] = factors[0] * (poses[first, i] - middle)
@@ -100,7 +105,7 @@ def fill_kinematics(length, times, poses, deviations, inverse, G, found):
 
         factors[0], factors[1], factors[2] = -1 / duration, 0.0, 1 / duration
         if is_new:
-            fill_combination(first, factors, inverse, G, border, through, of_rate)
+            fill_combination(first, factors, inverse, rows, of_rate)
         is_finite = True
         for i in range(4):
             rate = (poses[last, RATES[i]] - poses[first, RATES[i]]) / duration

@@ -18,6 +18,7 @@ from boxreg_ros.core.method.arrays import (
     copy,
     Factor,
     factor_of_window,
+    LANES,
     POSE,
 )
 from boxreg_ros.core.method.arrowhead import invert_poses, NEXT, solve
@@ -31,7 +32,7 @@ from boxreg_ros.core.method.assemble import (
     weigh,
 )
 from boxreg_ros.core.method.compile import kernel
-from boxreg_ros.core.method.covariance import fill_posterior, Inverse
+from boxreg_ros.core.method.covariance import empty_inverse, fill_posterior
 from boxreg_ros.core.method.expectation import expect, fill_evidence, SIZE
 from boxreg_ros.core.method.residuals import empty_linearised, TERMS
 import numpy as np
@@ -62,8 +63,9 @@ def empty_sums(B: int, N: int, S: int, prior_mean: Any, prior_information: Any) 
     common = np.empty(B, COMMON)
     common['prior_mean'] = prior_mean
     common['W_prior'] = prior_information
+    width = -(-(S + NEXT) // LANES) * LANES
     factor = Factor(
-        np.empty((B, N, POSE, POSE)), np.empty((B, N, POSE, S + NEXT)), np.empty((B, S, S))
+        np.empty((B, N, POSE, POSE)), np.empty((B, N, POSE, width)), np.empty((B, S, S))
     )
     return Sums(np.empty((B, N), TERMS), common, factor)
 
@@ -196,7 +198,7 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
     constants = constants[0]
     N, S = solution.poses.shape[1], solution.shared.shape[1]
     n = POSE * N
-    inverse = Inverse(np.empty((N, POSE, POSE)), np.empty((N, POSE, S + NEXT)))
+    inverse = empty_inverse(N, S)
     for row in range(first, last):
         b = rows[row]
         terms, common, factor = sums.terms[b], sums.common[b], factor_of_window(b, sums.factor)
@@ -212,7 +214,7 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
         )  # fmt: skip
         if not is_done[row]:
             continue
-        invert_poses(factor, inverse.poses, inverse.beside)
+        invert_poses(factor, inverse.poses, inverse.links, inverse.response)
         fill_posterior(
             b, problem, found, solution.shared[b], terms, common, free[b], inverse, factor.corner,
             constants, solution.posterior,
