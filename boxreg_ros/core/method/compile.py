@@ -10,7 +10,7 @@ from typing import Any
 from warnings import warn
 
 import numba
-from numba.core import event
+from numba.core import event, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
 
@@ -22,6 +22,18 @@ IMPORTED = re.compile(r'^from [\w.]*?(\w+) import', re.MULTILINE)
 
 DIGEST_LENGTH = 12
 """Letters of the digest of the sources. Chosen: 48 bits."""
+
+UNUSED_PASSES = {
+    'WithLifting', 'InlineClosureLikes', 'RewriteSemanticConstants', 'RewriteDynamicRaises',
+    'MakeFunctionToJitFunction', 'InlineInlinables', 'FindLiterallyCalls', 'InlineOverloads',
+    'NopythonRewrites',
+}  # fmt: skip
+"""
+Passes of numba that are left out.
+
+They are for what no kernel has: `with`, inner functions and generators, errors with arguments,
+arguments that have to be literal, functions to be inlined by numba, and sums of whole arrays.
+"""
 
 
 class _CollectionsAfterwards(event.Listener):
@@ -127,12 +139,46 @@ class _QuickFlags(Flags):
         return hash(frozenset(self._values))
 
 
+def _keep_operators(context: Any) -> None:
+    """
+    Let the context of types find the result of an operator once for each types of operands.
+
+    Numba tries all forms of an operator, a dozen, at each place where a kernel has one.
+
+    """
+    resolve, kept = context.resolve_function_type, {}
+
+    def kept_or_resolved(func: Any, args: Any, kws: Any) -> Any:
+        operation = getattr(func, 'typing_key', func)
+        is_operator = getattr(operation, '__module__', None) == '_operator'
+        if not is_operator or not all(isinstance(t, types.Number | types.Array) for t in args):
+            return resolve(func, args, kws)
+        if (operation, args) not in kept:
+            kept[operation, args] = resolve(func, args, kws)
+        return kept[operation, args]
+
+    context.resolve_function_type = kept_or_resolved
+
+
 class _KernelCompiler(Compiler):
-    """Compiles kernels with `_QuickFlags`."""
+    """Compiles kernels, without what takes numba long and changes none of them."""
+
+    def define_pipelines(self) -> Any:
+        """Return the usual passes but `UNUSED_PASSES`."""
+        (pipeline,) = super().define_pipelines()
+        pipeline.passes = [
+            step for step in pipeline.passes if step[0].__name__ not in UNUSED_PASSES
+        ]
+        return [pipeline]
 
     def compile_extra(self, function: Callable[..., Any]) -> Any:
         """Return the compiled kernel."""
-        self.state.flags = _QuickFlags(self.state.flags)
+        state = self.state
+        state.flags = _QuickFlags(state.flags)
+        if 'resolve_function_type' not in vars(state.typingctx):
+            _keep_operators(state.typingctx)
+        # Numba looks for new functions wherever an array is used.
+        state.targetctx.refresh = lambda: None
         return super().compile_extra(function)
 
 
