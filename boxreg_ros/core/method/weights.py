@@ -125,16 +125,13 @@ def is_parked(boxes, times, length, yaw_deviation, constants):
     duration = times[length - 1]
     speed = hypot(rate[0], rate[1])
     turned = abs(rate[2]) * duration / yaw_deviation
+    if not (speed < constants.parked_speed and turned < constants.gate):
+        return False
     x, y, _ = median_place(boxes, times, 0, length)
     distance = np.empty(length)
     for n in range(length):
         distance[n] = hypot(boxes[n, 0] - x, boxes[n, 1] - y)
-    moved = max(speed * duration, 2 * lower_median(distance))
-    return (
-        speed < constants.parked_speed
-        and moved < constants.parked_distance
-        and turned < constants.gate
-    )
+    return max(speed * duration, 2 * lower_median(distance)) < constants.parked_distance
 
 
 @kernel
@@ -149,6 +146,8 @@ def median_place(boxes, times, first, last):
 def fill_parked(boxes, times, length, yaw_deviation, constants, parked):
     """Write whether the object is parked from each box to the next (M25), (N,)."""
     parked[:] = is_parked(boxes, times, length, yaw_deviation, constants)
+    if not parked[0]:
+        return
     span = constants.driving_span
     for step in range(span - 1, length - span):
         x0, y0, t0 = median_place(boxes, times, step + 1 - span, step + 1)
