@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from itertools import chain, pairwise
+from typing import Any, ClassVar
 
 from boxreg_ros.core.metrics import iou_3d, pose_errors
 from boxreg_ros.core.tables import rows_by_key
@@ -101,6 +102,10 @@ class TrackChanges(Columns):
         return median(np.linalg.norm(self.deviations[self.is_refined, :2], axis=1))
 
 
+BOXES_AT_ONCE = 2**12
+"""Boxes whose arrays are reduced to a few numbers at once; chosen: they take 4 MB until then."""
+
+
 class Changes:
     """Collect all boxes before and after, in a few numbers each; NaN in other frames."""
 
@@ -108,7 +113,9 @@ class Changes:
         self._fixed_frame = fixed_frame
         self._track_ids: list[str] = []
         self._class_names: list[str] = []
-        self._parts: list[TrackChanges] = []  # one for each array, until they are one
+        self._waiting: list[tuple[BoxArray, RefinedBoxes, RefinedBoxes | None, list[str]]] = []
+        self._boxes_waiting = 0
+        self._parts: list[TrackChanges] = []  # until they are one
 
     def add(
         self,
@@ -133,43 +140,70 @@ class Changes:
             are no such objects.
 
         """
-        boxes = refined.boxes
-        n = len(refined.status)
+        names = [*given.track_ids, *added_ids]
+        names += [''] * (len(refined.status) - len(names))
+        self._waiting.append((given, refined, early, names))
+        self._boxes_waiting += len(names)
+        if self._boxes_waiting >= BOXES_AT_ONCE:
+            self._reduce()
+
+    def _reduce(self) -> None:
+        """Reduce the arrays that wait to one part."""
+        arrays, self._waiting, self._boxes_waiting = self._waiting, [], 0
+        given, results, early, names = zip(*arrays, strict=True)
+        ends = np.cumsum([0, *map(len, names)])
+        n = int(ends[-1])
+        boxes = [refined.boxes for refined in results]
         before = np.full((n, 9), np.nan)
-        before[: len(given.boxes)] = given.boxes
-        after = boxes.boxes.copy()
-        is_usable = is_valid_box(after) & (boxes.frame_id == self._fixed_frame)
+        for begin, of_input in zip(ends, given, strict=False):
+            before[begin : begin + len(of_input.boxes)] = of_input.boxes
+        after = np.concatenate([of_result.boxes for of_result in boxes])
+        counts = np.diff(ends)
+        is_fixed = [of_result.frame_id == self._fixed_frame for of_result in boxes]
+        is_usable = is_valid_box(after) & np.repeat(is_fixed, counts)
         before[~is_usable] = np.nan
         after[~is_usable] = np.nan
-        is_refined = np.isin(refined.status, (REFINED, HUMAN))
-        unknown = np.where(is_refined, 0.0, np.nan)[:, None]
-        variances = np.diagonal(refined.extent_covariances, axis1=1, axis2=2)
-        self._track_ids += boxes.track_ids
-        self._class_names += boxes.class_names
+        status = np.array([word for refined in results for word in refined.status], str)
+        unknown = np.where(np.isin(status, (REFINED, HUMAN)), 0.0, np.nan)[:, None]
+        variances = _joined(results, 'extent_covariances')[:, range(3), range(3)]
+        self._track_ids += chain.from_iterable(of_result.track_ids for of_result in boxes)
+        self._class_names += chain.from_iterable(of_result.class_names for of_result in boxes)
         self._parts.append(
             TrackChanges(
                 track_id='',
                 class_name='',
-                input_ids=(*given.track_ids, *(added_ids or ('',) * (n - len(given.boxes)))),
-                stamps_ns=np.full(n, boxes.stamp_ns),
+                input_ids=tuple(chain.from_iterable(names)),
+                stamps_ns=np.repeat([of_result.stamp_ns for of_result in boxes], counts),
                 given=before,
                 boxes=after,
                 change=np.broadcast_to(0.0, (n, 4)),  # these two follow once all are known
-                deviations=_deviations(after, refined.covariances) + unknown,
+                deviations=_deviations(after, _joined(results, 'covariances')) + unknown,
                 extent_deviations=np.sqrt(variances.clip(0)) + unknown,
-                face_distances=refined.face_distances,
-                near_points=refined.near_points.astype(np.float64),
+                face_distances=_joined(results, 'face_distances'),
+                near_points=_joined(results, 'near_points').astype(np.float64),
                 is_flipped=np.broadcast_to(False, n),
-                disagreement=_disagreement(after, early),
-                status=np.array(refined.status, str),
-                reasons=np.array(refined.reasons, str),
-                num_points=refined.num_points,
-                attributes=boxes.attributes or ({},) * n,
+                disagreement=np.concatenate(
+                    [
+                        _disagreement(after[begin:end], estimate)
+                        for (begin, end), estimate in zip(pairwise(ends), early, strict=True)
+                    ]
+                ),
+                status=status,
+                reasons=np.array([word for refined in results for word in refined.reasons], str),
+                num_points=_joined(results, 'num_points'),
+                attributes=tuple(
+                    chain.from_iterable(
+                        of_result.attributes or ({},) * len(of_result.track_ids)
+                        for of_result in boxes
+                    )
+                ),
             )
         )
 
     def tracks(self) -> list[TrackChanges]:
         """Return all tracks, by descending mean shift."""
+        if self._waiting:
+            self._reduce()
         if not self._parts:
             return []
         every = concatenated(self._parts)
@@ -197,6 +231,11 @@ class Changes:
                 )
             )
         return sorted(found, key=lambda track: -np.nan_to_num(track.shift, nan=-1.0))
+
+
+def _joined(results: Sequence[RefinedBoxes], name: str) -> NDArray[Any]:
+    """Return one column of several results."""
+    return np.concatenate([getattr(refined, name) for refined in results])
 
 
 def mean(values: ArrayLike) -> float:
