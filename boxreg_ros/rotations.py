@@ -115,17 +115,13 @@ def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:
         If the norm of a quaternion is zero.
 
     """
-    x, y, z, w = np.moveaxis(_unit(quaternion_xyzw), -1, 0)
-    R = np.empty((*x.shape, 3, 3))  # filled in place, as in `matrix_from_rpy`
-    R[..., 0, 0] = 1 - 2 * (y * y + z * z)
-    R[..., 0, 1] = 2 * (x * y - z * w)
-    R[..., 0, 2] = 2 * (x * z + y * w)
-    R[..., 1, 0] = 2 * (x * y + z * w)
-    R[..., 1, 1] = 1 - 2 * (x * x + z * z)
-    R[..., 1, 2] = 2 * (y * z - x * w)
-    R[..., 2, 0] = 2 * (x * z - y * w)
-    R[..., 2, 1] = 2 * (y * z + x * w)
-    R[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    unit = _unit(quaternion_xyzw)
+    products = 2 * unit[..., :, None] * unit[..., None, :]
+    R = np.empty((*unit.shape[:-1], 3, 3))  # filled in place, as in `matrix_from_rpy`
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        R[..., i, i] = 1 - (products[..., j, j] + products[..., k, k])
+        R[..., i, j] = products[..., i, j] - products[..., k, 3]
+        R[..., j, i] = products[..., i, j] + products[..., k, 3]
     return R
 
 

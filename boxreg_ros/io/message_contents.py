@@ -50,6 +50,7 @@ class MessageContents:
         self._repeats = Repeats()
         self._repeated: Counter[str] = Counter()  # by topic
         self._readers: dict[Typestore, BoxReader | None] = {}
+        self._is_standard = self._convention.is_standard
 
     def reset(self) -> None:
         """Forget which topics could be read: the recording is read again."""
@@ -124,8 +125,7 @@ class MessageContents:
             fields = None if reader is None else reader.ordinary(bytes(decompressed(data)))
             if reader is not None and fields is not None:
                 boxes = reader.boxes_of(fields)
-                is_standard = self._convention.is_standard
-                return boxes if is_standard else self._convention.to_centers(boxes)
+                return boxes if self._is_standard else self._convention.to_centers(boxes)
         return cast(BoxArray, self.of(connection.topic, self._decoder.decoded(connection, data)))
 
     def of(self, topic: str, message: Any) -> Sweep | BoxArray:
