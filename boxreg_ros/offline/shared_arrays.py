@@ -8,20 +8,29 @@ wakes a process.
 
 from __future__ import annotations
 
+from collections import deque
 from contextlib import suppress
 from mmap import mmap
 import pickle
 from typing import Any
+from weakref import finalize
 
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.offline.workers import Receive, Send, WorkerProcess
+import numpy as np
 
-SLOTS = 4
-"""Items in shared memory: so many are sent ahead. Chosen: the receiver takes at most two at once,
-as a cloud and its boxes, and caches of the processor hold four clouds."""
-SLOT_BYTES = 2**26
-"""Larger items go through the socket. Chosen: 5 million float32 points; memory that is not used is
-not taken."""
+SLOTS_AHEAD = 4
+"""Items that are sent ahead. Chosen: the receiver takes at most two at once, as a cloud and its
+boxes."""
+SLOTS_KEPT = 36
+"""Items that the receiver keeps in shared memory; further ones are copied. Derived: at 10 Hz the
+registrar has 20 clouds, of two seconds, and the estimate of the latency 16 of the time before."""
+SLOTS = SLOTS_AHEAD + SLOTS_KEPT
+SLOT_BYTES = 2**25
+"""Larger items go through the socket. Chosen: 2.7 million float32 points; memory that is not used
+is not taken."""
+ARRAY_ALIGNMENT = 64
+"""Arrays begin at multiples of this [bytes]; chosen: a line of the cache."""
 SHARED_BYTES = 2**17
 """Smaller items go through the socket, too. Chosen: those that it takes in one piece."""
 
@@ -45,32 +54,47 @@ class Sender:
         arrays: list[pickle.PickleBuffer] = []
         pickled = pickle.dumps(item, pickle.HIGHEST_PROTOCOL, buffer_callback=arrays.append)
         contents = [array.raw() for array in arrays]
-        if not SHARED_BYTES <= sum(content.nbytes for content in contents) <= SLOT_BYTES:
+        lines = [-(-content.nbytes // ARRAY_ALIGNMENT) for content in contents]
+        ends = np.cumsum(lines) * ARRAY_ALIGNMENT
+        if not contents or not SHARED_BYTES <= ends[-1] <= SLOT_BYTES:
             self._send((pickled, arrays, None))
             return
         slot = self._free.pop() if self._free else self._receive()
         places = []
-        begin = slot * SLOT_BYTES
-        for content in contents:
+        for begin, content in zip([0, *ends.tolist()], contents, strict=False):
             places.append(slice(begin, begin + content.nbytes))
-            self._memory[places[-1]] = content
-            begin = places[-1].stop
+            self._memory[slot * SLOT_BYTES :][places[-1]] = content
         self._send((pickled, places, slot))
 
 
 class Receiver:
-    """Receive the items in the parent."""
+    """Receive the items in the parent; some of their arrays are in shared memory while in use."""
 
     def __init__(self, memory: mmap, process: WorkerProcess) -> None:
-        self._memory = memoryview(memory)
+        self._memory = memory
         self._process = process
+        self._kept = 0
+        self._freed = deque[int]()  # slots whose arrays were freed, in any thread
 
     def __call__(self) -> Any:
         """Return the next item; raise as `WorkerProcess.receive`."""
+        while self._freed:
+            self._kept -= 1
+            self._return(self._freed.popleft())
         pickled, arrays, slot = self._process.receive()
         if slot is not None:
-            # Copies: the registrar keeps clouds for two seconds.
-            arrays = [bytearray(self._memory[place]) for place in arrays]
-            with suppress(BoxregError):  # the worker has ended: it needs no slot
-                self._process.send(slot)
+            end = arrays[-1].stop
+            content = np.frombuffer(self._memory, np.uint8, end, slot * SLOT_BYTES)
+            if self._kept < SLOTS_KEPT:
+                self._kept += 1
+                finalize(content, self._freed.append, slot).atexit = False
+            else:
+                content = content.copy()
+                self._return(slot)
+            arrays = [content[place] for place in arrays]
         return pickle.loads(pickled, buffers=arrays)
+
+    def _return(self, slot: int) -> None:
+        """Let the worker fill a slot again."""
+        with suppress(BoxregError):  # it has ended: it needs no slot
+            self._process.send(slot)
