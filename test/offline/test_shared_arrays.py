@@ -72,6 +72,18 @@ def test_arrays_are_not_overwritten_by_later_ones(received):
     np.testing.assert_equal([receive() for _ in items], items)
 
 
+def test_memory_of_freed_arrays_is_filled_again_and_that_of_others_is_not(received):
+    items = [np.full(SIZE, float(k)) for k in range(3 * SLOTS)]
+    receive = received(items)
+    held = []
+    for number, item in enumerate(items):
+        found = receive()
+        np.testing.assert_equal(found, item)
+        if number % 3 == 0:
+            held.append(found)
+    np.testing.assert_equal(held, items[::3])
+
+
 def test_arrays_larger_than_a_slot(received, monkeypatch):
     monkeypatch.setattr(shared_arrays, 'SLOT_BYTES', SHARED_BYTES * 2)
     items = [np.arange(3.0 * SIZE), (np.arange(1.0 * SIZE), np.ones(2 * SIZE))]
