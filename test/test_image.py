@@ -1,12 +1,14 @@
 """`boxreg compile`, and the Dockerfile that runs it, as far as that goes without docker."""
 
 import json
+import multiprocessing
 import os
 from pathlib import Path
 import re
 import shlex
 import subprocess
 import sys
+import time
 
 from compiled import fill_cache
 from paths import BAGS, ROOT
@@ -137,7 +139,7 @@ from boxreg_ros.io.warm_up import *
 config = Config(estimate='final')
 warm_up_solver(config)
 before, fit = kernels(), solver.fit
-warm_up_others(config.objective, config.mode, has_labels=True)
+warm_up_others(config.objective, config.mode, True, lambda: None)
 assert before and kernels() - before
 before, solver.fit = kernels(), fit
 warm_up(config)
@@ -156,42 +158,58 @@ def test_the_two_processes_of_a_first_start_compile_what_a_node_needs():
 
 def test_one_process_compiles_all_where_there_cannot_be_two(monkeypatch):
     from boxreg_ros.config import Config
-    from boxreg_ros.io import warm_up
+    from boxreg_ros.io.warm_up import compiled_beside, SecondProcess
 
-    def refuse(*args, **options):
+    def refuse():
         raise BlockingIOError('Resource temporarily unavailable')
 
-    monkeypatch.setattr(warm_up, 'Popen', refuse)
-    with warm_up.compiled_beside(Config(), has_labels=False):
+    with monkeypatch.context() as patch:
+        patch.setattr(os, 'fork', refuse)
+        second = SecondProcess.forked()
+    assert second is None
+    with compiled_beside(second, Config(), has_labels=False) as wait:
         assert numba.njit(lambda: 8)() == 8
+        wait()
+
+
+def test_the_second_process_is_not_waited_for_where_it_fails(monkeypatch):
+    from boxreg_ros.config import Config
+    from boxreg_ros.io import warm_up
+
+    def fail(*args):
+        raise MemoryError
+
+    monkeypatch.setattr(warm_up, 'warm_up_others', fail)
+    second = warm_up.SecondProcess()
+    with warm_up.compiled_beside(second, Config(), has_labels=False) as wait:
+        numba.njit(lambda: 8)()
+        wait()
+    assert multiprocessing.active_children() == []
 
 
 def test_the_second_process_ends_with_an_interrupted_one(monkeypatch):
     from boxreg_ros.config import Config
     from boxreg_ros.io import warm_up
 
-    begun = []
-
-    def wait_long(*args, **options):
-        begun.append(subprocess.Popen(['sleep', '300']))
-        return begun[0]
-
-    monkeypatch.setattr(warm_up, 'Popen', wait_long)
-    with pytest.raises(KeyboardInterrupt), warm_up.compiled_beside(Config(), has_labels=False):
+    monkeypatch.setattr(warm_up, 'warm_up_others', lambda *_: time.sleep(300))
+    second = warm_up.SecondProcess()
+    with (
+        pytest.raises(KeyboardInterrupt),
+        warm_up.compiled_beside(second, Config(), has_labels=False),
+    ):
         numba.njit(lambda: 8)()
         raise KeyboardInterrupt
-    assert begun[0].poll() is not None
+    assert multiprocessing.active_children() == []
 
 
-def test_the_second_process_takes_no_module_of_its_folder(tmp_path, monkeypatch):
+def test_the_second_process_ends_where_nothing_is_compiled():
     from boxreg_ros.config import Config
-    from boxreg_ros.io.warm_up import compiled_beside
+    from boxreg_ros.io import warm_up
 
-    (tmp_path / 'boxreg_ros.py').write_text("open('taken', 'w').close()")
-    monkeypatch.chdir(tmp_path)
-    with compiled_beside(Config(), has_labels=False):
-        numba.njit(lambda: 8)()
-    assert not (tmp_path / 'taken').exists()
+    second = warm_up.SecondProcess()
+    with warm_up.compiled_beside(second, Config(), has_labels=False) as wait:
+        wait()
+    assert multiprocessing.active_children() == []
 
 
 def test_the_first_drive_needs_no_kernel_beyond_those_of_the_start():

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import replace
-from subprocess import DEVNULL, PIPE, Popen
-import sys
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+import os
 
 from boxreg_ros.config import Config, KINDS, PaperConfig, SolverConfig
 from boxreg_ros.core.input_model import InputModel
@@ -61,7 +62,8 @@ def warm_up_solver(config: Config) -> None:
         sights=np.zeros(n),
         is_pinned=np.zeros(n, bool),
     )
-    quick, model = _quick(config), InputModel(config.faces)
+    ingredients = replace(config.ingredients, heading_sign=False)  # the second process has it
+    quick, model = replace(_quick(config), ingredients=ingredients), InputModel(config.faces)
     rows = [Observation(table, row) for row in range(quick.window)]
     window = Window('1', 'car', rows, quick.window, np.zeros((0, 9)))
     problem, _ = stack_windows([window], quick, model.constants.prior_decay)
@@ -74,51 +76,108 @@ def warm_up_solver(config: Config) -> None:
     solver.fit(batch, inputs, np.zeros(1, int), constants, is_last=True, may_settle=False)
 
 
-@contextmanager
-def compiled_beside(config: Config, has_labels: bool) -> Iterator[Callable[[], None]]:
+class SecondProcess:
     """
-    Let a second process compile what a node needs but `warm_up_solver`, if the block compiles.
+    A process that compiles, once it is asked, what a node needs but `warm_up_solver`.
 
-    A function is yielded that waits until that is on disk. What follows objects is there at the
-    end of the block. Where nothing can be written, this process has to compile all of it as well.
+    It is forked before ROS has threads and sockets, and has all that is imported by then: to
+    import that again takes two seconds. It ends with `end`; where nothing is asked, also with this
+    process.
+
+    """
+
+    def __init__(self) -> None:
+        from boxreg_ros.core import solver  # noqa: F401  torch, which both then have
+
+        context = get_context('fork')
+        self._connection, other = context.Pipe()
+        arguments = (other, self._connection)
+        self._process = context.Process(target=_compile_if_asked, args=arguments, daemon=True)
+        self._process.start()
+        other.close()  # otherwise the end of the process does not close the connection
+
+    @classmethod
+    def forked(cls) -> SecondProcess | None:
+        """Return a new one; None without memory or room for one."""
+        with suppress(OSError):
+            return cls()
+        return None
+
+    def ask(self, config: Config, has_labels: bool) -> None:
+        """Let it compile what a node with these settings needs."""
+        with suppress(OSError):  # it has ended: this process compiles all
+            self._connection.send((config.objective, config.mode, has_labels))
+
+    def wait(self) -> None:
+        """Wait until all is on disk that the first box needs; what follows objects comes later."""
+        with suppress(EOFError, OSError):  # it has ended
+            self._connection.recv()
+
+    def end(self, is_finished: bool) -> None:
+        """End it, after all that it was asked for `is_finished`, or at once."""
+        if not is_finished:
+            self._process.kill()  # kernels are written as a whole
+        self._connection.close()
+        self._process.join()
+
+
+def _compile_if_asked(connection: Connection, of_parent: Connection) -> None:
+    """Wait for settings, and compile what they need; end where the other process has ended."""
+    of_parent.close()  # otherwise its end does not close the connection
+    with (
+        open(os.devnull, 'w') as nowhere,
+        redirect_stderr(nowhere),  # the other process has the same warnings
+        suppress(EOFError, OSError),
+    ):
+        objective, mode, has_labels = connection.recv()
+        warm_up_others(objective, mode, has_labels, lambda: connection.send(None))
+
+
+@contextmanager
+def compiled_beside(
+    second: SecondProcess | None, config: Config, has_labels: bool
+) -> Iterator[Callable[[], None]]:
+    """
+    Let a second process, where there is one, compile its part, if the block compiles.
+
+    A function is yielded that waits until that is on disk. At the end of the block the process has
+    ended, and what follows objects is there. Where nothing can be written, this process has to
+    compile all of it as well.
 
     """
     from numba.core import event  # it takes half a second
 
-    processes: list[Popen[bytes]] = []
-    settings = f'{config.objective!r}, {config.mode!r}, {has_labels}'
-    code = f'from boxreg_ros.io import warm_up; warm_up.warm_up_others({settings})'
+    asked: list[SecondProcess] = []
 
-    class Start(event.Listener):
-        """Starts the process; kernels that are loaded from files cause no event."""
+    class Ask(event.Listener):
+        """Asks the process; kernels that are loaded from files cause no event."""
 
         def on_start(self, event: object) -> None:
-            if not processes:
-                command = [sys.executable, '-P', '-c', code]  # -P: no modules of its folder
-                with suppress(OSError):  # no memory, or no more processes: it compiles all alone
-                    processes.append(Popen(command, stdin=DEVNULL, stdout=PIPE, stderr=DEVNULL))
+            if second and not asked:
+                asked.append(second)
+                second.ask(config, has_labels)
 
         def on_end(self, event: object) -> None:
             """Do nothing."""
 
     def wait() -> None:
-        for process in processes:
-            assert process.stdout is not None  # a pipe
-            process.stdout.readline()  # empty if it has ended
-
-    try:
-        with event.install_listener('numba:compile', Start()):
-            yield wait
-        for process in processes:
-            process.communicate()
-    finally:
-        for process in processes:
-            process.kill()  # where this one is interrupted; kernels are written as a whole
+        for process in asked:
             process.wait()
 
+    is_finished = False
+    try:
+        with event.install_listener('numba:compile', Ask()):
+            yield wait
+        is_finished = True
+    finally:
+        if second:
+            second.end(is_finished)
 
-def warm_up_others(objective: str, mode: str, has_labels: bool) -> None:
-    """Do what `warm_up_solver` leaves out, and one kernel of it; print a line, then follow."""
+
+def warm_up_others(
+    objective: str, mode: str, has_labels: bool, announce: Callable[[], None]
+) -> None:
+    """Do what `warm_up_solver` leaves out, and one kernel of it; announce that, then follow."""
     from boxreg_ros.core import solver
     from boxreg_ros.core.method.round import empty_sums
     import torch
@@ -132,7 +191,7 @@ def warm_up_others(objective: str, mode: str, has_labels: bool) -> None:
     warm_up(config)
     if has_labels:
         warm_up_labels(config)
-    print('ready', flush=True)
+    announce()
     warm_up_followed(config)
 
 

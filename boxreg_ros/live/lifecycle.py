@@ -10,6 +10,7 @@ from typing import Any
 from uuid import uuid4
 
 from boxreg_ros.errors import BoxregError, one_line, UnsupportedMessage
+from boxreg_ros.io.warm_up import SecondProcess
 from boxreg_ros.live.diagnostics import diagnosis
 from boxreg_ros.live.node import BoxregNode, STATUS_PERIOD
 from boxreg_ros.live.topics import import_message
@@ -108,8 +109,8 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
 
     """
 
-    def __init__(self) -> None:
-        BoxregNode.__init__(self)
+    def __init__(self, second: SecondProcess | None = None) -> None:
+        BoxregNode.__init__(self, second)
         LifecycleNodeMixin.__init__(self)
         service = self._service_change_state
         service.callback = partial(self._answer_change, service.callback)

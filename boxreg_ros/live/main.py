@@ -9,6 +9,7 @@ import sys
 
 from boxreg_ros.allocation import collect_rarely, keep_freed_memory
 from boxreg_ros.errors import BoxregError, ConfigError, one_line
+from boxreg_ros.io.warm_up import SecondProcess
 
 NAME = 'boxreg_node'
 WITHOUT_ROS = "source a ROS 2 Jazzy installation, or pip install 'boxreg_ros[ros]'"
@@ -38,6 +39,7 @@ def main(args: Sequence[str] | None = None, is_managed: bool = False) -> int:
         # Until the node runs, a signal ends the process at once. An exception would be lost if
         # the signal came within a destructor.
         signal.signal(number, lambda *_: os._exit(0))
+    second = SecondProcess.forked()
     try:
         from boxreg_ros.live.process import make_node, run, shut_down
     except ImportError as error:
@@ -46,7 +48,8 @@ def main(args: Sequence[str] | None = None, is_managed: bool = False) -> int:
     keep_freed_memory()
     collect_rarely()
     try:
-        node = make_node(NAME, list(sys.argv[1:] if args is None else args), is_managed)
+        arguments = list(sys.argv[1:] if args is None else args)
+        node = make_node(NAME, arguments, second, is_managed)
     except Exception as error:
         shut_down()
         is_usage = isinstance(error, ConfigError) or not isinstance(error, BoxregError)

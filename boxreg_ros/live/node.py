@@ -18,6 +18,7 @@ from boxreg_ros.io.lidars import Lidars, SensorPlacement
 from boxreg_ros.io.session import Session
 from boxreg_ros.io.warm_up import (
     compiled_beside,
+    SecondProcess,
     warm_up,
     warm_up_followed,
     warm_up_labels,
@@ -78,7 +79,7 @@ class BoxregNode(PolledClockNode):
 
     """
 
-    def __init__(self) -> None:
+    def __init__(self, second: SecondProcess | None = None) -> None:
         try:
             super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
         except ValueError as error:
@@ -89,6 +90,7 @@ class BoxregNode(PolledClockNode):
         self.add_pre_set_parameters_callback(partial(numbers_as_declared, self))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
+        self._second = second
         self._health = Health(self.get_logger())
         config, options = self._settings
         self._inbox = Inbox(config.queue, max(1, len(options.lidars.topics)))
@@ -128,7 +130,7 @@ class BoxregNode(PolledClockNode):
         config, options = self._settings
         begun = time.monotonic()
         with announced_compilation(announce) as done:
-            with compiled_beside(config, options.static_points) as wait:
+            with compiled_beside(self._second, config, options.static_points) as wait:
                 if config.objective != 'paper':
                     warm_up_solver(config)
                 wait()
@@ -145,6 +147,7 @@ class BoxregNode(PolledClockNode):
                 gc.freeze()  # a collection of imported objects takes 50 ms, several times a minute
                 self._is_warm.set()
             warm_up_followed(config)
+        self._second = None  # it has ended
         self._can_follow.set()
 
     def warm_up_beside(self) -> None:

@@ -10,6 +10,7 @@ import signal
 from threading import Event, Thread
 import time
 
+from boxreg_ros.io.warm_up import SecondProcess
 from boxreg_ros.live.lifecycle import BoxregLifecycleNode
 from boxreg_ros.live.node import BoxregNode
 import rclpy
@@ -21,7 +22,9 @@ ENDING_TIME = 0.9
 """Time the threads have to end after a signal: 0.5 s to solve, 0.4 s for acknowledgements [s]."""
 
 
-def make_node(program: str, arguments: list[str], is_managed: bool = False) -> BoxregNode:
+def make_node(
+    program: str, arguments: list[str], second: SecondProcess | None, is_managed: bool = False
+) -> BoxregNode:
     """
     Initialise ROS and return the node.
 
@@ -31,6 +34,8 @@ def make_node(program: str, arguments: list[str], is_managed: bool = False) -> B
         Name for help texts.
     arguments : list of str
         Of the command line, those of ROS too.
+    second : SecondProcess or None
+        Helps to compile.
     is_managed : bool
         Whether it is a lifecycle node.
 
@@ -53,8 +58,8 @@ def make_node(program: str, arguments: list[str], is_managed: bool = False) -> B
     )
     parser.parse_args(remove_ros_args(arguments))
     if is_managed:
-        return BoxregLifecycleNode()
-    node = BoxregNode()
+        return BoxregLifecycleNode(second)
+    node = BoxregNode(second)
     node.prepare()
     node.warm_up_beside()
     node.open_topics()
