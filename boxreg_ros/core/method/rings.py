@@ -40,8 +40,8 @@ def ring_heights(points, counts, origins):
     most = 0
     for i in range(len(counts)):
         most = max(most, counts[i])
-    slopes, gaps = np.empty(most), np.empty(most)
-    rank, ordered = np.empty(most), np.empty(most)
+    slopes, gaps = np.empty(most, np.float32), np.empty(most, np.float32)
+    rank, ordered = np.empty(most, np.float32), np.empty(most, np.float32)
     first = 0
     for i in range(len(counts)):
         m = counts[i]
@@ -97,15 +97,16 @@ def sort_by_rank(values, rank, ordered):
     Write values (n,) in ascending order; `rank` (n,) is to work in.
 
     All pairs are compared, by vector instructions: a sort of a hundred takes twice as long, since
-    half of its branches are predicted wrong.
+    half of its branches are predicted wrong. All is in 32 bits: two thirds of the time of 64.
 
     """
+    none, one = np.float32(0.0), np.float32(1.0)
     for j in range(len(values)):
-        before = 0.0
+        before = none
         for i in range(j):
-            is_after = 1.0 if values[i] > values[j] else 0.0
+            is_after = one if values[i] > values[j] else none
             rank[i] += is_after
-            before += 1.0 - is_after
+            before += one - is_after
         rank[j] = before
     for i in range(len(values)):
         ordered[int(rank[i])] = values[i]
