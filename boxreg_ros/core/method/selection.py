@@ -29,11 +29,12 @@ def nth(values, rank):
             values[last], values[place] = values[place], pivot
             last = place - 1
             continue
-        for i in range(place, last):
-            value = values[i]
-            values[i] = values[place]
-            values[place] = value
-            place += value <= pivot
+        if place == first:  # nothing is less: leave out those that are equal, if there are some
+            for i in range(place, last):
+                value = values[i]
+                values[i] = values[place]
+                values[place] = value
+                place += value <= pivot
         values[last], values[place] = values[place], pivot
         if rank <= place:
             return pivot
