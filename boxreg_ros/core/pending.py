@@ -64,8 +64,8 @@ class PendingArray:
         Why each box is kept as long as it has no estimate.
     num_points : array, shape (n,)
         As in `RefinedBoxes`.
-    estimates : list of n pairs or None
-        Estimates of the windows that each box was last in, and its row there.
+    observed : list of n PendingBox or None
+        The boxes that have observations.
     num_unsettled : int
         Boxes whose estimate may still change; the array is settled at 0 or less.
     is_observed : bool
@@ -87,7 +87,7 @@ class PendingArray:
         self.input = boxes
         self.reasons = [''] * n
         self.num_points = np.zeros(n, int)
-        self.estimates: list[tuple[Estimates, int] | None] = [None] * n
+        self.observed: list[PendingBox | None] = [None] * n
         self.num_given = n
 
     def keep_all(self, reason: str) -> None:
@@ -119,10 +119,10 @@ class PendingArray:
         table = seen[0].table
         self.num_points[[one.row for one in boxes]] = table.num_points
         places = table.boxes[:, : LENGTH + 1].tolist()
-        for one, observation, place in zip(boxes, seen, places, strict=True):
+        for one, place in zip(boxes, places, strict=True):
             self.reasons[one.row] = Reason.SHORT_TRACK  # until there is an estimate
+            self.observed[one.row] = one
             one.array = self
-            one.observation = observation
             one.place = place
 
     def add_predicted(self, track: ObservedTrack, one: PendingBox) -> None:
@@ -139,14 +139,14 @@ class PendingArray:
         )
         self.reasons.append('')
         self.num_points = np.append(self.num_points, 0)
-        self.estimates.append(None)
-        one.row = len(self.estimates) - 1
+        self.observed.append(None)
+        one.row = len(self.observed) - 1
         if one.is_followed:
             self.followed.append(one.row)
 
     def _kept(self) -> Estimates:
         """Return the input boxes as estimates that keep them."""
-        n = len(self.estimates)
+        n = len(self.observed)
         return Estimates(
             boxes=self.input.boxes,
             status=np.full(n, KEPT),
@@ -165,11 +165,13 @@ class PendingArray:
         Of the predicted boxes, those that are refined, and those of followed objects.
 
         """
-        n = len(self.estimates)
-        found = [one for one in self.estimates if one is not None]
+        n = len(self.observed)
+        found = [one.estimate for one in self.observed if one is not None and one.estimate]
         if len(found) < n or not n:
             kept = self._kept()
-            found = [one or (kept, row) for row, one in enumerate(self.estimates)]
+            found = [
+                (one and one.estimate) or (kept, row) for row, one in enumerate(self.observed)
+            ]
         columns: Estimates = rows_of(found) if found else kept
         is_returned = columns.status == REFINED
         is_returned[: self.num_given] = True
@@ -201,9 +203,10 @@ class PendingBox:
     is_predicted: bool = False
     is_followed: bool = False
     array: PendingArray = field(init=False)
-    observation: Observation = field(init=False)
     place: list[float] = field(init=False)
     """x y z length of the box as plain numbers, of which motion is computed [m]."""
+    estimate: tuple[Estimates, int] | None = None
+    """Estimates of the windows that it was last in, and its row there."""
     is_settled: bool = False
 
     def settle(self) -> None:
@@ -220,6 +223,8 @@ class ObservedTrack:
     track_id: str
     class_name: str
     entries: list[PendingBox] = field(default_factory=list)
+    seen: list[Observation] = field(default_factory=list)
+    """Observation of each of the entries."""
     starts: Floats = field(default_factory=lambda: np.zeros((0, 9)))
     """Boxes that the next window starts from, of the first entries."""
     prior: tuple[MarginalisationPrior, int] | None = None
@@ -234,6 +239,11 @@ class ObservedTrack:
     def newest_ns(self) -> int:
         """Stamp of the newest observation [ns]."""
         return self.entries[-1].stamp_ns
+
+    def add(self, one: PendingBox, observation: Observation) -> None:
+        """Add the newest observation."""
+        self.entries.append(one)
+        self.seen.append(observation)
 
     def is_in(self, array: PendingArray) -> bool:
         """Return whether the newest observation is of `array`."""
@@ -251,31 +261,31 @@ class ObservedTrack:
         newest = self.entries[-1]
         newest.array.reasons[newest.row] = Reason.BUDGET
         if len(self.starts) == len(self.entries) - 1:  # else its first window is to come
-            self.starts = np.vstack([self.starts, newest.observation.box])
+            self.starts = np.vstack([self.starts, self.seen[-1].box])
         excess = slice(PRIOR_POSES, PRIOR_POSES + max(0, len(self.entries) - length))
-        del self.entries[excess]
+        del self.entries[excess], self.seen[excess]
         self.starts = np.delete(self.starts, excess, axis=0)
 
     def forget(self, length: int) -> None:
         """Leave only the last `length` observations to the next window."""
         excess = max(0, len(self.entries) - length)
-        self.entries = self.entries[excess:]
+        self.entries, self.seen = self.entries[excess:], self.seen[excess:]
         self.starts = self.starts[excess:]
 
     def coasts(self, stamp_ns: int, config: Config) -> bool:
         """Return whether a box may be predicted at a stamp without a detection."""
         if stamp_ns > self.detected_ns + round(config.coast * 1e9):
             return False
-        detected = [entry.observation for entry in self.entries if not entry.is_predicted]
+        pairs = zip(self.entries, self.seen, strict=True)
+        detected = [observation for entry, observation in pairs if not entry.is_predicted]
         if not self.entries[-1].is_predicted and len(detected) >= MIN_HITS:
             self.least_points = points_to_confirm(detected)
         return self.least_points < inf
 
     def predicted(self, stamp_ns: int, config: Config) -> Floats:
         """Return the box (9,) at a stamp by the motion of the newest estimates."""
-        seen = [entry.observation for entry in self.entries]
-        stamps_ns = np.array([one.stamp_ns for one in seen])
-        boxes = np.array([*self.starts, *(one.box for one in seen[len(self.starts) :])])
+        stamps_ns = np.array([one.stamp_ns for one in self.seen])
+        boxes = np.array([*self.starts, *(one.box for one in self.seen[len(self.starts) :])])
         motion = motion_at(stamps_ns, boxes, -1, config.class_config(self.class_name))
         return motion.predict(stamp_ns)
 
@@ -301,14 +311,18 @@ class ObservedTrack:
             off_y = entry.place[1] - latest_y - part * (latest_y - first_y)
             if hypot(off_x, off_y) < length / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9:
                 return None
-        moved = [copy(entry) for entry in self.entries[-2:]]
-        del self.entries[-2:]
+        moved, seen = [copy(entry) for entry in self.entries[-2:]], self.seen[-2:]
+        for entry in moved:
+            entry.array.observed[entry.row] = entry
+        del self.entries[-2:], self.seen[-2:]
         self.starts = self.starts[: len(self.entries)]
-        return ObservedTrack(self.track_id, self.class_name, moved, detected_ns=self.detected_ns)
+        return ObservedTrack(
+            self.track_id, self.class_name, moved, seen, detected_ns=self.detected_ns
+        )
 
     def write(self, estimate: Estimate, entries: list[PendingBox], length: int) -> None:
         """
-        Pass the estimate of the window of `entries` to the box arrays that are not settled.
+        Pass the estimate of the window of `entries` to those that are not settled.
 
         The next window begins with the last `length` of them.
 
@@ -318,6 +332,5 @@ class ObservedTrack:
         first = max(begin, end - length)
         self.starts = table.boxes[first : min(first + len(self.entries), end)]
         for row, entry in enumerate(entries, begin):
-            array = entry.array
-            if array.num_unsettled > 0 and not entry.is_settled:
-                array.estimates[entry.row] = table, row
+            if not entry.is_settled:
+                entry.estimate = table, row

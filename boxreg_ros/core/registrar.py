@@ -435,15 +435,15 @@ class BoxRegistrar:
         for track, one in confirmed:
             array.add_predicted(track, one)
         array.observe([one for _, one in (*given, *confirmed)], seen)
-        for track, one in given:
-            track.entries.append(one)
+        for (track, one), observation in zip(given, seen, strict=False):
+            track.add(one, observation)
             track.detected_ns = boxes.stamp_ns
             successor = track.split_at_id_switch()
             if successor is not None:
                 self._end([track.track_id])
                 self._tracks[track.track_id] = successor
-        for track, one in confirmed:
-            track.entries.append(one)
+        for (track, one), observation in zip(confirmed, seen[len(given) :], strict=True):
+            track.add(one, observation)
 
     def _followed(self, array: PendingArray, sweep: Sweep) -> list[_OfTrack]:
         """Return the boxes of followed objects that have none in `array`."""
@@ -623,11 +623,10 @@ def _windows(tracks: Sequence[ObservedTrack]) -> list[Window]:
     """Return for each track the window of all observations that it holds."""
     windows = []
     for track in tracks:
-        observations = [entry.observation for entry in track.entries]
-        num_new = len(observations) - len(track.starts)
+        num_new = len(track.seen) - len(track.starts)
         windows.append(
             Window(
-                track.track_id, track.class_name, observations, num_new, track.starts, track.prior
+                track.track_id, track.class_name, track.seen, num_new, track.starts, track.prior
             )
         )
     return windows
@@ -642,13 +641,13 @@ def _by_urgency(tracks: list[ObservedTrack], num_rotating: int) -> list[Observed
 
     """
     carried = np.array([track.num_carried for track in tracks])
-    before = [track.entries[-VELOCITY_OBSERVATIONS:][0] for track in tracks]
-    newest = [track.entries[-1] for track in tracks]
+    before = [track.seen[-VELOCITY_OBSERVATIONS:][0] for track in tracks]
+    newest = [track.seen[-1] for track in tracks]
     elapsed = 1e-9 * np.array(
         [b.stamp_ns - a.stamp_ns for a, b in zip(before, newest, strict=True)]
     )
-    ranges = _ranges([one.observation for one in newest])
-    approached = _ranges([one.observation for one in before]) - ranges
+    ranges = _ranges(newest)
+    approached = _ranges(before) - ranges
     speed = np.divide(approached, elapsed, out=np.zeros(len(tracks)), where=elapsed > 0)
     expected = ranges - REACTION_TIME * speed  # (n,) [m]; NaN, the last, if unknown
     order = np.lexsort((expected, -carried))

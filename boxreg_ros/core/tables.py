@@ -6,8 +6,9 @@ of a table and a row in it: many small arrays take longer to stack than a few la
 
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import count, pairwise
 from typing import Any
 
 from boxreg_ros.structures import Ints
@@ -17,18 +18,16 @@ import numpy as np
 def by_table(items: Sequence[tuple[Any, int]]) -> list[tuple[Any, Ints, Ints]]:
     """Return each table of some items, the places of its items among them, and their rows."""
     owners, rows = zip(*items, strict=True) if items else ((), ())
-    ids = list(map(id, owners))
-    of_id = dict(zip(ids, owners, strict=True))
     row = np.array(rows, int)
-    if len(of_id) == 1:
+    number_of = defaultdict[int, int](count().__next__)  # of each table, by its id
+    number = np.fromiter(map(number_of.__getitem__, map(id, owners)), int, len(owners))
+    if len(number_of) == 1:
         return [(owners[0], np.arange(len(row)), row)]
-    numbers = dict(zip(of_id, range(len(of_id)), strict=True))
-    kind = np.min_scalar_type(len(of_id))  # small numbers are fast to sort
-    number = np.fromiter(map(numbers.__getitem__, ids), kind, len(ids))
-    order = np.argsort(number, kind='stable')
-    ends = np.cumsum(np.bincount(number, minlength=len(of_id))).tolist()
+    kind = np.min_scalar_type(len(number_of))  # small numbers are fast to sort
+    order = np.argsort(number.astype(kind), kind='stable')
+    ends = np.cumsum(np.bincount(number)).tolist()
     parts = [order[begin:end] for begin, end in pairwise([0, *ends])]
-    return [(table, part, row[part]) for table, part in zip(of_id.values(), parts, strict=True)]
+    return [(owners[part[0]], part, row[part]) for part in parts if len(part)]
 
 
 def rows_by_key(keys: Sequence[str]) -> dict[str, Ints]:
