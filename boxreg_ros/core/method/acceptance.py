@@ -126,7 +126,8 @@ def accept(
     """
     M = most_points(problem.counts[first:last])
     room = _Room(np.empty((3, M)), np.empty((3, M)), np.empty((3, 3)))
-    velocity = np.zeros(3)
+    velocity = np.empty(3)
+    velocity[:] = 0.0
     constants = constants[0]
     kept_part = 1 - constants.max_lost_part
     for b in range(first, last):

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.arrays import copy, EXTENT, GAP, PIVOT, POSE
 from boxreg_ros.core.method.arrowhead import add_sandwich, NEXT
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.expectation import FACES, HEADING, SIZE
 from boxreg_ros.core.method.kinematics import fill_kinematics
 from boxreg_ros.core.method.rotation import fill_rotation
@@ -46,7 +46,7 @@ def empty_inverse(N, S):
     )  # fmt: skip
 
 
-@kernel
+@loop
 def fill_face_distances(boxes, poses, shared, expected, terms, R, distances):
     """Write the residuals (N, 6) of all faces [m], 0 for those without weight."""
     for n in range(len(poses)):
@@ -67,7 +67,7 @@ def fill_face_distances(boxes, poses, shared, expected, terms, R, distances):
             distances[n, face] = outward - surface
 
 
-@kernel
+@loop
 def fill_unclaimed(length, marginalised, terms, common, shape, constants, G):
     """
     Write the covariance (15, 15) of the gradient by shared variables that no weight claims.
@@ -108,7 +108,7 @@ def fill_shared_covariance(corner, G, inverse):
 @kernel
 def fill_pose_covariances(length, times, poses, inverse, constants, found):
     """Write the covariances of the poses, (N, 6, 6)."""
-    shift = np.zeros(3)
+    shift = np.empty(3)
     for n in range(len(poses)):
         beside, response = inverse.beside[n], inverse.response[n]
         for i in range(POSE):
@@ -131,7 +131,7 @@ def fill_pose_covariances(length, times, poses, inverse, constants, found):
                 found[n, i, j] += shift[i] * shift[j]
 
 
-@kernel
+@loop
 def fill_extent_covariance(covariance, free, common, found):
     """Write the covariance of the extents, (3, 3); held ones have the errors of the input."""
     for i in range(SIZE):

@@ -59,13 +59,13 @@ class CropNumbers(NamedTuple):
     min_road_points: int
 
 
-@kernel
+@loop
 def metre(value):
     """Return a coordinate as whole metres, truncated: the order of coordinates is kept."""
     return np.int32(min(max(value, -LARGEST), LARGEST))
 
 
-@kernel
+@loop
 def side_of(num_points):
     """Return the side of the raster: it has at least as many cells as there are points."""
     side = MIN_SIDE
@@ -74,7 +74,7 @@ def side_of(num_points):
     return side
 
 
-@kernel
+@loop
 def cell_of(x, y, side):
     """Return the cell of whole metres; `side` is a power of two."""
     return (x & (side - 1)) * side + (y & (side - 1))
@@ -91,7 +91,8 @@ def cells_of_boxes(shapes, side):
 
     """
     centers, reach = shapes.centers, shapes.reach
-    start = np.zeros(len(centers) + 1, np.int64)
+    start = np.empty(len(centers) + 1, np.int64)
+    start[0] = 0
     for box in range(len(centers)):
         x = metre(centers[box, 0] - reach[box, 0])
         across = min(side, metre(centers[box, 0] + reach[box, 0]) - x + 1)
@@ -173,7 +174,8 @@ def near_points(points, shapes):
     """
     side = side_of(points.shape[1])
     spans, start = cells_of_boxes(shapes, side)
-    is_touched = np.zeros(side * side, np.bool_)  # small enough for the processor's cache
+    is_touched = np.empty(side * side, np.bool_)  # small enough for the processor's cache
+    is_touched[:] = False
     for k in range(spans.shape[1]):
         for cell in range(spans[0, k], spans[1, k]):
             is_touched[cell] = True
@@ -225,7 +227,7 @@ def gather(box, near, room):
     return m
 
 
-@kernel
+@loop
 def turned(turn, x, y, z):
     """Return an offset in the frame of the points along the axes of the frame of the boxes."""
     return (
@@ -235,7 +237,7 @@ def turned(turn, x, y, z):
     )
 
 
-@kernel
+@loop
 def offset_of(points, i, shapes, box):
     """Return point `i` minus the centre of a box, along the axes of the frame [m]."""
     dx = points[0, i] - shapes.centers[box, 0]
@@ -286,7 +288,7 @@ def crop(points, shapes, margin):
     return row[:P], owner[:P], offset[:P], outside[:P]
 
 
-@kernel
+@loop
 def flat_height(heights, quantiles, flatness, min_points):
     """Return the height of a road from heights beside a box; NaN where it is not flat."""
     n = len(heights)
@@ -306,7 +308,8 @@ def grouped(values, owner, n):
     Those of owner b are values[first[b]:first[b + 1]]; `first` is the other result.
 
     """
-    first = np.zeros(n + 2, np.int64)
+    first = np.empty(n + 2, np.int64)
+    first[:] = 0
     for k in range(len(owner)):
         first[owner[k] + 2] += 1
     for b in range(n):
@@ -352,7 +355,7 @@ def measure(box, near, shapes, numbers, room):
     return m
 
 
-@kernel
+@loop
 def road_height(m, numbers, room):
     """Return the height of the road above the bottom of a box; NaN where not found [m]."""
     level, count = room.level, 0
@@ -383,7 +386,8 @@ def sorted_by_x(owner, x, rows, n):
         unit /= 2
         n //= 2
     order, other = np.empty(P, np.int64), np.empty(P, np.int64)
-    count = np.zeros((3, 2048), np.int64)
+    count = np.empty((3, 2048), np.int64)
+    count[:] = 0
     for k in range(P):
         place = np.int64((owner[k] + 0.5 + x[k] / scale / 4) * unit)
         order[k] = place << ROW_BITS | rows[k]
@@ -405,7 +409,7 @@ def sorted_by_x(owner, x, rows, n):
             place -= 1
         order[place] = pair
     for k in range(P):
-        order[k] &= 2**ROW_BITS - 1
+        order[k] &= (1 << ROW_BITS) - 1
     return order
 
 
@@ -436,8 +440,9 @@ def own_points(points, shapes, numbers):
     room = empty_room(near)
     own, owner = np.empty(near.pairs, np.int32), np.empty(near.pairs, np.int32)
     x, depth, chosen = np.empty(near.pairs), np.empty(near.pairs), np.empty(near.most, np.int32)
-    road, num_inside = np.empty(n), np.zeros(n, np.int64)
-    deepest = np.full(len(near.rows), np.inf)  # of each point in any box
+    road, num_inside = np.empty(n), np.empty(n, np.int64)
+    deepest = np.empty(len(near.rows))  # of each point in any box
+    deepest[:] = np.inf
     P = 0
     for box in range(n):
         m = measure(box, near, shapes, numbers, room)

@@ -8,7 +8,7 @@ And evidence of the points about its extents, after a round (M18).
 from math import exp, isfinite, log, sqrt
 
 from boxreg_ros.core.method.arrays import ANCHOR, BIAS, BOTTOM, EXTENT, GAP, PIVOT, POSE, SIDESLIP
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import loop
 from boxreg_ros.core.method.selection import sum_of
 
 SIZE, FACES = 3, 6
@@ -24,7 +24,7 @@ PINNED_DEVIATION = 0.01
 """Deviation of the bias of a pinned box [m, rad]: practically held. Chosen."""
 
 
-@kernel
+@loop
 def fill_mean_extents(b, problem, mean):
     """Write the mean input extents, marginalised ones included; of pinned boxes if there are."""
     has_pin = sum_of(problem.pinned[b]) > 0
@@ -39,21 +39,21 @@ def fill_mean_extents(b, problem, mean):
         mean[k] = total / count
 
 
-@kernel
+@loop
 def fill_all_mean_extents(problem, means):
     """Write the mean input extents of each window, (B, 3) [m]."""
     for b in range(len(means)):
         fill_mean_extents(b, problem, means[b])
 
 
-@kernel
+@loop
 def interval_of(b, problem):
     """Return the mean time step of window `b` [s]."""
     length = problem.lengths[b]
     return problem.times[b, length - 1] / max(length - 1, 1)
 
 
-@kernel
+@loop
 def constant_part(correlation, steps):
     """
     Return the deviation of the constant part of an error over that of the changing one (M17).
@@ -66,7 +66,7 @@ def constant_part(correlation, steps):
     return min(max(2 * later / (1 - later), LEAST_PART), 1.0)
 
 
-@kernel
+@loop
 def population_distance(mean, median, radius):
     """Return the squared distance of mean extents from those of the population of tracks."""
     distance = 0.0
@@ -75,7 +75,7 @@ def population_distance(mean, median, radius):
     return distance
 
 
-@kernel
+@loop
 def population_factor(k, mean, part, median, slopes, radius):
     """Return expected over given extent `k`, by the population of tracks (M18)."""
     pull = 0.0
@@ -84,7 +84,7 @@ def population_factor(k, mean, part, median, slopes, radius):
     return exp(part**2 * pull / (1 + population_distance(mean, median, radius)))
 
 
-@kernel
+@loop
 def fill_poses(b, problem, inputs, constants, common):
     """Write the deviations of the errors of the input poses of window `b` (M17)."""
     of_class, interval = problem.of_class[b], interval_of(b, problem)
@@ -104,7 +104,7 @@ def fill_poses(b, problem, inputs, constants, common):
         common.deviation[BIAS + j] = PINNED_DEVIATION if has_pin else bias
 
 
-@kernel
+@loop
 def fill_shared(b, problem, inputs, constants, mean, common):
     """Write means and deviations of extents, margins and motion of window `b`."""
     of_class, interval = problem.of_class[b], interval_of(b, problem)
@@ -144,7 +144,7 @@ def fill_shared(b, problem, inputs, constants, mean, common):
     deviation[ANCHOR:] = 1.0
 
 
-@kernel
+@loop
 def expect(b, problem, inputs, constants, mean, common):
     """
     Write means and deviations of window `b`.
@@ -170,7 +170,7 @@ def expect(b, problem, inputs, constants, mean, common):
     fill_shared(b, problem, inputs, constants, mean, common)
 
 
-@kernel
+@loop
 def fill_evidence(common, shared, corner, min_gain, evidence):
     """
     Write the evidence of the points alone about the extents (M18), see `Solution.evidence`.

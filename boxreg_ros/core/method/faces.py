@@ -418,7 +418,8 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
     toward = np.empty(3)
     lever = np.empty(3)
     tangent = np.empty(6)
-    velocity = np.zeros(3)
+    velocity = np.empty(3)
+    velocity[:] = 0.0
     length = problem.lengths[b]
     clear_padding(length, terms)
     for k in range(3):

@@ -22,7 +22,7 @@ Without a known sign the majority decides: a share of 0.5.
 """
 
 
-@kernel
+@loop
 def unwrap_half_turns(yaw):
     """
     Move each angle (N,) by half turns to the trend of those before.
@@ -40,7 +40,8 @@ def unwrap_half_turns(yaw):
 @kernel
 def forward_speed(boxes, times, yaw):
     """Return the median speed of the centres of boxes (n, 9) along `yaw` (n,) [m/s]."""
-    along = np.zeros(len(boxes))
+    along = np.empty(len(boxes))
+    along[0] = 0.0
     for n in range(1, len(boxes)):
         dx, dy = boxes[n, 0] - boxes[n - 1, 0], boxes[n, 1] - boxes[n - 1, 1]
         along[n] = (dx * cos(yaw[n]) + dy * sin(yaw[n])) / (times[n] - times[n - 1])

@@ -2,7 +2,7 @@
 
 from math import exp, log
 
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.expectation import constant_part, FACES, fill_mean_extents, SIZE
 from boxreg_ros.core.method.selection import nth, sum_of
 import numpy as np
@@ -21,7 +21,7 @@ GAP, OCCLUSION, RANGE = np.arange(3)  # of literals each would compile its funct
 """Quantities that the faces of a track show."""
 
 
-@kernel
+@loop
 def add_value(quantity, face, value, share, sums):
     """Add one value of a quantity of a face to the sums of its track, (3, 3, 6)."""
     sums[quantity, 0, face] += value
@@ -80,7 +80,7 @@ def sum_faces(problem, terms, inputs, constants, sums, logarithms):
                     add_value(RANGE, face, inset, distant, sums[b])
 
 
-@kernel
+@loop
 def pooled(values, mean, variance, between, prior_tracks):
     """
     Return what values (n,) of n tracks show of a quantity that differs from track to track.
@@ -121,7 +121,7 @@ def track_means(tracks, quantity, group, less, values):
     return values[:count]
 
 
-@kernel
+@loop
 def median_extent(tracks, axis, values):
     """Return the median of an extent of the tracks, in logarithms the mean of the middle two."""
     n = len(tracks)

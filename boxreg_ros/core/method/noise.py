@@ -2,7 +2,7 @@
 
 from math import exp, log, sqrt
 
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.expectation import SIZE
 from boxreg_ros.core.method.rotation import fill_rotation
 from boxreg_ros.core.method.selection import lower_median, sum_of
@@ -60,7 +60,7 @@ def fill_residuals(problem, poses, extents, residuals):
                 own[6 + k] = (box[3 + k] / extents[b, k] - 1) / of_class.extent
 
 
-@kernel
+@loop
 def are_finite(values):
     """Return whether all values (n,) are finite."""
     total = 0.0
@@ -69,7 +69,7 @@ def are_finite(values):
     return total == 0.0
 
 
-@kernel
+@loop
 def fill_valid(residuals, min_observations, valid):
     """Write which residuals (B, N, 9) count: finite ones of tracks with enough of them."""
     for b in range(len(residuals)):
@@ -81,7 +81,7 @@ def fill_valid(residuals, min_observations, valid):
             valid[b] = False
 
 
-@kernel
+@loop
 def fill_centred(residuals, valid, j, errors):
     """Write variable `j` less the mean of its track, (B, N)."""
     for b in range(len(residuals)):
@@ -96,7 +96,7 @@ def fill_centred(residuals, valid, j, errors):
             errors[b, n] = residuals[b, n, j] - total / count
 
 
-@kernel
+@loop
 def median_size(errors, valid, sizes):
     """Return the median size of the valid `errors` (B, N)."""
     count = 0
@@ -108,7 +108,7 @@ def median_size(errors, valid, sizes):
     return lower_median(sizes[:count])
 
 
-@kernel
+@loop
 def neighbour_sums(errors, valid, bound):
     """Return power and sum of products of neighbouring errors, each within +-bound."""
     power, products = 0.0, 0.0
@@ -122,7 +122,7 @@ def neighbour_sums(errors, valid, bound):
     return power, products
 
 
-@kernel
+@loop
 def removed_by_means(c, n):
     """
     Return the loss of variance when the mean of `n` autoregressive errors is subtracted.

@@ -39,7 +39,7 @@ def population_slopes(evidence, constants, median, slopes):
     constants = constants[0]
     for m in range(SIZE):
         median[m] = lower_median(evidence[:, 0, m].copy())
-    information = constants.slope_deviation**-2
+    information = 1 / constants.slope_deviation**2
     curvature, off = np.zeros((SIZE, SIZE, SIZE)), np.empty(SIZE)
     slopes[:] = 0.0
     for k in range(SIZE):

@@ -36,7 +36,7 @@ def ring_heights(points, counts, origins):
         With several sensors, whose rings lie between each other, the least.
 
     """
-    heights = np.zeros(len(counts))
+    heights = np.empty(len(counts))
     most = 0
     for i in range(len(counts)):
         most = max(most, counts[i])
@@ -54,8 +54,7 @@ def ring_heights(points, counts, origins):
                 ring = covering_gap(known, gaps, rank, ordered[:m])
                 away = sqrt(origins[i, k, 0] ** 2 + origins[i, k, 1] ** 2)
                 height = min(height, away * ring, height_of_highest(own, known, ring))
-        if isfinite(height):
-            heights[i] = height
+        heights[i] = height if isfinite(height) else 0.0
     return heights
 
 
@@ -112,7 +111,7 @@ def sort_by_rank(values, rank, ordered):
         ordered[int(rank[i])] = values[i]
 
 
-@kernel
+@loop
 def sort(values, rank, ordered):
     """Write values (n,) in ascending order; `rank` (n,) is to work in."""
     if len(values) <= MOST_RANKED:
@@ -122,7 +121,7 @@ def sort(values, rank, ordered):
         sort_in_place(ordered)
 
 
-@kernel
+@loop
 def covering_gap(values, gaps, rank, ordered):
     """
     Return the gap between neighbours that covers the middle of all gaps in their order.
