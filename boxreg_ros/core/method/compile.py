@@ -1,7 +1,8 @@
 """How kernels are compiled: by numba, once, kept on disk."""
 
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache, partial
 import gc
 from hashlib import sha256
 from pathlib import Path
@@ -139,25 +140,43 @@ class _QuickFlags(Flags):
         return hash(frozenset(self._values))
 
 
-def _keep_operators(context: Any) -> None:
+_RESULTS: dict[Any, Any] = {}
+"""What operators give, by operator and types of operands."""
+
+
+def _kept_or_resolved(resolve: Callable[..., Any], func: Any, args: Any, kws: Any) -> Any:
+    """Return the signature of a call; that of an operator from `_RESULTS` once it is known."""
+    operation = getattr(func, 'typing_key', func)
+    is_operator = getattr(operation, '__module__', None) == '_operator'
+    if not is_operator or not all(isinstance(t, types.Number | types.Array) for t in args):
+        return resolve(func, args, kws)
+    if (operation, args) not in _RESULTS:
+        _RESULTS[operation, args] = resolve(func, args, kws)
+    return _RESULTS[operation, args]
+
+
+@contextmanager
+def _looked_up_once(state: Any) -> Iterator[None]:
     """
-    Let the context of types find the result of an operator once for each types of operands.
+    Let numba look up operators once for each types of operands, and for no new functions.
 
-    Numba tries all forms of an operator, a dozen, at each place where a kernel has one.
+    It tries all forms of an operator, a dozen, at each place of a kernel that has one, and looks
+    for functions that were defined meanwhile wherever an array is used. Its contexts are those of
+    all libraries of a process, and as before after the block.
 
     """
-    resolve, kept = context.resolve_function_type, {}
-
-    def kept_or_resolved(func: Any, args: Any, kws: Any) -> Any:
-        operation = getattr(func, 'typing_key', func)
-        is_operator = getattr(operation, '__module__', None) == '_operator'
-        if not is_operator or not all(isinstance(t, types.Number | types.Array) for t in args):
-            return resolve(func, args, kws)
-        if (operation, args) not in kept:
-            kept[operation, args] = resolve(func, args, kws)
-        return kept[operation, args]
-
-    context.resolve_function_type = kept_or_resolved
+    typing, target = state.typingctx, state.targetctx
+    kept = partial(_kept_or_resolved, typing.resolve_function_type)
+    methods = (typing, 'resolve_function_type', kept), (target, 'refresh', lambda: None)
+    # In the block of a kernel that calls this one they are replaced already.
+    replaced = [method for method in methods if method[1] not in vars(method[0])]
+    for context, name, method in replaced:
+        setattr(context, name, method)
+    try:
+        yield
+    finally:
+        for context, name, _ in replaced:
+            delattr(context, name)
 
 
 class _KernelCompiler(Compiler):
@@ -173,13 +192,9 @@ class _KernelCompiler(Compiler):
 
     def compile_extra(self, function: Callable[..., Any]) -> Any:
         """Return the compiled kernel."""
-        state = self.state
-        state.flags = _QuickFlags(state.flags)
-        if 'resolve_function_type' not in vars(state.typingctx):
-            _keep_operators(state.typingctx)
-        # Numba looks for new functions wherever an array is used.
-        state.targetctx.refresh = lambda: None
-        return super().compile_extra(function)
+        self.state.flags = _QuickFlags(self.state.flags)
+        with _looked_up_once(self.state):
+            return super().compile_extra(function)
 
 
 class _LinkedCompiler(_KernelCompiler):
