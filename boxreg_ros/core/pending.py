@@ -188,6 +188,8 @@ class PendingArray:
             columns.face_distances,
             columns.near_points,
         )
+        if is_final:  # boxes, which tracks still have, know their array: no cycle is left
+            self.observed.clear()
         return whole if is_returned.all() else whole.take(np.flatnonzero(is_returned).tolist())
 
 

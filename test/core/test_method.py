@@ -5,7 +5,7 @@ from boxreg_ros.core.method.arrays import (
     Arrowhead,
     BLOCK,
     Factor,
-    LANES,
+    padded,
     PIVOT,
     POSE,
     PRIOR,
@@ -45,7 +45,7 @@ def matrix(N, S=SHARED):
 
 def empty_factor(N):
     """Return room for the factor of a window of N observations."""
-    width = -(-(SHARED + NEXT) // LANES) * LANES
+    width = padded(SHARED + NEXT)
     shapes = (N, POSE, POSE), (N, POSE, width), (SHARED, SHARED)
     return Factor(*(np.empty(shape) for shape in shapes))
 

@@ -1,6 +1,7 @@
 """Each box is returned once, in order, with its status; the same calls return the same boxes."""
 
 from dataclasses import replace
+import gc
 
 from boxreg_ros import Config, refine
 from boxreg_ros.config import Ingredients
@@ -9,6 +10,7 @@ from boxreg_ros.core.estimation import estimate_windows, solve
 from boxreg_ros.core.geometry import face_distances
 from boxreg_ros.core.latency import Latency
 from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.core.pending import PendingArray
 from boxreg_ros.core.problem import stack_windows
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.structures import BoxArray, Sweep
@@ -225,6 +227,20 @@ def test_reset_discards_all_but_the_counts(stream, estimate):
     registrar.counts.clear()
     assert_equal(fed(registrar, stream) + registrar.flush(), known)
     assert registrar.counts == counts
+
+
+def test_final_boxes_leave_no_garbage(tracks, stream):
+    # The commands and the node search for garbage rarely: what refers to itself would stay.
+    config = config_with(window=4, lag=1)
+    registrar = BoxRegistrar(config)
+    gc.collect()
+    gc.disable()
+    try:
+        fed(registrar, stream)
+        pending = [one for one in gc.get_objects() if isinstance(one, PendingArray)]
+    finally:
+        gc.enable()
+    assert len(pending) <= len(tracks) * config.window < len(stream)
 
 
 @each_estimate

@@ -166,13 +166,19 @@ def copy(values, target):
 
 
 @loop
+def padded(count):
+    """Return the least multiple of `LANES` that is a `count` or more."""
+    return (count + LANES - 1) & -LANES  # of which the compiler sees that it is one
+
+
+@loop
 def most_points(counts):
     """Return the most points of an observation, of `counts` (B, N), as a multiple of `LANES`."""
     most = 1
     for b in range(len(counts)):
         for n in range(counts.shape[1]):
             most = max(most, counts[b, n])
-    return (most + LANES - 1) & -LANES
+    return padded(most)
 
 
 @kernel

@@ -10,7 +10,7 @@ numba unrolls short loops into scalars.
 
 from math import sqrt
 
-from boxreg_ros.core.method.arrays import copy, LANES, PIVOT, POSE
+from boxreg_ros.core.method.arrays import copy, padded, PIVOT, POSE
 from boxreg_ros.core.method.compile import kernel, loop
 import numpy as np
 
@@ -188,7 +188,7 @@ def fill_sides(block, S, own, coupling):
 def fill_change(links, coupling, change):
     """Write the product of what the next poses are coupled to, and of their `coupling`."""
     for c in range(NEXT):
-        for r in range((coupling.shape[1] + LANES - 1) & -LANES):
+        for r in range(padded(coupling.shape[1])):
             total = 0.0
             for a in range(POSE):
                 total += links[a, POSE + c] * coupling[a, r]
@@ -269,7 +269,7 @@ def substitute_forward(factor, x, rest):
         coupling, own, after = factor.coupling[pose], x[POSE * pose :], POSE * (pose + 1)
         for c in range(NEXT):
             rest[S + c] = x[after + c] if after + c < end else 0.0
-        for r in range((len(rest) + LANES - 1) & -LANES):
+        for r in range(padded(len(rest))):
             total = 0.0
             for a in range(POSE):
                 total += coupling[a, r] * own[a]
@@ -295,7 +295,7 @@ def substitute_backward(factor, x, rest, found):
             total = 0.0
             for b in range(POSE):
                 total += own[a, b] * right[b]
-            for r in range((len(rest) + LANES - 1) & -LANES):
+            for r in range(padded(len(rest))):
                 total += coupling[a, r] * rest[r]
             found[a] = total
         for a in range(POSE):
@@ -348,7 +348,7 @@ def invert_poses(factor, blocks, links, response):
 
     """
     S = len(factor.corner)
-    known = np.zeros((NEXT, (NEXT + S + LANES - 1) & -LANES))  # Z_rr, T_r
+    known = np.zeros((NEXT, padded(NEXT + S)))  # Z_rr, T_r
     after, product = np.empty((POSE, NEXT)), np.empty((POSE, known.shape[1]))
     for pose in range(len(blocks) - 1, -1, -1):
         coupling, own = factor.coupling[pose], factor.own[pose]
@@ -373,7 +373,7 @@ def invert_poses(factor, blocks, links, response):
 def multiply(after, known, product):
     """Write the product of a matrix (6, 12) and one whose width is a multiple of `LANES`."""
     for a in range(POSE):
-        for r in range((known.shape[1] + LANES - 1) & -LANES):
+        for r in range(padded(known.shape[1])):
             total = 0.0
             for c in range(NEXT):
                 total += after[a, c] * known[c, r]

@@ -14,7 +14,7 @@ from boxreg_ros.core.method.arrays import (
     EXTENT,
     Factor,
     GAP,
-    LANES,
+    padded,
     POSE,
     PRIOR,
 )
@@ -472,7 +472,7 @@ def marginalise(x, gradient, A, mean, step, information):
     copy(x[n:], mean[NEXT:])
     for a in range(POSE):
         A.poses[0].links[a, a] += RIDGE
-    width = (S + NEXT + LANES - 1) & -LANES
+    width = padded(S + NEXT)
     oldest = Factor(np.empty((1, POSE, POSE)), np.empty((1, POSE, width)), np.empty((S, S)))
     is_definite = eliminate_poses(A, oldest)
     fill_dense(A, information)

@@ -8,7 +8,7 @@ This is the correspondence search of every round.
 from math import ceil, inf, isfinite, isnan, sqrt
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, LANES, most_points, TOP
+from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, most_points, padded, TOP
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
@@ -282,11 +282,11 @@ def fill_moved(b, n, problem, velocity, moved):
         for i in range(m):
             for k in range(3):
                 moved[k, i] -= velocity[k] * problem.delays[first + i * stride]
-    padded = (m + LANES - 1) & -LANES
-    for i in range(m, padded):
+    count = padded(m)
+    for i in range(m, count):
         for k in range(3):
             moved[k, i] = FAR
-    return padded
+    return count
 
 
 @loop

@@ -18,7 +18,7 @@ from boxreg_ros.core.method.arrays import (
     copy,
     Factor,
     factor_of_window,
-    LANES,
+    padded,
     POSE,
 )
 from boxreg_ros.core.method.arrowhead import invert_poses, NEXT, solve
@@ -63,10 +63,8 @@ def empty_sums(B: int, N: int, S: int, prior_mean: Any, prior_information: Any) 
     common = np.empty(B, COMMON)
     common['prior_mean'] = prior_mean
     common['W_prior'] = prior_information
-    width = -(-(S + NEXT) // LANES) * LANES
-    factor = Factor(
-        np.empty((B, N, POSE, POSE)), np.empty((B, N, POSE, width)), np.empty((B, S, S))
-    )
+    coupling = np.empty((B, N, POSE, padded(S + NEXT)))
+    factor = Factor(np.empty((B, N, POSE, POSE)), coupling, np.empty((B, S, S)))
     return Sums(np.empty((B, N), TERMS), common, factor)
 
 
