@@ -21,8 +21,6 @@ Chosen: clouds of a street have 4 to 60; in centimetres 400 to 6000.
 """
 SECTORS = 72
 """Parts of the azimuth that a cloud may cover; chosen: 5 degrees."""
-SECTOR_POINTS = 10_000
-"""Points of a cloud by which these are found, every other one of twice as many; chosen."""
 PACKET_CLOUDS = 30
 """Clouds by which it is seen whether each is a whole sweep; chosen: packets are 10 or more."""
 MIN_PACKETS = 3
@@ -103,8 +101,7 @@ def _unit_text(sweep: Sweep) -> str:
 
 def _sectors(sweep: Sweep) -> NDArray[np.bool_]:
     """Return in which of `SECTORS` of azimuth about the LiDAR a cloud in its frame has points."""
-    x, y = sweep.points[:: max(1, len(sweep.points) // SECTOR_POINTS), :2].T
-    angles = np.arctan2(y, x)
+    angles = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
     places = ((angles / (2 * np.pi) + 0.5) * SECTORS)[np.isfinite(angles)].astype(int)
     return np.bincount(places.clip(0, SECTORS - 1), minlength=SECTORS) > 0
 
