@@ -33,6 +33,17 @@ def test_clouds_that_are_parts_of_a_sweep_are_named(parts, is_merged):
     assert (named in found_in(clouds, is_merged)) == (parts == 10 and not is_merged)
 
 
+def test_parts_of_a_sweep_are_named_whichever_rings_see_nothing():
+    # 16 rings, a point of each after another: every sixteenth point is of the one to the sky.
+    clouds = []
+    for k in range(30):
+        angles = 2 * np.pi * (np.linspace(0, 1, 160_000, endpoint=False) + k) / 10
+        points = 9 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+        points[::16] = np.nan
+        clouds.append(points)
+    assert 'each covers about 40 degrees of azimuth' in found_in(clouds)
+
+
 @pytest.mark.parametrize('apart_ns', [0, 400_000, 10_000_000])
 @pytest.mark.parametrize('lidars', [1, 2, 4])
 def test_several_lidars_on_one_topic_are_named(apart_ns, lidars):
