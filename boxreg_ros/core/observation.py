@@ -7,9 +7,9 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.field_of_view import FieldOfView
 from boxreg_ros.core.method import crop as crop_kernels
 from boxreg_ros.core.method.rings import ring_heights
-from boxreg_ros.core.tables import by_table
+from boxreg_ros.core.tables import numbered
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import Floats, Ints, ROLL, Sweep, YAW
+from boxreg_ros.structures import Floats, Ints, ROLL, Sweep
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,6 +44,10 @@ FACE_TOLERANCE = 0.2
 by less are of both; boxes that move less until they are seen have no time [m]. Chosen: the error
 of an input or predicted box. Of simulated boxes of known time that move by 0.2 to 0.3 m, 84 to
 100 % vote for it; with 0.1 to 0.2 m some sets vote for the other."""
+
+
+NO_TURN = np.eye(3)
+"""The rotation of points that are in the frame of the sweep."""
 
 
 class Crop(NamedTuple):
@@ -114,18 +118,15 @@ class Observations(NamedTuple):
         A table that is used by half is not copied row by row: it has further rows.
 
         """
-        tables = []
-        rows = np.empty(len(items), int)
-        length = 0
-        for table, places, own in by_table(items):
-            if 2 * len(own) < len(table.boxes):
-                tables.append(table.take(own))
-                rows[places] = np.arange(length, length + len(own))
-            else:
-                tables.append(table)
-                rows[places] = own + length
-            length += len(tables[-1].boxes)
-        return cls.concatenated(tables), rows
+        tables, number, rows = numbered(items)
+        for k, used in enumerate(np.bincount(number).tolist()):
+            if 2 * used < len(tables[k].boxes):
+                places = (number == k).nonzero()[0]
+                tables[k] = tables[k].take(rows[places])
+                rows[places] = np.arange(used)
+        lengths = np.array([len(table.boxes) for table in tables])
+        first = np.cumsum(lengths) - lengths
+        return cls.concatenated(tables), rows + first[number]
 
     def take(self, rows: Ints) -> 'Observations':
         """Return some of the rows (n,), in their order."""
@@ -214,25 +215,26 @@ def observe(
 
     """
     n = len(boxes)
-    centers = boxes[:, :3]
-    own = own_points(sweep, boxes, config)
-    rows, owner = _thinned(own, sweep, n, config)
+    numbers = crop_numbers(config)
+    shapes = shapes_of(sweep, boxes, numbers.margin)
+    columns = np.ascontiguousarray(sweep.points.T)
+    own = OwnPoints(*crop_kernels.own_points(columns, shapes, numbers))
+    rows, owner, counts = _thinned(own, sweep, n, config)
 
-    points = _offsets(sweep, centers, rows, owner)
-    counts = np.bincount(owner, minlength=n)
+    points = _offsets(columns, shapes, rows, owner)
     delays = np.zeros(len(rows), np.float32)
     sights = np.zeros(n)
     if config.sampling.deskew and sweep.times is not None:
         delays = sweep.times[rows].astype(np.float32)
         sights = _medians(delays, counts)
-    up = np.cos(boxes[:, ROLL:YAW]).prod(1)  # of the z axis of each box, in the fixed frame
+    up = shapes.rotations[:, 2, 2]  # of the z axis of each box, in the fixed frame
     ground = (own.road - boxes[:, 5] / 2) / up.clip(LEAST_UP)  # along z of the fixed frame
-    origins = _origins(sweep, rows, owner, centers)
+    origins = _origins(sweep, rows, owner, boxes[:, :3])
     heights = ring_heights(points, counts, origins)
     if view is not None:
-        origin, places = (_among_points(sweep, at)[0] for at in (sweep.origin[None], centers))
+        (origin,), _ = _among_points(sweep, sweep.origin[None])
         is_hidden = view.hidden_tops(
-            sweep, origin[0], places, boxes[:, 3:6], own.row, own.owner, heights
+            sweep, origin, shapes.centers, boxes[:, 3:6], own.row, own.owner, heights
         )
         heights[is_hidden] = UNKNOWN_TOP
     return Observations(
@@ -250,12 +252,13 @@ def observe(
     )
 
 
-def _offsets(sweep: Sweep, centers: Floats, rows: Ints, owner: Ints) -> NDArray[np.float32]:
-    """Return points minus the `centers` (n, 3) of their boxes, axes of the sweep, (P, 3) [m]."""
-    at_points, turn = _among_points(sweep, centers)
-    x, y, z = sweep.points.T.take(rows, 1) - at_points.T.take(owner, 1)
+def _offsets(
+    columns: NDArray[np.floating], shapes: crop_kernels.Shapes, rows: Ints, owner: Ints
+) -> NDArray[np.float32]:
+    """Return points minus the centres of their boxes, axes of the fixed frame, (P, 3) [m]."""
+    x, y, z = columns.take(rows, 1) - shapes.centers.T.take(owner, 1)
     offsets = np.empty((len(rows), 3), np.float32)
-    for axis, (a, b, c) in enumerate(turn):
+    for axis, (a, b, c) in enumerate(shapes.turn):
         offsets[:, axis] = a * x + b * y + c * z
     return offsets
 
@@ -329,14 +332,6 @@ def crop_numbers(config: Config) -> crop_kernels.CropNumbers:
     )
 
 
-def own_points(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
-    """Return the points that belong to each box of `boxes` (n, 9)."""
-    numbers = crop_numbers(config)
-    columns = np.ascontiguousarray(sweep.points.T)
-    shapes = shapes_of(sweep, boxes, numbers.margin)
-    return OwnPoints(*crop_kernels.own_points(columns, shapes, numbers))
-
-
 def _among_points(sweep: Sweep, centers: Floats) -> tuple[Floats, Floats]:
     """
     Return `centers` (n, 3) in the frame of the points, and the rotation of that frame, (3, 3).
@@ -346,7 +341,7 @@ def _among_points(sweep: Sweep, centers: Floats) -> tuple[Floats, Floats]:
 
     """
     if sweep.T_frame_points is None:
-        return centers.copy(), np.eye(3)
+        return centers.copy(), NO_TURN.copy()
     R, t = sweep.T_frame_points[:3, :3], sweep.T_frame_points[:3, 3]
     return (centers - t) @ R, R.copy()
 
@@ -386,9 +381,11 @@ def crop(sweep: Sweep, boxes: Floats, margin: float) -> Crop:
     return Crop(row[order], owner[order], offset[order].T, outside[order].T)
 
 
-def _thinned(own: OwnPoints, sweep: Sweep, n: int, config: Config) -> tuple[Ints, Ints]:
+def _thinned(own: OwnPoints, sweep: Sweep, n: int, config: Config) -> tuple[Ints, Ints, Ints]:
     """
     Return sweep row and box of the points of n boxes that are kept, ascending by box; (P,) each.
+
+    And how many of each box, (n,).
 
     Farthest points for the paper, else every n-th.
 
@@ -403,13 +400,13 @@ def _thinned(own: OwnPoints, sweep: Sweep, n: int, config: Config) -> tuple[Ints
             picks = farthest_point_sample(sweep.points[own.row[part]].astype(np.float64), most)
             is_kept[part] = False
             is_kept[first[box] + picks] = True
-        place = np.flatnonzero(is_kept)
+        place, kept = np.flatnonzero(is_kept), np.minimum(counts, most)
     else:
         stride = np.maximum(1, -(-counts // most))
         kept = -(-counts // stride)
         step = _runs(np.zeros(n, int), kept)  # 0, 1, 2 ... of each box
         place = np.repeat(first, kept) + step * np.repeat(stride, kept)
-    return own.row[place], own.owner[place]
+    return own.row[place], own.owner[place], kept
 
 
 def _runs(first: Ints, counts: Ints) -> Ints:

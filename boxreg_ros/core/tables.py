@@ -7,7 +7,6 @@ records are taken by `take`, ten times as fast as by an index.
 
 """
 
-from collections import defaultdict
 from collections.abc import Sequence
 from itertools import count, pairwise
 from typing import Any
@@ -16,19 +15,26 @@ from boxreg_ros.structures import Ints
 import numpy as np
 
 
+def numbered(items: Sequence[tuple[Any, int]]) -> tuple[list[Any], Ints, Ints]:
+    """Return the tables of n items in the order they appear, their numbers and rows, (n,) each."""
+    owners, rows = zip(*items, strict=True) if items else ((), ())
+    ids = list(map(id, owners))
+    tables = dict(zip(ids, owners, strict=True))
+    number_of = dict(zip(tables, count()))
+    number = np.fromiter(map(number_of.__getitem__, ids), int, len(ids))
+    return [*tables.values()], number, np.array(rows, int)
+
+
 def by_table(items: Sequence[tuple[Any, int]]) -> list[tuple[Any, Ints, Ints]]:
     """Return each table of some items, the places of its items among them, and their rows."""
-    owners, rows = zip(*items, strict=True) if items else ((), ())
-    row = np.array(rows, int)
-    number_of = defaultdict[int, int](count().__next__)  # of each table, by its id
-    number = np.fromiter(map(number_of.__getitem__, map(id, owners)), int, len(owners))
-    if len(number_of) == 1:
-        return [(owners[0], np.arange(len(row)), row)]
-    kind = np.min_scalar_type(len(number_of))  # small numbers are fast to sort
+    tables, number, row = numbered(items)
+    if len(tables) == 1:
+        return [(tables[0], np.arange(len(row)), row)]
+    kind = np.min_scalar_type(len(tables))  # small numbers are fast to sort
     order = np.argsort(number.astype(kind), kind='stable')
     ends = np.cumsum(np.bincount(number)).tolist()
     parts = [order[begin:end] for begin, end in pairwise([0, *ends])]
-    return [(owners[part[0]], part, row[part]) for part in parts if len(part)]
+    return [(table, part, row[part]) for table, part in zip(tables, parts, strict=False)]
 
 
 def rows_by_key(keys: Sequence[str]) -> dict[str, Ints]:
