@@ -124,6 +124,8 @@ def _check_shape(
     name: str, found: tuple[int, ...], shape: tuple[int | None, ...], columns: str = ''
 ) -> None:
     """Raise ShapeError if an array `found` has another shape than expected."""
+    if found == shape:
+        return
     lengths = zip(shape, found, strict=False)
     if len(found) != len(shape) or any(want not in (None, got) for want, got in lengths):
         raise ShapeError(f'{name}: expected {_expected(shape, columns)}, got {found}')

@@ -173,9 +173,6 @@ class PendingArray:
                 (one and one.estimate) or (kept, row) for row, one in enumerate(self.observed)
             ]
         columns: Estimates = rows_of(found) if found else kept
-        is_returned = columns.status == REFINED
-        is_returned[: self.num_given] = True
-        is_returned[self.followed] = True
         added = (COASTED,) * (n - self.num_given)
         whole = RefinedBoxes(
             replace(self.input, boxes=columns.boxes, kinematics=columns.kinematics),
@@ -190,7 +187,12 @@ class PendingArray:
         )
         if is_final:  # boxes, which tracks still have, know their array: no cycle is left
             self.observed.clear()
-        return whole if is_returned.all() else whole.take(np.flatnonzero(is_returned).tolist())
+        if n == self.num_given:
+            return whole
+        is_returned = columns.status == REFINED
+        is_returned[: self.num_given] = True
+        is_returned[self.followed] = True
+        return whole.take(np.flatnonzero(is_returned).tolist())
 
 
 @dataclass(slots=True, eq=False)

@@ -8,7 +8,7 @@ numbers each and the shared variables s of `method.arrays`, the same for all obs
 
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import chain
+from itertools import chain, groupby
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config, KINDS
@@ -248,14 +248,14 @@ def group_windows(windows: Sequence[Window], config: Config) -> list[list[int]]:
     rows = [row for row, (_, length) in enumerate(kinds) if length >= config.min_observations]
     rows.sort(key=kinds.__getitem__)
     groups: list[list[int]] = []
-    for row in rows:
-        is_warm, length = kinds[row]
+    for (is_warm, length), alike in groupby(rows, kinds.__getitem__):
         hessian = (6 * length + SHARED) ** 2
         points = length * config.sampling.points * VALUES_PER_POINT
-        is_full = not groups or (len(groups[-1]) + 1) * max(hessian, points) > MAX_BATCH_VALUES
-        if is_full or kinds[groups[-1][0]][0] != is_warm:
-            groups.append([])
-        groups[-1].append(row)
+        most = MAX_BATCH_VALUES // max(hessian, points)
+        for row in alike:
+            if not groups or len(groups[-1]) >= most or kinds[groups[-1][0]][0] != is_warm:
+                groups.append([])
+            groups[-1].append(row)
     return groups
 
 

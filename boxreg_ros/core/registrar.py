@@ -447,7 +447,7 @@ class BoxRegistrar:
 
     def _followed(self, array: PendingArray, sweep: Sweep) -> list[_OfTrack]:
         """Return the boxes of followed objects that have none in `array`."""
-        if not array.is_observed:
+        if not (array.is_observed and self.followed.has_objects):
             return []
         boxes = array.input
         others = boxes.boxes[is_valid_box(boxes.boxes)]
@@ -493,16 +493,17 @@ class BoxRegistrar:
         boxes = np.array([one.box for _, one in to_observe])
         at_sweep = boxes.copy()
         offset = (sweep.stamp_ns - stamp_ns) * 1e-9  # [s]
-        velocities = np.zeros((len(boxes), 3))
-        motion = velocities
-        if offset or sweep.times is not None:
+        velocities = motion = np.zeros((len(boxes), 3))
+        is_compensated = offset != 0 or sweep.times is not None
+        if is_compensated:
             velocities = _input_velocities(to_observe, boxes, stamp_ns)
             # The points are relative to the box: motion-compensated to the stamp of the box.
             at_sweep[:, X : Z + 1] += offset * velocities
             if self.config.sampling.deskew:
                 motion = motion_to_sight(sweep, at_sweep, velocities)
-        table = observe(sweep, swept(at_sweep, motion), stamp_ns, self.config, self._view)
-        if offset or motion.any():
+                at_sweep = swept(at_sweep, motion)
+        table = observe(sweep, at_sweep, stamp_ns, self.config, self._view)
+        if is_compensated:
             table = table.relative_to(boxes, motion / 2)
         if given.pinned is not None:
             pinned = [one.row >= 0 and given.pinned[one.row] for _, one in to_observe]

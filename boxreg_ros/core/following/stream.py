@@ -110,6 +110,11 @@ class FollowedObjects:
         self._objects: dict[str, _Object] = {}
 
     @property
+    def has_objects(self) -> bool:
+        """Return whether any object is followed, or waits for its first sweep."""
+        return bool(self._waiting or self._objects)
+
+    @property
     def track_ids(self) -> tuple[str, ...]:
         """Return the ids of the objects that are followed."""
         return tuple(self._objects)
@@ -138,7 +143,7 @@ class FollowedObjects:
         The sweep of the stamp `sweep_ns` was added; `others` (n, 9) are boxes of other objects.
 
         """
-        if not (self._waiting or self._objects):
+        if not self.has_objects:
             return []
         rows = {sweep.stamp_ns: row for row, sweep in self._arrived.sweeps.items()}
         if sweep_ns not in rows:
