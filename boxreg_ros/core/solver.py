@@ -7,7 +7,6 @@ minimised. How many rounds there are, and what they use, is a `SolverPlan`, chos
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
@@ -47,8 +46,7 @@ NOISE_ROUNDS = 2
 the input, and the noise would be estimated smaller in every round."""
 
 
-@dataclass(frozen=True, slots=True)
-class SolverPlan:
+class SolverPlan(NamedTuple):
     """How a batch is solved."""
 
     rounds: int
@@ -76,8 +74,8 @@ class SolverPlan:
         """
         plan = cls(1, starts_from_fit=True) if is_warm else cls(config.solver.rounds)
         if config.estimate == 'track':
-            return replace(plan, uses_rigid_shape=True, estimates_noise=True)
-        return replace(plan, marginalises=True)
+            return plan._replace(uses_rigid_shape=True, estimates_noise=True)
+        return plan._replace(marginalises=True)
 
 
 class Batch(NamedTuple):

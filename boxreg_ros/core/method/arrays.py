@@ -231,8 +231,8 @@ class Quadratic(NamedTuple):
 
 def no_priors(B: int) -> Quadratic:
     """Return room for what B windows leave."""
-    shapes = (B, PRIOR), (B, PRIOR), (B, PRIOR, PRIOR)
-    return Quadratic(*(np.full(shape, np.nan) for shape in shapes))
+    step = np.full((B, PRIOR), np.nan)  # of a window that leaves nothing; then none is read
+    return Quadratic(np.empty((B, PRIOR)), step, np.empty((B, PRIOR, PRIOR)))
 
 
 class Solution(NamedTuple):

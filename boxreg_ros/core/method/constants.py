@@ -185,6 +185,7 @@ class Constants(NamedTuple):
     residuals: tuple[bool, ...] = (True,) * len(RESIDUALS)
     """Which of `RESIDUALS` are used; `measure ablation` leaves some out."""
 
+    @lru_cache(maxsize=8)  # noqa: B019
     def with_settings(self, config: Any) -> 'Constants':
         """Return these numbers with the settings of a `Config`."""
         faces, parts = config.faces, config.ingredients
@@ -201,6 +202,7 @@ class Constants(NamedTuple):
             residuals=tuple(name not in parts.without for name in RESIDUAL_NAMES),
         )
 
+    @lru_cache(maxsize=8)  # noqa: B019
     def in_round(self, uses_shape: bool, is_smooth: bool) -> 'Constants':
         """Return these numbers for a round; the start of a smooth one is not the noisy input."""
         residuals = tuple(
