@@ -211,9 +211,9 @@ class BoxRegistrar:
             If boxes of its stamp are in another frame.
 
         """
-        sweep = sweep.in_columns()
         self.counts['sweeps'] += not sweep.is_dropped
-        self.followed.add_sweep(sweep)
+        self.followed.add_sweep(sweep)  # those of some seconds: a copy of each would take memory
+        sweep = sweep.in_columns()
         self._correction.add_sweep(sweep)
         return self._process(self._matcher.add_sweep(sweep))
 
