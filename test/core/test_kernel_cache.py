@@ -169,6 +169,16 @@ def test_kernels_take_nothing_of_the_package_from_outside_of_their_folder():
                 assert node.module.startswith('boxreg_ros.core.method'), path.name
 
 
+def test_kernels_count_no_index_from_the_end():
+    # Negative indices are not wrapped: the element would be one before the array.
+    for path in (ROOT / 'boxreg_ros' / 'core' / 'method').glob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.Subscript):
+                parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+                found = [part for part in parts if ast.unparse(part).startswith('-')]
+                assert not found, f'{path.name}:{node.lineno}'
+
+
 @pytest.fixture
 def copy(tmp_path):
     """Return a folder with a copy of the package and its compiled kernels."""

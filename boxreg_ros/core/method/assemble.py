@@ -233,11 +233,15 @@ def add_shared_prior(shared, common, first, gradient, A):
     return value
 
 
-@kernel
-def add_marginal_prior(x, common, first, gradient, A):
-    """Add the quadratic form in the two oldest poses and the shared variables (M9)."""
+@loop
+def add_marginal_prior(x, common, r, first, gradient, A):
+    """
+    Add the quadratic form in the two oldest poses and the shared variables (M9).
+
+    `r` (29,) is to work in.
+
+    """
     W, mean = common.W_prior, common.prior_mean
-    r = np.empty(PRIOR)
     for k in range(PRIOR):
         r[k] = x[k if k < NEXT else first + k - NEXT] - mean[k]
     value = 0.0
@@ -277,7 +281,7 @@ def has_weight(W):
     return total != 0.0
 
 
-@kernel
+@loop
 def add_all(poses, shared, last, terms, at, room, first, gradient, A):
     """Add all `RESIDUALS` that begin at the first `last` observations."""
     value = 0.0
@@ -299,7 +303,7 @@ def add_all(poses, shared, last, terms, at, room, first, gradient, A):
     return value
 
 
-@kernel
+@loop
 def accumulate(x, last, terms, common, at, out, gradient, A):
     """
     Return the sum of the residuals of one window (M1); write its gradient and curvature.
@@ -336,7 +340,7 @@ def accumulate(x, last, terms, common, at, out, gradient, A):
                 value += add_faces(n, axis, shared, terms, room, first, gradient, A)
     value += add_all(poses, shared, last, terms, at, out, first, gradient, A)
     if common.W_prior[0, 0] != 0.0:
-        value += add_marginal_prior(x, common, first, gradient, A)
+        value += add_marginal_prior(x, common, room.off, first, gradient, A)
     if last >= N:
         value += add_shared_prior(shared, common, first, gradient, A)
     return value

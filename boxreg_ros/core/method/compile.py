@@ -14,6 +14,7 @@ import numba
 from numba.core import event, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
+from numba.np import arrayobj
 
 REORDER = {'contract', 'reassoc'}
 """Sums may be reordered for vector instructions; NaN and infinity are handled as usual."""
@@ -75,6 +76,7 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     It runs without the interpreter's lock, so that threads can share the windows of a batch. As
     no window depends on another, the results do not depend on the number of threads. Numba's own
     threads are not used: they do not survive a fork, and workers of `boxreg relabel` are forked.
+    No index may be negative: none is counted from the end of an array.
 
     Notes
     -----
@@ -161,8 +163,8 @@ def _looked_up_once(state: Any) -> Iterator[None]:
     Let numba look up operators once for each types of operands, and for no new functions.
 
     It tries all forms of an operator, a dozen, at each place of a kernel that has one, and looks
-    for functions that were defined meanwhile wherever an array is used. Its contexts are those of
-    all libraries of a process, and as before after the block.
+    for functions that were defined meanwhile wherever an array is used. Indices are used as they
+    are. Its contexts are those of all libraries of a process, and as before after the block.
 
     """
     typing, target = state.typingctx, state.targetctx
@@ -172,11 +174,23 @@ def _looked_up_once(state: Any) -> Iterator[None]:
     replaced = [method for method in methods if method[1] not in vars(method[0])]
     for context, name, method in replaced:
         setattr(context, name, method)
+    fix_index, arrayobj.fix_integer_index = arrayobj.fix_integer_index, _index
     try:
         yield
     finally:
+        arrayobj.fix_integer_index = fix_index
         for context, name, _ in replaced:
             delattr(context, name)
+
+
+def _index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
+    """
+    Return an index as it is, where numba would add the size to a negative one.
+
+    That takes instructions at each place, and keeps many loops from vector instructions.
+
+    """
+    return context.cast(builder, index, kind, types.intp)
 
 
 class _KernelCompiler(Compiler):

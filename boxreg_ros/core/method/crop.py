@@ -97,7 +97,7 @@ def cells_of_boxes(shapes, side):
         x = metre(centers[box, 0] - reach[box, 0])
         across = min(side, metre(centers[box, 0] + reach[box, 0]) - x + 1)
         start[box + 1] = start[box] + 2 * across
-    spans = np.empty((2, start[-1]), np.int64)
+    spans = np.empty((2, start[len(start) - 1]), np.int64)
     for box in range(len(centers)):
         x = metre(centers[box, 0] - reach[box, 0])
         y = metre(centers[box, 1] - reach[box, 1])

@@ -230,7 +230,7 @@ def slope(t, values, i, seconds, rate, error):
 
     """
     n = len(t)
-    begin = min(max(t[i] - seconds / 2, t[0]), max(t[0], t[-1] - seconds)) - 1e-6
+    begin = min(max(t[i] - seconds / 2, t[0]), max(t[0], t[len(t) - 1] - seconds)) - 1e-6
     end = begin + seconds + 2e-6
     low, high = max(i - 1, 0), min(i + 2, n)  # both neighbours at least
     while low > 0 and t[low - 1] >= begin:

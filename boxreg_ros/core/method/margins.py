@@ -2,6 +2,7 @@
 
 from math import exp, log
 
+from boxreg_ros.core.method.arrays import POSE
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.expectation import constant_part, FACES, fill_mean_extents, SIZE
 from boxreg_ros.core.method.selection import nth, sum_of
@@ -162,7 +163,7 @@ def fill_margins(k, tracks, settings, gap_deviations, occlusion_insets, learns, 
         bias = settings.pose[axis] * inputs.deviation[axis]
         bias *= constant_part(inputs.correlation[axis], 1.0)
         half_extent = settings.extent * inputs.extent_error[axis] / 2
-        half_extent *= constant_part(inputs.correlation[-SIZE + axis], 1.0)
+        half_extent *= constant_part(inputs.correlation[POSE + axis], 1.0)
         half_extent *= median_extent(tracks, axis, values)
         spread = settings.gap_spread if group < GROUPS - 1 else constants.road_spread
         of_face = max(constants.face_deviations[face], settings.roughness)

@@ -40,9 +40,9 @@ def fill_residuals(problem, poses, extents, residuals):
     """
     R = np.empty((3, 3))
     for b in range(len(poses)):
-        of_class = problem.of_class[b]
-        for n in range(poses.shape[1]):
-            box, before, pose = problem.boxes[b, n], problem.boxes[b, n - 1], poses[b, n]
+        boxes, of_class = problem.boxes[b], problem.of_class[b]
+        for n in range(len(boxes)):
+            box, before, pose = boxes[n], boxes[(n or len(boxes)) - 1], poses[b, n]
             own = residuals[b, n]
             change = 0.0
             for k in range(len(box)):

@@ -9,7 +9,17 @@ variables), and returns how many rows of r and columns of S it has. Its weight s
 
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import ANCHOR, BIAS, EXTENT, GAP, PIVOT, POSE, SIDESLIP, SPAN
+from boxreg_ros.core.method.arrays import (
+    ANCHOR,
+    BIAS,
+    EXTENT,
+    GAP,
+    PIVOT,
+    POSE,
+    PRIOR,
+    SIDESLIP,
+    SPAN,
+)
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.rotation import fill_rotation_derivatives
 from boxreg_ros.core.method.weights import (
@@ -64,6 +74,7 @@ LINEARISED = np.dtype(
         ('plane', float, 4),
         ('by_angles', float, (4, 3)),
         ('weighted', float, (4, 3)),
+        ('off', float, PRIOR),
     ],
     align=True,
 )
@@ -78,7 +89,7 @@ columns
 share
     Factors of the poses in a combination of them, (3,): the first six columns of J are derivatives
     by this.
-R, dR, step, pull, curvature, plane, by_angles, weighted
+R, dR, step, pull, curvature, plane, by_angles, weighted, off
     To work in.
 """
 
@@ -151,7 +162,7 @@ def input_pose(n, poses, shared, terms, at, out):
     return POSE, POSE
 
 
-@kernel
+@loop
 def rigid_shape(n, poses, shared, terms, at, out):
     """Write root'(step - anchor - wanted step), the rigid shape of the track (M4)."""
     fill_step(poses[n], terms[n].start, terms[n].axes, out)
@@ -173,7 +184,7 @@ def rigid_shape(n, poses, shared, terms, at, out):
     return POSE, POSE
 
 
-@kernel
+@loop
 def acceleration(n, poses, shared, terms, at, out):
     """Write the second difference of three poses over time, in the axes of the second (M5)."""
     axes = terms[n + 1].axes
