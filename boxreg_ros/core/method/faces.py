@@ -8,7 +8,7 @@ This is the correspondence search of every round.
 from math import ceil, inf, isfinite, isnan, sqrt
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, LANES, most_points, padded, TOP
+from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, most_points, padded, TOP
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
@@ -32,23 +32,19 @@ MIN_ALONG = 0.5
 
 
 @loop
-def fill_candidates(depth, m, constants, least, candidates):
+def fill_candidates(depth, m, constants, candidates):
     """
     Write the depths of those of m points that may be outermost on a face; return how many.
 
-    Those further behind the outermost one than `max_depth` are on another surface. `least` is to
-    work in: the least depth of each of `LANES`, by vector instructions.
+    Those further behind the outermost one than `max_depth` are on another surface.
 
     """
     behind = packed(constants.max_depth)
-    least[:] = packed(constants.deepest) - behind
-    for first in range(0, m, LANES):
-        for lane in range(LANES):
-            least[lane] = min(least[lane], depth[first + lane])
-    limit = least[0]
-    for lane in range(LANES):
-        limit = min(limit, least[lane])
-    limit += behind
+    a = b = c = d = packed(constants.deepest) - behind
+    for i in range(0, m, 4):  # one minimum would wait for the one before
+        a, b = min(a, depth[i]), min(b, depth[i + 1])
+        c, d = min(c, depth[i + 2]), min(d, depth[i + 3])
+    limit = min(min(a, b), min(c, d)) + behind
     count = 0
     for i in range(m):
         candidates[count] = depth[i]
@@ -117,7 +113,7 @@ def outermost_points(m, wanted, constants, work, moments):
     points, candidates, best = work.moved, work.candidates, work.best
     for face in range(FACES):
         own_strip, depth = work.strip[STRIP_AXIS[face]], work.depth[face]
-        count = fill_candidates(depth, m, constants, work.least, candidates)
+        count = fill_candidates(depth, m, constants, candidates)
         for s in range(len(best)):
             for rank in range(wanted):
                 best[s, rank] = inf
@@ -280,9 +276,14 @@ def fill_moved(b, n, problem, velocity, moved):
 
     """
     first, stride, m = problem.first[b, n], problem.stride, problem.counts[b, n]
-    for i in range(m):
-        for k in range(3):
-            moved[k, i] = problem.points[first + i * stride, k]
+    if stride == 1:
+        for i in range(m):
+            for k in range(3):
+                moved[k, i] = problem.points[first + i, k]
+    else:
+        for i in range(m):
+            for k in range(3):
+                moved[k, i] = problem.points[first + i * stride, k]
     if problem.is_moving:
         for i in range(m):
             for k in range(3):
@@ -336,8 +337,6 @@ class FaceWork(NamedTuple):
     candidates : array, shape (M + 1,)
         Depths of the points that may be outermost on one face; the last place is for one that may
         not.
-    least : array, shape (LANES,)
-        See `fill_candidates`.
     best : array
         Depths of the outermost points of each strip of one face.
     number, mean_depth : array, shape (5,)
@@ -352,7 +351,6 @@ class FaceWork(NamedTuple):
     depth: Any
     index: Any
     candidates: Any
-    least: Any
     best: Any
     number: Any
     mean_depth: Any
@@ -368,8 +366,8 @@ def empty_face_work(problem, constants):
         index[i] = i
     return FaceWork(
         np.empty((3, M)), np.empty((3, M)), np.empty((3, M)), np.empty((2, M), np.int32),
-        np.empty((FACES, M)), index, np.empty(M + 1), np.empty(LANES),
-        np.empty((constants.strips, size)), np.empty(FACES, np.int64), np.empty(FACES),
+        np.empty((FACES, M)), index, np.empty(M + 1), np.empty((constants.strips, size)),
+        np.empty(FACES, np.int64), np.empty(FACES),
     )  # fmt: skip
 
 
