@@ -219,9 +219,10 @@ def observe(
     shapes = shapes_of(sweep, boxes, numbers.margin)
     columns = np.ascontiguousarray(sweep.points.T)
     own = OwnPoints(*crop_kernels.own_points(columns, shapes, numbers))
-    rows, owner, counts = _thinned(own, sweep, n, config)
-
-    points = _offsets(columns, shapes, rows, owner)
+    row, owner, most = own.row, own.owner, config.sampling.points
+    if config.objective == 'paper':
+        row, owner = _farthest(own, sweep, n, most)
+    rows, points, counts = crop_kernels.thinned(columns, shapes, row, owner, most)
     delays = np.zeros(len(rows), np.float32)
     sights = np.zeros(n)
     if config.sampling.deskew and sweep.times is not None:
@@ -229,7 +230,7 @@ def observe(
         sights = _medians(delays, counts)
     up = shapes.rotations[:, 2, 2]  # of the z axis of each box, in the fixed frame
     ground = (own.road - boxes[:, 5] / 2) / up.clip(LEAST_UP)  # along z of the fixed frame
-    origins = _origins(sweep, rows, owner, boxes[:, :3])
+    origins = _origins(sweep, rows, counts, boxes[:, :3])
     heights = ring_heights(points, counts, origins)
     if view is not None:
         (origin,), _ = _among_points(sweep, sweep.origin[None])
@@ -252,31 +253,21 @@ def observe(
     )
 
 
-def _offsets(
-    columns: NDArray[np.floating], shapes: crop_kernels.Shapes, rows: Ints, owner: Ints
-) -> NDArray[np.float32]:
-    """Return points minus the centres of their boxes, axes of the fixed frame, (P, 3) [m]."""
-    x, y, z = columns.take(rows, 1) - shapes.centers.T.take(owner, 1)
-    offsets = np.empty((len(rows), 3), np.float32)
-    for axis, (a, b, c) in enumerate(shapes.turn):
-        offsets[:, axis] = a * x + b * y + c * z
-    return offsets
-
-
-def _origins(sweep: Sweep, rows: Ints, owner: Ints, centers: Floats) -> Floats:
+def _origins(sweep: Sweep, rows: Ints, counts: Ints, centers: Floats) -> Floats:
     """
     Return the sensors that see each of n objects, minus its centre, (n, K, 3) [m].
 
-    These are the sensors with `MIN_SENSOR_PART` of its points, which are `rows` of the sweep; all
-    of them for an object without points. The last repeats.
+    These are the sensors with `MIN_SENSOR_PART` of its points, `counts` (n,) of the `rows` of the
+    sweep; all of them for an object without points. The last repeats.
 
     """
     if sweep.origins is None or sweep.sensors is None:
         origin: Floats = (sweep.origin - centers)[:, None]
         return origin
     n, S = len(centers), len(sweep.origins)
-    counts = np.bincount(owner * S + sweep.sensors[rows], minlength=n * S).reshape(n, S)
-    sees = counts >= MIN_SENSOR_PART * counts.sum(1, keepdims=True)
+    owner = np.repeat(np.arange(n), counts)
+    by_sensor = np.bincount(owner * S + sweep.sensors[rows], minlength=n * S).reshape(n, S)
+    sees = by_sensor >= MIN_SENSOR_PART * by_sensor.sum(1, keepdims=True)
     number = sees.sum(1, keepdims=True)
     first_seeing = np.argsort(~sees, axis=1, kind='stable')
     place = np.minimum(np.arange(number.max(initial=1)), number - 1)  # (n, K)
@@ -381,32 +372,17 @@ def crop(sweep: Sweep, boxes: Floats, margin: float) -> Crop:
     return Crop(row[order], owner[order], offset[order].T, outside[order].T)
 
 
-def _thinned(own: OwnPoints, sweep: Sweep, n: int, config: Config) -> tuple[Ints, Ints, Ints]:
-    """
-    Return sweep row and box of the points of n boxes that are kept, ascending by box; (P,) each.
-
-    And how many of each box, (n,).
-
-    Farthest points for the paper, else every n-th.
-
-    """
-    most = config.sampling.points
+def _farthest(own: OwnPoints, sweep: Sweep, n: int, most: int) -> tuple[Ints, Ints]:
+    """Return those of the pairs of n boxes that are kept for the paper: farthest points; (P,)."""
     counts = np.bincount(own.owner, minlength=n)
     first = np.cumsum(counts) - counts
-    if config.objective == 'paper':
-        is_kept = np.ones(len(own.row), bool)
-        for box in np.flatnonzero(counts > most):
-            part = slice(first[box], first[box] + counts[box])
-            picks = farthest_point_sample(sweep.points[own.row[part]].astype(np.float64), most)
-            is_kept[part] = False
-            is_kept[first[box] + picks] = True
-        place, kept = np.flatnonzero(is_kept), np.minimum(counts, most)
-    else:
-        stride = np.maximum(1, -(-counts // most))
-        kept = -(-counts // stride)
-        step = _runs(np.zeros(n, int), kept)  # 0, 1, 2 ... of each box
-        place = np.repeat(first, kept) + step * np.repeat(stride, kept)
-    return own.row[place], own.owner[place], kept
+    is_kept = np.ones(len(own.row), bool)
+    for box in np.flatnonzero(counts > most):
+        part = slice(first[box], first[box] + counts[box])
+        picks = farthest_point_sample(sweep.points[own.row[part]].astype(np.float64), most)
+        is_kept[part] = False
+        is_kept[first[box] + picks] = True
+    return own.row[is_kept], own.owner[is_kept]
 
 
 def _runs(first: Ints, counts: Ints) -> Ints:

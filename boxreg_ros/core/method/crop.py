@@ -467,3 +467,54 @@ def own_points(points, shapes, numbers):
         count += depth[k] <= limit
     owner = owner[:count]  # ascending, before and after
     return sorted_by_x(owner, x[:count], own[:count], n), owner, road, num_inside
+
+
+@loop
+def step_of(count, most):
+    """Return the least step by which no more than `most` of some items are taken, at least 1."""
+    return max(1, (count + most - 1) // most)
+
+
+@kernel
+def thinned(points, shapes, row, owner, most):
+    """
+    Keep every n-th pair of each box, so that none has more than `most`.
+
+    Parameters
+    ----------
+    points, shapes
+        As for `crop`.
+    row, owner : array, shape (P,)
+        Point and box of each pair, ascending by box.
+    most : int
+        Pairs of a box.
+
+    Returns
+    -------
+    rows : array, shape (Q,)
+        Points of the pairs that are kept.
+    offsets : array, shape (Q, 3)
+        These minus the centres of their boxes, axes of the frame of the boxes [m].
+    counts : array, shape (n,)
+        How many each box keeps.
+
+    """
+    given, counts = np.empty(len(shapes.half), np.int64), np.empty(len(shapes.half), np.int64)
+    given[:] = 0
+    for k in range(len(owner)):
+        given[owner[k]] += 1
+    Q = 0
+    for box in range(len(given)):
+        step = step_of(given[box], most)
+        counts[box] = (given[box] + step - 1) // step
+        Q += counts[box]
+    rows, offsets = np.empty(Q, np.int64), np.empty((Q, 3), np.float32)
+    first, q = 0, 0
+    for box in range(len(given)):
+        step = step_of(given[box], most)
+        for k in range(counts[box]):
+            rows[q] = row[first + k * step]
+            offsets[q, 0], offsets[q, 1], offsets[q, 2] = offset_of(points, rows[q], shapes, box)
+            q += 1
+        first += given[box]
+    return rows, offsets, counts
