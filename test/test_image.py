@@ -156,6 +156,22 @@ def test_the_two_processes_of_a_first_start_compile_what_a_node_needs():
     assert done.stdout.split('\n')[-2] == '[]'
 
 
+@pytest.mark.parametrize('estimate', ['early', 'final', 'track'])
+def test_the_first_fit_has_no_residual_of_variables_that_it_lacks(estimate, monkeypatch):
+    from boxreg_ros.config import Config
+    from boxreg_ros.core import solver
+    from boxreg_ros.core.method.arrays import SHARED
+    from boxreg_ros.core.method.constants import RESIDUAL_NAMES
+    from boxreg_ros.io.warm_up import warm_up_solver
+
+    fits, fit = [], solver.fit
+    monkeypatch.setattr(solver, 'fit', lambda *args, **kws: fits.append(args) or fit(*args, **kws))
+    warm_up_solver(Config.from_dict({'estimate': estimate}))
+    ((batch, _, _, constants),) = fits
+    has_shape = constants.residuals[RESIDUAL_NAMES.index('rigid shape')]
+    assert has_shape == (batch.solution.shared.shape[1] == SHARED)
+
+
 def test_one_process_compiles_all_where_there_cannot_be_two(monkeypatch):
     from boxreg_ros.config import Config
     from boxreg_ros.io.warm_up import compiled_beside, SecondProcess

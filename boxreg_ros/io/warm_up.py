@@ -68,8 +68,11 @@ def warm_up_solver(config: Config) -> None:
     window = Window('1', 'car', rows, quick.window, np.zeros((0, 9)))
     problem, _ = stack_windows([window], quick, model.constants.prior_decay)
     # Deviations of 0 and correlations of 1 would end the search before it begins.
-    inputs, constants = np.full(len(KINDS), 0.5, INPUTS), model.constants.with_settings(quick)
-    plan = solver.SolverPlan.choose(quick, is_warm=False)
+    inputs, plan = np.full(len(KINDS), 0.5, INPUTS), solver.SolverPlan.choose(quick, is_warm=False)
+    # Without the variables of a rigid shape there must be none of its residuals.
+    constants = model.constants.with_settings(quick).in_round(
+        plan.uses_rigid_shape, is_smooth=True
+    )
     batch = solver.start(problem, quick, plan, inputs)
     batch.sums.terms[:] = np.zeros((), TERMS)
     batch.solution.poses[0, -1, 0] += 0.1  # off its input, so that there is something to search
