@@ -13,6 +13,7 @@ from paths import ROOT
 import pytest
 
 CALLER = """
+import sys
 from boxreg_ros.core.method.compile import kernel
 from inner import inner
 
@@ -22,7 +23,7 @@ def outer():
     return inner()
 
 
-print(outer(), len(outer.stats.cache_hits))
+print(outer(), len(outer.stats.cache_hits), 'numba.np.linalg' in sys.modules)
 """
 CALLED = """
 from boxreg_ros.core.method.compile import kernel
@@ -37,16 +38,16 @@ def inner():
 def test_a_caller_is_compiled_again_when_a_called_kernel_of_another_module_changes(tmp_path):
     (tmp_path / 'outer.py').write_text(CALLER)
 
-    def result_and_cache_hits(value):
+    def result_cache_hits_and_whether_numba_is_set_up(value):
         (tmp_path / 'inner.py').write_text(CALLED.format(value))
         # Python itself would take the old bytecode of a file that changes within a second.
         command = [sys.executable, '-B', 'outer.py']
         run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
         return run.stdout.split()
 
-    assert result_and_cache_hits(1) == ['1', '0']
-    assert result_and_cache_hits(1) == ['1', '1']
-    assert result_and_cache_hits(2) == ['2', '0']
+    assert result_cache_hits_and_whether_numba_is_set_up(1) == ['1', '0', 'True']
+    assert result_cache_hits_and_whether_numba_is_set_up(1) == ['1', '1', 'False']
+    assert result_cache_hits_and_whether_numba_is_set_up(2) == ['2', '0', 'True']
     # `inner` is part of `outer`: alone, it is neither translated nor kept.
     assert not list((tmp_path / '__pycache__').glob('inner.*'))
 

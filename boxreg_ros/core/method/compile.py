@@ -11,10 +11,10 @@ from typing import Any
 from warnings import warn
 
 import numba
-from numba.core import event, types
+from numba.core import cgutils, event, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
-from numba.np import arrayobj
+from numba.core.runtime.nrt import rtsys
 
 REORDER = {'contract', 'reassoc'}
 """Sums may be reordered for vector instructions; NaN and infinity are handled as usual."""
@@ -108,6 +108,27 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     return dispatcher
 
 
+class _CalledLibrary(JITCodeLibrary):
+    """
+    Code that Python calls, kept on disk as machine code and the names that it defines.
+
+    Numba would keep its intermediate code, too, for callers, which here link another form. To read
+    that is half of the time to load a kernel, and five times its memory.
+
+    """
+
+    def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
+        """Return what is kept on disk."""
+        names = self._codegen.create_library(self.name)
+        module = names.create_ir_module(self.name)
+        for symbol in (*self._final_module.functions, *self._final_module.global_variables):
+            if not symbol.is_declaration:
+                variable = cgutils.add_global_variable(module, cgutils.bool_t, symbol.name)
+                variable.initializer = cgutils.false_bit
+        names.add_ir_module(module)
+        return self.name, 'object', (self._get_compiled_object(), names._final_module.as_bitcode())
+
+
 class _LinkedLibrary(JITCodeLibrary):
     """
     Code that is linked into that of its callers, and only there optimised and made machine code.
@@ -167,6 +188,8 @@ def _looked_up_once(state: Any) -> Iterator[None]:
     are. Its contexts are those of all libraries of a process, and as before after the block.
 
     """
+    from numba.np import arrayobj  # slow, and no kernel that is loaded needs it
+
     typing, target = state.typingctx, state.targetctx
     kept = partial(_kept_or_resolved, typing.resolve_function_type)
     methods = (typing, 'resolve_function_type', kept), (target, 'refresh', lambda: None)
@@ -206,8 +229,12 @@ class _KernelCompiler(Compiler):
 
     def compile_extra(self, function: Callable[..., Any]) -> Any:
         """Return the compiled kernel."""
-        self.state.flags = _QuickFlags(self.state.flags)
-        with _looked_up_once(self.state):
+        state = self.state
+        state.flags = _QuickFlags(state.flags)
+        if state.library is None:
+            state.library = _CalledLibrary(state.targetctx.codegen(), function.__qualname__)
+            state.library.enable_object_caching()
+        with _looked_up_once(state):
             return super().compile_extra(function)
 
 
@@ -252,12 +279,17 @@ def _with_linked_form(dispatcher: Any, options: dict[str, Any]) -> Any:
 
 
 def _recover_from_damage(cache: Any) -> None:
-    """Let a damaged cache file be written again, with a warning; numba itself would raise."""
-    load = cache.load_overload
+    """
+    Let a damaged cache file be written again, with a warning; numba itself would raise.
 
-    def load_or_compile(*arguments: Any) -> Any:
+    A kernel is loaded without what numba sets up to compile one: 0.25 s of imports, and 35 MB.
+
+    """
+
+    def load_or_compile(signature: Any, target: Any) -> Any:
+        rtsys.initialize(target)  # the memory of arrays
         try:
-            return load(*arguments)
+            return cache._load_overload(signature, target)
         except Exception as error:  # whatever pickle raises for other bytes
             warn(
                 f'numba cache: expected compiled kernels in {cache.cache_path}, got a damaged '
