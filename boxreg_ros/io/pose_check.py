@@ -59,7 +59,7 @@ class PairedCheck:
         self._boxes: BoxArray | None = None
 
     def _paired(self, item: Sweep | BoxArray) -> tuple[NDArray[np.floating], BoxArray] | None:
-        """Take the next sweep or boxes; return points and boxes if they are of one time."""
+        """Take the next sweep or boxes; return points by x, and boxes, if they are of one time."""
         if isinstance(item, Sweep):
             self._sweep = item
         else:
@@ -70,7 +70,8 @@ class PairedCheck:
         if abs(sweep.stamp_ns - boxes.stamp_ns) > AT_ONCE * 1e9:
             return None
         self._sweep = self._boxes = None
-        return sweep.in_frame().points, boxes
+        columns = sweep.in_frame().points.T
+        return columns.take(np.argsort(columns[0]), axis=1).T, boxes
 
 
 @dataclass(slots=True)
@@ -284,13 +285,12 @@ def _listed(names: list[str]) -> str:
 
 
 def points_around(points: NDArray[np.floating], center: Floats, reach: float) -> Floats:
-    """Return those of the points (N, 3) nearer than `reach` along each axis, from `center`."""
-    # Python floats: those of NumPy would make float64 of all float32.
-    x, y, z = (
-        np.abs(column - of_center) < reach
-        for column, of_center in zip(points.T, center.tolist(), strict=True)
-    )
-    found: Floats = points[np.flatnonzero(x & y & z)] - center
+    """Return those of points (N, 3) by x nearer than `reach` along each axis, from `center`."""
+    x, y, z = center.tolist()  # Python floats: those of NumPy would make float64 of all float32
+    begin, end = np.searchsorted(points[:, 0], np.array([x - reach, x + reach], points.dtype))
+    near = points[begin:end]
+    is_near = (np.abs(near[:, 1] - y) < reach) & (np.abs(near[:, 2] - z) < reach)
+    found: Floats = near[is_near] - center
     return found
 
 
