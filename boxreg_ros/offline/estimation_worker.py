@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
+import gc
 import time
 from typing import Any, cast
 
@@ -85,12 +86,20 @@ class _Dispatcher:
 def _serve(config: Config, receive: Receive, send: Send) -> None:
     """Estimate windows in the worker until the connection is closed."""
     with announced_compilation(send), ThreadPoolExecutor(1) as pool:
-        warmed_up = pool.submit(warm_up, config)  # while the first windows fill and are received
+        warmed_up = pool.submit(_warm_up, config)  # while the first windows fill and are received
         while True:
             received = receive()
             warmed_up.result()
             send(_estimated(*received))
             del received  # before the next windows are received
+
+
+def _warm_up(config: Config) -> None:
+    """Import and load what estimates; its objects stay, and are never looked at for garbage."""
+    gc.disable()
+    warm_up(config)
+    gc.freeze()
+    gc.enable()
 
 
 def _estimated(packed: Any, config: Config, model: InputModel) -> tuple[Any, ...]:
