@@ -205,7 +205,7 @@ class Sweep:
     frame_id : str
         Frame of the sweep: of `origin` and `origins`, and of `points` without `T_frame_points`.
     points : array, shape (M, 3)
-        Finite points [m].
+        Finite points [m]; they are held, not copied: write the next cloud to another array.
     times : array, shape (M,), or None
         Time of measurement of each point relative to the stamp [s].
     origin : array, shape (3,)
