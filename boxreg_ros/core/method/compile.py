@@ -19,7 +19,7 @@ from numba.core.runtime.nrt import rtsys
 REORDER = {'contract', 'reassoc'}
 """Sums may be reordered for vector instructions; NaN and infinity are handled as usual."""
 
-IMPORTED = re.compile(r'^ *from [\w.]*?(\w+) import', re.MULTILINE)
+IMPORTED = re.compile(r'^from [\w.]*?(\w+) import', re.MULTILINE)
 """The last name of a module that a source imports from."""
 
 DIGEST_LENGTH = 12
@@ -183,25 +183,41 @@ def _kept_or_resolved(resolve: Callable[..., Any], func: Any, args: Any, kws: An
 
 
 @contextmanager
-def _compiled_quickly(state: Any) -> Iterator[None]:
+def _looked_up_once(state: Any) -> Iterator[None]:
     """
-    Let numba do what `lowering` says, and look up operators once for each types of operands.
+    Let numba look up operators once for each types of operands, and for no new functions.
 
     It tries all forms of an operator, a dozen, at each place of a kernel that has one, and looks
-    for functions that were defined meanwhile wherever an array is used. All of it is for all
-    libraries of a process, and as before after the block.
+    for functions that were defined meanwhile wherever an array is used. Indices are used as they
+    are. Its contexts are those of all libraries of a process, and as before after the block.
 
     """
-    # Slow, and no kernel that is loaded needs it.
-    from boxreg_ros.core.method.lowering import replaced, SHORTER
+    from numba.np import arrayobj  # slow, and no kernel that is loaded needs it
 
-    typing = state.typingctx
-    replacements = [(state.targetctx, 'refresh', lambda: None)]
-    if 'resolve_function_type' not in vars(typing):  # else in the block of a kernel that calls it
-        kept = partial(_kept_or_resolved, typing.resolve_function_type)
-        replacements += [(typing, 'resolve_function_type', kept), *SHORTER]
-    with replaced(*replacements):
+    typing, target = state.typingctx, state.targetctx
+    kept = partial(_kept_or_resolved, typing.resolve_function_type)
+    methods = (typing, 'resolve_function_type', kept), (target, 'refresh', lambda: None)
+    # In the block of a kernel that calls this one they are replaced already.
+    replaced = [method for method in methods if method[1] not in vars(method[0])]
+    for context, name, method in replaced:
+        setattr(context, name, method)
+    fix_index, arrayobj.fix_integer_index = arrayobj.fix_integer_index, _index
+    try:
         yield
+    finally:
+        arrayobj.fix_integer_index = fix_index
+        for context, name, _ in replaced:
+            delattr(context, name)
+
+
+def _index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
+    """
+    Return an index as it is, where numba would add the size to a negative one.
+
+    That takes instructions at each place, and keeps many loops from vector instructions.
+
+    """
+    return context.cast(builder, index, kind, types.intp)
 
 
 class _KernelCompiler(Compiler):
@@ -222,7 +238,7 @@ class _KernelCompiler(Compiler):
         if state.library is None:
             state.library = _CalledLibrary(state.targetctx.codegen(), function.__qualname__)
             state.library.enable_object_caching()
-        with _compiled_quickly(state):
+        with _looked_up_once(state):
             return super().compile_extra(function)
 
 
