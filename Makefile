@@ -42,7 +42,7 @@ JAZZY_TESTS := $(patsubst %,--ignore test/core/test_%.py, articulation box_time 
 # Each worker begins with one end of the suite and takes tests of the other when it is done.
 SHARED := -n $(WORKERS) --dist worksteal
 
-.PHONY: help demo test environments compiled compiled-jazzy test-main coverage test-jazzy lint format docs results figures clean
+.PHONY: help demo test environments compiled compiled-jazzy test-main coverage checked test-jazzy lint format docs results figures clean
 
 help: ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -74,6 +74,12 @@ test-main: $(tests) $(consumers)
 
 coverage: $(tests) $(consumers) ## run the suite and print the part of the lines that it executes
 	$(BIN)/python -m pytest $(SHARED) --cov --cov-report=term:skip-covered
+
+# `kernel` says why: an index that is negative or too large would read or damage other memory.
+checked: $(tests) ## run the tests of the core with each index of each kernel checked
+	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/out/checked $(BIN)/python -m pytest $(SHARED) \
+	    --ignore test/core/test_kernel_cache.py test/core test/tracks test/test_parity.py \
+	    test/test_image.py::test_the_first_fit_has_no_residual_of_variables_that_it_lacks
 
 test-jazzy: $(if $(PYTHON_JAZZY),$(jazzy)) ## run a part of the suite with the versions of Ubuntu 24.04
 	@[ -n '$(PYTHON_JAZZY)' ] || { \
