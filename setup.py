@@ -88,7 +88,7 @@ setup(
         'apsw',  # of rosbags, whose version it follows
         'filelock>=3.13,<5',  # torch needs it, too
         'mcap>=1.6,<2',
-        'numba>=0.59,<1',
+        'numba>=0.61,<1',  # `OLDEST_NUMBA`
         'numpy>=1.26,<3',
         'orjson>=3.9,<4',
         'pyyaml>=6,<7',

@@ -63,11 +63,14 @@ def description_of(error: BaseException) -> str:
         return str(error)
     if isinstance(error, OSError):
         return f'{error}; {remedy_of(error)}'
-    if isinstance(error, ModuleNotFoundError) and not (error.name or '').startswith(OWN_PACKAGES):
+    is_foreign = not (getattr(error, 'name', None) or '').startswith(OWN_PACKAGES)
+    if isinstance(error, ModuleNotFoundError) and is_foreign:
         return (
             f'{error}: a package that boxreg_ros depends on is missing; install it in the '
             f'environment that boxreg runs in, as docs/getting-started.md says'
         )
+    if isinstance(error, ImportError) and is_foreign:
+        return str(error)
     return (
         f'unexpected {type(error).__name__}: {error}; this is a fault of boxreg: please report it '
         f'with the traceback, which --debug prints'

@@ -6,7 +6,7 @@ import shutil
 import subprocess
 import sys
 
-from boxreg_ros.core.method.compile import sources_digest
+from boxreg_ros.core.method.compile import refuse_old, sources_digest
 from boxreg_ros.rotations import matrix_from_rpy
 import numpy as np
 from paths import ROOT
@@ -243,3 +243,11 @@ def test_a_damaged_cache_is_written_again_with_one_warning(copy):
     (text,) = rotated(copy)
     assert 'delete the folder' in text
     assert rotated(copy) == []
+
+
+@pytest.mark.parametrize('version', ['0.59.1', '0.60.0'])
+def test_a_numba_whose_sums_are_nan_is_refused(version):
+    refuse_old('0.61.2')
+    refuse_old('1.0.0rc1')
+    with pytest.raises(ImportError, match=rf'expected 0\.61 or newer, got {version}.*pip install'):
+        refuse_old(version)

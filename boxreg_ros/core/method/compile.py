@@ -19,6 +19,10 @@ from numba.core.runtime.nrt import rtsys
 REORDER = {'contract', 'reassoc'}
 """Sums may be reordered for vector instructions; NaN and infinity are handled as usual."""
 
+OLDEST_NUMBA = (0, 61)
+"""Measured: of 0.59.1, 0.60.0, 0.61.2 and 0.68.1 the first two, whose LLVM is 14, make NaN of
+sums that may be reordered."""
+
 IMPORTED = re.compile(r'^from [\w.]*?(\w+) import', re.MULTILINE)
 """The last name of a module that a source imports from."""
 
@@ -36,6 +40,19 @@ Passes of numba that are left out.
 They are for what no kernel has: `with`, inner functions and generators, errors with arguments,
 arguments that have to be literal, functions to be inlined by numba, and sums of whole arrays.
 """
+
+
+def refuse_old(version: str) -> None:
+    """Raise ImportError for a `version` of numba before `OLDEST_NUMBA`."""
+    if tuple(map(int, version.split('.')[:2])) < OLDEST_NUMBA:
+        oldest = '.'.join(map(str, OLDEST_NUMBA))
+        raise ImportError(
+            f'numba: expected {oldest} or newer, got {version}, which makes NaN of sums: '
+            f"pip install 'numba>={oldest}'"
+        )
+
+
+refuse_old(numba.__version__)
 
 
 class _CollectionsAfterwards(event.Listener):
