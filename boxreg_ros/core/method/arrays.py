@@ -231,7 +231,7 @@ class Quadratic(NamedTuple):
 
 def no_priors(B: int) -> Quadratic:
     """Return room for what B windows leave."""
-    step = np.full((B, PRIOR), np.nan)  # of a window that leaves nothing; then none is read
+    step = np.full((B, PRIOR), np.nan)  # by which `estimation` knows what leaves nothing
     return Quadratic(np.empty((B, PRIOR)), step, np.empty((B, PRIOR, PRIOR)))
 
 
@@ -249,7 +249,8 @@ class Solution(NamedTuple):
     posterior : Posterior
         Of windows that are done.
     left : Quadratic
-        What full windows leave to the next ones; NaN for others, no rows if it is not wanted.
+        What full windows leave to the next ones; the step of others is NaN, and the rest not
+        written. No rows if it is not wanted.
 
     """
 

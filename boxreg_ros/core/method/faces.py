@@ -36,7 +36,8 @@ def fill_candidates(depth, m, constants, candidates):
     """
     Write the depths of those of m points that may be outermost on a face; return how many.
 
-    Those further behind the outermost one than `max_depth` are on another surface.
+    They are m with the padding, a multiple of `LANES`; its depth is infinite. Those further behind
+    the outermost one than `max_depth` are on another surface.
 
     """
     behind = packed(constants.max_depth)
@@ -276,7 +277,7 @@ def fill_moved(b, n, problem, velocity, moved):
 
     """
     first, stride, m = problem.first[b, n], problem.stride, problem.counts[b, n]
-    if stride == 1:
+    if stride == 1:  # written out: else the compiler gathers the points, which is slow
         for i in range(m):
             for k in range(3):
                 moved[k, i] = problem.points[first + i, k]
