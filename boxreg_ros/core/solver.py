@@ -28,7 +28,7 @@ from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.method.faces import observe_faces
 from boxreg_ros.core.method.rigid_shape import observe_shapes
 from boxreg_ros.core.problem import Problem
-from boxreg_ros.core.threads import run, shared_between
+from boxreg_ros.core.threads import num_workers, run, shared_between
 from boxreg_ros.structures import Floats, Ints, KINEMATICS, POSE
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,10 @@ time."""
 NOISE_ROUNDS = 2
 """First rounds of a whole track whose residuals give the input noise. Chosen: later fits follow
 the input, and the noise would be estimated smaller in every round."""
+WINDOWS_AT_ONCE = 96
+"""Most windows that a thread takes through the steps of a round together, so that their data stay
+in the nearer caches of the processor. Measured: a sweep of 512 tracks took 0.89 of the time, as it
+did with 64 and with 128."""
 
 
 class SolverPlan(NamedTuple):
@@ -196,8 +200,12 @@ def run_round(
     uses_shape = plan.uses_rigid_shape and turn > 0
     is_smooth = turn > 0 or plan.starts_from_fit
     constants = constants.in_round(uses_shape, is_smooth)
-    observe(batch, inputs, rows, constants)
-    return fit(batch, inputs, rows, constants, turn + 1 >= plan.rounds, turn > 0)
+    ends = turn + 1 >= plan.rounds, turn > 0
+    is_done = []
+    for part in np.array_split(rows, -(-len(rows) // (WINDOWS_AT_ONCE * num_workers()))):
+        observe(batch, inputs, part, constants)
+        is_done.append(fit(batch, inputs, part, constants, *ends))
+    return np.concatenate(is_done)
 
 
 def observe(batch: Batch, inputs: Inputs, rows: Ints, constants: Constants) -> None:

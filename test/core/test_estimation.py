@@ -183,6 +183,17 @@ def test_the_number_of_threads_does_not_change_results(estimate):
                     np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize('estimate', ['final', 'track'])
+def test_windows_that_pass_a_round_in_parts_have_the_same_boxes(monkeypatch, estimate):
+    config = ALONE.updated({'estimate': estimate})
+    known = solved(windows(), config, InputModel(config.faces))
+    monkeypatch.setattr(solver, 'WINDOWS_AT_ONCE', 1)
+    found = solved(windows(), config, InputModel(config.faces))
+    for a, b in zip(found, known, strict=True):
+        np.testing.assert_array_equal(a.boxes, b.boxes)
+        np.testing.assert_array_equal(a.covariances, b.covariances)
+
+
 def note_rounds(monkeypatch, note):
     """Call `note` with the extents of the first window in every round."""
 
