@@ -212,7 +212,8 @@ class BoxRegistrar:
 
         """
         self.counts['sweeps'] += not sweep.is_dropped
-        self.followed.add_sweep(sweep)  # those of some seconds: a copy of each would take memory
+        if self.config.estimate != 'track':  # otherwise nothing is followed
+            self.followed.add_sweep(sweep)  # of some seconds: a copy of each would take memory
         sweep = sweep.in_columns()
         self._correction.add_sweep(sweep)
         return self._process(self._matcher.add_sweep(sweep))

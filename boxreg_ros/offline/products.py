@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -13,7 +13,7 @@ from boxreg_ros.io.stamp_join import joined_stamps
 from boxreg_ros.io.times import time_range
 from boxreg_ros.offline.notes import MAX_NAMED
 from boxreg_ros.offline.summary import Summary
-from boxreg_ros.structures import Ints, PROPOSED
+from boxreg_ros.structures import Floats, Ints, PROPOSED
 import numpy as np
 
 if TYPE_CHECKING:
@@ -70,14 +70,20 @@ def checked(
     from boxreg_ros.review.label_tracks import LabelTrack
     from boxreg_ros.review.rules import counts, violations
 
-    before = []
-    after = []
-    for track in tracks:
-        names = track.track_id, track.class_name, config, track.stamps_ns
-        before.append(LabelTrack.of(*names, track.given, track.num_points))
-        after.append(LabelTrack.of(*names, track.labels, track.num_points))
-    found = violations(after)
-    return {'before': counts(violations(before)), 'after': counts(found)}, found
+    def found(boxes_of: Callable[[TrackChanges], Floats]) -> dict[str, list[Violation]]:
+        return violations(
+            [
+                LabelTrack.of(
+                    *(track.track_id, track.class_name, config, track.stamps_ns),
+                    *(boxes_of(track), track.num_points),
+                )
+                for track in tracks
+            ]
+        )
+
+    before = counts(found(lambda track: track.given))
+    after = found(lambda track: track.labels)
+    return {'before': before, 'after': counts(after)}, after
 
 
 def fitting_truth(

@@ -22,9 +22,9 @@ import numpy as np
 SLOTS_AHEAD = 4
 """Items that are sent ahead. Chosen: the receiver takes at most two at once, as a cloud and its
 boxes."""
-SLOTS_KEPT = 36
-"""Items that the receiver keeps in shared memory; further ones are copied. Derived: at 10 Hz the
-registrar has 20 clouds, of two seconds, and the estimate of the latency 16 of the time before."""
+SLOTS_KEPT = 12
+"""Items that the receiver keeps in shared memory; further ones are copied. Derived: at 10 Hz late
+boxes wait with eight clouds, and four are compared with later boxes, or have none yet."""
 SLOTS = SLOTS_AHEAD + SLOTS_KEPT
 SLOT_BYTES = 2**25
 """Larger items go through the socket. Chosen: 2.7 million float32 points; memory that is not used
@@ -41,13 +41,13 @@ def shared_memory() -> mmap:
 
 
 class Sender:
-    """Send items from the worker; `receive` returns slots that the parent has read."""
+    """Send items from the worker; `receive` returns the slots of later items."""
 
     def __init__(self, memory: mmap, receive: Receive, send: Send) -> None:
         self._memory = memoryview(memory)
         self._receive = receive
         self._send = send
-        self._free = [*range(SLOTS)]
+        self._free = [*range(SLOTS_AHEAD)]
 
     def __call__(self, item: Any) -> None:
         """Send an item that can be pickled."""
@@ -73,28 +73,25 @@ class Receiver:
     def __init__(self, memory: mmap, process: WorkerProcess) -> None:
         self._memory = memory
         self._process = process
-        self._kept = 0
+        self._unused = iter(range(SLOTS_AHEAD, SLOTS))
         self._freed = deque[int]()  # slots whose arrays were freed, in any thread
 
     def __call__(self) -> Any:
         """Return the next item; raise as `WorkerProcess.receive`."""
-        while self._freed:
-            self._kept -= 1
-            self._return(self._freed.popleft())
         pickled, arrays, slot = self._process.receive()
         if slot is not None:
             end = arrays[-1].stop
             content = np.frombuffer(self._memory, np.uint8, end, slot * SLOT_BYTES)
-            if self._kept < SLOTS_KEPT:
-                self._kept += 1
-                finalize(content, self._freed.append, slot).atexit = False
+            # Freed slots first: as little memory as possible is ever used.
+            other = self._freed.pop() if self._freed else next(self._unused, None)
+            if other is None:
+                other, shared = slot, content
+                # Not of malloc, which would keep it, between smaller pieces, once it is freed.
+                content = np.frombuffer(mmap(-1, end), np.uint8)
+                content[:] = shared
             else:
-                content = content.copy()
-                self._return(slot)
+                finalize(content, self._freed.append, slot).atexit = False
+            with suppress(BoxregError):  # the worker has ended: it needs no slot
+                self._process.send(other)
             arrays = [content[place] for place in arrays]
         return pickle.loads(pickled, buffers=arrays)
-
-    def _return(self, slot: int) -> None:
-        """Let the worker fill a slot again."""
-        with suppress(BoxregError):  # it has ended: it needs no slot
-            self._process.send(slot)

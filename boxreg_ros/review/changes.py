@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import chain, pairwise
-from typing import Any, ClassVar
+from typing import Any
 
 from boxreg_ros.core.metrics import iou_3d, pose_errors
 from boxreg_ros.core.tables import rows_by_key
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import (
     BoxArray,
-    Columns,
-    concatenated,
     Floats,
     HUMAN,
     Ints,
@@ -29,14 +27,8 @@ from numpy.typing import ArrayLike, NDArray
 
 
 @dataclass(frozen=True, slots=True)
-class TrackChanges(Columns):
+class TrackChanges:
     """The boxes of one track before and after registration, by stamp."""
-
-    COLUMNS: ClassVar[tuple[str, ...]] = (
-        *('input_ids', 'stamps_ns', 'given', 'boxes', 'change', 'deviations'),
-        *('extent_deviations', 'face_distances', 'near_points', 'disagreement', 'is_flipped'),
-        *('status', 'reasons', 'num_points', 'attributes'),
-    )
 
     track_id: str
     class_name: str
@@ -106,16 +98,31 @@ BOXES_AT_ONCE = 2**12
 """Boxes whose arrays are reduced to a few numbers at once; chosen: they take 4 MB until then."""
 
 
+class _Column:
+    """Rows that become more; they are moved each time that there are twice as many."""
+
+    def __init__(self, rows: NDArray[Any]) -> None:
+        self.rows = self._room = rows
+
+    def append(self, rows: NDArray[Any]) -> None:
+        """Append rows; room that is not used yet takes no memory."""
+        begin, end = len(self.rows), len(self.rows) + len(rows)
+        if end > len(self._room):
+            self._room = np.empty((2 * end, *rows.shape[1:]), rows.dtype)
+            self._room[:begin] = self.rows
+        self._room[begin:end] = rows
+        self.rows = self._room[:end]
+
+
 class Changes:
     """Collect all boxes before and after, in a few numbers each; NaN in other frames."""
 
     def __init__(self, fixed_frame: str) -> None:
         self._fixed_frame = fixed_frame
-        self._track_ids: list[str] = []
-        self._class_names: list[str] = []
         self._waiting: list[tuple[BoxArray, RefinedBoxes, RefinedBoxes | None, list[str]]] = []
         self._boxes_waiting = 0
-        self._parts: list[TrackChanges] = []  # until they are one
+        self._columns: dict[str, _Column] = {}
+        self._known_texts: dict[str, str] = {}
 
     def add(
         self,
@@ -148,13 +155,12 @@ class Changes:
             self._reduce()
 
     def _reduce(self) -> None:
-        """Reduce the arrays that wait to one part."""
+        """Reduce the arrays that wait to rows of the columns."""
         arrays, self._waiting, self._boxes_waiting = self._waiting, [], 0
         given, results, early, names = zip(*arrays, strict=True)
         ends = np.cumsum([0, *map(len, names)])
-        n = int(ends[-1])
         boxes = [refined.boxes for refined in results]
-        before = np.full((n, 9), np.nan)
+        before = np.full((int(ends[-1]), 9), np.nan)
         for begin, of_input in zip(ends, given, strict=False):
             before[begin : begin + len(of_input.boxes)] = of_input.boxes
         after = np.concatenate([of_result.boxes for of_result in boxes])
@@ -163,73 +169,73 @@ class Changes:
         is_usable = is_valid_box(after) & np.repeat(is_fixed, counts)
         before[~is_usable] = np.nan
         after[~is_usable] = np.nan
-        status = np.array([word for refined in results for word in refined.status], str)
-        unknown = np.where(np.isin(status, (REFINED, HUMAN)), 0.0, np.nan)[:, None]
+        errors = pose_errors(before, after)  # of the input, in the axes of the result
+        yaw_change = wrap_angle(2 * errors.rotation[:, 2]) / 2  # half turns removed
+        status = self._texts(refined.status for refined in results)
+        is_refined = np.isin(status, (REFINED, HUMAN))
+        unknown = np.where(is_refined, 0.0, np.nan)[:, None]
         variances = _joined(results, 'extent_covariances')[:, range(3), range(3)]
-        self._track_ids += chain.from_iterable(of_result.track_ids for of_result in boxes)
-        self._class_names += chain.from_iterable(of_result.class_names for of_result in boxes)
-        self._parts.append(
-            TrackChanges(
-                track_id='',
-                class_name='',
-                input_ids=tuple(chain.from_iterable(names)),
-                stamps_ns=np.repeat([of_result.stamp_ns for of_result in boxes], counts),
-                given=before,
-                boxes=after,
-                change=np.broadcast_to(0.0, (n, 4)),  # these two follow once all are known
-                deviations=_deviations(after, _joined(results, 'covariances')) + unknown,
-                extent_deviations=np.sqrt(variances.clip(0)) + unknown,
-                face_distances=_joined(results, 'face_distances'),
-                near_points=_joined(results, 'near_points').astype(np.float64),
-                is_flipped=np.broadcast_to(False, n),
-                disagreement=np.concatenate(
-                    [
-                        _disagreement(after[begin:end], estimate)
-                        for (begin, end), estimate in zip(pairwise(ends), early, strict=True)
-                    ]
-                ),
-                status=status,
-                reasons=np.array([word for refined in results for word in refined.reasons], str),
-                num_points=_joined(results, 'num_points'),
-                attributes=tuple(
-                    chain.from_iterable(
-                        of_result.attributes or ({},) * len(of_result.track_ids)
-                        for of_result in boxes
-                    )
-                ),
-            )
-        )
+        disagreement = [
+            _disagreement(after[begin:end], estimate)
+            for (begin, end), estimate in zip(pairwise(ends), early, strict=True)
+        ]
+        attributes: list[Sequence[Mapping[str, str]]] = [
+            of_result.attributes or ({},) * len(of_result.track_ids) for of_result in boxes
+        ]
+        columns = {
+            'track_id': self._texts(of_result.track_ids for of_result in boxes),
+            'class_name': self._texts(of_result.class_names for of_result in boxes),
+            'input_ids': self._texts(names),
+            'stamps_ns': np.repeat([of_result.stamp_ns for of_result in boxes], counts),
+            'given': before,
+            'boxes': after,
+            'change': -np.column_stack([errors.translation, yaw_change]),
+            'deviations': _deviations(after, _joined(results, 'covariances')) + unknown,
+            'extent_deviations': np.sqrt(variances.clip(0)) + unknown,
+            'face_distances': _joined(results, 'face_distances'),
+            'near_points': _joined(results, 'near_points').astype(np.float64),
+            'is_flipped': errors.is_flipped & is_refined,
+            'disagreement': np.concatenate(disagreement),
+            'status': status,
+            'reasons': self._texts(refined.reasons for refined in results),
+            'num_points': _joined(results, 'num_points'),
+            'attributes': np.fromiter(chain.from_iterable(attributes), object),
+        }
+        for name, column in columns.items():
+            self._columns.setdefault(name, _Column(column[:0])).append(column)
+
+    def _texts(self, texts: Iterable[Iterable[str]]) -> NDArray[Any]:
+        """Return texts as objects, equal ones as the same one."""
+        found = (self._known_texts.setdefault(text, text) for text in chain.from_iterable(texts))
+        return np.fromiter(found, object)
 
     def tracks(self) -> list[TrackChanges]:
-        """Return all tracks, by descending mean shift."""
-        if self._waiting:
+        """Return all tracks, by descending mean shift; their arrays are parts of larger ones."""
+        if self._boxes_waiting:
             self._reduce()
-        if not self._parts:
+        if not self._columns:
             return []
-        every = concatenated(self._parts)
-        self._parts = [every]
-        errors = pose_errors(every.given, every.boxes)  # of the input, in the axes of the result
-        yaw_change = wrap_angle(2 * errors.rotation[:, 2]) / 2  # half turns removed
-        every = replace(
-            every,
-            change=-np.column_stack([errors.translation, yaw_change]),
-            is_flipped=errors.is_flipped & every.is_refined,
-        )
-        in_time = np.argsort(every.stamps_ns, kind='stable')
-        rows_of = rows_by_key([self._track_ids[row] for row in in_time.tolist()])
+        in_time = np.argsort(self._columns['stamps_ns'].rows, kind='stable')
+        rows_of = rows_by_key(self._columns['track_id'].rows[in_time].tolist())
+        order = in_time[np.concatenate([*rows_of.values()])]
+        for column in self._columns.values():
+            column.rows[:] = column.rows[order]
+        ends = np.cumsum([0, *map(len, rows_of.values())])
         found = []
-        for track_id, rows in rows_of.items():
-            own = in_time[rows]
-            track = every.take(own)
-            classes = Counter(map(self._class_names.__getitem__, own.tolist()))
-            found.append(
-                replace(
-                    track,
-                    track_id=track_id,
-                    class_name=classes.most_common(1)[0][0],
-                    attributes=track.attributes if any(track.attributes) else (),
-                )
-            )
+        for begin, end in pairwise(ends.tolist()):
+            own: dict[str, Any] = {
+                name: column.rows[begin:end] for name, column in self._columns.items()
+            }
+            attributes = own['attributes'].tolist()
+            own |= {
+                'track_id': own['track_id'][0],
+                'class_name': Counter(own['class_name'].tolist()).most_common(1)[0][0],
+                'input_ids': tuple(own['input_ids'].tolist()),
+                'status': own['status'].astype(str),
+                'reasons': own['reasons'].astype(str),
+                'attributes': tuple(attributes) if any(attributes) else (),
+            }
+            found.append(TrackChanges(**own))
         return sorted(found, key=lambda track: -np.nan_to_num(track.shift, nan=-1.0))
 
 

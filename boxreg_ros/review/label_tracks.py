@@ -119,7 +119,7 @@ def _near_pairs(stamps_ns: Ints, boxes: Floats, owner: Ints) -> Pairs:
     reach = 2 * radius.max(initial=0.0)
     order = np.lexsort((boxes[:, X], stamps_ns))
     stamps, x, radii, owners = stamps_ns[order], boxes[order, X], radius[order], owner[order]
-    centers = boxes[order][:, BOX_CENTER]
+    centers = boxes[:, BOX_CENTER][order]
     found = [np.zeros((0, 2), np.int64)]
     # Each box is compared with the next one along x, then with the one after it, and so on.
     for step in range(1, len(order)):
