@@ -327,7 +327,7 @@ def random_weights(rng, *shape):
 
 
 def random_terms(N=6, seed=1):
-    """Return records `TERMS` (N,) and `COMMON` of one window, with random weights and data."""
+    """Return `TERMS` (N,), `COMMON` and prior of one window, with random weights and data."""
     rng = np.random.default_rng(seed)
     terms, common = np.zeros(N, TERMS), np.zeros((), COMMON)[()]
     terms['time'] = np.cumsum(rng.random(N) + 0.05)
@@ -339,8 +339,7 @@ def random_terms(N=6, seed=1):
     terms['root'] = np.tril(rng.normal(size=(N, 6, 6)))
     terms['W'] = rng.random((N, len(RESIDUALS), 6)) + 0.1
     common['shared'], common['W_shared'] = rng.normal(size=SHARED), rng.random(SHARED) + 0.1
-    common['prior_mean'], common['W_prior'] = rng.normal(size=PRIOR), random_weights(rng, PRIOR)
-    return terms, common
+    return terms, common, (rng.normal(size=PRIOR), random_weights(rng, PRIOR))
 
 
 def random_variables(N=6, seed=2):

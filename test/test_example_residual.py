@@ -65,7 +65,7 @@ def insert(path, before, text):
 CHECK = """
 from boxreg_ros import Config
 from boxreg_ros.core.method.assemble import accumulate, empty_axes, no_matrix, number_of
-from boxreg_ros.core.method.arrays import COMMON
+from boxreg_ros.core.method.arrays import COMMON, PRIOR
 from boxreg_ros.core.method.constants import CONSTANTS, RESIDUAL_NAMES
 from boxreg_ros.core.method.residuals import empty_linearised, RESIDUALS, TERMS
 from boxreg_ros.core.method.weights import Weighing
@@ -110,7 +110,8 @@ def test_value_and_gradient_by_hand():
     x, gradient = np.zeros(35), np.empty(35)
     x[:12] = POSES.ravel()
     value = accumulate(
-        x, 2, terms, common, empty_axes(2), empty_linearised(), gradient, no_matrix()
+        x, 2, terms, common, np.zeros(PRIOR), np.zeros((PRIOR, PRIOR)), empty_axes(2),
+        empty_linearised(), gradient, no_matrix(),
     )
     np.testing.assert_allclose(value, 7 * 0.25 / 2)
     known = np.zeros(35)

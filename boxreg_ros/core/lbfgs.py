@@ -30,10 +30,10 @@ MAX_BACKTRACKS = 12
 HISTORY = 6
 """Curvature pairs that are kept. Literature: 3 to 20 (Nocedal and Wright, section 7.2)."""
 
-Function = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-Metric = Callable[[Tensor], Tensor]
-CurvaturePair = tuple[Tensor, Tensor, Tensor]
-"""A step s, the change y of the gradient over it, and 1 / s'y: (B, D), (B, D), (B, 1)."""
+Function = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
+CurvaturePair = tuple[Tensor, Tensor, Tensor, Tensor]
+"""A step s, the change y of the gradient over it, that of the scaled gradient, (B, D) each; and
+1 / s'y, (B, 1)."""
 
 
 class Status(IntEnum):
@@ -59,15 +59,25 @@ class Minimum(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """A point of each of b rows, its value and gradient: (b, D), (b,), (b, D)."""
+    """A point of each of b rows, its value, gradient and scaled gradient, (b, D) but the value."""
 
     x: Tensor
     value: Tensor
     gradient: Tensor
+    scaled: Tensor
+
+    @classmethod
+    def of(cls, x: Tensor, value: Tensor, gradient: Tensor, *scaled: Tensor) -> '_Points':
+        """Return points with what the function gives: without a scaled gradient, the gradient."""
+        return cls(x, value, gradient, *(scaled or (gradient,)))
 
     def copy(self) -> '_Points':
         """Return copies."""
         return _Points(*(part.clone() for part in self))
+
+    def part(self, rows: Tensor) -> '_Points':
+        """Return those of some rows."""
+        return _Points(*(part.index_select(0, rows) for part in self))
 
     def set_rows(self, rows: Ints, others: '_Points', chosen: Ints) -> None:
         """Replace those of `rows` by those of `others` that are `chosen`."""
@@ -82,8 +92,8 @@ def minimize(
     iterations: int,
     history: int,
     tolerance: float,
-    metric: Metric | None = None,
-    first: tuple[Tensor, Tensor] | None = None,
+    first: tuple[Tensor, ...] | None = None,
+    trial: tuple[Tensor, ...] | None = None,
 ) -> Minimum:
     """
     Minimise one function per row.
@@ -91,7 +101,9 @@ def minimize(
     Parameters
     ----------
     function : callable
-        Maps points (b, D) and their rows (b,) to values (b,) and gradients (b, D).
+        Maps points (b, D) and their rows (b,) to values (b,) and gradients (b, D); and, if it is
+        known, to an approximate inverse Hessian of each row, which is the same at all points,
+        times its gradient (b, D). Without that the usual scaled identity is used.
     start : Tensor, shape (B, D)
         Start of each row.
     iterations, history : int
@@ -99,11 +111,10 @@ def minimize(
     tolerance : float
         A row has converged when the predicted decrease of its value is less, as part of
         1 + |value|.
-    metric : callable, optional
-        Maps vectors (B, D) to the inverse of an approximate Hessian of each row times them.
-        Without it the usual scaled identity is used.
-    first : pair of Tensor, optional
-        Values and gradients at the start, where they are known.
+    first : tuple of Tensor, optional
+        What the function gives at the start, where it is known.
+    trial : tuple of Tensor, optional
+        The start less that times the gradient, and what the function gives there, if known.
 
     Returns
     -------
@@ -117,14 +128,16 @@ def minimize(
     evaluated.
 
     """
-    at = _Points(start, *(first or function(start, torch.arange(len(start)))))
+    at = _Points.of(start, *(first or function(start, torch.arange(len(start)))))
+    known = _Points(*trial) if trial else None
+    has_metric = at.scaled is not at.gradient
     is_running = np.ones(len(start), bool)
     status = np.full(len(start), int(Status.RUNNING))
     taken = np.zeros(len(start), int)
     pairs: list[CurvaturePair] = []
     for iteration in range(iterations):
-        step = _two_loop(at.gradient, pairs, metric)
-        step, slope = _downhill(step, at.gradient, is_scaled=bool(pairs) or metric is not None)
+        step = _two_loop(at, pairs, has_metric)
+        step, slope = _downhill(step, at.gradient, is_scaled=bool(pairs) or has_metric)
         value = at.value.numpy()
         goes_on = slope > tolerance * (1 + np.abs(value))  # neither is NaN
         ended = (is_running & ~goes_on).nonzero()[0]
@@ -137,7 +150,9 @@ def minimize(
             break
         taken += is_running
         before = at
-        at, stuck = _line_search(function, before, rows, step, slope)
+        if step is not at.scaled:
+            known = None
+        at, stuck = _line_search(function, before, rows, step, slope, known)
         status[stuck] = int(Status.STUCK)
         is_running[stuck] = False
         if iteration + 1 < iterations:
@@ -166,12 +181,18 @@ def _downhill(step: Tensor, gradient: Tensor, is_scaled: bool) -> tuple[Tensor, 
 
 
 def _line_search(
-    function: Function, before: _Points, rows: Ints, step: Tensor, slope: Floats
+    function: Function,
+    before: _Points,
+    rows: Ints,
+    step: Tensor,
+    slope: Floats,
+    known: _Points | None,
 ) -> tuple[_Points, Ints]:
     """
     Return the points where a step of each of `rows` ends, and the rows that found no better one.
 
-    The steps (B, D) and `slope` (B,), as those `before`, are of all rows; the others stay.
+    The steps (B, D) and `slope` (B,), as those `before`, are of all rows; the others stay. The
+    first points, those at the full step, may be `known`.
 
     """
     found, x, value = before, before.x, before.value.numpy()
@@ -181,8 +202,10 @@ def _line_search(
             index = torch.from_numpy(remaining)
             x, step = x.index_select(0, index), step.index_select(0, index)
             value, slope = value[remaining], slope[remaining]
+            known = known and known.part(index)
         reached = x - step
-        trial = _Points(reached, *function(reached, torch.from_numpy(rows)))
+        trial = known or _Points.of(reached, *function(reached, torch.from_numpy(rows)))
+        known = None
         is_good = trial.value.numpy() <= value - SUFFICIENT_DECREASE * slope
         good = is_good.nonzero()[0]
         if len(good) == len(before.x):
@@ -204,7 +227,8 @@ def _pair(before: _Points, after: _Points, slope: Floats) -> CurvaturePair:
     s, y = after.x - before.x, after.gradient - before.gradient
     s_y = _product(s, y)
     is_curved = s_y > MIN_CURVATURE * slope
-    return s, y, _column(np.divide(1, s_y, out=np.zeros(len(s_y)), where=is_curved))
+    rho = _column(np.divide(1, s_y, out=np.zeros(len(s_y)), where=is_curved))
+    return s, y, after.scaled - before.scaled, rho
 
 
 def _product(a: Tensor, b: Tensor) -> Floats:
@@ -226,20 +250,19 @@ def _shorter(slope: Floats, rise: Floats) -> Floats:
     return part
 
 
-def _two_loop(gradient: Tensor, pairs: list[CurvaturePair], metric: Metric | None) -> Tensor:
-    """Return the inverse Hessian approximated by `pairs`, times `gradient`."""
-    q = gradient
+def _two_loop(at: _Points, pairs: list[CurvaturePair], has_metric: bool) -> Tensor:
+    """Return the inverse Hessian approximated by `pairs`, times the gradient."""
+    q, step = at.gradient, at.scaled  # which is linear in q
     alphas = []
-    for s, y, rho in reversed(pairs):
+    for s, y, scaled_y, rho in reversed(pairs):
         alpha = rho * (s * q).sum(1, keepdim=True)
         q = q.addcmul(alpha, y, value=-1)
+        step = step.addcmul(alpha, scaled_y, value=-1)
         alphas.append(alpha)
-    if metric is not None:
-        q = metric(q)
-    elif pairs:
-        _, y, rho = pairs[-1]
+    if pairs and not has_metric:
+        _, y, _, rho = pairs[-1]
         scale = 1 / (rho * y.square().sum(1, keepdim=True))
-        q = q * torch.where(scale.isfinite(), scale, 1.0)
-    for (s, y, rho), alpha in zip(pairs, reversed(alphas), strict=True):
-        q = q.addcmul(s, alpha - rho * (y * q).sum(1, keepdim=True))
-    return q
+        step = step * torch.where(scale.isfinite(), scale, 1.0)
+    for (s, y, _, rho), alpha in zip(pairs, reversed(alphas), strict=True):
+        step = step.addcmul(s, alpha - rho * (y * step).sum(1, keepdim=True))
+    return step

@@ -20,7 +20,6 @@ from boxreg_ros.core.method.arrays import (
     EXTENT,
     no_priors,
     Posterior,
-    Quadratic,
     SHARED,
     Solution,
 )
@@ -177,8 +176,7 @@ def start(problem: Problem, config: Config, plan: SolverPlan, inputs: Inputs) ->
         ),
         no_priors(leaving),
     )  # fmt: skip
-    prior = problem.prior_mean, problem.prior_information
-    return Batch(problem, free, method.empty_sums(B, N, number, *prior), solution)
+    return Batch(problem, free, method.empty_sums(B, N, number), solution)
 
 
 def run_round(
@@ -228,54 +226,46 @@ def fit(
     may_settle: bool,
 ) -> NDArray[np.bool_]:
     """Search the minima of the windows `rows` (b,) after `observe`, and end their round."""
-    problem, free, sums, solution = batch
-    record = constants.record()
     b = len(rows)
-    x = np.empty((b, free.shape[1]))
-    run(
-        method.begin, 10, b, rows, problem, inputs, record, solution.poses, solution.shared, sums,
-        x,
-    )  # fmt: skip
-    objective = Objective(rows, free, sums, solution.left)
-    first = objective.sum(x, method.CURVATURE)
-    found = minimize(
-        objective.value_and_gradient, torch.from_numpy(x), ITERATIONS, HISTORY, TOLERANCE,
-        objective.metric, first,
-    )  # fmt: skip
+    objective = Objective(batch, inputs, constants.record(), rows)
+    x = np.empty((2, b, batch.free.shape[1]))
+    start, trial = zip(torch.from_numpy(x), *objective.sum(x, method.START), strict=True)
+    found = minimize(objective.at, start[0], ITERATIONS, HISTORY, TOLERANCE, start[1:], trial)
     x, is_done = found.x.numpy(), np.empty(b, bool)
     run(
-        method.end, 20, b, rows, x, problem, free, record, sums, solution, is_last, may_settle,
-        is_done,
+        method.end, 20, b, rows, x, batch, objective.constants, is_last, may_settle, is_done,
     )  # fmt: skip
-    if len(solution.left.state):
-        is_leaving = is_done & (problem.lengths[rows] == problem.length)
-        Objective(rows[is_leaving], free, sums, solution.left).sum(x[is_leaving], method.OLDEST)
+    if len(batch.solution.left.state):
+        is_leaving = is_done & (batch.problem.lengths[rows] == batch.problem.length)
+        leaving = objective._replace(rows=rows[is_leaving])
+        leaving.sum(x[None, is_leaving], method.OLDEST)
     return is_done
 
 
 class Objective(NamedTuple):
-    """The sums of residuals of the windows `rows` (b,) of a `Batch`, as `minimize` calls them."""
+    """The sums of residuals of the windows `rows` (b,) of a batch, as `minimize` calls them."""
 
+    batch: Batch
+    inputs: Inputs
+    constants: NDArray[np.void]
     rows: Ints
-    free: Floats
-    sums: method.Sums
-    left: Quadratic
 
-    def value_and_gradient(self, x: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
-        """Return values (p,) and gradients (p, D) of the windows `rows[part]` at x (p, D)."""
-        return self._replace(rows=self.rows[part.numpy()]).sum(x.contiguous().numpy())
+    def at(self, x: Tensor, part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `sum` does, of the windows `rows[part]` at x (b, D)."""
+        found = self._replace(rows=self.rows[part.numpy()]).sum(x.contiguous().numpy()[None])
+        value, gradient, scaled = (of_points[0] for of_points in found)
+        return value, gradient, scaled
 
-    def sum(self, x: Floats, wanted: int = method.VALUE) -> tuple[Tensor, Tensor]:
-        """Return values (b,) and gradients (b, D) at x (b, D), and write what else is `wanted`."""
-        value, gradient = np.empty(len(x)), np.empty(x.shape)
+    def sum(self, x: Floats, wanted: int = method.VALUE) -> tuple[Tensor, Tensor, Tensor]:
+        """
+        Return values (p, b), gradients (p, b, D), and the inverse curvature times these.
+
+        At points x (p, b, D), see `evaluate`; what else is `wanted` is written to the batch.
+
+        """
+        value, gradient, scaled = np.empty(x.shape[:2]), np.empty(x.shape), np.empty(x.shape)
         run(
-            method.evaluate, 8, len(x), self.rows, x, self.free, self.sums, wanted, value,
-            gradient, self.left,
+            method.evaluate, 8, len(self.rows), self.rows, wanted, self.batch, self.inputs,
+            self.constants, x, value, gradient, scaled,
         )  # fmt: skip
-        return torch.from_numpy(value), torch.from_numpy(gradient)
-
-    def metric(self, vectors: Tensor) -> Tensor:
-        """Return the inverse Gauss-Newton curvature times `vectors` (b, D)."""
-        found = vectors.numpy().copy()
-        run(method.precondition, 1.6, len(found), self.rows, self.sums.factor, found)
-        return torch.from_numpy(found)
+        return torch.from_numpy(value), torch.from_numpy(gradient), torch.from_numpy(scaled)

@@ -11,7 +11,7 @@ import os
 
 from boxreg_ros.config import Config, KINDS, PaperConfig, SolverConfig
 from boxreg_ros.core.input_model import InputModel
-from boxreg_ros.core.method.arrays import ANCHOR, INPUTS, no_priors, POSE
+from boxreg_ros.core.method.arrays import INPUTS
 from boxreg_ros.core.method.residuals import TERMS
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.point_labels import ObjectTrack, PointLabeller
@@ -180,15 +180,9 @@ def compiled_beside(
 def warm_up_others(
     objective: str, mode: str, has_labels: bool, announce: Callable[[], None]
 ) -> None:
-    """Do what `warm_up_solver` leaves out, and one kernel of it; announce that, then follow."""
+    """Do what `warm_up_solver` leaves out; announce that, then follow."""
     from boxreg_ros.core import solver
-    from boxreg_ros.core.method.round import empty_sums
-    import torch
 
-    if objective != 'paper':  # the other process, which takes longer, loads it
-        sums = empty_sums(1, 1, ANCHOR, 0.0, 0.0)
-        x = torch.zeros((1, POSE + ANCHOR), dtype=torch.float64)
-        solver.Objective(np.zeros(1, int), np.ones(x.shape), sums, no_priors(0)).metric(x)
     solver.fit = lambda _, __, rows, *___: np.ones(len(rows), bool)
     config = Config.from_dict({'objective': objective, 'mode': mode, 'estimate': 'final'})
     warm_up(config)

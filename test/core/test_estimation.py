@@ -237,7 +237,7 @@ def test_an_error_in_a_thread_is_raised(monkeypatch):
     def broken(*_):
         raise RuntimeError('broken')
 
-    monkeypatch.setattr(method, 'begin', broken)
+    monkeypatch.setattr(method, 'evaluate', broken)
     with pytest.raises(RuntimeError, match='broken'):
         solved(windows(), ALONE, InputModel(ALONE.faces))
     assert torch.get_num_threads() == threads
@@ -417,26 +417,30 @@ def test_minimum_of_the_default_objective_against_torch():
     constants = CONSTANTS.with_settings(ALONE).in_round(False, True)
     inputs = InputModel(ALONE.faces).inputs(ALONE)
     batch = start(problem, ALONE, SolverPlan.choose(ALONE, False), inputs)
-    rows, (B, D) = np.arange(4), batch.free.shape
-    x = np.empty((B, D))
+    rows, x = np.arange(4), np.empty((2, *batch.free.shape))
     batch.free[:] = 1.0
     observe(batch, inputs, rows, constants)
-    method.begin(
-        0, B, rows, problem, inputs, constants.record(), batch.solution.poses,
-        batch.solution.shared, batch.sums, x,
-    )  # fmt: skip
-    function = Objective(rows, batch.free, batch.sums, batch.solution.left)
-    value, _ = function.sum(x, method.CURVATURE)
-    start_x = torch.from_numpy(x)
-    found = minimize(function.value_and_gradient, start_x, 12, 6, 1e-6, function.metric)
-    np.testing.assert_allclose(function.value_and_gradient(start_x, torch.arange(4))[0], value)
+    function = Objective(batch, inputs, constants.record(), rows)
+    points = torch.from_numpy(x)
+    first, trial = zip(points, *function.sum(x, method.START), strict=True)
+    start_x, value = first[0], first[1]
+    found = minimize(function.at, start_x, 12, 6, 1e-6, first[1:], trial)
+    for known in (first, trial):
+        for part, again in zip(known[1:], function.at(known[0], torch.arange(4)), strict=True):
+            np.testing.assert_allclose(again, part)
+    unknown = minimize(function.at, start_x, 12, 6, 1e-6)
+    for part, again in zip(found, unknown, strict=True):
+        np.testing.assert_array_equal(part, again)
     assert (found.value < 0.9 * value).all()
     for row in range(4):
         terms = objective.tensors(batch.sums.terms[row])
         common = objective.tensors(batch.sums.common[row])
 
-        def loss(x, terms=terms, common=common):
-            return objective.whitened(x, terms, common).square().sum() / 2
+        prior = problem.prior_mean[row], problem.prior_information[row]
+        prior = [*map(torch.from_numpy, prior)]
+
+        def loss(x, terms=terms, common=common, prior=prior):
+            return objective.whitened(x, terms, common, prior).square().sum() / 2
 
         assert found.value[row] <= 1.01 * oracle(loss, start_x[row]) + 1e-9
 

@@ -133,10 +133,12 @@ def test_the_inverse_hessian_as_metric_solves_a_quadratic_in_one_step():
     # With the inverse of its Hessian the first step is Newton's, and ends at the minimum.
     A, known = quadratics(4, 5, seed=5)
     inverse = torch.linalg.inv(A)
-    found = minimize(
-        quadratic(A, known), starts(4, 5), 20, 5, 1e-14,
-        metric=lambda vector: (inverse @ vector[..., None])[..., 0],
-    )  # fmt: skip
+
+    def function(x, rows):
+        value, gradient = quadratic(A, known)(x, rows)
+        return value, gradient, (inverse[rows] @ gradient[..., None])[..., 0]
+
+    found = minimize(function, starts(4, 5), 20, 5, 1e-14)
     np.testing.assert_allclose(found.x, known, atol=1e-9)
     assert (found.iterations <= 2).all()
     assert (found.status == Status.CONVERGED).all()

@@ -50,13 +50,14 @@ def empty_factor(N):
     return Factor(*(np.empty(shape) for shape in shapes))
 
 
-def summed(x, terms, common, last=None, A=None):
+def summed(x, terms, common, prior, last=None, A=None):
     """Return value and gradient of the sum, and write the curvature `A`."""
     N = len(terms)
     gradient = np.empty(len(x))
     A = no_matrix() if A is None else A
     last = N if last is None else last
-    value = accumulate(x, last, terms, common, empty_axes(N), empty_linearised(), gradient, A)
+    room = empty_axes(N), empty_linearised()
+    value = accumulate(x, last, terms, common, *prior, *room, gradient, A)
     return value, gradient
 
 
@@ -70,15 +71,15 @@ def test_every_residual_has_a_name_of_its_own():
 
 @pytest.mark.parametrize('N', [2, 3, 6])
 def test_value_gradient_and_curvature_are_those_of_automatic_differentiation(N):
-    terms, common = random_terms(N)
+    terms, common, prior = random_terms(N)
     x, A = random_variables(N), matrix(N)
-    value, gradient = summed(x, terms, common, A=A)
-    known = objective.linearise(x, terms, common)
+    value, gradient = summed(x, terms, common, prior, A=A)
+    known = objective.linearise(x, terms, common, prior)
     scale = np.abs(known[2]).max()
     np.testing.assert_allclose(value, known[0], rtol=1e-12)
     np.testing.assert_allclose(gradient, known[1], atol=1e-9 * scale)
     np.testing.assert_allclose(dense(A, N), known[2], atol=1e-9 * scale)
-    alone = summed(x, terms, common)
+    alone = summed(x, terms, common, prior)
     np.testing.assert_allclose(alone[0], value, rtol=1e-14)
     np.testing.assert_allclose(alone[1], gradient, rtol=1e-12, atol=1e-12 * scale)
 
@@ -87,14 +88,14 @@ def test_value_gradient_and_curvature_are_those_of_automatic_differentiation(N):
 def test_each_residual_alone(i):
     # Its weight is the only one: a wrong row of the table cannot hide behind the others.
     N = 4
-    terms, common = random_terms(N)
+    terms, common, prior = random_terms(N)
     keep = terms['W'][:, i].copy()
     terms['W'], terms['W_faces'] = 0.0, 0.0
     terms['W'][:, i] = keep
-    common['W_prior'], common['W_shared'] = 0.0, 0.0
+    common['W_shared'] = prior[1][:] = 0.0
     x, A = random_variables(N), matrix(N)
-    value, gradient = summed(x, terms, common, A=A)
-    known = objective.linearise(x, terms, common)
+    value, gradient = summed(x, terms, common, prior, A=A)
+    known = objective.linearise(x, terms, common, prior)
     assert value > 0
     np.testing.assert_allclose(value, known[0], rtol=1e-12)
     np.testing.assert_allclose(gradient, known[1], rtol=1e-9, atol=1e-9)
@@ -102,10 +103,10 @@ def test_each_residual_alone(i):
 
 
 def test_residuals_without_weight_are_left_out():
-    terms, common = random_terms()
-    whole, _ = summed(random_variables(), terms, common)
+    terms, common, prior = random_terms()
+    whole, _ = summed(random_variables(), terms, common, prior)
     terms['W'][:, 2] = 0.0
-    less, _ = summed(random_variables(), terms, common)
+    less, _ = summed(random_variables(), terms, common, prior)
     assert 0 < less < whole
 
 
@@ -115,9 +116,9 @@ def test_residuals_without_weight_are_left_out():
 @pytest.mark.parametrize('is_held', [False, True], ids=['free', 'some held'])
 def test_the_factor_solves_and_inverts(is_held):
     N = 6
-    terms, common = random_terms(N)
+    terms, common, prior = random_terms(N)
     A, x = matrix(N), random_variables(N)
-    summed(x, terms, common, A=A)
+    summed(x, terms, common, prior, A=A)
     whole = dense(A, N)
     free = np.ones(len(x))
     if is_held:
@@ -187,15 +188,15 @@ def test_a_matrix_that_is_not_positive_definite_has_no_factor():
 def test_the_prior_is_the_schur_complement_of_the_oldest_residuals():
     # All residuals that the oldest observation has a part in, but the prior on shared variables.
     N = 6
-    terms, common = random_terms(N)
+    terms, common, prior = random_terms(N)
     terms['W'][:, 1] = 0.0  # a sliding window has no rigid shape
     x, A = random_variables(N)[: 6 * N + ANCHOR], matrix(N, ANCHOR)
-    _, gradient = summed(x, terms, common, last=1, A=A)
+    _, gradient = summed(x, terms, common, prior, last=1, A=A)
     first = terms.copy()
     first['W'][1:], first['W_faces'][1:] = 0.0, 0.0
     only = common.copy()
     only['W_shared'] = 0.0
-    _, pull, H = objective.linearise(x, first, only)
+    _, pull, H = objective.linearise(x, first, only, prior)
     np.testing.assert_allclose(dense(A, N), H, atol=1e-9 * np.abs(H).max())
     mean, step, information = np.empty(PRIOR), np.empty(PRIOR), np.empty((PRIOR, PRIOR))
     marginalise(x, gradient, A, mean, step, information)
@@ -213,30 +214,30 @@ def test_the_prior_is_exact_for_linear_residuals():
     # then another, the minimum of the window is that of all observations, wherever it is
     # linearised. Ridges of 1e-6 beside curvatures of 100 change 1e-8 of the step.
     N = 7
-    terms, common = random_terms(N)
+    terms, common, prior = random_terms(N)
     others = [RESIDUAL_NAMES.index(name) for name in ('rigid shape', 'slip')]
     terms['W'][:, others], terms['W_faces'] = 0.0, 0.0
     terms['W'] *= 100
     common['W_shared'] *= 100
-    common['W_prior'] += 100 * np.eye(PRIOR)
-    known = minimum(terms, common)
+    prior[1][:] += 100 * np.eye(PRIOR)
+    known = minimum(terms, common, prior)
     rng = np.random.default_rng(9)
     for n in (N - 1, N - 2):
         away = known[-6 * (n + 1) - ANCHOR :] + 0.1 * rng.normal(size=6 * (n + 1) + ANCHOR)
         A = matrix(n + 1, ANCHOR)
-        _, gradient = summed(away, terms, common, last=1, A=A)
+        _, gradient = summed(away, terms, common, prior, last=1, A=A)
         mean, step, information = np.empty(PRIOR), np.empty(PRIOR), np.empty((PRIOR, PRIOR))
         marginalise(away, gradient, A, mean, step, information)
         terms = terms[1:]
-        common['prior_mean'], common['W_prior'] = mean + step, information
-        np.testing.assert_allclose(minimum(terms, common), known[-6 * n - ANCHOR :], atol=1e-7)
+        found = minimum(terms, common, prior := (mean + step, information))
+        np.testing.assert_allclose(found, known[-6 * n - ANCHOR :], atol=1e-7)
 
 
-def minimum(terms, common):
+def minimum(terms, common, prior):
     """Return where the sum of linear residuals of a sliding window is least."""
     N = len(terms)
     x, A = np.zeros(6 * N + ANCHOR), matrix(N, ANCHOR)
-    _, gradient = summed(x, terms, common, A=A)
+    _, gradient = summed(x, terms, common, prior, A=A)
     return np.linalg.solve(dense(A, N), -gradient)
 
 

@@ -96,24 +96,24 @@ def shared_prior(p, s, c):
     return c['W_shared'].sqrt() * (s - c['shared'])
 
 
-def marginalisation_prior(p, s, c):
+def marginalisation_prior(p, s, mean, information):
     """(M9)."""
-    return root(c['W_prior']).mT @ (torch.cat([p[:2].flatten(), s[:ANCHOR]]) - c['prior_mean'])
+    return root(information).mT @ (torch.cat([p[:2].flatten(), s[:ANCHOR]]) - mean)
 
 
-def whitened(x, terms, common):
+def whitened(x, terms, common, prior):
     """Return all whitened residuals (R,) at variables x (6 N + S,); without an anchor it is 0."""
     end = 6 * len(terms['time'])
     p, s = x[:end].view(-1, 6), x[end:]
     s = torch.cat([s, s.new_zeros(SHARED - len(s))])
     parts = [OF_OBSERVATIONS[name](p, s, terms) for name in RESIDUAL_NAMES]
     parts += [faces(p, s, terms)]
-    return torch.cat([*parts, shared_prior(p, s, common), marginalisation_prior(p, s, common)])
+    return torch.cat([*parts, shared_prior(p, s, common), marginalisation_prior(p, s, *prior)])
 
 
-def linearise(x, terms, common):
+def linearise(x, terms, common, prior):
     """Return value, gradient (D,) and Gauss-Newton curvature (D, D) of the sum."""
-    x, t, c = torch.from_numpy(x), tensors(terms), tensors(common)
-    r = whitened(x, t, c)
-    J = torch.autograd.functional.jacobian(lambda x: whitened(x, t, c), x)
+    x, *given = torch.from_numpy(x), tensors(terms), tensors(common), [*map(torch.tensor, prior)]
+    r = whitened(x, *given)
+    J = torch.autograd.functional.jacobian(lambda x: whitened(x, *given), x)
     return float(r @ r / 2), (J.T @ r).numpy(), (J.T @ J).numpy()

@@ -42,8 +42,6 @@ COMMON = np.dtype(
         ('unclaimed', float, GAP),
         ('margin_variance', float, 6),
         ('W_shared', float, SHARED),
-        ('prior_mean', float, PRIOR),
-        ('W_prior', float, (PRIOR, PRIOR)),
     ],
     align=True,
 )
@@ -63,8 +61,6 @@ margin_variance
     Of the margins of the kind, which all its tracks have in common (M15), (6,) [m^2].
 W_shared
     Weights of the shared variables (M8), (23,).
-prior_mean, W_prior
-    Marginalisation prior (M9): minimum and information, (29,) and (29, 29).
 """
 
 INPUTS = np.dtype(

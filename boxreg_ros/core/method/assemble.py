@@ -234,14 +234,13 @@ def add_shared_prior(shared, common, first, gradient, A):
 
 
 @loop
-def add_marginal_prior(x, common, r, first, gradient, A):
+def add_marginal_prior(x, mean, W, r, first, gradient, A):
     """
     Add the quadratic form in the two oldest poses and the shared variables (M9).
 
-    `r` (29,) is to work in.
+    Its minimum is `mean` (29,), its information `W` (29, 29); `r` (29,) is to work in.
 
     """
-    W, mean = common.W_prior, common.prior_mean
     for k in range(PRIOR):
         r[k] = x[k if k < NEXT else first + k - NEXT] - mean[k]
     value = 0.0
@@ -304,7 +303,7 @@ def add_all(poses, shared, last, terms, at, room, first, gradient, A):
 
 
 @loop
-def accumulate(x, last, terms, common, at, out, gradient, A):
+def accumulate(x, last, terms, common, prior_mean, W_prior, at, out, gradient, A):
     """
     Return the sum of the residuals of one window (M1); write its gradient and curvature.
 
@@ -317,6 +316,8 @@ def accumulate(x, last, terms, common, at, out, gradient, A):
         prior on the shared variables too, which belongs to no observation.
     terms, common : array of `TERMS`, shape (N,), and record `COMMON`
         Data and weights of the window.
+    prior_mean, W_prior : array, shapes (29,) and (29, 29)
+        Marginalisation prior (M9): minimum and information.
     at, out : array of `AXES`, shape (N,), and of `LINEARISED`, shape (1,)
         To work in.
     gradient : array, shape (6 N + S,)
@@ -339,8 +340,8 @@ def accumulate(x, last, terms, common, at, out, gradient, A):
                 fill_plane(n, axis, poses, terms, at, room.plane, room.by_angles)
                 value += add_faces(n, axis, shared, terms, room, first, gradient, A)
     value += add_all(poses, shared, last, terms, at, out, first, gradient, A)
-    if common.W_prior[0, 0] != 0.0:
-        value += add_marginal_prior(x, common, room.off, first, gradient, A)
+    if W_prior[0, 0] != 0.0:
+        value += add_marginal_prior(x, prior_mean, W_prior, room.off, first, gradient, A)
     if last >= N:
         value += add_shared_prior(shared, common, first, gradient, A)
     return value

@@ -5,8 +5,8 @@ One round of many windows, in the order of the paper's figure.
                                                                                -> marginalise
 
 Faces are observed by `faces`. The search is `boxreg_ros.core.lbfgs`, for all windows at once; it
-calls `evaluate` and `precondition`. Whatever sums residuals is one kernel, `evaluate`: it would be
-compiled once more for each other one.
+calls `evaluate`. Whatever sums residuals is that one kernel: it would be compiled once more for
+each other one. What it does with a window is done while the data of that are in the cache.
 
 """
 
@@ -27,6 +27,7 @@ from boxreg_ros.core.method.assemble import (
     empty_axes,
     empty_matrix,
     factorise_free,
+    is_wanted,
     marginalise,
     no_matrix,
     weigh,
@@ -57,21 +58,22 @@ class Sums(NamedTuple):
     factor: Any
 
 
-def empty_sums(B: int, N: int, S: int, prior_mean: Any, prior_information: Any) -> Sums:
-    """Return room for B windows of N observations with a prior (B, 29) and (B, 29, 29)."""
-    # All of it is written before it is read.
-    common = np.empty(B, COMMON)
-    common['prior_mean'] = prior_mean
-    common['W_prior'] = prior_information
+def empty_sums(B: int, N: int, S: int) -> Sums:
+    """Return room for B windows of N observations; all of it is written before it is read."""
     coupling = np.empty((B, N, POSE, padded(S + NEXT)))
     factor = Factor(np.empty((B, N, POSE, POSE)), coupling, np.empty((B, S, S)))
-    return Sums(np.empty((B, N), TERMS), common, factor)
+    return Sums(np.empty((B, N), TERMS), np.empty(B, COMMON), factor)
+
+
+START, VALUE, OLDEST = range(3)
+"""What `evaluate` is called for: to begin a round, with its weights and the factor of its
+curvature; for the sum elsewhere; for what the oldest observation leaves."""
 
 
 @kernel
-def begin(first, last, rows, problem, inputs, constants, poses, shared, sums, x):
+def evaluate(first, last, rows, wanted, batch, inputs, constants, x, value, gradient, scaled):
     """
-    Begin a round of the windows `rows[first:last]`: expect and weigh.
+    Sum the residuals of the windows `rows[first:last]`.
 
     Parameters
     ----------
@@ -79,84 +81,61 @@ def begin(first, last, rows, problem, inputs, constants, poses, shared, sums, x)
         First row, and the one after the last.
     rows : array, shape (b,)
         Windows of the batch that take part.
-    problem : Problem
-        Input of the batch.
+    wanted : int
+        `START`: expect and weigh, with the face observations and the rigid shape; write the
+        weights and the factor. `VALUE`: the sum alone. `OLDEST`: only the residuals of the oldest
+        observation, which become a prior (M13).
+    batch : Batch
+        Of the solver.
     inputs : array of `INPUTS`, shape (K,)
         Noise, margins and population of the input, by kind.
     constants : array of one record of `Constants`, shape (1,)
         Of the method, with the settings.
-    poses, shared : array, shapes (B, N, 6) and (B, S)
-        Start of the round.
-    sums : Sums
-        Of the batch, with the face observations and the rigid shape: data and weights are written.
-    x : array, shape (b, 6 N + S)
-        Written: variables of the windows.
+    x : array, shape (p, b, 6 N + S)
+        Variables of the windows: one point of each. At the `START` two, which are written: the
+        solution, and that less the first `scaled`, the first trial of the search.
+    value, gradient, scaled : array, shapes (p, b) and twice (p, b, 6 N + S)
+        Written: the sum, its gradient, and the inverse curvature times that. Those of the oldest
+        observation are only to work in.
 
     """
-    constants = constants[0]
-    N = poses.shape[1]
-    n = POSE * N
+    problem, free, sums, solution = batch
+    D, N = x.shape[2], sums.terms.shape[1]
     at, out, mean_extents = empty_axes(N), empty_linearised(), np.empty(SIZE)
-    for row in range(first, last):
-        b = rows[row]
-        shared[b, ANCHOR:] = 0.0
-        terms, common = sums.terms[b], sums.common[b]
-        expect(b, problem, inputs[problem.kind[b]], constants, mean_extents, common)
-        weigh(b, problem, poses[b], shared[b], constants, at, out, terms, common)
-        copy(poses[b].ravel(), x[row, :n])
-        copy(shared[b], x[row, n:])
-
-
-VALUE, CURVATURE, OLDEST = range(3)
-"""What `evaluate` writes beside value and gradient: nothing; the factor of the curvature; what the
-oldest observation leaves."""
-
-
-@kernel
-def evaluate(first, last, rows, x, free, sums, wanted, value, gradient, left):
-    """
-    Sum the residuals of the windows `rows[first:last]`.
-
-    Parameters
-    ----------
-    first, last, rows, sums
-        As in `begin`; the factor is written if the `CURVATURE` is wanted.
-    x : array, shape (b, 6 N + S)
-        Variables of the windows.
-    free : array, shape (B, 6 N + S)
-        1 for variables that are estimated, 0 for those held fixed.
-    wanted : int
-        `VALUE`, `CURVATURE`; or `OLDEST`: only the residuals of the oldest observation, which
-        become a prior (M13).
-    value, gradient : array, shapes (b,) and (b, 6 N + S)
-        Written; those of the oldest observation are only to work in.
-    left : Quadratic
-        Of the batch: written by the oldest observations.
-
-    """
-    D, N = x.shape[1], sums.terms.shape[1]
-    at, out, A = empty_axes(N), empty_linearised(), no_matrix()
+    none = matrix = no_matrix()
     if wanted != VALUE:  # residuals of the oldest observation depend on three poses
-        A = empty_matrix(N if wanted == CURVATURE else 3, D - POSE * N)
+        matrix = empty_matrix(N if wanted == START else 3, D - POSE * N)
     for row in range(first, last):
         b = rows[row]
-        terms, common = sums.terms[b], sums.common[b]
+        terms, common, factor = sums.terms[b], sums.common[b], factor_of_window(b, sums.factor)
+        if wanted == START:
+            poses, shared = solution.poses[b], solution.shared[b]
+            shared[ANCHOR:] = 0.0
+            copy(poses.ravel(), x[0, row, : POSE * N])
+            copy(shared, x[0, row, POSE * N :])
+            expect(b, problem, inputs[problem.kind[b]], constants[0], mean_extents, common)
+            weigh(b, problem, poses, shared, constants[0], at, out, terms, common)
         observations = 1 if wanted == OLDEST else N
-        value[row] = accumulate(x[row], observations, terms, common, at, out, gradient[row], A)
-        if wanted == OLDEST:
-            marginalise(x[row], gradient[row], A, left.state[b], left.step[b], left.information[b])
-            continue
-        for k in range(D):
-            gradient[row, k] *= free[b, k]
-        if wanted == CURVATURE:
-            factorise_free(A, free[b], factor_of_window(b, sums.factor))
-
-
-@kernel
-def precondition(first, last, rows, factor, vectors):
-    """Replace the `vectors` (b, 6 N + S) of windows by the inverse curvature times them."""
-    for row in range(first, last):
-        solve(factor_of_window(rows[row], factor), vectors[row])
+        for point in range(len(x)):
+            at_x, pull, step = x[point, row], gradient[point, row], scaled[point, row]
+            if point > 0:
+                for k in range(D):
+                    at_x[k] = x[0, row, k] - scaled[0, row, k]
+            A = none if point > 0 else matrix
+            value[point, row] = accumulate(
+                at_x, observations, terms, common, problem.prior_mean[b],
+                problem.prior_information[b], at, out, pull, A,
+            )  # fmt: skip
+            if wanted == OLDEST:
+                left = solution.left
+                marginalise(at_x, pull, A, left.state[b], left.step[b], left.information[b])
+                continue
+            for k in range(D):
+                pull[k] *= free[b, k]
+            if is_wanted(A):
+                factorise_free(A, free[b], factor)
+            copy(pull, step)
+            solve(factor, step)
 
 
 @kernel
@@ -172,8 +151,7 @@ def has_settled(poses, start, errors, settled_step):
 
 
 @kernel
-def end(first, last, rows, x, problem, free, constants, sums, solution, is_last, may_settle,
-        is_done):  # fmt: skip
+def end(first, last, rows, x, batch, constants, is_last, may_settle, is_done):
     """
     End the round of the windows `rows[first:last]`.
 
@@ -181,12 +159,10 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
 
     Parameters
     ----------
-    first, last, rows, problem, free, constants, sums
-        As in `begin` and `evaluate`.
+    first, last, rows, batch, constants
+        As in `evaluate`; the solution of the batch is written.
     x : array, shape (b, 6 N + S)
         Minimum of each sum.
-    solution : Solution
-        Of the batch: written.
     is_last, may_settle : bool
         Whether all are done; whether those may be that hardly moved.
     is_done : array, shape (b,)
@@ -194,6 +170,7 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
 
     """
     constants = constants[0]
+    problem, free, sums, solution = batch
     N, S = solution.poses.shape[1], solution.shared.shape[1]
     n = POSE * N
     inverse = empty_inverse(N, S)

@@ -106,21 +106,14 @@ class _Fit:
         self.inputs = model.inputs(config)
         self.batch: Batch = start(problem, config, plan, self.inputs)
         self.row = np.zeros(1, np.int64)
-        self.objective = Objective(
-            self.row, self.batch.free, self.batch.sums, self.batch.solution.left
-        )
+        self.objective = Objective(self.batch, self.inputs, self.constants.record(), self.row)
 
     def linearise(self) -> tuple[Tensor, float]:
         """Renew the sum where the solution is; return its variables (1, D) and its value."""
-        problem, free, sums, solution = self.batch
-        x = np.empty_like(free)
+        x = np.empty((2, *self.batch.free.shape))
         observe(self.batch, self.inputs, self.row, self.constants)
-        method.begin(
-            0, 1, self.row, problem, self.inputs, self.constants.record(), solution.poses,
-            solution.shared, sums, x,
-        )  # fmt: skip
-        value, _ = self.objective.sum(x, method.CURVATURE)
-        return torch.from_numpy(x), float(value[0])
+        value, _, _ = self.objective.sum(x, method.START)
+        return torch.from_numpy(x[0]), float(value[0, 0])
 
     def deviations(self) -> Tensor:
         """Return the expected error of every variable, 0 for those held fixed; (1, D)."""
@@ -169,7 +162,7 @@ def _minimum(fit: _Fit) -> Floats:
     )
 
     def closure() -> Tensor:
-        value, gradient = fit.objective.value_and_gradient((begin + scale * y).detach(), row)
+        value, gradient, _ = fit.objective.at((begin + scale * y).detach(), row)
         y.grad = scale * gradient
         return value[0]
 
