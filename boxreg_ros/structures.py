@@ -35,6 +35,9 @@ LARGEST_COORDINATE = 3e7
 """Centres are nearer to the origin [m]; maps have up to 20,037,509 m (Web Mercator)."""
 LARGEST_BOX = np.array([LARGEST_COORDINATE] * 3 + [LARGEST_EXTENT] * 3 + [np.inf] * 3)
 BOX_AXES = 'x y z length width height roll pitch yaw'
+SHORTEST_PERIOD_NS, STAMPS_OF_UNIT = 10**6, 5
+"""Sweeps are further apart on average [ns], and the stamps that show it; chosen: LiDARs run at up
+to 100 Hz, and four of them on one vehicle may have stamps of almost the same time."""
 
 REFINED, KEPT = 'refined', 'kept'
 INTERPOLATED, EXTENDED, REJECTED = 'interpolated', 'extended', 'rejected'
@@ -129,6 +132,48 @@ def _check_shape(
     lengths = zip(shape, found, strict=False)
     if len(found) != len(shape) or any(want not in (None, got) for want, got in lengths):
         raise ShapeError(f'{name}: expected {_expected(shape, columns)}, got {found}')
+
+
+def checked_stamps(name: str, value: ArrayLike) -> Ints:
+    """
+    Return an argument of stamps as int64, shape (N,) [ns].
+
+    Parameters
+    ----------
+    name : str
+        Of the argument, for the error message.
+    value : array_like
+        Whole numbers [ns], or datetime64 of any unit.
+
+    Raises
+    ------
+    ShapeError
+        If the numbers are not whole, do not increase or have another unit.
+
+    """
+    given = np.asarray(value)
+    if given.dtype.kind == 'M':
+        given = given.astype('datetime64[ns]')
+    if given.size and given.dtype.kind not in 'iuM':
+        raise ShapeError(
+            f'{name}: expected whole numbers [ns], got {given.dtype}; convert seconds by '
+            f'(seconds * 1e9).round().astype(int)'
+        )
+    stamps_ns = given.astype(np.int64)
+    if stamps_ns.ndim != 1 or (np.diff(stamps_ns) <= 0).any():
+        raise ShapeError(
+            f'{name}: expected (N,) strictly increasing [ns], got shape {stamps_ns.shape}; sort '
+            f'them and remove repeated stamps'
+        )
+    n = len(stamps_ns)
+    if n >= STAMPS_OF_UNIT:
+        period_ns = int(stamps_ns[-1] - stamps_ns[0]) / (n - 1)
+        if period_ns < SHORTEST_PERIOD_NS:
+            raise ShapeError(
+                f'{name}: expected nanoseconds, got stamps that are {period_ns:.4g} ns apart on '
+                f'average, as of seconds, milliseconds or microseconds: multiply them'
+            )
+    return stamps_ns
 
 
 def _expected(shape: tuple[int | None, ...], columns: str) -> str:

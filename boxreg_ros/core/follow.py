@@ -26,6 +26,7 @@ from boxreg_ros.structures import (
     BOX_EXTENT,
     BoxArray,
     checked,
+    checked_stamps,
     Columns,
     EXTENDED,
     Floats,
@@ -104,7 +105,8 @@ def follow(
     Raises
     ------
     ShapeError
-        For arrays of other shapes, stamps that do not increase, or boxes without a track id.
+        For arrays of other shapes, stamps that do not increase or have another unit, or boxes
+        without a track id.
 
     Notes
     -----
@@ -114,18 +116,13 @@ def follow(
 
     """
     config = config or Config()
-    stamps = np.asarray(stamps_ns)
-    if stamps.ndim != 1 or stamps.dtype.kind not in 'iu' or (np.diff(stamps) <= 0).any():
-        raise ShapeError(
-            f'stamps_ns: expected (S,) whole numbers, strictly increasing [ns], got '
-            f'{stamps.dtype} of shape {stamps.shape}; sort them and remove repeated stamps'
-        )
+    stamps = checked_stamps('stamps_ns', stamps_ns)
     if len(points) != len(stamps):
         raise ShapeError(f'points: expected {len(stamps)} arrays, got {len(points)}')
     if sensor_origins is not None:
         sensor_origins = checked('sensor_origins', sensor_origins, (len(stamps), 3), 'x y z')
     ordered = [ascending(checked(f'points[{i}]', p, (None, 3))) for i, p in enumerate(points)]
-    tracks = follow_points(stamps.astype(np.int64), ordered, seeds, config, sensor_origins)
+    tracks = follow_points(stamps, ordered, seeds, config, sensor_origins)
     return solved(tracks, ordered, config, sensor_origins)
 
 

@@ -15,6 +15,7 @@ from boxreg_ros.structures import (
     BOX_AXES,
     BoxArray,
     checked,
+    checked_stamps,
     finite_points,
     Floats,
     HUMAN,
@@ -59,7 +60,8 @@ class Track:
     Raises
     ------
     ShapeError
-        For an array of the wrong shape or type, or stamps that do not increase.
+        For an array of the wrong shape or type, or stamps that do not increase or have another
+        unit.
 
     Notes
     -----
@@ -83,10 +85,10 @@ class Track:
                 f"class_name of track {self.track_id!r}: expected text such as 'car', got "
                 f'{self.class_name!r}'
             )
-        stamps_ns = self._checked_stamps()
+        of_track = f'of track {self.track_id!r}'
+        stamps_ns = checked_stamps(f'stamps_ns {of_track}', self.stamps_ns)
         n = len(stamps_ns)
         self._set('stamps_ns', stamps_ns)
-        of_track = f'of track {self.track_id!r}'
         self._set('boxes', checked(f'boxes {of_track}', self.boxes, (n, 9), BOX_AXES))
         points = tuple(self.points) if isinstance(self.points, Iterable) else ()
         if len(points) != n:
@@ -122,23 +124,6 @@ class Track:
                 f'remove its pin'
             )
         return pinned
-
-    def _checked_stamps(self) -> Ints:
-        given = np.asarray(self.stamps_ns)
-        if given.dtype.kind == 'M':
-            given = given.astype('datetime64[ns]')
-        if given.size and given.dtype.kind not in 'iuM':
-            raise ShapeError(
-                f'stamps_ns of track {self.track_id!r}: expected whole numbers [ns], got '
-                f'{given.dtype}; convert seconds by (seconds * 1e9).round().astype(int)'
-            )
-        stamps_ns = given.astype(np.int64)
-        if stamps_ns.ndim != 1 or (np.diff(stamps_ns) <= 0).any():
-            raise ShapeError(
-                f'stamps_ns of track {self.track_id!r}: expected (N,) strictly increasing [ns], '
-                f'got shape {stamps_ns.shape}; sort them and remove repeated stamps'
-            )
-        return stamps_ns
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)  # the class is frozen

@@ -346,3 +346,5 @@ def test_seeds_that_cannot_be_used_are_named_and_the_rest_is_done():
     assert follow(stamps(N), sweeps, []) == []
     with pytest.raises(ShapeError, match='expected 30 arrays, got 29'):
         follow(stamps(N), sweeps[1:], [good])
+    with pytest.raises(ShapeError, match='as of seconds, milliseconds or microseconds'):
+        follow(stamps(N) // 1000, sweeps, [good])

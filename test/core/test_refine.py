@@ -304,6 +304,20 @@ def test_points_that_are_not_finite_are_ignored():
     np.testing.assert_array_equal(only(replace(track, points=points)).boxes, known.boxes)
 
 
+def test_a_few_stamps_may_be_of_several_lidars_at_almost_the_same_time():
+    track, _ = a_track()
+    close = track.stamps_ns[0] + 300_000 * np.arange(4)
+    few = replace(
+        track,
+        stamps_ns=close,
+        boxes=track.boxes[:4],
+        points=track.points[:4],
+        sensor_origins=None,
+        scores=None,
+    )
+    np.testing.assert_array_equal(few.stamps_ns, close)
+
+
 @pytest.mark.parametrize('unit', ['us', 'ns'])
 def test_stamps_may_be_datetime64_of_any_unit(unit):
     track, _ = a_track()
@@ -316,6 +330,8 @@ def test_stamps_may_be_datetime64_of_any_unit(unit):
     [
         ({'stamps_ns': np.arange(12) * 0.1}, ['stamps_ns', 'float64', '1e9']),
         ({'stamps_ns': [None] * 12}, ['stamps_ns', 'object']),
+        ({'stamps_ns': np.arange(12)}, ["stamps_ns of track '1'", '1 ns apart', 'seconds']),
+        ({'stamps_ns': np.arange(12) * 100_000}, ['1e+05 ns apart', 'microseconds']),
         ({'class_name': None}, ['class_name', 'None']),
         ({'boxes': torch.zeros(12, 9, requires_grad=True)}, ['boxes', 'grad']),
         ({'boxes': np.zeros((12, 7))}, ["track '1'", '(12, 7)', 'height roll pitch yaw']),
@@ -554,6 +570,7 @@ def random_track(rng):
     if rng.random() < 0.3:
         origins[rng.integers(n)] = rng.choice([np.nan, np.inf])
     steps = (10.0 ** rng.uniform(0, 10, n)).astype(np.int64)
+    steps[-1] += 10**9  # all stamps close together are of another unit
     boxes[0] = np.where(np.isfinite(boxes[0]), boxes[0], 1.0)
     boxes[0, :3] = boxes[0, :3].clip(-1e5, 1e5)
     boxes[0, 3:6] = np.abs(boxes[0, 3:6]).clip(1e-3, 50.0)
