@@ -2,8 +2,8 @@
 
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import copy, EXTENT, GAP, PIVOT, POSE
-from boxreg_ros.core.method.arrowhead import add_sandwich, NEXT
+from boxreg_ros.core.method.arrays import copy, EXTENT, GAP, padded, PIVOT, POSE
+from boxreg_ros.core.method.arrowhead import add_sandwich, multiply_shared, NEXT
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.expectation import FACES, HEADING, SIZE
 from boxreg_ros.core.method.kinematics import fill_kinematics
@@ -102,7 +102,13 @@ def fill_shared_covariance(corner, G, inverse):
     S = len(corner)
     copy(corner.ravel(), inverse.shared.ravel())
     add_sandwich(corner, G, np.empty(PIVOT), inverse.shared)
-    np.dot(inverse.response.reshape(-1, S), inverse.shared, inverse.beside.reshape(-1, S))
+    shared, product = np.zeros((S, padded(S))), np.empty((POSE, padded(S)))
+    for s in range(S):
+        copy(inverse.shared[s], shared[s, :S])
+    for n in range(len(inverse.response)):
+        multiply_shared(inverse.response[n], shared, product)
+        for a in range(POSE):
+            copy(product[a], inverse.beside[n, a])
 
 
 @kernel
