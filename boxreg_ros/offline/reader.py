@@ -193,9 +193,9 @@ class RecordingReader:
         if pose is None or item.content.frame_id != frame:
             pose = self._items.pose_of(frame, item.content.stamp_ns)
         trimmed = item._replace(refined=None, parts=(), T_fixed_sensor=pose)
-        if isinstance(item.content, BoxArray):
-            return trimmed
         moved = item.moved
+        if isinstance(item.content, BoxArray):
+            return trimmed._replace(content=moved or item.content)
         if isinstance(moved, Sweep) and not (self._with_times and np.any(moved.times)):
             moved = replace(moved, times=None)  # times of 0 say no more
         if not self._with_points:
