@@ -139,8 +139,10 @@ def accept(
         given = np.empty((0, POSE))
         for n in range(len(boxes)):
             pose, extent = poses[b, n], extents[b, n]
-            is_finite = are_finite(pose) and are_finite(covariances[b, n].ravel())
-            is_finite &= are_finite(extent) and min(extent[0], extent[1], extent[2]) > 0.0
+            is_finite = are_finite(pose) and are_finite(extent)
+            is_finite &= min(extent[0], extent[1], extent[2]) > 0.0
+            for k in range(POSE):
+                is_finite &= are_finite(covariances[b, n, k])
             found.is_finite[b] &= is_finite
             fill_box(pose, extent, base[b], found.boxes[b, n])
             found.results[b, n] = ACCEPTED

@@ -332,7 +332,7 @@ def shift_known(known, own, links, response):
     Their covariances, where the shared variables are held, and their `response` to these.
 
     """
-    for a in range(POSE):
+    for a in range(len(own)):
         for c in range(POSE):
             known[POSE + a, POSE + c] = known[a, c]
             known[a, c] = own[a, c]

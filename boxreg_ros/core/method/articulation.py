@@ -8,7 +8,6 @@ The box around tractor and trailer is wider in a curve. One extent per track fit
 from math import log
 
 from boxreg_ros.core.method.compile import kernel, loop
-from boxreg_ros.core.method.expectation import SIZE
 from boxreg_ros.core.method.selection import nth
 import numpy as np
 
@@ -32,7 +31,7 @@ def extent_ranges(boxes, length, span, ranges):
 
     """
     values = np.empty(span)
-    for k in range(SIZE):
+    for k in range(ranges.shape[1]):
         for first in range(length + 1 - span):
             for i in range(span):
                 values[i] = boxes[first + i, 3 + k]

@@ -281,6 +281,13 @@ def has_weight(W):
 
 
 @loop
+def clear_derivatives(out):
+    """Set the derivatives of a residual to zero."""
+    out.J[:] = 0.0
+    out.S[:] = 0.0
+
+
+@loop
 def add_all(poses, shared, last, terms, at, room, first, gradient, A):
     """Add all `RESIDUALS` that begin at the first `last` observations."""
     value = 0.0
@@ -290,8 +297,7 @@ def add_all(poses, shared, last, terms, at, room, first, gradient, A):
         for n in range(min(last, number_of(len(poses), row.poses, True))):
             W = terms[n].W[i]
             if has_weight(W):
-                out.J[:] = 0.0
-                out.S[:] = 0.0
+                clear_derivatives(out)
                 rows, known = row.function(n, poses, shared, terms, at, out)
                 columns = np.int64(known)  # each literal number would be compiled by itself
                 if row.is_combination:
@@ -446,13 +452,13 @@ def factorise_free(A, free, factor):
 def fill_dense(A, dense):
     """Write the block of the second pose, the third and the shared variables, (29, 29)."""
     S = len(A.corner)
-    for pose in range(2):
-        for a in range(POSE):
-            i = POSE * pose + a
-            for c in range(a, NEXT - POSE * pose):
-                dense[i, POSE * pose + c] = A.poses[1 + pose].links[a, c]
-            for s in range(S):
-                dense[i, NEXT + s] = A.poses[1 + pose].border[a, s]
+    for i in range(len(dense) - S):
+        pose, a = i // POSE, i % POSE
+        links, border = A.poses[1 + pose].links[a], A.poses[1 + pose].border[a]
+        for c in range(i, NEXT):
+            dense[i, c] = links[c - POSE * pose]
+        for s in range(S):
+            dense[i, NEXT + s] = border[s]
     for s in range(S):
         for t in range(s, S):
             dense[NEXT + s, NEXT + t] = A.corner[s, t]

@@ -101,6 +101,9 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     the source of the caller only. The qualified name, which numba puts into the name of the cache
     file, therefore gets a digest of all sources that the caller imports. Modules of kernels import
     functions and constants from their own folder only.
+    Loops with constant bounds are written out, with all that they call: those whose bounds are
+    lengths of arrays take a fraction of that to compile, and where they run once a window no
+    longer to run.
 
     """
     source = Path(function.__code__.co_filename)

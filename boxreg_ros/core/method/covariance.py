@@ -100,7 +100,8 @@ def fill_unclaimed(length, marginalised, terms, common, shape, constants, G):
 def fill_shared_covariance(corner, G, inverse):
     """Write covariances of the shared variables, by their block (S, S) of the inverse and `G`."""
     S = len(corner)
-    copy(corner.ravel(), inverse.shared.ravel())
+    for s in range(S):
+        copy(corner[s], inverse.shared[s])
     add_sandwich(corner, G, np.empty(PIVOT), inverse.shared)
     shared, product = np.zeros((S, padded(S))), np.empty((POSE, padded(S)))
     for s in range(S):
@@ -117,8 +118,8 @@ def fill_pose_covariances(length, times, poses, inverse, constants, found):
     shift = np.empty(3)
     for n in range(len(poses)):
         beside, response = inverse.beside[n], inverse.response[n]
-        for i in range(POSE):
-            for j in range(i, POSE):
+        for i in range(len(response)):
+            for j in range(i, len(response)):
                 total = inverse.poses[n, i, j]
                 for s in range(beside.shape[1]):
                     total += beside[i, s] * response[j, s]

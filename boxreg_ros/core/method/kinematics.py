@@ -23,12 +23,12 @@ def fill_combination(first, factors, inverse, rows, found):
     Of their variables `RATES`. `rows` (2, 4, S) are to work in.
 
     """
-    for i in range(len(RATES)):
+    for i in range(len(found)):
         combine(first, factors, inverse.beside, RATES[i], rows[0, i])
         combine(first, factors, inverse.response, RATES[i], rows[1, i])
-    for i in range(len(RATES)):
+    for i in range(len(found)):
         k = RATES[i]
-        for j in range(i, len(RATES)):
+        for j in range(i, len(found)):
             m = RATES[j]
             total = 0.0
             for s in range(rows.shape[2]):

@@ -37,7 +37,7 @@ def population_slopes(evidence, constants, median, slopes):
 
     """
     constants = constants[0]
-    for m in range(SIZE):
+    for m in range(len(median)):
         median[m] = lower_median(evidence[:, 0, m].copy())
     information = 1 / constants.slope_deviation**2
     curvature, off = np.zeros((SIZE, SIZE, SIZE)), np.empty(SIZE)
@@ -60,6 +60,6 @@ def population_slopes(evidence, constants, median, slopes):
                 slopes[k, m] += similarity * correction[k] * weighted
                 for j in range(m, SIZE):
                     curvature[k, m, j] += weighted * off[j]
-    for k in range(SIZE):
+    for k in range(len(slopes)):
         factorise_corner(curvature[k])
         solve_corner(curvature[k], slopes[k])

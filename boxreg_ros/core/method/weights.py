@@ -127,7 +127,8 @@ def is_parked(boxes, times, length, yaw_deviation, constants):
     turned = abs(rate[2]) * duration / yaw_deviation
     if not (speed < constants.parked_speed and turned < constants.gate):
         return False
-    x, y, _ = median_place(boxes, times, 0, length)
+    first = np.int64(0)  # a literal would be compiled by itself
+    x, y, _ = median_place(boxes, times, first, length)
     distance = np.empty(length)
     for n in range(length):
         distance[n] = hypot(boxes[n, 0] - x, boxes[n, 1] - y)
@@ -137,9 +138,13 @@ def is_parked(boxes, times, length, yaw_deviation, constants):
 @kernel
 def median_place(boxes, times, first, last):
     """Return the medians of x, y and time of the boxes `first` to `last`."""
-    x = lower_median(boxes[first:last, 0].copy())
-    y = lower_median(boxes[first:last, 1].copy())
-    return x, y, lower_median(times[first:last].copy())
+    values, found = np.empty((3, last - first)), np.empty(3)
+    for n in range(last - first):
+        box = boxes[first + n]
+        values[0, n], values[1, n], values[2, n] = box[0], box[1], times[first + n]
+    for k in range(len(values)):
+        found[k] = lower_median(values[k])
+    return found[0], found[1], found[2]
 
 
 @kernel
