@@ -123,8 +123,9 @@ def compile_package(package: Path, folder: Path, compiler: str, library: Path) -
 
     name = package.name
     entry = library.with_name(f'_{name}_s.ep.rosidl_typesupport_c.c')
+    patterns = 'py/*/msg/*.c', 'introspection_c/**/*.c', 'c/**/*__functions.c', 'c/**/*__type_*.c'
     together = {
-        'python.c': [entry, *folder.glob('py/*/msg/*.c'), *folder.glob('introspection_c/**/*.c')],
+        'python.c': [entry, *(path for one in patterns for path in folder.glob(one))],
         'support.cpp': list(folder.glob('*/*/msg/**/*.cpp')),
     }
     for file, paths in together.items():
@@ -143,7 +144,7 @@ def compile_package(package: Path, folder: Path, compiler: str, library: Path) -
     ]
     command = [
         compiler, '-shared', '-fPIC', '-w', *(f'-I{path}' for path in headers),
-        '-x', 'c', folder / 'python.c', *folder.glob('c/**/*.c'),
+        '-x', 'c', folder / 'python.c', *folder.glob('c/**/*__description.c'),
         '-x', 'c++', folder / 'support.cpp',
         f'-L{PREFIX}/lib', *(f'-l{library}' for library in libraries), '-o', library,
     ]  # fmt: skip
