@@ -55,14 +55,13 @@ demo: $(runtime) ## set up, refine the sample recording and complete its tracks,
 	$(BIN)/boxreg evaluate out/demo/boxes.csv bags/street_truth.csv
 	@echo; echo 'Refined boxes: out/demo/boxes.csv    What was done, to look at: out/demo/report.html'
 
+# Download, unpacking and compilation do not depend on each other: they share the cores.
 test: ## set up, run the whole suite, and a part of it as on Ubuntu 24.04
-	@$(MAKE) --no-print-directory --jobs environments
 	@$(MAKE) --no-print-directory --jobs test-main jazzy-beside
 	@cat out/jazzy.txt
 	@! grep -q '^NOT PASSED' out/jazzy.txt
 
-# They do not depend on each other: download, unpacking and compilation share the cores.
-environments: $(tests) $(consumers) compiled $(if $(PYTHON_JAZZY),$(jazzy))
+environments: $(tests) $(consumers) $(if $(PYTHON_JAZZY),$(jazzy)) ## set up all that tests need, in parallel with --jobs
 
 compiled: $(runtime)
 	$(BIN)/python test/warmed.py
@@ -75,7 +74,7 @@ jazzy-beside: $(if $(PYTHON_JAZZY),$(jazzy))
 	    nice -n 19 $(MAKE) --no-print-directory test-jazzy > out/jazzy.txt 2>&1 \
 	    || echo 'NOT PASSED: the tests with the versions of Ubuntu 24.04' >> out/jazzy.txt
 
-test-main: $(tests) $(consumers)
+test-main: compiled $(tests) $(consumers)
 	$(BIN)/python -m pytest $(SHARED)
 
 coverage: $(tests) $(consumers) ## run the suite and print the part of the lines that it executes
