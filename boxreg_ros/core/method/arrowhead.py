@@ -392,6 +392,7 @@ def multiply(after, known, product):
 @loop
 def multiply_shared(response, shared, product):
     """Write the product of a `response` (6, S) and a matrix (S, S or more) as `multiply`."""
+    # Both forms of S have these variables; a sum of constant length takes a quarter of the time.
     for a in range(POSE):
         for r in range(padded(shared.shape[1])):
             total = 0.0
