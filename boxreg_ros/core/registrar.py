@@ -24,6 +24,7 @@ from boxreg_ros.core.problem import SETTINGS_OF
 from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import by_table
 from boxreg_ros.core.window import Estimate, PRIOR_POSES, Window
+from boxreg_ros.errors import ConfigError
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, RefinedBoxes, Sweep, X, Z
 import numpy as np
@@ -267,7 +268,17 @@ class BoxRegistrar:
             Boxes of a person in the fixed frame [m, rad]. The object of an id that is followed
             starts anew; a box without an id, or an invalid one, is listed in ``followed.refused``.
 
+        Raises
+        ------
+        ConfigError
+            With `estimate` 'track': whole tracks follow objects by `boxreg_ros.follow`.
+
         """
+        if self.config.estimate == 'track':
+            raise ConfigError(
+                "estimate: expected 'early' or 'final' to follow objects live, got 'track'; "
+                'set another one, or follow them through all sweeps by boxreg_ros.follow'
+            )
         self.followed.add(boxes)
 
     def flush(self) -> list[RefinedBoxes]:

@@ -3,8 +3,10 @@
 from boxreg_ros import Config
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.errors import ConfigError
 from boxreg_ros.structures import BoxArray, COASTED, Sweep
 import numpy as np
+import pytest
 from scenes import drive, returns, stamps, START_NS
 
 STEPS = 30
@@ -134,3 +136,9 @@ def test_an_object_that_drifts_does_not_end_one_that_is_seen_all_the_time():
     found, registrar = run(truth, seeds, gone=range(9, STEPS), parked=parked)
     assert [step for name, step in found if name == 'parked'] == list(range(2, STEPS))
     assert registrar.followed.track_ids == ('parked',)
+
+
+def test_whole_tracks_refuse_objects_to_follow_in_a_stream():
+    registrar = BoxRegistrar(CONFIG.updated({'estimate': 'track'}))
+    with pytest.raises(ConfigError, match="expected 'early' or 'final'"):
+        registrar.follow(array(0, {'1': np.array([0.0, 0, 0, 4, 2, 1.5, 0, 0, 0])}))
