@@ -263,13 +263,14 @@ class ReadAhead:
             received = self._receive()
             if isinstance(received, Findings):
                 self.findings = received
+                del self._receive
                 return
             yield received
 
 
 def _read(
     messages: Callable[[], Iterator[Source | Item | Findings]],
-    memory: mmap,
+    memory: list[mmap],
     receive: Receive,
     send: Send,
 ) -> None:

@@ -110,6 +110,7 @@ def _relabel(request: Request, out: Path, progress: Progress, fingerprint: str) 
         from boxreg_ros.offline.main_process import MainProcess
 
         recording = ReadAhead(receive)
+        del receive  # with the last item, its memory is free
         if first is None:
             clock.begun('start')
         submit = workers.enter_context(estimation_worker(request.config, clock, progress.announce))
@@ -117,6 +118,7 @@ def _relabel(request: Request, out: Path, progress: Progress, fingerprint: str) 
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock, corrections) as sink:
                 registrar = run.register(sink, submit, shown)
+            workers.close()  # their memory is free for the tables of tracks
             summary = run.write(folder, out, registrar, sink, fingerprint)
             _check_ids(request, summary.associated_tracks is not None)
             write_summary(folder, summary.as_json())

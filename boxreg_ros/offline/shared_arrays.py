@@ -35,16 +35,16 @@ SHARED_BYTES = 2**17
 """Smaller items go through the socket, too. Chosen: those that it takes in one piece."""
 
 
-def shared_memory() -> mmap:
-    """Return memory for `Sender` and `Receiver`, to be made before the worker is forked."""
-    return mmap(-1, SLOTS * SLOT_BYTES)
+def shared_memory() -> list[mmap]:
+    """Return the slots of `Sender` and `Receiver`, to be made before the worker is forked."""
+    return [mmap(-1, SLOT_BYTES) for _ in range(SLOTS)]
 
 
 class Sender:
     """Send items from the worker; `receive` returns the slots of later items."""
 
-    def __init__(self, memory: mmap, receive: Receive, send: Send) -> None:
-        self._memory = memoryview(memory)
+    def __init__(self, memory: list[mmap], receive: Receive, send: Send) -> None:
+        self._memory = memory
         self._receive = receive
         self._send = send
         self._free = [*range(SLOTS_AHEAD)]
@@ -63,14 +63,14 @@ class Sender:
         places = []
         for begin, content in zip([0, *ends.tolist()], contents, strict=False):
             places.append(slice(begin, begin + content.nbytes))
-            self._memory[slot * SLOT_BYTES :][places[-1]] = content
+            self._memory[slot][places[-1]] = content
         self._send((pickled, places, slot))
 
 
 class Receiver:
     """Receive the items in the parent; some of their arrays are in shared memory while in use."""
 
-    def __init__(self, memory: mmap, process: WorkerProcess) -> None:
+    def __init__(self, memory: list[mmap], process: WorkerProcess) -> None:
         self._memory = memory
         self._process = process
         self._unused = iter(range(SLOTS_AHEAD, SLOTS))
@@ -81,7 +81,7 @@ class Receiver:
         pickled, arrays, slot = self._process.receive()
         if slot is not None:
             end = arrays[-1].stop
-            content = np.frombuffer(self._memory, np.uint8, end, slot * SLOT_BYTES)
+            content = np.frombuffer(self._memory[slot], np.uint8, end)
             # Freed slots first: as little memory as possible is ever used.
             other = self._freed.pop() if self._freed else next(self._unused, None)
             if other is None:

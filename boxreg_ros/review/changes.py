@@ -71,7 +71,8 @@ class TrackChanges:
     @property
     def labels(self) -> Floats:
         """Return the result (n, 9) without rejected boxes: NaN in their place."""
-        return np.where(self.is_label[:, None], self.boxes, np.nan)
+        is_label = self.is_label
+        return self.boxes if is_label.all() else np.where(is_label[:, None], self.boxes, np.nan)
 
     @property
     def is_refined(self) -> NDArray[np.bool_]:

@@ -60,12 +60,15 @@ class LabelTrack:
         Returns
         -------
         track : LabelTrack
-            In the order of stamps.
+            In the order of stamps; its arrays are those given where they are so.
 
         """
-        rows = np.flatnonzero(is_valid_box(boxes))
-        rows = rows[np.argsort(stamps_ns[rows], kind='stable')]
-        columns = stamps_ns[rows], boxes[rows], num_points[rows]
+        columns = stamps_ns, boxes, num_points
+        is_valid = is_valid_box(boxes)
+        if not is_valid.all() or (np.diff(stamps_ns) < 0).any():  # else copies take memory
+            rows = np.flatnonzero(is_valid)
+            rows = rows[np.argsort(stamps_ns[rows], kind='stable')]
+            columns = stamps_ns[rows], boxes[rows], num_points[rows]
         return cls(track_id, class_name, config.kind(class_name), *columns)
 
     @cached_property

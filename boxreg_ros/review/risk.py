@@ -90,8 +90,8 @@ class Risk(NamedTuple):
 
     boxes: Floats
     """(n,), of each box [m]."""
-    parts: Mapping[str, Floats]
-    """(n,) by their reason in words [m], largest contributions included."""
+    means: Mapping[str, float]
+    """Of `parts_of` its boxes, by their reason in words [m]."""
 
     @property
     def track(self) -> float:
@@ -130,8 +130,16 @@ UNKNOWN_USUAL = Usual()
 
 
 def assess(track: TrackChanges, usual: Usual = UNKNOWN_USUAL) -> Risk:
+    """Return the risk of each box of a track among tracks of which `usual` is known."""
+    parts = parts_of(track, usual)
+    total = np.sum([*parts.values()], axis=0)
+    means = {reason: float(part.mean()) for reason, part in parts.items()}
+    return Risk(total.clip(max=MAX_LOSS * REFERENCE_LENGTH / 2), means)
+
+
+def parts_of(track: TrackChanges, usual: Usual = UNKNOWN_USUAL) -> dict[str, Floats]:
     """
-    Return the risk of each box of a track among tracks of which `usual` is known.
+    Return the parts of the risk of each box of a track, (n,) by their reason in words [m].
 
     A face that is off by d costs d / L of 3D IoU, L the extent across it; a turn by a costs
     a l / (2 w). The error of a face is normal. Its deviation is that of the centre and half the
@@ -171,20 +179,17 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN_USUAL) -> Risk:
     losses['size unlike its class'] = _unlike(track, extents, usual)
     losses['id switch'] = np.full(len(is_kept), SWITCH_LOSS * _has_id_switch(track))
     parts = np.nan_to_num(_with_added(np.array([*losses.values()]), track)) * REFERENCE_LENGTH / 2
-    total = parts.sum(axis=0)
-    return Risk(
-        total.clip(max=MAX_LOSS * REFERENCE_LENGTH / 2), dict(zip(losses, parts, strict=True))
-    )
+    return dict(zip(losses, parts, strict=True))
 
 
 def typical_parts(risks: Sequence[Risk]) -> dict[str, float]:
     """Return the median of each part over the tracks [m]; none for fewer than `MIN_COMPARED`."""
     if len(risks) < MIN_COMPARED:
         return {}
-    means = {
-        reason: [float(risk.parts[reason].mean()) for risk in risks] for reason in risks[0].parts
+    return {
+        reason: float(np.median([risk.means[reason] for risk in risks]))
+        for reason in risks[0].means
     }
-    return {reason: float(np.median(values)) for reason, values in means.items()}
 
 
 def reasons_of(track: TrackChanges, risk: Risk, typical: Mapping[str, float]) -> str:
@@ -195,8 +200,7 @@ def reasons_of(track: TrackChanges, risk: Risk, typical: Mapping[str, float]) ->
     common is no reason to open this one.
 
     """
-    means = {reason: float(part.mean()) for reason, part in risk.parts.items()}
-    values = {reason: value for reason, value in means.items() if value >= MIN_SHOWN}
+    values = {reason: value for reason, value in risk.means.items() if value >= MIN_SHOWN}
     largest = sorted(values, key=lambda reason: typical.get(reason, 0.0) - values[reason])
     words = [f'{name} ({values[name]:.2f} m)' for name in largest[:3]]
     points = float(np.median(track.num_points))

@@ -4,7 +4,7 @@ import csv
 from dataclasses import replace
 
 from boxreg_ros.review.changes import Changes
-from boxreg_ros.review.risk import assess, MIN_COMPARED, risks_of_box, Usual
+from boxreg_ros.review.risk import assess, MIN_COMPARED, parts_of, risks_of_box, Usual
 from boxreg_ros.review.tables import assessed, REVIEW_COLUMNS, write_tables
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 import numpy as np
@@ -46,7 +46,7 @@ def test_risk_is_the_expected_loss_of_overlap():
     # one has them all: twice the variance of one.
     track = track_with(0.05)
     mean = np.hypot(0.05, 0.025) * np.sqrt(2 / np.pi)
-    parts = assess(track).parts
+    parts = parts_of(track)
     for faces, across in (('ends', 4.5), ('sides', 1.8), ('top and bottom', 1.5)):
         expected = np.sqrt(2) * mean / across * 4.5 / 2
         np.testing.assert_allclose(parts[f'uncertain {faces}'], expected)
@@ -65,7 +65,7 @@ def test_estimates_that_disagree_beyond_their_deviations_raise_the_risk():
         refined, before = (RefinedBoxes(boxes, *columns, **spread) for boxes in (array, early))
         changes.add(array, refined, before)
         (track,) = changes.tracks()
-        parts.append(assess(track).parts['estimates disagree'])
+        parts.append(parts_of(track)['estimates disagree'])
     np.testing.assert_allclose(parts[0], (1 - 4 / 5) * 4.5 / 2, rtol=1e-3)
     assert parts[1] == 0  # the deviations explain it
 
@@ -74,7 +74,7 @@ def test_a_face_far_off_its_points_costs_its_distance():
     # .33 m beyond the .03 m of a car's surface is certain: the loss is .3 / 1.8, less what the
     # deviation of the face costs anyway.
     distances = np.array([[0.0, 0.0, 0.33, 0.0, 0.0, 0.0]])
-    parts = assess(track_with(0.001, face_distances=distances)).parts
+    parts = parts_of(track_with(0.001, face_distances=distances))
     noise = np.hypot(0.001, 0.0005) * np.sqrt(2 / np.pi)
     np.testing.assert_allclose(
         parts['sides off their points'], (0.3 - noise) / 1.8 * 4.5 / 2, rtol=1e-6
@@ -85,8 +85,8 @@ def test_extents_unlike_those_of_the_class_raise_the_risk():
     cars = [track_with(boxes=boxes_of(size)) for size in np.linspace(0.95, 1.05, MIN_COMPARED)]
     usual = Usual.of(cars)
     reason = 'size unlike its class'
-    assert assess(cars[0], usual).parts[reason].sum() == 0
-    assert assess(track_with(boxes=boxes_of(1.3)), usual).parts[reason].min() > 0.3
+    assert parts_of(cars[0], usual)[reason].sum() == 0
+    assert parts_of(track_with(boxes=boxes_of(1.3)), usual)[reason].min() > 0.3
     assert Usual.of(cars[1:]).sizes == {}  # too few tracks
 
 
@@ -102,17 +102,17 @@ def test_points_outside_count_beyond_what_is_usual_and_by_their_number():
     part = (30 + 10 * of_track) / (100 + 10)
     fill = np.prod(np.array(CAR[3:6]) / (np.array(CAR[3:6]) + 1.2)) / 0.34
     shift = (part - 0.1) * fill
-    loss = assess(track).parts[reason] / (4.5 / 2)
+    loss = parts_of(track)[reason] / (4.5 / 2)
     np.testing.assert_allclose(loss, 2 * shift / (1 + shift), atol=1e-5)
-    assert assess(track, Usual(outside=0.3)).parts[reason].sum() == 0
+    assert parts_of(track, Usual(outside=0.3))[reason].sum() == 0
 
 
 def test_a_box_off_its_object_is_found_by_the_few_points_of_all_its_boxes():
     # One point of a parked car, outside of its box at each of 70 stamps.
     reason = 'points left outside'
-    assert assess(track_with(n=70, **near(0, 1))).parts[reason].min() > 1.0
-    assert assess(track_with(n=1, **near(0, 1))).parts[reason].max() < 0.3
-    assert assess(track_with(n=70, **near(0, 0))).parts[reason].max() == 0.0
+    assert parts_of(track_with(n=70, **near(0, 1)))[reason].min() > 1.0
+    assert parts_of(track_with(n=1, **near(0, 1)))[reason].max() < 0.3
+    assert parts_of(track_with(n=70, **near(0, 0)))[reason].max() == 0.0
 
 
 def test_points_outside_that_other_reasons_explain_count_once():
@@ -138,11 +138,11 @@ def test_evidence_of_errors_raises_the_risk(worse):
 def test_an_id_switch_raises_the_risk_and_steady_motion_does_not():
     driving = np.array([CAR] * 8)
     driving[:, 0] = np.arange(8)
-    assert assess(track_with(n=8, boxes=driving)).parts['id switch'].sum() == 0
+    assert parts_of(track_with(n=8, boxes=driving))['id switch'].sum() == 0
     for across in (2.8, 8.0):  # a car in the next lane, and further
         switched = driving.copy()
         switched[4:, 1] += across
-        assert assess(track_with(n=8, boxes=switched)).parts['id switch'].all()
+        assert parts_of(track_with(n=8, boxes=switched))['id switch'].all()
     switched, beside = driving.copy(), driving.copy()
     switched[4:, 1] += 3.5
     beside[:4, 1] += 3.5
