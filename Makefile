@@ -71,7 +71,7 @@ compiled: $(runtime)
 jazzy-beside: $(if $(PYTHON_JAZZY),$(jazzy))
 	@mkdir -p out
 	@PYTHONPYCACHEPREFIX=$(CURDIR)/$(VENV_JAZZY)/pycache NUMBA_CACHE_DIR=$(CURDIR)/$(VENV_JAZZY)/kernels \
-	    nice -n 19 $(MAKE) --no-print-directory test-jazzy > out/jazzy.txt 2>&1 \
+	    nice -n 19 $(MAKE) --no-print-directory WORKERS=2 test-jazzy > out/jazzy.txt 2>&1 \
 	    || echo 'NOT PASSED: the tests with the versions of Ubuntu 24.04' >> out/jazzy.txt
 
 test-main: compiled $(tests) $(consumers)
