@@ -150,7 +150,8 @@ def follow_points(
     origins : array, shape (S, 3), optional
         Positions of the sensor, NaN where unknown [m].
     grows : bool
-        Whether a single seed takes the size of the points that are seen of its object.
+        Whether a single seed that is not pinned takes the size of the points that are seen of its
+        object.
 
     Returns
     -------
@@ -194,12 +195,15 @@ class _Object(NamedTuple):
     """Indices of the objects with a seed that is inside of one of this, or the other way."""
     is_of_class: bool = False
     """Whether another object has the same size: no person draws the same box twice."""
+    is_pinned: bool = False
+    """Whether a person has decided on a seed, and so on the size."""
 
 
 class _Seed(NamedTuple):
     stamp_ns: int
     class_name: str
     box: Floats
+    is_pinned: bool
 
 
 def _by_track(arrays: Sequence[BoxArray]) -> dict[str, list[_Seed]]:
@@ -211,7 +215,8 @@ def _by_track(arrays: Sequence[BoxArray]) -> dict[str, list[_Seed]]:
                 raise ShapeError(
                     'seeds: expected a track id for each box, got an empty one; add it'
                 )
-            seed = _Seed(array.stamp_ns, array.class_names[i], array.boxes[i])
+            is_pinned = bool(array.is_pinned[i])
+            seed = _Seed(array.stamp_ns, array.class_names[i], array.boxes[i], is_pinned)
             found.setdefault(name, []).append(seed)
     return found
 
@@ -236,7 +241,13 @@ def _placed(track_id: str, given: Sequence[_Seed], stamps_ns: Ints) -> _Object:
             boxes[row] = seed.box
     rows = np.array(list(boxes), np.int64)
     seeds = Seeds(rows, np.array(list(boxes.values())).reshape(-1, 9))
-    return _Object(track_id, given[0].class_name, seeds, tuple(problems))
+    return _Object(
+        track_id,
+        given[0].class_name,
+        seeds,
+        tuple(problems),
+        is_pinned=any(seed.is_pinned for seed in given),
+    )
 
 
 def _followed(
@@ -276,7 +287,7 @@ def _followed(
         ends.append(End(int(stamps_ns[last]), reason))
     rows = np.array(sorted(poses), np.int64)
     boxes = _boxes(rows, np.array([poses[row] for row in rows.tolist()]), seeds)
-    if grows and len(seeds.rows) == 1:
+    if grows and not one.is_pinned and len(seeds.rows) == 1:
         boxes = follower.grown(rows, boxes, one.is_of_class)
     words = tuple(status[row] for row in rows.tolist())
     return FollowedTrack(

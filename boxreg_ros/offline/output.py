@@ -165,8 +165,6 @@ class Sink:
                 self.unknown_classes[name] += boxes
         moved = item.moved
         if isinstance(moved, BoxArray):
-            if self._has_keyframes:  # soft: evidence may move those that files call pinned
-                moved = replace(moved, pinned=None)
             place = moved.ticket
             assert isinstance(place, ArrayPlace)
             place.boxes = moved

@@ -20,6 +20,7 @@ from boxreg_ros.structures import (
     Floats,
     HUMAN,
     INTERPOLATED,
+    KEPT,
     REFINED,
     RefinedBoxes,
 )
@@ -158,9 +159,12 @@ def with_evidence(
         if fit_rows:
             own = moved(at, own, stamps_ns[fit_rows], steps[fit_rows])
         if exact:
-            own = between_exact(at, own, Keyframes(stamps_ns[rows], boxes[rows], away[rows]))
+            key_ns, first = np.unique(stamps_ns[rows], return_index=True)  # of two, the first
+            keys = np.array(rows)[first]
+            own = between_exact(at, own, Keyframes(key_ns, boxes[keys], away[keys]))
         for (index, row), box in zip(places[name], own, strict=True):
-            found[index][row] = box
+            if results[index].status[row] != KEPT:
+                found[index][row] = box
     return [
         replace(result, boxes=replace(result.boxes, boxes=own))
         for result, own in zip(results, found, strict=True)

@@ -719,6 +719,17 @@ def test_pinned_box_decides_on_the_heading():
     assert (np.cos(refined.boxes[:, 8] - truth[:, 8]) > 0.9).all()
 
 
+def test_a_pinned_box_that_is_turned_does_not_turn_those_of_the_others():
+    truth = drive(12, speed=1.0, turn=0.0)
+    track, _ = a_track(truth=truth, position=0.02, heading=0.01)
+    pinned = np.arange(12) % 3 == 1
+    boxes = np.where(pinned[:, None], truth, track.boxes)
+    boxes[4, 8] += np.pi
+    (refined,) = refine([replace(track, boxes=boxes, pinned=pinned)], Config(estimate='track'))
+    is_turned = np.cos(refined.boxes[:, 8] - truth[:, 8]) < 0
+    np.testing.assert_array_equal(is_turned, np.arange(12) == 4)
+
+
 def test_pins_change_nothing_of_other_tracks_without_any():
     track, _ = a_track()
     (plain,) = refine([track])

@@ -134,6 +134,33 @@ def test_bad_keyframes_are_named_in_one_line_each_and_the_rest_is_done(street, t
     assert len(found['10']) > 10
 
 
+def test_a_second_box_of_an_exact_keyframe_is_written_as_it_is(street, tmp_path):
+    keys = rows_in(street / 'keys.csv')
+    second = dict(keys[0], x=str(float(keys[0]['x']) + 3))
+    write(tmp_path / 'twice.csv', [*keys, second])
+    words = f'relabel {street}/drive.mcap --keyframes --labels csv:{tmp_path}/twice.csv'
+    assert main([*words.split(), '-o', f'{tmp_path}/out']) == 0
+    kept = [row for row in rows_of(tmp_path / 'out') if row['status'] == 'kept']
+    assert [row['track_id'] for row in kept] == [second['track_id']]
+    assert abs(float(kept[0]['x']) - float(second['x'])) < 1e-9
+
+
+def test_what_a_person_has_corrected_stays_as_it_is(street, tmp_path):
+    truth = rows_in(street / 'truth.csv')
+    seeds = [row for row in truth if row['stamp_ns'] == truth[0]['stamp_ns']]
+    drawn = max(seeds, key=lambda row: int(row['num_points']))
+    drawn |= {'status': 'human', 'width': str(float(drawn['width']) + 0.8)}
+    write(tmp_path / 'drawn.csv', seeds)
+    words = f'relabel {street}/drive.mcap --keyframes --labels csv:{tmp_path}/drawn.csv'
+    assert main([*words.split(), '-o', f'{tmp_path}/out']) == 0
+    found = [row for row in rows_of(tmp_path / 'out') if row['track_id'] == drawn['track_id']]
+    for name in ('x', 'y', 'z', 'length', 'width', 'height'):
+        assert abs(float(found[0][name]) - float(drawn[name])) < 1e-9
+    assert [row['status'] for row in found] == ['human', *['extended'] * (SWEEPS - 1)]
+    wider = [float(row['width']) - float(drawn['width']) for row in found]
+    assert np.abs(wider).max() < 0.05
+
+
 def test_one_box_of_each_object_is_followed(street, tmp_path):
     out = tmp_path / 'out'
     words = ['follow', f'{street}/drive.mcap', f'{street}/seeds.csv', '-o', str(out)]

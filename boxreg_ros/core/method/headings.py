@@ -102,18 +102,19 @@ def correct_flips(boxes, times, lengths, pinned, known_yaw):
     """
     Correct 180° flips of the angles of boxes, as `resolve_headings`.
 
-    A pinned box, of those `pinned` (B, N), decides on the heading sign of its window.
+    The majority of the pinned boxes, `pinned` (B, N), decides on the heading sign of their window.
 
     """
     yaw = np.empty(times.shape)
     resolve_headings(boxes, times, lengths, known_yaw, yaw)
     for b in range(len(boxes)):
-        is_contrary = False
+        contrary = 0  # pinned boxes that are, less those that are not
         for n in range(boxes.shape[1]):
-            is_contrary |= pinned[b, n] and cos(yaw[b, n] - boxes[b, n, HEADING]) < 0
+            if pinned[b, n]:
+                contrary += 1 if cos(yaw[b, n] - boxes[b, n, HEADING]) < 0 else -1
         for n in range(boxes.shape[1]):
             box = boxes[b, n]
-            angle = yaw[b, n] + (pi if is_contrary else 0.0)
+            angle = yaw[b, n] + (pi if contrary > 0 else 0.0)
             # A half turn about the z axis of the box changes the signs of roll and pitch.
             sign = 1.0 if cos(angle - box[HEADING]) >= 0 else -1.0
             for k in ANGLES[:2]:
