@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
+from math import prod
+from mmap import mmap
 from typing import Any
 
 from boxreg_ros.core.metrics import iou_3d, pose_errors
@@ -109,10 +111,17 @@ class _Column:
         """Append rows; room that is not used yet takes no memory."""
         begin, end = len(self.rows), len(self.rows) + len(rows)
         if end > len(self._room):
-            self._room = np.empty((2 * end, *rows.shape[1:]), rows.dtype)
+            self._room = _room((2 * end, *rows.shape[1:]), rows.dtype)
             self._room[:begin] = self.rows
         self._room[begin:end] = rows
         self.rows = self._room[:end]
+
+
+def _room(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Return an array; of numbers not by malloc, which keeps it once there is a larger one."""
+    if kind.hasobject:
+        return np.empty(shape, kind)
+    return np.ndarray(shape, kind, mmap(-1, prod(shape) * kind.itemsize))
 
 
 class Changes:
