@@ -10,7 +10,7 @@ batch are an array (B, N) of records `residuals.TERMS`, and (B,) of `COMMON`. On
 
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.compile import loop
 import numpy as np
 
 POSE = 6
@@ -177,7 +177,7 @@ def most_points(counts):
     return padded(most)
 
 
-@kernel
+@loop
 def factor_of_window(b, factor):
     """Return the factor of window `b`."""
     return Factor(factor.own[b], factor.coupling[b], factor.corner[b])

@@ -353,7 +353,7 @@ def accumulate(x, last, terms, common, prior_mean, W_prior, at, out, gradient, A
     return value
 
 
-@kernel
+@loop
 def weigh(b, problem, poses, shared, constants, at, out, terms, common):
     """
     Write data and weights of the terms of window `b` at the start of a round.
@@ -377,7 +377,7 @@ def weigh(b, problem, poses, shared, constants, at, out, terms, common):
     """
     N, length = len(poses), problem.lengths[b]
     boxes, times, of_class = problem.boxes[b], problem.times[b], problem.of_class[b]
-    parked, pin_factor, face_weight = np.empty(N, np.bool_), np.empty(POSE), np.empty((N, 6))
+    parked, pin_factor, face_weight = at['parked'], out[0].pin_factor, at['face_weight']
     yaw_deviation = max(common.pose_deviation[5], of_class.pose[5])
     fill_parked(boxes, times, length, yaw_deviation, constants, parked)
     fill_pin_factor(length, common, pin_factor)
@@ -400,12 +400,10 @@ def weigh(b, problem, poses, shared, constants, at, out, terms, common):
     weigh_each(poses, shared, terms, window, constants, at, out)
 
 
-@kernel
+@loop
 def weigh_each(poses, shared, terms, window, constants, at, room):
     """Write the weights of each of `RESIDUALS` where they are not zero."""
-    squared = np.zeros(len(poses))
-    i = 0
-    out = room[0]
+    i, out, squared = 0, room[0], at['squared']
     for row in literal_unroll(RESIDUALS):
         count = number_of(window.length, row.poses, constants.residuals[i])
         for n in range(count):
@@ -433,7 +431,7 @@ def squared_norm(rows, W, r):
     return total
 
 
-@kernel
+@loop
 def factorise_free(A, free, factor):
     """
     Write the factor of a matrix in the `free` variables (6 N + S,).

@@ -75,6 +75,8 @@ LINEARISED = np.dtype(
         ('by_angles', float, (4, 3)),
         ('weighted', float, (4, 3)),
         ('off', float, PRIOR),
+        ('extents', float, 3),
+        ('pin_factor', float, POSE),
     ],
     align=True,
 )
@@ -89,17 +91,28 @@ columns
 share
     Factors of the poses in a combination of them, (3,): the first six columns of J are derivatives
     by this.
-R, dR, step, pull, curvature, plane, by_angles, weighted, off
+R, dR, step, pull, curvature, plane, by_angles, weighted, off, extents, pin_factor
     To work in.
 """
 
 
-AXES = np.dtype([('R', float, (3, 3)), ('dR', float, (3, 3, 3))], align=True)
+AXES = np.dtype(
+    [
+        ('R', float, (3, 3)),
+        ('dR', float, (3, 3, 3)),
+        ('squared', float),
+        ('face_weight', float, 6),
+        ('parked', bool),
+    ],
+    align=True,
+)
 """
 Axes of a pose of a state.
 
 R, dR
     Columns are the axes (3, 3); derivatives by roll, pitch and yaw, in front (3, 3, 3).
+squared, face_weight, parked
+    To work in, of its observation: `weights.robustify`, `weigh_faces` and `fill_parked`.
 """
 
 

@@ -32,9 +32,9 @@ from boxreg_ros.core.method.assemble import (
     no_matrix,
     weigh,
 )
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.covariance import empty_inverse, fill_posterior
-from boxreg_ros.core.method.expectation import expect, fill_evidence, SIZE
+from boxreg_ros.core.method.expectation import expect, fill_evidence
 from boxreg_ros.core.method.residuals import empty_linearised, TERMS
 import numpy as np
 
@@ -99,22 +99,32 @@ def evaluate(first, last, rows, wanted, batch, inputs, constants, x, value, grad
         observation are only to work in.
 
     """
-    problem, free, sums, solution = batch
-    D, N = x.shape[2], sums.terms.shape[1]
-    at, out, mean_extents = empty_axes(N), empty_linearised(), np.empty(SIZE)
+    N = batch.sums.terms.shape[1]
     none = matrix = no_matrix()
     if wanted != VALUE:  # residuals of the oldest observation depend on three poses
-        matrix = empty_matrix(N if wanted == START else 3, D - POSE * N)
+        matrix = empty_matrix(N if wanted == START else 3, x.shape[2] - POSE * N)
+    evaluate_in_turn(
+        first, last, rows, wanted, batch, inputs, constants[0], x, value, gradient, scaled,
+        empty_axes(N), empty_linearised(), none, matrix,
+    )  # fmt: skip
+
+
+@loop
+def evaluate_in_turn(first, last, rows, wanted, batch, inputs, constants, x, value, gradient,
+                     scaled, at, out, none, matrix):  # fmt: skip
+    """Do what `evaluate` does; the arrays after its own are to work in."""
+    problem, free, sums, solution = batch.problem, batch.free, batch.sums, batch.solution
+    D, N = x.shape[2], sums.terms.shape[1]
     for row in range(first, last):
         b = rows[row]
         terms, common, factor = sums.terms[b], sums.common[b], factor_of_window(b, sums.factor)
         if wanted == START:
             poses, shared = solution.poses[b], solution.shared[b]
             shared[ANCHOR:] = 0.0
-            copy(poses.ravel(), x[0, row, : POSE * N])
+            copy(poses.reshape(POSE * N), x[0, row, : POSE * N])
             copy(shared, x[0, row, POSE * N :])
-            expect(b, problem, inputs[problem.kind[b]], constants[0], mean_extents, common)
-            weigh(b, problem, poses, shared, constants[0], at, out, terms, common)
+            expect(b, problem, inputs[problem.kind[b]], constants, out[0].extents, common)
+            weigh(b, problem, poses, shared, constants, at, out, terms, common)
         observations = 1 if wanted == OLDEST else N
         for point in range(len(x)):
             at_x, pull, step = x[point, row], gradient[point, row], scaled[point, row]
@@ -138,7 +148,7 @@ def evaluate(first, last, rows, wanted, batch, inputs, constants, x, value, grad
             solve(factor, step)
 
 
-@kernel
+@loop
 def has_settled(poses, start, errors, settled_step):
     """Return whether no box of a window moves by more than `settled_step` errors of its input."""
     for n in range(len(poses)):
@@ -169,19 +179,24 @@ def end(first, last, rows, x, batch, constants, is_last, may_settle, is_done):
         Written.
 
     """
-    constants = constants[0]
-    problem, free, sums, solution = batch
-    N, S = solution.poses.shape[1], solution.shared.shape[1]
+    inverse = empty_inverse(batch.solution.poses.shape[1], batch.solution.shared.shape[1])
+    end_in_turn(first, last, rows, x, batch, constants[0], is_last, may_settle, is_done, inverse)
+
+
+@loop
+def end_in_turn(first, last, rows, x, batch, constants, is_last, may_settle, is_done, inverse):
+    """Do what `end` does; `inverse` is to work in."""
+    problem, free, sums, solution = batch.problem, batch.free, batch.sums, batch.solution
+    N = solution.poses.shape[1]
     n = POSE * N
-    inverse = empty_inverse(N, S)
     for row in range(first, last):
         b = rows[row]
         terms, common, factor = sums.terms[b], sums.common[b], factor_of_window(b, sums.factor)
-        found = x[row, :n].copy().reshape(N, POSE)
+        found = x[row][:n].reshape(N, POSE)
         errors = problem.of_class[b].pose
         is_settled = has_settled(found, solution.poses[b], errors, constants.settled_step)
         is_done[row] = is_last or (may_settle and is_settled)
-        copy(x[row], solution.poses[b].ravel())
+        copy(x[row], solution.poses[b].reshape(n))
         copy(x[row, n:], solution.shared[b])
         fill_evidence(
             common, solution.shared[b], factor.corner, constants.min_extent_gain,
