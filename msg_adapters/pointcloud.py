@@ -67,6 +67,7 @@ def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
     """
     stamp = stamp_ns(msg.header)
     if not msg.width * msg.height:
+        _check_empty(msg)
         return Sweep(stamp, msg.header.frame_id, np.zeros((0, 3), np.float32))
     fields = _fields(msg)
     kinds = _kinds(fields)
@@ -331,6 +332,16 @@ def _likely_share(table: NDArray[Any]) -> float:
     is_likely = (values == 0) | ((values > NEXT_TO_NOTHING) & (values < MAX_COORDINATE))
     is_known = np.isfinite(values).all(axis=0)
     return float(is_likely.all(axis=0)[is_known].mean()) if is_known.any() else 0.0
+
+
+def _check_empty(msg: Any) -> None:
+    """Raise `UnsupportedMessage` if a cloud of no rows has the bytes of a row of points."""
+    num_bytes = len(bytes_of(msg.data))
+    if msg.width > 0 and num_bytes >= msg.width * msg.point_step > 0:
+        raise UnsupportedMessage(
+            f'PointCloud2: expected a height of 1 for a row of {msg.width} points, got 0 with '
+            f'{num_bytes} bytes of data; the publisher fills in height wrongly'
+        )
 
 
 def _checked_row_step(msg: Any, num_bytes: int) -> int:

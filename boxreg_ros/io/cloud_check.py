@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from boxreg_ros.structures import Sweep
@@ -31,6 +32,14 @@ SHORT_STEP, SHORT_SHARE = 0.25, 0.4
 """Steps of so many periods are short, and so large a part of them is no jitter; chosen."""
 LONGEST_CLOUD_PERIOD = 0.1
 """Period that is taken for a longer one [s]: of a LiDAR clouds are lost, or left out, then."""
+MIN_OF_FRAME = 3
+"""Clouds of a frame that make it one of a LiDAR; chosen: a frame may be named late."""
+SEVERAL_LIDARS = (
+    'several LiDARs publish on one topic, and a box takes the points of one cloud; give each a '
+    'topic of its own (Livox: multi_topic 1) and name them by --points (node: points), or join '
+    'the clouds of each time in a copy of the recording'
+)
+"""What is wrong with such clouds, and how it is mended."""
 
 
 class CloudCheck:
@@ -46,11 +55,13 @@ class CloudCheck:
         self._coordinates = ''
         self._sectors: list[NDArray[np.bool_]] = []
         self._stamps_ns: list[int] = []
+        self._frames: Counter[str] = Counter()
 
     def add(self, sweep: Sweep) -> None:
         """Add a cloud in its own frame."""
         if not self._is_merged and len(self._sectors) < PACKET_CLOUDS:
             sectors = _sectors(sweep)
+            self._frames[sweep.frame_id] += 1
             is_again = self._stamps_ns[-1:] == [sweep.stamp_ns]
             if not (is_again and np.array_equal(sectors, self._sectors[-1])):
                 self._sectors.append(sectors)
@@ -60,8 +71,8 @@ class CloudCheck:
     @property
     def findings(self) -> list[str]:
         """Return what was found so far."""
-        parts = ''
-        if len(self._sectors) == PACKET_CLOUDS:
+        parts = _frames_text(self._frames)
+        if not parts and len(self._sectors) == PACKET_CLOUDS:
             parts = _lidars_text(self._stamps_ns) or _packets_text(self._sectors)
         return [text for text in (parts, self._coordinates) if text]
 
@@ -122,6 +133,14 @@ def _packets_text(seen: Sequence[NDArray[np.bool_]]) -> str:
     )
 
 
+def _frames_text(clouds: Counter[str]) -> str:
+    """Return that some clouds, counted by frame, are of several LiDARs; '' if of one."""
+    frames = [repr(name) for name, count in clouds.items() if count >= MIN_OF_FRAME]
+    if len(frames) < 2:
+        return ''
+    return f'clouds: expected those of one frame, got {" and ".join(frames)}: {SEVERAL_LIDARS}'
+
+
 def _lidars_text(stamps_ns: Sequence[int]) -> str:
     """Return that clouds with these stamps [ns] come several at a time; '' if one by one."""
     steps = np.diff(np.sort(np.array(stamps_ns))) * 1e-9
@@ -130,10 +149,8 @@ def _lidars_text(stamps_ns: Sequence[int]) -> str:
     if share < SHORT_SHARE:
         return ''
     return (
-        f'clouds: expected one every {period:.3f} s, got {1 / (1 - share):.0f} at a time: several '
-        f'LiDARs publish on one topic, and a box takes the points of one cloud; give each a topic '
-        f'of its own (Livox: multi_topic 1) and name them by --points (node: points), or join the '
-        f'clouds of each time in a copy of the recording'
+        f'clouds: expected one every {period:.3f} s, got {1 / (1 - share):.0f} at a time: '
+        f'{SEVERAL_LIDARS}'
     )
 
 

@@ -60,6 +60,17 @@ def test_several_lidars_on_one_topic_are_named(apart_ns, lidars):
     assert not found_in(clouds, is_merged=True, stamps_ns=stamps_ns)
 
 
+@pytest.mark.parametrize('frames', [('front', 'rear'), ('front',), ('', *('front',) * 9)])
+def test_lidars_that_take_turns_on_one_topic_are_named_by_their_frames(frames):
+    cloud = np.random.default_rng(0).uniform(-9, 9, (5000, 3))
+    check = CloudCheck(is_merged=False)
+    for k in range(10):
+        check.add(Sweep(START + k * 50_000_000, frames[k % len(frames)], cloud))
+    text = ' '.join(check.findings)
+    assert ("got 'front' and 'rear': several LiDARs" in text) == (len(frames) == 2)
+    assert not text or len(frames) == 2
+
+
 @pytest.mark.parametrize('is_recorded_twice', [True, False])
 def test_clouds_one_by_one_are_of_one_lidar(is_recorded_twice):
     clouds = [np.random.default_rng(k).uniform(-9, 9, (5000, 3)) for k in range(40)]

@@ -165,6 +165,7 @@ def test_empty_cloud():
     ('fields', 'expected'),
     [
         ({'width': 5}, 'expected at least 60 bytes, got 48'),
+        ({'height': 0}, 'expected a height of 1 for a row of 4 points, got 0 with 48 bytes'),
         ({'height': 2, 'width': 4, 'row_step': 47}, 'expected at least 96 bytes, got 48'),
         ({'width': -1}, 'of at least 0, got -1, 1, 12, 48'),
         ({'data': np.zeros(0, np.uint8)}, 'expected at least 48 bytes, got 0'),
