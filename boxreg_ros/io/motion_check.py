@@ -340,6 +340,7 @@ class MotionCheck:
             'carried': Finding(fault, _carried_text(tree, fixed_frame, frame)),
             'sparse': Finding(fault, _sparse_text(moving)),
             'parents': Finding(fault, _parents_text(tree, route)),
+            'loop': Finding(fault, _loop_text(tree, frame)),
             'once': Finding(fault, _once_text([edge for edge in route if edge not in moving])),
         }
         self.findings |= {kind: one for kind, one in found.items() if one.text}
@@ -499,8 +500,14 @@ def _carried_text(tree: TransformTree, fixed_frame: str, frame: str) -> str:
 
 
 def _contradiction_text(route: Sequence[Edge]) -> str:
-    """Return which transform has several positions at one stamp."""
+    """Return which transform has several poses at one stamp, or at all times."""
     for edge in route:
+        if edge.is_static and edge.contradictions:
+            return (
+                f'transform {edge.parent} -> {edge.child}: expected one static pose, got others: '
+                f'two publishers state it, or a calibration was changed; the last one is used; '
+                f'leave the others out'
+            )
         if not edge.is_static and edge.contradictions >= MIN_ALTERNATIONS:
             return (
                 f'transform {edge.parent} -> {edge.child}: expected one position at each stamp, '
@@ -539,6 +546,18 @@ def _parents_text(tree: TransformTree, route: Sequence[Edge]) -> str:
                 f'{others[0]} (node: fixed_frame:={others[0]})'
             )
     return ''
+
+
+def _loop_text(tree: TransformTree, frame: str) -> str:
+    """Return that the root above the frame of the clouds is attached to a frame below it."""
+    closing = tree.loop(frame)
+    if closing is None:
+        return ''
+    return (
+        f'transforms: expected a tree, got a loop by {closing.parent} -> {closing.child}, while '
+        f'{closing.child} is above {closing.parent}: one is inverse, or of a publisher too many; '
+        f'{tree.root(frame)!r} is taken for the root; leave the wrong one out'
+    )
 
 
 def _once_text(constant: Sequence[Edge]) -> str:

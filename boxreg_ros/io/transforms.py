@@ -39,6 +39,8 @@ carried on for that long is off by 2 cm.
 """
 SAME_POSITION = 0.01
 """Positions of one frame at one stamp differ by less [m]; chosen: one centimetre of rounding."""
+SAME_ANGLE = 0.01
+"""And its orientations by less [rad]; chosen: a centimetre at a metre."""
 END_NS = 10**9
 """Time without transforms that is not the fault of a clock [ns]; chosen: detectors are as late."""
 MAX_LINEAR_GAP = 0.25
@@ -413,11 +415,17 @@ class TransformTree:
         """Return the pairs of frames from `source` up to the root of TF."""
         top = self._known(source)
         path: list[Edge] = []
+        frames = {top}
         edge = self._above(top)
-        while edge is not None and edge not in path:
+        while edge is not None and edge.parent not in frames:
             path.append(edge)
+            frames.add(edge.parent)
             edge = self._above(edge.parent)
         return path
+
+    def loop(self, source: str) -> Edge | None:
+        """Return the pair by which the root of `source` is below itself, too; None for a tree."""
+        return self._above(self.root(source))
 
     def _above(self, child: str) -> Edge | None:
         """Return the edge from a frame up in TF, or in the odometry that takes its place."""
@@ -541,7 +549,8 @@ class TransformTree:
         """Return the edges from `source` to `target`, each with True where it leads upward."""
         key = (_name(target), _name(source))
         if key not in self._routes:
-            route = _connect(*key, self._tf_edges())
+            closing = self.loop(source)
+            route = _connect(*key, [edge for edge in self._tf_edges() if edge is not closing])
             if route is None:
                 route = _connect(*key, self.edges())
             if route is None:
@@ -611,7 +620,7 @@ class Edge:
     poses : list of (7,) float64
         x y z qx qy qz qw of the child in the parent at these stamps [m].
     contradictions : int
-        Samples of a moving pair with the stamp of another one, but at another position.
+        Samples at another position than one of the same stamp; of a static pair, than the last.
     arrivals : ReceiveTimes
         When the first samples were received.
     num_ahead : int
@@ -708,13 +717,11 @@ class Edge:
             self._forget()
             self._was_forgotten = True
         self._was_old = is_old and not has_jumped
+        first, end = bisect_left(self.stamps, stamp_ns), bisect_right(self.stamps, stamp_ns)
         if self.is_static:
             first, end = 0, len(self.stamps)
-        else:
-            first, end = bisect_left(self.stamps, stamp_ns), bisect_right(self.stamps, stamp_ns)
-            if end > first:
-                apart = np.linalg.norm(self.poses[first][:3] - values[:3])
-                self.contradictions += bool(apart > SAME_POSITION)
+        if end > first:
+            self.contradictions += _differ(self.poses[first], values)
         self.stamps[first:end], self.poses[first:end] = [stamp_ns], [values]
         old = bisect_left(self.stamps, self.stamps[-1] - self._buffer_ns)
         # Two samples stay at any age: extrapolation needs a velocity.
@@ -883,6 +890,13 @@ class Edge:
         if later < len(stamps) and stamps[later] - stamps[after] <= limit_ns:
             nodes.append(later)
         return nodes
+
+
+def _differ(one: Floats, other: Floats) -> bool:
+    """Return whether two poses (7,) are further apart than rounding explains."""
+    cosine = one[3:] @ other[3:] / np.sqrt((one[3:] @ one[3:]) * (other[3:] @ other[3:]))
+    apart = np.linalg.norm(one[:3] - other[:3])
+    return bool(apart > SAME_POSITION or abs(cosine) < np.cos(SAME_ANGLE / 2))
 
 
 def numbers_of(position: Any, orientation: Any) -> Pose:

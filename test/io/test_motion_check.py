@@ -568,6 +568,32 @@ def test_a_frame_with_two_parents_is_named_and_either_may_be_chosen(tmp_path):
     np.testing.assert_allclose(origins[START + SECOND], [105, 0, 2], atol=1e-6)
 
 
+@pytest.mark.parametrize('child', ['lidar', 'base'])
+def test_a_loop_of_transforms_is_named_and_the_frame_that_moves_is_not_the_root(tmp_path, child):
+    drive = Drive(sweeps=12)
+    m = drive.messages
+    for stamp in drive.stamps:
+        drive.items.append(('/tf', stamp, m.tf(m.transform(stamp, child, 'odom', (9, 0, 0)))))
+    drive.items.sort(key=lambda item: item[1])
+    origins, frame, found = read(drive, tmp_path)
+    assert frame == 'odom'
+    assert_true(origins, 12)
+    assert f'got a loop by {child} -> odom, while odom is above {child}' in found
+
+
+@pytest.mark.parametrize('turn', [0.0, 0.02])
+def test_static_transforms_that_contradict_each_other_are_named(tmp_path, turn):
+    drive = Drive(sweeps=12)
+    m = drive.messages
+    late = drive.stamps[5]
+    quaternion = (0, 0, np.sin(turn / 2), np.cos(turn / 2))
+    again = m.tf(m.transform(late, 'base', 'lidar', (0, 0, 2), quaternion))
+    drive.items.append(('/tf_static', late, again))
+    drive.items.sort(key=lambda item: item[1])
+    text = 'transform base -> lidar: expected one static pose, got others'
+    assert (text in read(drive, tmp_path)[2]) == (turn > 0)
+
+
 def with_sparse_transforms(sweeps):
     """Return a drive with transforms at 1 Hz, and its motion as odometry at 10 Hz."""
     drive = Drive(sweeps=sweeps)
