@@ -34,7 +34,7 @@ LONGEST_CLOUD_PERIOD = 0.1
 """Period that is taken for a longer one [s]: of a LiDAR clouds are lost, or left out, then."""
 MIN_OF_FRAME = 3
 """Clouds of a frame that make it one of a LiDAR; chosen: a frame may be named late."""
-SEVERAL_LIDARS = (
+ON_ONE_TOPIC = (
     'several LiDARs publish on one topic, and a box takes the points of one cloud; give each a '
     'topic of its own (Livox: multi_topic 1) and name them by --points (node: points), or join '
     'the clouds of each time in a copy of the recording'
@@ -138,7 +138,7 @@ def _frames_text(clouds: Counter[str]) -> str:
     frames = [repr(name) for name, count in clouds.items() if count >= MIN_OF_FRAME]
     if len(frames) < 2:
         return ''
-    return f'clouds: expected those of one frame, got {" and ".join(frames)}: {SEVERAL_LIDARS}'
+    return f'clouds: expected those of one frame, got {" and ".join(frames)}: {ON_ONE_TOPIC}'
 
 
 def _lidars_text(stamps_ns: Sequence[int]) -> str:
@@ -150,7 +150,7 @@ def _lidars_text(stamps_ns: Sequence[int]) -> str:
         return ''
     return (
         f'clouds: expected one every {period:.3f} s, got {1 / (1 - share):.0f} at a time: '
-        f'{SEVERAL_LIDARS}'
+        f'{ON_ONE_TOPIC}'
     )
 
 
