@@ -64,6 +64,7 @@ class Writer(cuboids.CuboidWriter):
         self._classes: dict[str, None] = {}
         self._tracks = TrackNumbers()
         self._objects: dict[str, int] = {}
+        self._first_keys: dict[str, str] = {}  # of the objects of a track, by its id
         self._tags: dict[str, None] = dict.fromkeys(TAGS)
         self._figures = 0
         # Figures are as many as boxes: their numbers wait in a file.
@@ -112,11 +113,14 @@ class Writer(cuboids.CuboidWriter):
     def _object(self, cuboid: cuboids.Cuboid, others: dict[str, Any]) -> dict[str, Any]:
         """Return the object of a cuboid, with its status and attributes as tags."""
         key = key_of(f'object/{cuboid.class_name}/{cuboid.track_id}')
-        if not cuboid.track_id or key in others:
+        name = cuboid.track_id
+        if not name or key in others:
             key = key_of(f'object/{self.number}/{cuboid.row}')
-        else:
-            self._objects.setdefault(key, self._tracks.of(cuboid.track_id))
-        self._objects.setdefault(key, self._tracks.of(''))
+            name = ''
+        elif self._first_keys.setdefault(name, key) != key:
+            name = ''  # of another class before: no number may be of two objects
+        if key not in self._objects:
+            self._objects[key] = self._tracks.of(name)
         values = {'status': cuboid.evidence['status'], **cuboid.evidence.get('attributes', {})}
         tags = []
         for name, value in values.items():

@@ -755,6 +755,15 @@ def test_supervisely_and_datumaro_read_single_clouds(tmp_path):
     assert cuboids[0]['scale'] == EXTENT
 
 
+def test_supervisely_reads_single_clouds_with_a_track_of_two_classes(tmp_path):
+    frames = [frame(STAMP, ['7', '8']), frame(STAMP + 1, ['7'], classes=('truck',))]
+    write('sly_pointcloud', tmp_path, frames, with_points=True)
+    folder = tmp_path / 'sly_pointcloud'
+    found = consumer('supervisely_clouds', folder)['figures']
+    assert [one['class'] for one in found] == ['car', 'car', 'truck']
+    assert ids(read('sly_pointcloud', folder)) == [('7', '8'), ('7',)]
+
+
 def test_single_clouds_of_cvat(tmp_path):
     """An object has one key in all clouds; those of the tool itself have one in each."""
     for i, keys in enumerate([('a', 'b'), ('a', 'c')]):
