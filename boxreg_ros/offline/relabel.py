@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.storage.urls import url_of
+from boxreg_ros.labels import frames_of
+from boxreg_ros.labels.output import WITH_REJECTED
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.progress import Progress, Stopwatch
 from boxreg_ros.offline.reader import JumpingIds, ReadAhead, reader
@@ -32,6 +34,7 @@ from boxreg_ros.offline.summary import Summary
 from boxreg_ros.offline.survey import Passes, survey
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.review.decisions import Decision, DECISIONS, read_decisions
+from boxreg_ros.structures import REJECTED
 
 if TYPE_CHECKING:
     from boxreg_ros.core.input_statistics import Drives
@@ -95,7 +98,7 @@ def _relabel(request: Request, out: Path, progress: Progress, fingerprint: str) 
 
     """
     clock = Stopwatch()
-    corrections = Corrections(_decisions(request, out))
+    corrections = Corrections(_decisions(request, out), _rejected(request))
     # What cannot be read is refused before the work.
     truth = true_boxes(request.truth) if request.report and request.truth is not None else None
     drives = _other_drives(request)
@@ -123,6 +126,20 @@ def _relabel(request: Request, out: Path, progress: Progress, fingerprint: str) 
             _check_ids(request, summary.associated_tracks is not None)
             write_summary(folder, summary.as_json())
     return summary
+
+
+def _rejected(request: Request) -> set[tuple[str, int]]:
+    """Return ids and stamps of the boxes of a result that are rejected, where others are added."""
+    if request.labels is None or request.labels[0] not in WITH_REJECTED or not request.completes:
+        return set()
+    if request.convention.associate:
+        return set()  # ids of the result are of no meaning
+    return {
+        (track_id, frame.refined.boxes.stamp_ns)
+        for frame in frames_of(*request.labels)
+        for track_id, word in zip(frame.refined.boxes.track_ids, frame.refined.status, strict=True)
+        if word == REJECTED
+    }
 
 
 def _decisions(request: Request, out: Path) -> list[Decision]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -35,12 +35,16 @@ class Corrections:
 
     Deleted boxes are not registered; ids, classes and pinned boxes are those of the decisions
     before any step of the run; rejected boxes are as in the input again after it. Boxes can be
-    pinned already. The steps that complete tracks ask for the decisions as
+    pinned already; none is added where the files of the input have one that is `rejected`, named
+    by id and stamp. The steps that complete tracks ask for the decisions as
     `tracks.decided.Decided`, after the boxes of the input have passed `to_register`.
 
     """
 
-    def __init__(self, decisions: Iterable[Decision] = ()) -> None:
+    def __init__(
+        self, decisions: Iterable[Decision] = (), rejected: Collection[tuple[str, int]] = ()
+    ) -> None:
+        self._rejected = rejected
         self._of_track: dict[str, list[Decision]] = {}
         for one in held(decisions):
             self._of_track.setdefault(one.track_id, []).append(one)
@@ -155,7 +159,8 @@ class Corrections:
         """
         found = self._judgement(input_id, stamp_ns)
         is_rejected = found is not None and found.kind == 'reject'
-        return is_rejected or self._last('deletion', input_id, stamp_ns) is not None
+        is_deleted = self._last('deletion', input_id, stamp_ns) is not None
+        return is_rejected or is_deleted or (input_id, stamp_ns) in self._rejected
 
     def is_accepted(self, input_id: str, stamp_ns: int) -> bool:
         """Return whether a box is accepted or pinned."""

@@ -350,6 +350,22 @@ def test_rejected_boxes_of_a_result_are_no_input(tmp_path, capsys):
         assert {row['track_id'] for row in rows_of(out)} == {'1'}
 
 
+@pytest.mark.parametrize('options', ['--complete', '--keyframes'])
+def test_no_box_is_added_where_a_result_has_a_rejected_one(tmp_path, options):
+    drive = Drive(sweeps=9)
+    arrays = []
+    for k, (stamp, boxes) in enumerate(drive.truth.items()):
+        array = BoxArray(stamp, 'odom', ('1', '2'), ('car', 'car'), np.ones(2), boxes)
+        status = ('rejected' if k == 4 else 'refined', 'refined')
+        refined = RefinedBoxes(array, status, ('', ''), np.zeros(2, int), np.zeros((2, 6, 6)))
+        arrays.append(LabelFrame(refined, 'odom', 'lidar'))
+    write('csv', tmp_path, arrays)
+    words = f'relabel {drive.write(tmp_path / "drive")} --labels csv:{tmp_path}/boxes.csv'
+    assert main([*words.split(), '-o', f'{tmp_path}/out', options]) == 0
+    stamps_of = Counter(row['stamp_ns'] for row in rows_of(tmp_path / 'out'))
+    assert list(stamps_of.values()) == [2] * 4 + [1] + [2] * 4
+
+
 def test_keyframes_of_cvat_in_tracklets(tmp_path):
     flags = [f'<state>2</state><occlusion_kf>{kf}</occlusion_kf>' for kf in (1, 0)]
     item = ('Car', (4.5, 1.9, 1.6), flags)
