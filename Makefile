@@ -12,7 +12,7 @@ VENV_JAZZY ?= .venv-jazzy
 BIN := $(VENV)/bin
 # A compat install puts a plain path into site-packages, which type checkers can follow.
 BUILD := --no-build-isolation --config-settings editable_mode=compat
-INSTALL := test/uv_install.py
+INSTALL = $(BIN)/python test/uv_install.py --python
 
 # Another ROS installation that the shell has sourced must not shadow the environment's packages.
 unexport PYTHONPATH AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
@@ -24,6 +24,7 @@ DATA ?= ../recordings
 ONLY ?= *
 
 version := $(shell $(PYTHON) -c 'import platform; print(platform.python_version())')
+installer := $(VENV)/.installer-$(version)
 runtime := $(VENV)/.runtime-$(version)
 tests := $(VENV)/.tests-$(version)
 consumers := .venv-consumers/.done-$(version)
@@ -116,29 +117,33 @@ clean: ## remove environments and whatever builds and runs left
 	rm -rf $(VENV) $(VENV_JAZZY) .venv-consumers .venv-page build dist install log out .coverage
 	find boxreg_ros msg_adapters test -name __pycache__ -prune -exec rm -rf {} +
 
-$(runtime): constraints.txt setup.py package.xml
+# The only environment with pip, which takes seconds: its uv installs into all of them.
+$(installer): constraints.txt
 	@echo 'Setting up $(VENV): the first time takes some minutes'
 	[ "$$($(BIN)/python -V 2>&1)" = 'Python $(version)' ] || $(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python $(INSTALL) -c constraints.txt setuptools
-	$(BIN)/python $(INSTALL) -c constraints.txt $(BUILD) -e '.[ros,report,tracking]'
+	$(INSTALL) $(VENV) -c constraints.txt setuptools
+	@touch $@
+
+$(runtime): $(installer) setup.py package.xml
+	$(INSTALL) $(VENV) -c constraints.txt $(BUILD) -e '.[ros,report,tracking]'
 	@touch $@
 
 $(tests): $(runtime) $(shell find test/interfaces msg_adapters/interfaces test/build_interfaces.py -type f)
-	$(BIN)/python $(INSTALL) -c constraints.txt $(BUILD) -e '.[ros,report,tracking,test]'
+	$(INSTALL) $(VENV) -c constraints.txt $(BUILD) -e '.[ros,report,tracking,test]'
 	$(BIN)/python test/build_interfaces.py
 	@touch $@
 
-$(consumers): test/consumers.txt
-	$(PYTHON) -m venv --clear .venv-consumers
-	.venv-consumers/bin/python $(INSTALL) --no-deps -r $<
+$(consumers): test/consumers.txt | $(installer)
+	$(PYTHON) -m venv --clear --without-pip .venv-consumers
+	$(INSTALL) .venv-consumers --no-deps -r $<
 	@touch $@
 
-$(jazzy): constraints.txt constraints-jazzy.txt setup.py package.xml
+$(jazzy): constraints.txt constraints-jazzy.txt setup.py package.xml | $(installer)
 	@echo 'Setting up $(VENV_JAZZY) with $(PYTHON_JAZZY)'
-	$(PYTHON_JAZZY) -m venv --clear $(VENV_JAZZY)
+	$(PYTHON_JAZZY) -m venv --clear --without-pip $(VENV_JAZZY)
 	awk -F '==' '{name = tolower($$1)} FNR == NR {own[name]} FNR == NR || !(name in own)' \
 	    constraints-jazzy.txt constraints.txt > $(VENV_JAZZY)/constraints.txt
-	$(VENV_JAZZY)/bin/python $(INSTALL) -c $(VENV_JAZZY)/constraints.txt setuptools
-	$(VENV_JAZZY)/bin/python $(INSTALL) -c $(VENV_JAZZY)/constraints.txt $(BUILD) \
+	$(INSTALL) $(VENV_JAZZY) -c $(VENV_JAZZY)/constraints.txt setuptools
+	$(INSTALL) $(VENV_JAZZY) -c $(VENV_JAZZY)/constraints.txt $(BUILD) \
 	    -e '.[ros,report]' pytest pytest-xdist shapely
 	@touch $@

@@ -1,8 +1,8 @@
 """
 Install packages by uv, in a third of pip's time, from where pip's settings say.
 
-``python test/uv_install.py ARGUMENT...``: arguments of ``uv pip install``, into the environment of
-this Python. uv, which does not read the settings of pip, is installed by pip.
+``python test/uv_install.py ARGUMENT...``: arguments of ``uv pip install``, which installs into the
+environment of ``--python``. uv, which does not read the settings of pip, is installed by pip.
 
 """
 
@@ -48,7 +48,7 @@ def main(arguments):
         [*PIP, 'config', 'list'], check=True, stdout=subprocess.PIPE, text=True
     )
     environment = os.environ | variables(listed.stdout.splitlines())
-    command = [uv, 'pip', 'install', '--quiet', '--python', sys.executable, *arguments]
+    command = [uv, 'pip', 'install', '--quiet', *arguments]
     os.execve(uv, command, environment)
 
 
