@@ -101,9 +101,16 @@ class Corrections:
         return bool(self._of_kind('add'))
 
     def added(self, tracks: Iterable[FollowedTrack]) -> list[FollowedTrack]:
-        """Return followed objects without deleted boxes, with the ids and classes decided."""
+        """
+        Return followed objects without deleted boxes, with the ids and classes decided.
+
+        One whose id the input has is left out: it is there already, as in an earlier result.
+
+        """
         found: list[FollowedTrack] = []
         for track in tracks:
+            if track.track_id in self._own_ids:
+                continue
             rows_of: dict[tuple[str, str], list[int]] = {}
             for row, stamp_ns in enumerate(track.stamps_ns.tolist()):
                 if self._last('deletion', track.track_id, stamp_ns) is not None:

@@ -321,6 +321,11 @@ def test_a_run_follows_added_objects_beside_its_other_steps(drive, tmp_path, cap
         assert table.status[row] == 'human'
         np.testing.assert_allclose(table.boxes[row], box, atol=1e-6)
         assert np.median(ious_with_truth(table, drive, 'new')) > 0.8
+    again = tmp_path / 'again'  # its labels have what was added: it is not added twice
+    assert main([*command, str(again), '--labels', f'csv:{tmp_path}/plain']) == 1
+    assert "'new' at " in capsys.readouterr().err.splitlines()[-1]
+    table = BoxTable.read(again / 'boxes.csv')
+    assert len(set(zip(table.track_ids, table.stamps_ns, strict=True))) == len(table.stamps_ns)
     other = tmp_path / 'other.csv'
     DecisionLog(other).append([replace(added, frame_id='map')])
     assert main([*command[:-3], '--decisions', str(other), '-o', str(tmp_path / 'other')]) == 1
