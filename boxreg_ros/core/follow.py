@@ -44,6 +44,14 @@ from boxreg_ros.structures import (
 import numpy as np
 from numpy.typing import NDArray
 
+MAX_TURN_RATE = 1.5
+"""
+No vehicle makes more than a quarter turn faster [rad/s].
+
+Derived: on a circle of 5 m, at 27 km/h.
+
+"""
+
 
 class End(NamedTuple):
     """Where a track ends: the last stamp with a box [ns], and why, see `following.tracker`."""
@@ -264,10 +272,12 @@ def _followed(
     poses = {int(row): box[POSE4] for row, box in zip(seeds.rows, seeds.boxes, strict=True)}
     status = dict.fromkeys(poses, HUMAN)
     for first in range(len(seeds.rows) - 1):
+        at = stamps_ns[seeds.rows[first : first + 2]].tolist()
         if follower.jumps(first):
-            at = stamps_ns[seeds.rows[first : first + 2]].tolist()
             problems = (*problems, _jump(one, at))
             continue
+        if follower.is_rigid and _turns_around(seeds.boxes[first : first + 2, YAW], at):
+            problems = (*problems, _turned(one, at))
         rows, found = between(follower, times, seeds, first)
         poses |= dict(zip(rows.tolist(), found, strict=True))
         status |= dict.fromkeys(rows.tolist(), INTERPOLATED)
@@ -300,6 +310,20 @@ def _jump(one: _Object, stamps_ns: list[int]) -> str:
         f'seeds of track {one.track_id!r} at {stamps_ns[0]} and {stamps_ns[1]}: expected boxes of '
         f'one object, got some too far apart for a {one.class_name!r}; no boxes are added between '
         f'them: give each object an id of its own'
+    )
+
+
+def _turns_around(yaw: Floats, stamps_ns: list[int]) -> bool:
+    """Return whether two headings (2,) differ by more than a quarter turn, too soon for one."""
+    turn = abs(float(wrap_angle(yaw[1] - yaw[0])))
+    return turn > max(np.pi / 2, MAX_TURN_RATE * (stamps_ns[1] - stamps_ns[0]) * 1e-9)
+
+
+def _turned(one: _Object, stamps_ns: list[int]) -> str:
+    return (
+        f'seeds of track {one.track_id!r} at {stamps_ns[0]} and {stamps_ns[1]}: expected headings '
+        f'of one object, got some that differ by more than a {one.class_name!r} turns; boxes '
+        f'between them turn: turn one around'
     )
 
 

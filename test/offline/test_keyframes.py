@@ -134,6 +134,21 @@ def test_bad_keyframes_are_named_in_one_line_each_and_the_rest_is_done(street, t
     assert len(found['10']) > 10
 
 
+def test_keyframes_of_a_vehicle_that_are_turned_around_are_named(street, tmp_path, capsys):
+    keys = rows_in(street / 'keys.csv')
+    stamps = sorted({row['stamp_ns'] for row in keys})
+    for row in keys:
+        if row['track_id'] in ('9', '6') and row['stamp_ns'] == stamps[1]:  # a car, a cyclist
+            row |= {'qz': row['qw'], 'qw': str(-float(row['qz']))}
+    write(tmp_path / 'turned.csv', keys)
+    words = f'relabel {street}/drive.mcap --keyframes --labels csv:{tmp_path}/turned.csv'
+    assert main([*words.split(), '-o', f'{tmp_path}/out']) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if 'expected headings' in line]
+    assert [line.split(': ')[1] for line in lines] == [
+        f"seeds of track '9' at {stamps[k]} and {stamps[k + 1]}" for k in range(2)
+    ]
+
+
 def test_a_second_box_of_an_exact_keyframe_is_written_as_it_is(street, tmp_path):
     keys = rows_in(street / 'keys.csv')
     second = dict(keys[0], x=str(float(keys[0]['x']) + 3))

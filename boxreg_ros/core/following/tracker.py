@@ -162,6 +162,11 @@ class Follower:
         grown[:, BOX_EXTENT] = high - low
         return grown
 
+    @property
+    def is_rigid(self) -> bool:
+        """Return whether the object is a vehicle, which keeps its shape."""
+        return self._kind.is_rigid
+
     def _sees_top(self, row: int, pose: Floats) -> bool:
         """Return whether the sensor would see points above the box."""
         limits = self._points.sweeps.sight_limits
