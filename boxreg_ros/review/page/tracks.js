@@ -118,8 +118,7 @@ async function loadPart(s) {
 }
 
 function decoded(part) {
-  const bytes = Uint8Array.from(atob(part.points), c => c.charCodeAt(0));
-  part.points = new Int16Array(bytes.buffer);
+  part.points = new Int16Array(bytesOf(part.points).buffer);
   complete(part);
   return part;
 }
