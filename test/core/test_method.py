@@ -150,7 +150,7 @@ def test_the_factor_solves_and_inverts(is_held):
     factors, G = np.array([2.0, -3.0, 0.5]), np.diag(np.linspace(0.1, 1.0, PIVOT))
     found = np.empty((4, 4))
     fill_shared_covariance(C, G, parts)
-    fill_combination(2, factors, parts, np.empty((2, 4, SHARED)), found)
+    fill_combination(2, factors, parts, found)
     J = np.hstack([factor * np.eye(6) for factor in factors])
     rows = slice(12, 30)
     through = (J @ inverse[rows, 6 * N :])[:, :PIVOT]

@@ -28,6 +28,8 @@ SPAN = 3 * POSE
 LANES = 16
 """Points of an observation, and columns of a coupling, are padded to a multiple of this. Derived:
 four vectors of 256 bits, as loops are compiled: then none are left to be taken one by one."""
+WIDTH = -(-(SHARED + 2 * POSE) // LANES) * LANES
+"""The most columns of a coupling."""
 BOX_POSE = (0, 1, 2, 6, 7, 8)
 """Places of the pose in a box x y z length width height roll pitch yaw."""
 

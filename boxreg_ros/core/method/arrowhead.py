@@ -10,9 +10,8 @@ SciPy's BLAS would take 0.2 s and 10 to 15 MB to import.
 
 from math import sqrt
 
-from boxreg_ros.core.method.arrays import ANCHOR, copy, padded, PIVOT, POSE, SHARED
-from boxreg_ros.core.method.compile import kernel, loop
-import numpy as np
+from boxreg_ros.core.method.arrays import ANCHOR, copy, padded, PIVOT, POSE, SHARED, WIDTH
+from boxreg_ros.core.method.compile import loop, small_array
 
 NEXT = 2 * POSE
 """Variables of the two poses after one."""
@@ -209,17 +208,17 @@ def subtract(change, S, first, second):
 
 
 @loop
-def add_product(border, coupling, found):
+def add_product(border, coupling, S, found):
     """Add the product of the border of a pose, transposed, and of its `coupling` to the border."""
-    for s in range(len(found)):
-        for t in range(padded(found.shape[1])):
+    for s in range(S):
+        for t in range(padded(S)):
             total = found[s, t]
             for a in range(POSE):
                 total += border[a, s] * coupling[a, t]
             found[s, t] = total
 
 
-@kernel
+@loop
 def eliminate_poses(A, factor):
     """
     Write the factor of each pose, and subtract its products from the variables after it.
@@ -228,8 +227,10 @@ def eliminate_poses(A, factor):
 
     """
     N, S = len(factor.own), len(A.corner)
-    triangle, change = np.empty((POSE, POSE)), np.empty((NEXT, factor.coupling.shape[2]))
-    of_corner = np.zeros((S, padded(S)))
+    triangle, change, of_corner = (
+        small_array(POSE, POSE), small_array(NEXT, WIDTH), small_array(SHARED, WIDTH)
+    )  # fmt: skip
+    of_corner[:S] = 0.0
     for pose in range(N):
         block, own, coupling = A.poses[pose], factor.own[pose], factor.coupling[pose]
         if not factorise_block(block.links, triangle):
@@ -239,14 +240,14 @@ def eliminate_poses(A, factor):
         divide(coupling, triangle)
         fill_change(block.links, coupling, change)
         subtract(change, S, A.poses[pose + 1], A.poses[pose + 2])
-        add_product(block.border, coupling, of_corner)
+        add_product(block.border, coupling, S, of_corner)
     for s in range(S):
         for t in range(s, S):
             A.corner[s, t] += of_corner[s, t]
     return True
 
 
-@kernel
+@loop
 def factorise(A, factor):
     """Write the factor of a matrix, which is changed; return False if it is not definite."""
     if not eliminate_poses(A, factor):
@@ -310,10 +311,10 @@ def substitute_backward(factor, x, rest, found):
             rest[S + a] = right[a] = found[a]
 
 
-@kernel
+@loop
 def solve(factor, x):
     """Replace a right side `x` (6 N + S,) by the solution of A x = b."""
-    rest, found = np.empty(factor.coupling.shape[2]), np.empty(POSE)
+    rest, found = small_array(WIDTH)[: factor.coupling.shape[2]], small_array(POSE)
     first = POSE * len(factor.own)
     substitute_forward(factor, x, rest)
     for s in range(len(factor.corner)):
@@ -342,7 +343,7 @@ def shift_known(known, own, links, response):
             known[a, NEXT + s] = response[a, s]
 
 
-@kernel
+@loop
 def invert_poses(factor, blocks, links, response):
     """
     Write the blocks of the poses in the inverse, where the shared variables are held.
@@ -357,14 +358,15 @@ def invert_poses(factor, blocks, links, response):
 
     """
     S = len(factor.corner)
-    known = np.zeros((NEXT, padded(NEXT + S)))  # Z_rr, T_r
-    after, product = np.empty((POSE, NEXT)), np.empty((POSE, known.shape[1]))
+    known = small_array(NEXT, WIDTH)  # Z_rr, T_r
+    after, product = small_array(POSE, NEXT), small_array(POSE, WIDTH)
+    known[:] = 0.0
     for pose in range(len(blocks) - 1, -1, -1):
         coupling, own = factor.coupling[pose], factor.own[pose]
         for a in range(POSE):
             for c in range(NEXT):
                 after[a, c] = coupling[a, S + c]
-        multiply(after, known, product)
+        multiply(after, known, NEXT + S, product)
         for a in range(POSE):
             for c in range(NEXT):
                 links[pose, a, c] = product[a, c]
@@ -379,10 +381,10 @@ def invert_poses(factor, blocks, links, response):
 
 
 @loop
-def multiply(after, known, product):
-    """Write the product of a matrix (6, 12) and one whose width is a multiple of `LANES`."""
+def multiply(after, known, width, product):
+    """Write the product of a matrix (6, 12) and the first columns of one, `width` or more."""
     for a in range(POSE):
-        for r in range(padded(known.shape[1])):
+        for r in range(padded(width)):
             total = 0.0
             for c in range(NEXT):
                 total += after[a, c] * known[c, r]
@@ -391,17 +393,17 @@ def multiply(after, known, product):
 
 @loop
 def multiply_shared(response, shared, product):
-    """Write the product of a `response` (6, S) and a matrix (S, S or more) as `multiply`."""
+    """Write the product of a `response` (6, S) and the first S columns of a matrix."""
     # Both forms of S have these variables; a sum of constant length takes a quarter of the time.
     for a in range(POSE):
-        for r in range(padded(shared.shape[1])):
+        for r in range(padded(response.shape[1])):
             total = 0.0
             for s in range(ANCHOR):
                 total += response[a, s] * shared[s, r]
             product[a, r] = total
     if response.shape[1] > ANCHOR:
         for a in range(POSE):
-            for r in range(padded(shared.shape[1])):
+            for r in range(padded(response.shape[1])):
                 total = product[a, r]
                 for s in range(ANCHOR, SHARED):
                     total += response[a, s] * shared[s, r]

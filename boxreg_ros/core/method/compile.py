@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from functools import cache, partial
 import gc
 from hashlib import sha256
+from math import prod
 from pathlib import Path
 import re
 from typing import Any
@@ -15,6 +16,7 @@ from numba.core import cgutils, event, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
 from numba.core.runtime.nrt import rtsys
+from numba.extending import intrinsic
 
 REORDER = {'contract', 'reassoc'}
 """Sums may be reordered for vector instructions; NaN and infinity are handled as usual."""
@@ -128,6 +130,32 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     _recover_from_damage(dispatcher._cache)
     _go_on_without_room(dispatcher._cache)
     return dispatcher
+
+
+@intrinsic(prefer_literal=True)
+def small_array(typing: Any, rows: Any, columns: Any = None) -> Any:
+    """
+    Return an array of constant shape on the stack, for a `loop`; it must not be returned.
+
+    It counts no references and is compiled in a third of the time of a numpy array.
+
+    """
+    from numba.np import arrayobj  # slow, and no kernel that is loaded needs it
+
+    sizes = [rows] if columns is None else [rows, columns]
+    shape = [size.literal_value for size in sizes]
+    array = types.Array(types.float64, len(shape), 'C')
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        made = arrayobj.make_array(array)(context, builder)
+        data = cgutils.alloca_once(builder, context.get_value_type(types.float64), prod(shape))
+        data.align = 64  # of vectors, and lines of the cache
+        number = partial(context.get_constant, types.intp)
+        strides = [number(8 * prod(shape[k + 1 :])) for k in range(len(shape))]
+        arrayobj.populate_array(made, data, list(map(number, shape)), strides, number(8), None)
+        return made._getvalue()
+
+    return array(rows, types.Omitted(None) if columns is None else columns), generate
 
 
 class _CalledLibrary(JITCodeLibrary):

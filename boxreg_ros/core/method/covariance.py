@@ -2,9 +2,9 @@
 
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import copy, EXTENT, GAP, padded, PIVOT, POSE
+from boxreg_ros.core.method.arrays import copy, EXTENT, GAP, PIVOT, POSE, SHARED, WIDTH
 from boxreg_ros.core.method.arrowhead import add_sandwich, multiply_shared, NEXT
-from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.compile import kernel, loop, small_array
 from boxreg_ros.core.method.expectation import FACES, HEADING, SIZE
 from boxreg_ros.core.method.kinematics import fill_kinematics
 from boxreg_ros.core.method.rotation import fill_rotation
@@ -96,14 +96,15 @@ def fill_unclaimed(length, marginalised, terms, common, shape, constants, G):
             G[own, opposite] = W[own] * W[opposite] * common.margin_variance[face]
 
 
-@kernel
+@loop
 def fill_shared_covariance(corner, G, inverse):
     """Write covariances of the shared variables, by their block (S, S) of the inverse and `G`."""
     S = len(corner)
     for s in range(S):
         copy(corner[s], inverse.shared[s])
-    add_sandwich(corner, G, np.empty(PIVOT), inverse.shared)
-    shared, product = np.zeros((S, padded(S))), np.empty((POSE, padded(S)))
+    add_sandwich(corner, G, small_array(PIVOT), inverse.shared)
+    shared, product = small_array(SHARED, WIDTH), small_array(POSE, WIDTH)
+    shared[:] = 0.0
     for s in range(S):
         copy(inverse.shared[s], shared[s, :S])
     for n in range(len(inverse.response)):
@@ -112,10 +113,10 @@ def fill_shared_covariance(corner, G, inverse):
             copy(product[a], inverse.beside[n, a])
 
 
-@kernel
+@loop
 def fill_pose_covariances(length, times, poses, inverse, constants, found):
     """Write the covariances of the poses, (N, 6, 6)."""
-    shift = np.empty(3)
+    shift = small_array(3)
     for n in range(len(poses)):
         beside, response = inverse.beside[n], inverse.response[n]
         for i in range(len(response)):
@@ -148,7 +149,7 @@ def fill_extent_covariance(covariance, free, common, found):
         found[i, i] += (1 - free[EXTENT + i]) * variance
 
 
-@kernel
+@loop
 def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, corner, constants,
                    found):  # fmt: skip
     """
@@ -178,7 +179,7 @@ def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, corn
     """
     length, shape = problem.lengths[b], problem.of_class[b].roughness
     distances, free_shared = found.face_distances[b], free[6 * len(poses) :]
-    R, G = np.empty((3, 3)), np.empty((PIVOT, PIVOT))
+    R, G, deviations = small_array(3, 3), small_array(PIVOT, PIVOT), small_array(3)
     fill_face_distances(problem.boxes[b], poses, shared, common.shared, terms, R, distances)
     marginalised = problem.marginalised_extents[b, 3]
     fill_unclaimed(length, marginalised, terms, common, shape, constants, G)
@@ -186,5 +187,5 @@ def fill_posterior(b, problem, poses, shared, terms, common, free, inverse, corn
     fill_pose_covariances(length, problem.times[b], poses, inverse, constants, found.poses[b])
     fill_extent_covariance(inverse.shared, free_shared, common, found.extents[b])
     forward, sideways, _ = problem.of_class[b].motion
-    deviations = np.array((forward, sideways, constants.vertical))
+    deviations[0], deviations[1], deviations[2] = forward, sideways, constants.vertical
     fill_kinematics(length, problem.times[b], poses, deviations, inverse, found.kinematics[b])

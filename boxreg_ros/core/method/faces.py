@@ -9,7 +9,7 @@ from math import ceil, inf, isfinite, isnan, sqrt
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, most_points, padded, TOP
-from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.compile import kernel, loop, small_array
 from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
 
@@ -178,13 +178,6 @@ def to_middle(R, shift, lever, moment):
             moment[i, j] += lever[i] * R[j, 1] + R[i, 1] * (lever[j] + variance * R[j, 1])
         moment[i, 3] += R[i, 1] * (middle - mean)
         moment[3, i] = moment[i, 3]
-
-
-@kernel
-def returns_of(problem, values, b, n):
-    """Return the values of the points of one observation."""
-    first = problem.first[b, n]
-    return values[first : first + problem.counts[b, n] * problem.stride : problem.stride]
 
 
 @loop
@@ -384,7 +377,7 @@ def clear_padding(length, terms):
         terms[n].num_points = 0.0
 
 
-@kernel
+@loop
 def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
     """
     Write the face observations of window `b`.
@@ -418,14 +411,14 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
     pitch, but would roll the body toward the sensor.
 
     """
-    R = np.empty((3, 3))
-    half = np.empty(3)
-    shift = np.empty(3)
-    level = np.empty(6)
-    toward = np.empty(3)
-    lever = np.empty(3)
-    tangent = np.empty(6)
-    velocity = np.empty(3)
+    R = small_array(3, 3)
+    half = small_array(3)
+    shift = small_array(3)
+    level = small_array(6)
+    toward = small_array(3)
+    lever = small_array(3)
+    tangent = small_array(6)
+    velocity = small_array(3)
     velocity[:] = 0.0
     length = problem.lengths[b]
     clear_padding(length, terms)
@@ -436,7 +429,8 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
         ground = problem.ground[b, n]
         term = terms[n]
         distance, weight, inset = term.distance, term.visibility, term.inset
-        points = returns_of(problem, problem.points, b, n)
+        first, stride = problem.first[b, n], problem.stride
+        points = problem.points[first : first + problem.counts[b, n] * stride : stride]
         fill_visibility(box, origins, points, R, toward, tangent)
         fill_insets(
             origins, problem.ring_heights[b, n], tangent, inputs, constants, term.inset_shares,

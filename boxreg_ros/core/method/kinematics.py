@@ -1,7 +1,7 @@
 """Velocity (M26a) and acceleration (M26b) of the boxes of one window, and their covariances."""
 
-from boxreg_ros.core.method.arrays import POSE
-from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.arrays import POSE, SHARED
+from boxreg_ros.core.method.compile import loop, small_array
 import numpy as np
 
 RATES = (0, 1, 2, 5)
@@ -16,23 +16,24 @@ Measured: with less, final accelerations err by more than zero does.
 
 
 @loop
-def fill_combination(first, factors, inverse, rows, found):
+def fill_combination(first, factors, inverse, found):
     """
     Write the covariance (4, 4) of the sum of `factors` times three poses, from `first` on.
 
-    Of their variables `RATES`. `rows` (2, 4, S) are to work in.
+    Of their variables `RATES`.
 
     """
+    beside, response = small_array(4, SHARED), small_array(4, SHARED)
     for i in range(len(found)):
-        combine(first, factors, inverse.beside, RATES[i], rows[0, i])
-        combine(first, factors, inverse.response, RATES[i], rows[1, i])
+        combine(first, factors, inverse.beside, RATES[i], beside[i])
+        combine(first, factors, inverse.response, RATES[i], response[i])
     for i in range(len(found)):
         k = RATES[i]
         for j in range(i, len(found)):
             m = RATES[j]
             total = 0.0
-            for s in range(rows.shape[2]):
-                total += rows[0, i, s] * rows[1, j, s]
+            for s in range(inverse.response.shape[2]):
+                total += beside[i, s] * response[j, s]
             for a in range(3):
                 total += factors[a] ** 2 * inverse.poses[first + a, k, m]
                 links = inverse.links[first + a]
@@ -46,7 +47,7 @@ def fill_combination(first, factors, inverse, rows, found):
 @loop
 def combine(first, factors, values, k, row):
     """Write the sum of `factors` times the rows (S,) of variable `k` of three poses."""
-    for s in range(len(row)):
+    for s in range(values.shape[2]):
         row[s] = (
             factors[0] * values[first, k, s]
             + factors[1] * values[first + 1, k, s]
@@ -54,7 +55,7 @@ def combine(first, factors, values, k, row):
         )
 
 
-@kernel
+@loop
 def fill_kinematics(length, times, poses, deviations, inverse, found):
     """
     Write velocity and acceleration of the boxes of a window, (N,) records `KINEMATICS`.
@@ -77,8 +78,7 @@ def fill_kinematics(length, times, poses, deviations, inverse, found):
         Written.
 
     """
-    of_change, of_rate, factors = np.empty((4, 4)), np.empty((4, 4)), np.empty(3)
-    rows = np.empty((2, len(RATES), inverse.response.shape[2]))
+    of_change, of_rate, factors = small_array(4, 4), small_array(4, 4), small_array(3)
     prior = 0.0
     for i in range(3):
         prior += deviations[i] ** 2
@@ -94,7 +94,7 @@ def fill_kinematics(length, times, poses, deviations, inverse, found):
         factors[0], factors[2] = 2 / (before * duration), 2 / (after * duration)
         factors[1] = -factors[0] - factors[2]
         if is_new:
-            fill_combination(first, factors, inverse, rows, of_change)
+            fill_combination(first, factors, inverse, of_change)
         for i in range(3):
             middle = poses[first + 1, i]
             own.acceleration[i] = factors[0] * (poses[first, i] - middle)
@@ -105,7 +105,7 @@ def fill_kinematics(length, times, poses, deviations, inverse, found):
 
         factors[0], factors[1], factors[2] = -1 / duration, 0.0, 1 / duration
         if is_new:
-            fill_combination(first, factors, inverse, rows, of_rate)
+            fill_combination(first, factors, inverse, of_rate)
         is_finite = True
         for i in range(4):
             rate = (poses[last, RATES[i]] - poses[first, RATES[i]]) / duration

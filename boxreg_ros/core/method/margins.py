@@ -3,7 +3,7 @@
 from math import exp, log
 
 from boxreg_ros.core.method.arrays import POSE
-from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.compile import kernel, loop, small_array
 from boxreg_ros.core.method.expectation import constant_part, FACES, fill_mean_extents, SIZE
 from boxreg_ros.core.method.selection import nth, sum_of
 import numpy as np
@@ -30,7 +30,7 @@ def add_value(quantity, face, value, share, sums):
     sums[quantity, 2, face] += share
 
 
-@kernel
+@loop
 def sum_faces(problem, terms, inputs, constants, sums, logarithms):
     """
     Sum what the faces of each window show of its track.
@@ -50,7 +50,7 @@ def sum_faces(problem, terms, inputs, constants, sums, logarithms):
 
     """
     constants = constants[0]
-    mean = np.empty(SIZE)
+    mean = small_array(SIZE)
     sums[:] = 0.0
     for b in range(len(terms)):
         known = inputs[problem.kind[b]]

@@ -2,7 +2,7 @@
 
 from math import exp, log, sqrt
 
-from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.compile import kernel, loop, small_array
 from boxreg_ros.core.method.expectation import SIZE
 from boxreg_ros.core.method.rotation import fill_rotation
 from boxreg_ros.core.method.selection import lower_median, sum_of
@@ -27,7 +27,7 @@ LEAST_RATIO = 0.02
 """Least estimated error over the one of the settings. Chosen."""
 
 
-@kernel
+@loop
 def fill_residuals(problem, poses, extents, residuals):
     """
     Write input minus fit over the deviations of the settings, (B, N, 9).
@@ -38,7 +38,7 @@ def fill_residuals(problem, poses, extents, residuals):
     that is held throughout is left out.
 
     """
-    R = np.empty((3, 3))
+    R = small_array(3, 3)
     for b in range(len(poses)):
         boxes, of_class = problem.boxes[b], problem.of_class[b]
         for n in range(len(boxes)):
