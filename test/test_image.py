@@ -164,11 +164,11 @@ def test_the_first_fit_has_no_residual_of_variables_that_it_lacks(estimate, monk
     from boxreg_ros.core.method.constants import RESIDUAL_NAMES
     from boxreg_ros.io.warm_up import warm_up_solver
 
-    fits, fit = [], solver.fit
-    monkeypatch.setattr(solver, 'fit', lambda *args, **kws: fits.append(args) or fit(*args, **kws))
+    sought, search = [], solver.search
+    monkeypatch.setattr(solver, 'search', lambda fit: sought.append(fit) or search(fit))
     warm_up_solver(Config.from_dict({'estimate': estimate}))
-    ((batch, _, _, constants),) = fits
-    has_shape = constants.residuals[RESIDUAL_NAMES.index('rigid shape')]
+    ((batch, _, constants, _),) = sought
+    has_shape = constants['residuals'][0, RESIDUAL_NAMES.index('rigid shape')]
     assert has_shape == (batch.solution.shared.shape[1] == SHARED)
 
 

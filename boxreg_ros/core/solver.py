@@ -226,19 +226,32 @@ def fit(
     may_settle: bool,
 ) -> NDArray[np.bool_]:
     """Search the minima of the windows `rows` (b,) after `observe`, and end their round."""
-    b = len(rows)
     objective = Objective(batch, inputs, constants.record(), rows)
-    x = np.empty((2, b, batch.free.shape[1]))
-    start, trial = zip(torch.from_numpy(x), *objective.sum(x, method.START), strict=True)
-    found = minimize(objective.at, start[0], ITERATIONS, HISTORY, TOLERANCE, start[1:], trial)
-    x, is_done = found.x.numpy(), np.empty(b, bool)
-    run(
-        method.end, 20, b, rows, x, batch, objective.constants, is_last, may_settle, is_done,
-    )  # fmt: skip
+    x = search(objective)
+    is_done = end(objective, x, is_last, may_settle)
     if len(batch.solution.left.state):
         is_leaving = is_done & (batch.problem.lengths[rows] == batch.problem.length)
         leaving = objective._replace(rows=rows[is_leaving])
         leaving.sum(x[None, is_leaving], method.OLDEST)
+    return is_done
+
+
+def search(objective: 'Objective') -> Floats:
+    """Begin the round of the windows of an objective; return their minima (b, D)."""
+    x = np.empty((2, len(objective.rows), objective.batch.free.shape[1]))
+    start, trial = zip(torch.from_numpy(x), *objective.sum(x, method.START), strict=True)
+    found = minimize(objective.at, start[0], ITERATIONS, HISTORY, TOLERANCE, start[1:], trial)
+    minima: Floats = found.x.numpy()
+    return minima
+
+
+def end(objective: 'Objective', x: Floats, is_last: bool, may_settle: bool) -> NDArray[np.bool_]:
+    """End the round of the windows of an objective at x (b, D); return which are done."""
+    batch, _, constants, rows = objective
+    is_done = np.empty(len(rows), bool)
+    run(
+        method.end, 20, len(rows), rows, x, batch, constants, is_last, may_settle, is_done,
+    )  # fmt: skip
     return is_done
 
 

@@ -4,22 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, suppress
+from copy import deepcopy
 from dataclasses import replace
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 import os
+from typing import TYPE_CHECKING
 
 from boxreg_ros.config import Config, KINDS, PaperConfig, SolverConfig
-from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.input_model import InputModel, Inputs
 from boxreg_ros.core.method.arrays import INPUTS
+from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.method.residuals import TERMS
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.point_labels import ObjectTrack, PointLabeller
 from boxreg_ros.core.problem import stack_windows
 from boxreg_ros.core.registrar import BoxRegistrar, Submit
 from boxreg_ros.core.window import Window
-from boxreg_ros.structures import BoxArray, Sweep
+from boxreg_ros.structures import BoxArray, Ints, Sweep
 import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from boxreg_ros.core.solver import Batch  # torch
 
 
 def warm_up(config: Config, submit: Submit | None = None) -> None:
@@ -43,7 +50,7 @@ def warm_up(config: Config, submit: Submit | None = None) -> None:
 
 
 def warm_up_solver(config: Config) -> None:
-    """Fit a window without points: half of what a node needs is loaded or compiled."""
+    """Observe faces without points, and search a minimum: half of what a node needs."""
     from boxreg_ros.core import solver  # torch
 
     _, arrays = _passing_car()
@@ -76,7 +83,9 @@ def warm_up_solver(config: Config) -> None:
     batch = solver.start(problem, quick, plan, inputs)
     batch.sums.terms[:] = np.zeros((), TERMS)
     batch.solution.poses[0, -1, 0] += 0.1  # off its input, so that there is something to search
-    solver.fit(batch, inputs, np.zeros(1, int), constants, is_last=True, may_settle=False)
+    first = np.zeros(1, int)
+    solver.observe(batch, inputs, first, constants.in_round(uses_shape=False, is_smooth=True))
+    solver.search(solver.Objective(batch, inputs, constants.record(), first))
 
 
 class SecondProcess:
@@ -183,13 +192,34 @@ def warm_up_others(
     """Do what `warm_up_solver` leaves out; announce that, then follow."""
     from boxreg_ros.core import solver
 
-    solver.fit = lambda _, __, rows, *___: np.ones(len(rows), bool)
+    solver.observe = lambda *arguments: _observe_nothing(*arguments)
+    solver.fit = lambda *arguments: _fit_without_search(*arguments)
     config = Config.from_dict({'objective': objective, 'mode': mode, 'estimate': 'final'})
     warm_up(config)
     if has_labels:
         warm_up_labels(config)
     announce()
     warm_up_followed(config)
+
+
+def _observe_nothing(batch: Batch, _: Inputs, rows: Ints, __: Constants) -> None:
+    """Write faces that are seen where they are expected."""
+    batch.sums.terms[rows] = np.zeros((), TERMS)
+    batch.sums.terms['visibility'][rows] = 1.0
+    batch.sums.terms['num_points'][rows] = 64.0
+
+
+def _fit_without_search(
+    batch: Batch, inputs: Inputs, rows: Ints, constants: Constants, *_: bool
+) -> NDArray[np.bool_]:
+    """End a round where it begins: all but the kernels of the search are loaded or compiled."""
+    from boxreg_ros.core import solver
+
+    # The sums have not been written, so that nothing may be read of what follows from them.
+    aside = batch._replace(solution=deepcopy(batch.solution))
+    x = np.zeros((len(rows), batch.free.shape[1]))
+    objective = solver.Objective(aside, inputs, constants.record(), rows)
+    return solver.end(objective, x, is_last=True, may_settle=True)
 
 
 def warm_up_follower(config: Config) -> None:
