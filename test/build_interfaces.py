@@ -10,6 +10,7 @@ that use the originals. A package whose files have not changed since its build i
 
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import redirect_stdout
+from functools import cache
 from hashlib import sha256
 from io import StringIO
 import logging
@@ -88,10 +89,13 @@ def generate(package: Path, folder: Path) -> None:
     from rosidl_adapter.cli import TranslateMsgToIDL
     from rosidl_generator_c.cli import GenerateC
     from rosidl_generator_py.cli import GeneratePython
+    from rosidl_parser import parser
     from rosidl_typesupport_c.cli import GenerateCTypesupport
     from rosidl_typesupport_fastrtps_c.cli import GenerateFastRTPSCTypesupport
     from rosidl_typesupport_introspection_c.cli import GenerateIntrospectionCTypesupport
 
+    # Each generator parses each file again, by Earley's method: a quarter of the time of all.
+    parser.get_ast_from_idl_string = cache(parser.get_ast_from_idl_string)
     generators = (
         GenerateC('c'),
         GeneratePython('py'),
