@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.storage.urls import url_of
-from boxreg_ros.labels import frames_of
-from boxreg_ros.labels.output import WITH_REJECTED
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.progress import Progress, Stopwatch
 from boxreg_ros.offline.reader import JumpingIds, ReadAhead, reader
@@ -130,10 +128,13 @@ def _relabel(request: Request, out: Path, progress: Progress, fingerprint: str) 
 
 def _rejected(request: Request) -> set[tuple[str, int]]:
     """Return ids and stamps of the boxes of a result that are rejected, where others are added."""
-    if request.labels is None or request.labels[0] not in WITH_REJECTED or not request.completes:
+    if request.labels is None or not request.completes or request.convention.associate:
+        return set()  # with `associate`, ids of the result are of no meaning
+    from boxreg_ros.labels import frames_of  # slow, and few runs need them
+    from boxreg_ros.labels.output import WITH_REJECTED
+
+    if request.labels[0] not in WITH_REJECTED:
         return set()
-    if request.convention.associate:
-        return set()  # ids of the result are of no meaning
     return {
         (track_id, frame.refined.boxes.stamp_ns)
         for frame in frames_of(*request.labels)
