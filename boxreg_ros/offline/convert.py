@@ -7,6 +7,7 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from shutil import copyfile
 from typing import Any
 
 from boxreg_ros import __version__
@@ -90,6 +91,9 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             counts['rejected'] += frame.refined.status.count(REJECTED)
             output.write(frame)
         output.close()
+        applied = request.applied_decisions()
+        if applied is not None and 'csv' in request.formats:
+            copyfile(applied, folder / applied.name)
         left_out = output.left_out()
         _require_valid_boxes(source, counts)
         _require_boxes(request, left_out, counts['boxes'] - counts['rejected'])

@@ -36,7 +36,7 @@ from boxreg_ros.offline.result_folder import CONFIG, INPUT_MODEL
 from boxreg_ros.offline.stored_sweeps import StoredSweeps
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.offline.survey import Passes, Survey
-from boxreg_ros.review.decisions import DECISIONS
+from boxreg_ros.review.decisions import APPLIED, DecisionLog, DECISIONS
 from boxreg_ros.review.rules import Violation
 from boxreg_ros.review.tables import TrackRow
 from boxreg_ros.structures import BoxArray
@@ -121,6 +121,9 @@ class MainProcess:
         self._write_input_model(folder, registrar, summary)
         if self.request.decisions is not None:
             copyfile(self.request.decisions, folder / DECISIONS)  # a review goes on from there
+        applied = sink.corrections.applied()
+        if applied:
+            DecisionLog(folder / APPLIED).append(applied)
         settings = yaml.safe_dump(asdict(self.request.config), sort_keys=False)
         (folder / CONFIG).write_text(settings, encoding='utf-8')
         return summary

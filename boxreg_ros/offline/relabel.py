@@ -96,7 +96,7 @@ def _relabel(request: Request, out: Path, progress: Progress, fingerprint: str) 
 
     """
     clock = Stopwatch()
-    corrections = Corrections(_decisions(request, out), _rejected(request))
+    corrections = Corrections(_decisions(request, out), _rejected(request), _applied(request))
     # What cannot be read is refused before the work.
     truth = true_boxes(request.truth) if request.report and request.truth is not None else None
     drives = _other_drives(request)
@@ -141,6 +141,20 @@ def _rejected(request: Request) -> set[tuple[str, int]]:
         for track_id, word in zip(frame.refined.boxes.track_ids, frame.refined.status, strict=True)
         if word == REJECTED
     }
+
+
+def _applied(request: Request) -> list[Decision]:
+    """Return the decisions that the boxes of a result, as labels, have already."""
+    path = request.applied_decisions()
+    if path is None:
+        return []
+    if request.convention.associate or request.jumping_ids:
+        raise ConfigError(
+            f'labels {str(path.parent)!r}: expected their ids, which {path.name} is about, got '
+            f'boxes to associate: decisions of a person would be lost; relabel without '
+            f'--associate, and with --keep-ids, or delete {path.name}'
+        )
+    return read_decisions(path)
 
 
 def _decisions(request: Request, out: Path) -> list[Decision]:

@@ -16,6 +16,7 @@ from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.storage.urls import entries_of, url_of
 from boxreg_ros.labels import check_options, files_of, labels_points, module_of, Options
 from boxreg_ros.options import option
+from boxreg_ros.review.decisions import APPLIED
 from msg_adapters.convention import Convention, STANDARD
 
 if TYPE_CHECKING:
@@ -280,11 +281,21 @@ class Request:
         paths += [path for path in of_formats if path is not None and path.is_file()]
         if self.labels is not None:
             paths.append(files_of(*self.labels))
+            applied = self.applied_decisions()
+            paths += [] if applied is None else [applied]
         if self.truth is not None:
             paths += _parts_of(self.truth)
         if self.decisions is not None:
             paths.append(self.decisions)
         return (*paths, *self.input_model)
+
+    def applied_decisions(self) -> Path | None:
+        """Return the file of decisions that the labels have already; None without one."""
+        if self.labels is None or self.labels[0] != 'csv':
+            return None
+        path = self.labels[1]
+        path = (path if path.is_dir() else path.parent) / APPLIED
+        return path if path.is_file() else None
 
     def drive_name(self) -> str:
         """Return a name of the drive: a hash of the names and sizes of its recordings."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from itertools import groupby
+from typing import NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.reasons import Reason
@@ -17,6 +18,7 @@ from boxreg_ros.structures import (
     KEPT,
     KINEMATICS,
     RefinedBoxes,
+    REJECTED,
     with_rejected,
 )
 import numpy as np
@@ -29,24 +31,38 @@ SAME_SWEEP_NS = 50_000_000
 WITHOUT_EFFECT = ('accept', 'unsure', 'none')
 
 
+class _Applied(NamedTuple):
+    """What was decided about one box of the result; empty for nothing."""
+
+    stamp_ns: int
+    class_name: str
+    track_id: str
+    judgement: str  # `accept` or `reject`
+
+
 class Corrections:
     """
     The decisions of a person, in the order they were made, as a run applies them.
 
     Deleted boxes are not registered; ids, classes and pinned boxes are those of the decisions
     before any step of the run; rejected boxes are as in the input again after it. Boxes can be
-    pinned already; none is added where the files of the input have one that is `rejected`, named
-    by id and stamp. The steps that complete tracks ask for the decisions as
-    `tracks.decided.Decided`, after the boxes of the input have passed `to_register`.
+    pinned already, and have the class of a person then; none is added where the files of the input
+    have one that is `rejected`, named by id and stamp. The steps that complete tracks ask for the
+    decisions as `tracks.decided.Decided`, after the boxes of the input have passed `to_register`.
+    `earlier` decisions are those that the boxes of the input have already, see `applied`.
 
     """
 
     def __init__(
-        self, decisions: Iterable[Decision] = (), rejected: Collection[tuple[str, int]] = ()
+        self,
+        decisions: Iterable[Decision] = (),
+        rejected: Collection[tuple[str, int]] = (),
+        earlier: Iterable[Decision] = (),
     ) -> None:
         self._rejected = rejected
         self._of_track: dict[str, list[Decision]] = {}
-        for one in held(decisions):
+        decisions = [*decisions]
+        for one in held([*earlier, *decisions]):
             self._of_track.setdefault(one.track_id, []).append(one)
         self._unused = {
             one.scope
@@ -59,6 +75,8 @@ class Corrections:
         self._boxes: set[tuple[str, int]] = set()  # of tracks with a pin: id and stamp, as given
         self._before: dict[str, tuple[str, Mapping[str, str]]] = {}  # id, attributes; by new id
         self._origins: dict[str, list[tuple[int, str]]] = {}  # stamps and first ids of added boxes
+        self._human_classes: dict[tuple[str, int], str] = {}  # of pinned input, by id and stamp
+        self._of_result: dict[str, list[_Applied]] = {}  # by id in the result
 
     def unused(self) -> list[str]:
         """Return the tracks and boxes with a decision that the recording does not have."""
@@ -154,8 +172,9 @@ class Corrections:
         return self._value('id', input_id, stamp_ns)
 
     def class_name(self, input_id: str, stamp_ns: int) -> str:
-        """Return the class that was given to a box; empty for none."""
-        return self._value('class', input_id, stamp_ns)
+        """Return the class that was given to a box, or a pinned one has; empty for none."""
+        known = self._human_classes.get((input_id, stamp_ns), '')
+        return self._value('class', input_id, stamp_ns) or known
 
     def is_left_out(self, input_id: str, stamp_ns: int) -> bool:
         """
@@ -245,6 +264,8 @@ class Corrections:
 
         """
         given = given.plain()  # `with_attributes` gives the result its own
+        for row in np.flatnonzero(given.is_pinned).tolist():
+            self._human_classes[given.track_ids[row], given.stamp_ns] = given.class_names[row]
         if not self._of_track:
             return given
         rows = self._left(given)
@@ -352,9 +373,46 @@ class Corrections:
             else:
                 input_id, own = self._before.get(track_id) or (self._first_id(track_id), {})
                 input_id = self.origin_of(given.stamp_ns, track_id) or input_id
+            if refined.status[row] != REJECTED:
+                self._note(track_id, input_id, given.stamp_ns)
             found.append({**own, **self._decided_attributes(input_id, given.stamp_ns)})
         attributes = tuple(found) if any(found) else ()
         return replace(refined, boxes=replace(refined.boxes, attributes=attributes))
+
+    def applied(self) -> list[Decision]:
+        """
+        Return the decisions that the boxes of all results have, about the ids of the results.
+
+        A later run on these boxes, as labels, is bound by them: tables of labels do not state
+        which classes and ids are those of a person.
+
+        """
+        found: list[Decision] = []
+        apart = self.apart
+        for track_id, rows in self._of_result.items():
+            rows.sort()
+            if track_id in apart:  # also boxes that a step has added
+                rows = [one._replace(track_id=track_id) for one in rows]
+            for kind, values in (
+                ('reclass', [one.class_name for one in rows]),
+                ('rename', [one.track_id for one in rows]),
+                ('accept', [one.judgement == 'accept' for one in rows]),
+                ('reject', [one.judgement == 'reject' for one in rows]),
+            ):
+                found += _ranges(track_id, kind, [one.stamp_ns for one in rows], values)
+        return found
+
+    def _note(self, track_id: str, input_id: str, stamp_ns: int) -> None:
+        """Note what was decided about a box of a result."""
+        judgement = self._judgement(input_id, stamp_ns)
+        self._of_result.setdefault(track_id, []).append(
+            _Applied(
+                stamp_ns,
+                self.class_name(input_id, stamp_ns),
+                self.track_id(input_id, stamp_ns),
+                '' if judgement is None else judgement.kind,
+            )
+        )
 
     def _first_id(self, track_id: str) -> str:
         """Return an id in the input of a track whose boxes there are later."""
@@ -443,6 +501,21 @@ def _array_of(one: Decision, track_id: str, class_name: str) -> BoxArray:
     assert one.stamp_ns is not None and one.box is not None
     columns = (track_id,), (class_name,), np.ones(1), one.box[None]
     return BoxArray(one.stamp_ns, one.frame_id, *columns)
+
+
+def _ranges(
+    track_id: str, kind: str, stamps_ns: Sequence[int], values: Sequence[str | bool]
+) -> list[Decision]:
+    """Return decisions with the values of a track's boxes: one for each range of equal ones."""
+    found = []
+    for value, rows in groupby(zip(values, stamps_ns, strict=True), lambda row: row[0]):
+        if value:
+            within = [stamp_ns for _, stamp_ns in rows]
+            is_whole = len(within) == len(stamps_ns)
+            span = (None, None) if is_whole else (within[0], within[-1])
+            text = value if isinstance(value, str) else ''
+            found.append(Decision(track_id, span[0], kind, end_ns=span[1], value=text))
+    return found
 
 
 def _closeness(decision: Decision) -> int:

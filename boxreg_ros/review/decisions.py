@@ -28,6 +28,8 @@ from boxreg_ros.structures import BOX_EXTENT, Floats, is_valid_box, LENGTH, ROLL
 import numpy as np
 
 DECISIONS = 'decisions.csv'
+APPLIED = 'applied_decisions.csv'
+"""Beside boxes that have these decisions already, about their ids; as `DECISIONS` otherwise."""
 VERSION = 2
 VERSION_LINE = '# boxreg decisions '
 """Begins the first line, before the version. Files of version 1 do not have it."""

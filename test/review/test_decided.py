@@ -12,7 +12,7 @@ from boxreg_ros.io.velocity_table import read_velocities, VELOCITIES
 from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.changes import Changes
-from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
+from boxreg_ros.review.decisions import APPLIED, Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, kept
 from browser import NEEDS_BROWSER, opened_page, press, serving
@@ -467,3 +467,50 @@ def test_attributes_are_set_in_the_page(completed, tmp_path):
         press(page, 'y', "attributesAt(3).weather === 'rain'")
     found = [(one.stamp_ns, one.end_ns, one.value) for one in read_decisions(out / DECISIONS)]
     assert found[:2] == [(None, None, 'parked=true'), (stamps[2], stamps[4], 'weather=rain')]
+
+
+@pytest.mark.parametrize('options', [(), ('--complete',)])
+def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, options):
+    """A split stays one, classes are not outvoted, accepted tracks not rejected, however often."""
+    _, stamps, _, out = completed
+    recording = out.with_name('drive')
+    decisions = [
+        Decision('2', stamps[10], 'rename', end_ns=stamps[-1], value='2_2'),
+        Decision('2', stamps[1], 'reclass', end_ns=stamps[2], value='truck'),
+        Decision('9', None, 'accept'),
+        Decision('1', stamps[3], 'reject'),
+    ]
+    rows = Run(recording, *options)(tmp_path / '0', decisions)
+    as_rejected = rows['1', stamps[3]]
+    for k in (1, 2):
+        labels = f'csv:{tmp_path / str(k - 1)}'
+        run = Run(recording, '--labels', labels, '--complete', *options)
+        rows = run(tmp_path / str(k))
+        assert run.status == 0, capsys.readouterr().err
+        is_known = {(name, row['status'] != 'rejected') for (name, _), row in rows.items()}
+        assert is_known == {('1', True), ('2', True), ('2_2', True), ('9', True)}
+        names = ['2_2' if k >= 10 else '2' for k in range(SWEEPS)]
+        classes = [rows[key]['class_name'] for key in zip(names, stamps, strict=True)]
+        assert classes == ['car', 'truck', 'truck'] + ['car'] * 13
+        words = [str(cell)[:9] for cell in rows['1', stamps[3]].values()]
+        assert words == [str(cell)[:9] for cell in as_rejected.values()]
+    command = ['relabel', str(recording), '-o', str(tmp_path / 'x'), '--labels', labels]
+    assert main([*command, '--associate', *QUICK]) == 2
+    assert 'without --associate' in capsys.readouterr().err
+    main(['convert', str(tmp_path / '2'), '-o', str(tmp_path / '3'), '--from=csv', '--to=csv'])
+    assert read_decisions(tmp_path / '3' / APPLIED) == read_decisions(tmp_path / '2' / APPLIED)
+
+
+def test_a_box_of_a_person_keeps_its_class(completed, tmp_path):
+    _, stamps, _, out = completed
+    table = BoxTable.read(out / 'boxes.csv').without_rejected()
+    is_own = [
+        key == ('2', stamps[1]) for key in zip(table.track_ids, table.stamps_ns, strict=True)
+    ]
+    status = tuple('human' if own else 'refined' for own in is_own)
+    names = tuple('truck' if own else 'car' for own in is_own)
+    replace(table, status=status, class_names=names).write(tmp_path / 'boxes.csv')
+    labels = f'csv:{tmp_path / "boxes.csv"}'
+    rows = Run(out.with_name('drive'), '--labels', labels, '--complete')(tmp_path / 'out')
+    found = {key: row['class_name'] for key, row in rows.items() if row['class_name'] != 'car'}
+    assert found == {('2', stamps[1]): 'truck'}
