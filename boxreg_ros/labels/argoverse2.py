@@ -18,10 +18,10 @@ from typing import Any
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.transforms import matrix
 from boxreg_ros.labels.arrow import read_rows, read_table
-from boxreg_ros.labels.files import frame_names, to_json
+from boxreg_ros.labels.files import frame_names, read_provenance, to_json
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, SceneFrames
-from boxreg_ros.labels.records import EVIDENCE_COLUMNS, evidence_of, refined_boxes
+from boxreg_ros.labels.records import EVIDENCE_COLUMNS, evidence_of, refined_boxes, refined_of
 from boxreg_ros.rotations import boxes_from_quaternions, quaternion_from_matrix
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, RefinedBoxes, Sweep
 from msg_adapters.poses import quaternions_of
@@ -109,7 +109,13 @@ class Writer(FolderWriter):
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
-    """Yield the annotated stamps of a log, with the poses of its pose file."""
+    """
+    Yield the annotated stamps of a log, with the poses of its pose file.
+
+    Files of `Writer` have the poses of all frames, also without boxes; those of a log are of all
+    sensors.
+
+    """
     if path.is_dir():
         path = path / FEATHER_FILE
     folder = path.parent
@@ -117,9 +123,11 @@ def read(path: Path) -> Iterator[LabelFrame]:
     poses = read_rows(pose_file) if pose_file.exists() else []
     T_city_ego = {row['timestamp_ns']: matrix(xyz_xyzw(row)) for row in poses}
     fixed_frame, sensor_frame = frame_names(folder, CITY_FRAME, EGO_FRAME)
-    for refined in _refined(_annotations(path), sensor_frame):
-        T = T_city_ego.get(refined.boxes.stamp_ns)
-        yield LabelFrame(refined, fixed_frame, sensor_frame, T)
+    by_stamp = {one.boxes.stamp_ns: one for one in _refined(_annotations(path), sensor_frame)}
+    empty = T_city_ego if read_provenance(folder) else {}
+    for stamp_ns in sorted({*by_stamp, *empty}):
+        refined = by_stamp.get(stamp_ns) or refined_of(stamp_ns, sensor_frame, ())
+        yield LabelFrame(refined, fixed_frame, sensor_frame, T_city_ego.get(stamp_ns))
 
 
 def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:

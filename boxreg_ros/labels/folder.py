@@ -19,9 +19,12 @@ from boxreg_ros.labels.kitti_camera import KittiCamera
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.labels.sidecar import POSES_FILE, STAMPS_FILE
 from boxreg_ros.reasons import Reason
+from boxreg_ros.structures import ADDED, HUMAN
 import numpy as np
 
 NO_POINTS = np.zeros((0, 3))
+NOTED_STATUS = (HUMAN, *ADDED)
+"""Status that later steps act on, noted in ``boxreg.json`` by formats without a place for it."""
 
 
 class FolderWriter:
@@ -64,6 +67,7 @@ class FolderWriter:
         self.number = 0
         self.name = ''
         self.about: dict[str, Any] = asdict(provenance)
+        self._status: dict[str, dict[str, list[int]]] = {}  # frames by status and track
         self._used_stamps: Counter[int] = Counter()
         self.files = ExitStack()
         if self.has_kitti_camera:
@@ -165,6 +169,11 @@ class FolderWriter:
         points = NO_POINTS if frame.sweep is None else frame.sweep.points
         write_cloud(path, points, frame.intensities)
 
+    def note_status(self, track: str, status: str) -> None:
+        """Note a status of `NOTED_STATUS` of a track in this frame, see `noted_status`."""
+        if status in NOTED_STATUS:
+            self._status.setdefault(status, {}).setdefault(track, []).append(self.number)
+
     def finish(self) -> None:
         """Complete the labels, before their files are closed."""
 
@@ -176,7 +185,19 @@ class FolderWriter:
             self.about['class_names'] = self.class_names.translated
         if self.class_names.uncounted:
             self.about['uncounted'] = dict(self.class_names.uncounted)
+        if self._status:
+            self.about['status'] = self._status
         write_provenance(self.folder, self.about)
+
+
+def noted_status(about: Mapping[str, Any]) -> dict[tuple[str, int], str]:
+    """Return the status by track and frame that `FolderWriter.note_status` has noted."""
+    return {
+        (track, number): status
+        for status, frames in about.get('status', {}).items()
+        for track, numbers in frames.items()
+        for number in numbers
+    }
 
 
 def frame_name(stamp_ns: int, used: Counter[int]) -> str:

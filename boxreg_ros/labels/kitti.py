@@ -18,7 +18,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.attributes import FALSE, is_set, OCCLUDED, PARTLY, TRUE, TRUNCATED
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.files import at, following, read_provenance, require_single, visible
-from boxreg_ros.labels.folder import FolderWriter
+from boxreg_ros.labels.folder import FolderWriter, noted_status
 from boxreg_ros.labels.protocol import (
     absolute,
     Format,
@@ -95,6 +95,7 @@ class Writer(FolderWriter):
                 self._given_classes[f'{track} {name}'] = given
             attributes = array.attributes_of(row)
             cut = truncation_of(attributes, int(truncation[i]))
+            self.note_status(str(track), frame.refined.status[row])
             self._file.write(f'{self.number} {track} {name} {cut} {occlusion_of(attributes)} ')
             self._file.write(decimals(columns[i], array.scores[row]) + '\n')
 
@@ -295,6 +296,7 @@ def _placed(path: Path, lines: Lines, camera: Camera) -> Lines:
     """Return the boxes of lines in the LiDAR frame; tracks have the names beside the file."""
     about = read_provenance(absolute(path).parent.parent)
     tracks, given = {NO_TRACK: ''} | about.get('tracks', {}), about.get('given_classes', {})
+    status = noted_status(about)
     found: Lines = {}
     for frame, items in lines.items():
         with following(path, 'rotations in radians'):
@@ -304,6 +306,7 @@ def _placed(path: Path, lines: Lines, camera: Camera) -> Lines:
                 track_id=tracks.get(item.track_id, item.track_id),
                 class_name=given.get(f'{item.track_id} {item.class_name}', item.class_name),
                 box=box,
+                evidence={**item.evidence, 'status': status.get((item.track_id, frame))},
             )
             for item, box in zip(items, boxes, strict=True)
         ]

@@ -1,9 +1,9 @@
 """
 KITTI raw: ``tracklet_labels.xml``, one tracklet per gapless sequence of a track in one class.
 
-A tracklet has one extent, the median over its boxes, and one pose per frame: the centre of the
-bottom face in the LiDAR frame. ``l`` is the extent along x of the box. Datumaro and CVAT differ,
-see `_convention_of`; ``--swap-axes`` writes files for them.
+A tracklet has one extent, the median over its boxes, or over those of a person if it has any, and
+one pose per frame: the centre of the bottom face in the LiDAR frame. ``l`` is the extent along x
+of the box. Datumaro and CVAT differ, see `_convention_of`; ``--swap-axes`` writes files for them.
 
 """
 
@@ -23,8 +23,8 @@ from xml.sax.saxutils import escape, unescape
 
 from boxreg_ros.config import Config
 from boxreg_ros.labels.attributes import attributes_from, OCCLUDED
-from boxreg_ros.labels.files import at, following, to_json
-from boxreg_ros.labels.folder import FolderWriter
+from boxreg_ros.labels.files import at, following, read_provenance, to_json
+from boxreg_ros.labels.folder import FolderWriter, noted_status
 from boxreg_ros.labels.kitti import attributes_of, occlusion_of, truncation_of
 from boxreg_ros.labels.protocol import (
     Format,
@@ -37,7 +37,7 @@ from boxreg_ros.labels.records import ReadBox
 from boxreg_ros.labels.sidecar import numbered_frames, numbered_scene
 from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, INTERPOLATED, ROLL, YAW
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, HUMAN, INTERPOLATED, ROLL, YAW
 import numpy as np
 
 FORMAT = Format(
@@ -62,6 +62,8 @@ EXTENT_TAGS = {False: ('l', 'w', 'h'), True: ('h', 'w', 'l')}
 SWAPPED_COMMENT = 'axes swapped'
 OWN_COMMENT = '"tool":"boxreg_ros"'
 """In the comment with the origin of files written by `Writer`."""
+SAME_EXTENT = 1e-3
+"""Extents that differ by less are the same [m]; chosen: far below what a person draws."""
 TRACK_COMMENT = 'track '
 ESCAPED_HYPHEN = '&#45;'
 """Replaces a hyphen in a comment where XML forbids it: beside another, or at the end."""
@@ -110,6 +112,7 @@ class _Tracklet:
     first_frame: int
     boxes: list[Floats] = field(default_factory=list)
     states: list[int] = field(default_factory=list)
+    are_human: list[bool] = field(default_factory=list)
     attributes: list[Mapping[str, str]] = field(default_factory=list)
 
 
@@ -128,6 +131,19 @@ class Writer(FolderWriter):
         self._body = TemporaryFile('w+', encoding='utf-8', dir=self.folder)  # noqa: SIM115
         self._open: dict[tuple[str, str], _Tracklet] = {}
         self._count = 0
+        self._changed = 0  # boxes of a person
+        self._largest_change = 0.0  # of their extents [m]
+
+    @property
+    def notes(self) -> list[str]:
+        """Return what could not be written as it is."""
+        if not self._changed:
+            return super().notes
+        return [
+            *super().notes,
+            f'{self._changed:,} boxes of the status human have other extents than they had, by up '
+            f'to {self._largest_change:.2f} m: a tracklet has one size; another format keeps them',
+        ]
 
     def add(self, frame: LabelFrame) -> None:
         """Add a pose to the tracklets of this frame, and write those that have ended."""
@@ -144,10 +160,14 @@ class Writer(FolderWriter):
             else:
                 tracklet = self._open.pop(key, tracklet)
             continued[key] = tracklet
-            is_interpolated = frame.refined.status[row] in NOT_OF_A_PERSON
+            status = frame.refined.status[row]
+            is_interpolated = status in NOT_OF_A_PERSON
             tracklet.boxes.append(box)
             tracklet.attributes.append(array.attributes_of(row))
             tracklet.states.append(INTERPOLATED_STATE if is_interpolated else LABELLED_STATE)
+            tracklet.are_human.append(status == HUMAN)
+            if track_id:
+                self.note_status(track_id, status)
         for tracklet in self._open.values():
             self._write(tracklet)
         self._open = continued
@@ -165,7 +185,12 @@ class Writer(FolderWriter):
 
     def _write(self, tracklet: _Tracklet) -> None:
         boxes = np.array(tracklet.boxes)
-        extent = np.median(boxes[:, BOX_EXTENT], axis=0)
+        extents = boxes[:, BOX_EXTENT]
+        of_person = extents[tracklet.are_human]
+        extent = np.median(of_person if len(of_person) else extents, axis=0)
+        change = np.abs(of_person - extent).max(axis=1, initial=0.0)
+        self._changed += int((change > SAME_EXTENT).sum())
+        self._largest_change = max(self._largest_change, change.max(initial=0.0))
         sizes = dict(zip(EXTENT_TAGS[self._is_swapped], extent.tolist(), strict=True))
         shift = 0.0 if self._is_swapped else -extent[2] / 2
         poses = np.hstack([_shifted_centres(boxes, shift), boxes[:, ROLL : YAW + 1]])
@@ -262,6 +287,19 @@ class _Content(NamedTuple):
     left_out: dict[int, Counter[str]]
     note: str
 
+    def with_status(self, status: Mapping[tuple[str, int], str]) -> _Content:
+        """Return it with the status of some boxes, by track and index of the frame."""
+        boxes = {
+            index: [
+                one._replace(evidence={**one.evidence, 'status': status[one.track_id, index]})
+                if (one.track_id, index) in status
+                else one
+                for one in found
+            ]
+            for index, found in self.boxes.items()
+        }
+        return self._replace(boxes=boxes)
+
     def noted(self, frames: Iterator[LabelFrame]) -> Iterator[LabelFrame]:
         """Yield frames, the first with the note."""
         for index, frame in enumerate(frames):
@@ -279,11 +317,11 @@ def _read_file(path: Path) -> _Content:
             raise ValueError(str(error)) from None
         origin = text[: text.find('<boost_serialization')]
         root = tree.getroot()
-        if SWAPPED_COMMENT in origin:
-            return _content(root, DATUMARO, is_own=True)
-        if OWN_COMMENT in origin:
-            return _content(root, KITTI_CONVENTION, is_own=True)
-        return _content(root, _convention_of(root))
+        is_swapped = SWAPPED_COMMENT in origin
+        if not is_swapped and OWN_COMMENT not in origin:
+            return _content(root, _convention_of(root))
+        content = _content(root, DATUMARO if is_swapped else KITTI_CONVENTION, is_own=True)
+    return content.with_status(noted_status(read_provenance(path.parent)))
 
 
 def _frame_names(path: Path) -> list[str]:

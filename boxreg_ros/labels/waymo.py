@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import lru_cache
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 
 from boxreg_ros.config import Config, words_of
@@ -72,7 +73,7 @@ BOX_COLUMNS = (
 )
 REQUIRED = [name for name in BOX_COLUMNS if name not in UNUSED_COLUMNS | BOXREG_COLUMNS]
 VEHICLE_POSE = '[VehiclePoseComponent].world_from_vehicle.transform'
-VEHICLE_POSE_COLUMNS = KEY_COLUMNS | {VEHICLE_POSE: 'double[16]'}
+VEHICLE_POSE_COLUMNS = KEY_COLUMNS | {VEHICLE_POSE: 'double[16]', 'boxreg.stamp_ns': 'int64'}
 TYPE_NAMES = ('', 'vehicle', 'pedestrian', 'sign', 'cyclist')
 """Names of the values of the type column; '' is unknown."""
 
@@ -116,19 +117,20 @@ class Writer(FolderWriter):
                 *evidence_of(refined, row).values(),
             )
         if frame.T_fixed_sensor is not None:
-            self._poses.add(*key, frame.T_fixed_sensor.ravel().tolist())
+            self._poses.add(*key, frame.T_fixed_sensor.ravel().tolist(), array.stamp_ns)
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
     Yield the boxes of one segment: a file of ``lidar_box``, or the only one in a folder.
 
-    Stamps are whole microseconds, unless the column ``boxreg.stamp_ns`` has nanoseconds.
+    Stamps are whole microseconds, unless the column ``boxreg.stamp_ns`` has nanoseconds. A frame
+    with a pose and no row is one without boxes: all frames of a segment are labelled.
 
     """
     if path.is_dir():
-        found = visible(path, 'lidar_box/*.parquet')
-        path = require_single(found, path, 'segment, lidar_box/NAME.parquet')
+        files = visible(path, 'lidar_box/*.parquet')
+        path = require_single(files, path, 'segment, lidar_box/NAME.parquet')
     folder = absolute(path).parent.parent
     rows = read_table(path, REQUIRED, 'lidar_box of Waymo').to_pylist()
     pose_file = folder / 'vehicle_pose' / path.name
@@ -138,10 +140,17 @@ def read(path: Path) -> Iterator[LabelFrame]:
     }
     fixed_frame, sensor_frame = frame_names(folder, 'world', 'vehicle')
     rows.sort(key=_stamp_ns)
-    for stamp_ns, group in groupby(rows, _stamp_ns):
-        items = list(group)
+    found = [(stamp_ns, list(group)) for stamp_ns, group in groupby(rows, _stamp_ns)]
+    micros_of = {stamp_ns: items[0][MICROSECONDS] for stamp_ns, items in found}
+    empty = T_world_vehicle.keys() - micros_of.values()
+    for row in poses:
+        if row[MICROSECONDS] in empty:
+            micros_of[_stamp_ns(row)] = row[MICROSECONDS]
+            found.append((_stamp_ns(row), []))
+    for stamp_ns, items in sorted(found, key=itemgetter(0)):
         boxes = np.zeros((len(items), 9))
-        boxes[:, : HEIGHT + 1] = [[item[name] for name in (*CENTER, *SIZE)] for item in items]
+        for box, item in zip(boxes, items, strict=True):
+            box[: HEIGHT + 1] = [item[name] for name in (*CENTER, *SIZE)]
         boxes[:, YAW] = [item[HEADING] for item in items]
         refined = refined_boxes(
             stamp_ns,
@@ -155,8 +164,9 @@ def read(path: Path) -> Iterator[LabelFrame]:
                 for item in items
             ],
         )
-        T = T_world_vehicle.get(items[0][MICROSECONDS])
-        yield LabelFrame(refined, fixed_frame, sensor_frame, T)
+        yield LabelFrame(
+            refined, fixed_frame, sensor_frame, T_world_vehicle.get(micros_of[stamp_ns])
+        )
 
 
 def _stamp_ns(row: dict[str, int]) -> int:

@@ -36,6 +36,8 @@ from boxreg_ros.structures import BoxArray, is_valid_box, REJECTED, Sweep
 
 FORMAT_OF_NODE = 'recording'
 """Format of labels that are messages of a recording, which also has the clouds and poses."""
+ROW_FORMATS = ('csv', 'parquet')
+"""Tables with a row per box alone, and no place for a frame without boxes."""
 
 
 def convert(request: Request, out: Path) -> dict[str, Any]:
@@ -83,6 +85,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
         for frame in _read_frames(request, folder, unused):
             counts['frames'] += 1
             counts['boxes'] += len(frame.refined.status)
+            counts['empty'] += not frame.refined.status
             counts['valid'] += int(is_valid_box(frame.refined.boxes.boxes).sum())
             not_read.update(frame.left_out)
             if frame.note:
@@ -104,6 +107,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             'to': list(request.formats),
             'frames': counts['frames'],
             'boxes': counts['boxes'],
+            'frames_without_boxes': counts['empty'],
             'invalid_boxes': counts['boxes'] - counts['valid'],
             'rejected_boxes': counts['rejected'],
             'left_out_of_source': dict(+not_read),
@@ -288,6 +292,12 @@ def run(args: argparse.Namespace) -> int:
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in counts.items())
         parts.append(f'{name} leaves out {reasons}')
     parts += summary['label_notes']
+    rows_alone = ' and '.join(name for name in ROW_FORMATS if name in args.target_formats)
+    if summary['frames_without_boxes'] and rows_alone:
+        parts.append(
+            f'{summary["frames_without_boxes"]:,} frames without boxes are not in {rows_alone}, '
+            f'which has a row per box'
+        )
     if summary['invalid_boxes']:
         parts.append(
             f'{summary["invalid_boxes"]:,} boxes are invalid: {Reason.INVALID_BOX.meaning}'

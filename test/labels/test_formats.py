@@ -620,6 +620,47 @@ def test_round_trip(tmp_path, name):
 
 
 @pytest.mark.parametrize('name', READABLE_FORMATS)
+def test_boxes_of_a_person_stay_and_empty_frames_are_frames(tmp_path, name):
+    """A pinned box keeps size and status; a frame without boxes was looked at."""
+    larger = [*IN_FIXED[:3], *np.array(EXTENT) + 0.5, *IN_FIXED[6:]]
+    words = ['refined', 'human', 'interpolated', 'refined']
+    frames = [
+        frame_of([larger if word == 'human' else IN_FIXED], stamp_ns=STAMP + i * 10**8)
+        for i, word in enumerate(words)
+    ]
+    frames = [
+        replace(frame, refined=replace(frame.refined, status=(word,)))
+        for frame, word in zip(frames, words, strict=True)
+    ]
+    for i in (4, 5):
+        frames.insert(i - 2, frame_of([], (), STAMP + i * 10**8))
+    frames.sort(key=lambda frame: frame.refined.boxes.stamp_ns)
+    _, folder = written(name, tmp_path, frames)
+    found = list(frames_of(name, folder))
+    without_rows = name in ('csv', 'parquet')
+    assert len(found) == (4 if without_rows else 6)
+    status = [word for frame in found for word in frame.refined.status]
+    assert [word for word in status if word != 'input'] in (words, words[1:3])
+    np.testing.assert_allclose(
+        found[1].refined.boxes.boxes[0, 3:6], larger[3:6], atol=1e-5, err_msg=str(status)
+    )
+
+
+def test_tracklets_say_which_sizes_of_a_person_they_change(tmp_path):
+    frames = []
+    for i, more in enumerate((0, 0.2, 0.2, 9)):
+        box = [*IN_FIXED[:3], *np.array(EXTENT) + more, *IN_FIXED[6:]]
+        frame = frame_of([box], stamp_ns=STAMP + i * 10**8)
+        status = ('human' if i < 3 else 'refined',)
+        frames.append(replace(frame, refined=replace(frame.refined, status=status)))
+    writer, _ = written('tracklets', tmp_path, frames)
+    (note,) = writer.notes
+    assert note.startswith(
+        '1 boxes of the status human have other extents than they had, by up to 0.20 m'
+    )
+
+
+@pytest.mark.parametrize('name', READABLE_FORMATS)
 def test_track_that_changes_its_class(tmp_path, name):
     classes = ['Car', 'Car', 'Van', 'Car']
     frames = [frame_of(stamp_ns=STAMP + i * 10**8, class_name=c) for i, c in enumerate(classes)]

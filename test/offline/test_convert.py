@@ -26,7 +26,7 @@ R_rect: 1 0 0 0 1 0 0 0 1
 Tr_velo_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0
 """
 
-NO_STATUS = {'kitti', 'tracklets', 'mcap', 'recording'}
+NO_STATUS = {'mcap', 'recording'}
 WITH_STATUS = tuple(
     sorted(name for name in FORMATS if not labels_points(name) and name not in NO_STATUS)
 )
@@ -363,6 +363,16 @@ def test_a_missing_camera_is_refused_before_a_recording_is_read(tmp_path):
     options = Options(camera=Path('missing.yaml'))
     with pytest.raises(ConfigError, match=r'missing\.yaml: cannot be read'):
         Request((tmp_path / 'missing.mcap',), formats=('kitti',), options=options)
+
+
+def test_frames_that_have_no_row_in_a_table_are_counted(tmp_path, capsys):
+    times = '{"1": {"frame_properties": {"timestamp": 1.0}, "objects": {}}}'
+    (tmp_path / 'a.json').write_text(
+        '{"openlabel": {"metadata": {"schema_version": "1.0.0"}, "frames": ' + times + '}}'
+    )
+    command = ['convert', str(tmp_path / 'a.json'), '-o', str(tmp_path / 'out')]
+    assert cli.main([*command, '--from=openlabel', '--to=csv,waymo']) == 0
+    assert '1 frames without boxes are not in csv' in capsys.readouterr().out
 
 
 def test_formats_command_lists_all_formats(capsys):
