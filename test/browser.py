@@ -84,6 +84,13 @@ def opened_page(url, expected='', ready='html[data-ready]', **context):
     assert not unexpected, unexpected
 
 
+def show_charts(page):
+    """Scroll to the charts of the open track, which are drawn then, and back."""
+    page.locator('#charts').scroll_into_view_if_needed()
+    page.wait_for_function("view.charts && !$('cursor').hidden")
+    page.locator('#title').scroll_into_view_if_needed()
+
+
 def press(page, key, until, **options):
     """Press a key, and wait until an expression holds on the page."""
     page.keyboard.press(key)

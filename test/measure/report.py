@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.review.report import REPORT
-from browser import launched
+from browser import launched, show_charts
 from measure.common import BOXREG
 from measure.speed.recordings import write_traffic
 import numpy as np
@@ -131,7 +131,8 @@ def _stepped(report, options):
         page.wait_for_selector('html[data-ready]', timeout=120_000)
         paint = page.wait_for_function(FIRST_PAINT, polling=100).json_value()
         page.evaluate('openTrack(DATA.tracks.findIndex(track => track.boxes > 1))')
-        page.wait_for_function('view.space && view.charts', timeout=120_000)
+        page.wait_for_function('view.part', timeout=120_000)
+        show_charts(page)
         page.evaluate(STEPPING, WARM_UP_STEPS)
         starts, scripts = page.evaluate(STEPPING, STEPS)
     frames = np.diff(starts)

@@ -15,7 +15,7 @@ from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.decisions import APPLIED, Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, kept
-from browser import NEEDS_BROWSER, opened_page, press, serving
+from browser import NEEDS_BROWSER, opened_page, press, serving, show_charts
 import numpy as np
 import pytest
 from relabel_results import rows_in
@@ -346,6 +346,7 @@ def test_decisions_of_the_page_are_all_in_the_labels_that_it_writes(
         page.keyboard.press('b')
         page.evaluate('step(5)')
         press(page, 'Shift+D', 'current().deleted === 2')  # the end of its input
+        show_charts(page)
         DecisionLog(out / DECISIONS).append([Decision('nobody', None, 'delete')])
         page.keyboard.press('Control+s')
         page.wait_for_selector('#failure:not([hidden])', timeout=120_000)

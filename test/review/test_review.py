@@ -24,7 +24,7 @@ from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, kept, RefinedBoxes
-from browser import NEEDS_BROWSER, opened_page, press, serving
+from browser import NEEDS_BROWSER, opened_page, press, serving, show_charts
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -600,7 +600,8 @@ def test_page_waits_for_the_rest_of_what_is_half_read(result, half_read):
     place = source.index(b'</script>', source.index(f'id="{half_read}"'.encode())) - 100
     with slowly_served(source, place) as url, opened_page(f'{url}#tracks', '404') as page:
         page.evaluate('openTrack(0)')
-        page.wait_for_function('view.part && view.charts')
+        page.wait_for_function('view.part')
+        show_charts(page)
 
 
 @NEEDS_BROWSER
@@ -646,7 +647,8 @@ def test_slider_keys_and_links_step_through_a_track(result):
         page.keyboard.press('Shift+ArrowRight')
         assert row() == 13
         assert page.evaluate("document.getElementById('top').toDataURL()") != before
-        page.wait_for_function("location.hash.includes('stamp=') && view.part && view.charts")
+        page.wait_for_function("location.hash.includes('stamp=') && view.part")
+        show_charts(page)
         page.keyboard.press('ArrowDown')
         press(page, 'ArrowUp', 'view.part !== null')
         for mode in ('after', 'before', 'sweep'):
@@ -662,7 +664,58 @@ def test_slider_keys_and_links_step_through_a_track(result):
         page.evaluate('view.part.usable[4] = null; step(4, true)')
         assert page.inner_text('#legend') == 'no valid box at this stamp'
         assert page.locator('#space canvas').count() > 0
-        assert page.locator('#charts svg.main-svg').count() > 0
+
+
+CHART = "$('charts').data?.[0].x.length && [view.charts, $('charts').data[0].y]"
+"""Whether the charts are of the open track, and the risk of each box of theirs."""
+
+
+@NEEDS_BROWSER
+def test_charts_are_those_of_the_open_track_once_they_are_seen(result):
+    with opened_page((result[1] / 'report.html').as_uri() + '#track=2') as page:
+
+        def open_next(key):
+            before = page.evaluate('view.open.id')
+            press(page, key, f'view.open.id !== {before!r} && view.part')
+            page.evaluate('painted().then(painted)')  # what is in view is known by then
+            return page.evaluate('view.part.risk')
+
+        open_next('ArrowDown')
+        first = open_next('ArrowUp')
+        assert page.evaluate('plotly === undefined')  # a second of the start of each page
+        page.locator('#charts').scroll_into_view_if_needed()
+        page.wait_for_selector('#charts svg.main-svg')
+        assert page.evaluate(CHART) == [True, first]
+        page.wait_for_function("!$('cursor').hidden")
+        second = open_next('ArrowDown')
+        assert second != first
+        page.wait_for_function('view.charts')
+        assert page.evaluate(CHART) == [True, second]
+        page.locator('#title').scroll_into_view_if_needed()
+        open_next('ArrowUp')
+        assert page.evaluate(CHART) == [False, second]
+        show_charts(page)
+        assert page.evaluate(CHART) == [True, first]
+
+
+@NEEDS_BROWSER
+def test_what_is_printed_has_its_charts_though_nobody_has_seen_them(result):
+    url = (result[1] / 'report.html').as_uri() + '#track=1'
+    small = {'viewport': {'width': 390, 'height': 400}, 'color_scheme': 'dark'}
+    with opened_page(url, **small) as page:
+        page.evaluate('painted().then(painted)')
+        assert page.evaluate('plotly === undefined')
+        for tab, plot in (('tracks', 'charts'), ('overview', 'map')):
+            page.click(f'#tab-{tab}')
+            page.evaluate(
+                f"window.print = () => {{ onPaper = '{plot}:' + $('{plot}').childElementCount; }}"
+            )
+            page.keyboard.press('Control+p')
+            page.wait_for_function(f"window.onPaper === '{plot}:1'")
+        text = "$('map')._fullLayout.font.color"
+        dark = page.evaluate(text)
+        page.emulate_media(media='print')
+        page.wait_for_function(f'{text} !== {dark!r}')
 
 
 @NEEDS_BROWSER
@@ -670,6 +723,7 @@ def test_slider_keys_and_links_step_through_a_track(result):
 def test_narrow_page_does_not_overflow(result, scheme):
     narrow = {'viewport': {'width': 390, 'height': 844}, 'color_scheme': scheme}
     with opened_page((result[1] / 'report.html').as_uri(), **narrow) as page:
+        page.locator('#map').scroll_into_view_if_needed()
         page.wait_for_selector('#map .main-svg')
         for tab in ('tracks', 'run', 'overview'):
             page.click(f'#tab-{tab}')

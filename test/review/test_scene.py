@@ -17,7 +17,7 @@ from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_d
 from boxreg_ros.review.fit import drawn, fitted, USUAL_EXTENTS
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray
-from browser import NEEDS_BROWSER, opened_page, press, serving
+from browser import NEEDS_BROWSER, opened_page, press, serving, show_charts
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -128,6 +128,7 @@ def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serv
         press(page, 'Enter', "view.part.status.filter(one => one === 'human').length === 2")
         assert page.evaluate('view.row') == 0
         assert 'human' in page.inner_text('#clock')
+        show_charts(page)
         page.evaluate('step(5)')
         press(page, 'Shift+D', 'current().deleted === 1')
         page.keyboard.press('k')

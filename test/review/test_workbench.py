@@ -433,6 +433,9 @@ def test_axe_finds_nothing(server, context):
     with opened_page(server.address, **context) as page:
         for tab in ('overview', 'tracks', 'drive', 'run'):
             page.click(f'#tab-{tab}')
+            for plot in page.locator(f'#{tab} .plot').all():
+                plot.scroll_into_view_if_needed()
+                plot.locator('.main-svg').first.wait_for()
             page.wait_for_timeout(500)
             check(page)
         page.click('#tab-tracks')

@@ -90,9 +90,14 @@ function nextTrack(by) {
 
 function onKey(event) {
   if (document.querySelector('dialog[open]')) return;
-  if ((event.ctrlKey || event.metaKey) && !event.altKey && event.key.toLowerCase() === 's' && IS_REVIEW) {
+  const isControl = (event.ctrlKey || event.metaKey) && !event.altKey;
+  if (isControl && event.key.toLowerCase() === 's' && IS_REVIEW) {
     event.preventDefault();
     return void save();
+  }
+  if (isControl && event.key === 'p') {
+    event.preventDefault();
+    return void printPage();
   }
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   // The focus stays in a dialog for a moment after it has closed.

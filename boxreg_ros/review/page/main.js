@@ -41,7 +41,7 @@ async function openTrack(index, stamp = null, row = null, isLinked = false) {
   }
   if (stamp) row = nearestRow(stamp);
   if (view.part) step(row ?? view.row, true);
-  drawCharts();
+  drawOnceSeen('charts');
 }
 
 function nearestRow(stamp, part = view.part) {
@@ -120,7 +120,7 @@ function showTab(name) {
     $('tab-' + one).setAttribute('aria-selected', String(one === name));
   }
   if (name === 'overview') { drawOverview(); drawTimeline(); }
-  if (name === 'overview' && !$('map').hasChildNodes()) setTimeout(() => { drawMap(); drawExample(); });
+  if (name === 'overview' && !$('map').hasChildNodes()) setTimeout(() => { drawOnceSeen('map'); drawExample(); });
   if (name === 'tracks') drawLines();
   if (name === 'drive') showScene(scene.sweep ? scene.at : Math.max(0, view.part ? DATA.stamps.indexOf(view.part.stamps[view.row]) : 0), true);
 }

@@ -93,15 +93,32 @@ let plotly;
 
 function withPlotly() {
   plotly ??= (async () => {
-    await painted();  // the script takes a second to start
+    await painted();  // the script takes a while to start
     document.head.append(element('script', { nonce: NONCE }, await inflate(await textOf('plotly'))));
     $('plotly').remove();
   })();
   return plotly;
 }
 
+// Plotly takes a second: it draws what is scrolled into view.
+const onceSeen = new IntersectionObserver(entries => {
+  for (const { isIntersecting, target } of entries) if (isIntersecting) (target.id === 'map' ? drawMap : drawCharts)();
+});
+
+function drawOnceSeen(id) {
+  onceSeen.unobserve($(id));  // what is in view already is reported again
+  onceSeen.observe($(id));
+}
+
+// A browser does not wait for what is drawn while it prints.
+async function printPage() {
+  await ($('overview').hidden ? drawCharts() : drawMap());
+  print();
+}
+
 async function drawMap() {
   await withPlotly();
+  if ($('map').hasChildNodes()) return;
   const lines = { x: [], y: [], customdata: [], text: [] };
   const shownAs = new Map(TRACKS.flatMap(({ pieces, index }) => pieces.map(({ s }) => [DATA.tracks[s], index])));
   for (const track of DATA.tracks) {
