@@ -7,6 +7,7 @@ minimised. How many rounds there are, and what they use, is a `SolverPlan`, chos
 """
 
 from collections.abc import Callable
+from math import ceil
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
@@ -43,10 +44,10 @@ time."""
 NOISE_ROUNDS = 2
 """First rounds of a whole track whose residuals give the input noise. Chosen: later fits follow
 the input, and the noise would be estimated smaller in every round."""
-WINDOWS_AT_ONCE = 96
-"""Most windows that a thread takes through the steps of a round together, so that their data stay
-in the nearer caches of the processor. Measured: a sweep of 512 tracks took 0.89 of the time, as it
-did with 64 and with 128."""
+POSES_AT_ONCE = 960
+"""Most poses, or those of one window, that a thread takes through the steps of a round together,
+so that their data stay in the nearer caches of the processor. Measured: a sweep of 512 tracks, of
+ten poses each, took 0.89 of the time, as it did with 640 and with 1,280."""
 
 
 class SolverPlan(NamedTuple):
@@ -87,8 +88,6 @@ class Batch(NamedTuple):
     problem: Problem
     free: Floats
     """(B, 6 N + S), 1 for variables that are estimated."""
-    sums: method.Sums
-    """The sums of residuals of the round."""
     solution: Solution
     """Where the round begins; the round writes its end."""
 
@@ -176,7 +175,7 @@ def start(problem: Problem, config: Config, plan: SolverPlan, inputs: Inputs) ->
         ),
         no_priors(leaving),
     )  # fmt: skip
-    return Batch(problem, free, method.empty_sums(B, N, number), solution)
+    return Batch(problem, free, solution)
 
 
 def run_round(
@@ -200,37 +199,42 @@ def run_round(
     constants = constants.in_round(uses_shape, is_smooth)
     ends = turn + 1 >= plan.rounds, turn > 0
     is_done = []
-    for part in np.array_split(rows, -(-len(rows) // (WINDOWS_AT_ONCE * num_workers()))):
-        observe(batch, inputs, part, constants)
-        is_done.append(fit(batch, inputs, part, constants, *ends))
+    at_once = max(1, POSES_AT_ONCE * num_workers() // batch.problem.length)
+    for part in np.array_split(rows, ceil(len(rows) / at_once)):
+        sums = observe(batch, inputs, part, constants)
+        is_done.append(fit(batch, sums, inputs, constants, *ends))
     return np.concatenate(is_done)
 
 
-def observe(batch: Batch, inputs: Inputs, rows: Ints, constants: Constants) -> None:
-    """Write what the points show of the windows `rows` (b,) where the round begins."""
-    problem, _, sums, solution = batch
+def observe(batch: Batch, inputs: Inputs, rows: Ints, constants: Constants) -> method.Sums:
+    """Return what the points show of the windows `rows` (b,) where the round begins."""
+    problem, free, solution = batch
+    N = solution.poses.shape[1]
+    sums = method.empty_sums(rows, N, free.shape[1] - 6 * N)
     record, at = constants.record(), (solution.poses, solution.shared)
     run(observe_faces, 40, len(rows), rows, problem, *at, inputs, record, sums.terms)
     if constants.uses_shape:
         thinned = problem.thinned(constants.shape_points)
         run(observe_shapes, 20, len(rows), rows, thinned, *at, record, sums.terms)
+    return sums
 
 
 @torch.inference_mode()
 def fit(
     batch: Batch,
+    sums: method.Sums,
     inputs: Inputs,
-    rows: Ints,
     constants: Constants,
     is_last: bool,
     may_settle: bool,
 ) -> NDArray[np.bool_]:
-    """Search the minima of the windows `rows` (b,) after `observe`, and end their round."""
-    objective = Objective(batch, inputs, constants.record(), rows)
+    """Search the minima of `sums`, with what `observe` has found, and end the round of these."""
+    rows = np.arange(len(sums.windows))
+    objective = Objective(batch, sums, inputs, constants.record(), rows)
     x = search(objective)
     is_done = end(objective, x, is_last, may_settle)
     if len(batch.solution.left.state):
-        is_leaving = is_done & (batch.problem.lengths[rows] == batch.problem.length)
+        is_leaving = is_done & (batch.problem.lengths[sums.windows] == batch.problem.length)
         leaving = objective._replace(rows=rows[is_leaving])
         leaving.sum(x[None, is_leaving], method.OLDEST)
     return is_done
@@ -247,18 +251,19 @@ def search(objective: 'Objective') -> Floats:
 
 def end(objective: 'Objective', x: Floats, is_last: bool, may_settle: bool) -> NDArray[np.bool_]:
     """End the round of the windows of an objective at x (b, D); return which are done."""
-    batch, _, constants, rows = objective
+    batch, sums, _, constants, rows = objective
     is_done = np.empty(len(rows), bool)
     run(
-        method.end, 20, len(rows), rows, x, batch, constants, is_last, may_settle, is_done,
+        method.end, 20, len(rows), x, batch, sums, constants, is_last, may_settle, is_done,
     )  # fmt: skip
     return is_done
 
 
 class Objective(NamedTuple):
-    """The sums of residuals of the windows `rows` (b,) of a batch, as `minimize` calls them."""
+    """The sums of the windows `rows` (b,) of those of a round, as `minimize` calls them."""
 
     batch: Batch
+    sums: method.Sums
     inputs: Inputs
     constants: NDArray[np.void]
     rows: Ints
@@ -278,7 +283,7 @@ class Objective(NamedTuple):
         """
         value, gradient, scaled = np.empty(x.shape[:2]), np.empty(x.shape), np.empty(x.shape)
         run(
-            method.evaluate, 8, len(self.rows), self.rows, wanted, self.batch, self.inputs,
-            self.constants, x, value, gradient, scaled,
+            method.evaluate, 8, len(self.rows), self.rows, wanted, self.batch, self.sums,
+            self.inputs, self.constants, x, value, gradient, scaled,
         )  # fmt: skip
         return torch.from_numpy(value), torch.from_numpy(gradient), torch.from_numpy(scaled)

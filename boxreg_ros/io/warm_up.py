@@ -16,6 +16,7 @@ from boxreg_ros.core.input_model import InputModel, Inputs
 from boxreg_ros.core.method.arrays import INPUTS
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.method.residuals import TERMS
+from boxreg_ros.core.method.round import empty_sums, Sums
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.point_labels import ObjectTrack, PointLabeller
 from boxreg_ros.core.problem import stack_windows
@@ -81,11 +82,12 @@ def warm_up_solver(config: Config) -> None:
         plan.uses_rigid_shape, is_smooth=True
     )
     batch = solver.start(problem, quick, plan, inputs)
-    batch.sums.terms[:] = np.zeros((), TERMS)
     batch.solution.poses[0, -1, 0] += 0.1  # off its input, so that there is something to search
     first = np.zeros(1, int)
-    solver.observe(batch, inputs, first, constants.in_round(uses_shape=False, is_smooth=True))
-    solver.search(solver.Objective(batch, inputs, constants.record(), first))
+    faces = constants.in_round(uses_shape=False, is_smooth=True)
+    sums = solver.observe(batch, inputs, first, faces)
+    sums.terms['root'] = sums.terms['wanted'] = 0.0
+    solver.search(solver.Objective(batch, sums, inputs, constants.record(), first))
 
 
 class SecondProcess:
@@ -202,23 +204,27 @@ def warm_up_others(
     warm_up_followed(config)
 
 
-def _observe_nothing(batch: Batch, _: Inputs, rows: Ints, __: Constants) -> None:
-    """Write faces that are seen where they are expected."""
-    batch.sums.terms[rows] = np.zeros((), TERMS)
-    batch.sums.terms['visibility'][rows] = 1.0
-    batch.sums.terms['num_points'][rows] = 64.0
+def _observe_nothing(batch: Batch, _: Inputs, rows: Ints, __: Constants) -> Sums:
+    """Return faces that are seen where they are expected."""
+    N = batch.solution.poses.shape[1]
+    sums = empty_sums(rows, N, batch.free.shape[1] - 6 * N)
+    sums.terms[:] = np.zeros((), TERMS)
+    sums.terms['visibility'] = 1.0
+    sums.terms['num_points'] = 64.0
+    return sums
 
 
 def _fit_without_search(
-    batch: Batch, inputs: Inputs, rows: Ints, constants: Constants, *_: bool
+    batch: Batch, sums: Sums, inputs: Inputs, constants: Constants, *_: bool
 ) -> NDArray[np.bool_]:
     """End a round where it begins: all but the kernels of the search are loaded or compiled."""
     from boxreg_ros.core import solver
 
     # The sums have not been written, so that nothing may be read of what follows from them.
     aside = batch._replace(solution=deepcopy(batch.solution))
+    rows = np.arange(len(sums.windows))
     x = np.zeros((len(rows), batch.free.shape[1]))
-    objective = solver.Objective(aside, inputs, constants.record(), rows)
+    objective = solver.Objective(aside, sums, inputs, constants.record(), rows)
     return solver.end(objective, x, is_last=True, may_settle=True)
 
 

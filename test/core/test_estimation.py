@@ -187,7 +187,7 @@ def test_the_number_of_threads_does_not_change_results(estimate):
 def test_windows_that_pass_a_round_in_parts_have_the_same_boxes(monkeypatch, estimate):
     config = ALONE.updated({'estimate': estimate})
     known = solved(windows(), config, InputModel(config.faces))
-    monkeypatch.setattr(solver, 'WINDOWS_AT_ONCE', 1)
+    monkeypatch.setattr(solver, 'POSES_AT_ONCE', 1)
     found = solved(windows(), config, InputModel(config.faces))
     for a, b in zip(found, known, strict=True):
         np.testing.assert_array_equal(a.boxes, b.boxes)
@@ -419,8 +419,8 @@ def test_minimum_of_the_default_objective_against_torch():
     batch = start(problem, ALONE, SolverPlan.choose(ALONE, False), inputs)
     rows, x = np.arange(4), np.empty((2, *batch.free.shape))
     batch.free[:] = 1.0
-    observe(batch, inputs, rows, constants)
-    function = Objective(batch, inputs, constants.record(), rows)
+    sums = observe(batch, inputs, rows, constants)
+    function = Objective(batch, sums, inputs, constants.record(), rows)
     points = torch.from_numpy(x)
     first, trial = zip(points, *function.sum(x, method.START), strict=True)
     start_x, value = first[0], first[1]
@@ -433,8 +433,8 @@ def test_minimum_of_the_default_objective_against_torch():
         np.testing.assert_array_equal(part, again)
     assert (found.value < 0.9 * value).all()
     for row in range(4):
-        terms = objective.tensors(batch.sums.terms[row])
-        common = objective.tensors(batch.sums.common[row])
+        terms = objective.tensors(sums.terms[row])
+        common = objective.tensors(sums.common[row])
 
         prior = problem.prior_mean[row], problem.prior_information[row]
         prior = [*map(torch.from_numpy, prior)]

@@ -462,10 +462,10 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
 
 @kernel
 def observe_faces(first, last, rows, problem, poses, shared, inputs, constants, terms):
-    """Write the face observations of the windows `rows[first:last]`, see `observe_window`."""
+    """Write face observations of the windows `rows[first:last]`, one by one: `observe_window`."""
     constants = constants[0]
     work = empty_face_work(problem, constants)
     for row in range(first, last):
         b = rows[row]
         kind = problem.kind[b]
-        observe_window(b, problem, poses[b], shared[b], inputs[kind], constants, work, terms[b])
+        observe_window(b, problem, poses[b], shared[b], inputs[kind], constants, work, terms[row])

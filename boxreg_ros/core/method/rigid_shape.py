@@ -247,4 +247,4 @@ def observe_shapes(first, last, rows, problem, poses, shared, constants, terms):
     work = empty_shape_work(problem, poses.shape[1], constants.cells)
     for row in range(first, last):
         b = rows[row]
-        agree(b, problem, poses[b], shared[b, :3], constants, work, terms[b])
+        agree(b, problem, poses[b], shared[b, :3], constants, work, terms[row])

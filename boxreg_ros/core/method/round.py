@@ -37,15 +37,18 @@ from boxreg_ros.core.method.covariance import empty_inverse, fill_posterior
 from boxreg_ros.core.method.expectation import expect, fill_evidence
 from boxreg_ros.core.method.residuals import empty_linearised, TERMS
 import numpy as np
+from numpy.typing import NDArray
 
 
 class Sums(NamedTuple):
     """
-    The sums of the residuals of B windows in one round.
+    The sums of the residuals of the windows that pass a round together.
 
     Attributes
     ----------
-    terms, common : array of `TERMS` and `COMMON`, shapes (B, N) and (B,)
+    windows : array, shape (b,)
+        Windows of the batch.
+    terms, common : array of `TERMS` and `COMMON`, shapes (b, N) and (b,)
         Data and weights.
     factor : Factor
         Of the Gauss-Newton curvature at the start of the round; NaN where it is not positive
@@ -53,16 +56,18 @@ class Sums(NamedTuple):
 
     """
 
+    windows: Any
     terms: Any
     common: Any
     factor: Any
 
 
-def empty_sums(B: int, N: int, S: int) -> Sums:
-    """Return room for B windows of N observations; all of it is written before it is read."""
-    coupling = np.empty((B, N, POSE, padded(S + NEXT)))
-    factor = Factor(np.empty((B, N, POSE, POSE)), coupling, np.empty((B, S, S)))
-    return Sums(np.empty((B, N), TERMS), np.empty(B, COMMON), factor)
+def empty_sums(windows: NDArray[np.int64], N: int, S: int) -> Sums:
+    """Return room for `windows` of N observations; all of it is written before it is read."""
+    b = len(windows)
+    coupling = np.empty((b, N, POSE, padded(S + NEXT)))
+    factor = Factor(np.empty((b, N, POSE, POSE)), coupling, np.empty((b, S, S)))
+    return Sums(windows, np.empty((b, N), TERMS), np.empty(b, COMMON), factor)
 
 
 START, VALUE, OLDEST = range(3)
@@ -71,22 +76,26 @@ curvature; for the sum elsewhere; for what the oldest observation leaves."""
 
 
 @kernel
-def evaluate(first, last, rows, wanted, batch, inputs, constants, x, value, gradient, scaled):
+def evaluate(first, last, rows, wanted, batch, sums, inputs, constants, x, value, gradient,
+             scaled):  # fmt: skip
     """
-    Sum the residuals of the windows `rows[first:last]`.
+    Sum the residuals of the windows `sums.windows[rows[first:last]]`.
 
     Parameters
     ----------
     first, last : int
         First row, and the one after the last.
     rows : array, shape (b,)
-        Windows of the batch that take part.
+        Windows of the sums that take part.
     wanted : int
         `START`: expect and weigh, with the face observations and the rigid shape; write the
         weights and the factor. `VALUE`: the sum alone. `OLDEST`: only the residuals of the oldest
         observation, which become a prior (M13).
     batch : Batch
         Of the solver.
+    sums : Sums
+        Of the round. Terms are those of the faces, and of the rigid shape; the rest is written at
+        the `START`.
     inputs : array of `INPUTS`, shape (K,)
         Noise, margins and population of the input, by kind.
     constants : array of one record of `Constants`, shape (1,)
@@ -99,25 +108,26 @@ def evaluate(first, last, rows, wanted, batch, inputs, constants, x, value, grad
         observation are only to work in.
 
     """
-    N = batch.sums.terms.shape[1]
+    N = sums.terms.shape[1]
     none = matrix = no_matrix()
     if wanted != VALUE:  # residuals of the oldest observation depend on three poses
         matrix = empty_matrix(N if wanted == START else 3, x.shape[2] - POSE * N)
     evaluate_in_turn(
-        first, last, rows, wanted, batch, inputs, constants[0], x, value, gradient, scaled,
+        first, last, rows, wanted, batch, sums, inputs, constants[0], x, value, gradient, scaled,
         empty_axes(N), empty_linearised(), none, matrix,
     )  # fmt: skip
 
 
 @loop
-def evaluate_in_turn(first, last, rows, wanted, batch, inputs, constants, x, value, gradient,
+def evaluate_in_turn(first, last, rows, wanted, batch, sums, inputs, constants, x, value, gradient,
                      scaled, at, out, none, matrix):  # fmt: skip
     """Do what `evaluate` does; the arrays after its own are to work in."""
-    problem, free, sums, solution = batch.problem, batch.free, batch.sums, batch.solution
+    problem, free, solution = batch.problem, batch.free, batch.solution
     D, N = x.shape[2], sums.terms.shape[1]
     for row in range(first, last):
-        b = rows[row]
-        terms, common, factor = sums.terms[b], sums.common[b], factor_of_window(b, sums.factor)
+        s = rows[row]
+        b, factor = sums.windows[s], factor_of_window(s, sums.factor)
+        terms, common = sums.terms[s], sums.common[s]
         if wanted == START:
             poses, shared = solution.poses[b], solution.shared[b]
             shared[ANCHOR:] = 0.0
@@ -161,15 +171,15 @@ def has_settled(poses, start, errors, settled_step):
 
 
 @kernel
-def end(first, last, rows, x, batch, constants, is_last, may_settle, is_done):
+def end(first, last, x, batch, sums, constants, is_last, may_settle, is_done):
     """
-    End the round of the windows `rows[first:last]`.
+    End the round of the windows `sums.windows[first:last]`.
 
     Those that are done, since they are settled or the round `is_last`, have covariances.
 
     Parameters
     ----------
-    first, last, rows, batch, constants
+    first, last, batch, sums, constants
         As in `evaluate`; the solution of the batch is written.
     x : array, shape (b, 6 N + S)
         Minimum of each sum.
@@ -180,18 +190,18 @@ def end(first, last, rows, x, batch, constants, is_last, may_settle, is_done):
 
     """
     inverse = empty_inverse(batch.solution.poses.shape[1], batch.solution.shared.shape[1])
-    end_in_turn(first, last, rows, x, batch, constants[0], is_last, may_settle, is_done, inverse)
+    end_in_turn(first, last, x, batch, sums, constants[0], is_last, may_settle, is_done, inverse)
 
 
 @loop
-def end_in_turn(first, last, rows, x, batch, constants, is_last, may_settle, is_done, inverse):
+def end_in_turn(first, last, x, batch, sums, constants, is_last, may_settle, is_done, inverse):
     """Do what `end` does; `inverse` is to work in."""
-    problem, free, sums, solution = batch.problem, batch.free, batch.sums, batch.solution
+    problem, free, solution = batch.problem, batch.free, batch.solution
     N = solution.poses.shape[1]
     n = POSE * N
     for row in range(first, last):
-        b = rows[row]
-        terms, common, factor = sums.terms[b], sums.common[b], factor_of_window(b, sums.factor)
+        b, factor = sums.windows[row], factor_of_window(row, sums.factor)
+        terms, common = sums.terms[row], sums.common[row]
         found = x[row][:n].reshape(N, POSE)
         errors = problem.of_class[b].pose
         is_settled = has_settled(found, solution.poses[b], errors, constants.settled_step)

@@ -98,6 +98,9 @@ def compare(config: Config, count: int, references: int) -> dict[str, float]:
 class _Fit:
     """One window: the sum of its residuals, and where it starts."""
 
+    objective: Objective
+    """The sum, once it has been linearised."""
+
     def __init__(self, problem: Problem, config: Config) -> None:
         model = InputModel(config.faces)
         plan = SolverPlan.choose(config, False)
@@ -105,19 +108,19 @@ class _Fit:
         self.constants = constants.in_round(uses_shape=False, is_smooth=False)
         self.inputs = model.inputs(config)
         self.batch: Batch = start(problem, config, plan, self.inputs)
-        self.row = np.zeros(1, np.int64)
-        self.objective = Objective(self.batch, self.inputs, self.constants.record(), self.row)
 
     def linearise(self) -> tuple[Tensor, float]:
         """Renew the sum where the solution is; return its variables (1, D) and its value."""
-        x = np.empty((2, *self.batch.free.shape))
-        observe(self.batch, self.inputs, self.row, self.constants)
+        x, row = np.empty((2, *self.batch.free.shape)), np.zeros(1, np.int64)
+        sums = observe(self.batch, self.inputs, row, self.constants)
+        self.objective = Objective(self.batch, sums, self.inputs, self.constants.record(), row)
         value, _, _ = self.objective.sum(x, method.START)
         return torch.from_numpy(x[0]), float(value[0, 0])
 
     def deviations(self) -> Tensor:
         """Return the expected error of every variable, 0 for those held fixed; (1, D)."""
-        problem, free, sums, _ = self.batch
+        problem, free, _ = self.batch
+        sums = self.objective.sums
         poses = np.tile(problem.of_class['pose'], problem.length)
         number = free.shape[1] - poses.shape[1]
         errors = np.concatenate([poses, sums.common['deviation'][:, :number]], axis=1)
