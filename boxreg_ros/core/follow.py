@@ -368,8 +368,8 @@ def _of_class(objects: Sequence[_Object]) -> list[_Object]:
 
 def _without_points(one: _Object, count: int) -> str:
     return (
-        f'seeds of track {one.track_id!r}: expected points in their boxes, got {count}; it is not '
-        f'followed: correct the boxes, or their frame'
+        f'seeds of track {one.track_id!r}: expected {GOOD_POINTS} points in their boxes, got '
+        f'{count}; it is not followed: correct the boxes, or their frame'
     )
 
 

@@ -233,10 +233,12 @@ class FixedFrameItems:
     def _count(self, item: Item) -> None:
         given = item.content
         kind = 'sweeps' if isinstance(given, Sweep) else 'box_arrays'
+        # The time of a simulation begins at 0: its first message has a transform, and is used.
+        is_unset = item.reason or self.counts[kind]
+        if given.stamp_ns <= 0 and is_unset and not is_placeholder(given):
+            self.counts[f'{kind}_without_stamp'] += 1
         if not (self._is_merging and isinstance(given, Sweep)):  # those are counted merged
             self.counts[kind] += 1
-        if given.stamp_ns <= 0 and not is_placeholder(given):
-            self.counts[f'{kind}_without_stamp'] += 1
         if not item.reason:
             return
         if isinstance(given, Sweep):

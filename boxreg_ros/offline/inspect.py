@@ -287,7 +287,7 @@ def _warnings(sample: _Sample, finding: str, recording: ItemSource) -> Iterator[
     if sample.without_id:
         yield f'{sample.without_id} boxes have no track id; --associate assigns them'
     for name, stamps in (('clouds', sample.sweeps), ('box arrays', sample.arrays)):
-        unusable = sum(stamp <= 0 for stamp in stamps)
+        unusable = sum(stamp <= 0 for stamp in stamps[1:])  # a simulation begins at 0
         if unusable:
             yield f'{unusable} {name} have the stamp 0 in their header and cannot be used'
         usable = [stamp for stamp in stamps if stamp > 0]

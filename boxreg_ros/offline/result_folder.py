@@ -295,7 +295,7 @@ def _digest(path: Path) -> str:
 
 def _beside(out: Path, suffix: str) -> Path:
     """Return the hidden path beside an output for its lock or its parts."""
-    return out.with_name(f'.{out.name}.{suffix}')
+    return out.parent / f'.{out.name}.{suffix}'
 
 
 def _is_near(path: Path, out: Path) -> bool:

@@ -337,7 +337,7 @@ def test_seeds_that_cannot_be_used_are_named_and_the_rest_is_done():
     by_name = {track.track_id: track for track in tracks}
     assert len(by_name['a'].rows) == N
     assert 'expected one box at a stamp' in by_name['a'].problems[0]
-    assert 'expected points in their boxes, got 0' in by_name['empty'].problems[0]
+    assert 'expected 5 points in their boxes, got 0' in by_name['empty'].problems[0]
     assert by_name['empty'].rows.tolist() == [0]
     assert 'the nearest is' in by_name['late'].problems[0]
     assert not len(by_name['late'].rows)

@@ -114,7 +114,7 @@ def test_boxes_that_cannot_be_followed_are_named_and_the_rest_is_done():
     lines = dict(registrar.followed.refused)
     assert len(registrar.followed.refused) == 5
     assert 'expected a track id' in lines['']
-    assert 'expected points in it, got 0' in lines['road']
+    assert 'expected 5 points in it, got 0' in lines['road']
     assert 'finite' in lines['nan']
     assert 'the nearest is 5.00 s away' in lines['old']
     assert 'the nearest is' in lines['ahead']

@@ -539,6 +539,15 @@ def test_stamps_of_zero_are_reported(tmp_path, capsys):
     assert summary['without_stamp'] == {'sweeps': 2}
 
 
+def test_a_simulation_begins_at_0_without_a_word(tmp_path, capsys):
+    path = str(Drive(sweeps=12, start=0).write(tmp_path / 'drive'))
+    assert main(['relabel', path, '-o', str(tmp_path / 'out'), '--strict']) == 0
+    assert main(['inspect', path]) == 0
+    output = capsys.readouterr()
+    assert '24 boxes in, 24 refined' in output.out
+    assert 'stamp 0' not in output.out + output.err
+
+
 def zero_of(drive):
     return drive.messages.make('builtin_interfaces/msg/Time', sec=0, nanosec=0)
 

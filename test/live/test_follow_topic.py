@@ -66,7 +66,7 @@ def test_one_box_is_followed_until_its_points_are_gone(graph: Graph, tmp_path):
     assert values[f'lost {name}'].startswith(f'few_points at {last}, x ')
     assert values['not_followed'] == '2'
     assert 'expected a track id' in values['not_followed ']
-    assert 'expected points in it, got 0' in values['not_followed road']
+    assert 'expected 5 points in it, got 0' in values['not_followed road']
     assert ended_cleanly(node)
     assert (
         'not_followed: : box at' in node.output() and f'lost: {name}: few_points' in node.output()

@@ -61,7 +61,7 @@ def test_keyframes_get_a_box_at_every_sweep(street, tmp_path, capsys):
     assert main([*words, '--keyframes', '--formats', 'csv,openlabel']) == 0
     printed = capsys.readouterr()
     assert f'boxes at 4 stamps before, {SWEEPS + 1} after' in printed.out
-    assert "seeds of track 'nothing': expected points in their boxes" in printed.err
+    assert "seeds of track 'nothing': expected 5 points in their boxes" in printed.err
     assert "track 'late'" in printed.err and 'the nearest is' in printed.err
     rows = rows_of(out)
     given = rows_in(street / 'keys.csv')
@@ -117,7 +117,7 @@ def test_bad_keyframes_are_named_in_one_line_each_and_the_rest_is_done(street, t
         'between': 'the nearest is 999',
         'twice': 'expected one box at a stamp; the first is used',
         'jumps': 'too far apart',
-        'road': 'expected points in their boxes',
+        'road': 'expected 5 points in their boxes',
     }
     for name, words in named.items():
         assert [line for line in problems[name] if words in line], (name, problems[name])

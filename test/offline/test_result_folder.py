@@ -148,6 +148,9 @@ def test_the_current_folder_is_not_replaced(tmp_path, capsys, monkeypatch):
         assert 'not the current one nor contains it' in capsys.readouterr().err
     monkeypatch.chdir(tmp_path / 'out')
     assert main(['relabel', str(recording), '-o', '.', *QUICK]) == 2
+    capsys.readouterr()
+    assert main(['relabel', str(recording), '-o', '/', *QUICK]) == 2
+    assert "output '/': expected a folder that contains no input" in capsys.readouterr().err
 
 
 def test_a_full_disk_is_named_and_nothing_is_written(tmp_path):

@@ -193,8 +193,8 @@ class FollowedObjects:
         stamp_ns = self._arrived.sweeps[row].stamp_ns
         follower = Follower(sweeps, seeds, self._config.kind(one.class_name), owned)
         if follower.num_points < GOOD_POINTS:
-            what = f'expected points in it, got {follower.num_points}: correct it, or its frame'
-            self._refuse(one, stamp_ns, what)
+            got = f'expected {GOOD_POINTS} points in it, got {follower.num_points}'
+            self._refuse(one, stamp_ns, f'{got}: correct it, or its frame')
             return
         way = follower.begin(0, 1)
         way.poses[row] = one.box[POSE4]
