@@ -167,7 +167,7 @@ def test_the_first_fit_has_no_residual_of_variables_that_it_lacks(estimate, monk
     sought, search = [], solver.search
     monkeypatch.setattr(solver, 'search', lambda fit: sought.append(fit) or search(fit))
     warm_up_solver(Config.from_dict({'estimate': estimate}))
-    ((batch, _, constants, _),) = sought
+    ((batch, _, _, constants, _),) = sought
     has_shape = constants['residuals'][0, RESIDUAL_NAMES.index('rigid shape')]
     assert has_shape == (batch.solution.shared.shape[1] == SHARED)
 
