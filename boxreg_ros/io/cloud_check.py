@@ -26,6 +26,8 @@ PACKET_CLOUDS = 30
 """Clouds by which it is seen whether each is a whole sweep; chosen: packets are 10 or more."""
 MIN_PACKETS = 3
 """Clouds that a revolution is split into, at least; chosen: two LiDARs may share a frame."""
+SAME_VIEW = 0.5
+"""Part of the sectors of two clouds that both have, from which they see the same; chosen: half."""
 PERIOD_QUANTILE = 0.8
 """Quantile of the steps between clouds that is a period; derived: up to four LiDARs on a topic."""
 SHORT_STEP, SHORT_SHARE = 0.25, 0.4
@@ -73,7 +75,8 @@ class CloudCheck:
         """Return what was found so far."""
         parts = _frames_text(self._frames)
         if not parts and len(self._sectors) == PACKET_CLOUDS:
-            parts = _lidars_text(self._stamps_ns) or _packets_text(self._sectors)
+            seen = self._sectors
+            parts = _lidars_text(self._stamps_ns) or _packets_text(seen) or _turns_text(seen)
         return [text for text in (parts, self._coordinates) if text]
 
 
@@ -130,6 +133,23 @@ def _packets_text(seen: Sequence[NDArray[np.bool_]]) -> str:
         f'{together * degrees:.0f}: most boxes have no points in the cloud of their time; join '
         f'the clouds of each revolution, by the setting of the driver, or in a copy of the '
         f'recording, with the times of the points'
+    )
+
+
+def _turns_text(seen: Sequence[NDArray[np.bool_]]) -> str:
+    """Return that two views take turns in some clouds; '' if each sees what the one before did."""
+
+    def overlap(steps: int) -> float:
+        pairs = zip(seen, seen[steps:], strict=False)
+        return float(np.median([(a & b).sum() / max(1, (a | b).sum()) for a, b in pairs]))
+
+    if not overlap(1) < SAME_VIEW <= overlap(2):
+        return ''
+    degrees = [360 / SECTORS * _extent(one) for one in (seen[0], seen[1], seen[0] | seen[1])]
+    return (
+        f'clouds: expected all of a view in each, got two by turns, of about {degrees[0]:.0f} and '
+        f'{degrees[1]:.0f} degrees of azimuth, {degrees[2]:.0f} together: the boxes in one have '
+        f'no points in clouds of the other; {ON_ONE_TOPIC}'
     )
 
 

@@ -43,6 +43,8 @@ STEP_RADIUS = 20.0
 """Distance from the sensor at which a rotation counts as a step [m]; chosen: that of objects."""
 MAX_EGO_SPEED = 100.0
 """Speed that no vehicle has [m/s]; derived: 360 km/h."""
+MAX_EGO_ACCELERATION = 20.0
+"""Acceleration that no vehicle has [m/s^2]; derived: tyres transmit that of gravity, and twice."""
 MIN_ALTERNATIONS = 3
 """Samples at impossible speed that mean two publishers; chosen: one or two are a restart."""
 MIN_REVERSALS = 3
@@ -122,6 +124,8 @@ class JumpSearch:
     """By parent and child, of the transforms that stepped."""
     alternations: dict[tuple[str, str], FrameSteps] = field(default_factory=dict)
     """FrameSteps of the motion itself that no vehicle makes: too fast, or back and forth."""
+    jumps: dict[tuple[str, str], FrameSteps] = field(default_factory=dict)
+    """FrameSteps of the motion itself after which it goes on as before, displaced."""
     _seen_ns: dict[tuple[str, str], int] = field(default_factory=dict)
     _reversals: Counter[tuple[str, str]] = field(default_factory=Counter)
     """Steps back and forth up to the last sample."""
@@ -136,6 +140,7 @@ class JumpSearch:
                     self._add_step(tree, edge, row, sensor_frame)
                 else:
                     self._add_speed(edge, row)
+                    self._add_jump(edge, row)
 
     def smooth_frame(self, tree: TransformTree, fixed_frame: str, sensor_frame: str) -> str:
         """Return the topmost frame on the way to the sensor that no transform below it steps."""
@@ -180,6 +185,30 @@ class JumpSearch:
         is_too_fast = way > MIN_STEP and way > MAX_EGO_SPEED * seconds
         if is_too_fast or self._reversals[key] >= MIN_REVERSALS:
             self.alternations.setdefault(key, FrameSteps(*key)).add(way, edge.stamps[row])
+
+    def _add_jump(self, edge: Edge, row: int) -> None:
+        """
+        Note a step of the motion that no acceleration explains, two samples before the newest one.
+
+        With acceleration a, the velocity in the middle of five steps differs from their median by
+        at most a times half of their time. A single wrong sample is a step there and one back.
+
+        """
+        if row < 5:
+            return
+        stamps_ns, poses = edge.stamps[row - 5 : row + 1], edge.poses[row - 5 : row + 1]
+        if np.linalg.norm(poses[3][:3] - poses[2][:3]) <= MIN_STEP:
+            return
+        seconds = np.diff(stamps_ns)[:, None] * 1e-9
+        steps = np.diff([pose[:3] for pose in poses], axis=0)
+        steps -= np.median(steps / seconds, axis=0) * seconds  # off the motion around them
+        jump = steps[2]
+        limit = max(MIN_STEP, MAX_EGO_ACCELERATION * seconds[2, 0] * seconds.sum() / 2)
+        pairs = jump, jump + steps[1], jump + steps[3]
+        if min(map(np.linalg.norm, pairs)) > limit:
+            key = edge.parent, edge.child
+            way = float(np.linalg.norm(jump))
+            self.jumps.setdefault(key, FrameSteps(*key)).add(way, stamps_ns[3])
 
 
 def _moves(edge: Edge) -> bool:
@@ -333,6 +362,7 @@ class MotionCheck:
         found = {
             'jumps': Finding(Reason.FIXED_FRAME_JUMPS, self._jump_text(fixed_frame, frame)),
             'publishers': Finding(fault, self._publisher_text() or _contradiction_text(route)),
+            'displaced': Finding(fault, self._displaced_text()),
             'clock': Finding(clock, self._clock_text(moving)),
             'boxes_clock': Finding(clock, self._boxes_clock_text()),
             'microseconds': Finding(clock, self._microseconds_text()),
@@ -344,6 +374,8 @@ class MotionCheck:
             'once': Finding(fault, _once_text([edge for edge in route if edge not in moving])),
         }
         self.findings |= {kind: one for kind, one in found.items() if one.text}
+        if 'publishers' in self.findings:
+            self.findings.pop('displaced', None)
         for kind in ('clock', 'boxes_clock'):
             if not found[kind].text and len(self._received_ns) >= SETTLED_CLOUDS:
                 self.findings.pop(kind, None)  # an offset of the first ones that is not constant
@@ -369,6 +401,18 @@ class MotionCheck:
                     f'--fixed-frame or --odometry'
                 )
         return ''
+
+    def _displaced_text(self) -> str:
+        """Return that the motion itself jumps, but for what other findings explain."""
+        if not self._jumps.jumps or not self.findings.keys().isdisjoint(('jitter', 'publishers')):
+            return ''
+        steps = _worst(self._jumps.jumps.values())
+        return (
+            f'the motion itself jumps: {steps}: boxes of what stands still jump with it, and '
+            f'their tracks are wrong there; use a source of motion without corrections, with '
+            f'--odometry or --fixed-frame, or relabel the parts before and after it by '
+            f'themselves, with --end and --start'
+        )
 
     def _clock_text(self, moving: Sequence[Edge]) -> str:
         """Return how far the clock of the fastest motion is off from that of the clouds."""

@@ -60,6 +60,22 @@ def test_several_lidars_on_one_topic_are_named(apart_ns, lidars):
     assert not found_in(clouds, is_merged=True, stamps_ns=stamps_ns)
 
 
+@pytest.mark.parametrize('apart_ns', [30_000_000, 50_000_000])
+@pytest.mark.parametrize('views', [2, 1])
+def test_two_views_that_take_turns_are_named(apart_ns, views):
+    """Two LiDARs of half a view each, with one frame, that are not triggered at the same time."""
+    rng = np.random.default_rng(0)
+    clouds, stamps_ns = [], []
+    for k in range(40):
+        angles = rng.uniform(0, 3.3, 3000) + np.pi * (k % views)
+        clouds.append(9 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1))
+        stamps_ns.append(k // 2 * 100_000_000 + k % 2 * apart_ns)
+    text = found_in(clouds, stamps_ns=stamps_ns)
+    assert ('got two by turns, of about 190 and 190' in text) == (views == 2), text
+    assert ('several LiDARs publish on one topic' in text) == (views == 2)
+    assert not found_in(clouds, is_merged=True, stamps_ns=stamps_ns)
+
+
 @pytest.mark.parametrize('frames', [('front', 'rear'), ('front',), ('', *('front',) * 9)])
 def test_lidars_that_take_turns_on_one_topic_are_named_by_their_frames(frames):
     cloud = np.random.default_rng(0).uniform(-9, 9, (5000, 3))

@@ -381,6 +381,32 @@ def test_a_jump_that_rotates_the_map_is_found(tmp_path):
     assert read(drive, tmp_path)[1] == 'odom'
 
 
+@pytest.mark.parametrize('jump', [0.0, 3.0])
+def test_a_single_jump_of_the_motion_itself_is_named(tmp_path, jump):
+    drive = Drive(sweeps=30)
+    for topic, stamp, message in drive.items:
+        if topic == '/tf' and stamp >= drive.stamps[12]:
+            message.transforms[0].transform.translation.y += jump
+    found = read(drive, tmp_path)[2]
+    assert bool(found) == bool(jump)
+    if jump:
+        assert 'odom -> base has a step of 3.00 m, the first at' in found
+        assert f'{drive.stamps[12]} ns' in found
+
+
+@pytest.mark.parametrize('braking', [10.0, 200.0])
+def test_a_vehicle_that_brakes_hard_or_a_wrong_sample_is_no_jump(tmp_path, braking):
+    """With the second one, it stands within a sample; with both, one position is wrong."""
+    drive = Drive(sweeps=40)
+    moving = [one for one in drive.items if one[0] == '/tf']
+    for k, (_, _, message) in enumerate(moving):
+        seconds = 0.1 * max(k - 15, 0)
+        stopped = min(seconds, 20 / braking)
+        x = 2.0 * min(k, 15) + 20 * stopped - braking / 2 * stopped**2
+        message.transforms[0].transform.translation.x = x + 4.0 * (k == 8)
+    assert 'jumps' not in read(drive, tmp_path)[2]
+
+
 def test_a_map_that_drifts_smoothly_stays_the_fixed_frame(tmp_path):
     drive = with_map(Drive(sweeps=20), lambda k: (5 + 0.01 * k, -0.005 * k, 0))
     _, frame, found = read(drive, tmp_path)
