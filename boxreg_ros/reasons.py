@@ -269,7 +269,7 @@ class Reason(StrEnum):
     DUPLICATE_STAMP = (
         'duplicate_stamp',
         'box',
-        'a second message with the same stamp',
+        'a second message with the same stamp, and some of the same objects',
         'publish one message per stamp: merge the outputs of several detectors',
     )
     NO_TRACK_ID = (

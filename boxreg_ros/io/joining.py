@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 
-from boxreg_ros.structures import BoxArray
+from boxreg_ros.structures import BOX_CENTER, BoxArray, LENGTH
 import numpy as np
 
 JOIN_NS = 20 * 10**6
@@ -34,18 +34,25 @@ def are_parts(boxes: BoxArray, more: BoxArray) -> bool:
     """
     Return whether two arrays have different objects of one stamp, in one frame.
 
-    Their ids say so, or their classes, where a detector publishes one array for each.
+    Their ids say so, their classes, where a detector publishes one array for each, or their
+    places, where each of several detectors numbers its own: boxes nearer to each other than half
+    a length are of one object.
 
     """
     if (boxes.stamp_ns, boxes.frame_id) != (more.stamp_ns, more.frame_id):
         return False
-    return any(
+    is_named_apart = any(
         '' not in (*names, *others) and set(names).isdisjoint(others)
         for names, others in (
             (boxes.track_ids, more.track_ids),
             (boxes.class_names, more.class_names),
         )
     )
+    if is_named_apart:
+        return True
+    one, other = boxes.boxes[:, None], more.boxes[None]
+    apart = np.linalg.norm(one[..., BOX_CENTER] - other[..., BOX_CENTER], axis=-1)
+    return bool((apart > np.maximum(one[..., LENGTH], other[..., LENGTH]) / 2).all())
 
 
 def joined(boxes: BoxArray, more: BoxArray) -> BoxArray:

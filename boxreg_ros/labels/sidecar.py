@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 import re
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.labels.files import following, frame_names
 from boxreg_ros.labels.protocol import LabelFrame, SceneFrames
 from boxreg_ros.labels.records import ReadBox, refined_of
@@ -254,11 +254,22 @@ def filled_stamps(stamps_ns: Sequence[int | None], count: int = 0) -> list[int]:
     Returns
     -------
     stamps_ns : list of int
-        Of each frame [ns]. Of less than two stamps there is no period: these alone are returned.
+        Of each frame [ns]. Of less than two stamps there is no period: that of the first frame
+        alone is returned, or none.
+
+    Raises
+    ------
+    RecordingError
+        If the only stamp is that of a later frame.
 
     """
     known = [number for number, stamp_ns in enumerate(stamps_ns) if stamp_ns is not None]
     given_ns = [stamp_ns for stamp_ns in stamps_ns if stamp_ns is not None]
+    if known and known[0] and len(known) < 2:
+        raise RecordingError(
+            f'stamps: expected two or more, whose period blank lines have, got one, in line '
+            f'{known[0] + 1}; write the stamp of each frame'
+        )
     if len(known) < 2:
         return given_ns
     end = max(1 + known[-1], min(count, len(stamps_ns)))
@@ -297,12 +308,14 @@ def read_stamps(path: Path, names: Sequence[str] = ()) -> list[int | None]:
     """
     try:
         lines = [line.strip() for line in path.read_text(encoding='utf-8').splitlines()]
-    except OSError:
+    except FileNotFoundError:
         got = f' (names such as {names[0]!r} are none)' if names else ''
         raise RecordingError(
             f'{path}: not found, and these labels have no stamps of their own{got}; create it '
             f'with one stamp per frame, as whole nanoseconds'
         ) from None
+    except OSError as error:
+        raise RecordingError(unreadable(path, error)) from None
     for number, line in enumerate(lines, 1):
         try:
             stamps_ns([line] if line else [])
@@ -342,6 +355,8 @@ def read_poses(path: Path, count: int) -> list[Floats | None]:
         return [None] * count
     try:
         rows = np.loadtxt(path, ndmin=2).reshape(-1, 3, 4)  # (frame, row, column)
+    except OSError as error:
+        raise RecordingError(unreadable(path, error)) from None
     except ValueError as error:
         raise RecordingError(f'{path}: expected twelve numbers a line: {error}') from None
     if len(rows) != count:

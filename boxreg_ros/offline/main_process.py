@@ -102,6 +102,8 @@ class MainProcess:
         """Write everything beside the labels into `folder`, which becomes `out`."""
         summary = self._summary(registrar, sink)
         summary.fingerprint = fingerprint
+        warnings = summary.warning, self.request.unbound_text()
+        summary.warning = '; '.join(filter(None, warnings))
         if self.sweeps is not None:
             self.sweeps.places = self.recording.findings.places
             self._write_points(folder, sink, registrar, self.sweeps, summary)

@@ -297,6 +297,20 @@ class Request:
         path = (path if path.is_dir() else path.parent) / APPLIED
         return path if path.is_file() else None
 
+    def unbound_text(self) -> str:
+        """Return that the labels have decisions of a person that do not bind; '' for none."""
+        if self.labels is None or self.labels[0] == 'csv' or not self.completes:
+            return ''
+        folders = self.labels[1].absolute().parents[:2]
+        found = [folder for folder in folders if (folder / APPLIED).is_file()]
+        if not found:
+            return ''
+        return (
+            f'labels {str(self.labels[1])!r}: {APPLIED} beside them is about boxes.csv alone: '
+            f'classes and ids that a person gave may change; use --labels csv:{found[0]}, or '
+            f'relabel the recording with --decisions'
+        )
+
     def drive_name(self) -> str:
         """Return a name of the drive: a hash of the names and sizes of its recordings."""
         names = [path.name for path in self.recordings]

@@ -607,6 +607,24 @@ def test_a_loop_of_transforms_is_named_and_the_frame_that_moves_is_not_the_root(
     assert f'got a loop by {child} -> odom, while odom is above {child}' in found
 
 
+@pytest.mark.parametrize(
+    ('below', 'closing', 'root'),
+    [('lidar', 'lidar', 'map'), ('base', 'base', 'map'), ('imu', 'base', 'imu')],
+)
+def test_a_loop_over_frames_above_the_motion_is_named(tmp_path, below, closing, root):
+    """It goes over three frames and more; one of them may be beside the way to the LiDAR."""
+    drive = Drive(sweeps=12)
+    m = drive.messages
+    for parent, child in (('map', 'odom'), ('base', 'imu'), (below, 'map')):
+        drive.items.insert(
+            0, ('/tf_static', START, m.tf(m.transform(0, parent, child, (0, 0, 0))))
+        )
+    origins, frame, found = read(drive, tmp_path)
+    assert frame == root
+    assert_true(origins, 12)
+    assert f'got a loop by {closing} -> {root}, while {root} is above {closing}' in found
+
+
 @pytest.mark.parametrize('turn', [0.0, 0.02])
 def test_static_transforms_that_contradict_each_other_are_named(tmp_path, turn):
     drive = Drive(sweeps=12)

@@ -8,7 +8,7 @@ from boxreg_ros.cli import main
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, LabelFrame
 from boxreg_ros.labels.merging import keyframes_of
-from boxreg_ros.labels.sidecar import whole_stamps
+from boxreg_ros.labels.sidecar import filled_stamps, read_poses, read_stamps, whole_stamps
 from boxreg_ros.labels.stamps import stamps_ns, stamps_of_names
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 from consumers import consumer
@@ -90,6 +90,20 @@ def test_values_that_are_no_stamps_are_refused(value):
 def test_stamps_beside_labels_in_any_unit(tmp_path, lines, expected):
     path = put(tmp_path / 'timestamps.txt', ''.join(f'{line}\n' for line in lines))
     assert whole_stamps(path) == expected
+
+
+def test_a_single_stamp_is_not_that_of_another_frame():
+    assert filled_stamps([]) == filled_stamps([None]) == []
+    assert filled_stamps([5]) == filled_stamps([5, None]) == [5]
+    assert filled_stamps([None, 5, 7]) == [3, 5, 7]
+    with pytest.raises(RecordingError, match='got one, in line 2; write the stamp of each frame'):
+        filled_stamps([None, 5])
+
+
+@pytest.mark.parametrize('read', [read_stamps, lambda path: read_poses(path, 3)])
+def test_a_folder_in_place_of_stamps_or_poses_is_named(tmp_path, read):
+    with pytest.raises(RecordingError, match='cannot be read: Is a directory'):
+        read(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,16 @@
 """Several messages of boxes with one stamp: joined for the registrar, published one by one."""
 
 from copy import deepcopy
+from dataclasses import replace
 
 from boxreg_ros.io.items import Item
+from boxreg_ros.io.joining import are_parts
 from boxreg_ros.live.bursts import Bursts, JOIN_TIME, JoiningAdapter, messages_of, Parts
 from boxreg_ros.structures import BoxArray
 from msg_adapters import vision
 import numpy as np
-from ros_messages import Drive
+import pytest
+from ros_messages import Drive, START
 from test_pipeline import Live
 
 
@@ -53,6 +56,16 @@ def test_boxes_are_those_of_one_message_and_each_message_has_its_own():
     assert apart.keys() == whole.keys()
     for key, box in whole.items():
         np.testing.assert_allclose(apart[key], box, atol=1e-9)
+
+
+@pytest.mark.parametrize('is_apart', [True, False])
+def test_arrays_with_ids_of_their_own_are_parts_where_their_places_differ(is_apart):
+    """Detectors that look to several sides each number their objects from 0."""
+    name = ('0', '1'), ('car', 'car')
+    boxes = np.array([[9.0, 0, 0, 4, 2, 1.5, 0, 0, 0], [-9.0, 0, 0, 4, 2, 1.5, 0, 0, 0]])
+    front = BoxArray(START, 'base', *name, np.ones(2), boxes)
+    rear = replace(front, boxes=boxes + (1.9 + 0.2 * is_apart) * np.eye(9)[0])
+    assert are_parts(front, rear) == is_apart
 
 
 def test_a_missed_box_is_published_behind_the_last_message_of_its_stamp():

@@ -3,6 +3,7 @@
 import csv
 from dataclasses import replace
 import json
+from pathlib import Path
 import shutil
 
 from boxreg_ros.cli import main
@@ -500,6 +501,12 @@ def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, op
     assert 'without --associate' in capsys.readouterr().err
     main(['convert', str(tmp_path / '2'), '-o', str(tmp_path / '3'), '--from=csv', '--to=csv'])
     assert read_decisions(tmp_path / '3' / APPLIED) == read_decisions(tmp_path / '2' / APPLIED)
+    other = tmp_path / '3' / 'openlabel'
+    main(['convert', str(other.parent), '-o', f'{other}x', '--from=csv', '--to=openlabel'])
+    Path(f'{other}x', 'openlabel').rename(other)
+    capsys.readouterr()
+    Run(recording, '--labels', f'openlabel:{other}', '--complete')(tmp_path / '4')
+    assert f'--labels csv:{tmp_path / "3"}, or' in capsys.readouterr().err
 
 
 def test_a_box_of_a_person_keeps_its_class(completed, tmp_path):

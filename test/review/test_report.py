@@ -325,6 +325,19 @@ def test_risks_and_violations_of_each_track_are_shown(tmp_path):
 
 
 @NEEDS_BROWSER
+def test_long_names_do_not_push_columns_out_of_view(tmp_path):
+    truth = drive(12)
+    (track,) = assessed(changes_of(truth, truth))
+    found = [track._replace(track=replace(track.track, class_name='vehicle_' * 30))]
+    write_report(tmp_path, 'done', SUMMARY, Config(), found, {}, PointCollector(Config()))
+    with opened_page((tmp_path / 'report.html').as_uri()) as page:
+        width, room = page.evaluate(
+            "[$('first').offsetWidth, $('first').parentElement.clientWidth]"
+        )
+    assert 0 < width <= room
+
+
+@NEEDS_BROWSER
 def test_a_thousand_tracks_are_listed_without_laying_out_all(tmp_path):
     changes = Changes('odom')
     names = tuple(map(str, range(1000)))

@@ -36,7 +36,7 @@ function drawOverview() {
   fill($('first'), element('tr', {}, ...['', 'track', 'class', 'risk', 'why'].map(t => (t ? element('th', { scope: 'col' }, t) : element('td')))),
     ...first.map((track, k) => element('tr', { class: 'link', onclick: () => openTrack(track.index, track.riskiest) },
       element('td', {}, element('canvas', { id: `thumbnail-${k}`, role: 'img', 'aria-label': `Track ${track.id} from above` })),
-      element('td', {}, element('a', { href: hashOf(track.id, track.riskiest) }, track.id || 'no id')), element('td', {}, track.class),
+      element('td', { class: 'name' }, element('a', { href: hashOf(track.id, track.riskiest) }, track.id || 'no id')), element('td', { class: 'name' }, track.class),
       element('td', { class: 'n' }, `${number(track.risk)} m`), element('td', {}, ...reasonsOf(track)))));
   drawThumbnails(first);
 }
