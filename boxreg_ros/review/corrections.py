@@ -49,7 +49,8 @@ class Corrections:
     pinned already, and have the class of a person then; none is added where the files of the input
     have one that is `rejected`, named by id and stamp. The steps that complete tracks ask for the
     decisions as `tracks.decided.Decided`, after the boxes of the input have passed `to_register`.
-    `earlier` decisions are those that the boxes of the input have already, see `applied`.
+    `earlier` decisions are those that the boxes of the input have already, see `applied`; whatever
+    class such a box has, it is that of a person.
 
     """
 
@@ -61,9 +62,13 @@ class Corrections:
     ) -> None:
         self._rejected = rejected
         self._of_track: dict[str, list[Decision]] = {}
-        decisions = [*decisions]
-        for one in held([*earlier, *decisions]):
+        self._earlier_classes: dict[str, list[Decision]] = {}
+        decisions, earlier = [*decisions], held(earlier)
+        for one in held([*(one for one in earlier if one.kind != 'reclass'), *decisions]):
             self._of_track.setdefault(one.track_id, []).append(one)
+        for one in earlier:
+            if one.kind == 'reclass':
+                self._earlier_classes.setdefault(one.track_id, []).append(one)
         self._unused = {
             one.scope
             for one in held(decisions)
@@ -75,7 +80,7 @@ class Corrections:
         self._boxes: set[tuple[str, int]] = set()  # of tracks with a pin: id and stamp, as given
         self._before: dict[str, tuple[str, Mapping[str, str]]] = {}  # id, attributes; by new id
         self._origins: dict[str, list[tuple[int, str]]] = {}  # stamps and first ids of added boxes
-        self._human_classes: dict[tuple[str, int], str] = {}  # of pinned input, by id and stamp
+        self._human_classes: dict[tuple[str, int], str] = {}  # of the input, by id and stamp
         self._of_result: dict[str, list[_Applied]] = {}  # by id in the result
 
     def unused(self) -> list[str]:
@@ -172,9 +177,15 @@ class Corrections:
         return self._value('id', input_id, stamp_ns)
 
     def class_name(self, input_id: str, stamp_ns: int) -> str:
-        """Return the class that was given to a box, or a pinned one has; empty for none."""
+        """Return the class that was given to a box, or one of a person has; empty for none."""
         known = self._human_classes.get((input_id, stamp_ns), '')
-        return self._value('class', input_id, stamp_ns) or known
+        decided = self._value('class', input_id, stamp_ns)
+        return decided or known or self._earlier_class(input_id, stamp_ns)
+
+    def _earlier_class(self, track_id: str, stamp_ns: int) -> str:
+        """Return the class that a box was given in an earlier run; empty for none."""
+        rows = reversed(self._earlier_classes.get(track_id, ()))
+        return next((one.value for one in rows if one.covers(stamp_ns)), '')
 
     def is_left_out(self, input_id: str, stamp_ns: int) -> bool:
         """
@@ -264,8 +275,10 @@ class Corrections:
 
         """
         given = given.plain()  # `with_attributes` gives the result its own
-        for row in np.flatnonzero(given.is_pinned).tolist():
-            self._human_classes[given.track_ids[row], given.stamp_ns] = given.class_names[row]
+        for row, is_pinned in enumerate(given.is_pinned.tolist()):
+            track_id = given.track_ids[row]
+            if is_pinned or self._earlier_class(track_id, given.stamp_ns):
+                self._human_classes[track_id, given.stamp_ns] = given.class_names[row]
         if not self._of_track:
             return given
         rows = self._left(given)

@@ -496,6 +496,11 @@ def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, op
         assert classes == ['car', 'truck', 'truck'] + ['car'] * 13
         words = [str(cell)[:9] for cell in rows['1', stamps[3]].values()]
         assert words == [str(cell)[:9] for cell in as_rejected.values()]
+    table = BoxTable.read(tmp_path / '2' / 'boxes.csv')
+    names = tuple('bus' if name == 'truck' else name for name in table.class_names)
+    replace(table, class_names=names).write(tmp_path / '2' / 'boxes.csv')  # by hand, afterwards
+    rows = Run(recording, '--labels', f'csv:{tmp_path / "2"}', '--complete')(tmp_path / 'edited')
+    assert [rows['2', stamps[k]]['class_name'] for k in range(3)] == ['car', 'bus', 'bus']
     command = ['relabel', str(recording), '-o', str(tmp_path / 'x'), '--labels', labels]
     assert main([*command, '--associate', *QUICK]) == 2
     assert 'without --associate' in capsys.readouterr().err
