@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from statistics import median
 
 from boxreg_ros.errors import TransformUnavailable
@@ -124,8 +125,9 @@ class JumpSearch:
     """By parent and child, of the transforms that stepped."""
     alternations: dict[tuple[str, str], FrameSteps] = field(default_factory=dict)
     """FrameSteps of the motion itself that no vehicle makes: too fast, or back and forth."""
-    jumps: dict[tuple[str, str], FrameSteps] = field(default_factory=dict)
-    """FrameSteps of the motion itself after which it goes on as before, displaced."""
+    jumps: list[tuple[tuple[str, str], int, int, float]] = field(default_factory=list)
+    """Steps of the motion itself after which it goes on as before, displaced: of parent and child,
+    the stamps before and after them, and their size [m]."""
     _seen_ns: dict[tuple[str, str], int] = field(default_factory=dict)
     _reversals: Counter[tuple[str, str]] = field(default_factory=Counter)
     """Steps back and forth up to the last sample."""
@@ -206,9 +208,8 @@ class JumpSearch:
         limit = max(MIN_STEP, MAX_EGO_ACCELERATION * seconds[2, 0] * seconds.sum() / 2)
         pairs = jump, jump + steps[1], jump + steps[3]
         if min(map(np.linalg.norm, pairs)) > limit:
-            key = edge.parent, edge.child
             way = float(np.linalg.norm(jump))
-            self.jumps.setdefault(key, FrameSteps(*key)).add(way, stamps_ns[3])
+            self.jumps.append(((edge.parent, edge.child), stamps_ns[2], stamps_ns[3], way))
 
 
 def _moves(edge: Edge) -> bool:
@@ -267,6 +268,7 @@ class MotionCheck:
         self._named_sensors = named_sensors
         self._jumps = JumpSearch()
         self.findings: dict[str, Finding] = {}
+        self._clouds_ns = inf, -inf  # first and last stamp
         self.forget()
 
     def forget(self) -> None:
@@ -306,6 +308,8 @@ class MotionCheck:
                 nearest = min(abs(item.stamp_ns - stamp_ns) for stamp_ns in stamps_ns)
                 self._copied.append(nearest <= COPY_NS)
             return
+        first_ns, last_ns = self._clouds_ns
+        self._clouds_ns = min(first_ns, item.stamp_ns), max(last_ns, item.stamp_ns)
         self._cloud_stamps.append(item.stamp_ns)
         self._first_milliseconds += item.stamp_ns % 10**9 < 10**6
         self._count += 1
@@ -403,10 +407,15 @@ class MotionCheck:
         return ''
 
     def _displaced_text(self) -> str:
-        """Return that the motion itself jumps, but for what other findings explain."""
-        if not self._jumps.jumps or not self.findings.keys().isdisjoint(('jitter', 'publishers')):
+        """Return that the motion jumps between clouds, but for what other faults explain."""
+        first_ns, last_ns = self._clouds_ns
+        found: dict[tuple[str, str], FrameSteps] = {}
+        for key, before_ns, after_ns, way in self._jumps.jumps:
+            if first_ns < after_ns and before_ns < last_ns:  # transforms of other parts are known
+                found.setdefault(key, FrameSteps(*key)).add(way, after_ns)
+        if not found or not self.findings.keys().isdisjoint(('jitter', 'publishers')):
             return ''
-        steps = _worst(self._jumps.jumps.values())
+        steps = _worst(found.values())
         return (
             f'the motion itself jumps: {steps}: boxes of what stands still jump with it, and '
             f'their tracks are wrong there; use a source of motion without corrections, with '
