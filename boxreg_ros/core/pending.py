@@ -265,10 +265,11 @@ class ObservedTrack:
         newest = self.entries[-1]
         newest.array.reasons[newest.row] = Reason.BUDGET
         if len(self.starts) == len(self.entries) - 1:  # else its first window is to come
-            self.starts = np.vstack([self.starts, self.seen[-1].box])
-        excess = slice(PRIOR_POSES, PRIOR_POSES + max(0, len(self.entries) - length))
-        del self.entries[excess], self.seen[excess]
-        self.starts = np.delete(self.starts, excess, axis=0)
+            self.starts = np.concatenate([self.starts, self.seen[-1].box[None]])
+        if len(self.entries) > length:
+            excess = slice(PRIOR_POSES, PRIOR_POSES + len(self.entries) - length)
+            del self.entries[excess], self.seen[excess]
+            self.starts = np.delete(self.starts, excess, axis=0)
 
     def forget(self, length: int) -> None:
         """Leave only the last `length` observations to the next window."""

@@ -46,7 +46,7 @@ Its argument is the number that refines every final box: one of each track in `l
 VELOCITY_OBSERVATIONS = 4
 """Observations that the input velocity is estimated from; chosen: 0.3 s at 10 Hz."""
 REACTION_TIME = 2.0
-"""Of tracks that cannot all be solved, those that are nearest after this time come first [s].
+"""Of tracks that cannot all be solved, those that come nearest within this time come first [s].
 Literature: the time headway that drivers are told to keep."""
 _OfTrack = tuple[ObservedTrack, PendingBox]
 """A box and its track; boxes do not refer to tracks: cycles would wait for garbage collection."""
@@ -135,10 +135,11 @@ class BoxRegistrar:
 
     With a **budget**, waiting tracks that have no box here are solved first, since their boxes
     become final before they end; then as many of those that have waited longest as let every
-    track be solved before its boxes are final; then those that come nearest to a sensor within
-    `REACTION_TIME`. The boxes of the others are kept for now, with the reason ``budget``; their
-    observations join the next window that is solved. While there is time, `catch_up` solves
-    tracks that wait, for their final boxes.
+    track be solved before its boxes are final, less those that `catch_up` has solved since the
+    last box array; then those that come nearest to a sensor within `REACTION_TIME`. The boxes of
+    the others are kept for now, with the reason ``budget``; their observations join the next
+    window that is solved. While there is time, `catch_up` solves tracks that wait, for their
+    final boxes.
 
     """
 
@@ -179,6 +180,7 @@ class BoxRegistrar:
         self._tracks: dict[str, ObservedTrack] = {}
         self._ended_tracks: list[ObservedTrack] = []
         self._arrays_since_solve = 0
+        self._num_caught_up = 0  # windows, since the last box array
         self._submitted: list[_SubmittedTrack] = []
         self._get_estimates: GetEstimates = list
         if config.estimate == 'track':
@@ -327,7 +329,9 @@ class BoxRegistrar:
         """
         waiting = [track for track in self._tracks.values() if track.num_carried]
         if waiting:
-            self._solve(_by_urgency(waiting, limit)[:limit])
+            chosen = _by_urgency(waiting, limit)[:limit]
+            self._num_caught_up += len(chosen)
+            self._solve(chosen)
         return self._returned()
 
     @property
@@ -565,7 +569,10 @@ class BoxRegistrar:
         # A track that has waited keeps two observations of its prior beside the new ones.
         longest_wait = min(self._lag + 1, self.config.window - PRIOR_POSES)
         num_last = num_ended + len(silent)
-        num_rotating = ceil(len(ready) / longest_wait)
+        num_due = sum(track.num_carried >= longest_wait - 1 for track in ready)
+        # As many are caught up until the next array as since the last; what is due cannot wait.
+        num_rotating = max(num_due, ceil(len(ready) / longest_wait) - self._num_caught_up)
+        self._num_caught_up = 0
         limit = self._budget(num_last + num_rotating)
         self._settle_ended_tracks_beyond(max(limit - len(ready), min(limit, num_ended)))
         limit = max(0, limit - len(self._ended_tracks))
@@ -649,8 +656,8 @@ def _by_urgency(tracks: list[ObservedTrack], num_rotating: int) -> list[Observed
     """
     Return tracks in the order in which they are solved.
 
-    First `num_rotating` of those that have waited longest, then those that are nearest to a sensor
-    after `REACTION_TIME` if they approach it as they did.
+    First `num_rotating` of those that have waited longest, then those that come nearest to a
+    sensor within `REACTION_TIME`, if they approach it as they did.
 
     """
     carried = np.array([track.num_carried for track in tracks])
@@ -662,10 +669,10 @@ def _by_urgency(tracks: list[ObservedTrack], num_rotating: int) -> list[Observed
     ranges = _ranges(newest)
     approached = _ranges(before) - ranges
     speed = np.divide(approached, elapsed, out=np.zeros(len(tracks)), where=elapsed > 0)
-    expected = ranges - REACTION_TIME * speed  # (n,) [m]; NaN, the last, if unknown
-    order = np.lexsort((expected, -carried))
+    nearest = ranges - REACTION_TIME * np.maximum(speed, 0.0)  # (n,) [m]; NaN, last, if unknown
+    order = np.lexsort((nearest, -carried))
     rest = order[num_rotating:]
-    order[num_rotating:] = rest[np.argsort(expected[rest], kind='stable')]
+    order[num_rotating:] = rest[np.argsort(nearest[rest], kind='stable')]
     return [tracks[i] for i in order.tolist()]
 
 

@@ -44,11 +44,11 @@ class TickBudget:
     Limit the windows that are solved for a box array, so that it is published by its deadline.
 
     The registrar reads no clock; this object does for it. The time for windows is the deadline
-    less the time used by then, for decoding and cropping, less that for publishing, less a
-    reserve for overruns. The times of a window and of publishing are the medians of `RECENT`
-    ones. The reserve is the second largest overrun of the last `RESERVE_MEMORY` seconds, without
-    those that no reserve would hold. So interruptions of the process cost the boxes of their own
-    ticks, and none after them.
+    less the time used by then, for decoding and cropping, less that for the order of the tracks
+    and for publishing, less a reserve for overruns. The times of a window, and of what is done
+    beside solving, are the medians of `RECENT` ones. The reserve is the second largest overrun of
+    the last `RESERVE_MEMORY` seconds, without those that no reserve would hold. So interruptions
+    of the process cost the boxes of their own ticks, and none after them.
 
     Final boxes are given up last: the windows that they need are solved in any case, as long as
     these take no longer than what a batch costs (`BATCH_OVERHEAD`). A batch of their own, after
@@ -67,9 +67,10 @@ class TickBudget:
     def __post_init__(self) -> None:
         """Begin without a tick."""
         self._since = self.clock()
-        self._solved_at = self._since
+        self._asked_at = self._since
+        self._solving_time: float | None = None  # in the tick at hand [s]
         self._planned_end = inf
-        self._publishing_times = deque[float](maxlen=RECENT)  # [s]
+        self._other_times = deque[float](maxlen=RECENT)  # from the budget to the end [s]
         self._overruns = deque[tuple[float, float]]()  # when, and by how much [s]
         self._times = deque[float](maxlen=RECENT)  # per window [s]
         self._arrivals = deque[float](maxlen=RECENT)
@@ -83,7 +84,7 @@ class TickBudget:
     def begin(self, since: float) -> None:
         """Begin a tick whose data are complete since a moment (monotonic) [s]."""
         self._since = since
-        self._solved_at = 0.0
+        self._solving_time = None
         self._planned_end = inf
 
     def end(self) -> float | None:
@@ -93,11 +94,11 @@ class TickBudget:
         None if it has ended, or if nothing was solved in it.
 
         """
-        if self._solved_at:
+        if self._solving_time is not None:
             now = self.clock()
-            self._publishing_times.append(now - self._solved_at)
+            self._other_times.append(now - self._asked_at - self._solving_time)
             self._overruns.append((now, now - self._planned_end))
-            self._solved_at = 0.0
+            self._solving_time = None
             return now - self._since
         return None
 
@@ -109,9 +110,10 @@ class TickBudget:
 
         """
         number = 0
+        self._asked_at = self.clock()
         if self._times:
             planned_end = self._since + self.seconds - self._reserve
-            time_left = planned_end - _median(self._publishing_times) - self.clock()
+            time_left = planned_end - _median(self._other_times) - self._asked_at
             number = int(time_left / _median(self._times)) - BATCH_OVERHEAD
         least = max(1, min(needed, BATCH_OVERHEAD))
         if number >= least:  # the tick can be in time
@@ -119,10 +121,18 @@ class TickBudget:
         return max(number, least)
 
     def spare_windows(self) -> int:
-        """Return how many windows fit into the part of the period that no deadline covers."""
+        """
+        Return how many windows fit into the part of the period that no deadline covers.
+
+        They are solved before the next boxes arrive, unless these are late.
+
+        """
         if not self._times:
             return 0
         spare = (1.0 - PART_OF_PERIOD) * self._period
+        until_next = self._arrivals[-1] + self._period - self.clock() if self._arrivals else 0.0
+        if until_next > 0:
+            spare = min(spare, until_next)
         return int(spare / _median(self._times)) - BATCH_OVERHEAD
 
     def submit(self, windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
@@ -156,10 +166,10 @@ class TickBudget:
     ) -> list[Estimate | None]:
         begin = self.clock()
         estimates = self.solve(windows, config, model)
-        self._solved_at = self.clock()
+        self._solving_time = self.clock() - begin
         num_solved = sum(estimate is not None for estimate in estimates)
         if num_solved:
-            self._times.append((self._solved_at - begin) / (num_solved + BATCH_OVERHEAD))
+            self._times.append(self._solving_time / (num_solved + BATCH_OVERHEAD))
         return estimates
 
 

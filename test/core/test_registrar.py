@@ -615,6 +615,40 @@ def test_early_boxes_of_the_nearest_and_of_those_that_approach_are_refined():
     assert {word for r in finals(results)[2:-10] for word in r.status} == {'refined'}
 
 
+def test_tracks_that_catch_up_do_not_take_the_windows_of_the_nearest():
+    # Final boxes need 2 windows of 6 in each array, as many as it has; 4 are solved after it.
+    rng = np.random.default_rng(0)
+    cars = [track_of(drive(20, start=(5.0, 8.0 * i, 0.0)), rng, str(i)) for i in range(6)]
+    asked = []
+
+    def two(needed):
+        asked.append(needed)
+        return 2
+
+    registrar = BoxRegistrar(config_with(window=10, lag=2), budget=two)
+    results = []
+    for item in stream_of(cars):
+        ready = fed(registrar, [item])
+        results += ready
+        if ready:
+            registrar.catch_up(4)
+    early = [result for result in results if not result.is_final][5:]
+    assert set(asked[5:]) == {0}
+    assert {r.status for r in early} == {('refined',) * 2 + ('kept',) * 4}
+    assert registrar.counts['budget'] == 0
+
+
+def test_a_near_object_that_moves_away_keeps_its_early_boxes():
+    rng = np.random.default_rng(0)
+    cars = [track_of(drive(30, start=(20.0, 8.0 * i, 0.0)), rng, str(i)) for i in range(6)]
+    truth = drive(30, start=(5.0, -3.0, 0.0))
+    truth[:, 0] += 12.0 * 0.1 * np.arange(30)  # 24 m in two seconds
+    cars.append(track_of(truth[:14], rng, 'leaving'))
+    results, _ = fed_within(lambda _: 2, cars, window=10, lag=9)
+    early = [result for result in results if not result.is_final][4:9]
+    assert {r.status[6] for r in early} == {'refined'}
+
+
 def test_ended_tracks_beyond_the_budget_release_their_boxes():
     # Without boxes of the second car the arrays that hold its last boxes must not wait for it.
     rng = np.random.default_rng(0)

@@ -36,9 +36,14 @@ def windows(budget, since, needed=1):
 
 def tick(budget, clock, solving=0.0, publishing=0.0):
     """Run a tick whose solving and publishing take a time [s]."""
+
+    def solve(*_):
+        clock.now += solving
+        return []
+
+    budget.solve = solve
     budget.begin(clock.now)
     budget.windows(1)
-    clock.now += solving
     budget.submit([], Config(), InputModel(Config().faces))()
     clock.now += publishing
     budget.end()
@@ -77,6 +82,16 @@ def test_spare_windows_fit_into_the_rest_of_the_period():
     for received in (50.0, 50.1, 50.2):
         budget.add_arrival(received)
     assert budget.spare_windows() < 0
+
+
+def test_spare_windows_are_solved_before_the_next_boxes():
+    budget, clock = solved(0.1)
+    for received in (-0.4, -0.2, 0.0):
+        budget.add_arrival(clock.now + received)
+    clock.now += 0.17
+    assert budget.spare_windows() + BATCH_OVERHEAD == pytest.approx(30, abs=1)
+    clock.now += 0.05  # they are late
+    assert budget.spare_windows() + BATCH_OVERHEAD == pytest.approx(40, abs=1)
 
 
 def test_time_for_publishing_is_left():
