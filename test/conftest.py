@@ -1,5 +1,6 @@
 """Environment of all tests: ROS on this machine only, in its own domain, with type checks."""
 
+import fcntl
 import os
 from pathlib import Path
 import signal
@@ -43,6 +44,20 @@ def pytest_sessionstart():
     """Load the kernels in each process of a run in parallel."""
     if 'PYTEST_XDIST_WORKER' in os.environ:
         import warmed  # noqa: F401
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Let one worker rewrite the assertions of all modules for the others, which wait for it."""
+    folder = os.open(sys.prefix, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        fcntl.flock(folder, fcntl.LOCK_SH)
+    try:
+        return (yield)
+    finally:
+        os.close(folder)
 
 
 @pytest.fixture(scope='module', autouse=True)
