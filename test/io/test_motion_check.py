@@ -665,6 +665,20 @@ def test_sparse_transforms_are_named_and_odometry_may_take_their_place(tmp_path)
     assert_true({stamp: at - [0, 9, 0] for stamp, at in origins.items()}, 41)
 
 
+@pytest.mark.parametrize('clouds_go_on', [True, False])
+def test_a_gap_of_the_motion_is_named_where_clouds_go_on(tmp_path, clouds_go_on):
+    drive = Drive(sweeps=41)
+    missing = {'/tf'} if clouds_go_on else {'/tf', '/points', '/boxes'}
+    begin = START + SECOND
+    drive.items = [
+        item for item in drive.items
+        if item[0] not in missing or not begin < item[1] < begin + 3 * SECOND // 2
+    ]  # fmt: skip
+    found = read(drive, tmp_path)[2]
+    text = f'transform odom -> base is missing for 1.5 s, from {begin} ns on'
+    assert (text in found) == clouds_go_on
+
+
 def test_odometry_of_another_frame_is_refused(tmp_path):
     drive = Drive(sweeps=8)
     m = drive.messages
