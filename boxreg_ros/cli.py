@@ -198,7 +198,11 @@ def _run(arguments: list[str]) -> int:
     args, unknown = whole.parse_known_args(arguments)
     if unknown:
         options = re.findall(r'--[a-z-]+', args.subparser.format_usage())
-        proposal = _proposal(unknown, options)
+        key = unknown[0].removeprefix('--').partition('=')[0]
+        if '--set' in options and key in _setting_names():
+            proposal = f'; did you mean --set {key}=VALUE?'
+        else:
+            proposal = _proposal(unknown, options)
         args.subparser.error(f'unrecognized arguments: {" ".join(unknown)}{proposal}')
     args.arguments = arguments
     keep_freed_memory()
@@ -214,6 +218,13 @@ def _proposal(unknown: Iterable[str], known: Iterable[str]) -> str:
         if similar:
             return f'; did you mean {similar[0]}?'
     return ''
+
+
+def _setting_names() -> set[str]:
+    """Return the names of all settings; only an error needs them."""
+    from boxreg_ros.config import settings
+
+    return {setting.name for setting in settings()}
 
 
 def _module(command: str) -> ModuleType:

@@ -113,6 +113,7 @@ def test_options_are_used_by_the_run(tmp_path, capsys):
         (['--time-unit', 'sec'], 2, "--time-unit: expected one of auto, s, ms, us, ns, got 'sec'"),
         (['--reprot'], 2, 'unrecognized arguments: --reprot; did you mean --report?'),
         (['--fixedframe=map'], 2, '--fixedframe=map; did you mean --fixed-frame?'),
+        (['--estimate', 'final'], 2, '--estimate final; did you mean --set estimate=VALUE?'),
         (['--set', 'solver.round=2'], 2, '; did you mean solver.rounds?\n'),
         (['--set=window=8', '--set=lag=8'], 2, 'lag: expected less than window (8), got 8'),
         (['{0.parent}/../{0.parent.name}/{0.name}'], 2, 'each recording once'),
