@@ -128,8 +128,8 @@ class JumpSearch:
     alternations: dict[tuple[str, str], FrameSteps] = field(default_factory=dict)
     """FrameSteps of the motion itself that no vehicle makes: too fast, or back and forth."""
     jumps: list[tuple[tuple[str, str], int, int, float]] = field(default_factory=list)
-    """Steps of the motion itself after which it goes on as before, displaced: of parent and child,
-    the stamps before and after them, and their size [m]."""
+    """Steps of the motion itself after which it goes on as before, displaced, until `MotionCheck`
+    takes them: of parent and child, the stamps before and after them, and their size [m]."""
     _seen_ns: dict[tuple[str, str], int] = field(default_factory=dict)
     _reversals: Counter[tuple[str, str]] = field(default_factory=Counter)
     """Steps back and forth up to the last sample."""
@@ -271,6 +271,7 @@ class MotionCheck:
         self._jumps = JumpSearch()
         self.findings: dict[str, Finding] = {}
         self._clouds_ns = inf, -inf  # first and last stamp
+        self._displaced: dict[tuple[str, str], FrameSteps] = {}  # that jump between clouds
         self.forget()
 
     def forget(self) -> None:
@@ -412,10 +413,14 @@ class MotionCheck:
     def _displaced_text(self) -> str:
         """Return that the motion jumps between clouds, but for what other faults explain."""
         first_ns, last_ns = self._clouds_ns
-        found: dict[tuple[str, str], FrameSteps] = {}
-        for key, before_ns, after_ns, way in self._jumps.jumps:
-            if first_ns < after_ns and before_ns < last_ns:  # transforms of other parts are known
+        found, ahead = self._displaced, []
+        for jump in self._jumps.jumps:
+            key, before_ns, after_ns, way = jump
+            if before_ns >= last_ns:  # transforms of a recording are known before its clouds
+                ahead.append(jump)
+            elif first_ns < after_ns:
                 found.setdefault(key, FrameSteps(*key)).add(way, after_ns)
+        self._jumps.jumps = ahead
         if not found or not self.findings.keys().isdisjoint(('jitter', 'publishers')):
             return ''
         steps = _worst(found.values())
