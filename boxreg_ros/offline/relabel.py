@@ -135,8 +135,9 @@ def _rejected(request: Request) -> set[tuple[str, int]]:
 
     if request.labels[0] not in WITH_REJECTED:
         return set()
+    offset_ns = round(request.convention.boxes_offset * 1e9)
     return {
-        (track_id, frame.refined.boxes.stamp_ns)
+        (track_id, frame.refined.boxes.stamp_ns + offset_ns)
         for frame in frames_of(*request.labels)
         for track_id, word in zip(frame.refined.boxes.track_ids, frame.refined.status, strict=True)
         if word == REJECTED
@@ -148,11 +149,12 @@ def _applied(request: Request) -> list[Decision]:
     path = request.applied_decisions()
     if path is None:
         return []
-    if request.convention.associate or request.jumping_ids:
+    if request.convention.associate or request.jumping_ids or request.convention.boxes_offset:
         raise ConfigError(
-            f'labels {str(path.parent)!r}: expected their ids, which {path.name} is about, got '
-            f'boxes to associate: decisions of a person would be lost; relabel without '
-            f'--associate, and with --keep-ids, or delete {path.name}'
+            f'labels {str(path.parent)!r}: expected their ids and stamps, which {path.name} is '
+            f'about, got boxes to associate or to shift: decisions of a person would be lost; '
+            f'relabel without --associate and --boxes-offset, and with --keep-ids, or delete '
+            f'{path.name}'
         )
     return read_decisions(path)
 

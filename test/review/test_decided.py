@@ -502,8 +502,9 @@ def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, op
     rows = Run(recording, '--labels', f'csv:{tmp_path / "2"}', '--complete')(tmp_path / 'edited')
     assert [rows['2', stamps[k]]['class_name'] for k in range(3)] == ['car', 'bus', 'bus']
     command = ['relabel', str(recording), '-o', str(tmp_path / 'x'), '--labels', labels]
-    assert main([*command, '--associate', *QUICK]) == 2
-    assert 'without --associate' in capsys.readouterr().err
+    for option in ('--associate', '--boxes-offset=0.1'):
+        assert main([*command, option, *QUICK]) == 2
+        assert 'without --associate and --boxes-offset' in capsys.readouterr().err
     main(['convert', str(tmp_path / '2'), '-o', str(tmp_path / '3'), '--from=csv', '--to=csv'])
     assert read_decisions(tmp_path / '3' / APPLIED) == read_decisions(tmp_path / '2' / APPLIED)
     other = tmp_path / '3' / 'openlabel'
