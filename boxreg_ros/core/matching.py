@@ -59,7 +59,7 @@ class StampMatcher:
         self._unpaired: list[Pair] = []  # ascending by stamp
         self._newest_boxes_ns = 0
         self._used_ns: set[int] = set()  # stamps of held sweeps that were paired
-        self._newest_ns = -inf  # of all sweeps added
+        self._newest_ns = -inf  # of all sweeps added, and boxes released
         self._steps_ns = deque[float](maxlen=STEPS)
         self._oldest_ns = -inf  # sweeps before this one are late
 
@@ -111,6 +111,11 @@ class StampMatcher:
             self._newest_boxes_ns = max(self._newest_boxes_ns, order_ns)
         waiting = Pair(boxes, reason=reason, order_ns=order_ns)
         insort(self._unpaired, waiting, key=lambda one: one.order_ns)
+        return self._pop_pairs()
+
+    def release(self, stamp_ns: int) -> Iterator[Pair]:
+        """Return the pairs of the box arrays up to a stamp, which wait for no sweep any more."""
+        self._newest_ns = max(self._newest_ns, stamp_ns)
         return self._pop_pairs()
 
     def flush(self) -> Iterator[Pair]:

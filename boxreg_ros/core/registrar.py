@@ -221,6 +221,10 @@ class BoxRegistrar:
         self._correction.add_sweep(sweep)
         return self._process(self._matcher.add_sweep(sweep))
 
+    def release(self, stamp_ns: int) -> list[RefinedBoxes]:
+        """Return the box arrays that are completed as those up to a stamp wait for no sweep."""
+        return self._process(self._matcher.release(stamp_ns))
+
     def add_boxes(self, boxes: BoxArray) -> list[RefinedBoxes]:
         """
         Add a box array; return the box arrays that are completed by it.

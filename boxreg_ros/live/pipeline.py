@@ -194,9 +194,8 @@ class MessagePipeline:
         ]
         if not overdue:
             return []
-        # Beyond the reach of these boxes: a cloud that arrived before them may still be theirs.
-        overdue_ns = max(overdue) + round(self.registrar.config.reach * 1e9) + 1
-        return self._add_sweeps(self.session.unmerged()) + self.lose(overdue_ns)
+        unmerged = self._add_sweeps(self.session.unmerged())
+        return unmerged + self._messages(self.registrar.release(max(overdue)))
 
     def has_no_boxes(self, now: float) -> bool:
         """Return whether no boxes have arrived for long."""

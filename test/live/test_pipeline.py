@@ -521,6 +521,24 @@ def test_boxes_do_not_wait_after_the_lidar_has_stopped():
     assert [set(item.refined.reasons) for item in early][4:] == [{'no_sweep'}] * 2
 
 
+@pytest.mark.parametrize('goes_on', [False, True])
+def test_boxes_after_a_silence_wait_for_their_own_cloud(goes_on):
+    drive = Drive(sweeps=8)
+    silent = drive.stamps[4:6]
+    drive.items = [i for i in drive.items if i[0] != '/points' or i[1] not in silent]
+    begin = next(k for k, item in enumerate(drive.items) if item[1] == drive.stamps[6])
+    drive.items, after = drive.items[:begin], drive.items[begin:]
+    live = Live()
+    out = live.feed(drive, now=10.0) + live.lose_overdue(10.6, cloud_received=10.0)
+    drive.items = [i for i in after if i[0] != '/points']  # boxes come before their clouds
+    drive.items += [i for i in after if i[0] == '/points' and goes_on]
+    out += live.feed(drive, now=11.0) + live.flush()
+    reasons = [item.refined.reasons for item in out if item.is_final]
+    assert reasons == 4 * [('', '')] + 2 * [('no_sweep',) * 2] + 2 * [
+        ('', '') if goes_on else ('no_sweep',) * 2
+    ]
+
+
 def test_reset_returns_held_boxes_and_keeps_the_transforms():
     drive = Drive(sweeps=6)
     live = Live()
