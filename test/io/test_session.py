@@ -297,6 +297,29 @@ def test_a_class_that_is_turned_is_named_rather_than_the_axes_of_all():
     assert 'forward_axis' not in session.finding
 
 
+@pytest.mark.parametrize('trusts_ids', [False, True])
+def test_ways_from_object_to_object_say_nothing_about_yaw(trusts_ids):
+    """Cars and vans are counted by a tracker each, and are the first of a message by turns."""
+    session = Session(STANDARD, Config(), 'map')
+    session.trusts_ids = trusts_ids
+    true = np.tile([0, 0, 1, 4.5, 2, 2, 0, 0, 0], (20, 1))
+    true[:, 1] = np.tile(9 * np.arange(10), 2)
+    true[10:, 1] += 3
+    classes = np.repeat(['car', 'van'], 10)
+    ids = np.tile(np.arange(1, 11).astype(str), 2)
+    for k in range(40):
+        true[:, 0] = 0.1 * k
+        true[10:, 0] += 3  # vans are ahead, in the lane beside
+        rows = np.roll(np.arange(20), 10 * (k % 2))
+        boxes = BoxArray(
+            START + k * SECOND // 10, 'map', tuple(ids[rows]), tuple(classes[rows]), np.ones(20),
+            true[rows],
+        )  # fmt: skip
+        session.admit(Item(0, boxes))
+    assert ('track id of another box' in session.finding) != trusts_ids
+    assert ('yaw of the boxes' in session.finding) == trusts_ids
+
+
 def test_boxes_of_a_recording_stamped_in_the_future_are_kept_and_said(tmp_path):
     drive = Drive(sweeps=12)
     arrays = [message for topic, _, message in drive.items if topic == '/boxes']
