@@ -67,13 +67,17 @@ environments: $(tests) $(consumers) $(if $(PYTHON_JAZZY),$(jazzy)) ## set up all
 compiled: $(runtime)
 	$(BIN)/python test/warmed.py
 
-# It takes what the tests of nodes and pages leave of the cores, and prints nothing among theirs. What
-# it compiles is apart: tests copy the sources with all that is beside them.
+# It takes what the tests of nodes and pages leave of the cores, and prints nothing among theirs. It
+# compiles beside them: after them one core would wait for it. What it compiles is apart: tests copy
+# the sources with all that is beside them.
 jazzy-beside: $(if $(PYTHON_JAZZY),$(jazzy))
 	@mkdir -p out
-	@PYTHONPYCACHEPREFIX=$(CURDIR)/$(VENV_JAZZY)/pycache NUMBA_CACHE_DIR=$(CURDIR)/$(VENV_JAZZY)/kernels \
-	    nice -n 19 $(MAKE) --no-print-directory WORKERS=2 test-jazzy > out/jazzy.txt 2>&1 \
-	    || echo 'NOT PASSED: the tests with the versions of Ubuntu 24.04' >> out/jazzy.txt
+	@export PYTHONPYCACHEPREFIX=$(CURDIR)/$(VENV_JAZZY)/pycache NUMBA_CACHE_DIR=$(CURDIR)/$(VENV_JAZZY)/kernels; \
+	{ \
+	    $(if $(PYTHON_JAZZY),$(VENV_JAZZY)/bin/python test/warmed.py;) \
+	    nice -n 19 $(MAKE) --no-print-directory WORKERS=2 test-jazzy \
+	    || echo 'NOT PASSED: the tests with the versions of Ubuntu 24.04'; \
+	} > out/jazzy.txt 2>&1
 
 test-main: compiled $(tests) $(consumers)
 	$(BIN)/python -m pytest $(SHARED)
