@@ -573,8 +573,13 @@ class BoxRegistrar:
         # A track that has waited keeps two observations of its prior beside the new ones.
         longest_wait = min(self._lag + 1, self.config.window - PRIOR_POSES)
         num_last = num_ended + len(silent)
-        num_due = sum(track.num_carried >= longest_wait - 1 for track in ready)
-        # As many are caught up until the next array as since the last; what is due cannot wait.
+        arrays_left = longest_wait - np.array([track.num_carried for track in ready])
+        # As many may be caught up until the next array as since the last. If not, tracks that have
+        # waited for half of their time are solved in equal shares while it lasts.
+        num_due = max(
+            ceil(np.count_nonzero(arrays_left <= number) / number)
+            for number in range(1, (longest_wait + 1) // 2 + 1)
+        )
         num_rotating = max(num_due, ceil(len(ready) / longest_wait) - self._num_caught_up)
         self._num_caught_up = 0
         limit = self._budget(num_last + num_rotating)
