@@ -833,7 +833,10 @@ class Edge:
                 'nothing to do where the recording begins or ends; elsewhere transforms are '
                 'missing, or the stamp is late'
             )
-        return 'check that its stamps use the clock of the point cloud'
+        return (
+            'check that its stamps use the clock of the point cloud; of a recording, a part '
+            'without transforms is left out by --start and --end'
+        )
 
     def at_each(self, stamps_ns: Sequence[int], is_constant: bool) -> Floats:
         """
