@@ -209,8 +209,7 @@ def run_round(
 def observe(batch: Batch, inputs: Inputs, rows: Ints, constants: Constants) -> method.Sums:
     """Return what the points show of the windows `rows` (b,) where the round begins."""
     problem, free, solution = batch
-    N = solution.poses.shape[1]
-    sums = method.empty_sums(rows, N, free.shape[1] - 6 * N)
+    sums = method.empty_sums(rows, problem.length, free.shape[1])
     record, at = constants.record(), (solution.poses, solution.shared)
     run(observe_faces, 40, len(rows), rows, problem, *at, inputs, record, sums.terms)
     if constants.uses_shape:
@@ -228,7 +227,7 @@ def fit(
     is_last: bool,
     may_settle: bool,
 ) -> NDArray[np.bool_]:
-    """Search the minima of `sums`, with what `observe` has found, and end the round of these."""
+    """Search the minima of the windows of `sums`, which `observe` has made; end their round."""
     rows = np.arange(len(sums.windows))
     objective = Objective(batch, sums, inputs, constants.record(), rows)
     x = search(objective)
@@ -260,7 +259,7 @@ def end(objective: 'Objective', x: Floats, is_last: bool, may_settle: bool) -> N
 
 
 class Objective(NamedTuple):
-    """The sums of the windows `rows` (b,) of those of a round, as `minimize` calls them."""
+    """The sums of some windows of a round, `rows` (b,) of these, as `minimize` calls them."""
 
     batch: Batch
     sums: method.Sums

@@ -206,8 +206,7 @@ def warm_up_others(
 
 def _observe_nothing(batch: Batch, _: Inputs, rows: Ints, __: Constants) -> Sums:
     """Return faces that are seen where they are expected."""
-    N = batch.solution.poses.shape[1]
-    sums = empty_sums(rows, N, batch.free.shape[1] - 6 * N)
+    sums = empty_sums(rows, batch.problem.length, batch.free.shape[1])
     sums.terms[:] = np.zeros((), TERMS)
     sums.terms['visibility'] = 1.0
     sums.terms['num_points'] = 64.0

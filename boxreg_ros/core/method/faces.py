@@ -462,7 +462,12 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
 
 @kernel
 def observe_faces(first, last, rows, problem, poses, shared, inputs, constants, terms):
-    """Write face observations of the windows `rows[first:last]`, one by one: `observe_window`."""
+    """
+    Write the face observations of the windows `rows[first:last]`, see `observe_window`.
+
+    Those of the window `rows[i]` are in `terms[i]`, of shape (b, N).
+
+    """
     constants = constants[0]
     work = empty_face_work(problem, constants)
     for row in range(first, last):

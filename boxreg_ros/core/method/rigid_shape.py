@@ -242,7 +242,12 @@ def agree(b, problem, poses, extents, constants, work, terms):
 
 @kernel
 def observe_shapes(first, last, rows, problem, poses, shared, constants, terms):
-    """Compare the windows `rows[first:last]` with the shapes of their tracks, see `agree`."""
+    """
+    Compare the windows `rows[first:last]` with the shapes of their tracks, see `agree`.
+
+    What it shows of the window `rows[i]` is in `terms[i]`, of shape (b, N).
+
+    """
     constants = constants[0]
     work = empty_shape_work(problem, poses.shape[1], constants.cells)
     for row in range(first, last):

@@ -62,9 +62,14 @@ class Sums(NamedTuple):
     factor: Any
 
 
-def empty_sums(windows: NDArray[np.int64], N: int, S: int) -> Sums:
-    """Return room for `windows` of N observations; all of it is written before it is read."""
-    b = len(windows)
+def empty_sums(windows: NDArray[np.int64], N: int, D: int) -> Sums:
+    """
+    Return room for `windows` of N observations and D variables.
+
+    All of it is written before it is read.
+
+    """
+    b, S = len(windows), D - POSE * N
     coupling = np.empty((b, N, POSE, padded(S + NEXT)))
     factor = Factor(np.empty((b, N, POSE, POSE)), coupling, np.empty((b, S, S)))
     return Sums(windows, np.empty((b, N), TERMS), np.empty(b, COMMON), factor)
