@@ -178,7 +178,8 @@ def test_associated_ids_are_the_same_in_markers_and_messages():
 
 
 def test_heading_signs_are_resolved_per_track_and_stay_marked_as_unknown():
-    """One of five headings of each object is flipped, and its twist must be as well.
+    """
+    One of five headings of each object is flipped, and its twist must be as well.
 
     That of a box with a velocity is its own, in the axes of the object.
     """
