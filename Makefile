@@ -2,8 +2,9 @@
 
 PYTHON ?= python3
 VENV ?= .venv
-# Processes that share the tests: more than cores, as tests of nodes wait for most of their time.
-WORKERS ?= 4
+# Processes that share the tests, beside that of `test-jazzy`: more than cores, as tests of nodes wait
+# for most of their time. Each takes some 8 s of processor time to begin.
+WORKERS ?= 3
 # Python 3.12 for `make test-jazzy`: the first of these that runs.
 PYTHON_JAZZY ?= $(firstword $(foreach python,python3.12 $(wildcard $(HOME)/.pyenv/versions/3.12.*/bin/python),\
     $(shell $(python) -c 'import ensurepip, venv' 2>/dev/null && echo $(python))))
@@ -30,13 +31,16 @@ tests := $(VENV)/.tests-$(version)
 consumers := .venv-consumers/.done-$(version)
 jazzy := $(VENV_JAZZY)/.done
 
-# Rooms without nodes, processes and pictures: the tests that depend on numpy, SciPy and numba, and
-# two that take a recording all the way. How accurate boxes are depends on none of them.
-JAZZY_TESTS := $(patsubst %,--ignore test/core/test_%.py, articulation box_time covariance estimation \
-        kernel_cache kinematics latency refine rigid_shape rings) \
-    $(patsubst %,--ignore test/io/test_%.py, damaged malformed remote) \
-    test/test_config.py test/core test/io test/msg_adapters test/labels/test_labels.py \
-    test/offline/test_evaluate.py test/live/test_pipeline.py test/measure/test_baselines.py \
+# What depends on the versions of Python, numpy, SciPy, PyYAML or pytest: kernels by their known
+# answers, readers and writers, arrays of messages, splines, and two recordings taken all the way. On
+# none of them depend the accuracy of boxes, the order of input and what is said of it, and torch.
+JAZZY_TESTS := test/test_config.py test/msg_adapters test/labels/test_labels.py \
+    $(patsubst %,test/core/test_%.py, faces field_of_view follow geometry input_model input_statistics \
+        l_shape matching metrics observation point_labels problem solver voxels) \
+    test/core/test_method.py::test_value_gradient_and_curvature_are_those_of_automatic_differentiation \
+    $(patsubst %,test/io/test_%.py, definitions foxglove id_assignment item_source lidars \
+        message_contents recording schemas session transforms valid_files whole_files) \
+    test/offline/test_evaluate.py test/measure/test_baselines.py \
     test/offline/test_relabel.py::test_every_box_is_written_once_in_order \
     test/offline/test_relabel.py::test_refined_boxes_match_the_truth_in_the_fixed_frame
 
@@ -67,15 +71,13 @@ environments: $(tests) $(consumers) $(if $(PYTHON_JAZZY),$(jazzy)) ## set up all
 compiled: $(runtime)
 	$(BIN)/python test/warmed.py
 
-# It takes what the tests of nodes and pages leave of the cores, and prints nothing among theirs. It
-# compiles beside them: after them one core would wait for it. What it compiles is apart: tests copy
-# the sources with all that is beside them.
+# It is one more process beside those of the other tests, and prints nothing among theirs. What it
+# compiles is apart: tests copy the sources with all that is beside them.
 jazzy-beside: $(if $(PYTHON_JAZZY),$(jazzy))
 	@mkdir -p out
 	@export PYTHONPYCACHEPREFIX=$(CURDIR)/$(VENV_JAZZY)/pycache NUMBA_CACHE_DIR=$(CURDIR)/$(VENV_JAZZY)/kernels; \
 	{ \
-	    $(if $(PYTHON_JAZZY),$(VENV_JAZZY)/bin/python test/warmed.py;) \
-	    nice -n 19 $(MAKE) --no-print-directory WORKERS=2 test-jazzy \
+	    $(MAKE) --no-print-directory test-jazzy \
 	    || echo 'NOT PASSED: the tests with the versions of Ubuntu 24.04'; \
 	} > out/jazzy.txt 2>&1
 
@@ -95,7 +97,7 @@ test-jazzy: $(if $(PYTHON_JAZZY),$(jazzy)) ## run a part of the suite with the v
 	@[ -n '$(PYTHON_JAZZY)' ] || { \
 	    echo 'NOT RUN: the tests with the versions of Ubuntu 24.04 need Python 3.12, and none was found.'; \
 	    echo 'Install it, or name it: make test-jazzy PYTHON_JAZZY=/path/to/python3.12'; }
-	$(if $(PYTHON_JAZZY),$(VENV_JAZZY)/bin/python -m pytest -q $(SHARED) --durations=3 $(JAZZY_TESTS))
+	$(if $(PYTHON_JAZZY),$(VENV_JAZZY)/bin/python -m pytest -q -n 0 --durations=3 $(JAZZY_TESTS))
 
 lint: $(tests) ## run the linters alone
 	$(BIN)/python -m pytest test/test_lint.py

@@ -33,16 +33,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 torch.set_num_threads(1)
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_setupnodes():
-    """Compile the kernels once, before the workers start nodes that wait for them."""
-    # Imported here: messages are imported after their checks are switched on.
-    import warmed  # noqa: F401
-
-
-def pytest_sessionstart():
-    """Load the kernels in each process of a run in parallel."""
-    if 'PYTEST_XDIST_WORKER' in os.environ:
+def pytest_sessionstart(session):
+    """Load the kernels where many tests run; compile them before workers start nodes."""
+    is_worker = 'PYTEST_XDIST_WORKER' in os.environ
+    if is_worker or session.config.getoption('numprocesses', None) is not None:
+        # Imported here: messages are imported after their checks are switched on.
         import warmed  # noqa: F401
 
 
@@ -61,9 +56,13 @@ def pytest_collection():
 
 
 @pytest.fixture(scope='module', autouse=True)
-def browser_of_the_module():
-    """End the browser that the tests of a module share."""
-    yield
+def browser_of_pages(request):
+    """End the browser that tests share before a module without pages: it has an event loop."""
+    if 'opened_page' not in vars(request.module):
+        end_shared_browser()
+
+
+def pytest_sessionfinish():
     end_shared_browser()
 
 
