@@ -95,7 +95,7 @@ server = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 server.connect({address!r})
 server.send(json.dumps([os.getpid(), sys.argv, dict(os.environ), os.getcwd()]).encode())
 process = int(server.recv(16))
-for number in (signal.SIGINT, signal.SIGTERM):
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
     signal.signal(number, lambda number, _: os.kill(process, number))
 status = int(server.recv(16))
 if status < 0:
@@ -162,6 +162,7 @@ def _run_for(launcher, arguments, environment, folder):
     sys.executable, *arguments = arguments
     os.chdir(folder)
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored
     if arguments[0] == '-c':
         _run_entry_point(CODE, arguments[1:])
     assert arguments[:2] == ['-m', 'boxreg_ros.cli'], arguments

@@ -37,9 +37,9 @@ def boxreg(capsys, *arguments):
     return status, out, err
 
 
-def start(*arguments, **options):
+def start(*arguments, python=sys.executable, **options):
     """Start the command in another process."""
-    command = [sys.executable, '-m', 'boxreg_ros.cli', *map(str, arguments)]
+    command = [python, '-m', 'boxreg_ros.cli', *map(str, arguments)]
     return subprocess.Popen(command, cwd=ROOT, text=True, **options)
 
 
@@ -384,14 +384,13 @@ def test_help_and_version(capsys):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_an_interrupted_run_leaves_no_files(tmp_path, number):
+def test_an_interrupted_run_leaves_no_files(tmp_path, preloaded_python, number):
     recording = Drive(sweeps=60).write(tmp_path / 'drive')
-    before = signal.signal(number, signal.SIG_DFL)  # under nohup it is ignored
     process = start(
         'relabel', recording, '-o', tmp_path / 'results' / 'out', *SLOW,
+        python=sys.executable if number == signal.SIGINT else preloaded_python,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
-    signal.signal(number, before)
     while not any((tmp_path / 'results').glob('.out.*')):
         assert process.poll() is None
         time.sleep(0.05)
@@ -498,50 +497,31 @@ def test_a_run_that_ends_while_results_wait_to_be_written(
     assert {path.name: path.read_bytes() for path in out.glob('*.*')} == before
 
 
-def test_a_run_under_nohup_ignores_sighup(tmp_path):
+def test_a_run_under_nohup_ignores_sighup_and_a_closed_stdout(tmp_path):
     recording = Drive(sweeps=20).write(tmp_path / 'drive')
     command = ['nohup', sys.executable, '-m', 'boxreg_ros.cli', 'relabel', recording]
-    silent = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL}
-    process = subprocess.Popen([*command, '-o', tmp_path / 'out', *QUICK], cwd=ROOT, **silent)
+    process = subprocess.Popen(
+        [*command, '-o', tmp_path / 'out', *QUICK], cwd=ROOT, text=True,
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    process.stdout.close()
     while not any(tmp_path.glob('.out.*')):
         assert process.poll() is None
         time.sleep(0.01)
     process.send_signal(signal.SIGHUP)
-    assert process.wait() == 0
-    assert (tmp_path / 'out' / 'boxes.csv').exists()
-
-
-def test_file_names_that_stdout_cannot_encode_are_escaped(tmp_path):
-    recording = Drive(sweeps=4).write(tmp_path / 'drive')
-    process = start(
-        'relabel', recording, '-o', tmp_path / 'ü', *QUICK, stdout=subprocess.PIPE,
-        env=os.environ | {'PYTHONIOENCODING': 'ascii'},
-    )  # fmt: skip
-    out = process.communicate(timeout=60)[0]
-    assert process.returncode == 0
-    assert '\\xfc: 8 boxes in' in out
-
-
-def test_a_closed_stdout_is_no_error(tmp_path):
-    recording = Drive(sweeps=4).write(tmp_path / 'drive')
-    process = start(
-        'relabel', recording, '-o', tmp_path / 'out', *QUICK,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-    process.stdout.close()
     err = process.stderr.read()
     process.stderr.close()
     assert (process.wait(timeout=60), err) == (0, '')
     assert (tmp_path / 'out' / 'boxes.csv').exists()
 
 
-def test_a_terminal_shows_a_progress_bar(tmp_path):
+def test_a_terminal_shows_a_progress_bar_and_stdout_names_that_it_can_encode(tmp_path):
     recording = Drive(sweeps=4).write(tmp_path / 'drive')
     leader, follower = pty.openpty()
     fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 100, 0, 0))
     process = start(
-        'relabel', recording, '-o', tmp_path / 'out', *QUICK,
-        stdout=subprocess.PIPE, stderr=follower,
+        'relabel', recording, '-o', tmp_path / 'ü', *QUICK,
+        stdout=subprocess.PIPE, stderr=follower, env=os.environ | {'PYTHONIOENCODING': 'ascii'},
     )  # fmt: skip
     os.close(follower)
     shown = io.BytesIO()
@@ -554,4 +534,5 @@ def test_a_terminal_shows_a_progress_bar(tmp_path):
     out = process.communicate(timeout=60)[0]
     assert process.returncode == 0
     assert len(out.splitlines()) == 2
+    assert '\\xfc: 8 boxes in' in out
     assert b's of the recording' in shown.getvalue()

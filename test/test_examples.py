@@ -1,7 +1,7 @@
 """The examples of the documentation run, and the pages show them as they are."""
 
-import os
 import re
+import runpy
 import subprocess
 import sys
 
@@ -16,17 +16,6 @@ def example(name):
     return ROOT / 'docs' / 'examples' / f'{name}.py'
 
 
-def output_of(example):
-    # An installation beside these sources, as that of colcon, may have no compiled kernels.
-    paths = os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')])
-    done = subprocess.run(
-        [sys.executable, example], env={**os.environ, 'PYTHONPATH': paths}, cwd=ROOT,
-        capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 def block_after(text, start):
     """Return the content of the first fenced block of `text` that starts with `start`."""
     first = text.index(start) + len(start)
@@ -34,8 +23,9 @@ def block_after(text, start):
 
 
 @pytest.mark.parametrize('name', ['refine_tracks', 'stream'])
-def test_example_reduces_the_position_error_as_its_page_shows(name):
-    output = output_of(example(name))
+def test_example_reduces_the_position_error_as_its_page_shows(name, capsys):
+    runpy.run_path(str(example(name)), run_name='__main__')
+    output = capsys.readouterr().out
     errors = {key: float(value) for key, value in ERROR.findall(output)}
     given = errors.pop('input')
     assert max(errors.values()) < 0.5 * given
