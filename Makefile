@@ -150,6 +150,7 @@ $(jazzy): constraints.txt constraints-jazzy.txt setup.py package.xml | $(install
 	awk -F '==' '{name = tolower($$1)} FNR == NR {own[name]} FNR == NR || !(name in own)' \
 	    constraints-jazzy.txt constraints.txt > $(VENV_JAZZY)/constraints.txt
 	$(INSTALL) $(VENV_JAZZY) -c $(VENV_JAZZY)/constraints.txt setuptools
-	$(INSTALL) $(VENV_JAZZY) -c $(VENV_JAZZY)/constraints.txt $(BUILD) \
-	    -e '.[ros,report]' pytest pytest-xdist shapely
+	printf '%s\n' triton cuda-bindings > $(VENV_JAZZY)/excluded.txt  # of torch: .7 GB for GPUs
+	$(INSTALL) $(VENV_JAZZY) -c $(VENV_JAZZY)/constraints.txt --excludes $(VENV_JAZZY)/excluded.txt \
+	    $(BUILD) -e '.[ros,report]' pytest pytest-xdist shapely
 	@touch $@

@@ -11,6 +11,7 @@ from importlib import import_module
 import json
 from multiprocessing import connection, forkserver, get_context
 import os
+import resource
 import signal
 import socket
 import sys
@@ -109,8 +110,9 @@ class PreloadedPython:
     """
     An executable that runs ``-m boxreg_ros.cli`` and ``-c CODE`` in preloaded processes.
 
-    A process ends with its launcher, and starts its own processes in the same way. Where the
-    number or the memory of a process are tested, use Python itself.
+    A process ends with its launcher, which states how large its files may be, and starts its own
+    processes in the same way. Where the number or the memory of a process are tested, use Python
+    itself.
 
     Parameters
     ----------
@@ -157,6 +159,8 @@ def _run_for(launcher, arguments, environment, folder):
         os.dup2(os.open(f'/proc/{launcher}/fd/{stream}', os.O_WRONLY | os.O_APPEND), stream)
     # Those there were may be of files, and these of pipes.
     sys.stdout, sys.stderr = os.fdopen(1, 'w'), os.fdopen(2, 'w', 1)
+    limit = resource.RLIMIT_FSIZE
+    resource.setrlimit(limit, resource.prlimit(launcher, limit))
     os.environ.clear()
     os.environ.update(environment)
     sys.executable, *arguments = arguments

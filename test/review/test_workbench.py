@@ -6,7 +6,6 @@ import resource
 import shutil
 import signal
 import subprocess
-import sys
 
 from boxreg_ros import Config, refine, Track
 from boxreg_ros.cli import main
@@ -186,7 +185,7 @@ def test_labels_that_cannot_be_written_leave_all_as_it_was(server, made):
 
 
 @contextmanager
-def running(out, python=sys.executable, max_bytes=None):
+def running(out, python, max_bytes=None):
     """Yield the process of `boxreg review` and its address; no file may have more bytes."""
 
     def limit():
@@ -205,7 +204,7 @@ def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path, preloaded_
     out = shutil.copytree(made / 'out', tmp_path / 'out')
     log, again = out / DECISIONS, tmp_path / 'out.corrected'
     with (
-        running(out, max_bytes=200_000) as (process, address),
+        running(out, preloaded_python, max_bytes=200_000) as (process, address),
         opened_page(address + '#track=1', expected='Failed to load resource') as page,
     ):
         press(page, 'd', 'isGone(current())')
