@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
-from statistics import median
+from statistics import fmean, median
 
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.clocks import (
@@ -29,6 +29,7 @@ from boxreg_ros.io.clocks import (
 from boxreg_ros.io.findings import Finding
 from boxreg_ros.io.transforms import Edge, inverse, matrix, MAX_LINEAR_GAP, TransformTree
 from boxreg_ros.reasons import Reason
+from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 import numpy as np
 
@@ -42,10 +43,19 @@ a third of it.
 """
 STEP_RADIUS = 20.0
 """Distance from the sensor at which a rotation counts as a step [m]; chosen: that of objects."""
+MIN_STEP_ANGLE = MIN_STEP / STEP_RADIUS
+"""Smallest turn between two samples that is one [rad]."""
 MAX_EGO_SPEED = 100.0
 """Speed that no vehicle has [m/s]; derived: 360 km/h."""
 MAX_EGO_ACCELERATION = 20.0
 """Acceleration that no vehicle has [m/s^2]; derived: tyres transmit that of gravity, and twice."""
+MAX_EGO_YAW_ACCELERATION = 5.0
+"""
+Yaw acceleration that no vehicle has [rad/s^2].
+
+Chosen: an evasive manoeuvre has 3, a robot that begins to turn on the spot 4.
+
+"""
 MIN_ALTERNATIONS = 3
 """Samples at impossible speed that mean two publishers; chosen: one or two are a restart."""
 MIN_REVERSALS = 3
@@ -70,6 +80,12 @@ Standard deviation of the position of the sensor that is reported [m].
 Chosen: boxes lose .02 of 3D IoU by it, and all of their gain by twice as much; drives have 0.001.
 
 """
+MIN_YAW_JITTER = 0.01
+"""That of its yaw [rad]; chosen: boxes lose .02 of 3D IoU by it, and all of their gain by 0.02."""
+YAW_JITTER_SCALE = 2.33
+"""Standard deviation of yaw over the mean of `PoseJitter`; derived by simulation."""
+MIDDLE_STEPS = 0.9
+"""Part of the steps of yaw, the smallest ones, in this mean; chosen: the others may be jumps."""
 JITTER_CLOUDS = 50
 """Newest clouds by which it is measured, and the most that are needed; chosen: 5 s."""
 MIN_JITTER_CLOUDS = 30
@@ -93,9 +109,10 @@ class FrameSteps:
 
     parent: str
     child: str
+    unit: str = 'm'
     count: int = 0
     largest: float = 0.0
-    """In metres, a rotation as the way at `STEP_RADIUS`."""
+    """In metres, a rotation as the way at `STEP_RADIUS`; or rotations alone, in degrees."""
     first_ns: int = 0
 
     def add(self, step: float, stamp_ns: int) -> None:
@@ -108,8 +125,8 @@ class FrameSteps:
         """Return number and size of the steps."""
         steps = f'{self.count} steps of up to' if self.count > 1 else 'a step of'
         return (
-            f'{self.parent} -> {self.child} has {steps} {self.largest:.2f} m, the first at '
-            f'{self.first_ns} ns, as localisation makes them'
+            f'{self.parent} -> {self.child} has {steps} {self.largest:.2f} {self.unit}, the '
+            f'first at {self.first_ns} ns, as localisation makes them'
         )
 
 
@@ -127,9 +144,9 @@ class JumpSearch:
     """By parent and child, of the transforms that stepped."""
     alternations: dict[tuple[str, str], FrameSteps] = field(default_factory=dict)
     """FrameSteps of the motion itself that no vehicle makes: too fast, or back and forth."""
-    jumps: list[tuple[tuple[str, str], int, int, float]] = field(default_factory=list)
+    jumps: list[tuple[tuple[str, str, str], int, int, float]] = field(default_factory=list)
     """Steps of the motion itself after which it goes on as before, displaced, until `MotionCheck`
-    takes them: of parent and child, the stamps before and after them, and their size [m]."""
+    takes them: of parent, child and unit, the stamps before and after them, and their size."""
     _seen_ns: dict[tuple[str, str], int] = field(default_factory=dict)
     _reversals: Counter[tuple[str, str]] = field(default_factory=Counter)
     """Steps back and forth up to the last sample."""
@@ -198,20 +215,54 @@ class JumpSearch:
         at most a times half of their time. A single wrong sample is a step there and one back.
 
         """
-        if row < 5:
+        if row < 5 or not _is_step(*edge.poses[row - 3 : row - 1]):
             return
-        stamps_ns, poses = edge.stamps[row - 5 : row + 1], edge.poses[row - 5 : row + 1]
-        if np.linalg.norm(poses[3][:3] - poses[2][:3]) <= MIN_STEP:
-            return
-        seconds = np.diff(stamps_ns)[:, None] * 1e-9
-        steps = np.diff([pose[:3] for pose in poses], axis=0)
-        steps -= np.median(steps / seconds, axis=0) * seconds  # off the motion around them
-        jump = steps[2]
-        limit = max(MIN_STEP, MAX_EGO_ACCELERATION * seconds[2, 0] * seconds.sum() / 2)
-        pairs = jump, jump + steps[1], jump + steps[3]
-        if min(map(np.linalg.norm, pairs)) > limit:
-            way = float(np.linalg.norm(jump))
-            self.jumps.append(((edge.parent, edge.child), stamps_ns[2], stamps_ns[3], way))
+        stamps_ns = edge.stamps[row - 5 : row + 1]
+        poses = np.array(edge.poses[row - 5 : row + 1])
+        seconds = np.asarray(np.diff(stamps_ns) * 1e-9, float)
+        jump = _jump_of(np.diff(poses[:, :3], axis=0), seconds, MIN_STEP, MAX_EGO_ACCELERATION)
+        unit = 'm'
+        if not jump:
+            turns = _turns_between(poses[:, 3:])
+            jump = np.degrees(_jump_of(turns, seconds, MIN_STEP_ANGLE, MAX_EGO_YAW_ACCELERATION))
+            unit = 'degrees'
+        if jump:
+            key = edge.parent, edge.child, unit
+            self.jumps.append((key, stamps_ns[2], stamps_ns[3], float(jump)))
+
+
+def _is_step(one: Floats, other: Floats) -> bool:
+    """Return whether two poses (7,) are as far apart as the smallest jump."""
+    if np.linalg.norm(other[:3] - one[:3]) > MIN_STEP:
+        return True
+    first, second = one[3:], other[3:]
+    cosine_squared = (first @ second) ** 2 / ((first @ first) * (second @ second))
+    return bool(cosine_squared < np.cos(MIN_STEP_ANGLE / 2) ** 2)
+
+
+def _jump_of(steps: Floats, seconds: Floats, least: float, acceleration: float) -> float:
+    """Return how far the third of steps (5, 3) exceeds the motion around it; 0 if it may."""
+    if np.linalg.norm(steps[2]) <= least:
+        return 0.0
+    rate = np.median(steps / seconds[:, None], axis=0)
+    steps = steps - rate * seconds[:, None]
+    jump = steps[2]
+    limit = max(least, acceleration * seconds[2] * seconds.sum() / 2)
+    pairs = jump, jump + steps[1], jump + steps[3]
+    is_jump = min(map(np.linalg.norm, pairs)) > limit
+    return float(np.linalg.norm(jump)) if is_jump else 0.0
+
+
+def _turns_between(quaternions_xyzw: Floats) -> Floats:
+    """Return the rotations (n - 1, 3) [rad] from each of n quaternions to the next one."""
+    unit = quaternions_xyzw / np.linalg.norm(quaternions_xyzw, axis=1, keepdims=True)
+    (v, w), (v2, w2) = ((q[:, :3], q[:, 3:]) for q in (unit[:-1], unit[1:]))
+    axes = w * v2 - w2 * v - np.cross(v, v2)
+    cosines = (unit[:-1] * unit[1:]).sum(axis=1, keepdims=True)
+    sines = np.linalg.norm(axes, axis=1, keepdims=True)
+    angles = 2 * np.arctan2(sines, np.abs(cosines)) * np.sign(cosines)
+    turns: Floats = axes / np.maximum(sines, np.finfo(float).tiny) * angles
+    return turns
 
 
 def _moves(edge: Edge) -> bool:
@@ -224,13 +275,15 @@ class PoseJitter:
     """
     Standard deviation of independent errors of the horizontal position of a sensor, per axis [m].
 
-    With independent errors a position is off the line through those before and after it, and the
-    next one is off to the other side. The smaller one of both distances has the standard deviation
-    as its median; motions of vehicles go on to one side.
+    Or of its yaw [rad]. With independent errors a position is off the line through those before
+    and after it, and the next one is off to the other side. The smaller one of both distances has
+    the standard deviation as its median; motions of vehicles go on to one side. That of a yaw,
+    which goes on to the same side more often, is taken by its mean, whose variance is smaller.
 
     """
 
-    def __init__(self) -> None:
+    def __init__(self, of_yaw: bool = False) -> None:
+        self._of_yaw = of_yaw
         self._poses = deque[tuple[int, Floats]](maxlen=3)
         self._away: Floats | None = None
         self._steps = deque[float](maxlen=JITTER_CLOUDS)
@@ -238,10 +291,15 @@ class PoseJitter:
     @property
     def deviation(self) -> float:
         """Return the standard deviation; 0 while it is not known."""
-        return median(self._steps) if len(self._steps) >= MIN_JITTER_CLOUDS else 0.0
+        count = len(self._steps)
+        if count < MIN_JITTER_CLOUDS:
+            return 0.0
+        if not self._of_yaw:
+            return median(self._steps)
+        return YAW_JITTER_SCALE * fmean(sorted(self._steps)[: round(MIDDLE_STEPS * count)])
 
     def add(self, stamp_ns: int, position: Floats) -> None:
-        """Add the next position (2,) at a stamp."""
+        """Add the next position (2,), or yaw (1,), at a stamp."""
         if self._poses and not 0 < stamp_ns - self._poses[-1][0] <= MAX_LINEAR_GAP * 1e9:
             self._poses.clear()
             self._away = None
@@ -271,7 +329,7 @@ class MotionCheck:
         self._jumps = JumpSearch()
         self.findings: dict[str, Finding] = {}
         self._clouds_ns = inf, -inf  # first and last stamp
-        self._displaced: dict[tuple[str, str], FrameSteps] = {}  # that jump between clouds
+        self._displaced: dict[tuple[str, str, str], FrameSteps] = {}  # that jump between clouds
         self.forget()
 
     def forget(self) -> None:
@@ -283,6 +341,7 @@ class MotionCheck:
         self._count = 0
         self._first_milliseconds = 0
         self._jitters: dict[str, PoseJitter] = {}  # by the frame of the clouds
+        self._yaw_jitters: dict[str, tuple[PoseJitter, Floats]] = {}  # with the last yaw, likewise
         # First and last position (3,), and length of the path in the plane [m], likewise.
         self._paths: dict[str, tuple[Floats, Floats, float]] = {}
 
@@ -343,6 +402,7 @@ class MotionCheck:
                 f'of motion, with --fixed-frame or --odometry, or smooth this one'
             )
             self.findings['jitter'] = Finding(Reason.TRANSFORM_FAULT, text)
+        self._add_yaw(cloud, fixed_frame, T_fixed_cloud)
         position = T_fixed_cloud[:3, 3]
         begin, last, length = self._paths.get(cloud.frame_id, (position, position, 0.0))
         length += float(np.linalg.norm(position[:2] - last[:2]))
@@ -357,6 +417,24 @@ class MotionCheck:
                 f'of Tr, pose, Tr), or choose another motion with --fixed-frame or --odometry'
             )
             self.findings.setdefault('axes', Finding(Reason.TRANSFORM_FAULT, text))
+
+    def _add_yaw(self, cloud: Sweep, fixed_frame: str, T_fixed_cloud: Floats) -> None:
+        """Add the yaw of the frame of a cloud."""
+        yaw = np.arctan2(T_fixed_cloud[1:2, 0], T_fixed_cloud[:1, 0])
+        new = PoseJitter(of_yaw=True), yaw
+        jitter, last = self._yaw_jitters.get(cloud.frame_id, new)
+        yaw = last + wrap_angle(yaw - last)
+        jitter.add(cloud.stamp_ns, yaw)
+        self._yaw_jitters[cloud.frame_id] = jitter, yaw
+        if jitter.deviation >= MIN_YAW_JITTER and 'publishers' not in self.findings:
+            text = (
+                f'the yaw of {cloud.frame_id!r} in {fixed_frame!r} errs by '
+                f'{np.degrees(jitter.deviation):.1f} degrees from cloud to cloud, back and forth: '
+                f'points and boxes are displaced by it, at {STEP_RADIUS:.0f} m by '
+                f'{STEP_RADIUS * jitter.deviation:.1f} m; use a smoother source of motion, with '
+                f'--fixed-frame or --odometry, or smooth this one'
+            )
+            self.findings.setdefault('jitter', Finding(Reason.TRANSFORM_FAULT, text))
 
     def _look(self, fixed_frame: str, frame: str) -> None:
         """Look at the transforms as they are now."""
@@ -423,7 +501,8 @@ class MotionCheck:
         self._jumps.jumps = ahead
         if not found or not self.findings.keys().isdisjoint(('jitter', 'publishers')):
             return ''
-        steps = _worst(found.values())
+        turning = all(steps.unit == 'degrees' for steps in found.values())
+        steps = _worst(one for one in found.values() if turning or one.unit == 'm')
         return (
             f'the motion itself jumps: {steps}: boxes of what stands still jump with it, and '
             f'their tracks are wrong there; use a source of motion without corrections, with '

@@ -66,6 +66,8 @@ MIN_UPRIGHT = 0.5
 """Cosine of the tilt below which a box is not upright; derived: 60 degrees."""
 MIN_TILTED = 0.3
 """Part of the boxes on their sides or backs; chosen: with w first, all but oncoming ones."""
+LEAST_TILT = 1e-6
+"""Least difference of the cosines of two tilts; derived: 0.1 degrees, beyond rounding."""
 MOST_TILTED = 0.9
 """Part of them that shows a fixed frame with another axis up; chosen: all but those that err."""
 MAX_TILTED = 0.05
@@ -116,7 +118,8 @@ class PlaceCheck(PairedCheck):
             'mirrored': _Place('orientation', 'left_handed'),
             'doubled': _Place('size_scale', f'{scale:g}'),
         }
-        self._tilted: list[tuple[bool, bool]] = []  # as read, and with w first
+        # As read, and with w at the other end of the quaternion: cosine of the tilt.
+        self._tilts: list[tuple[float, float]] = []
         self._within: list[float] = []
         self._heights: list[float] = []  # in the frame of the messages
         self._stands: list[float] = []  # cosine of z of each box with that of the fixed frame
@@ -127,7 +130,7 @@ class PlaceCheck(PairedCheck):
     @property
     def is_open(self) -> bool:
         """Return whether more boxes are compared."""
-        return len(self._tilted) < MAX_COMPARED and not self.finding
+        return len(self._tilts) < MAX_COMPARED and not self.finding
 
     def add(
         self,
@@ -161,13 +164,12 @@ class PlaceCheck(PairedCheck):
 
     def _compare(self, points: NDArray[np.floating], array: BoxArray) -> None:
         """Add what boxes in the frame of their message contain of the points, in each place."""
-        boxes = array.boxes[is_valid_box(array.boxes)][: MAX_COMPARED - len(self._tilted)]
+        boxes = array.boxes[is_valid_box(array.boxes)][: MAX_COMPARED - len(self._tilts)]
         count = len(boxes)
         kept = BoxArray(0, '', ('',) * count, ('',) * count, np.ones(count), boxes)
         raw = self._convention.from_centers(kept)
-        wxyz = replace(self._convention, orientation='wxyz').to_centers(raw).boxes
-        tilted = np.cos([boxes[:, ROLL:YAW], wxyz[:, ROLL:YAW]]).prod(axis=2) < MIN_UPRIGHT
-        self._tilted += [(bool(own), bool(other)) for own, other in tilted.T]
+        other = replace(self._convention, orientation=self._other_order).to_centers(raw).boxes
+        self._tilts += np.cos([boxes[:, ROLL:YAW], other[:, ROLL:YAW]]).prod(axis=2).T.tolist()
         T = self._frames.pop('')
         own = moved_boxes(boxes, T)
         self._stands += np.cos(own[:, ROLL:YAW]).prod(axis=1).tolist()
@@ -181,17 +183,34 @@ class PlaceCheck(PairedCheck):
             place = self._others.setdefault(f'frame {name}', _Place('boxes_frame', name))
             _add_coverages(place, points, moved_boxes(boxes, T_fixed_frame))
 
+    @property
+    def _other_order(self) -> str:
+        """Return the orientation that takes w of quaternions from the other end."""
+        return 'xyzw' if self._convention.orientation == 'wxyz' else 'wxyz'
+
     def _tilt_text(self) -> str:
-        """Return that the boxes lie on their backs, unless w of their quaternions comes first."""
-        if len(self._tilted) < ENOUGH_BOXES or self._convention.orientation == 'wxyz':
+        """
+        Return that the boxes are tilted, unless w of their quaternions is at the other end.
+
+        With w taken to come first by mistake, those along x of their frame are tilted by their yaw
+        alone: all that are on a straight road are upright, and turned around.
+
+        """
+        if len(self._tilts) < ENOUGH_BOXES:
             return ''
-        own, wxyz = np.mean(self._tilted, axis=0)
-        if own < MIN_TILTED or wxyz > MAX_TILTED:
+        own, other = np.mean(np.array(self._tilts) < MIN_UPRIGHT, axis=0)
+        own_median, other_median = np.median(self._tilts, axis=0)
+        is_less_upright = own_median < other_median - LEAST_TILT
+        is_tilted = own >= MIN_TILTED or (self._other_order == 'xyzw' and is_less_upright)
+        if not is_tilted or other > MAX_TILTED:
             return ''
+        how = f'{own:.0%} of the boxes lie on their sides or backs'
+        if own < MIN_TILTED:
+            how = 'boxes are tilted by what should be their yaw'
         return (
-            f'{own:.0%} of the boxes lie on their sides or backs: expected orientation '
-            f"'wxyz', got {self._convention.orientation!r}; set orientation:=wxyz (boxreg "
-            f'relabel: --orientation wxyz)'
+            f'{how}: expected orientation {self._other_order!r}, got '
+            f'{self._convention.orientation!r}; set orientation:={self._other_order} (boxreg '
+            f'relabel: --orientation {self._other_order})'
         )
 
     @property
@@ -259,7 +278,7 @@ class PlaceCheck(PairedCheck):
                 'recording'
             )
         return (
-            f'boxes do not fit the points: {len(self._own.coverages)} of {len(self._tilted)} have '
+            f'boxes do not fit the points: {len(self._own.coverages)} of {len(self._tilts)} have '
             f'points around them, and contain {self._own.mean:.0%} of these; elsewhere '
             f'{len(best.coverages)} and {best.mean:.0%}: expected {option} {best.value}, got '
             f'{got[option]}; set {option}:={best.value} (boxreg relabel: '

@@ -113,7 +113,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             'left_out_of_source': dict(+not_read),
             'assumed': assumed,
             **unused,
-            'warning': axes.finding,
+            'warning': '; '.join(filter(None, (axes.finding, request.unbound_text()))),
             'left_out_of_labels': left_out,
             'label_notes': output.notes(),
             'versions': {'boxreg_ros': __version__},

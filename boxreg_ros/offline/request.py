@@ -15,8 +15,9 @@ from boxreg_ros.errors import ConfigError, require_packages
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.storage.urls import entries_of, url_of
 from boxreg_ros.labels import check_options, files_of, labels_points, module_of, Options
+from boxreg_ros.offline.result_folder import has_changed
 from boxreg_ros.options import option
-from boxreg_ros.review.decisions import APPLIED
+from boxreg_ros.review.decisions import APPLIED, DECISIONS
 from msg_adapters.convention import Convention, STANDARD
 
 if TYPE_CHECKING:
@@ -298,17 +299,29 @@ class Request:
         return path if path.is_file() else None
 
     def unbound_text(self) -> str:
-        """Return that the labels have decisions of a person that do not bind; '' for none."""
-        if self.labels is None or self.labels[0] == 'csv' or not self.completes:
+        """Return that decisions of a person beside the labels do not bind; '' for none."""
+        if self.labels is None or self.decisions is not None:
             return ''
-        folders = self.labels[1].absolute().parents[:2]
-        found = [folder for folder in folders if (folder / APPLIED).is_file()]
-        if not found:
+        name, path = self.labels
+        folders = path.absolute().parents[:2]
+        if name == 'csv':
+            folders = (path if path.is_dir() else path.parent,)
+        for folder in folders:
+            if has_changed(folder / DECISIONS):
+                return (
+                    f'labels {str(path)!r}: they do not have all decisions of '
+                    f'{folder / DECISIONS}, which is newer: write the labels first (boxreg review '
+                    f'{folder}, Ctrl-S) and use these, or relabel the recording with '
+                    f'--decisions {folder / DECISIONS}'
+                )
+        files = [folder / each for folder in folders for each in (APPLIED, DECISIONS)]
+        found = next((file for file in files if file.is_file()), None)
+        if found is None or name == 'csv' or not self.completes:
             return ''
         return (
-            f'labels {str(self.labels[1])!r}: {APPLIED} beside them is about boxes.csv alone: '
-            f'classes and ids that a person gave may change; use --labels csv:{found[0]}, or '
-            f'relabel the recording with --decisions'
+            f'labels {str(path)!r}: {found.name} beside them is about boxes.csv alone: classes '
+            f'and ids that a person gave may change, and deleted boxes be added again; use '
+            f'--labels csv:{found.parent}, or relabel the recording with --decisions'
         )
 
     def drive_name(self) -> str:

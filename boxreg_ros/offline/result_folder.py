@@ -59,6 +59,15 @@ def whole_summary(out: Path, fingerprint: str) -> dict[str, Any] | None:
     return None if lost or has_arrived else summary
 
 
+def has_changed(path: Path) -> bool:
+    """Return whether a file in a result was added or changed after its run."""
+    summary = earlier_summary(path.parent)
+    if summary is None or not path.is_file():
+        return False
+    known = summary.get(FILES, {}).get(path.name, {})
+    return bool(known.get('sha256') != _digest(path))
+
+
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:
     """Add all files of a result to its summary, and write this last file."""
     summary[FILES] = {

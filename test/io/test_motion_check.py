@@ -381,18 +381,24 @@ def test_a_jump_that_rotates_the_map_is_found(tmp_path):
     assert read(drive, tmp_path)[1] == 'odom'
 
 
-@pytest.mark.parametrize('jump', [0.0, 3.0])
-def test_a_single_jump_of_the_motion_itself_is_named(tmp_path, jump):
+@pytest.mark.parametrize(('jump', 'unit'), [(0.0, ''), (3.0, 'm'), (-8.0, 'degrees')])
+def test_a_single_jump_of_the_motion_itself_is_named(tmp_path, jump, unit):
+    """Beside a turn of half a radian a second."""
     drive = Drive(sweeps=30)
     for topic, stamp, message in drive.items:
-        if topic == '/tf' and stamp >= drive.stamps[12]:
-            message.transforms[0].transform.translation.y += jump
+        if topic == '/tf':
+            pose = message.transforms[0].transform
+            yaw = 0.5e-9 * (stamp - START)
+            if stamp >= drive.stamps[12]:
+                pose.translation.y += jump * (unit == 'm')
+                yaw += np.radians(jump) * (unit == 'degrees')
+            pose.rotation.z, pose.rotation.w = np.sin(yaw / 2), np.cos(yaw / 2)
     _, _, found = read(drive, tmp_path)
     assert bool(found) == bool(jump)
     for i, part in enumerate(({'end': 1.2}, {'start': 1.2})):
         assert not read(drive, tmp_path / str(i), **part)[2]  # the remedy
     if jump:
-        assert 'odom -> base has a step of 3.00 m, the first at' in found
+        assert f'odom -> base has a step of {abs(jump):.2f} {unit}, the first at' in found
         assert f'{drive.stamps[12]} ns' in found
 
 
@@ -448,15 +454,26 @@ def test_a_fixed_frame_of_a_sensor_that_stands_is_not(tmp_path):
     assert not read(drive, tmp_path, fixed_frame='base')[2]
 
 
-@pytest.mark.parametrize('deviation', [0.0, 0.01, 0.05])
-def test_motion_that_errs_from_cloud_to_cloud_is_named(tmp_path, deviation):
+@pytest.mark.parametrize(('deviation', 'turn'), [(0, 0), (0.01, 0.2), (0.05, 0), (0, 1.0)])
+def test_motion_that_errs_from_cloud_to_cloud_is_named(tmp_path, deviation, turn):
+    """The position by metres, or the yaw by degrees."""
     rng = np.random.default_rng(4)
+    turns = np.random.default_rng(2).normal(0, turn, 50)
     drive = Drive(sweeps=50)
     for number in range(50):
         drive.replace('/tf', number, lambda message: shifted(message, rng.normal(0, deviation, 2)))
+        drive.replace('/tf', number, lambda message, k=number: turned(message, turns[k]))
     found = read(drive, tmp_path)[2]
     assert ('errs by 0.05 m from cloud to cloud' in found) == (deviation > 0.03)
-    assert bool(found) == (deviation > 0.03)
+    assert ("yaw of 'lidar' in 'odom' errs by 1.1 degrees" in found) == (turn > 0.5)
+    assert bool(found) == (max(deviation / 0.03, turn / 0.5) > 1)
+
+
+def turned(message, degrees):
+    turn = message.transforms[0].transform.rotation
+    half = np.radians(degrees) / 2
+    turn.z, turn.w = np.sin(half), np.cos(half)
+    return message
 
 
 def shifted(message, offset):

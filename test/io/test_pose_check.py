@@ -405,6 +405,24 @@ def test_boxes_that_are_tilted_mirrored_or_of_half_the_size_are_named(option, va
     assert placed(meant, taken=meant) == ''
 
 
+@pytest.mark.parametrize(('turn', 'how'), [(0, 'tilted by'), (np.pi, 'of the boxes lie on')])
+def test_w_that_is_taken_to_come_first_by_mistake_is_named(turn, how):
+    """On a straight road, in and against the direction of the vehicle."""
+    boxes, points = scene()
+    boxes[:, 8] = turn + np.linspace(-0.1, 0.1, len(boxes))
+    for meant in ('xyzw', 'wxyz'):
+        check = PlaceCheck(Convention(orientation='wxyz'))
+        raw = Convention(orientation=meant).from_centers(array_of(*boxes))
+        for k in range(2):
+            check.add(Sweep(STAMP + k * 10**8, 'map', points), np.eye(4))
+            read = Convention(orientation='wxyz').to_centers(
+                replace(raw, stamp_ns=STAMP + k * 10**8)
+            )
+            check.add(read, np.eye(4))
+        found = check.finding
+        assert (how in found and 'set orientation:=xyzw' in found) == (meant == 'xyzw'), found
+
+
 def test_boxes_twice_as_large_as_their_objects_are_named():
     meant = Convention(size_scale=0.5)
     assert 'set size_scale:=0.5 (boxreg relabel: --size-scale 0.5)' in placed(meant)

@@ -7,10 +7,12 @@ from pathlib import Path
 import shutil
 
 from boxreg_ros.cli import main
+from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import COVARIANCES, read_covariances
 from boxreg_ros.io.velocity_table import read_velocities, VELOCITIES
 from boxreg_ros.labels import frames_of
+from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.decisions import APPLIED, Decision, DecisionLog, DECISIONS, read_decisions
@@ -513,6 +515,20 @@ def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, op
     capsys.readouterr()
     Run(recording, '--labels', f'openlabel:{other}', '--complete')(tmp_path / '4')
     assert f'--labels csv:{tmp_path / "3"}, or' in capsys.readouterr().err
+    decided = tmp_path / '0'
+    (decided / APPLIED).unlink()  # as of a run that has deleted boxes alone
+    requests = [
+        Request(
+            (recording,), labels=labels, config=Config.from_dict({'complete': {'fill': fills}})
+        )
+        for labels in (('csv', decided), ('openlabel', decided / 'openlabel'))
+        for fills in (False, True)
+    ]
+    texts = [request.unbound_text() for request in requests]
+    assert not any(texts[:3]) and 'deleted boxes be added again' in texts[3]
+    DecisionLog(decided / DECISIONS).append([Decision('2', stamps[4], 'delete')])
+    newer = f'do not have all decisions of {decided / DECISIONS}'
+    assert all(newer in request.unbound_text() for request in requests)
 
 
 def test_a_box_of_a_person_keeps_its_class(completed, tmp_path):
