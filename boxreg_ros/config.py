@@ -415,6 +415,14 @@ class Config:
                 f'lag: expected less than window ({self.window}), got {self.lag}: a final box '
                 f'waits within its window; lower lag or raise window'
             )
+        name = 'track_window' if self.estimate == 'track' else 'window'
+        most = getattr(self, name)
+        if self.min_observations > most:
+            raise ConfigError(
+                f'min_observations: expected at most {name} ({most}), got '
+                f'{self.min_observations}: no window has as many, and no box would be refined; '
+                f'lower min_observations or raise {name}'
+            )
 
     def __hash__(self) -> int:
         """Return a hash of a few settings: of all it takes 4 us, and is looked up in each tick."""

@@ -288,3 +288,12 @@ def test_a_lag_is_less_than_the_window():
     assert Config(window=8, lag=7).lag == 7
     with pytest.raises(ConfigError, match=r'^lag: expected less than window \(8\), got 8'):
         Config(window=8, lag=8)
+
+
+def test_a_window_has_room_for_the_observations_that_it_needs():
+    config = Config(window=5, min_observations=9)  # for estimate 'track'
+    expected = r'^min_observations: expected at most window \(5\), got 9'
+    with pytest.raises(ConfigError, match=expected):
+        config.updated({'estimate': 'final'})
+    with pytest.raises(ConfigError, match=r'^min_observations: expected at most track_window'):
+        Config(track_window=10, min_observations=11)

@@ -31,6 +31,7 @@ from boxreg_ros.offline.arguments import (
 )
 from boxreg_ros.offline.notes import sparse_boxes
 from boxreg_ros.offline.request import REPORT_PACKAGES, Request
+from boxreg_ros.reasons import Reason
 
 if TYPE_CHECKING:
     from boxreg_ros.datasets.registry import Address
@@ -190,12 +191,13 @@ class _Sample:
     durations: list[float] = field(default_factory=list)
     classes: Counter[str] = field(default_factory=Counter)
     without_id: int = 0
+    invalid: int = 0
     without_transform: list[str] = field(default_factory=list)
     tracks: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
 
     def add(self, item: Item) -> None:
         """Add a cloud or a box array."""
-        from boxreg_ros.structures import Sweep
+        from boxreg_ros.structures import is_valid_box, Sweep
 
         content = item.content
         if content.stamp_ns > 0:
@@ -208,6 +210,7 @@ class _Sample:
             return
         self.arrays.append(content.stamp_ns)
         self.classes.update(content.class_names)
+        self.invalid += int((~is_valid_box(content.boxes)).sum())
         for name in content.track_ids:
             self.without_id += not name
             if name:
@@ -278,6 +281,7 @@ def _summary(sample: _Sample) -> dict[str, Any]:
         'tracks': len(lengths),
         'boxes_per_track': lengths[len(lengths) // 2] if lengths else 0,
         'boxes_without_id': sample.without_id,
+        'invalid_boxes': sample.invalid,
     }
 
 
@@ -286,6 +290,11 @@ def _warnings(sample: _Sample, finding: str, recording: ItemSource) -> Iterator[
     yield from filter(None, (recording.finding, finding))
     if sample.without_id:
         yield f'{sample.without_id} boxes have no track id; --associate assigns them'
+    if sample.invalid:
+        yield (
+            f'{sample.invalid} of {sample.classes.total()} boxes are invalid, and are not '
+            f'refined: each {Reason.INVALID_BOX.meaning}; {Reason.INVALID_BOX.remedy}'
+        )
     for name, stamps in (('clouds', sample.sweeps), ('box arrays', sample.arrays)):
         unusable = sum(stamp <= 0 for stamp in stamps[1:])  # a simulation begins at 0
         if unusable:

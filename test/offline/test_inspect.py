@@ -69,6 +69,7 @@ def test_warnings_gaps_and_damage(tmp_path, capsys):
     ]
     for index in range(30):
         drive.replace('/boxes', index, clear_ids)
+    drive.replace('/boxes', 3, lambda message: setattr(message.detections[0].bbox.size, 'x', 0.0))
     path = drive.write(tmp_path / 'drive')
     data = path.read_bytes()
     path.write_bytes(data[: data.index(b'serialized_metadata')])  # behind the only chunk
@@ -77,6 +78,7 @@ def test_warnings_gaps_and_damage(tmp_path, capsys):
     assert '1 gaps' in out
     assert 'damage: ' in out and 'interrupted' in out
     assert 'warning: 60 boxes have no track id' in out
+    assert 'warning: 1 of 60 boxes are invalid' in out and 'an extent that is not positive' in out
     assert '  0 tracks' in out
     assert 'away from the nearest cloud' in out
     assert ' --associate --complete' in out.splitlines()[-1]
