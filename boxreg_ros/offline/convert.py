@@ -16,6 +16,7 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.axis_check import AxisCheck
 from boxreg_ros.io.fixed_frame import FixedFrameItems, StoredCloud
 from boxreg_ros.io.lidars import SINGLE_LIDAR
+from boxreg_ros.io.place_check import MIN_TILTED, MIN_UPRIGHT
 from boxreg_ros.labels import (
     check_options,
     frames_of,
@@ -32,7 +33,9 @@ from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
 from boxreg_ros.offline.sources import label_frame_of, scene_address, writer_options
 from boxreg_ros.reasons import Reason
-from boxreg_ros.structures import BoxArray, is_valid_box, REJECTED, Sweep
+from boxreg_ros.structures import BoxArray, is_valid_box, REJECTED, ROLL, Sweep, YAW
+from msg_adapters.convention import Convention
+import numpy as np
 
 FORMAT_OF_NODE = 'recording'
 """Format of labels that are messages of a recording, which also has the clouds and poses."""
@@ -90,7 +93,14 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             not_read.update(frame.left_out)
             if frame.note:
                 assumed.append(frame.note)
-            axes.add(frame.moved('fixed').refined.boxes)
+            boxes = frame.moved('fixed').refined.boxes
+            named = list(filter(None, boxes.track_ids))
+            counts['without_id'] += len(boxes.track_ids) - len(named)
+            counts['repeated_id'] += len(named) - len(set(named))
+            valid = boxes.boxes[is_valid_box(boxes.boxes)]
+            counts['tilted'] += int((np.cos(valid[:, ROLL:YAW]).prod(axis=1) < MIN_UPRIGHT).sum())
+            if not counts['repeated_id']:  # whose way is that of several objects
+                axes.add(boxes)
             counts['rejected'] += frame.refined.status.count(REJECTED)
             output.write(frame)
         output.close()
@@ -110,6 +120,9 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             'frames_without_boxes': counts['empty'],
             'invalid_boxes': counts['boxes'] - counts['valid'],
             'rejected_boxes': counts['rejected'],
+            'boxes_without_id': counts['without_id'],
+            'boxes_with_repeated_id': counts['repeated_id'],
+            'tilted_boxes': counts['tilted'],
             'left_out_of_source': dict(+not_read),
             'assumed': assumed,
             **unused,
@@ -216,6 +229,27 @@ def _read_with_recording(
         spool.remove()
 
 
+def _doubts(summary: dict[str, Any], convention: Convention) -> Iterator[str]:
+    """Yield what boxes have that their formats need, or that labels do not."""
+    if summary['boxes_without_id']:
+        yield (
+            f'{summary["boxes_without_id"]:,} boxes have no track id, and each is an object of '
+            f'its own: boxreg relabel --associate assigns ids'
+        )
+    if summary['boxes_with_repeated_id']:
+        yield (
+            f'{summary["boxes_with_repeated_id"]:,} boxes have the track id of another one of '
+            f'their frame: boxreg relabel --associate assigns others'
+        )
+    if summary['tilted_boxes'] >= MIN_TILTED * max(1, summary['boxes']):
+        other = 'xyzw' if convention.orientation == 'wxyz' else 'wxyz'
+        yield (
+            f'{summary["tilted_boxes"]:,} boxes lie on their sides or backs: if w of their '
+            f'quaternions comes {"last" if other == "xyzw" else "first"}, set --orientation '
+            f'{other}'
+        )
+
+
 def _with_clouds(
     waiting: deque[LabelFrame], cloud: StoredCloud, spool: Spool
 ) -> Iterator[LabelFrame]:
@@ -302,6 +336,7 @@ def run(args: argparse.Namespace) -> int:
         parts.append(
             f'{summary["invalid_boxes"]:,} boxes are invalid: {Reason.INVALID_BOX.meaning}'
         )
+    parts += _doubts(summary, request.convention)
     if summary['rejected_boxes']:
         parts.append(
             f'{summary["rejected_boxes"]:,} boxes are rejected, which are no labels: they are in '

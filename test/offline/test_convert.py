@@ -15,6 +15,7 @@ from boxreg_ros.labels.registry import labels_points
 from boxreg_ros.offline.convert import convert
 from boxreg_ros.offline.formats import FORMAT_COLUMNS, rows
 from boxreg_ros.offline.relabel import relabel, Request
+from boxreg_ros.structures import ROLL
 import numpy as np
 import pytest
 from relabel_results import QUICK, rows_of
@@ -326,6 +327,18 @@ def test_convert_on_the_command_line(tmp_path, drive, capsys):
     expected = BoxTable.read(table)
     assert [row['track_id'] for row in found] == list(expected.track_ids)
     assert [float(row['x']) for row in found] == pytest.approx(list(expected.boxes[:, 0]))
+    boxes = expected.boxes.copy()
+    boxes[::2, ROLL] = np.pi
+    doubtful = replace(expected, track_ids=('', '1', '1') + ('1',) * 11, boxes=boxes)
+    doubtful.write(tmp_path / 'doubtful.csv')
+    options = ['--from=csv', '--to=openlabel', '-o', str(tmp_path / 'last')]
+    assert cli.main(['convert', str(tmp_path / 'doubtful.csv'), *options]) == 0
+    out = capsys.readouterr().out
+    assert '; 1 boxes have no track id' in out and '; 6 boxes have the track id of another' in out
+    assert out.endswith(
+        '; 7 boxes lie on their sides or backs: if w of their quaternions comes '
+        'first, set --orientation wxyz\n'
+    )
 
 
 @pytest.mark.parametrize(
