@@ -18,11 +18,12 @@ from scenes import drive, shared_of, simulated, track_of
 
 CONSTANTS = constants.CONSTANTS
 RECORD = CONSTANTS.with_settings(Config()).record()[0]
+SWEEPS = 15  # of a simulated street
 
 
 def refined_tracks():
     """Return refined tracks of a simulated street."""
-    return refine(tracks_of(simulated('street', 0))[:3], Config())
+    return refine(tracks_of(simulated('street', 0, SWEEPS))[:3], Config())
 
 
 def test_the_model_errors_are_those_of_time_and_heading(set_constants):
@@ -108,7 +109,7 @@ def test_correlated_residuals_of_a_face_are_an_error_of_its_margin():
 def test_fixed_extents_have_the_errors_of_the_input():
     found = covariance_of(np.eye(23), free=0.0, deviation=0.2, variance=0.01)
     np.testing.assert_allclose(found, 0.05 * np.eye(3))
-    for track in refine(tracks_of(simulated('street', 0))[:2], Config(extent='fixed')):
+    for track in refine(tracks_of(simulated('street', 0, SWEEPS))[:2], Config(extent='fixed')):
         deviations = np.sqrt(np.diagonal(track.extent_covariances, axis1=1, axis2=2))
         assert (deviations > 0.01 * track.boxes[:, 3:6]).all()
         assert (deviations < 0.2 * track.boxes[:, 3:6]).all()
