@@ -334,7 +334,9 @@ def test_long_names_do_not_push_columns_out_of_view(tmp_path):
         width, room = page.evaluate(
             "[$('first').offsetWidth, $('first').parentElement.clientWidth]"
         )
+        named = page.evaluate("['7_2', '0b9c7c1e-5d64-4f0b-9b0e-2f1f5cc6a701'].map(shortId)")
     assert 0 < width <= room
+    assert named == ['7_2', '…c6a701']  # on map and timeline
 
 
 @NEEDS_BROWSER

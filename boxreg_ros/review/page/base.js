@@ -20,6 +20,8 @@ const view = { track: -1, open: null, part: null, row: 0, mark: null, sort: 'ran
 
 const isKnown = value => value !== null && value !== undefined && Number.isFinite(value);
 const number = (value, digits = 2) => isKnown(value) ? value.toLocaleString('en', { minimumFractionDigits: digits, maximumFractionDigits: digits }) : '–';
+// An id where there is little room: the end of a long one, as of a UUID.
+const shortId = id => id.length <= 7 ? id : '…' + id.slice(-6);
 const colour = name => getComputedStyle(document.documentElement).getPropertyValue('--' + name).trim();
 
 function element(tag, attributes = {}, ...children) {

@@ -136,7 +136,7 @@ async function drawMap() {
     { ...lines, mode: 'lines+markers', line: { color: colour('refined'), width: 1.5 }, marker: { size: 4, color: colour('refined') }, hovertemplate: '%{text}<extra></extra>' },
     { x: risky.map(t => middle(t)[0]), y: risky.map(t => middle(t)[1]), customdata: risky.map(mark), text: risky.map(t => escaped(`${t.id} ${t.class}: ${number(t.risk)} m`)),
       mode: 'markers', hovertemplate: '%{text}<extra></extra>', marker: { size: risky.map(t => Math.min(30, 6 + 30 * t.risk)), color: colour('input'), opacity: 0.45 } },
-    { x: names.map(t => middle(t)[0]), y: names.map(t => middle(t)[1]), customdata: names.map(mark), text: names.map(t => escaped(t.id)), mode: names.length <= 60 ? 'text' : 'none', textposition: 'top center', textfont: { size: 10, color: colour('grey') }, hoverinfo: 'skip' },
+    { x: names.map(t => middle(t)[0]), y: names.map(t => middle(t)[1]), customdata: names.map(mark), text: names.map(t => escaped(shortId(t.id))), mode: names.length <= 60 ? 'text' : 'none', textposition: 'top center', textfont: { size: 10, color: colour('grey') }, hoverinfo: 'skip' },
   ], { ...LAYOUT(), xaxis: { ...AXIS(), title: { text: 'x [m]' } }, yaxis: { ...AXIS(), title: { text: 'y [m]' }, scaleanchor: 'x' } }, CONFIG);
   $('map').on('plotly_click', event => {
     const [index, row] = event.points[0].customdata;

@@ -37,7 +37,7 @@ function drawTimeline() {
     context.globalAlpha = 1;
     if (height < 9) return;
     context.fillStyle = colour('grey');
-    context.fillText(track.id, 2, line * pitch + height - 2, MARGIN.left - 4);
+    context.fillText(shortId(track.id), 2, line * pitch + height - 2, MARGIN.left - 4);
   });
   context.fillStyle = colour('grey');
   const tick = [0.5, 1, 2, 5, 10, 20, 60, 120, 300, 600].find(one => end / one < 12) ?? 1200;
