@@ -84,13 +84,15 @@ def _coarse_text(sweep: Sweep) -> str:
     """Return that the coordinates of a cloud are rounded to centimetres; empty if they are not."""
     if sweep.points.dtype != np.float32 or not len(sweep.points):
         return ''
-    largest = np.abs(sweep.points[::100]).max()  # a far origin is that of all
+    away = np.abs(sweep.points[::100]).max(axis=1)
+    # A far origin is that of all, but for some that a driver writes in place of no return.
+    largest = np.partition(away, len(away) // 10)[len(away) // 10]
     step = float(np.spacing(largest))
     if not MAX_ROUNDING <= step < np.inf:
         return ''
     return (
-        f'clouds in {sweep.frame_id!r} have coordinates of up to {largest:.7g} m as float32, '
-        f'which are {step:.2g} m apart there: points and boxes are as coarse; take the clouds '
+        f'clouds in {sweep.frame_id!r} have coordinates of {largest:.7g} m as float32, which '
+        f'are {step:.2g} m apart there: points and boxes are as coarse; take the clouds '
         f'before their registration, in the frame of the LiDAR, or of a map with a near origin'
     )
 
