@@ -7,9 +7,10 @@ They refer to each other: an estimate of a track is written to the box arrays of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from math import hypot, inf
 
 from boxreg_ros.config import Config
@@ -144,7 +145,7 @@ class PendingArray:
         if one.is_followed:
             self.followed.append(one.row)
 
-    def _kept(self) -> Estimates:
+    def kept(self) -> Estimates:
         """Return the input boxes as estimates that keep them."""
         n = len(self.observed)
         return Estimates(
@@ -158,21 +159,22 @@ class PendingArray:
             kinematics=np.zeros(n, KINEMATICS),
         )
 
-    def result(self, is_final: bool) -> RefinedBoxes:
+    def estimates(self) -> list[tuple[Estimates, int]]:
+        """Return the present estimate of each box; without one, the input box."""
+        found = [one.estimate for one in self.observed if one is not None and one.estimate]
+        if len(found) == len(self.observed):
+            return found
+        kept = self.kept()
+        return [(one and one.estimate) or (kept, row) for row, one in enumerate(self.observed)]
+
+    def result(self, columns: Estimates, is_final: bool) -> RefinedBoxes:
         """
-        Return the present estimates as copies; without an estimate, the input box.
+        Return the result with `columns`, which are copies of the present estimates.
 
         Of the predicted boxes, those that are refined, and those of followed objects.
 
         """
         n = len(self.observed)
-        found = [one.estimate for one in self.observed if one is not None and one.estimate]
-        if len(found) < n or not n:
-            kept = self._kept()
-            found = [
-                (one and one.estimate) or (kept, row) for row, one in enumerate(self.observed)
-            ]
-        columns: Estimates = rows_of(found) if found else kept
         added = (COASTED,) * (n - self.num_given)
         whole = RefinedBoxes(
             replace(self.input, boxes=columns.boxes, kinematics=columns.kinematics),
@@ -193,6 +195,19 @@ class PendingArray:
         is_returned[: self.num_given] = True
         is_returned[self.followed] = True
         return whole.take(np.flatnonzero(is_returned).tolist())
+
+
+def results(arrays: Sequence[PendingArray], is_final: bool) -> Iterator[RefinedBoxes]:
+    """Yield the present result of each array; to copy the estimates of all at once is faster."""
+    if not arrays:
+        return
+    found = [array.estimates() for array in arrays]
+    items = [*chain.from_iterable(found)]
+    columns = rows_of(items) if items else arrays[0].kept()
+    end = 0
+    for array, of_array in zip(arrays, found, strict=True):
+        begin, end = end, end + len(of_array)
+        yield array.result(Estimates._make(column[begin:end] for column in columns), is_final)
 
 
 @dataclass(slots=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import chain
+from itertools import chain, takewhile
 from math import ceil, inf
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from boxreg_ros.core.latency import Latency, LatencyCorrection
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.observation import Observation, observe
-from boxreg_ros.core.pending import ObservedTrack, PendingArray, PendingBox
+from boxreg_ros.core.pending import ObservedTrack, PendingArray, PendingBox, results
 from boxreg_ros.core.problem import SETTINGS_OF
 from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import by_table
@@ -391,7 +391,7 @@ class BoxRegistrar:
                 else:
                     self._solve(self._within_budget(array))
             if not is_track:
-                self._ready.append(array.result(is_final=False))
+                self._ready += results([array], is_final=False)
                 self._settle_after_lag()
             self._pop_settled()
 
@@ -633,8 +633,8 @@ class BoxRegistrar:
 
     def _pop_settled(self) -> None:
         """Make the results of settled box arrays, up to the first one that is not."""
-        while self._pending and self._pending[0].num_unsettled <= 0:
-            refined = self._pending[0].result(is_final=True)
+        settled = [*takewhile(lambda array: array.num_unsettled <= 0, self._pending)]
+        for refined in results(settled, is_final=True):
             self._pending.popleft()
             self.counts.update(refined.status)
             self.counts.update(reason for reason in refined.reasons if reason)
