@@ -218,7 +218,8 @@ def observe(
     numbers = crop_numbers(config)
     shapes = shapes_of(sweep, boxes, numbers.margin)
     columns = np.ascontiguousarray(sweep.points.T)
-    own = OwnPoints(*crop_kernels.own_points(columns, shapes, numbers))
+    near = crop_kernels.near_points(columns, shapes)
+    own = OwnPoints(*crop_kernels.own_points(near, shapes, numbers))
     row, owner, most = own.row, own.owner, config.sampling.points
     if config.objective == 'paper':
         row, owner = _farthest(own, sweep, n, most)
@@ -365,9 +366,9 @@ def crop(sweep: Sweep, boxes: Floats, margin: float) -> Crop:
         Ascending by box, then by the row of the point.
 
     """
-    columns = np.ascontiguousarray(sweep.points.T)
     shapes = shapes_of(sweep, boxes, margin)
-    row, owner, offset, outside = crop_kernels.crop(columns, shapes, margin)
+    near = crop_kernels.near_points(np.ascontiguousarray(sweep.points.T), shapes)
+    row, owner, offset, outside = crop_kernels.crop(near, shapes, margin)
     order = np.lexsort((row, owner))
     return Crop(row[order], owner[order], offset[order].T, outside[order].T)
 

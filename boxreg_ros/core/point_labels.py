@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.method import labelling
+from boxreg_ros.core.method.crop import near_points
 from boxreg_ros.core.method.labelling import (
     MOVING,
     Objects,
@@ -140,10 +141,11 @@ class PointLabeller:
         shapes = shapes_of(sweep, objects.boxes, margin)
         way = objects.velocities * np.abs(times).max(initial=0) * 2  # before or after the stamp
         shapes = shapes._replace(reach=shapes.reach + np.abs(way @ shapes.turn))
-        columns = np.ascontiguousarray(sweep.points.T)
+        near = near_points(np.ascontiguousarray(sweep.points.T), shapes)
         elsewhere = BACKGROUND if self.knows(sweep.stamp_ns) else UNKNOWN
         track, motion, rows, owner, local = labelling.label(
-            columns,
+            near,
+            len(sweep.points),
             times,
             shapes,
             objects,

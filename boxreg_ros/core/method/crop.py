@@ -166,10 +166,18 @@ class Room(NamedTuple):
 @kernel
 def near_points(points, shapes):
     """
-    Return the `NearPoints` of boxes; the arguments are those of `crop`.
+    Return the `NearPoints` of boxes.
 
     The cells are found in a loop that is compiled to vector instructions, the points in one
-    without a branch: a quarter of them, in no order, would be mispredicted.
+    without a branch: a quarter of them, in no order, would be mispredicted. The other kernels take
+    what is returned, of one type for points of either precision: they are compiled once.
+
+    Parameters
+    ----------
+    points : array, shape (3, M)
+        Coordinates [m].
+    shapes : Shapes
+        Boxes, with bounding boxes that include the margin.
 
     """
     side = side_of(points.shape[1])
@@ -196,7 +204,7 @@ def near_points(points, shapes):
     for k in range(K):
         cells[k] = number[cells[k]]
     rows, first = grouped(rows[:K], cells[:K], T)
-    at = np.empty((3, K), points.dtype)
+    at = np.empty((3, K))
     for axis in range(3):
         for k in range(K):
             at[axis, k] = points[axis, rows[k]]
@@ -256,16 +264,14 @@ def offset_of(points, i, shapes, box):
 
 
 @kernel
-def crop(points, shapes, margin):
+def crop(near, shapes, margin):
     """
     Find the pairs of a point and a box within `margin` of each other, ascending by box.
 
     Parameters
     ----------
-    points : array, shape (3, M)
-        Coordinates [m].
-    shapes : Shapes
-        Boxes, with bounding boxes that include the margin.
+    near, shapes
+        Points and boxes, as of `near_points`.
     margin : float
         Distance from the faces of the box [m].
 
@@ -277,7 +283,6 @@ def crop(points, shapes, margin):
         Point minus centre, and distance outside of the faces [m].
 
     """
-    near = near_points(points, shapes)
     room = empty_room(near)
     row, owner = np.empty(near.pairs, np.int64), np.empty(near.pairs, np.int64)
     offset, outside = np.empty((near.pairs, 3)), np.empty((near.pairs, 3))
@@ -423,13 +428,13 @@ def sorted_by_x(owner, x, rows, n):
 
 
 @kernel
-def own_points(points, shapes, numbers):
+def own_points(near, shapes, numbers):
     """
     Find the points that belong to each box, and the height of the road beside it.
 
     Parameters
     ----------
-    points, shapes
+    near, shapes
         As for `crop`, with the margin `numbers.margin`.
     numbers : CropNumbers
         Constants and settings.
@@ -445,7 +450,6 @@ def own_points(points, shapes, numbers):
 
     """
     n = len(shapes.half)
-    near = near_points(points, shapes)
     room = empty_room(near)
     own, owner = np.empty(near.pairs, np.int32), np.empty(near.pairs, np.int32)
     x, depth, chosen = np.empty(near.pairs), np.empty(near.pairs), np.empty(near.most, np.int32)
@@ -492,7 +496,7 @@ def thinned(points, shapes, row, owner, most):
     Parameters
     ----------
     points, shapes
-        As for `crop`.
+        As for `near_points`.
     row, owner : array, shape (P,)
         Point and box of each pair, ascending by box.
     most : int

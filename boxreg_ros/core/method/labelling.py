@@ -4,14 +4,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.constants import CONSTANTS
-from boxreg_ros.core.method.crop import (
-    empty_room,
-    gather,
-    measure,
-    near_points,
-    offset_of,
-    road_height,
-)
+from boxreg_ros.core.method.crop import empty_room, gather, measure, offset_of, road_height
 from boxreg_ros.core.method.selection import lower_median
 import numpy as np
 
@@ -144,14 +137,16 @@ def outside(shapes, objects, limits, road, box, x, y, z):
 
 
 @kernel
-def label(points, times, shapes, objects, limits, is_at_stamp, elsewhere, numbers):
+def label(near, num_points, times, shapes, objects, limits, is_at_stamp, elsewhere, numbers):
     """
     Find the object that each point is on, at the time of the point.
 
     Parameters
     ----------
-    points : array, shape (3, M)
-        Coordinates [m].
+    near : crop.NearPoints
+        The points near the boxes.
+    num_points : int
+        M, that of all points.
     times : array, shape (M,) or (0,)
         Of the points relative to the stamp [s]; empty where unknown.
     shapes : crop.Shapes
@@ -180,7 +175,6 @@ def label(points, times, shapes, objects, limits, is_at_stamp, elsewhere, number
         These points in the frame of the box at their own time [m].
 
     """
-    near = near_points(points, shapes)
     room = empty_room(near)
     road, seen = surroundings(times, shapes, near, numbers, room)
     K = len(near.rows)
@@ -200,14 +194,14 @@ def label(points, times, shapes, objects, limits, is_at_stamp, elsewhere, number
             best[k], is_on[k], least[k] = box, is_sure, excess
             for axis in range(3):
                 own[k, axis] = R[0, axis] * x + R[1, axis] * y + R[2, axis] * z
-    track = np.full(points.shape[1], elsewhere, np.int32)
-    motion = np.zeros(points.shape[1], np.uint8)
-    place = np.full(points.shape[1], -1, np.int32)
+    track = np.full(num_points, elsewhere, np.int32)
+    motion = np.zeros(num_points, np.uint8)
+    place = np.full(num_points, -1, np.int32)
     for k in range(K):
         place[near.rows[k]] = k
     rows, owner, local = np.empty(K, np.int64), np.empty(K, np.int32), np.empty((K, 3))
     L = 0
-    for i in range(points.shape[1]):
+    for i in range(num_points):
         k = place[i]
         if k < 0 or best[k] < 0:
             continue
