@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TYPE_CHECKING
+from urllib.parse import quote
 
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method.labelling import MOVING
@@ -48,6 +49,8 @@ if TYPE_CHECKING:
     from boxreg_ros.core.registrar import BoxRegistrar
 
 CLOUDS_FOLDER = 'clouds'
+MAX_NAME = 200
+"""Longest name of a file of an object [bytes]; derived: file systems take 255."""
 MAP_VOXEL, OBJECT_VOXEL = 0.1, 0.02
 """Edges of the voxels of the map and of objects, one point each [m]; chosen."""
 AXIS_BITS = 21
@@ -142,7 +145,7 @@ class PointProducts:
         if 'object' in self._request.clouds:
             (self._clouds / 'objects').mkdir()
             for row, cloud in self._objects.items():
-                name = _file_name(self._labeller.tracks[row].track_id, row)
+                name = object_name(self._labeller.tracks[row].track_id, row)
                 write_cloud(self._clouds / 'objects' / f'{name}.ply', cloud.points())
         facts: dict[str, Any] = dict(self._counts)
         if self._maps and self._origin is not None:
@@ -243,10 +246,12 @@ def is_kept(labels: PointLabels, name: str) -> NDArray[np.bool_]:
     return is_background
 
 
-def _file_name(track_id: str, row: int) -> str:
-    """Return a file name of a track; its row where the id has other characters."""
-    is_plain = track_id.replace('-', '').replace('_', '').isalnum() and track_id.isascii()
-    return track_id if is_plain else f'track_{row}'
+def object_name(track_id: str, row: int) -> str:
+    """Return a file name of a track: its id with other characters as in a URL; a part if long."""
+    name = quote(track_id, safe=' ', errors='surrogatepass')
+    if name.startswith('.'):
+        name = f'%2E{name[1:]}'
+    return name if len(name) <= MAX_NAME else f'{name[:MAX_NAME]}~{row}'
 
 
 class VoxelCloud:

@@ -13,7 +13,7 @@ from boxreg_ros.io.storage.mcap import McapFile
 from boxreg_ros.labels import check_options, LabelOutput, Options, Provenance
 from boxreg_ros.labels.recording_copy import compression_of, COMPRESSION_TYPES
 from boxreg_ros.labels.semantickitti import class_of
-from boxreg_ros.offline.point_products import object_tracks
+from boxreg_ros.offline.point_products import object_name, object_tracks
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
 from boxreg_ros.review.changes import Changes
@@ -181,6 +181,14 @@ def test_objects_are_accumulated_in_their_boxes(scene, results):
     half = largest.extent / 2
     assert (np.abs(points) < half + 0.35).all()
     assert np.ptp(points[:, 0]) > 0.8 * largest.extent[0]
+
+
+def test_objects_have_a_file_of_their_id_each():
+    ids = ('7', '21.2', 'track_3', 'car/7', 'car 7', '.x', 'ü', '\ud800', 'x' * 300, 'x' * 301)
+    names = [object_name(track_id, row) for row, track_id in enumerate(ids)]
+    assert names[:6] == ['7', '21.2', 'track_3', 'car%2F7', 'car 7', '%2Ex']
+    assert len(set(names)) == len(ids)
+    assert max(map(len, names)) < 250 and ''.join(names).isascii()
 
 
 def test_points_of_moving_objects_are_moved_to_the_stamp(tmp_path):
