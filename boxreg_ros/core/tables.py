@@ -54,4 +54,4 @@ def rows_of(items: Sequence[tuple[Any, int]]) -> Any:
         return table._make(part.take(rows, 0) for part in table)
     back = np.argsort(np.concatenate([places for _, places, _ in parts]))
     taken = [[part.take(rows, 0) for part in owner] for owner, _, rows in parts]
-    return table._make(np.concatenate(column)[back] for column in zip(*taken, strict=True))
+    return table._make(np.concatenate(column).take(back, 0) for column in zip(*taken, strict=True))
