@@ -11,12 +11,18 @@ from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.reasons import Reason
 from boxreg_ros.review.label_tracks import LabelTrack
 from boxreg_ros.review.rules import ERROR, RULES, Violation, violations, WARNING
 from boxreg_ros.structures import BoxArray, Floats, Ints, REJECTED
 import numpy as np
 
 RECORDING_SUFFIXES = ('.mcap', '.db3', '.bag')
+NOT_CHECKED = {
+    'boxes_without_id': 'no track id; run a tracker first, or boxreg relabel --associate',
+    'invalid_boxes': Reason.INVALID_BOX.meaning,
+}
+"""Boxes that are in no rule, and why."""
 LABEL_SUFFIXES = {'.csv': 'csv', '.parquet': 'parquet'}
 """Label files whose format follows from their suffix."""
 
@@ -30,31 +36,49 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument('--config', type=Path, metavar='FILE', help='settings as a YAML file')
     parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument('--strict', action='store_true', help='exit with 1 if a rule is violated')
+    parser.add_argument(
+        '--strict',
+        action='store_true',
+        help='exit with 1 if a rule is violated, or a box is invalid',
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the violations of all rules; return 1 with ``--strict`` if there are any."""
     config = Config() if args.config is None else Config.from_yaml(args.config)
-    tracks = _tracks(args.source, config)
-    if not tracks:
+    unread: Counter[str] = Counter()
+    tracks, left_out = _tracks(args.source, config, unread)
+    reasons = [
+        f'{count:,} boxes are not checked: {NOT_CHECKED[name]}'
+        for name, count in unread.items()
+        if count
+    ]
+    reasons += filter(None, [left_out])
+    if not any(len(track.boxes) for track in tracks):
+        because = '; '.join(reasons) or 'there are none'
         raise RecordingError(
-            f'{args.source}: expected boxes with a track id, got none; run a tracker first, or '
-            f'boxreg relabel --associate'
+            f'{args.source}: expected valid boxes with a track id, got none: {because}'
         )
     found = violations(tracks)
     if args.json:
-        print(json.dumps(_report(tracks, found)))
+        print(json.dumps(_report(tracks, found, unread, left_out)))
     else:
-        _print(tracks, found)
-    return int(args.strict and bool(found))
+        _print(tracks, found, reasons)
+    return int(args.strict and bool(found or unread['invalid_boxes']))
 
 
-def _report(tracks: list[LabelTrack], found: dict[str, list[Violation]]) -> dict[str, Any]:
+def _report(
+    tracks: list[LabelTrack],
+    found: dict[str, list[Violation]],
+    unread: Counter[str],
+    left_out: str,
+) -> dict[str, Any]:
     """Return tracks, boxes and all violations as plain values."""
     return {
         'tracks': len(tracks),
         'boxes': sum(len(track.boxes) for track in tracks),
+        **{name: unread[name] for name in NOT_CHECKED},
+        'left_out': left_out,
         'rules': {
             name: {
                 'severity': rule.severity,
@@ -67,13 +91,17 @@ def _report(tracks: list[LabelTrack], found: dict[str, list[Violation]]) -> dict
     }
 
 
-def _print(tracks: list[LabelTrack], found: dict[str, list[Violation]]) -> None:
-    """Print the violations by rule, and one closing line."""
+def _print(
+    tracks: list[LabelTrack], found: dict[str, list[Violation]], reasons: list[str]
+) -> None:
+    """Print the violations by rule, and one closing line, after `reasons` of boxes left out."""
     for name, items in found.items():
         rule = RULES[name]
         print(f'{rule.severity}: {name}: {rule.meaning}; {rule.remedy}')
         for item in items:
             print(f'  track {item.track_id} at {item.stamp_ns}: {item.text}')
+    for reason in reasons:
+        print(reason)
     boxes = sum(len(track.boxes) for track in tracks)
     kinds = 'no rule violated'
     if found:
@@ -85,21 +113,27 @@ def _print(tracks: list[LabelTrack], found: dict[str, list[Violation]]) -> None:
     print(f'{len(tracks):,} tracks, {boxes:,} boxes: {kinds}')
 
 
-def _tracks(source: str, config: Config) -> list[LabelTrack]:
-    """Read the tracks of label files, whose rejected boxes are no labels, or of a recording."""
+def _tracks(source: str, config: Config, unread: Counter[str]) -> tuple[list[LabelTrack], str]:
+    """
+    Read the tracks of label files, whose rejected boxes are no labels, or of a recording.
+
+    Also what a recording has left out; boxes that are no labels are counted in `unread`.
+
+    """
     path = Path(source)
     if _is_recording(path):
         from boxreg_ros.io.fixed_frame import input_boxes  # slow to import: it reads bags
         from boxreg_ros.offline.request import Request
 
-        arrays, _ = input_boxes(Request((path,)).recording())
-        return _grouped(((array, None) for array in arrays), config)
+        arrays, left_out = input_boxes(Request((path,)).recording())
+        return _grouped(((array, None) for array in arrays), config, unread), left_out
     from boxreg_ros.labels import frames_of
 
     name, path = _format_of(source)
     frames = (frame.moved('fixed').refined for frame in frames_of(name, path))
     labels = (refined.without(REJECTED) for refined in frames)
-    return _grouped(((refined.boxes, refined.num_points) for refined in labels), config)
+    pairs = ((refined.boxes, refined.num_points) for refined in labels)
+    return _grouped(pairs, config, unread), ''
 
 
 def _is_recording(path: Path) -> bool:
@@ -129,11 +163,14 @@ def _format_of(source: str) -> tuple[str, Path]:
     )
 
 
-def _grouped(arrays: Iterable[tuple[BoxArray, Ints | None]], config: Config) -> list[LabelTrack]:
+def _grouped(
+    arrays: Iterable[tuple[BoxArray, Ints | None]], config: Config, unread: Counter[str]
+) -> list[LabelTrack]:
     """Return the tracks of box arrays with their numbers of points; boxes without id are none."""
     rows: dict[str, list[tuple[int, str, Floats, int]]] = {}
     for array, num_points in arrays:
         numbers = np.full(len(array.boxes), -1) if num_points is None else num_points
+        unread['boxes_without_id'] += array.track_ids.count('')
         for i, track_id in enumerate(array.track_ids):
             if track_id:
                 row = array.stamp_ns, array.class_names[i], array.boxes[i], int(numbers[i])
@@ -146,5 +183,7 @@ def _grouped(arrays: Iterable[tuple[BoxArray, Ints | None]], config: Config) -> 
         points = np.array(given) if is_known else np.full(len(items), -1)
         name = Counter(classes).most_common(1)[0][0]
         stamps = np.array(stamps_ns, np.int64)
-        tracks.append(LabelTrack.of(track_id, name, config, stamps, np.array(boxes), points))
+        track = LabelTrack.of(track_id, name, config, stamps, np.array(boxes), points)
+        unread['invalid_boxes'] += len(items) - len(track.boxes)
+        tracks.append(track)
     return tracks

@@ -1,5 +1,6 @@
 """`boxreg check` and the consistency of `boxreg evaluate`, from the command line."""
 
+from dataclasses import replace
 import json
 from pathlib import Path
 
@@ -43,6 +44,21 @@ def test_check_prints_violations_and_fails_with_strict_only(tmp_path, capsys):
     assert report['boxes'] == 10
     assert len(report['rules']['spin']['violations']) == 1
     assert report['rules']['jump']['violations'] == []
+    labels = BoxTable.read(path)
+    boxes = labels.boxes.copy()
+    boxes[5:, 3] = 0
+    replace(labels, boxes=boxes, track_ids=('', *labels.track_ids[1:])).write(path)
+    assert main(['check', str(path)]) == 0  # boxes 1 to 4
+    first, second, last = capsys.readouterr().out.splitlines()
+    assert first.startswith('1 boxes are not checked: no track id')
+    assert second.startswith('5 boxes are not checked: contains NaN or infinity, an extent')
+    assert last == '1 tracks, 4 boxes: no rule violated'
+    assert main(['check', str(path), '--strict', '--json']) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert (report['boxes_without_id'], report['invalid_boxes']) == (1, 5)
+    replace(labels, boxes=0 * boxes).write(path)
+    assert main(['check', str(path)]) == 1
+    assert 'expected valid boxes with a track id, got none: 10' in capsys.readouterr().err
 
 
 def test_check_reads_recordings_and_refuses_unreadable_files(tmp_path, capsys):
