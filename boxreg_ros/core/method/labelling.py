@@ -1,5 +1,6 @@
 """Which object each point of a sweep is on, and the motion of objects by their boxes."""
 
+from math import hypot
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.compile import kernel, loop
@@ -285,8 +286,8 @@ def motions(first, t, values):
             values[i, 3] -= turns * np.pi
         for i in range(b - a):
             span = slope(t[a:b], values[a:b], i, SPEED_SECONDS, rate, error)
-            speed = np.hypot(rate[0], rate[1])
-            noise = SPEED_DEVIATIONS * np.hypot(error[0], error[1])
+            speed = hypot(rate[0], rate[1])
+            noise = SPEED_DEVIATIONS * hypot(error[0], error[1])
             moves[a + i] = speed > max(PARKED_SPEED, LEAST_WAY / span, noise)
         begin = a
         while begin < b:  # motions between two rests that lead nowhere
@@ -296,7 +297,7 @@ def motions(first, t, values):
             if moves[begin] and begin > a and end < b:
                 x = values[end, 0] - values[begin - 1, 0]
                 y = values[end, 1] - values[begin - 1, 1]
-                moves[begin:end] = np.hypot(x, y) >= WAY_BETWEEN_RESTS
+                moves[begin:end] = hypot(x, y) >= WAY_BETWEEN_RESTS
             begin = end
         for i in range(b - a):
             if moves[a + i]:  # less smooth, for the place

@@ -231,7 +231,7 @@ def agree(b, problem, poses, extents, constants, work, terms):
         and the root L of the information L L' about it, in box axes [m, rad].
 
     """
-    half = extents / 2
+    half = extents[0] / 2, extents[1] / 2, extents[2] / 2
     information = np.empty((6, 6))
     fill_sums(b, problem, poses, half, constants, work)
     fill_planes(problem.of_class[b].roughness, constants, work)

@@ -1,5 +1,6 @@
 """The surface of one object in its box frame: cells with the moments of their points."""
 
+from math import hypot
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.compile import kernel, loop
@@ -156,7 +157,7 @@ def normal_at(mean, half, slots, moments, C):
     values = eigenvalues(C)
     if values[1] < FOLLOW.line**2 or values[1] < 3 * values[0]:
         x, y, _ = eigenvector(C, values[2])
-        length = np.hypot(x, y)
+        length = hypot(x, y)
         return across if length < 0.5 else (-y / length, x / length, 0.0)
     return eigenvector(C, values[0])
 

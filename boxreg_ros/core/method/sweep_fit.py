@@ -1,5 +1,6 @@
 """Registration of the points of one sweep to the surface of one object."""
 
+from math import hypot
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.arrays import copy
@@ -102,7 +103,7 @@ def find(points, expected, target):
             step = 2 * FOLLOW.cell
             count = int(expected.reach / step)
         elif target.is_rigid:
-            information *= (best.fit.score / expected.usual) ** 2
+            scale(information, (best.fit.score / expected.usual) ** 2)
         for n in range(-count, count + 1):
             start = prior.copy()
             start[0] += n * step * np.cos(prior[3])
@@ -148,8 +149,10 @@ def registered(points, start, prior, information, target, iterations):
         factorise_corner(factor)
         solve_corner(factor, step)
         size = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-        step *= min(1.0, 2 * FOLLOW.cell / max(size, 1e-9))
-        pose = pose - step
+        part = min(1.0, 2 * FOLLOW.cell / max(size, 1e-9))
+        for a in range(4):
+            step[a] *= part
+            pose[a] -= step[a]
         if size < FOLLOW.settled and abs(step[3]) < FOLLOW.settled_yaw:
             break
     found = fit(points, pose, target)
@@ -222,8 +225,19 @@ def _system(points, pose, target):
             g[a] += w * J[a] * r
             for b in range(4):
                 H[a, b] += w * J[a] * J[b]
-    scale = FOLLOW.effective_points / max(weights, FOLLOW.effective_points)
-    return H * scale, g * scale, count
+    part = FOLLOW.effective_points / max(weights, FOLLOW.effective_points)
+    scale(H, part)
+    for a in range(4):
+        g[a] *= part
+    return H, g, count
+
+
+@loop
+def scale(matrix, factor):
+    """Multiply a matrix (4, 4) by a number, in place."""
+    for a in range(4):
+        for b in range(4):
+            matrix[a, b] *= factor
 
 
 @loop
@@ -239,8 +253,8 @@ def fit(points, pose, target):
     """Return how points (n, 3) fit a pose, `Fit`."""
     half, surface, slots = target.half, target.surface, target.surface.slots
     R = axes(pose, target.tilt)
-    hit = np.zeros(surface.used[0], np.bool_)
-    inside, fitting, beside, matched = 0.0, 0.0, 0.0, 0.0
+    is_hit = np.zeros(surface.used[0], np.bool_)
+    inside, fitting, beside, matched, hit = 0.0, 0.0, 0.0, 0.0, 0.0
     for n in range(len(points)):
         _, _, x, y, z = offset_in_box(points, n, pose, R)
         if z < target.road.clearance - half[2] or z > half[2] + FOLLOW.tolerance:
@@ -253,13 +267,14 @@ def fit(points, pose, target):
         inside += 1
         slot = nearest_cell(x, y, z, surface)
         if slot >= 0:
-            hit[slot] = True
+            hit += not is_hit[slot]
+            is_hit[slot] = True
             matched += 1
             fitting += abs(from_surface(x, y, z, slot, surface)) < FOLLOW.outlier
     score = 0.0
     if inside >= 3:
         part = fitting / (inside + beside)
-        seen = hit.sum() / max(1.0, surface.used[0])
+        seen = hit / max(1.0, surface.used[0])
         score = 2 * part * seen / max(part + seen, 1e-9)
     return Fit(inside, fitting, matched, score)
 
@@ -267,15 +282,15 @@ def fit(points, pose, target):
 @kernel
 def around(points, pose, half, margin):
     """Return the points (n, 3), which ascend by x, around a pose."""
-    reach = np.hypot(half[0], half[1]) + FOLLOW.crop + margin
+    reach = hypot(half[0], half[1]) + FOLLOW.crop + margin
     return within(points, pose, reach, half[2] + FOLLOW.crop)
 
 
 @kernel
 def within(points, center, reach, height):
     """Return the points (n, 3), which ascend by x, within `reach` in x and y, `height` in z."""
-    first = np.searchsorted(points[:, 0], center[0] - reach)
-    last = np.searchsorted(points[:, 0], center[0] + reach)
+    first = first_from(center[0] - reach, points)
+    last = first_from(center[0] + reach, points)
     found = np.empty((last - first, 3))
     count = 0
     for n in range(first, last):
@@ -289,6 +304,19 @@ def within(points, center, reach, height):
     return found[:count]
 
 
+@loop
+def first_from(x, points):
+    """Return the first of points (n, 3), which ascend by x, that is not below x."""
+    first, last = 0, len(points)
+    while first < last:
+        middle = (first + last) // 2
+        if points[middle, 0] < x:
+            first = middle + 1
+        else:
+            last = middle
+    return first
+
+
 @kernel
 def near(points, pose, half, margin, boxes, same):
     """
@@ -300,12 +328,14 @@ def near(points, pose, half, margin, boxes, same):
 
     """
     found = around(points, pose, half, margin)
-    reach = np.hypot(half[0], half[1]) + FOLLOW.crop + margin
+    reach = hypot(half[0], half[1]) + FOLLOW.crop + margin
     for k in range(len(boxes)):
         other = boxes[k]
-        away = np.hypot(other[0] - pose[0], other[1] - pose[1])
-        is_near = half[1] < away < reach + np.hypot(other[3], other[4])
-        if is_near and not (same == other[15]).any():
+        away = hypot(other[0] - pose[0], other[1] - pose[1])
+        is_near = half[1] < away < reach + hypot(other[3], other[4])
+        for number in same:
+            is_near &= number != other[15]
+        if is_near:
             found = _outside(found, other[:3], other[3:6], other[6:15].reshape(3, 3))
     return found
 

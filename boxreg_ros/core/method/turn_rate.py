@@ -64,7 +64,8 @@ def predict(state, seconds, noise, pivot):
     values, F = state.values.copy(), np.eye(STATE)
     yaw, speed, rate = values[YAW_STATE:]
     turned, middle = yaw + rate * seconds, yaw + rate * seconds / 2
-    chord = seconds * np.sinc(rate * seconds / (2 * np.pi))  # of a speed of 1 m/s
+    half = rate * seconds / 2
+    chord = seconds if half == 0 else seconds * np.sin(half) / half  # of a speed of 1 m/s
     c, s = chord * np.cos(middle), chord * np.sin(middle)
     dx = speed * c + pivot * (np.cos(turned) - np.cos(yaw))
     dy = speed * s + pivot * (np.sin(turned) - np.sin(yaw))
