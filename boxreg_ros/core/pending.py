@@ -259,22 +259,8 @@ class ObservedTrack:
         """Stamp of the newest observation [ns]."""
         return self.entries[-1].stamp_ns
 
-    def add(self, one: PendingBox, observation: Observation, length: int) -> None:
-        """
-        Add the newest observation.
-
-        If that before it waits for a window, it will start from its input box, and only the last
-        `length` are held beside the new one. Those in excess are removed behind the two oldest,
-        which the marginalisation prior refers to.
-
-        """
-        if self.num_carried:
-            if len(self.starts):  # else the first window is to come
-                self.starts = np.concatenate([self.starts, self.seen[-1].box[None]])
-            if len(self.entries) > length:
-                excess = slice(PRIOR_POSES, PRIOR_POSES + len(self.entries) - length)
-                del self.entries[excess], self.seen[excess]
-                self.starts = np.delete(self.starts, excess, axis=0)
+    def add(self, one: PendingBox, observation: Observation) -> None:
+        """Add the newest observation."""
         self.entries.append(one)
         self.seen.append(observation)
 
@@ -282,11 +268,23 @@ class ObservedTrack:
         """Return whether the newest observation is of `array`."""
         return self.entries[-1].array is array
 
-    def carry(self) -> None:
-        """Leave the newest observation to a later window."""
+    def carry(self, length: int) -> None:
+        """
+        Leave the newest observation to a later window, which then starts from its input box.
+
+        At most `length` observations are held. Those in excess are removed behind the two oldest,
+        which the marginalisation prior refers to.
+
+        """
         self.num_carried += 1
         newest = self.entries[-1]
         newest.array.reasons[newest.row] = Reason.BUDGET
+        if len(self.starts) == len(self.entries) - 1:  # else its first window is to come
+            self.starts = np.concatenate([self.starts, self.seen[-1].box[None]])
+        if len(self.entries) > length:
+            excess = slice(PRIOR_POSES, PRIOR_POSES + len(self.entries) - length)
+            del self.entries[excess], self.seen[excess]
+            self.starts = np.delete(self.starts, excess, axis=0)
 
     def forget(self, length: int) -> None:
         """Leave only the last `length` observations to the next window."""

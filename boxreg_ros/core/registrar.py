@@ -456,14 +456,14 @@ class BoxRegistrar:
             array.add_predicted(track, one)
         array.observe([one for _, one in (*given, *confirmed)], seen)
         for (track, one), observation in zip(given, seen, strict=False):
-            track.add(one, observation, self._num_overlapping)
+            track.add(one, observation)
             track.detected_ns = boxes.stamp_ns
             successor = track.split_at_id_switch()
             if successor is not None:
                 self._end([track.track_id])
                 self._tracks[track.track_id] = successor
         for (track, one), observation in zip(confirmed, seen[len(given) :], strict=True):
-            track.add(one, observation, self._num_overlapping)
+            track.add(one, observation)
 
     def _followed(self, array: PendingArray, sweep: Sweep) -> list[_OfTrack]:
         """Return the boxes of followed objects that have none in `array`."""
@@ -591,7 +591,7 @@ class BoxRegistrar:
             return silent + tracks
         ready = _by_urgency(ready, num_rotating)
         for track in ready[limit:]:
-            track.carry()
+            track.carry(self._num_overlapping)
         return silent + ready[:limit]
 
     def _settle_ended_tracks_beyond(self, limit: int) -> None:

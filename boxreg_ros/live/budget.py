@@ -26,13 +26,13 @@ FIRST_PERIOD = 0.1
 LONGEST_PERIOD = 1.0
 """A longer time between two box arrays is a pause [s]; chosen: the slowest sensors run at 2 Hz."""
 BATCH_OVERHEAD = 25
-"""Time of a batch that does not depend on its size, in windows; measured: 2.5 ms beside 0.1 ms a
-window."""
+"""Time of a batch that does not depend on its size, in windows; measured with
+`measure speed`: 10 ms beside 0.4 ms a window."""
 RECENT = 10
 """Last batches and box arrays that times are estimated from; chosen: a second at 10 Hz."""
-RESERVE_MEMORY = 3.0
-"""Overruns of this time are a reserve [s]. Derived: the second largest of thirty, at 10 Hz, is
-exceeded in one tick of fifteen."""
+RESERVE_MEMORY = 1.0
+"""Overruns of this time are a reserve [s]; chosen: a machine that has become free is used within
+a second."""
 LARGEST_RESERVE = 0.5
 """Part of the deadline that the reserve may take; chosen: the rest is for solving. A longer
 overrun is an interruption of the process, and would be late with any reserve."""
@@ -46,15 +46,13 @@ class TickBudget:
     The registrar reads no clock; this object does for it. The time for windows is the deadline
     less the time used by then, for decoding and cropping, less that for the order of the tracks
     and for publishing, less a reserve for overruns. The times of a window, and of what is done
-    beside solving, are the medians of `RECENT` ticks; windows between the ticks are of far
-    objects, which have fewer points. The reserve is the second largest overrun of the last
-    `RESERVE_MEMORY` seconds, without those that no reserve would hold. So interruptions of the
-    process cost the boxes of their own ticks, and none after them.
+    beside solving, are the medians of `RECENT` ones. The reserve is the second largest overrun of
+    the last `RESERVE_MEMORY` seconds, without those that no reserve would hold. So interruptions
+    of the process cost the boxes of their own ticks, and none after them.
 
     Final boxes are given up last: the windows that they need are solved in any case, as long as
-    there is time without the reserve, or these take no longer than what a batch costs
-    (`BATCH_OVERHEAD`). A batch of their own, after the early boxes, would take twice as long, and
-    clouds would be dropped.
+    these take no longer than what a batch costs (`BATCH_OVERHEAD`). A batch of their own, after
+    the early boxes, would take twice as long, and clouds would be dropped.
 
     `deadline`, which may change, is the maximum time from complete data to published early boxes
     [s]; negative: `PART_OF_PERIOD` of the measured period of the boxes. `solve` does the same as
@@ -71,7 +69,6 @@ class TickBudget:
         self._since = self.clock()
         self._asked_at = self._since
         self._solving_time: float | None = None  # in the tick at hand [s]
-        self._is_over = False
         self._planned_end = inf
         self._other_times = deque[float](maxlen=RECENT)  # from the budget to the end [s]
         self._overruns = deque[tuple[float, float]]()  # when, and by how much [s]
@@ -88,7 +85,6 @@ class TickBudget:
         """Begin a tick whose data are complete since a moment (monotonic) [s]."""
         self._since = since
         self._solving_time = None
-        self._is_over = False
         self._planned_end = inf
 
     def end(self) -> float | None:
@@ -98,7 +94,6 @@ class TickBudget:
         None if it has ended, or if nothing was solved in it.
 
         """
-        self._is_over = True
         if self._solving_time is not None:
             now = self.clock()
             self._other_times.append(now - self._asked_at - self._solving_time)
@@ -114,24 +109,22 @@ class TickBudget:
         `needed` is the number of windows per box array that refine every final box.
 
         """
-        number = most = 0
+        number = 0
         self._asked_at = self.clock()
         if self._times:
-            reserve, per_window = self._reserve, _median(self._times)
-            end = self._since + self.seconds
-            time_left = end - _median(self._other_times) - self._asked_at
-            most = int(time_left / per_window) - BATCH_OVERHEAD
-            number = int((time_left - reserve) / per_window) - BATCH_OVERHEAD
-        least = max(1, min(needed, max(most, BATCH_OVERHEAD)))
+            planned_end = self._since + self.seconds - self._reserve
+            time_left = planned_end - _median(self._other_times) - self._asked_at
+            number = int(time_left / _median(self._times)) - BATCH_OVERHEAD
+        least = max(1, min(needed, BATCH_OVERHEAD))
         if number >= least:  # the tick can be in time
-            self._planned_end = end - reserve
+            self._planned_end = planned_end
         return max(number, least)
 
     def spare_windows(self) -> int:
         """
         Return how many windows fit into the part of the period that no deadline covers.
 
-        They are solved and published before the next boxes arrive, unless these are late.
+        They are solved before the next boxes arrive, unless these are late.
 
         """
         if not self._times:
@@ -140,7 +133,6 @@ class TickBudget:
         until_next = self._arrivals[-1] + self._period - self.clock() if self._arrivals else 0.0
         if until_next > 0:
             spare = min(spare, until_next)
-        spare -= _median(self._other_times)
         return int(spare / _median(self._times)) - BATCH_OVERHEAD
 
     def submit(self, windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
@@ -174,8 +166,6 @@ class TickBudget:
     ) -> list[Estimate | None]:
         begin = self.clock()
         estimates = self.solve(windows, config, model)
-        if self._is_over:
-            return estimates
         self._solving_time = self.clock() - begin
         num_solved = sum(estimate is not None for estimate in estimates)
         if num_solved:

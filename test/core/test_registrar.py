@@ -12,7 +12,7 @@ from boxreg_ros.core.latency import Latency
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.pending import PendingArray
 from boxreg_ros.core.problem import stack_windows
-from boxreg_ros.core.registrar import BoxRegistrar, submit_locally
+from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest
@@ -578,13 +578,7 @@ def test_the_least_windows_refine_every_final_box():
 def test_waiting_tracks_catch_up_before_their_boxes_are_final():
     rng = np.random.default_rng(0)
     cars = [track_of(drive(14, start=(5.0, 8.0 * i, 0.0)), rng, str(i)) for i in range(3)]
-    solved = []
-
-    def submit(windows, *others):
-        solved.extend(windows)
-        return submit_locally(windows, *others)
-
-    registrar = BoxRegistrar(config_with(), submit, budget=lambda _: 0)
+    registrar = BoxRegistrar(config_with(), budget=lambda _: 0)
     results = []
     for item in stream_of(cars):
         results += fed(registrar, [item])
@@ -596,9 +590,6 @@ def test_waiting_tracks_catch_up_before_their_boxes_are_final():
     assert {word for result in early for word in result.status} == {'kept'}
     assert {word for result in finals(results)[2:] for word in result.status} == {'refined'}
     assert registrar.counts['budget'] == 0
-    # They are solved as in time: from the fit before, with what older boxes have left.
-    assert all(window.is_warm for window in solved if len(window.observations) > 3)
-    assert all(window.prior for window in solved[-3:])
 
 
 def test_early_boxes_of_the_nearest_and_of_those_that_approach_are_refined():
