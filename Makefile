@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 # Processes that share the tests, beside that of `test-jazzy`: more than cores, as tests of nodes wait
 # for most of their time. Each takes some 8 s of processor time to begin.
-WORKERS ?= 3
+WORKERS ?= 4
 # Python 3.12 for `make test-jazzy`: the first of these that runs.
 PYTHON_JAZZY ?= $(firstword $(foreach python,python3.12 $(wildcard $(HOME)/.pyenv/versions/3.12.*/bin/python),\
     $(shell $(python) -c 'import ensurepip, venv' 2>/dev/null && echo $(python))))

@@ -65,7 +65,11 @@ def test_exponents_without_a_decimal_point_are_numbers(tmp_path):
     assert Config.from_yaml(path).paper.closeness == 1e-6
 
 
-@pytest.mark.parametrize('text', ['[' * 5000, 'lag: 2026-13-45', 'lag: !!python/name:os.system'])
+@pytest.mark.parametrize(
+    'text',
+    ['[' * 5000, 'lag: 2026-13-45', 'lag: !!python/name:os.system'],
+    ids=['nested', 'date', 'name'],
+)
 def test_malformed_yaml_is_an_error_in_one_line(tmp_path, text):
     path = tmp_path / 'config.yaml'
     path.write_text(text)
