@@ -28,7 +28,7 @@ from boxreg_ros.errors import BoxregError
 from boxreg_ros.io.items import Wanted
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.record import Record
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request

@@ -13,7 +13,7 @@ from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.items import EVERYTHING, Item, LOOKAHEAD_NS, requested_part, Wanted
 from boxreg_ros.io.lidars import Lidars, SensorPlacement
 from boxreg_ros.io.storage.record import Damage
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.labels import frames_of, LabelFrame
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.merging import LabelMerger

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from boxreg_ros.io.id_assignment import Tracker
-from boxreg_ros.io.transforms import Edge
+from boxreg_ros.io.transform_edge import Edge
 from boxreg_ros.structures import Floats
 import numpy as np
 from numpy.typing import NDArray

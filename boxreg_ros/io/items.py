@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.lidars import SensorPlacement
 from boxreg_ros.io.storage.record import Damage
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import ConfigError, TransformUnavailable, UnsupportedMessage
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.options import option
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import Floats, Sweep

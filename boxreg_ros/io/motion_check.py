@@ -27,7 +27,9 @@ from boxreg_ros.io.clocks import (
     seconds_text,
 )
 from boxreg_ros.io.findings import Finding
-from boxreg_ros.io.transforms import Edge, inverse, matrix, MAX_LINEAR_GAP, TransformTree
+from boxreg_ros.io.transform_edge import Edge, MAX_LINEAR_GAP
+from boxreg_ros.io.transform_tree import TransformTree
+from boxreg_ros.io.transforms import inverse, matrix
 from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BoxArray, Floats, Sweep

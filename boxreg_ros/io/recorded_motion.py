@@ -20,7 +20,8 @@ from boxreg_ros.io.topics import (
     TF_TYPES,
     Topics,
 )
-from boxreg_ros.io.transforms import numbers_of, TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
+from boxreg_ros.io.transforms import numbers_of
 
 TF_SEARCH_NS = 10 * 10**9
 """Odometry is used if TF does not connect the frames in this first part of a recording [ns]."""

@@ -27,7 +27,7 @@ from boxreg_ros.io.storage.files import part_of
 from boxreg_ros.io.storage.reader import Reader
 from boxreg_ros.io.storage.record import Damage, Record
 from boxreg_ros.io.topics import ODOMETRY_TYPE, Topics
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.structures import BoxArray, Floats
 from msg_adapters import adapter_for, clouds, poses
 from msg_adapters.convention import Convention, STANDARD

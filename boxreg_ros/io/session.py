@@ -26,7 +26,8 @@ from boxreg_ros.io.lidars import ignore, MergedSweep, Report, SensorPlacement, S
 from boxreg_ros.io.motion_check import MotionCheck
 from boxreg_ros.io.place_check import PlaceCheck
 from boxreg_ros.io.pose_check import PoseCheck
-from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame, TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
+from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame
 from boxreg_ros.io.unit_check import UnitCheck
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep

@@ -18,7 +18,7 @@ from boxreg_ros.errors import (
 )
 from boxreg_ros.io.images import Image, ImageCamera
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.structures import Floats
 import numpy as np

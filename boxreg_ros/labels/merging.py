@@ -9,7 +9,7 @@ from dataclasses import replace
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.times import time_range
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.labels.protocol import LabelFrame
 from boxreg_ros.structures import HUMAN, is_valid_box
 

@@ -36,7 +36,7 @@ from boxreg_ros.reasons import Reason
 if TYPE_CHECKING:
     from boxreg_ros.datasets.registry import Address
     from boxreg_ros.io.items import Item, ItemSource
-    from boxreg_ros.io.transforms import Edge
+    from boxreg_ros.io.transform_edge import Edge
 
 DONE = 0
 FAILED = 1

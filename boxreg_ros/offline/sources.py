@@ -15,7 +15,8 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.items import EVERYTHING, Item, ItemSource, Wanted
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import inverse, moved_boxes, TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
+from boxreg_ros.io.transforms import inverse, moved_boxes
 from boxreg_ros.labels import frames_of, module_of, Options
 from boxreg_ros.labels.merging import LabelMerger
 from boxreg_ros.offline.request import NO_TOPIC, Request

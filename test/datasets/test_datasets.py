@@ -14,7 +14,8 @@ from boxreg_ros.datasets.scene_recording import SceneRecording
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.items import EVERYTHING, ItemSource, Wanted
-from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame, TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
+from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame
 from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.structures import Sweep

@@ -6,7 +6,8 @@ from boxreg_ros.config import Config
 from boxreg_ros.datasets.files import pose_rows
 from boxreg_ros.io.common_motion import CommonMotionCheck
 from boxreg_ros.io.id_assignment import IdCheck
-from boxreg_ros.io.transforms import inverse, TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
+from boxreg_ros.io.transforms import inverse
 from boxreg_ros.structures import BoxArray
 import numpy as np
 import pytest

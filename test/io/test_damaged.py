@@ -15,7 +15,7 @@ from boxreg_ros.errors import BoxregError, RecordingError
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage import mcap
 from boxreg_ros.io.storage.files import opened
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.structures import BoxArray, Sweep
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode

@@ -6,7 +6,7 @@ import sqlite3
 from boxreg_ros.io.definitions import types_of
 from boxreg_ros.io.items import Wanted
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.structures import BoxArray
 from msg_adapters import ADAPTERS
 from msg_adapters.convention import Convention

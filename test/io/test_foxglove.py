@@ -11,7 +11,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.foxglove import encoded
 from boxreg_ros.io.items import Wanted
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.structures import BoxArray, Sweep
 from foxglove_recordings import KINDS, PointCloud, scene, SceneUpdate, write_foxglove_mcap
 from mcap.reader import make_reader

@@ -3,7 +3,8 @@
 from boxreg_ros.cli import main
 from boxreg_ros.io.items import ItemSource, Wanted
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame, TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
+from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame
 from boxreg_ros.offline.sources import LabelledRecording
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import STANDARD

@@ -4,7 +4,8 @@ from types import SimpleNamespace
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.lidars import ignore, Lidars, merged, SensorPlacement, SweepMerger
-from boxreg_ros.io.transforms import sweep_to_frame, TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
+from boxreg_ros.io.transforms import sweep_to_frame
 from boxreg_ros.structures import Sweep
 from lidar_drives import DELAY_NS, LidarDrive, LIDARS, SPEED
 import numpy as np

@@ -8,7 +8,7 @@ from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.message_decoder import ENCAPSULATIONS
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.record import Record
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from foxglove_recordings import write_foxglove_mcap
 from mcap.reader import make_reader
 from msg_adapters import ADAPTERS, pointcloud, vision

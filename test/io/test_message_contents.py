@@ -1,7 +1,7 @@
 """Boxes of recorded messages: read as arrays, and the same as by the adapters of objects."""
 
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from msg_adapters.convention import Convention
 from msg_adapters.serialized import BOX_FIELDS, BoxReader
 import numpy as np

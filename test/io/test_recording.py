@@ -9,7 +9,7 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.resync import MessageOrder
 from boxreg_ros.io.storage.files import opened, part_of
 from boxreg_ros.io.storage.reader import Reader
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.structures import BoxArray, Sweep
 from mcap_files import rewritten
 import numpy as np

@@ -16,7 +16,7 @@ from boxreg_ros.io.storage import urls
 from boxreg_ros.io.storage.byte_file import ByteFile
 from boxreg_ros.io.storage.files import part_of
 from boxreg_ros.io.storage.urls import url_of
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap_files import rewritten

@@ -1,7 +1,7 @@
 """MCAP files whose definitions are IDL, and MCAP files with messages of ROS 1."""
 
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.structures import BoxArray
 from mcap.writer import Writer
 import numpy as np

@@ -1,14 +1,9 @@
 """Transforms: lookup, interpolation, odometry, forgetting, time jumps, sweeps and boxes."""
 
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.transforms import (
-    boxes_to_frame,
-    Edge,
-    FRAMES_BEFORE_CLEANUP,
-    inverse,
-    sweep_to_frame,
-    TransformTree,
-)
+from boxreg_ros.io.transform_edge import Edge
+from boxreg_ros.io.transform_tree import FRAMES_BEFORE_CLEANUP, TransformTree
+from boxreg_ros.io.transforms import boxes_to_frame, inverse, sweep_to_frame
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest

@@ -4,7 +4,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.session import Session
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.structures import Sweep
 from measure.truck import CORNER_LIDARS, truck_scene, TRUCK_SENSORS, write_truck
 from msg_adapters.convention import STANDARD

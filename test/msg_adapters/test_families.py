@@ -7,7 +7,8 @@ from types import SimpleNamespace
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import boxes_to_frame, TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
+from boxreg_ros.io.transforms import boxes_to_frame
 from boxreg_ros.structures import is_valid_box, KINEMATICS
 from msg_adapters import adapter_for, ADAPTERS, MESSAGE_COLUMNS, rows, WITHOUT_IDS
 from msg_adapters.convention import Convention, STANDARD

@@ -17,7 +17,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.labels import Options
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline import reader as reading

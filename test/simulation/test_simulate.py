@@ -7,7 +7,7 @@ from boxreg_ros.core.metrics import iou_bev
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.offline.box_scores import match, summarise
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.simulation import simulate as cli
