@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.reasons import Reason
-from boxreg_ros.review.decisions import Decision, held, Scope
+from boxreg_ros.review.decisions import Decision, held, MAX_STAMP_NS, Scope
 from boxreg_ros.structures import (
     BOX_EXTENT,
     BoxArray,
@@ -413,6 +413,33 @@ class Corrections:
                 ('reject', [one.judgement == 'reject' for one in rows]),
             ):
                 found += _ranges(track_id, kind, [one.stamp_ns for one in rows], values)
+        return found + self._deletions()
+
+    def _deletions(self) -> list[Decision]:
+        """Return where the tracks of the results have no boxes by a decision: none is added."""
+        places: list[tuple[str, int, int]] = []
+        parts: dict[str, list[int]] = {}  # first and last stamps of new tracks
+        for one in (*self._of_kind('delete'), *self._of_kind('rename')):
+            if one.stamp_ns is None or one.value == one.track_id:
+                continue
+            span = one.stamp_ns, one.stamp_ns if one.end_ns is None else one.end_ns
+            places.append((one.track_id, *span))
+            if one.kind == 'delete':
+                renames = (each for each in self._of_track[one.track_id] if each.kind == 'rename')
+                places += [(each.value, *span) for each in renames]
+            elif one.value in self.apart:
+                parts.setdefault(one.value, []).extend(span)
+        for name, ends in parts.items():
+            places.append((name, -MAX_STAMP_NS, min(ends) - 1))
+            places.append((name, max(ends) + 1, MAX_STAMP_NS))
+        found = []
+        for name, first_ns, last_ns in dict.fromkeys(places):
+            left = sorted(one.stamp_ns for one in self._of_result.get(name, ()))
+            within = [stamp_ns for stamp_ns in left if first_ns <= stamp_ns <= last_ns]
+            for before_ns, after_ns in pairwise([first_ns - 1, *within, last_ns + 1]):
+                if left and after_ns - before_ns > 1:
+                    span = before_ns + 1, after_ns - 1
+                    found.append(Decision(name, span[0], 'delete', end_ns=span[1]))
         return found
 
     def _note(self, track_id: str, input_id: str, stamp_ns: int) -> None:

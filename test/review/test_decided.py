@@ -473,9 +473,16 @@ def test_attributes_are_set_in_the_page(completed, tmp_path):
     assert found[:2] == [(None, None, 'parked=true'), (stamps[2], stamps[4], 'weather=rain')]
 
 
-@pytest.mark.parametrize('options', [(), ('--complete',)])
-def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, options):
-    """A split stays one, classes are not outvoted, accepted tracks not rejected, however often."""
+@pytest.mark.parametrize(
+    ('options', 'last'), [((), '--complete'), (('--complete',), '--keyframes')]
+)
+def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, options, last):
+    """
+    A split stays one, classes are not outvoted, accepted tracks not rejected, however often.
+
+    Boxes that were deleted, also those that a run has added, are not added again.
+
+    """
     _, stamps, _, out = completed
     recording = out.with_name('drive')
     decisions = [
@@ -483,19 +490,25 @@ def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, op
         Decision('2', stamps[1], 'reclass', end_ns=stamps[2], value='truck'),
         Decision('9', None, 'accept'),
         Decision('1', stamps[3], 'reject'),
+        Decision('2', stamps[GAP[1]], 'delete'),
+        Decision('2', stamps[12], 'delete'),
+        Decision('1', stamps[SWEEPS - 3], 'delete'),
     ]
     rows = Run(recording, *options)(tmp_path / '0', decisions)
     as_rejected = rows['1', stamps[3]]
     for k in (1, 2):
         labels = f'csv:{tmp_path / str(k - 1)}'
-        run = Run(recording, '--labels', labels, '--complete', *options)
+        run = Run(recording, '--labels', labels, *(options if k == 1 else [last]))
         rows = run(tmp_path / str(k))
         assert run.status == 0, capsys.readouterr().err
         is_known = {(name, row['status'] != 'rejected') for (name, _), row in rows.items()}
         assert is_known == {('1', True), ('2', True), ('2_2', True), ('9', True)}
-        names = ['2_2' if k >= 10 else '2' for k in range(SWEEPS)]
-        classes = [rows[key]['class_name'] for key in zip(names, stamps, strict=True)]
-        assert classes == ['car', 'truck', 'truck'] + ['car'] * 13
+        keys = [('2_2' if k >= 10 else '2', stamps[k]) for k in range(SWEEPS)]
+        found = {key: row['class_name'] for key, row in rows.items() if key[0] in ('2', '2_2')}
+        classes = dict(zip(keys, ['car', 'truck', 'truck'] + ['car'] * 13, strict=True))
+        gone = {keys[12], *(keys[j] for j in (GAP if k == 1 and not options else GAP[1:2]))}
+        assert found == {key: classes[key] for key in keys if key not in gone}
+        assert words_of(rows, '1', stamps)[-3] == ''
         words = [str(cell)[:9] for cell in rows['1', stamps[3]].values()]
         assert words == [str(cell)[:9] for cell in as_rejected.values()]
     table = BoxTable.read(tmp_path / '2' / 'boxes.csv')
