@@ -323,7 +323,11 @@ class LatencyCorrection:
             self._waiting.append(pair)
             if not pair.reason:
                 self._note(pair.boxes)
+            if self._waits:
+                self._compare()
             yield from self._ready()
+            if not self._waits:  # after its early boxes, which this would delay
+                self._compare()
 
     def flush(self) -> Iterator[Pair]:
         """Yield the pairs that wait, without waiting on."""
@@ -331,12 +335,15 @@ class LatencyCorrection:
             yield self._pop_corrected()
 
     def _note(self, boxes: BoxArray) -> None:
-        """Add boxes to their tracks, and compare earlier sweeps with these."""
+        """Add boxes to their tracks."""
         if self._first_ns is None:
             self._first_ns = boxes.stamp_ns
         if self._is_estimated or self.latency.seconds:
             oldest_ns = min(boxes.stamp_ns, self._waiting[0].boxes.stamp_ns)
             self._tracks.add(boxes, oldest_ns - TRACK_SECONDS * 1e9)
+
+    def _compare(self) -> None:
+        """Compare earlier sweeps with the boxes that are known now."""
         if self._is_estimated:
             self._evidence.compare(self._tracks)
 

@@ -244,8 +244,8 @@ class ObservedTrack:
     entries: list[PendingBox] = field(default_factory=list)
     seen: list[Observation] = field(default_factory=list)
     """Observation of each of the entries."""
-    starts: Floats = field(default_factory=lambda: np.zeros((0, 9)))
-    """Boxes that the next window starts from, of the first entries."""
+    starts: Floats | list[Floats] = field(default_factory=list)
+    """Boxes (9,) that the next window starts from, of the first entries."""
     prior: tuple[MarginalisationPrior, int] | None = None
     num_carried: int = 0
     """Newest observations that were in no window yet, because the budget was used up."""
@@ -279,12 +279,12 @@ class ObservedTrack:
         self.num_carried += 1
         newest = self.entries[-1]
         newest.array.reasons[newest.row] = Reason.BUDGET
+        self.starts = [*self.starts]
         if len(self.starts) == len(self.entries) - 1:  # else its first window is to come
-            self.starts = np.concatenate([self.starts, self.seen[-1].box[None]])
+            self.starts.append(self.seen[-1].box)
         if len(self.entries) > length:
             excess = slice(PRIOR_POSES, PRIOR_POSES + len(self.entries) - length)
-            del self.entries[excess], self.seen[excess]
-            self.starts = np.delete(self.starts, excess, axis=0)
+            del self.entries[excess], self.seen[excess], self.starts[excess]
 
     def forget(self, length: int) -> None:
         """Leave only the last `length` observations to the next window."""

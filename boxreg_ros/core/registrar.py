@@ -33,6 +33,8 @@ GetEstimates = Callable[[], list[Estimate | None]]
 """Waits for the estimates of submitted windows, None for windows that are too short."""
 Submit = Callable[[list[Window], Config, InputModel], GetEstimates]
 """Starts `estimate_windows` with the same arguments, perhaps in another process."""
+Publish = Callable[[RefinedBoxes], None]
+"""Takes early boxes before the final ones of older arrays are made."""
 Prepare = Callable[[Pair], BoxArray]
 """Returns the boxes to register in place of those of a pair, which are in time."""
 Budget = Callable[[int], int]
@@ -102,6 +104,8 @@ class BoxRegistrar:
         Evidence of the time that the input boxes are of.
     followed : FollowedObjects
         Objects that are followed from one box each, see `follow`.
+    publish : callable or None
+        Called with early boxes as soon as they are known; by default they are returned.
 
     Notes
     -----
@@ -156,6 +160,7 @@ class BoxRegistrar:
     ) -> None:
         self.config = config
         self.counts: Counter[str] = Counter()
+        self.publish: Publish | None = None
         self._submit = submit
         self._budget = budget
         self._drives = drives
@@ -391,9 +396,17 @@ class BoxRegistrar:
                 else:
                     self._solve(self._within_budget(array))
             if not is_track:
-                self._ready += results([array], is_final=False)
+                self._ready += self._published(results([array], is_final=False))
                 self._settle_after_lag()
             self._pop_settled()
+
+    def _published(self, early: Iterator[RefinedBoxes]) -> list[RefinedBoxes]:
+        """Publish early boxes; return those that are to be returned."""
+        if self.publish is None:
+            return [*early]
+        for refined in early:
+            self.publish(refined)
+        return []
 
     def _open(self, pair: Pair) -> PendingArray:
         """Make a box array pending: its valid boxes become observations of their tracks."""
@@ -655,7 +668,12 @@ def _windows(tracks: Sequence[ObservedTrack]) -> list[Window]:
         num_new = len(track.seen) - len(track.starts)
         windows.append(
             Window(
-                track.track_id, track.class_name, track.seen, num_new, track.starts, track.prior
+                track.track_id,
+                track.class_name,
+                track.seen,
+                num_new,
+                np.reshape(track.starts, (-1, 9)),
+                track.prior,
             )
         )
     return windows

@@ -107,6 +107,15 @@ class MessagePipeline:
         """Return whether messages wait for a cloud, further observations or confirmation."""
         return self.registrar.num_held > 0 or self.incoming.is_holding
 
+    def publish_early_by(self, publish: Callable[[list[Outgoing]], None]) -> None:
+        """
+        Set a function that is called with early boxes as soon as they are known.
+
+        Without it they are returned, with the final boxes that are made after them.
+
+        """
+        self.registrar.publish = lambda refined: publish(self._messages([refined]))
+
     # ------------------------------------------------------------ one message
 
     def confirm(self, item: Item) -> tuple[list[Item], list[Outgoing]]:

@@ -89,6 +89,8 @@ class Worker:
         self._waited = 0.0
         self._fully_collected_at = time.monotonic()
         self._board = MarkerBoard()
+        self._early_out: list[Outgoing] = []  # published, without their labels and markers
+        self._live.publish_early_by(self._publish_early)
         self.static: Publisher | None = None  # of clouds without moving objects
         self._boxes: dict[bool, Publisher] = {}  # by whether they are final
         self._labels: dict[bool, Publisher] = {}  # of all that label files hold of the same boxes
@@ -175,7 +177,9 @@ class Worker:
         reason = REASONS[f'{message.topic}_queue_full']
         self._health.report(reason, reason.remedy)
         if message.topic == 'boxes':
-            self._publish([Outgoing(message.content, False)])
+            passed = [Outgoing(message.content, False)]
+            self._publish_boxes(passed)
+            self._show(passed)
             self._inbox.put_passing(message)  # the final copy, in the order of all
         else:
             lost_ns = stamp_ns(header_of(message.content))
@@ -378,19 +382,19 @@ class Worker:
             self._health.set_core_counts(self._live.registrar.counts)
 
     def _publish(self, ready: list[Outgoing]) -> None:
-        for out in ready:
-            self._publish_boxes(out)
-            if out.is_final:
-                continue
-            if out.received is not None:
-                took = self._budget.end()
-                self._health.add_latency(time.monotonic() - out.received, took)
-                if self.times is not None and took is not None and out.given is not None:
-                    self.times.add(out.given.stamp_ns, took)
-            if out.given is not None:
-                self.tracks = len(set(out.given.track_ids) - {''})
-            if out.refined is not None:
-                self._health.add_early(out.refined)
+        """Publish boxes, then labels and markers, also of the early boxes before."""
+        self._publish_boxes(ready)
+        early = self._early_out
+        self._early_out = []
+        self._show([*early, *ready])
+
+    def _publish_early(self, ready: list[Outgoing]) -> None:
+        """Publish early boxes; labels and markers follow with the final boxes."""
+        self._publish_boxes(ready)
+        self._early_out += ready
+
+    def _show(self, ready: list[Outgoing]) -> None:
+        """Publish labels and markers of boxes that are published."""
         for out in ready:
             self._publish_labels(out)
         if not self._markers.get_subscription_count():
@@ -403,12 +407,24 @@ class Worker:
             else:
                 self._markers.publish(self._board.update(out.given, out.refined))
 
-    def _publish_boxes(self, out: Outgoing) -> None:
-        """Publish the message, or the messages of one stamp, of early or final boxes."""
-        publisher = self._boxes[out.is_final]
-        for message in messages_of(out.message):
-            publisher.publish(message)
-            self._health.count('final_published' if out.is_final else 'early_published')
+    def _publish_boxes(self, ready: list[Outgoing]) -> None:
+        """Publish boxes of one stamp or several, and count them."""
+        for out in ready:
+            publisher = self._boxes[out.is_final]
+            for message in messages_of(out.message):
+                publisher.publish(message)
+                self._health.count('final_published' if out.is_final else 'early_published')
+            if out.is_final:
+                continue
+            if out.received is not None:
+                took = self._budget.end()
+                self._health.add_latency(time.monotonic() - out.received, took)
+                if self.times is not None and took is not None and out.given is not None:
+                    self.times.add(out.given.stamp_ns, took)
+            if out.given is not None:
+                self.tracks = len(set(out.given.track_ids) - {''})
+            if out.refined is not None:
+                self._health.add_early(out.refined)
 
     def _save_model(self) -> None:
         """Write what the drive has shown of its detector, and log where drives differ."""

@@ -74,7 +74,17 @@ def items_of(drive, topic):
 def test_each_message_is_published_early_and_final_in_its_input_frame():
     drive = Drive(sweeps=6)
     live = Live()
-    out = live.feed(drive) + live.flush()
+    out, finals_made = [], []
+
+    def publish(ready):
+        out.extend(ready)
+        finals_made.append((live.registrar.counts[REFINED] + live.registrar.counts[KEPT]) // 2)
+
+    live.publish_early_by(publish)
+    final = live.feed(drive) + live.flush()
+    assert all(item.is_final for item in final)
+    assert finals_made == [0, 0, 0, 1, 2, 3]  # those of the same array follow
+    out += final
     assert live.session.fixed_frame == 'odom'
     for is_final in (False, True):
         messages = [item.message for item in out if item.is_final == is_final]
@@ -354,10 +364,13 @@ def test_held_boxes_are_published_unchanged_once_after_a_fault():
     assert len(live.feed(again) + live.flush()) == 12
 
 
-def test_messages_made_before_a_fault_are_published():
+@pytest.mark.parametrize('is_early', [False, True])
+def test_messages_made_before_a_fault_are_published(is_early):
     drive = Drive(sweeps=6)
     live = Live()
     made = [0]
+    out = []
+    live.publish_early_by(out.extend)
 
     class Faulty:
         from_msg = staticmethod(vision.from_msg)
@@ -371,11 +384,13 @@ def test_messages_made_before_a_fault_are_published():
 
     live.adapter = Faulty
     made[0] = -100
-    out = live.feed(drive)
-    made[0] = 0  # conversion of the second final message fails
+    last = received(*drive.items.pop()[::2])
+    out += live.feed(drive)
+    made[0] = 1 if is_early else -1  # conversion of the last early or second final message fails
     with pytest.raises(ZeroDivisionError):
+        out += live.process(last)
         live.flush()
-    out += live.abandon(None)
+    out += live.abandon(last)
     for is_final in (False, True):
         stamps = [
             vision.from_msg(item.message).stamp_ns for item in out if item.is_final == is_final
