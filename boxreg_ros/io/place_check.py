@@ -60,8 +60,8 @@ Share of the points in the upper half of a box within this part of it: that of a
 Chosen: in the median of the sample 0.13, with extents twice as large 0.88; by chance 0.34.
 
 """
-MAX_ZERO = 1e-6
-"""Height that is taken for 0 [m]; derived: rounding of the transforms that it went through."""
+MAX_FLAT = 1e-5
+"""Difference of heights that count as one [m]; derived: rounding of float32 and transforms."""
 MIN_UPRIGHT = 0.5
 """Cosine of the tilt below which a box is not upright; derived: 60 degrees."""
 MIN_TILTED = 0.3
@@ -231,15 +231,16 @@ class PlaceCheck(PairedCheck):
 
     @property
     def flat(self) -> str:
-        """Return that all boxes have z of 0, as a detector in the plane writes it; else ''."""
+        """Return that all boxes have one z, as a detector in the plane writes it; else ''."""
         if len(self._heights) < MAX_COMPARED or self._convention.pose_reference != 'center':
             return ''
-        if np.abs(self._heights).max() > MAX_ZERO:
+        if np.ptp(self._heights) > MAX_FLAT:
             return ''
+        z = round(self._heights[0], 3) or 0.0  # no -0.0
         return (
-            f'all of {len(self._heights)} boxes have z of 0: expected the heights of their '
+            f'all of {len(self._heights)} boxes have z of {z:g}: expected the heights of their '
             f'objects, got those of a detector in the plane; x, y and yaw are refined, z is right '
-            f'only where 0 is the height of their centres: if the ground is at 0, set '
+            f'only where {z:g} is the height of their centres: if the ground is there, set '
             f'pose_reference:=bottom (boxreg relabel: --pose-reference bottom); a pose at another '
             f'height is a fraction of that of the box, as in --pose-reference=0,0,0.5'
         )

@@ -12,9 +12,11 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from boxreg_ros.core.metrics import iou_3d, pose_errors
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import COVARIANCES, read_covariances
+from boxreg_ros.io.pose_check import DECISIVE_BOXES, MIN_GAIN
 from boxreg_ros.io.stamp_join import joined_stamps, LARGEST_OFFSET_NS, unknown_stamps
 from boxreg_ros.io.times import time_range
 from boxreg_ros.io.velocity_table import read_velocities, VELOCITIES
@@ -37,9 +39,25 @@ from boxreg_ros.offline.sources import in_labelled_view, true_boxes
 from boxreg_ros.offline.track_scores import has_trackeval, LEAST_IOU, track_scores, TrackScores
 from boxreg_ros.offline.velocity_scores import beside, velocity_scores, VelocityScores
 from boxreg_ros.offline.velocity_scores import table as velocity_table
-from boxreg_ros.structures import is_valid_box
+from boxreg_ros.structures import BoxArray, is_valid_box
+from msg_adapters.convention import Convention, FORWARD, ORIENTATIONS, REFERENCES, SIZE_ORDERS
 import numpy as np
 from numpy.typing import NDArray
+
+CONVENTIONS = {
+    'pose_reference': tuple(REFERENCES),
+    'size_order': SIZE_ORDERS,
+    'forward_axis': tuple(FORWARD),
+    'orientation': ORIENTATIONS,
+    'size_scale': (2, 0.5),
+}
+"""Options of a `Convention`, and the values that true boxes may have where they fit badly."""
+MIN_FIT = 0.5
+"""Mean 3D IoU that another convention must reach; chosen: by none, another place has it."""
+MAX_TURN = math.pi / 4
+"""Angle between two headings from which they are others [rad]; derived: half a quarter turn."""
+COMPARED_PAIRS = 1000
+"""Pairs that are looked at: 25 conventions of so many take about 0.1 s."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -96,6 +114,7 @@ def run(args: argparse.Namespace) -> int:
     _warn_of_predictions(predicted, truth, matches)
     if matches.is_matched.any() and not classes:
         _warn_of_other_classes(predicted, truth, matches, is_unknown)
+    _warn_of_convention(args, predicted, truth, matches)
     overall = summarise(matches)
     tracks = track_scores(predicted.rows(~is_unknown), truth, matches.rows)
     if not has_trackeval():
@@ -277,6 +296,40 @@ def _warn_of_other_classes(
             f'no predicted box of these classes has a true one: {names}; they count as ghosts: '
             f'if the truth has no such objects because nobody labelled them, name the others by '
             f'--classes'
+        )
+
+
+def _warn_of_convention(
+    args: argparse.Namespace, predicted: BoxTable, truth: BoxTable, matches: Matches
+) -> None:
+    """Say under which other convention the true boxes fit the predicted ones, if there is one."""
+    pairs = np.flatnonzero(matches.is_matched)
+    pairs = pairs[:: max(1, len(pairs) // COMPARED_PAIRS)]
+    found = predicted.boxes[matches.predicted_rows[pairs]]
+    rows = matches.rows[pairs]
+    names = ('',) * len(rows)
+    true = BoxArray(0, truth.frame_id, names, names, np.ones(len(rows)), truth.boxes[rows])
+
+    def fit(convention: Convention) -> float:
+        """Return the mean 3D IoU under a convention; a box of another heading has 0."""
+        boxes = convention.to_centers(true).boxes
+        is_near = np.abs(pose_errors(found, boxes).rotation[:, 2]) < MAX_TURN
+        return float(np.mean(np.where(is_near, iou_3d(found, boxes), 0)))
+
+    own = fit(Convention()) if len(pairs) >= DECISIVE_BOXES else 1.0
+    if MIN_GAIN * own > 1:
+        return
+    options = [(name, value) for name, values in CONVENTIONS.items() for value in values]
+    fits = [fit(Convention(**{name: value})) for name, value in options]  # type: ignore[arg-type]
+    best = int(np.argmax(fits))
+    if fits[best] >= max(MIN_FIT, MIN_GAIN * own):
+        name, value = options[best]
+        _warn(
+            f'conventions: expected one for both tables, got true boxes that fit the predicted '
+            f'ones with {name} {value}: their mean 3D IoU is then {fits[best]:.3f} in place of '
+            f'{own:.3f}, with 0 for those of another heading; correct them by boxreg convert '
+            f'{args.truth} -o OUT --from csv --to csv --{name.replace("_", "-")} {value}, or, if '
+            f'the predicted ones are wrong, see boxreg inspect of their recording'
         )
 
 

@@ -17,6 +17,7 @@ from importlib.util import find_spec
 from itertools import pairwise
 import json
 from pathlib import Path
+import re
 import shlex
 from typing import Any, TYPE_CHECKING
 
@@ -48,6 +49,12 @@ DEFAULTS = Config()
 """Settings of the proposed command."""
 GAP_PERIODS = 3.0
 """A pause longer than this many median periods is a gap."""
+ADVICE = re.compile(
+    r'; (?:set [^;]*?\(boxreg relabel[a-z ]*: |correct [a-z ]+ with )(--[^();]+?)(?:\)| \(node)'
+)
+"""The options in a warning that advises them without a condition."""
+REACHED_PERIODS = 0.55
+"""Periods of the clouds by which `reach` takes all boxes between them; derived: half, and 10 %."""
 MAX_SPANS = 500
 """Spans of messages closer than 1 / MAX_SPANS of a recording are joined; chosen."""
 
@@ -320,10 +327,14 @@ def _warnings(sample: _Sample, finding: str, recording: ItemSource) -> Iterator[
         yield from sparse_boxes(*(1 / period for period in periods))
     offset = facts['stamp_offset_s']
     if offset is not None and offset > DEFAULTS.reach:
-        yield (
+        text = (
             f'boxes are up to {offset:.3f} s away from the nearest cloud; those beyond reach '
             f'({DEFAULTS.reach:g} s) are not refined'
         )
+        if all(periods) and periods[0] < REACHED_PERIODS * periods[1] > DEFAULTS.reach:
+            reach = f'{REACHED_PERIODS * periods[1]:.2g}'
+            text += f'; set reach:={reach} (boxreg relabel: --set reach={reach})'
+        yield text
 
 
 def _period(stamps: list[int]) -> float | None:
@@ -353,7 +364,9 @@ def _command(args: argparse.Namespace, facts: dict[str, Any], scene: Address | N
     out = f'out/{first.stem if scene is None else scene.scene or scene.root.name}'
     words = ['boxreg', 'relabel', *map(str, args.recordings), '-o', out]
     words += words_of(args, Request, *TOPICS)
-    if facts['sample']['boxes_without_id']:
+    advised = ADVICE.findall('; '.join(facts['warnings']))
+    words += shlex.split(' '.join(dict.fromkeys(advised)))
+    if facts['sample']['boxes_without_id'] and '--associate' not in words:
         words.append('--associate')
     words.append('--complete')
     if all(map(find_spec, REPORT_PACKAGES)):

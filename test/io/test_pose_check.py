@@ -433,12 +433,13 @@ def test_boxes_without_heights_are_named():
     boxes = np.tile([5.0, 0, 0, 4, 2, 1.5, 0, 0, 0], (100, 1))
     T_map_lidar = np.eye(4)
     T_map_lidar[:3, :3] = Rotation.from_euler('z', 0.4).as_matrix()
-    for z, is_named in ((0.0, True), (0.1, False)):
-        boxes[-1, 2] = z
+    for z, last, is_named in ((0, 0, True), (0, 0.1, False), (-1.2, -1.2, True)):
+        boxes[:, 2] = z
+        boxes[-1, 2] = last
         check = PlaceCheck(STANDARD)
         check.add(Sweep(STAMP, 'map', np.zeros((3, 3))), T_map_lidar)
         check.add(boxes_to_frame(array_of(*boxes), T_map_lidar, 'map'), T_map_lidar)
-        assert ('all of 100 boxes have z of 0' in check.flat) == is_named
+        assert (f'all of 100 boxes have z of {z}:' in check.flat) == is_named
 
 
 def test_boxes_of_another_frame_than_their_messages_name_are_named():

@@ -14,6 +14,7 @@ from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline import evaluate as cli
 from boxreg_ros.offline.box_scores import groups, has_word, match, summarise
 from boxreg_ros.structures import BoxArray, KEPT, RefinedBoxes
+from msg_adapters.convention import Convention
 import numpy as np
 import pytest
 
@@ -398,6 +399,29 @@ def test_classes_that_the_truth_may_lack_are_said(tmp_path, capsys):
     renamed.write(tmp_path / 'truth.csv')
     assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
     assert 'a true one' not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    'option',
+    [('pose_reference', 'bottom'), ('size_order', 'wlh'), ('forward_axis', 'y-')],
+)
+def test_true_boxes_of_another_convention_are_named(tmp_path, capsys, option):
+    truth = truth_table()
+    truth.write(tmp_path / 'right.csv')
+    raw = BoxArray(0, 'odom', truth.track_ids, truth.class_names, truth.scores, truth.boxes)
+    name, value = option
+    boxes = Convention(**{name: value}).from_centers(raw).boxes
+    replace(truth, boxes=boxes).write(tmp_path / 'truth.csv')
+    assert run(tmp_path / 'right.csv', tmp_path / 'truth.csv') == 0
+    warning = capsys.readouterr().err
+    assert f'with {name} {value}: their mean 3D IoU is then 1.000' in warning
+    flag = f'--{name.replace("_", "-")} {value}'
+    assert f'boxreg convert {tmp_path / "truth.csv"} -o OUT --from csv --to csv {flag}' in warning
+    noise = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0, 0, 0, 0.1])
+    boxes = truth.boxes + noise  # that of a detector is no convention
+    replace(truth, boxes=boxes).write(tmp_path / 'truth.csv')
+    assert run(tmp_path / 'right.csv', tmp_path / 'truth.csv') == 0
+    assert capsys.readouterr().err == ''
 
 
 def test_invalid_true_boxes_are_left_out_with_a_warning(tmp_path, capsys):

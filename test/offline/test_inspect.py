@@ -47,6 +47,17 @@ def test_the_command_is_that_of_the_readme(capsys, monkeypatch):
     assert f'    {facts["command"]}\n' in (ROOT / 'README.md').read_text(encoding='utf-8')
 
 
+def test_the_command_has_the_options_that_warnings_advise(tmp_path, capsys):
+    drive = Drive(sweeps=30)
+    clouds = [item for item in drive.items if item[0] == '/points']
+    drive.items = [item for item in drive.items if item not in clouds[1::2]]  # at 5 Hz
+    for index in range(30):
+        drive.replace('/boxes', index, half_extents)
+    _, facts = facts_of(capsys, drive.write(tmp_path / 'drive'))
+    assert '(boxreg relabel: --set reach=0.11)' in ' '.join(facts['warnings'])
+    assert ' -o out/drive --size-scale 2 --set reach=0.11 --complete' in facts['command']
+
+
 def test_why_no_command_can_be_run(tmp_path, capsys):
     drive = Drive(motion='none')
     status, facts = facts_of(capsys, drive.write(tmp_path / 'drive'))
@@ -127,6 +138,12 @@ def test_stamps_that_repeat_or_go_back_are_warnings(tmp_path, capsys):
     assert '1 clouds repeat the stamp of another one' in facts['warnings']
     assert any('before that of the one received' in line for line in facts['warnings'])
     assert facts['sample']['received_after_stamp_s'] == pytest.approx(0, abs=0.2)
+
+
+def half_extents(message):
+    for detection in message.detections:
+        size = detection.bbox.size
+        size.x, size.y, size.z = size.x / 2, size.y / 2, size.z / 2
 
 
 def clear_ids(message):
