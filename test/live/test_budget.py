@@ -2,7 +2,7 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
-from boxreg_ros.live.budget import BATCH_OVERHEAD, RESERVE_MEMORY, TickBudget
+from boxreg_ros.live.budget import BATCH_OVERHEAD, RESERVE_MEMORY, TickBudget, TRANSPORT_TIME
 import pytest
 
 
@@ -19,9 +19,10 @@ class Clock:
 
 
 def solved(deadline):
-    """Return a budget that has timed windows of 1 ms, and its clock."""
+    """Return a budget that has timed windows of 1 ms, with a deadline of the node; and a clock."""
     clock = Clock()
-    budget = TickBudget(deadline, clock, lambda windows, *_: [object()] * len(windows))
+    total = deadline + TRANSPORT_TIME
+    budget = TickBudget(total, clock, lambda windows, *_: [object()] * len(windows))
     clock.step = 1e-3 * (1 + BATCH_OVERHEAD)
     budget.submit([None], Config(), InputModel(Config().faces))()
     clock.step = 0.0
@@ -92,6 +93,18 @@ def test_spare_windows_are_solved_before_the_next_boxes():
     assert budget.spare_windows() + BATCH_OVERHEAD == pytest.approx(30, abs=1)
     clock.now += 0.05  # they are late
     assert budget.spare_windows() + BATCH_OVERHEAD == pytest.approx(40, abs=1)
+    tick(budget, clock, publishing=0.03)
+    assert budget.spare_windows() + BATCH_OVERHEAD == pytest.approx(10, abs=1)
+
+
+def test_windows_between_the_ticks_are_timed_apart():
+    budget, clock = solved(0.1)
+    assert windows(budget, clock.now) == pytest.approx(100, abs=1)  # no others are known
+    clock.step = 2e-3 * (1 + BATCH_OVERHEAD)
+    budget.submit([None], Config(), InputModel(Config().faces))()
+    clock.step = 0.0
+    assert windows(budget, clock.now) == pytest.approx(50, abs=1)
+    assert budget.spare_windows() + BATCH_OVERHEAD == pytest.approx(20, abs=1)
 
 
 def test_time_for_publishing_is_left():
@@ -101,12 +114,12 @@ def test_time_for_publishing_is_left():
     assert windows(budget, clock.now) == pytest.approx(70, abs=1)
 
 
-def test_the_second_largest_overrun_of_the_last_second_is_a_reserve():
+def test_the_second_largest_of_the_last_overruns_is_a_reserve():
     budget, clock = solved(0.1)
     for solving in (0.12, 0.13, 0.05):
         tick(budget, clock, solving)
     assert windows(budget, clock.now) == pytest.approx(80, abs=1)
-    clock.now += 0.9 * RESERVE_MEMORY
+    clock.now += RESERVE_MEMORY - 0.1
     assert windows(budget, clock.now) == pytest.approx(100, abs=1)
 
 
@@ -153,7 +166,7 @@ def test_all_boxes_are_refined_within_a_second_of_the_last_stall(stalled):
 def test_a_tick_that_cannot_be_in_time_takes_no_reserve():
     budget, clock = solved(0.02)  # less than a batch of one window
     tick(budget, clock, solving=0.05)
-    budget.deadline = 0.1
+    budget.deadline = 0.1 + TRANSPORT_TIME
     assert windows(budget, clock.now) == pytest.approx(100, abs=1)
 
 
