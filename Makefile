@@ -97,7 +97,8 @@ test-jazzy: $(if $(PYTHON_JAZZY),$(jazzy)) ## run a part of the suite with the v
 	@[ -n '$(PYTHON_JAZZY)' ] || { \
 	    echo 'NOT RUN: the tests with the versions of Ubuntu 24.04 need Python 3.12, and none was found.'; \
 	    echo 'Install it, or name it: make test-jazzy PYTHON_JAZZY=/path/to/python3.12'; }
-	$(if $(PYTHON_JAZZY),$(VENV_JAZZY)/bin/python -m pytest -q -n 0 --durations=3 $(JAZZY_TESTS))
+	$(if $(PYTHON_JAZZY),$(VENV_JAZZY)/bin/python -m pytest -q -n 0 --durations=3 \
+	    -W error::FutureWarning $(JAZZY_TESTS))
 
 lint: $(tests) ## run the linters alone
 	$(BIN)/python -m pytest test/test_lint.py

@@ -135,7 +135,7 @@ def _parabola(times: Floats, places: Floats, i: int) -> Floats | None:
     if is_near.sum() < 3:
         return None
     seconds = times[is_near] - times[i]
-    slope: Floats = np.linalg.lstsq(np.vander(seconds, 3), places[is_near])[0][1]
+    slope: Floats = np.linalg.lstsq(np.vander(seconds, 3), places[is_near], rcond=None)[0][1]
     return slope
 
 
