@@ -741,6 +741,10 @@ def test_narrow_page_does_not_overflow(result, scheme):
 @NEEDS_BROWSER
 def test_decisions_and_a_pin_are_made_by_keys_and_the_mouse(server):
     with opened_page(server.address + '#track=1') as page:
+        press(page, '?', "$('help').open")
+        sizes = "[$('help').scrollTop, $('help').scrollHeight > $('help').clientHeight]"
+        assert page.evaluate(sizes) == [0, True]  # the first keys are in view
+        page.keyboard.press('Escape')
         page.keyboard.press('a')
         page.wait_for_selector('[data-do=accept][aria-pressed=true]')
         page.keyboard.press('r')
