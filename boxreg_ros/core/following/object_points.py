@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from boxreg_ros.core.following.sweeps import Sweeps
-from boxreg_ros.core.method import sweep_fit, turn_rate
+from boxreg_ros.core.method import sweep_fit
 from boxreg_ros.core.method.sweep_fit import Registered, Target
 from boxreg_ros.core.method.turn_rate import State
 from boxreg_ros.rotations import matrix_from_rpy
@@ -67,13 +67,10 @@ class ObjectPoints:
 
     def score(self, row: int, pose: Floats) -> float:
         """Return how well the points of a sweep fit a pose, see `Fit`."""
-        return float(sweep_fit.fit(self.near(row, pose), pose, self.target).score)
+        return float(sweep_fit.score(self.near(row, pose), pose, self.target))
 
     def fitted(self, row: int, state: State, steps: int) -> Registered:
         """Return the pose in a sweep from one start."""
-        information = turn_rate.pose_information(state)
         points = self.near(row, state.pose)
-        found: Registered = sweep_fit.registered(
-            points, state.pose, state.pose, information, self.target, steps
-        )
+        found: Registered = sweep_fit.fitted(points, state, self.target, steps)
         return found

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from boxreg_ros.core.following.motion_kinds import MotionModel
 from boxreg_ros.core.following.object_points import ObjectPoints
 from boxreg_ros.core.following.person import ANGLE, POSITION
-from boxreg_ros.core.method import sweep_fit, turn_rate
+from boxreg_ros.core.method import turn_rate
 from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.core.method.turn_rate import State
 from boxreg_ros.structures import Floats, Ints, YAW
@@ -107,7 +107,7 @@ class StartSpeeds:
                     break
                 state = self._motion.predicted(state, times[other] - times[other - sign])
                 found = self._points.fitted(other, state, FOLLOW.test_iterations)
-                total += sweep_fit.rank(found) / count
+                total += found.rank / count
                 weights += 1 / count
                 state = turn_rate.update(state, found.pose, found.covariance)
             found_speeds.append(state.speed)

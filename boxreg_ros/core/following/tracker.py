@@ -203,7 +203,6 @@ class Follower:
 
     def _learn(self, points: Floats, pose: Floats, is_seed: bool = False) -> int:
         """Add points at a pose to the surface, and find the road; return how many are new."""
-        count: int = sweep_fit.learn(points, pose, self._target, is_seed)
-        if np.isnan(self._road):
-            self._road = sweep_fit.road_below(points, pose, self._target)
+        count: int
+        count, self._road = sweep_fit.learn(points, pose, self._target, is_seed, self._road)
         return count

@@ -1,5 +1,6 @@
 """Every number of following one object: value, unit, origin."""
 
+from types import ModuleType
 from typing import NamedTuple
 
 
@@ -179,3 +180,8 @@ class FollowNumbers(NamedTuple):
 
 
 FOLLOW = FollowNumbers()
+
+IN_KERNELS = ModuleType('follow')
+"""The same for kernels. Attributes of a module are constants; of a tuple, numba makes all fields,
+and counts their references, wherever one of them is used."""
+vars(IN_KERNELS).update(FOLLOW._asdict())

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.eigen import eigenvalues, eigenvector
-from boxreg_ros.core.method.follow_numbers import FOLLOW
+from boxreg_ros.core.method.follow_numbers import IN_KERNELS as FOLLOW
 import numpy as np
 
 FOREIGN = -1

@@ -7,7 +7,7 @@ from boxreg_ros.core.method.arrays import copy
 from boxreg_ros.core.method.arrowhead import factorise_corner, invert, solve_corner
 from boxreg_ros.core.method.compile import kernel, loop
 from boxreg_ros.core.method.crop import flat_height
-from boxreg_ros.core.method.follow_numbers import FOLLOW
+from boxreg_ros.core.method.follow_numbers import IN_KERNELS as FOLLOW
 from boxreg_ros.core.method.surface import insert, insert_foreign, is_foreign, nearest_cell
 from boxreg_ros.core.method.turn_rate import pose_information
 import numpy as np
@@ -67,12 +67,13 @@ class Fit(NamedTuple):
 
 
 class Registered(NamedTuple):
-    """A pose (4,), its covariance (4, 4), fit, squared distance from the prediction, `REASONS`."""
+    """A pose (4,), its covariance (4, 4), fit, rank, and reason of `REASONS`."""
 
     pose: Any
     covariance: Any
     fit: Any
-    jump: float
+    rank: float
+    """Score of the fit, less what the distance from the prediction costs."""
     reason: int
 
 
@@ -112,19 +113,20 @@ def find(points, expected, target):
             if (n == 0 and is_lost) or len(own) < FOLLOW.min_points:
                 continue
             other = registered(own, start, prior, information, target, FOLLOW.max_steps)
-            if rank(other) > rank(best) + FOLLOW.jump_cost:
+            if other.rank > best.rank + FOLLOW.jump_cost:
                 best = other
     if is_lost and best.reason == ACCEPTED:
         fits = best.fit.fitting >= FOLLOW.min_sure_fit * max(best.fit.matched, 1.0)
         if not fits or best.fit.score < FOLLOW.min_score_again * expected.usual:
-            return Registered(best.pose, best.covariance, best.fit, best.jump, NO_FIT)
+            return Registered(best.pose, best.covariance, best.fit, best.rank, NO_FIT)
     return best
 
 
 @kernel
-def rank(found):
-    """Return the score of a registered pose, less what the distance from its prediction costs."""
-    return found.fit.score - FOLLOW.jump_cost * min(found.jump, FOLLOW.max_jump)
+def fitted(points, state, target, iterations):
+    """Return the pose of an object by points (n, 3) near it, from its prediction alone."""
+    pose = state.values[:4]
+    return registered(points, pose, pose, pose_information(state), target, iterations)
 
 
 @kernel
@@ -161,7 +163,8 @@ def registered(points, start, prior, information, target, iterations):
     for a in range(4):
         for b in range(4):
             jump += (pose[a] - prior[a]) * information[a, b] * (pose[b] - prior[b])
-    return Registered(pose, total, found, jump, _reason(pose, total, found, jump))
+    rank = found.score - FOLLOW.jump_cost * min(jump, FOLLOW.max_jump)
+    return Registered(pose, total, found, rank, _reason(pose, total, found, jump))
 
 
 @kernel
@@ -280,6 +283,12 @@ def fit(points, pose, target):
 
 
 @kernel
+def score(points, pose, target):
+    """Return how well points (n, 3) fit a pose, see `Fit`."""
+    return fit(points, pose, target).score
+
+
+@kernel
 def around(points, pose, half, margin):
     """Return the points (n, 3), which ascend by x, around a pose."""
     reach = hypot(half[0], half[1]) + FOLLOW.crop + margin
@@ -393,11 +402,12 @@ def in_box(points, pose, target, margin):
 
 
 @kernel
-def learn(points, pose, target, is_seed):
+def learn(points, pose, target, is_seed, road):
     """
-    Add the points (n, 3) in a box to the map of its surface; return their number.
+    Add the points (n, 3) in a box to the map of its surface; return their number and the road.
 
-    Those beside the box of a seed are foreign.
+    Those beside the box of a seed are foreign. The road is its height above the bottom of the box
+    [m], which is found by these points where it is NaN.
 
     """
     if is_seed:
@@ -405,7 +415,7 @@ def learn(points, pose, target, is_seed):
         insert_foreign(beside, target.half, target.surface.slots)
     inside = in_box(points, pose, target, FOLLOW.tolerance)
     insert(inside, target.half, target.surface)
-    return len(inside)
+    return len(inside), road_below(points, pose, target) if np.isnan(road) else road
 
 
 @kernel
