@@ -14,6 +14,7 @@ from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.labels import can_read, FORMATS, frames_of, LabelFrame, Provenance, writer_for
 from boxreg_ros.labels.records import refined_boxes
 from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.sources import source_of
 import numpy as np
 from paths import ROOT
 import pytest
@@ -62,7 +63,7 @@ def test_broken_file_is_refused(tmp_path, text):
 def test_convert_to_the_format_and_back(tmp_path):
     table = tmp_path / 'boxes.csv'
     BoxTable.from_arrays(
-        input_boxes(Request((Drive(sweeps=5).write(tmp_path / 'drive'),)).recording())[0]
+        input_boxes(source_of(Request((Drive(sweeps=5).write(tmp_path / 'drive'),))))[0]
     ).write(table)
     there, back = (str(tmp_path / name) for name in ('there', 'back'))
     assert cli.main(['convert', str(table), '-o', there, '--from', 'csv', '--to', 'jsonl']) == 0

@@ -36,7 +36,7 @@ from boxreg_ros.offline.arguments import (
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import spare_file
-from boxreg_ros.offline.sources import true_boxes
+from boxreg_ros.offline.sources import source_of, true_boxes
 from boxreg_ros.structures import Floats, is_valid_box, POSE, ROLL
 import numpy as np
 import yaml
@@ -300,7 +300,7 @@ def run(args: argparse.Namespace) -> int:
     truth = true_boxes(args.truth)
     if not len(truth.boxes):
         raise RecordingError(f'{args.truth}: expected true boxes, got none; give another table')
-    recording = request.recording()
+    recording = source_of(request)
     recording.has_boxes = not args.no_boxes
     drive = Drive.of(recording, truth, AT_ONCE, config)
     if drive.left_out:

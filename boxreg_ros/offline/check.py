@@ -124,8 +124,9 @@ def _tracks(source: str, config: Config, unread: Counter[str]) -> tuple[list[Lab
     if _is_recording(path):
         from boxreg_ros.io.fixed_frame import input_boxes  # slow to import: it reads bags
         from boxreg_ros.offline.request import Request
+        from boxreg_ros.offline.sources import source_of
 
-        arrays, left_out = input_boxes(Request((path,)).recording())
+        arrays, left_out = input_boxes(source_of(Request((path,))))
         return _grouped(((array, None) for array in arrays), config, unread), left_out
     from boxreg_ros.labels import frames_of
 

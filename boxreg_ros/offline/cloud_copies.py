@@ -15,8 +15,9 @@ from boxreg_ros.labels import Provenance
 from boxreg_ros.labels.mcap import OVERLAY
 from boxreg_ros.labels.recording_copy import RawMessage, RecordingCopy
 from boxreg_ros.labels.semantickitti import point_numbers
-from boxreg_ros.offline.point_products import is_kept, LabelledSweep
+from boxreg_ros.offline.labelled_sweep import is_kept, LabelledSweep
 from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.sources import source_of
 from boxreg_ros.offline.stored_sweeps import MergedCloud, StoredPlace
 from boxreg_ros.structures import Floats, Ints
 from msg_adapters import pointcloud
@@ -75,7 +76,7 @@ class CloudCopies:
             self._copy(source, {'overlay': overlay}, None)
             whole.unlink()
         if paths:
-            recording = request.recording()
+            recording = source_of(request)
             assert isinstance(recording, Recording)  # checked on reading
             self._copy(recording, paths, provenance)
 

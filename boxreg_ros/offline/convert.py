@@ -31,7 +31,7 @@ from boxreg_ros.offline.arguments import add_options, values_of
 from boxreg_ros.offline.notes import left_out_line
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
-from boxreg_ros.offline.sources import label_frame_of, scene_address, writer_options
+from boxreg_ros.offline.sources import label_frame_of, scene_address, source_of, writer_options
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, is_valid_box, REJECTED, ROLL, Sweep, YAW
 from msg_adapters.convention import Convention
@@ -200,7 +200,7 @@ def _read_with_recording(
     config = Config()
     waiting = deque[LabelFrame]()  # merged clouds are complete later than the boxes of their time
     spool = Spool(folder, config) if request.options.with_points else None
-    with request.recording() as recording:
+    with source_of(request) as recording:
         items = FixedFrameItems(recording, config, fixed_frame=request.fixed_frame)
         fixed_frame = items.fixed_frame
         sensor_frame = label_frame_of(recording, items.tree, fixed_frame, request.label_frame)

@@ -35,7 +35,7 @@ from boxreg_ros.offline.consistency import consistency
 from boxreg_ros.offline.consistency import table as consistency_table
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import earlier_summary
-from boxreg_ros.offline.sources import in_labelled_view, true_boxes
+from boxreg_ros.offline.sources import in_labelled_view, source_of, true_boxes
 from boxreg_ros.offline.track_scores import has_trackeval, LEAST_IOU, track_scores, TrackScores
 from boxreg_ros.offline.velocity_scores import beside, velocity_scores, VelocityScores
 from boxreg_ros.offline.velocity_scores import table as velocity_table
@@ -210,7 +210,7 @@ def _of_recording(args: argparse.Namespace, source: Path) -> BoxTable:
     """Return the input boxes of a recording."""
     from boxreg_ros.io.fixed_frame import input_boxes  # slow to import: it reads bags
 
-    recording = request_from(args, source).recording()
+    recording = source_of(request_from(args, source))
     arrays, others = input_boxes(recording, args.fixed_frame)
     if others:
         _warn(others)

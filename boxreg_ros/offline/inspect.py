@@ -83,8 +83,10 @@ def run(args: argparse.Namespace) -> int:
 
 def inspect(args: argparse.Namespace, address: Address | None) -> dict[str, Any]:
     """Return what `boxreg inspect --json` prints; RecordingError if nothing can be read."""
+    from boxreg_ros.offline.sources import source_of
+
     request = request_from(args)
-    source = request.recording()
+    source = source_of(request)
     facts = _contents(args.recordings) if address is None else _scene_contents(address)
     try:
         with source as recording:

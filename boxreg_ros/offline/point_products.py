@@ -12,14 +12,13 @@ from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 from urllib.parse import quote
 
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method.labelling import MOVING
 from boxreg_ros.core.method.voxels import add_new, FREE
 from boxreg_ros.core.point_labels import (
-    BACKGROUND,
     ObjectTrack,
     PointLabeller,
     PointLabels,
@@ -29,6 +28,7 @@ from boxreg_ros.io.fixed_frame import StoredCloud
 from boxreg_ros.labels import LabelFrame, LabelWriter, Options, Provenance, writer_for
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.records import ReadBox, refined_of
+from boxreg_ros.offline.labelled_sweep import is_kept, LabelledSweep
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stored_sweeps import StoredSweeps
 from boxreg_ros.review.changes import TrackChanges
@@ -40,7 +40,6 @@ from boxreg_ros.structures import (
     KEPT,
     REFINED,
     REJECTED,
-    Sweep,
 )
 import numpy as np
 from numpy.typing import NDArray
@@ -90,15 +89,6 @@ def object_tracks(tracks: Sequence[TrackChanges]) -> list[ObjectTrack]:
         boxes = track.boxes[rows]
         found.append(ObjectTrack(track.track_id, track.class_name, stamps_ns, boxes, is_certain))
     return found
-
-
-class LabelledSweep(NamedTuple):
-    """A sweep in the fixed frame, its labels, and whether boxes state what is there."""
-
-    sweep: Sweep
-    cloud: StoredCloud | None
-    labels: PointLabels
-    is_known: bool
 
 
 class PointProducts:
@@ -236,14 +226,6 @@ class PointProducts:
     def _added(self, number: int) -> LabelledSweep | None:
         self._add_until(number + 1)
         return self._labelled(number)
-
-
-def is_kept(labels: PointLabels, name: str) -> NDArray[np.bool_]:
-    """Return which points the map ``static`` or ``background`` keeps, (M,)."""
-    if name == 'static':
-        return ~labels.is_dynamic
-    is_background: NDArray[np.bool_] = labels.track == BACKGROUND
-    return is_background
 
 
 def object_name(track_id: str, row: int) -> str:

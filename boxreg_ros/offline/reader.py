@@ -24,7 +24,7 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.offline.shared_arrays import Receiver, Sender, shared_memory
-from boxreg_ros.offline.sources import label_frame_of, scene_address
+from boxreg_ros.offline.sources import label_frame_of, scene_address, source_of
 from boxreg_ros.offline.stored_sweeps import StoredPlace, StoredSweeps
 from boxreg_ros.offline.workers import Receive, run_in_worker, Send
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
@@ -284,7 +284,7 @@ def _messages(
     request: Request, sweeps: StoredSweeps | None
 ) -> Generator[Source | Item | Findings]:
     """Yield the source of a recording, all its items, and the findings."""
-    with request.recording() as recording:
+    with source_of(request) as recording:
         _check_copies(request, recording)
         reading = RecordingReader(recording, request, Stopwatch(), sweeps)
         yield reading.source

@@ -27,7 +27,7 @@ from boxreg_ros.offline.result_folder import (
     whole_folder,
     write_summary,
 )
-from boxreg_ros.offline.sources import true_boxes
+from boxreg_ros.offline.sources import source_of, true_boxes
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.offline.survey import Passes, survey
 from boxreg_ros.review.corrections import Corrections
@@ -102,7 +102,7 @@ def _relabel(request: Request, out: Path, progress: Progress, fingerprint: str) 
     drives = _other_drives(request)
     shown = Passes(progress, 1 + (request.completes or corrections.adds))
     with claimed(out), ExitStack() as workers:
-        with request.recording() if request.cloud_copies else nullcontext():
+        with source_of(request) if request.cloud_copies else nullcontext():
             pass  # both processes need the types of its messages
         first = survey(request, clock, shown, corrections, drives)
         sweeps = _stored_sweeps(request, out)

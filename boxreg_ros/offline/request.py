@@ -21,8 +21,7 @@ from boxreg_ros.review.decisions import APPLIED, DECISIONS
 from msg_adapters.convention import Convention, STANDARD
 
 if TYPE_CHECKING:
-    from boxreg_ros.datasets.scene_recording import SceneRecording
-    from boxreg_ros.io.recording import Recording
+    pass
 
 NO_TOPIC = 'none'
 """In place of a topic of boxes: the drive has no boxes."""
@@ -230,12 +229,6 @@ class Request:
                 f'end: expected more than start ({start:g} s), got {self.end:g}; choose a larger '
                 f'--end or a smaller --start'
             )
-
-    def recording(self) -> Recording | SceneRecording:
-        """Return the recording, not yet open."""
-        from boxreg_ros.offline.sources import source_of  # imports rosbags
-
-        return source_of(self)
 
     @property
     def box_formats(self) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 import json
 import os
 from pathlib import Path
@@ -27,7 +28,7 @@ from boxreg_ros.offline.arguments import (
 from boxreg_ros.offline.relabel_command import arguments_of
 from boxreg_ros.offline.request import NO_TOPIC, Request
 from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_summary
-from boxreg_ros.offline.sources import scene_address
+from boxreg_ros.offline.sources import scene_address, source_of
 from boxreg_ros.review.folders import newest_of
 from boxreg_ros.review.scene import DriveSource
 from boxreg_ros.review.server import add_server_arguments, classes_of, serve
@@ -140,7 +141,7 @@ def drive_of(out: Path) -> DriveSource | None:
     request = Request(tuple(_within(folder, path) for path in args.recordings), **values)
     config = Config.from_yaml(out / CONFIG)
     return DriveSource(
-        request.recording, request.convention, summary['fixed_frame'], config, _titles,
+        partial(source_of, request), request.convention, summary['fixed_frame'], config, _titles,
         tuple(request.formats),
     )  # fmt: skip
 

@@ -115,7 +115,7 @@ def writer_options(request: Request) -> Options:
     """Return the options of the label writers, with the source as far as they use it."""
     if not request.recordings:
         return request.options
-    recording = request.recording()
+    recording = source_of(request)
     if isinstance(recording, Recording):
         return replace(request.options, recording=recording)
     if not any('camera' in module_of(name).FORMAT.options for name in request.formats):

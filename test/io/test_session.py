@@ -11,6 +11,7 @@ from boxreg_ros.io.time_jumps import Confirmed, JumpConfirmation
 from boxreg_ros.offline.progress import Stopwatch
 from boxreg_ros.offline.reader import RecordingReader
 from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.sources import source_of
 from boxreg_ros.structures import BoxArray, Sweep
 from msg_adapters import adapter_for, pointcloud
 from msg_adapters.convention import Convention, STANDARD
@@ -326,7 +327,7 @@ def test_boxes_of_a_recording_stamped_in_the_future_are_kept_and_said(tmp_path):
     arrays[5].header.stamp.sec += 3600
     path = write_recording(tmp_path / 'drive', drive.items)
     request = Request((path,))
-    with request.recording() as recording:
+    with source_of(request) as recording:
         reading = RecordingReader(recording, request, Stopwatch())
         items = list(reading)
         warning = reading.findings().warning
@@ -339,7 +340,7 @@ def test_boxes_of_a_recording_stamped_in_the_future_are_kept_and_said(tmp_path):
 
 def findings_of(path):
     request = Request((path,))
-    with request.recording() as recording:
+    with source_of(request) as recording:
         reading = RecordingReader(recording, request, Stopwatch())
         for item in reading:
             yield item.restarts, reading.findings().warning

@@ -15,6 +15,7 @@ from boxreg_ros.labels.registry import labels_points
 from boxreg_ros.offline.convert import convert
 from boxreg_ros.offline.formats import FORMAT_COLUMNS, rows
 from boxreg_ros.offline.relabel import relabel, Request
+from boxreg_ros.offline.sources import source_of
 from boxreg_ros.structures import ROLL
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def drive(tmp_path):
     """Return a recording, and a table of its boxes in the fixed frame."""
     recording = Drive(sweeps=7).write(tmp_path / 'drive')
     table = tmp_path / 'input.csv'
-    BoxTable.from_arrays(input_boxes(Request((recording,)).recording())[0]).write(table)
+    BoxTable.from_arrays(input_boxes(source_of(Request((recording,))))[0]).write(table)
     return recording, table
 
 
@@ -114,7 +115,7 @@ def test_boxes_of_a_person_stay_as_they_are(tmp_path, drive, camera):
     convert(conversion(table, WITH_STATUS, options, (recording,)), tmp_path / 'made')
     for name in WITH_STATUS:
         labels = (name, tmp_path / 'made' / ('boxes.csv' if name == 'csv' else name))
-        with Request((recording,), labels=labels).recording() as source:
+        with source_of(Request((recording,), labels=labels)) as source:
             items = list(FixedFrameItems(source, QUICK).read(with_clouds=False))
         pins = [item.moved.pinned for item in items]
         assert [pin is not None and pin.all() for pin in pins] == [i == 3 for i in range(7)], name

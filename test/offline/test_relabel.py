@@ -24,6 +24,7 @@ from boxreg_ros.offline import reader as reading
 from boxreg_ros.offline.convert import convert
 from boxreg_ros.offline.notes import closing_line, notes
 from boxreg_ros.offline.relabel import relabel, Request
+from boxreg_ros.offline.sources import source_of
 from boxreg_ros.offline.summary import Summary
 from boxreg_ros.review import tables
 from boxreg_ros.structures import Sweep
@@ -350,7 +351,7 @@ def test_boxes_without_transform_stay_in_their_frame(tmp_path):
     assert 'odom -> base is known from' in summary.first_missing_transform
     (note,) = notes(summary)
     assert note.startswith('4 boxes and 2 clouds have no transform; first: transform odom -> base')
-    arrays, left_out = input_boxes(Request((tmp_path / 'drive',)).recording())
+    arrays, left_out = input_boxes(source_of(Request((tmp_path / 'drive',))))
     assert len(arrays) == 8
     assert left_out.startswith('2 messages had no transform, first: transform odom -> base')
 
@@ -836,7 +837,7 @@ def test_box_topic_with_ids_is_preferred(tmp_path):
 
 def test_input_boxes_in_the_fixed_frame(tmp_path):
     drive = Drive(sweeps=4)
-    arrays, left_out = input_boxes(Request((drive.write(tmp_path / 'drive'),)).recording())
+    arrays, left_out = input_boxes(source_of(Request((drive.write(tmp_path / 'drive'),))))
     assert not left_out
     assert [array.stamp_ns for array in arrays] == drive.stamps
     for array in arrays:
@@ -851,7 +852,7 @@ def test_evaluate_and_convert_accept_the_options_they_propose(tmp_path, capsys):
     path = str(drive.write(tmp_path / 'drive'))
     table = str(tmp_path / 'input.csv')
     topics = {'boxes': '/boxes2', 'odometry': '/odom2'}
-    BoxTable.from_arrays(input_boxes(Request((Path(path),), **topics).recording())[0]).write(table)
+    BoxTable.from_arrays(input_boxes(source_of(Request((Path(path),), **topics)))[0]).write(table)
     assert main(['evaluate', path, table]) == 1
     assert 'choose one with --boxes' in capsys.readouterr().err
     words = ['--boxes', '/boxes2', '--odometry', '/odom2', '--fixed-frame', 'odom']
@@ -880,7 +881,7 @@ def test_every_real_box_is_written_once(tmp_path, storage, boxes):
     recording = tmp_path / ('recording' if storage == 'sqlite3' else 'recording.mcap')
     given = [
         (array.stamp_ns, track)
-        for array in input_boxes(Request((recording,)).recording())[0]
+        for array in input_boxes(source_of(Request((recording,))))[0]
         for track in array.track_ids
     ]
     summary, rows = run(recording, tmp_path / 'out')
