@@ -37,6 +37,19 @@ MIN_TRACKS_OF_NOISE = 3
 """Tracks that show it; chosen: the directions of one that turns or slides depend on each other."""
 MIN_DIRECTIONS_OF_NOISE = 20
 """Directions that show it; chosen: by chance, more than half lie along x in 1 of 26 cases."""
+MIN_TURNED = pi / 36
+"""
+Angle by which boxes are turned from their way [rad]; chosen: 5 degrees.
+
+Of right boxes it is up to 1.6 degrees (five drives); boxes turned by 6 cost 0.015 of 3D IoU.
+
+"""
+MAX_SPREAD = pi / 12
+"""Deviation from this angle of the directions that agree on it [rad]; chosen: 15 degrees."""
+MAX_SAME = 1e-4
+"""Difference of yaws that count as one [rad]; derived: rounding of quaternions in float32."""
+AS_READ, MIRRORED_YAW, OF_FIXED_FRAME = range(3)
+"""Columns of the angles from x of a box to its way, by three meanings of its yaw."""
 MIRRORED_OF = {'xyzw': 'clockwise', 'clockwise': 'xyzw'}
 """Orientation -> that in which yaw grows the other way."""
 MIN_RATIO = 1.15
@@ -70,7 +83,8 @@ class AxisCheck:
 
     Points cannot show which axis points forward; the way of moving vehicles and cyclists does.
     Once that is known, the larger horizontal extent is the length. `finding` says which options
-    would fit; it is empty where nothing moves. The check ends after `MAX_DIRECTIONS`.
+    would fit; it is empty where nothing moves. `is_turned` says that all boxes are turned from
+    their way by one angle that is no quarter turn. The check ends after `MAX_DIRECTIONS`.
 
     """
 
@@ -81,8 +95,10 @@ class AxisCheck:
         self._axes: Counter[str] = Counter()
         self._tracks: Counter[str] = Counter()  # by the axis along which they moved first
         self._mirrored: Counter[bool] = Counter()  # where one sense of yaw fits alone: the other?
-        self._angles: list[tuple[float, float]] = []  # from x of a box, as read and mirrored
+        self._angles: list[tuple[float, float, float]] = []  # from x of a box to its way
+        self._yaws: list[float] = []  # in the frame of the message
         self.finding = ''
+        self.is_turned = False
         self.forget()
 
     def forget(self) -> None:
@@ -112,6 +128,7 @@ class AxisCheck:
                 self._add(track_id, boxes.stamp_ns, boxes.boxes[row], frame_yaw)
         if len(self._ratios) > known:
             self.finding = self._text()
+            self.is_turned = self._is_enough and self._is_turned(AS_READ)
 
     def _add(self, track_id: str, stamp_ns: int, box: Floats, frame_yaw: float) -> None:
         way = self._ways.setdefault(track_id, _Way(stamp_ns, box, frame_yaw))
@@ -125,7 +142,9 @@ class AxisCheck:
             turn = pi * round((box[YAW] - way.box[YAW]) / pi)
             yaws = np.array([way.box[YAW] + turn, box[YAW]])
             mirrored = 2 * np.array([way.frame_yaw, frame_yaw]) - yaws
-            angles = heading - _mean_angle(yaws), heading - _mean_angle(mirrored)
+            self._yaws.append(float(wrap_angle(box[YAW] - frame_yaw)))
+            own = _mean_angle(yaws - [way.frame_yaw, frame_yaw])
+            angles = heading - _mean_angle(yaws), heading - _mean_angle(mirrored), heading - own
             self._angles.append(angles)
             axis = _axis_of(angles[0])
             fits_mirrored = _axis_of(angles[1]) == 'x+'
@@ -143,7 +162,7 @@ class AxisCheck:
         if self._is_mirrored:
             return replace(self._convention, orientation=MIRRORED_OF[self._convention.orientation])
         axis = self._axis()
-        if axis is None:
+        if axis is None or self._is_turned(AS_READ):
             return self._convention
         turned = AXES[(AXES.index(self._convention.forward_axis) + AXES.index(axis)) % 4]
         wanted = replace(self._convention, forward_axis=turned)
@@ -159,7 +178,7 @@ class AxisCheck:
         wanted, own = self.wanted, self._convention
         names = [name for name in OPTIONS if getattr(wanted, name) != getattr(own, name)]
         if not names:
-            return self._noise_text()
+            return self._yaw_text()
         ways = len(self._ratios)
         expected = ' and '.join(f'{name} {getattr(wanted, name)!r}' for name in names)
         got = ' and '.join(repr(getattr(own, name)) for name in names)
@@ -185,29 +204,66 @@ class AxisCheck:
             return False
         # A box that is turned by a quarter or a half seems mirrored where its way crosses an axis.
         fitting = self._axes['x+'] + total[True] - total[False]
-        if fitting < MIN_SHARE * self._axes.total():
+        if fitting < MIN_SHARE * self._axes.total() or self._is_turned(MIRRORED_YAW):
             return False
         axis = self._axis()
         if axis is None:
             return True
         # Vehicles of one road may fit both: the nearer one is taken.
-        angles = np.array(self._angles) - (FORWARD[axis], 0)
+        angles = np.array(self._angles)[:, : MIRRORED_YAW + 1] - (FORWARD[axis], 0)
         as_read, mirrored = np.median(np.abs(wrap_angle(angles)), axis=0)
         return bool(mirrored < as_read)
 
-    def _noise_text(self) -> str:
-        """Return that yaw has nothing to do with the way, as degrees taken for radians have."""
-        total, along = self._axes.total(), self._axes['x+'] + self._axes['x-']
-        is_enough = total >= MIN_DIRECTIONS_OF_NOISE
+    def _turn(self, meaning: int) -> float | None:
+        """Return the angle [rad] of the ways from the nearest axes; None if they do not agree."""
+        if len(self._angles) < MIN_DIRECTIONS:
+            return None
+        angles = 4 * np.array(self._angles)[:, meaning]  # axes are a quarter turn apart
+        turn = _mean_angle(angles) / 4
+        agreeing = np.mean(np.abs(wrap_angle(angles - 4 * turn)) < 4 * MAX_SPREAD)
+        return turn if agreeing >= MIN_SHARE else None
+
+    def _is_turned(self, meaning: int) -> bool:
+        """Return whether the ways agree on another angle than that of an axis; few on twice it."""
+        least = MIN_TURNED if self._is_enough else 2 * MIN_TURNED
+        return abs(self._turn(meaning) or 0.0) >= least
+
+    def _is_straight(self, meaning: int) -> bool:
+        """Return whether the ways agree on an axis."""
+        return self._turn(meaning) is not None and not self._is_turned(meaning)
+
+    @property
+    def _is_enough(self) -> bool:
+        """Return whether there are enough directions to say that yaw does not follow them."""
         is_of_many = self._tracks.total() >= MIN_TRACKS_OF_NOISE
-        across = max(self._axes['y+'], self._axes['y-'])
-        if not (is_enough and is_of_many) or max(along, across) > MAX_SHARE_OF_NOISE * total:
+        return is_of_many and self._axes.total() >= MIN_DIRECTIONS_OF_NOISE
+
+    def _yaw_text(self) -> str:
+        """Return that yaw has nothing to do with the way, or is turned from it; else ''."""
+        total, along = self._axes.total(), self._axes['x+'] + self._axes['x-']
+        is_noise = max(along, self._axes['y+'], self._axes['y-']) <= MAX_SHARE_OF_NOISE * total
+        is_turned = self._is_turned(AS_READ)
+        is_of_fixed = self._is_straight(OF_FIXED_FRAME) and not self._is_straight(AS_READ)
+        if not self._is_enough or not (is_noise or is_turned or is_of_fixed):
             return ''
+        way = f'{along}'
+        if is_turned:
+            angles = np.array(self._angles)[:, AS_READ]
+            turn = _mean_angle(2 * angles) / 2  # headings may be unresolved
+            way = f'boxes turned by {np.degrees(abs(turn)):.0f} degrees to the '
+            way += 'right' if turn > 0 else 'left'
+        what = 'degrees written as radians, which no option can undo in a quaternion'
+        if np.ptp(self._yaws) < MAX_SAME:
+            what = f'one for all boxes, {self._yaws[0]:.2g}, as of a detector without orientation'
+        elif is_of_fixed:
+            what = 'that of the fixed frame, where positions are of another one'
+        elif is_turned:
+            what = 'of another frame than the positions, or counted from another axis, as north'
         return (
             f'yaw of the boxes of vehicles does not follow their way: expected nearly all of '
-            f'{total} directions along a box, got {along}; it may be degrees written as radians, '
-            f'which no option can undo in a quaternion: convert yaw to radians where the boxes '
-            f'are made, or see whether another topic has them'
+            f'{total} directions along a box, got {way}; it may be {what}: convert yaw to '
+            f'radians of the frame of the positions where the boxes are made, or see whether '
+            f'another topic has it'
         )
 
     def _axis(self) -> str | None:

@@ -271,7 +271,8 @@ class Session:
         # of all classes together; boxes in another place show neither.
         place, pose = self._place_check, self._pose_check
         of_ways = '' if self.jumping_ids else self._axis_check.finding  # by ids
-        of_axes = pose.class_finding or of_ways or pose.finding
+        of_classes = '' if self._axis_check.is_turned else pose.class_finding
+        of_axes = of_classes or of_ways or pose.finding
         poses = self._unit_check.finding or place.finding or of_axes or place.flat
         odometry = f'odometry: {self.tree.odometry_note}' if self._odometry_lacks_child else ''
         texts = [

@@ -247,6 +247,24 @@ def test_a_yaw_in_degrees_is_named():
     assert 'degrees written as radians' in finding
 
 
+@pytest.mark.parametrize(
+    'yaw_of, frame_yaw, words',
+    [
+        (lambda yaw: yaw + 0.3, 0.0, 'turned by 17 degrees to the left; it may be of another'),
+        (lambda yaw: yaw - 0.8, 0.0, 'turned by 46 degrees to the right; it may be of another'),
+        (lambda yaw: yaw + 0.5, 0.5, 'left; it may be that of the fixed frame, where positions'),
+        (lambda yaw: 0 * yaw - 0.5, 0.0, 'it may be one for all boxes, -0.5, as of a detector'),
+        (lambda yaw: yaw + 0.05, 0.0, ''),
+    ],
+)
+def test_a_yaw_that_is_turned_from_the_way_by_one_angle_is_named(yaw_of, frame_yaw, words):
+    check = street_of(yaw_of, frame_yaw)
+    assert check.wanted == STANDARD
+    assert words in check.finding
+    assert bool(check.finding) == bool(words)
+    assert check.is_turned == ('turned by' in check.finding)
+
+
 def test_label_files_with_other_axes_are_named_and_read_by_the_options(tmp_path, capsys):
     """The table of a drive along its x axis, written with y forward and width, length, height."""
     convention = Convention(forward_axis='y+', size_order='wlh')
