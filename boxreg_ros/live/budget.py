@@ -33,9 +33,10 @@ BATCH_OVERHEAD = 25
 window."""
 RECENT = 10
 """Last batches and box arrays that times are estimated from; chosen: a second at 10 Hz."""
-RESERVE_MEMORY = 3.0
-"""Overruns of this time are a reserve [s]. Derived: the second largest of thirty, at 10 Hz, is
-exceeded in one tick of fifteen."""
+RESERVE_MEMORY = 1.0
+"""Overruns of this time are a reserve [s]. Derived: the second largest of ten, at 10 Hz, is
+exceeded in one tick of five or six. Measured: with 3 s one tick of fifteen, but on a slow machine
+the reserve stays when its cause is gone, and final boxes are given up."""
 LARGEST_RESERVE = 0.5
 """Part of the deadline that the reserve may take; chosen: the rest is for solving. A longer
 overrun is an interruption of the process, and would be late with any reserve."""
