@@ -9,8 +9,8 @@ import shlex
 from typing import Any
 
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.io.checks.jump_search import JumpSearch
 from boxreg_ros.io.items import LOOKAHEAD_NS
-from boxreg_ros.io.jump_search import JumpSearch
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder
 from boxreg_ros.io.storage.record import Record
 from boxreg_ros.io.topics import (

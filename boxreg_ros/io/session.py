@@ -16,19 +16,19 @@ from typing import TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.axis_check import AxisCheck
-from boxreg_ros.io.cloud_check import CloudCheck
-from boxreg_ros.io.common_motion import CommonMotionCheck
-from boxreg_ros.io.findings import Finding
+from boxreg_ros.io.checks.axis import AxisCheck
+from boxreg_ros.io.checks.cloud import CloudCheck
+from boxreg_ros.io.checks.common_motion import CommonMotionCheck
+from boxreg_ros.io.checks.finding import Finding
+from boxreg_ros.io.checks.motion import MotionCheck
+from boxreg_ros.io.checks.place import PlaceCheck
+from boxreg_ros.io.checks.pose import PoseCheck
+from boxreg_ros.io.checks.unit import UnitCheck
 from boxreg_ros.io.id_assignment import IdCheck, Tracker
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import ignore, MergedSweep, Report, SensorPlacement, SweepMerger
-from boxreg_ros.io.motion_check import MotionCheck
-from boxreg_ros.io.place_check import PlaceCheck
-from boxreg_ros.io.pose_check import PoseCheck
 from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.io.transforms import boxes_to_frame, sweep_to_frame
-from boxreg_ros.io.unit_check import UnitCheck
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention

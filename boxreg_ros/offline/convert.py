@@ -13,10 +13,10 @@ from typing import Any
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.io.axis_check import AxisCheck
+from boxreg_ros.io.checks.axis import AxisCheck
+from boxreg_ros.io.checks.place import MIN_TILTED, MIN_UPRIGHT
 from boxreg_ros.io.fixed_frame import FixedFrameItems, StoredCloud
 from boxreg_ros.io.lidars import SINGLE_LIDAR
-from boxreg_ros.io.place_check import MIN_TILTED, MIN_UPRIGHT
 from boxreg_ros.labels import (
     check_options,
     frames_of,

@@ -15,8 +15,8 @@ from typing import Any
 from boxreg_ros.core.metrics import iou_3d, pose_errors
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.checks.pose import DECISIVE_BOXES, MIN_GAIN
 from boxreg_ros.io.covariance_table import COVARIANCES, read_covariances
-from boxreg_ros.io.pose_check import DECISIVE_BOXES, MIN_GAIN
 from boxreg_ros.io.stamp_join import joined_stamps, LARGEST_OFFSET_NS, unknown_stamps
 from boxreg_ros.io.times import time_range
 from boxreg_ros.io.velocity_table import read_velocities, VELOCITIES

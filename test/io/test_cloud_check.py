@@ -1,4 +1,4 @@
-from boxreg_ros.io.cloud_check import CloudCheck
+from boxreg_ros.io.checks.cloud import CloudCheck
 from boxreg_ros.structures import Sweep
 import numpy as np
 import pytest

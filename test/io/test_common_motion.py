@@ -4,7 +4,7 @@ from functools import partial
 
 from boxreg_ros.config import Config
 from boxreg_ros.datasets.files import pose_rows
-from boxreg_ros.io.common_motion import CommonMotionCheck
+from boxreg_ros.io.checks.common_motion import CommonMotionCheck
 from boxreg_ros.io.id_assignment import IdCheck
 from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.io.transforms import inverse

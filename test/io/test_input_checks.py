@@ -2,8 +2,8 @@
 
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
-from boxreg_ros.io.axis_check import AxisCheck
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.checks.axis import AxisCheck
 from boxreg_ros.io.id_assignment import IdCheck
 from boxreg_ros.structures import BoxArray
 from msg_adapters.convention import Convention, FORWARD, STANDARD

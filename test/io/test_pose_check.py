@@ -4,8 +4,8 @@ from dataclasses import replace
 from itertools import product
 
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.io.place_check import PlaceCheck
-from boxreg_ros.io.pose_check import DECISIVE_BOXES, PoseCheck
+from boxreg_ros.io.checks.place import PlaceCheck
+from boxreg_ros.io.checks.pose import DECISIVE_BOXES, PoseCheck
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.structures import BoxArray, KINEMATICS, Sweep
 from msg_adapters import adapter_for

@@ -1,6 +1,6 @@
 """Boxes in centimetres and millimetres are named, with what to do; those in metres are not."""
 
-from boxreg_ros.io.unit_check import UnitCheck
+from boxreg_ros.io.checks.unit import UnitCheck
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest

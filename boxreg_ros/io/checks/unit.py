@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from boxreg_ros.io.place_check import ENOUGH_BOXES, MAX_COMPARED
+from boxreg_ros.io.checks.place import ENOUGH_BOXES, MAX_COMPARED
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, finite_points, Floats, Sweep
 import numpy as np
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from boxreg_ros.io.pose_check import PairedCheck, POINT_MARGIN, points_around
+from boxreg_ros.io.checks.pose import PairedCheck, POINT_MARGIN, points_around
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, moved_boxes
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (

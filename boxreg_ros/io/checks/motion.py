@@ -11,6 +11,9 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 
+from boxreg_ros.io.checks.finding import Finding
+from boxreg_ros.io.checks.jump_search import FrameSteps, JumpSearch, STEP_RADIUS
+from boxreg_ros.io.checks.pose_jitter import PoseJitter
 from boxreg_ros.io.clocks import (
     CAPACITY,
     clock_offset,
@@ -21,9 +24,6 @@ from boxreg_ros.io.clocks import (
     ReceiveTimes,
     seconds_text,
 )
-from boxreg_ros.io.findings import Finding
-from boxreg_ros.io.jump_search import FrameSteps, JumpSearch, STEP_RADIUS
-from boxreg_ros.io.pose_jitter import PoseJitter
 from boxreg_ros.io.transform_edge import Edge, MAX_LINEAR_GAP
 from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.reasons import Reason
