@@ -21,6 +21,7 @@ from boxreg_ros.io.checks.cloud import CloudCheck
 from boxreg_ros.io.checks.common_motion import CommonMotionCheck
 from boxreg_ros.io.checks.finding import Finding
 from boxreg_ros.io.checks.motion import MotionCheck
+from boxreg_ros.io.checks.motion_time import MotionTimeCheck
 from boxreg_ros.io.checks.place import PlaceCheck
 from boxreg_ros.io.checks.pose import PoseCheck
 from boxreg_ros.io.checks.unit import UnitCheck
@@ -102,6 +103,7 @@ class Session:
         self._pose_check = PoseCheck(self.convention)
         self._place_check = PlaceCheck(self.convention)
         self._unit_check = UnitCheck()
+        self._motion_time = MotionTimeCheck()
         parts = (self._motion_check, self._axis_check, self._common_motion, self._merger)
         for part in (*parts, self._id_check or self._tracker):
             if part is not None:
@@ -158,7 +160,14 @@ class Session:
                 self._common_motion.add(moved.stamp_ns, self._tracker, route, self._pose_of_sensor)
             frame_yaw = float(np.arctan2(T_fixed_item[1, 0], T_fixed_item[0, 0]))
             self._axis_check.add(moved, frame_yaw)
+        if isinstance(given, Sweep) or not self._is_carried(given.frame_id):
+            offset = self.tree.clock_offset
+            self._motion_time.add(moved, self._pose_of_sensor, self.sensor_frame, offset)
         return item._replace(moved=moved, T_fixed_item=T_fixed_item, reason=reason, detail=detail)
+
+    def _is_carried(self, frame: str) -> bool:
+        """Return whether a frame is fixed to that of the clouds, which may not move either."""
+        return all(map(self.tree.is_constant, self.tree.route(frame, self.sensor_frame)))
 
     def _pose_of_sensor(self, stamp_ns: int) -> Floats | None:
         """Return the pose (4, 4) of the frame of the clouds at a stamp; None if it is unknown."""
@@ -274,12 +283,15 @@ class Session:
         of_classes = '' if self._axis_check.is_turned else pose.class_finding
         of_axes = of_classes or of_ways or pose.finding
         poses = self._unit_check.finding or place.finding or of_axes or place.flat
+        known = self._motion_check.findings
+        of_time = '' if 'clock' in known else self._motion_time.finding
         odometry = f'odometry: {self.tree.odometry_note}' if self._odometry_lacks_child else ''
         texts = [
             *((Reason.POINT_TIMES, text) for text in self.placement.normalised.values()),
             (Reason.TRANSFORM_FAULT, same and SAME_FRAMES.format(same)),
             *((Reason.CLOUD_FAULT, text) for text in self._cloud_check.findings),
             (Reason.TRANSFORM_FAULT, self._common_motion.finding),
+            (Reason.CLOCK_OFFSET, of_time),
             (Reason.TRANSFORM_FAULT, place.fallen),
             (Reason.TRANSFORM_FAULT, self._boxes_without_frame),
             (Reason.TRANSFORM_FAULT, odometry),
@@ -287,7 +299,7 @@ class Session:
             (Reason.TRACK_IDS_JUMP, self.jumping_ids and f'{self.jumping_ids}; {ASSOCIATE}'),
         ]
         found = [Finding(reason, text) for reason, text in texts if text]
-        return [*self._motion_check.findings.values(), *found]
+        return [*known.values(), *found]
 
     @property
     def jumping_ids(self) -> str:
