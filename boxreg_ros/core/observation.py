@@ -92,6 +92,24 @@ class Observations(NamedTuple):
     is_pinned: NDArray[np.bool_]
     """(n,), whether a person has corrected the box."""
 
+    @classmethod
+    def without_points(cls, stamps_ns: Ints, boxes: Floats, origins: Floats) -> 'Observations':
+        """Return those of boxes (n, 9) without points, seen from `origins` (n, K, 3)."""
+        n = len(boxes)
+        return cls(
+            stamps_ns=stamps_ns,
+            boxes=boxes,
+            points=np.zeros((0, 3), np.float32),
+            delays=np.zeros(0, np.float32),
+            counts=np.zeros(n, int),
+            origins=origins,
+            ground=np.full(n, np.nan),
+            ring_heights=np.zeros(n),
+            num_points=np.zeros(n, int),
+            sights=np.zeros(n),
+            is_pinned=np.zeros(n, bool),
+        )
+
     @property
     def first(self) -> Ints:
         """First of the points of each box, (n,)."""

@@ -16,7 +16,6 @@ from dataclasses import replace
 from typing import cast, NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.items import Item, ItemSource, not_measured, Stage, Wanted
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MISSING, MergedSweep
 from boxreg_ros.io.session import is_placeholder, Session
@@ -121,10 +120,7 @@ class FixedFrameItems:
 
     def pose_of(self, frame_id: str, stamp_ns: int) -> Floats | None:
         """Return the pose (4, 4) of a frame in the fixed frame at a stamp; None if unknown."""
-        try:
-            return self.tree.lookup(self.fixed_frame, frame_id, stamp_ns)
-        except TransformUnavailable:
-            return None
+        return self.tree.find(self.fixed_frame, frame_id, stamp_ns)
 
     def stored_cloud(self, item: Item, frame_id: str) -> StoredCloud:
         """

@@ -20,17 +20,6 @@ from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionF
 
 FOXGLOVE_ENCODINGS = ('protobuf', 'json')
 """Encodings of messages with a schema of Foxglove."""
-ROS_TYPES = {
-    'foxglove.SceneUpdate': 'foxglove_msgs/msg/SceneUpdate',
-    'foxglove.PointCloud': 'sensor_msgs/msg/PointCloud2',
-    'foxglove.CompressedPointCloud': 'foxglove_msgs/msg/CompressedPointCloud',
-    'foxglove.FrameTransform': 'tf2_msgs/msg/TFMessage',
-    'foxglove.FrameTransforms': 'tf2_msgs/msg/TFMessage',
-    'foxglove.Odometry': 'nav_msgs/msg/Odometry',
-    'foxglove.CompressedImage': 'sensor_msgs/msg/CompressedImage',
-    'foxglove.RawImage': 'sensor_msgs/msg/Image',
-    'foxglove.CameraCalibration': 'sensor_msgs/msg/CameraInfo',
-}
 DATATYPES = (0, 2, 1, 4, 3, 6, 5, 7, 8)
 """``PointField.datatype`` of ROS by Foxglove's number of the same type."""
 
@@ -84,7 +73,8 @@ A field whose name ends with ``?`` may be null.
 
 def ros_type(schema_name: str) -> str:
     """Return the ROS type that messages of a schema are read as; else the name of the schema."""
-    return ROS_TYPES.get(schema_name, schema_name)
+    kind, _ = SCHEMAS.get(schema_name, (schema_name, None))
+    return kind
 
 
 def schema_as_definition(schema: Schema) -> MessageDefinition:
@@ -118,9 +108,8 @@ class ChannelDecoder:
             if self._decode is None:
                 self._decode = self._protobuf()
             message = self._decode(data)
-        if self._name in CONVERTERS:
-            return CONVERTERS[self._name](message)
-        return message
+        _, convert = SCHEMAS.get(self._name, ('', None))
+        return convert(message) if convert else message
 
     def _protobuf(self) -> Callable[[bytes], Any]:
         try:
@@ -303,13 +292,18 @@ def _odometry(message: Any) -> Any:
     )  # fmt: skip
 
 
-CONVERTERS = {
-    'foxglove.PointCloud': _cloud,
-    'foxglove.CompressedPointCloud': _compressed_cloud,
-    'foxglove.FrameTransform': _transforms,
-    'foxglove.FrameTransforms': _transforms,
-    'foxglove.Odometry': _odometry,
-    'foxglove.CompressedImage': _compressed_image,
-    'foxglove.RawImage': _raw_image,
-    'foxglove.CameraCalibration': _calibration,
+SCHEMAS: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    'foxglove.SceneUpdate': ('foxglove_msgs/msg/SceneUpdate', lambda message: message),
+    'foxglove.PointCloud': ('sensor_msgs/msg/PointCloud2', _cloud),
+    'foxglove.CompressedPointCloud': (
+        'foxglove_msgs/msg/CompressedPointCloud',
+        _compressed_cloud,
+    ),
+    'foxglove.FrameTransform': ('tf2_msgs/msg/TFMessage', _transforms),
+    'foxglove.FrameTransforms': ('tf2_msgs/msg/TFMessage', _transforms),
+    'foxglove.Odometry': ('nav_msgs/msg/Odometry', _odometry),
+    'foxglove.CompressedImage': ('sensor_msgs/msg/CompressedImage', _compressed_image),
+    'foxglove.RawImage': ('sensor_msgs/msg/Image', _raw_image),
+    'foxglove.CameraCalibration': ('sensor_msgs/msg/CameraInfo', _calibration),
 }
+"""ROS types that messages are read as, and what converts them."""

@@ -80,6 +80,11 @@ class RecordedImages:
         self._reader = reader
         self._decoder = decoder
         self._delays: dict[str, int] = {}  # of receive times after the stamps [ns]
+        self._infos = {
+            name: first[2]
+            for name in topics.filled(INFO_TYPES)
+            if (first := next(self._messages({name}), None)) is not None
+        }
         self.cameras: list[ImageCamera] = []
         for topic in topics.filled(IMAGE_TYPES):
             first = next(self._messages({topic}), None)
@@ -94,14 +99,11 @@ class RecordedImages:
         known = {camera.info_topic for camera in self.cameras}
         frames = {camera.frame_id for camera in self.cameras}
         found = []
-        for name in self._topics.filled(INFO_TYPES):
-            first = next(self._messages({name}), None)
-            if first is None or name in known:
-                continue
-            frame_id = _frame_of(first[2])
-            if frame_id not in frames:
+        for name, info in self._infos.items():
+            frame_id = _frame_of(info)
+            if name not in known and frame_id not in frames:
                 bare = ImageCamera(name, frame_id, (0, 0), None, np.zeros(0), '')
-                found.append(_with_model(bare, name, first[2], has_own_frame=True))
+                found.append(_with_model(bare, name, info, has_own_frame=True))
         return found
 
     def nearest(self, camera: ImageCamera, stamp_ns: int) -> Image:
@@ -156,11 +158,7 @@ class RecordedImages:
     def _camera(self, topic: str, frame_id: str, message: Any) -> ImageCamera:
         """Return the camera of a topic by the info beside it, or of its frame."""
         camera = ImageCamera(topic, frame_id, _size_of(message), None, np.zeros(0), '')
-        infos = {
-            name: found[2]
-            for name in self._topics.filled(INFO_TYPES)
-            if (found := next(self._messages({name}), None)) is not None
-        }
+        infos = self._infos
         of_frame = [name for name, info in infos.items() if _frame_of(info) == frame_id]
         for own in (
             [name for name in infos if _parent(name) == _parent(topic)],

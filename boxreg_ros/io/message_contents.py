@@ -104,16 +104,15 @@ class MessageContents:
             self._joined.remove(id(record))
             return None
         intensities = None
-        content: Sweep | BoxArray
-        try:
+        content: Sweep | BoxArray | None = None
+        with self._decoder.counted(topic):
             if topic == self._boxes_topic:
                 content = self._whole(self.boxes(record.connection, record.data), record, later)
             else:
                 message = self._decoder.message(record)
                 content = self.of(topic, message)
                 intensities = self._intensities(topic, message) if with_intensities else None
-        except UnsupportedMessage as error:
-            self._decoder.count_unreadable(topic, error)
+        if content is None:
             return None
         self.decoded_topics.add(topic)
         return Item(record.received_ns, content, intensities)
@@ -160,11 +159,9 @@ class MessageContents:
 
     def _intensities(self, topic: str, message: Any) -> Floats | None:
         """Return the intensities of a cloud; None, and counted, where they cannot be read."""
-        try:
+        with self._decoder.counted(topic):
             return pointcloud.intensities(clouds.plain(message))
-        except UnsupportedMessage as error:
-            self._decoder.count_unreadable(topic, error)
-            return None
+        return None
 
     def _whole(self, boxes: BoxArray, record: Record, later: Iterable[Record]) -> BoxArray:
         """Return the boxes of a message, and of those behind it that have others of its stamp."""

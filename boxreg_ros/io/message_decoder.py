@@ -87,10 +87,14 @@ class MessageDecoder:
             return decoder.definitions[0].store
         return None
 
-    def count_unreadable(self, topic: str, error: UnsupportedMessage) -> None:
-        """Count a message of a topic that cannot be decoded."""
-        self.unreadable[topic] += 1
-        self.first_errors.setdefault(topic, error)
+    @contextmanager
+    def counted(self, topic: str) -> Iterator[None]:
+        """Count a message of a topic that cannot be decoded: the rest of the block is left out."""
+        try:
+            yield
+        except UnsupportedMessage as error:
+            self.unreadable[topic] += 1
+            self.first_errors.setdefault(topic, error)
 
     def reset(self) -> None:
         """Forget the counts."""

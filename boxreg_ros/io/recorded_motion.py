@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
 import shlex
@@ -132,18 +133,16 @@ class RecordedMotion:
             first_ns = record.received_ns if first_ns is None else first_ns
             if record.received_ns > first_ns + TF_SEARCH_NS:
                 break
-            try:
+            with suppress(UnsupportedMessage):  # it is counted when it is read for good
                 message = self._decoder.message(record)
                 with malformed(f'topic {record.connection.topic!r}'):
                     found.add(message.transforms)
-            except UnsupportedMessage:
-                continue  # it is counted when it is read for good
         return found
 
     def add(self, tree: TransformTree, record: Record) -> None:
         """Add a message of `topics` to `tree`, or count it as unreadable."""
         topic = record.connection.topic
-        try:
+        with self._decoder.counted(topic):
             message = self._decoder.message(record)
             with malformed(f'topic {topic!r}'):
                 if record.connection.msgtype == ODOMETRY_TYPE:
@@ -151,8 +150,6 @@ class RecordedMotion:
                 else:
                     is_static = topic in self._topics.static_transforms
                     tree.add_transforms(message.transforms, is_static, record.received_ns)
-        except UnsupportedMessage as error:
-            self._decoder.count_unreadable(topic, error)
 
     def first(self, topic: str) -> Any:
         """Return the first readable message on a topic; UnsupportedMessage if none of them is."""

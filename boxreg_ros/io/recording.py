@@ -413,9 +413,7 @@ class Recording:
         if topic != self.placement.lidars.info:
             self._motion.add(tree, record)
             return
-        try:
+        with self._decoder.counted(topic):
             message = self._decoder.message(record)
             with malformed(f'topic {topic!r}'):
                 self.placement.add_info(message)
-        except UnsupportedMessage as error:
-            self._decoder.count_unreadable(topic, error)

@@ -171,10 +171,7 @@ class Session:
 
     def _pose_of_sensor(self, stamp_ns: int) -> Floats | None:
         """Return the pose (4, 4) of the frame of the clouds at a stamp; None if it is unknown."""
-        try:
-            return self.tree.lookup(self.fixed_frame, self.sensor_frame, stamp_ns)
-        except TransformUnavailable:
-            return None
+        return self.tree.find(self.fixed_frame, self.sensor_frame, stamp_ns)
 
     def _name_odometry_child(self) -> None:
         """Take odometry without a child frame for that of the vehicle, if no motion is known."""
@@ -191,10 +188,9 @@ class Session:
         route = self.tree.route(self.fixed_frame, self.sensor_frame or item.frame_id)
         names = {name for edge in route for name in (edge.parent, edge.child)}
         for name in sorted(names - {item.frame_id}):
-            try:
-                found[name] = self.tree.lookup(self.fixed_frame, name, item.stamp_ns)
-            except TransformUnavailable:
-                continue
+            pose = self.tree.find(self.fixed_frame, name, item.stamp_ns)
+            if pose is not None:
+                found[name] = pose
         return found
 
     def merged(self, sweep: Sweep, extra: object = None) -> list[MergedSweep]:

@@ -223,6 +223,13 @@ class TransformTree:
             T_target_source = T if T_target_source is None else T @ T_target_source
         return np.eye(4) if T_target_source is None else T_target_source + 0.0  # not -0.0
 
+    def find(self, target: str, source: str, stamp_ns: int) -> Floats | None:
+        """Return the transform (4, 4) that `lookup` does; None where that raises."""
+        try:
+            return self.lookup(target, source, stamp_ns)
+        except TransformUnavailable:
+            return None
+
     def motion(self, target: str, source: str, stamp_ns: int) -> FrameMotion | None:
         """
         Return the motion of a frame in another up to a stamp.

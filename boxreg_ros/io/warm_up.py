@@ -56,20 +56,8 @@ def warm_up_solver(config: Config) -> None:
 
     _, arrays = _passing_car()
     boxes = np.concatenate([array.boxes for array in arrays])
-    n = len(boxes)
-    table = Observations(
-        stamps_ns=np.array([array.stamp_ns for array in arrays]),
-        boxes=boxes,
-        points=np.zeros((0, 3), np.float32),
-        delays=np.zeros(0, np.float32),
-        counts=np.zeros(n, int),
-        origins=-boxes[:, None, :3],
-        ground=np.full(n, np.nan),
-        ring_heights=np.zeros(n),
-        num_points=np.zeros(n, int),
-        sights=np.zeros(n),
-        is_pinned=np.zeros(n, bool),
-    )
+    stamps_ns = np.array([array.stamp_ns for array in arrays])
+    table = Observations.without_points(stamps_ns, boxes, -boxes[:, None, :3])
     ingredients = replace(config.ingredients, heading_sign=False)  # the second process has it
     quick, model = replace(_quick(config), ingredients=ingredients), InputModel(config.faces)
     rows = [Observation(table, row) for row in range(quick.window)]

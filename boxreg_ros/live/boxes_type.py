@@ -5,10 +5,17 @@ from __future__ import annotations
 import time
 
 from boxreg_ros.errors import UnsupportedMessage
-from boxreg_ros.live.topics import import_message, NodeTopics, PATIENCE, TopicProblem
+from boxreg_ros.live.topics import (
+    import_message,
+    nodes_of,
+    NodeTopics,
+    PATIENCE,
+    TopicProblem,
+)
 from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters import adapter_for, ADAPTERS
 from msg_adapters.convention import Convention
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 
 class BoxesTypeSearch:
@@ -36,7 +43,7 @@ class BoxesTypeSearch:
         publishers one by one.
 
         """
-        types = self._topics.types_published('boxes')
+        types = _types_of(self._topics.box_publishers()[False])
         is_stable = types == self._types
         self._types = types
         readable, _ = self._sorted_out(types)
@@ -46,7 +53,8 @@ class BoxesTypeSearch:
 
     def problems(self) -> list[TopicProblem]:
         """Return why no type could be chosen, or which other types the topic has beside it."""
-        types = self._topics.types_published('boxes')
+        publishers = self._topics.box_publishers()
+        types = _types_of(publishers[False])
         readable, errors = self._sorted_out(types)
         if self._chosen:
             others = [name for name in readable if name != self._chosen]
@@ -56,23 +64,17 @@ class BoxesTypeSearch:
             return [TopicProblem(f'{self._name}: {text}')]
         if errors and not readable:
             return [TopicProblem(f'{self._name}: {errors[0]}', DiagnosticStatus.ERROR)]
-        refiners = self._topics.refiners('boxes')
-        if refiners and not types:
-            text = (
-                f'has nothing but the refined boxes of {refiners}; remap boxes to their input, or '
-                f'set boxes_type if they are meant'
-            )
-            return [TopicProblem(f'{self._name}: {text}')]
-        if not types and time.monotonic() >= self._since + PATIENCE:
-            return [self._absence()]
-        return []
-
-    def _absence(self) -> TopicProblem:
-        """Return the problem that no known node publishes boxes."""
-        if not self._topics.is_published_without_node('boxes'):
-            return self._topics.unpublished('boxes', set(ADAPTERS))
+        if types or not (publishers[True] or time.monotonic() >= self._since + PATIENCE):
+            return []
+        if not (publishers[True] or publishers[None]):
+            return [self._topics.unpublished('boxes', set(ADAPTERS))]
         text = 'its publishers belong to no known node; set boxes_type if they send boxes'
-        return TopicProblem(f'{self._name}: {text}')
+        if publishers[True]:
+            text = (
+                f'has nothing but the refined boxes of {nodes_of(publishers[True])}; remap boxes '
+                f'to their input, or set boxes_type if they are meant'
+            )
+        return [TopicProblem(f'{self._name}: {text}')]
 
     def _sorted_out(self, types: set[str]) -> tuple[list[str], list[str]]:
         """Return the types that can be read, sorted, and an error text for each of the others."""
@@ -87,3 +89,8 @@ class BoxesTypeSearch:
             else:
                 readable.append(name)
         return readable, errors
+
+
+def _types_of(publishers: list[TopicEndpointInfo]) -> set[str]:
+    """Return the message types of some publishers."""
+    return {publisher.topic_type for publisher in publishers}

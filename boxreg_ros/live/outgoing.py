@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from boxreg_ros.errors import TransformUnavailable, UnsupportedMessage
+from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.session import covariances_to_write, refined_to_frame, Session
 from boxreg_ros.io.transforms import boxes_to_frame
 from boxreg_ros.live.following import Following
@@ -140,9 +140,8 @@ def labels_passed_through(message: Any, adapter: Adapter, session: Session) -> R
         boxes = adapter.from_msg(message)
     except UnsupportedMessage:
         return None
-    try:
-        T_fixed_boxes = session.tree.lookup(session.fixed_frame, boxes.frame_id, boxes.stamp_ns)
-    except TransformUnavailable:
+    T_fixed_boxes = session.tree.find(session.fixed_frame, boxes.frame_id, boxes.stamp_ns)
+    if T_fixed_boxes is None:
         return kept(boxes, Reason.NO_TRANSFORM)
     moved = boxes_to_frame(boxes, T_fixed_boxes, session.fixed_frame)
     return kept(moved, Reason.BOXES_QUEUE_FULL)

@@ -187,26 +187,17 @@ class NodeTopics:
         published = [_described(item) for item in self._endpoints if not item.is_input]
         return f'subscribed to {"; ".join(subscribed)}. Publishing {"; ".join(published)}'
 
-    def types_published(self, topic: str) -> set[str]:
+    def box_publishers(self) -> dict[bool | None, list[TopicEndpointInfo]]:
         """
-        Return the message types that are published on a topic, but for refined boxes.
+        Return the publishers of boxes by whether these are refined by a node of this kind.
 
-        A publisher is discovered before its node, which may be of this kind: until then its type
-        is left out.
+        None is of those that were discovered before their node, which may be of this kind.
 
         """
-        publishers = self._node.get_publishers_info_by_topic(topic)
-        return {p.topic_type for p in publishers if self._refines(*_node_of(p)) is False}
-
-    def refiners(self, topic: str) -> str:
-        """Return the names of the nodes of this kind that publish on a topic; '' for none."""
-        publishers = self._node.get_publishers_info_by_topic(topic)
-        return _nodes([p for p in publishers if self._refines(*_node_of(p))])
-
-    def is_published_without_node(self, topic: str) -> bool:
-        """Return whether a topic has publishers whose node is not known."""
-        publishers = self._node.get_publishers_info_by_topic(topic)
-        return any(self._refines(*_node_of(p)) is None for p in publishers)
+        found: dict[bool | None, list[TopicEndpointInfo]] = {True: [], False: [], None: []}
+        for peer in self._node.get_publishers_info_by_topic('boxes'):
+            found[self._refines(peer.node_name, peer.node_namespace)].append(peer)
+        return found
 
     def problems(self) -> list[TopicProblem]:
         """Return the reasons why messages do not arrive now, on any topic of the node."""
@@ -248,10 +239,10 @@ class NodeTopics:
     def unpublished(self, topic: str, type_names: set[str]) -> TopicProblem:
         """Return the problem that nobody publishes a topic, with topics of the types wanted."""
         name = self._node.resolve_topic_name(topic)
-        is_remapped = name != self._node.resolve_topic_name(topic, only_expand=True)
-        candidates = self._published_topics(type_names)
-        there = ', '.join(candidates) if candidates else 'none'
-        remedy = 'check the remap' if is_remapped else f'start the publisher or remap {topic}'
+        there = ', '.join(self._published_topics(type_names)) or 'none'
+        remedy = f'start the publisher or remap {topic}'
+        if self._is_remapped(topic):
+            remedy = 'check the remap'
         return TopicProblem(
             f'{name}: nobody publishes it; published topics of a fitting type: {there}; {remedy}',
         )
@@ -307,19 +298,20 @@ class NodeTopics:
         self, endpoint: Endpoint, peers: list[TopicEndpointInfo]
     ) -> Iterator[TopicProblem]:
         """Yield a problem if nothing was ever received on an endpoint that ought to have some."""
-        is_remapped = endpoint.name != self._node.resolve_topic_name(
-            endpoint.topic, only_expand=True
-        )
-        is_expected = endpoint.is_required or is_remapped
+        is_expected = endpoint.is_required or self._is_remapped(endpoint.topic)
         if not is_expected or endpoint.received or time.monotonic() < endpoint.since + PATIENCE:
             return
         if not peers:
             yield self.unpublished(endpoint.topic, {endpoint.type_name})
         elif any(peer.topic_type == endpoint.type_name for peer in peers):
             yield TopicProblem(
-                f'{endpoint.name}: nothing received yet from {_nodes(peers)}; check that messages '
-                f'are sent, and shared memory and network in between',
+                f'{endpoint.name}: nothing received yet from {nodes_of(peers)}; check that '
+                f'messages are sent, and shared memory and network in between',
             )
+
+    def _is_remapped(self, topic: str) -> bool:
+        plain = self._node.resolve_topic_name(topic, only_expand=True)
+        return self._node.resolve_topic_name(topic) != plain
 
     def _other_transforms(self, endpoint: Endpoint) -> Iterator[TopicProblem]:
         """Yield a problem if nobody publishes transforms here, but somebody in a namespace."""
@@ -435,7 +427,7 @@ def _qos_problems(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Iterato
             if not endpoint.is_input:
                 theirs, ours = ours, theirs
             text = (
-                f'the {theirs[0]} of {_nodes([peer])} {theirs[1]} {policy} {theirs[2]}, the '
+                f'the {theirs[0]} of {nodes_of([peer])} {theirs[1]} {policy} {theirs[2]}, the '
                 f'{ours[0]} of this node {ours[1]} {ours[2]}; set the parameter '
                 f'qos_overrides.{endpoint.name}.{ours[0]}.{policy} to {theirs[2]}, or change the '
                 f'{theirs[0]}'
@@ -448,8 +440,8 @@ def _type_problem(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> TopicPr
     types = ', '.join(sorted({peer.topic_type for peer in peers}))
     if not endpoint.is_input:
         return TopicProblem(
-            f'{endpoint.name}: {_nodes(peers)} subscribes with type {types}, this node publishes '
-            f'{endpoint.type_name}; change the subscription',
+            f'{endpoint.name}: {nodes_of(peers)} subscribes with type {types}, this node '
+            f'publishes {endpoint.type_name}; change the subscription',
         )
     remedy = f'remap {endpoint.topic} to a topic of the expected type'
     if endpoint.topic == FOLLOW_TOPIC:
@@ -458,17 +450,12 @@ def _type_problem(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> TopicPr
         remedy = 'set boxes_type, or restart the node if the type of the topic has changed'
     return TopicProblem(
         f'{endpoint.name}: expected messages of type {endpoint.type_name}, got {types} from '
-        f'{_nodes(peers)}; {remedy}',
+        f'{nodes_of(peers)}; {remedy}',
         DiagnosticStatus.ERROR,
     )
 
 
-def _node_of(peer: TopicEndpointInfo) -> tuple[str, str]:
-    """Return name and namespace of the node that an endpoint belongs to."""
-    return peer.node_name, peer.node_namespace
-
-
-def _nodes(peers: list[TopicEndpointInfo]) -> str:
+def nodes_of(peers: list[TopicEndpointInfo]) -> str:
     """Return the full names of the nodes that endpoints belong to."""
     names = {f'{peer.node_namespace.rstrip("/")}/{peer.node_name}' for peer in peers}
     return ', '.join(sorted(names))

@@ -232,13 +232,19 @@ class Worker:
         if message is None:
             return
         if message.topic == 'passing':
-            self._publish(self._live.pass_through(message.content, is_early_out=True))
+            self._pass_on(message)
         elif self._is_overdue(message):
             self.drop(message)
         else:
             item = self._decoded(message)
             if item is not None:
                 self._publish(self._guarded(partial(self._confirm, item)))
+
+    def _pass_on(self, message: Message) -> None:
+        """Pass a message of boxes through; a cloud is left out."""
+        if message.topic != 'points':
+            is_early_out = message.topic == 'passing'
+            self._publish(self._live.pass_through(message.content, is_early_out=is_early_out))
 
     def _confirm(self, item: Item) -> list[Outgoing]:
         """Queue a message for processing; return the messages that a time jump releases."""
@@ -272,8 +278,7 @@ class Worker:
             self._health.report_failure(error)
         else:
             return Item(message.received_ns, content, message=message.content)
-        if message.topic == 'boxes':
-            self._publish(self._live.pass_through(message.content))
+        self._pass_on(message)
         return None
 
     def _log_layouts(self) -> None:
@@ -459,13 +464,8 @@ class Worker:
             if waiting is not None:  # its transforms will not come
                 self._process(waiting)
         self._publish(self._guarded(self._live.flush))
-        message = self._inbox.take()
-        while message is not None:
-            if message.topic == 'boxes':
-                self._publish(self._live.pass_through(message.content))
-            elif message.topic == 'passing':
-                self._publish(self._live.pass_through(message.content, is_early_out=True))
-            message = self._inbox.take()
+        while (message := self._inbox.take()) is not None:
+            self._pass_on(message)
         self._save_model()
         self._publish_static()
         self._markers.publish(self._board.clear())

@@ -379,21 +379,8 @@ def _bare(rows: Iterable[Sequence[Any]]) -> Window:
     """Return a window of (stamp, box) without points."""
     stamps, boxes = zip(*rows, strict=True)
     n = len(stamps)
-    none = np.zeros(n, int)
-    unknown = np.full(n, np.nan)
-    table = Observations(
-        stamps_ns=np.array(stamps),
-        boxes=np.array(boxes),
-        points=np.zeros((0, 3), np.float32),
-        delays=np.zeros(0, np.float32),
-        counts=none,
-        origins=np.full((n, 1, 3), np.nan),
-        ground=unknown,
-        ring_heights=np.zeros(n),
-        num_points=none,
-        sights=np.zeros(n),
-        is_pinned=np.zeros(n, bool),
-    )
+    origins = np.full((n, 1, 3), np.nan)
+    table = Observations.without_points(np.array(stamps), np.array(boxes), origins)
     observations = [Observation(table, row) for row in range(n)]
     return Window('', '', observations, n, np.zeros((0, 9)))
 

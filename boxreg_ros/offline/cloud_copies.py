@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from contextlib import closing, ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from boxreg_ros.core.method.labelling import MOVING, STOOD
 from boxreg_ros.core.point_labels import PointLabels, UNKNOWN
@@ -32,13 +32,6 @@ FIELDS = {'label': (np.uint16, 0), 'instance': (np.uint16, 0), 'moving': (np.uin
 """Fields of labelled clouds: types, and values of unknown points."""
 
 
-class CloudPart(NamedTuple):
-    """A cloud of the recording, and the number of the sweep that it is a part of."""
-
-    number: int
-    part: MergedCloud
-
-
 class CloudCopies:
     """
     Copy a recording, once for each kind of clouds.
@@ -55,8 +48,9 @@ class CloudCopies:
         labelled: Callable[[int], LabelledSweep | None],
     ) -> None:
         self._request = request
+        # By topic and stamp, the number of the sweep that a cloud is a part of.
         self._clouds = {
-            (part.topic, part.stamp_ns): CloudPart(number, part)
+            (part.topic, part.stamp_ns): (number, part)
             for number, place in enumerate(places)
             for part in place.parts
         }

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import hashlib
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
@@ -19,9 +18,6 @@ from boxreg_ros.offline.result_folder import has_changed
 from boxreg_ros.options import option
 from boxreg_ros.review.decisions import APPLIED, DECISIONS
 from msg_adapters.convention import Convention, STANDARD
-
-if TYPE_CHECKING:
-    pass
 
 NO_TOPIC = 'none'
 """In place of a topic of boxes: the drive has no boxes."""

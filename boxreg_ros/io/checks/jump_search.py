@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
-from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.transform_edge import Edge
 from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.io.transforms import inverse, matrix
@@ -118,9 +117,8 @@ class JumpSearch:
     def _add_step(self, tree: TransformTree, edge: Edge, row: int, sensor_frame: str) -> None:
         """Compare a sample with the one before it, at the place of the sensor."""
         stamp_ns = edge.stamps[row]
-        try:
-            T_child_sensor = tree.lookup(edge.child, sensor_frame, stamp_ns)
-        except TransformUnavailable:
+        T_child_sensor = tree.find(edge.child, sensor_frame, stamp_ns)
+        if T_child_sensor is None:
             return
         before, after = (matrix(pose) @ T_child_sensor for pose in edge.poses[row - 1 : row + 1])
         change = inverse(before) @ after

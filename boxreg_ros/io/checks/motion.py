@@ -27,7 +27,6 @@ from boxreg_ros.io.clocks import (
 from boxreg_ros.io.transform_edge import Edge, MAX_LINEAR_GAP
 from boxreg_ros.io.transform_tree import TransformTree
 from boxreg_ros.reasons import Reason
-from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 import numpy as np
 
@@ -93,8 +92,8 @@ class MotionCheck:
         self._copied: list[bool] = []
         self._count = 0
         self._first_milliseconds = 0
-        self._jitters: dict[str, PoseJitter] = {}  # by the frame of the clouds
-        self._yaw_jitters: dict[str, tuple[PoseJitter, Floats]] = {}  # with the last yaw, likewise
+        # Of position and yaw, by the frame of the clouds.
+        self._jitters: dict[str, tuple[PoseJitter, PoseJitter]] = {}
         # First and last position (3,), and length of the path in the plane [m], likewise.
         self._paths: dict[str, tuple[Floats, Floats, float]] = {}
 
@@ -145,17 +144,14 @@ class MotionCheck:
             Pose of its frame in the fixed frame at its stamp [m].
 
         """
-        jitter = self._jitters.setdefault(cloud.frame_id, PoseJitter())
-        jitter.add(cloud.stamp_ns, T_fixed_cloud[:2, 3])
-        if jitter.deviation >= MIN_JITTER and 'publishers' not in self.findings:
-            text = (
-                f'the position of {cloud.frame_id!r} in {fixed_frame!r} errs by '
-                f'{jitter.deviation:.2f} m from cloud to cloud, back and forth: points and boxes '
-                f'are displaced as much, and more where its yaw errs too; use a smoother source '
-                f'of motion, with --fixed-frame or --odometry, or smooth this one'
-            )
+        new = PoseJitter(), PoseJitter(of_yaw=True)
+        of_position, of_yaw = self._jitters.setdefault(cloud.frame_id, new)
+        of_position.add(cloud.stamp_ns, T_fixed_cloud[:2, 3])
+        of_yaw.add(cloud.stamp_ns, np.arctan2(T_fixed_cloud[1:2, 0], T_fixed_cloud[:1, 0]))
+        jitter = _jitter_text(of_position.deviation, of_yaw.deviation)
+        if jitter and 'publishers' not in self.findings:
+            text = jitter.format(f'{cloud.frame_id!r} in {fixed_frame!r}')
             self.findings['jitter'] = Finding(Reason.TRANSFORM_FAULT, text)
-        self._add_yaw(cloud, fixed_frame, T_fixed_cloud)
         position = T_fixed_cloud[:3, 3]
         begin, last, length = self._paths.get(cloud.frame_id, (position, position, 0.0))
         length += float(np.linalg.norm(position[:2] - last[:2]))
@@ -170,24 +166,6 @@ class MotionCheck:
                 f'of Tr, pose, Tr), or choose another motion with --fixed-frame or --odometry'
             )
             self.findings.setdefault('axes', Finding(Reason.TRANSFORM_FAULT, text))
-
-    def _add_yaw(self, cloud: Sweep, fixed_frame: str, T_fixed_cloud: Floats) -> None:
-        """Add the yaw of the frame of a cloud."""
-        yaw = np.arctan2(T_fixed_cloud[1:2, 0], T_fixed_cloud[:1, 0])
-        new = PoseJitter(of_yaw=True), yaw
-        jitter, last = self._yaw_jitters.get(cloud.frame_id, new)
-        yaw = last + wrap_angle(yaw - last)
-        jitter.add(cloud.stamp_ns, yaw)
-        self._yaw_jitters[cloud.frame_id] = jitter, yaw
-        if jitter.deviation >= MIN_YAW_JITTER and 'publishers' not in self.findings:
-            text = (
-                f'the yaw of {cloud.frame_id!r} in {fixed_frame!r} errs by '
-                f'{np.degrees(jitter.deviation):.1f} degrees from cloud to cloud, back and forth: '
-                f'points and boxes are displaced by it, at {STEP_RADIUS:.0f} m by '
-                f'{STEP_RADIUS * jitter.deviation:.1f} m; use a smoother source of motion, with '
-                f'--fixed-frame or --odometry, or smooth this one'
-            )
-            self.findings.setdefault('jitter', Finding(Reason.TRANSFORM_FAULT, text))
 
     def _look(self, fixed_frame: str, frame: str) -> None:
         """Look at the transforms as they are now."""
@@ -329,6 +307,22 @@ class MotionCheck:
             f'received at the same time{of_whom}; correct them with --boxes-offset={shown} '
             f'(node: boxes_offset:={shown})'
         )
+
+
+def _jitter_text(position: float, yaw: float) -> str:
+    """Return that a pose errs by these deviations, {} for its frames; '' if it hardly does."""
+    if position >= MIN_JITTER:
+        errs = f'the position of {{}} errs by {position:.2f} m'
+        displaced = 'as much, and more where its yaw errs too'
+    elif yaw >= MIN_YAW_JITTER:
+        errs = f'the yaw of {{}} errs by {np.degrees(yaw):.1f} degrees'
+        displaced = f'by it, at {STEP_RADIUS:.0f} m by {STEP_RADIUS * yaw:.1f} m'
+    else:
+        return ''
+    return (
+        f'{errs} from cloud to cloud, back and forth: points and boxes are displaced {displaced}; '
+        f'use a smoother source of motion, with --fixed-frame or --odometry, or smooth this one'
+    )
 
 
 def _lidars_text(offsets: Mapping[str, float]) -> str:

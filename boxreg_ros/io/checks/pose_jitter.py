@@ -4,6 +4,7 @@ from collections import deque
 from statistics import fmean, median
 
 from boxreg_ros.io.transform_edge import MAX_LINEAR_GAP
+from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats
 import numpy as np
 
@@ -49,6 +50,9 @@ class PoseJitter:
         if self._poses and not 0 < stamp_ns - self._poses[-1][0] <= MAX_LINEAR_GAP * 1e9:
             self._poses.clear()
             self._away = None
+        if self._of_yaw and self._poses:
+            last = self._poses[-1][1]
+            position = last + wrap_angle(position - last)
         self._poses.append((stamp_ns, position))
         if len(self._poses) < 3:
             return

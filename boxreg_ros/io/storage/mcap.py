@@ -27,7 +27,6 @@ from boxreg_ros.io.storage.record import (
     Damages,
     Definition,
     Record,
-    shown,
     span_ns,
 )
 from mcap import records
@@ -112,7 +111,7 @@ class McapFile:
     """
 
     def __init__(self, path: Path, origin: Path | None = None) -> None:
-        self.name = shown(path, origin)
+        self.name = str(origin or path)
         self.damages: Damages = {}
         self.compression = ''
         self.is_indexed = True

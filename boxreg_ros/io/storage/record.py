@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from boxreg_ros.errors import BoxregError, one_line, RecordingError, TransferError, unreadable
@@ -111,11 +110,6 @@ def span_ns(spans: Collection[tuple[int, int]]) -> tuple[int, int]:
     """Return the earliest begin and the latest end of `spans` [ns]."""
     begins, ends = zip(NO_MESSAGES_NS, *spans, strict=True)
     return min(begins), max(ends)
-
-
-def shown(path: Path, origin: Path | None) -> str:
-    """Return the file to name in messages: `path`, or the file it was unpacked from."""
-    return str(origin or path)
 
 
 @contextmanager

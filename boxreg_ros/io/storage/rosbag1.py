@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from boxreg_ros.io.storage.record import Damage, Damages, readable, Record, shown
+from boxreg_ros.io.storage.record import Damage, Damages, readable, Record
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import ChunkInfo
@@ -31,7 +31,7 @@ class Rosbag1File:
     """
 
     def __init__(self, path: Path, origin: Path | None = None) -> None:
-        self.name = shown(path, origin)
+        self.name = str(origin or path)
         self.damages: Damages = {}
         self._reader = _Reader(path)
         with self._readable():

@@ -15,7 +15,7 @@ import shutil
 from urllib.parse import quote
 
 import apsw
-from boxreg_ros.io.storage.record import Damage, Damages, readable, Record, shown
+from boxreg_ros.io.storage.record import Damage, Damages, readable, Record
 from boxreg_ros.io.whole_files import temporary_folder
 from rosbags.interfaces import Connection
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
@@ -64,7 +64,7 @@ class SqliteFile:
     """
 
     def __init__(self, path: Path, origin: Path | None = None) -> None:
-        self.name = shown(path, origin)
+        self.name = str(origin or path)
         self.damages: Damages = {}
         with self._readable(), _without_log(path) as whole, _prepared(whole):
             self._reader = Sqlite3Reader(Path(quote(str(whole))))  # its name is part of a URI
