@@ -53,6 +53,16 @@ Derived: on a circle of 5 m, at 27 km/h.
 """
 
 
+JUMP = (
+    'boxes of one object, got some too far apart for a {!r}; no boxes are added between them: '
+    'give each object an id of its own'
+)
+TURNED = (
+    'headings of one object, got some that differ by more than a {!r} turns; boxes between them '
+    'turn: turn one around'
+)
+
+
 class End(NamedTuple):
     """Where a track ends: the last stamp with a box [ns], and why, see `following.tracker`."""
 
@@ -273,17 +283,20 @@ def _followed(
     status = dict.fromkeys(poses, HUMAN)
     for first in range(len(seeds.rows) - 1):
         at = stamps_ns[seeds.rows[first : first + 2]].tolist()
+        pair = f'seeds of track {one.track_id!r} at {at[0]} and {at[1]}: expected'
         if follower.jumps(first):
-            problems = (*problems, _jump(one, at))
+            problems = (*problems, f'{pair} {JUMP.format(one.class_name)}')
             continue
         if follower.is_rigid and _turns_around(seeds.boxes[first : first + 2, YAW], at):
-            problems = (*problems, _turned(one, at))
+            problems = (*problems, f'{pair} {TURNED.format(one.class_name)}')
         rows, found = between(follower, times, seeds, first)
         poses |= dict(zip(rows.tolist(), found, strict=True))
         status |= dict.fromkeys(rows.tolist(), INTERPOLATED)
     ends = []
     if follower.num_points < GOOD_POINTS:
-        problems = (*problems, _without_points(one, follower.num_points))
+        lack = f'expected {GOOD_POINTS} points in their boxes, got {follower.num_points}'
+        line = f'seeds of track {one.track_id!r}: {lack}; it is not followed: correct the boxes'
+        problems = (*problems, f'{line}, or their frame')
     for seed, sign, stop in ((0, -1, 0), (len(seeds.rows) - 1, 1, len(times) - 1)):
         last = int(seeds.rows[seed])
         reason = 'few_points'
@@ -305,26 +318,10 @@ def _followed(
     )
 
 
-def _jump(one: _Object, stamps_ns: list[int]) -> str:
-    return (
-        f'seeds of track {one.track_id!r} at {stamps_ns[0]} and {stamps_ns[1]}: expected boxes of '
-        f'one object, got some too far apart for a {one.class_name!r}; no boxes are added between '
-        f'them: give each object an id of its own'
-    )
-
-
 def _turns_around(yaw: Floats, stamps_ns: list[int]) -> bool:
     """Return whether two headings (2,) differ by more than a quarter turn, too soon for one."""
     turn = abs(float(wrap_angle(yaw[1] - yaw[0])))
     return turn > max(np.pi / 2, MAX_TURN_RATE * (stamps_ns[1] - stamps_ns[0]) * 1e-9)
-
-
-def _turned(one: _Object, stamps_ns: list[int]) -> str:
-    return (
-        f'seeds of track {one.track_id!r} at {stamps_ns[0]} and {stamps_ns[1]}: expected headings '
-        f'of one object, got some that differ by more than a {one.class_name!r} turns; boxes '
-        f'between them turn: turn one around'
-    )
 
 
 def _overlapping(objects: Sequence[_Object]) -> list[_Object]:
@@ -364,13 +361,6 @@ def _of_class(objects: Sequence[_Object]) -> list[_Object]:
         one._replace(is_of_class=any(counts[size] > 1 for size in own))
         for one, own in zip(objects, sizes, strict=True)
     ]
-
-
-def _without_points(one: _Object, count: int) -> str:
-    return (
-        f'seeds of track {one.track_id!r}: expected {GOOD_POINTS} points in their boxes, got '
-        f'{count}; it is not followed: correct the boxes, or their frame'
-    )
 
 
 def _supported(way: Way) -> Iterator[int]:

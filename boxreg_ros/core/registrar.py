@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import chain, takewhile
 from math import ceil, inf
-from typing import NamedTuple
 
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
@@ -52,6 +51,8 @@ REACTION_TIME = 2.0
 Literature: the time headway that drivers are told to keep."""
 _OfTrack = tuple[ObservedTrack, PendingBox]
 """A box and its track; boxes do not refer to tracks: cycles would wait for garbage collection."""
+_Submitted = tuple[ObservedTrack, list[PendingBox], bool]
+"""A track with the observations of its submitted window, and whether it has ended."""
 
 
 class BoxRegistrar:
@@ -186,7 +187,7 @@ class BoxRegistrar:
         self._ended_tracks: list[ObservedTrack] = []
         self._arrays_since_solve = 0
         self._num_caught_up = 0  # windows, since the last box array
-        self._submitted: list[_SubmittedTrack] = []
+        self._submitted: list[_Submitted] = []
         self._get_estimates: GetEstimates = list
         if config.estimate == 'track':
             # The ends of a window are its weakest part. The newest eighth of its observations is
@@ -618,8 +619,8 @@ class BoxRegistrar:
         """Submit the windows of `tracks` and of ended tracks, after collecting those before."""
         self._collect()
         ended = self._ended_tracks
-        self._submitted = [_SubmittedTrack(track, track.entries, True) for track in ended]
-        self._submitted += [_SubmittedTrack(track, track.entries, False) for track in tracks]
+        self._submitted = [(track, track.entries, True) for track in ended]
+        self._submitted += [(track, track.entries, False) for track in tracks]
         windows = _windows(ended + tracks)
         submit = self._submit or submit_locally
         config = self.box_time.resolved(self.config)
@@ -731,14 +732,6 @@ def _confirmed(coasting: list[_OfTrack], seen: list[Observation]) -> list[_OfTra
         for (track, one), count in zip(coasting, inside.tolist(), strict=True)
         if one.is_followed or count >= track.least_points
     ]
-
-
-class _SubmittedTrack(NamedTuple):
-    """A track with the observations of its submitted window."""
-
-    track: ObservedTrack
-    entries: list[PendingBox]
-    is_ended: bool
 
 
 def submit_locally(windows: list[Window], config: Config, model: InputModel) -> GetEstimates:

@@ -9,10 +9,12 @@ records are taken by `take`, ten times as fast as by an index.
 
 from collections.abc import Sequence
 from itertools import count, pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 from boxreg_ros.structures import Ints
 import numpy as np
+
+_Key = TypeVar('_Key')
 
 
 def numbered(items: Sequence[tuple[Any, int]]) -> tuple[list[Any], Ints, Ints]:
@@ -37,7 +39,7 @@ def by_table(items: Sequence[tuple[Any, int]]) -> list[tuple[Any, Ints, Ints]]:
     return [(table, part, row[part]) for table, part in zip(tables, parts, strict=False)]
 
 
-def rows_by_key(keys: Sequence[str]) -> dict[str, Ints]:
+def rows_by_key(keys: Sequence[_Key]) -> dict[_Key, Ints]:
     """Return the rows of each key among n keys, ascending; the keys in the order they appear."""
     number_of = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     number = np.fromiter(map(number_of.__getitem__, keys), int, len(keys))

@@ -59,14 +59,6 @@ class TopicProblem(NamedTuple):
     is_qos: bool = False
 
 
-class Mismatch(NamedTuple):
-    """A QoS policy for which a publisher offers less than a subscription requests."""
-
-    policy: str
-    offered: str
-    requested: str
-
-
 @dataclass(eq=False, slots=True)
 class Endpoint:
     """A subscription or publisher of the node."""
@@ -393,8 +385,8 @@ def import_message(type_name: str) -> type:
     return kind
 
 
-def mismatches(offered: QoSProfile, requested: QoSProfile) -> list[Mismatch]:
-    """Return the policies for which a publisher offers less than a subscription requests."""
+def mismatches(offered: QoSProfile, requested: QoSProfile) -> list[tuple[str, str, str]]:
+    """Return policies of which a publisher offers less than is requested: name and both values."""
     found = []
     for policy, weaker, stronger in (
         ('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
@@ -402,12 +394,12 @@ def mismatches(offered: QoSProfile, requested: QoSProfile) -> list[Mismatch]:
         ('liveliness', LivelinessPolicy.AUTOMATIC, LivelinessPolicy.MANUAL_BY_TOPIC),
     ):
         if (getattr(offered, policy), getattr(requested, policy)) == (weaker, stronger):
-            found.append(Mismatch(policy, weaker.name.lower(), stronger.name.lower()))
+            found.append((policy, weaker.name.lower(), stronger.name.lower()))
     for policy in ('deadline', 'liveliness_lease_duration'):
         offer = getattr(offered, policy).nanoseconds or INFINITE_NS  # 0: the default, infinite
         request = getattr(requested, policy).nanoseconds or INFINITE_NS
         if offer > request:
-            found.append(Mismatch(policy, _seconds(offer), _seconds(request)))
+            found.append((policy, _seconds(offer), _seconds(request)))
     return found
 
 

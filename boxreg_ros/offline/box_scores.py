@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.config import words_of
 from boxreg_ros.core.metrics import iou_3d, iou_bev, pose_errors
+from boxreg_ros.core.tables import rows_by_key
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.rotations import wrap_angle
@@ -30,6 +31,9 @@ POINT_BINS = (0, 10, 30, 100, 300, 1000)
 """Lower limits of the groups by number of points."""
 MAX_STEP = 1.0
 """Jitter is not computed across longer gaps [s]."""
+
+MEANS = ('iou_bev', 'iou_3d', 'jitter', 'turn_jitter', 'true_jitter')
+"""Fields of `Scores` that are means of those of `Matches`."""
 
 Mask = NDArray[np.bool_]
 Pairing = Callable[[BoxTable, BoxTable], Ints]
@@ -187,25 +191,25 @@ def match(
     aligned = true_boxes.copy()
     aligned[:, BOX_EXTENT] = boxes[:, BOX_EXTENT]
     errors = pose_errors(boxes, true_boxes)
-    jitter = _second_difference(stamps, tracks, boxes[:, :3])
-    turn_jitter = _second_difference(stamps, tracks, boxes[:, [YAW]], is_angle=True)
-    true_jitter = _second_difference(stamps, tracks, true_boxes[:, :3])
+    of_matched = {
+        'iou_bev': iou_bev(boxes, true_boxes),
+        'iou_3d': iou_3d(boxes, true_boxes),
+        **errors._asdict(),
+        'scale_iou': iou_3d(aligned, true_boxes),
+    }
+    jitters = {
+        'jitter': _second_difference(stamps, tracks, boxes[:, :3]),
+        'turn_jitter': _second_difference(stamps, tracks, boxes[:, [YAW]], is_angle=True),
+        'true_jitter': _second_difference(stamps, tracks, true_boxes[:, :3]),
+    }
     return Matches(
         rows=scope,
         predicted_rows=predicted_rows,
         class_names=tuple(truth.class_names[i] for i in scope),
         num_points=truth.num_points[scope],
         is_matched=is_matched,
-        iou_bev=_spread(iou_bev(boxes, true_boxes), is_matched),
-        iou_3d=_spread(iou_3d(boxes, true_boxes), is_matched),
-        translation=_spread(errors.translation, is_matched),
-        extent=_spread(errors.extent, is_matched),
-        rotation=_spread(errors.rotation, is_matched),
-        scale_iou=_spread(iou_3d(aligned, true_boxes), is_matched),
-        is_flipped=_spread(errors.is_flipped, is_matched),
-        jitter=_spread(jitter, is_matched, np.nan),
-        turn_jitter=_spread(turn_jitter, is_matched, np.nan),
-        true_jitter=_spread(true_jitter, is_matched, np.nan),
+        **{name: _spread(values, is_matched) for name, values in of_matched.items()},
+        **{name: _spread(values, is_matched, np.nan) for name, values in jitters.items()},
         unmatched=np.setdiff1d(np.arange(len(predicted.boxes)), paired_rows),
         invalid=int((~is_valid).sum()),
     )
@@ -220,8 +224,6 @@ def summarise(matches: Matches, mask: Mask | None = None) -> Scores:
         boxes=int(chosen.sum()),
         missing=int(chosen.sum() - rows.sum()),
         unmatched=len(matches.unmatched) if mask is None else 0,
-        iou_bev=_mean(matches.iou_bev[rows]),
-        iou_3d=_mean(matches.iou_3d[rows]),
         iou_bev_median=_median(matches.iou_bev[rows]),
         iou_3d_median=_median(matches.iou_3d[rows]),
         recall_bev=tuple(_mean(matches.iou_bev[chosen] >= level) for level in RECALLS),
@@ -231,9 +233,7 @@ def summarise(matches: Matches, mask: Mask | None = None) -> Scores:
         aoe=_mean(yaw_errors),
         aoe_median=_median(yaw_errors),
         flips=_mean(matches.is_flipped[rows]),
-        jitter=_mean(matches.jitter[rows]),
-        turn_jitter=_mean(matches.turn_jitter[rows]),
-        true_jitter=_mean(matches.true_jitter[rows]),
+        **{name: _mean(getattr(matches, name)[rows]) for name in MEANS},
     )
 
 
@@ -383,8 +383,5 @@ def best_pairs(
 def _rows_by_stamp(table: BoxTable) -> dict[int, Ints]:
     """Return the rows of the valid boxes of each stamp."""
     valid = np.flatnonzero(is_valid_box(table.boxes))
-    valid = valid[np.argsort(table.stamps_ns[valid], kind='stable')]
-    stamps, first = np.unique(table.stamps_ns[valid], return_index=True)
-    ends = [*first[1:], len(valid)][: len(first)]
-    parts = zip(stamps.tolist(), first, ends, strict=True)
-    return {stamp_ns: valid[begin:end] for stamp_ns, begin, end in parts}
+    of_stamp = rows_by_key(table.stamps_ns[valid].tolist())
+    return {stamp_ns: valid[rows] for stamp_ns, rows in of_stamp.items()}

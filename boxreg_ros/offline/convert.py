@@ -39,6 +39,11 @@ import numpy as np
 
 FORMAT_OF_NODE = 'recording'
 """Format of labels that are messages of a recording, which also has the clouds and poses."""
+COUNTED = (
+    *('frames', 'boxes', 'frames_without_boxes', 'invalid_boxes', 'rejected_boxes'),
+    *('boxes_without_id', 'boxes_with_repeated_id', 'tilted_boxes'),
+)
+"""Numbers of the summary, in their order."""
 ROW_FORMATS = ('csv', 'parquet')
 """Tables with a row per box alone, and no place for a frame without boxes."""
 
@@ -77,7 +82,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
         Provenance.of(request.recordings or (source,)),
         config_hash=config_hash(source) if is_of_node else '',
     )
-    counts: Counter[str] = Counter()
+    counts = Counter(dict.fromkeys(COUNTED, 0))
     not_read: Counter[str] = Counter()
     assumed: list[str] = []
     options = writer_options(request)
@@ -88,20 +93,20 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
         for frame in _read_frames(request, folder, unused):
             counts['frames'] += 1
             counts['boxes'] += len(frame.refined.status)
-            counts['empty'] += not frame.refined.status
-            counts['valid'] += int(is_valid_box(frame.refined.boxes.boxes).sum())
+            counts['frames_without_boxes'] += not frame.refined.status
+            counts['invalid_boxes'] += int((~is_valid_box(frame.refined.boxes.boxes)).sum())
             not_read.update(frame.left_out)
             if frame.note:
                 assumed.append(frame.note)
             boxes = frame.moved('fixed').refined.boxes
             named = list(filter(None, boxes.track_ids))
-            counts['without_id'] += len(boxes.track_ids) - len(named)
-            counts['repeated_id'] += len(named) - len(set(named))
-            valid = boxes.boxes[is_valid_box(boxes.boxes)]
-            counts['tilted'] += int((np.cos(valid[:, ROLL:YAW]).prod(axis=1) < MIN_UPRIGHT).sum())
-            if not counts['repeated_id']:  # whose way is that of several objects
+            counts['boxes_without_id'] += len(boxes.track_ids) - len(named)
+            counts['boxes_with_repeated_id'] += len(named) - len(set(named))
+            tilts = np.cos(boxes.boxes[is_valid_box(boxes.boxes), ROLL:YAW]).prod(axis=1)
+            counts['tilted_boxes'] += int((tilts < MIN_UPRIGHT).sum())
+            if not counts['boxes_with_repeated_id']:  # whose way is that of several objects
                 axes.add(boxes)
-            counts['rejected'] += frame.refined.status.count(REJECTED)
+            counts['rejected_boxes'] += frame.refined.status.count(REJECTED)
             output.write(frame)
         output.close()
         applied = request.applied_decisions()
@@ -109,20 +114,13 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             copyfile(applied, folder / applied.name)
         left_out = output.left_out()
         _require_valid_boxes(source, counts)
-        _require_boxes(request, left_out, counts['boxes'] - counts['rejected'])
+        _require_boxes(request, left_out, counts['boxes'] - counts['rejected_boxes'])
         summary = {
             'source': str(source),
             'recordings': [str(path) for path in request.recordings],
             'from': source_format,
             'to': list(request.formats),
-            'frames': counts['frames'],
-            'boxes': counts['boxes'],
-            'frames_without_boxes': counts['empty'],
-            'invalid_boxes': counts['boxes'] - counts['valid'],
-            'rejected_boxes': counts['rejected'],
-            'boxes_without_id': counts['without_id'],
-            'boxes_with_repeated_id': counts['repeated_id'],
-            'tilted_boxes': counts['tilted'],
+            **counts,
             'left_out_of_source': dict(+not_read),
             'assumed': assumed,
             **unused,
@@ -165,7 +163,7 @@ def _check(request: Request) -> None:
 
 def _require_valid_boxes(source: Path, counts: Counter[str]) -> None:
     """Raise `RecordingError` if no box of the labels can be of an object."""
-    if counts['boxes'] and not counts['valid']:
+    if counts['boxes'] and counts['invalid_boxes'] == counts['boxes']:
         raise RecordingError(
             f'{source}: expected boxes of objects, got none among {counts["boxes"]:,}: '
             f'{Reason.INVALID_BOX.meaning}; labels of images alone have extents of -1: give those '

@@ -364,7 +364,7 @@ def test_internal_errors_while_decoding_count_as_failed(graph, tmp_path):
 def test_a_policy_mismatches_in_one_direction_only(policy, offered, requested):
     weak = QoSProfile(depth=1, **{policy: offered})
     strong = QoSProfile(depth=1, **{policy: requested})
-    assert [item.policy for item in mismatches(weak, strong)] == [policy]
+    assert [name for name, *_ in mismatches(weak, strong)] == [policy]
     assert not mismatches(strong, weak)
     assert not mismatches(weak, weak)
 
