@@ -8,7 +8,7 @@ from functools import partial
 from itertools import chain, takewhile
 from math import ceil, inf
 
-from boxreg_ros.config import Config, KINDS
+from boxreg_ros.config import Config
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.field_of_view import FieldOfView
 from boxreg_ros.core.following.stream import FollowedObjects
@@ -19,7 +19,7 @@ from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.observation import Observation, observe
 from boxreg_ros.core.pending import ObservedTrack, PendingArray, PendingBox, results
-from boxreg_ros.core.problem import SETTINGS_OF
+from boxreg_ros.core.problem import settings_of_kinds
 from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import by_table
 from boxreg_ros.core.window import Estimate, PRIOR_POSES, Window
@@ -351,11 +351,8 @@ class BoxRegistrar:
 
     def margins(self) -> Floats:
         """Return the labelling margin of each face, of each of `KINDS`, (K, 6) [m]."""
-        names = SETTINGS_OF['gaps']
-        kinds = [getattr(self.config, kind) for kind in KINDS]
-        of_settings = np.array([[getattr(kind, name) for name in names] for kind in kinds])
         inputs = self._input_model.inputs(self.config, with_noise=False)
-        margins: Floats = of_settings + inputs['margin']
+        margins: Floats = settings_of_kinds(self.config)['gaps'] + inputs['margin']
         return margins
 
     def statistics(self, name: str = '') -> Drives:

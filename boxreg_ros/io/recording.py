@@ -49,7 +49,7 @@ class Recording:
     Attributes are those of `ItemSource`; also the `files`, all `topics` with their types,
     `points_topics`, `data_topics` of clouds and boxes, whether messages are encoded as by ROS 2
     (`is2`), and `part_ns`: begin and end that were asked for, in receive time [ns], None where
-    not.
+    not; and the `decoder` and the order (`timeline`) of its messages.
 
     Raises RecordingError on entering, if a file or topic cannot be read or found; the message
     lists the topics.
@@ -105,20 +105,20 @@ class Recording:
         if self.odometry:
             topics.find('odometry', 'odometry', (ODOMETRY_TYPE,), self.odometry)
         self.data_topics = {*self.points_topics, self.boxes_topic}
-        self._decoder = MessageDecoder(str(self))
-        self.unreadable, self.first_errors = self._decoder.unreadable, self._decoder.first_errors
+        self.decoder = MessageDecoder(str(self))
+        self.unreadable, self.first_errors = self.decoder.unreadable, self.decoder.first_errors
         self._contents = MessageContents(
-            self._decoder, self.placement, self.boxes_topic, adapter, self.convention
+            self.decoder, self.placement, self.boxes_topic, adapter, self.convention
         )
         motion = topics.transforms | topics.of((ODOMETRY_TYPE,))
         chosen = map(self.choose_definition, topics.connections(self.data_topics | motion))
         self._chosen = list(filter(None, chosen))
-        self._timeline = MessageOrder(self._reader, self.points_topic, self._stamp_of)
-        span_ns = self._timeline.span_ns(self.data_topics | motion - topics.static_transforms)
+        self.timeline = MessageOrder(self._reader, self.points_topic, self._stamp_of)
+        span_ns = self.timeline.span_ns(self.data_topics | motion - topics.static_transforms)
         part_ns = requested_part(str(self), *span_ns, self.start, self.end)
         self.start_ns, self.end_ns = part_ns
         self._motion = RecordedMotion(
-            topics, self._decoder, self._read, part_ns, self.odometry, self.points_topics,
+            topics, self.decoder, self._read, part_ns, self.odometry, self.points_topics,
             self.tf,
         )  # fmt: skip
 
@@ -162,7 +162,7 @@ class Recording:
             If a file is damaged so that the rest of it cannot be read.
 
         """
-        self._decoder.reset()
+        self.decoder.reset()
         self._contents.reset()
         topics = self.data_topics if wanted.clouds else {self.boxes_topic}
         waiting = deque[Record]()
@@ -180,7 +180,7 @@ class Recording:
     def choose_definition(self, connection: Connection) -> str:
         """Choose the definition of a connection, see `MessageDecoder.choose_definition`."""
         records = self._reader.messages([connection], None, None)
-        return self._decoder.choose_definition(connection, records)
+        return self.decoder.choose_definition(connection, records)
 
     def check_readable(self) -> None:
         """Raise UnsupportedMessage, after the last item, if no cloud or no boxes were readable."""
@@ -191,7 +191,7 @@ class Recording:
 
     def box_message(self, connection: Connection, data: bytes) -> tuple[Any, BoxArray]:
         """Return a message of the boxes' topic, and its boxes; UnsupportedMessage if malformed."""
-        message = self._decoder.decoded(connection, data)
+        message = self.decoder.decoded(connection, data)
         return message, cast(BoxArray, self._contents.of(self.boxes_topic, message))
 
     def with_boxes(
@@ -218,14 +218,10 @@ class Recording:
 
         """
         replaced = self._contents.with_boxes(message, boxes, covariances)
-        store = self.store_of(connection)
+        store = self.decoder.store_of(connection)
         if store is None:
             return encoded(replaced)
         return self._encoded(replaced, connection.msgtype, store)
-
-    def cloud_message(self, connection: Connection, data: bytes) -> Any:
-        """Return a message of a topic of clouds; UnsupportedMessage if it is malformed."""
-        return self._decoder.decoded(connection, data)
 
     def encoded_cloud(self, message: Any) -> bytes:
         """Return the bytes of a PointCloud2 as the recording encodes its messages."""
@@ -235,22 +231,14 @@ class Recording:
     def _encoded(self, message: Any, kind: str, store: Typestore) -> bytes:
         return bytes((store.serialize_cdr if self.is2 else store.serialize_ros1)(message, kind))
 
-    def received_ns(self, connection: Connection, received_ns: int, data: bytes) -> int:
-        """Return the receive time that a message on a topic of `apart` gets: its cloud's [ns]."""
-        return self._timeline.received_ns(connection, received_ns, data)
-
-    def store_of(self, connection: Connection) -> Typestore | None:
-        """Return the definition of a connection's messages; None if unknown, or not of ROS."""
-        return self._decoder.store_of(connection)
-
     def store_of_type(self, kind: str) -> Typestore | None:
         """Return the definition of a type in the recording; None if no topic has it."""
         same = (c for c in self._reader.connections if c.msgtype == kind)
-        return next(filter(None, map(self.store_of, same)), None)
+        return next(filter(None, map(self.decoder.store_of, same)), None)
 
     def images(self) -> RecordedImages:
         """Return the camera images."""
-        return RecordedImages(self._topics, self._reader, self._decoder)
+        return RecordedImages(self._topics, self._reader, self.decoder)
 
     @property
     def odometry_topic(self) -> str | None:
@@ -261,20 +249,20 @@ class Recording:
     def apart(self) -> dict[str, float]:
         """Return the topics in use that were recorded apart, and how much later [s]."""
         used = self.data_topics | self._ahead_topics()
-        return {topic: late for topic, late in self._timeline.apart.items() if topic in used}
+        return {topic: late for topic, late in self.timeline.apart.items() if topic in used}
 
     @property
     def finding(self) -> str:
         """Return what is unusual about the recordings as a whole; empty if nothing is."""
         own = (
             *self._chosen, self._contents.finding, *self._pauses(), *self._slow(),
-            self._timeline.finding,
+            self.timeline.finding,
         )  # fmt: skip
         return '; '.join(filter(None, (*own, *self._motion.notes.values())))
 
     def _slow(self) -> Iterator[str]:
         """Yield that the boxes are taken for those of a slow detector."""
-        late = self._timeline.as_slow.get(self.boxes_topic)
+        late = self.timeline.as_slow.get(self.boxes_topic)
         if late is not None:
             yield (
                 f'{self.boxes_topic}: boxes have stamps of clouds that were received {late:.2f} s '
@@ -284,7 +272,7 @@ class Recording:
 
     def _pauses(self) -> Iterator[str]:
         """Yield that the recordings are not of one drive, if they are not."""
-        parts = self._timeline.parts_ns
+        parts = self.timeline.parts_ns
         if len(parts) == 1:
             return
         spans = ' and '.join(f'{begin * 1e-9:.3f} to {end * 1e-9:.3f} s' for begin, end in parts)
@@ -362,7 +350,7 @@ class Recording:
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Record]:
         """Yield the messages on some topics in order."""
-        return self._timeline.messages(self._topics.connections(topics), start_ns, end_ns)
+        return self.timeline.messages(self._topics.connections(topics), start_ns, end_ns)
 
     def _records(
         self, tree: TransformTree, topics: set[str], waiting: deque[Record]
@@ -396,7 +384,7 @@ class Recording:
         try:
             if connection.topic == self.boxes_topic:
                 return self._contents.boxes(connection, data).stamp_ns or None
-            message = self._decoder.decoded(connection, data)
+            message = self.decoder.decoded(connection, data)
             stamped = getattr(message, 'transforms', [message])
             with malformed(f'topic {connection.topic!r}'):
                 header = clouds.header_of(stamped[0]) if len(stamped) else None
@@ -413,7 +401,7 @@ class Recording:
         if topic != self.placement.lidars.info:
             self._motion.add(tree, record)
             return
-        with self._decoder.counted(topic):
-            message = self._decoder.message(record)
+        with self.decoder.counted(topic):
+            message = self.decoder.message(record)
             with malformed(f'topic {topic!r}'):
                 self.placement.add_info(message)

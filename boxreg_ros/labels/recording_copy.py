@@ -107,7 +107,7 @@ class RecordingCopy:
             if raw.topic not in apart:
                 yield raw
                 continue
-            time_ns = self.recording.received_ns(raw.connection, raw.log_time, raw.data)
+            time_ns = self.recording.timeline.received_ns(raw.connection, raw.log_time, raw.data)
             if (start_ns or 0) <= time_ns and (end_ns is None or time_ns < end_ns):
                 is_same = time_ns == raw.log_time
                 yield raw if is_same else raw._replace(log_time=time_ns, publish_time=time_ns)
@@ -142,7 +142,7 @@ class RecordingCopy:
         store = None
         if connection.msgdef.format is MessageDefinitionFormat.NONE:
             self.recording.choose_definition(connection)
-            store = self.recording.store_of(connection)
+            store = self.recording.decoder.store_of(connection)
         return _definition(connection, store)
 
 

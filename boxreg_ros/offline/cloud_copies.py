@@ -96,7 +96,7 @@ class CloudCopies:
     ) -> Mapping[str, RawMessage]:
         """Return the message of a cloud for each kind of copy; none where it has no labels."""
         try:
-            message = source.cloud_message(raw.connection, raw.data)
+            message = source.decoder.decoded(raw.connection, raw.data)
             stamp_ns = stamp_ns_of(message.header)
             rows = pointcloud.finite_rows(message)
         except UnsupportedMessage:

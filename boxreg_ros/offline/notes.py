@@ -83,7 +83,8 @@ def notes(summary: Summary) -> Iterator[str]:
     yield from _label_notes(summary)
     yield from _keyframe_notes(summary)
     if summary.complete.get('unfilled'):
-        yield _unfilled_line(summary.complete['unfilled'])
+        reason, count = Reason.RARELY_DETECTED, summary.complete['unfilled']
+        yield f'{count:,} boxes were {reason.meaning} ({reason}); {reason.remedy}'
     if summary.unused_decisions and summary.is_part:
         yield (
             f'decisions: {len(summary.unused_decisions):,} are about tracks and boxes that this '
@@ -146,12 +147,6 @@ def left_out_line(name: str, count: int) -> str:
     reason = REASONS[name]
     remedy = f'; remedy: {reason.remedy}' if reason.remedy else ''
     return f'labels: {count:,} boxes are left out ({name}): {reason.meaning}{remedy}'
-
-
-def _unfilled_line(count: int) -> str:
-    """Return the number of missing boxes that were not added, and why."""
-    reason = REASONS[Reason.RARELY_DETECTED]
-    return f'{count:,} boxes were {reason.meaning} ({reason}); {reason.remedy}'
 
 
 def _keyframe_notes(summary: Summary) -> Iterator[str]:

@@ -128,7 +128,7 @@ def test_refined_boxes_of_an_older_release_are_written_as_that_release_has_them(
         covariances = np.full((2, 6, 6), np.nan)
         written = recording.with_boxes(connection, message, boxes, covariances)
         assert written == record.data
-        text, _ = recording.store_of(connection).generate_msgdef(DETECTIONS, ros_version=2)
+        text, _ = recording.decoder.store_of(connection).generate_msgdef(DETECTIONS, ros_version=2)
     assert 'tracking_id' in text
 
 

@@ -151,7 +151,7 @@ def test_other_fields_are_copied_in_the_encoding_of_the_input(tmp_path, encoding
         ((_, _, raw),) = make_reader(file).iter_messages('/boxes')
     with Recording([path]) as recording:
         (record,) = recording._records(TransformTree(), {'/boxes'}, deque())
-        message = recording._decoder.message(record)
+        message = recording.decoder.message(record)
         adapter = adapter_for(SCENE)
         boxes = adapter.from_msg(message)
         longer = replace(boxes, boxes=boxes.boxes + np.array([0, 0, 0, 1, 0, 0, 0, 0, 0]))
@@ -159,7 +159,7 @@ def test_other_fields_are_copied_in_the_encoding_of_the_input(tmp_path, encoding
         np.testing.assert_allclose(adapter.from_msg(written).boxes, longer.boxes, atol=1e-12)
         np.testing.assert_array_equal(adapter.from_msg(message).boxes, boxes.boxes)
         restored = encoded(adapter.to_msg(written, boxes))
-        decoded = recording._decoder.decoded(record.connection, restored)
+        decoded = recording.decoder.decoded(record.connection, restored)
     np.testing.assert_allclose(adapter.from_msg(decoded).boxes, boxes.boxes, atol=1e-12)
     if encoding == 'json':
         old, new = json.loads(raw.data), json.loads(restored)
@@ -197,7 +197,7 @@ def test_clouds_with_a_pose_other_than_identity_are_refused(tmp_path):
         (connection,) = recording._topics.connections({'/points'})
         message = PointCloud(pose={'position': {'x': 1.0}, 'orientation': {'w': 1.0}})
         with pytest.raises(UnsupportedMessage, match='pose'):
-            recording.cloud_message(connection, message.SerializeToString())
+            recording.decoder.decoded(connection, message.SerializeToString())
 
 
 def test_the_error_of_invalid_json_names_the_topic(tmp_path):

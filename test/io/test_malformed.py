@@ -148,7 +148,7 @@ def test_a_field_that_the_definition_lacks_is_unreadable(tmp_path):
     path = Drive(sweeps=1).write(tmp_path / 'drive')
     with Recording([path]) as recording:
         record = next(recording._read({'/boxes'}))
-        message = recording._decoder.message(record)
+        message = recording.decoder.message(record)
         del message.detections[0].bbox.__dict__['size']
         with pytest.raises(UnsupportedMessage, match=r"topic '/boxes'.*field 'size'"):
             recording._contents.of('/boxes', message)

@@ -35,7 +35,7 @@ def test_boxes_are_read_without_objects_and_are_the_same(tmp_path, monkeypatch, 
     path = write_recording(tmp_path / 'drive', items)
     with Recording([path], convention=convention) as recording:
         record = next(recording._read({'/boxes'}))
-        contents, decoder = recording._contents, recording._decoder
+        contents, decoder = recording._contents, recording.decoder
         by_objects = contents.of('/boxes', decoder.message(record))
         monkeypatch.setattr(decoder, 'decoded', None)
         boxes = contents.boxes(record.connection, record.data)
@@ -74,7 +74,7 @@ def test_boxes_of_a_drive_are_those_of_the_objects(tmp_path, monkeypatch, storag
         items = list(recording.items(TransformTree()))
         arrays = [item.content for item in items if hasattr(item.content, 'boxes')]
         records = list(recording._read({recording.boxes_topic}))
-        contents, decoder = recording._contents, recording._decoder
+        contents, decoder = recording._contents, recording.decoder
         expected = [contents.of(recording.boxes_topic, decoder.message(r)) for r in records]
     assert bool(read) == (storage != 'rosbag1')
     assert len(arrays) == 4 and all(map(equal, arrays, expected))

@@ -81,6 +81,8 @@ class _Place:
 
     option: str
     value: str
+    convention: Convention | None = None
+    """By which boxes are there; None for those of another frame, or where they are."""
     coverages: list[float] = field(default_factory=list)
 
     @property
@@ -109,14 +111,12 @@ class PlaceCheck(PairedCheck):
         super().__init__()
         self._convention = convention
         scale = 2 * convention.size_scale
-        self._meant = {
-            'mirrored': replace(convention, orientation='left_handed'),
-            'doubled': replace(convention, size_scale=scale),
-        }
+        mirrored = replace(convention, orientation='left_handed')
+        doubled = replace(convention, size_scale=scale)
         self._own = _Place('', '')
         self._others = {
-            'mirrored': _Place('orientation', 'left_handed'),
-            'doubled': _Place('size_scale', f'{scale:g}'),
+            'mirrored': _Place('orientation', 'left_handed', mirrored),
+            'doubled': _Place('size_scale', f'{scale:g}', doubled),
         }
         # As read, and with w at the other end of the quaternion: cosine of the tilt.
         self._tilts: list[tuple[float, float]] = []
@@ -176,9 +176,10 @@ class PlaceCheck(PairedCheck):
         _add_coverages(self._own, points, own)
         self._within += [share for box in own if (share := _share_within(points, box)) is not None]
         self._heights += raw.boxes[:, BOX_CENTER][:, 2].tolist()
-        for name, convention in self._meant.items():
-            meant = convention.to_centers(raw).boxes
-            _add_coverages(self._others[name], points, moved_boxes(meant, T))
+        for place in self._others.values():
+            if place.convention is not None:
+                meant = place.convention.to_centers(raw).boxes
+                _add_coverages(place, points, moved_boxes(meant, T))
         for name, T_fixed_frame in self._frames.items():
             place = self._others.setdefault(f'frame {name}', _Place('boxes_frame', name))
             _add_coverages(place, points, moved_boxes(boxes, T_fixed_frame))
