@@ -53,11 +53,11 @@ Derived: on a circle of 5 m, at 27 km/h.
 """
 
 
-JUMP = (
+APART_SEEDS = (
     'boxes of one object, got some too far apart for a {!r}; no boxes are added between them: '
     'give each object an id of its own'
 )
-TURNED = (
+TURNED_SEEDS = (
     'headings of one object, got some that differ by more than a {!r} turns; boxes between them '
     'turn: turn one around'
 )
@@ -285,10 +285,10 @@ def _followed(
         at = stamps_ns[seeds.rows[first : first + 2]].tolist()
         pair = f'seeds of track {one.track_id!r} at {at[0]} and {at[1]}: expected'
         if follower.jumps(first):
-            problems = (*problems, f'{pair} {JUMP.format(one.class_name)}')
+            problems = (*problems, f'{pair} {APART_SEEDS.format(one.class_name)}')
             continue
         if follower.is_rigid and _turns_around(seeds.boxes[first : first + 2, YAW], at):
-            problems = (*problems, f'{pair} {TURNED.format(one.class_name)}')
+            problems = (*problems, f'{pair} {TURNED_SEEDS.format(one.class_name)}')
         rows, found = between(follower, times, seeds, first)
         poses |= dict(zip(rows.tolist(), found, strict=True))
         status |= dict.fromkeys(rows.tolist(), INTERPOLATED)
