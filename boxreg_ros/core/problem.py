@@ -67,6 +67,12 @@ CLASS_SETTINGS = np.dtype(
 """Settings of the class of one window, a record."""
 
 
+OF_OBSERVATIONS = (
+    *('boxes', 'start', 'times', 'origins', 'ground', 'ring_heights', 'first', 'counts', 'pinned'),
+)
+"""Fields of `Problem` with a row for each observation of each window."""
+
+
 class Problem(NamedTuple):
     """A batch of padded windows; centres are relative to one point per window."""
 
@@ -145,17 +151,11 @@ class Problem(NamedTuple):
         row, last = rows[:, None], lengths[:, None] - 1
         place = np.arange(lengths.max())
         column = first[:, None] + step[:, None] * np.minimum(place, last)
+        of_each = {name: getattr(self, name)[row, column] for name in OF_OBSERVATIONS}
+        of_each['times'] += PADDING_PERIOD * np.maximum(place - last, 0)
         return self._replace(
-            boxes=self.boxes[row, column],
-            start=self.start[row, column],
+            **of_each,
             lengths=lengths,
-            times=self.times[row, column] + PADDING_PERIOD * np.maximum(place - last, 0),
-            origins=self.origins[row, column],
-            ground=self.ground[row, column],
-            ring_heights=self.ring_heights[row, column],
-            first=self.first[row, column],
-            counts=self.counts[row, column],
-            pinned=self.pinned[row, column],
             prior_mean=self.prior_mean[:0],
             prior_information=self.prior_information[:0],
             marginalised_extents=np.zeros((len(rows), 4)),

@@ -101,7 +101,7 @@ class Health:
         """Count a reason and log the text, at most once per `LOG_PERIOD` and reason."""
         self.count(reason, number)
         if self.is_due(reason):
-            self._log(reason, f'{reason}: {" ".join(text.split())}')
+            self.log(f'{reason}: {" ".join(text.split())}', reason in FAULTS)
 
     def report_failure(self, error: Exception) -> None:
         """Count an internal error as ``failed``; its traceback goes to the debug log."""
@@ -126,7 +126,7 @@ class Health:
         for reason in Reason:
             if unlogged[reason] and reason.remedy and self.is_due(reason):
                 text = f'{reason} ({unlogged[reason]} more): {reason.meaning}; {reason.remedy}'
-                self._log(reason, text)
+                self.log(text, reason in FAULTS)
 
     def log_waiting(self, fixed_frame: str) -> None:
         """Log what the node waits for, every `LOG_PERIOD` until its first refined box."""
@@ -164,8 +164,9 @@ class Health:
             self._logger.warning(late)
         return diagnosis(name, *_level_and_message(recent, late), values)
 
-    def _log(self, reason: str, text: str) -> None:
-        if reason in FAULTS:
+    def log(self, text: str, is_error: bool) -> None:
+        """Log a text as an error or a warning."""
+        if is_error:  # rclpy takes one level of each line of a source
             self._logger.error(text)
         else:
             self._logger.warning(text)

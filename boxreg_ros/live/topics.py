@@ -366,10 +366,7 @@ class NodeTopics:
     def _log(self, problem: TopicProblem) -> None:
         if problem.is_qos:
             self._health.is_due(Reason.QOS_INCOMPATIBLE)  # this entry replaces the general one
-        if problem.level == DiagnosticStatus.ERROR:
-            self._node.get_logger().error(problem.text)
-        else:
-            self._node.get_logger().warning(problem.text)
+        self._health.log(problem.text, problem.level == DiagnosticStatus.ERROR)
 
 
 def import_message(type_name: str) -> type:

@@ -17,7 +17,6 @@ from importlib.util import find_spec
 from itertools import pairwise
 import json
 from pathlib import Path
-import re
 import shlex
 from typing import Any, TYPE_CHECKING
 
@@ -49,10 +48,6 @@ DEFAULTS = Config()
 """Settings of the proposed command."""
 GAP_PERIODS = 3.0
 """A pause longer than this many median periods is a gap."""
-ADVICE = re.compile(
-    r'; (?:set [^;]*?\(boxreg relabel[a-z ]*: |correct [a-z ]+ with )(--[^();]+?)(?:\)| \(node)'
-)
-"""The options in a warning that advises them without a condition."""
 REACHED_PERIODS = 0.55
 """Periods of the clouds by which `reach` takes all boxes between them; derived: half, and 10 %."""
 MAX_SPANS = 500
@@ -362,11 +357,13 @@ def _gaps(stamps: list[int]) -> list[list[float]]:
 
 def _command(args: argparse.Namespace, facts: dict[str, Any], scene: Address | None) -> str:
     """Return the relabel command with the same recordings and topics."""
+    from boxreg_ros.io.checks.finding import ADVISED
+
     first = args.recordings[0]
     out = f'out/{first.stem if scene is None else scene.scene or scene.root.name}'
     words = ['boxreg', 'relabel', *map(str, args.recordings), '-o', out]
     words += words_of(args, Request, *TOPICS)
-    advised = ADVICE.findall('; '.join(facts['warnings']))
+    advised = ADVISED.findall('; '.join(facts['warnings']))
     words += shlex.split(' '.join(dict.fromkeys(advised)))
     if facts['sample']['boxes_without_id'] and '--associate' not in words:
         words.append('--associate')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import NamedTuple
 
 from boxreg_ros.reasons import Reason
@@ -14,3 +15,14 @@ class Finding(NamedTuple):
     """By which the node counts it."""
     text: str
     """What was found and what to do, for people."""
+
+
+ADVISED = re.compile(
+    r'; (?:set [^;]*?\(boxreg relabel[a-z ]*: |correct [a-z ]+ with )(--[^();]+?)(?:\)| \(node)'
+)
+"""The options in a text that advises them without a condition, as `advice` states them."""
+
+
+def advice(name: str, value: object) -> str:
+    """Return how an option is set, for the node and for commands."""
+    return f'set {name}:={value} (boxreg relabel: --{name.replace("_", "-")} {value})'

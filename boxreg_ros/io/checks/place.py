@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from boxreg_ros.io.checks.finding import advice
 from boxreg_ros.io.checks.pose import PairedCheck, POINT_MARGIN, points_around
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, moved_boxes
 from boxreg_ros.rotations import matrix_from_rpy
@@ -210,8 +211,7 @@ class PlaceCheck(PairedCheck):
             how = 'boxes are tilted by what should be their yaw'
         return (
             f'{how}: expected orientation {self._other_order!r}, got '
-            f'{self._convention.orientation!r}; set orientation:={self._other_order} (boxreg '
-            f'relabel: --orientation {self._other_order})'
+            f'{self._convention.orientation!r}; {advice("orientation", self._other_order)}'
         )
 
     @property
@@ -241,9 +241,9 @@ class PlaceCheck(PairedCheck):
         return (
             f'all of {len(self._heights)} boxes have z of {z:g}: expected the heights of their '
             f'objects, got those of a detector in the plane; x, y and yaw are refined, z is right '
-            f'only where {z:g} is the height of their centres: if the ground is there, set '
-            f'pose_reference:=bottom (boxreg relabel: --pose-reference bottom); a pose at another '
-            f'height is a fraction of that of the box, as in --pose-reference=0,0,0.5'
+            f'only where {z:g} is the height of their centres: if the ground is there, '
+            f'{advice("pose_reference", "bottom")}; a pose at another height is a fraction of '
+            f'that of the box, as in --pose-reference=0,0,0.5'
         )
 
     def _size_text(self) -> str:
@@ -256,8 +256,7 @@ class PlaceCheck(PairedCheck):
             f'boxes are about twice as large as the objects in them: in half of '
             f'{len(self._within)}, {np.median(self._within):.0%} of the points or more lie within '
             f'{MAX_FILLED:g} of the extents: expected size_scale {scale}, got '
-            f'{self._convention.size_scale:g}; set size_scale:={scale} (boxreg relabel: '
-            f'--size-scale {scale})'
+            f'{self._convention.size_scale:g}; {advice("size_scale", scale)}'
         )
 
     def _place_text(self) -> str:
@@ -271,7 +270,6 @@ class PlaceCheck(PairedCheck):
             'size_scale': f'{self._convention.size_scale:g}',
             'boxes_frame': 'that of the messages',
         }
-        option = best.option
         instead = ''
         if best.value == 'left_handed':
             instead = (
@@ -282,9 +280,8 @@ class PlaceCheck(PairedCheck):
         return (
             f'boxes do not fit the points: {len(self._own.coverages)} of {len(self._tilts)} have '
             f'points around them, and contain {self._own.mean:.0%} of these; elsewhere '
-            f'{len(best.coverages)} and {best.mean:.0%}: expected {option} {best.value}, got '
-            f'{got[option]}; set {option}:={best.value} (boxreg relabel: '
-            f'--{option.replace("_", "-")} {best.value}){instead}'
+            f'{len(best.coverages)} and {best.mean:.0%}: expected {best.option} {best.value}, got '
+            f'{got[best.option]}; {advice(best.option, best.value)}{instead}'
         )
 
     def _is_better(self, place: _Place) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from boxreg_ros.core.matching import AT_ONCE
+from boxreg_ros.io.checks.finding import advice
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
     BOX_CENTER,
@@ -274,8 +275,7 @@ class PoseCheck(PairedCheck):
                 f'--from recording --to csv writes and boxreg relabel --labels csv:FOLDER reads'
             )
         return (
-            f'{seen}: expected {name} {expected!r}, got {got!r}; set {name}:={expected} (boxreg '
-            f'relabel: --{name.replace("_", "-")} {expected}){instead}'
+            f'{seen}: expected {name} {expected!r}, got {got!r}; {advice(name, expected)}{instead}'
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from boxreg_ros.io.checks.finding import advice
 from boxreg_ros.io.checks.place import ENOUGH_BOXES, MAX_COMPARED
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, BoxArray, finite_points, Floats, Sweep
 import numpy as np
@@ -68,12 +69,11 @@ class UnitCheck:
         is_far = enough and away > MAX_DISTANCES * self._reach
         if length > MAX_LENGTH:
             power = max(2, round(np.log10(length / USUAL_LENGTH)))
-            scale = f'{10.0**-power:g}'
             remedy = (
                 f'divide their extents and positions by {10**power}, where they are made or in a '
                 f'copy of the recording'
                 if is_far
-                else f'set size_scale:={scale} (boxreg relabel: --size-scale {scale})'
+                else advice('size_scale', f'{10.0**-power:g}')
             )
             return (
                 f'boxes: expected extents in metres, got a longest one of {length:.4g} in the '
