@@ -27,7 +27,7 @@ from boxreg_ros.labels import (
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.labels.output import WITH_REJECTED
 from boxreg_ros.labels.recording import config_hash, files_of
-from boxreg_ros.offline.arguments import add_options, values_of
+from boxreg_ros.offline.arguments import add_options, TOPICS, values_of
 from boxreg_ros.offline.notes import left_out_line
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
@@ -44,6 +44,14 @@ COUNTED = (
     *('boxes_without_id', 'boxes_with_repeated_id', 'tilted_boxes'),
 )
 """Numbers of the summary, in their order."""
+DOUBTS = {
+    'invalid_boxes': f'are invalid: {Reason.INVALID_BOX.meaning}',
+    'boxes_without_id': 'have no track id, and each is an object of its own: boxreg relabel '
+    '--associate assigns ids',
+    'boxes_with_repeated_id': 'have the track id of another one of their frame: boxreg relabel '
+    '--associate assigns others',
+}
+"""Words of some of them."""
 ROW_FORMATS = ('csv', 'parquet')
 """Tables with a row per box alone, and no place for a frame without boxes."""
 
@@ -229,16 +237,9 @@ def _read_with_recording(
 
 def _doubts(summary: dict[str, Any], convention: Convention) -> Iterator[str]:
     """Yield what boxes have that their formats need, or that labels do not."""
-    if summary['boxes_without_id']:
-        yield (
-            f'{summary["boxes_without_id"]:,} boxes have no track id, and each is an object of '
-            f'its own: boxreg relabel --associate assigns ids'
-        )
-    if summary['boxes_with_repeated_id']:
-        yield (
-            f'{summary["boxes_with_repeated_id"]:,} boxes have the track id of another one of '
-            f'their frame: boxreg relabel --associate assigns others'
-        )
+    for name, text in DOUBTS.items():
+        if summary[name]:
+            yield f'{summary[name]:,} boxes {text}'
     if summary['tilted_boxes'] >= MIN_TILTED * max(1, summary['boxes']):
         other = 'xyzw' if convention.orientation == 'wxyz' else 'wxyz'
         yield (
@@ -289,11 +290,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--recording', type=Path, action='append', default=[], metavar='RECORDING',
         help='recording of the labels, if the label files lack the sensor poses; repeatable',
     )  # fmt: skip
-    add_options(
-        parser, Request, 'options', 'label_frame', 'lidars', 'odometry', 'tf', 'clock_offset',
-        'fixed_frame', 'pose_reference', 'size_order', 'forward_axis', 'orientation',
-        'size_scale', 'boxes_frame', 'boxes_offset',
-    )  # fmt: skip
+    of_recording = [name for name in TOPICS if name != 'boxes']
+    add_options(parser, Request, 'options', 'label_frame', 'fixed_frame', *of_recording)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -329,10 +327,6 @@ def run(args: argparse.Namespace) -> int:
         parts.append(
             f'{summary["frames_without_boxes"]:,} frames without boxes are not in {rows_alone}, '
             f'which has a row per box'
-        )
-    if summary['invalid_boxes']:
-        parts.append(
-            f'{summary["invalid_boxes"]:,} boxes are invalid: {Reason.INVALID_BOX.meaning}'
         )
     parts += _doubts(summary, request.convention)
     if summary['rejected_boxes']:

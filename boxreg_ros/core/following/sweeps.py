@@ -21,11 +21,8 @@ class Points(Protocol):
         """Return the points of a sweep."""
 
 
-class Times(Protocol):
-    """Times of sweeps."""
-
-    def __getitem__(self, row: int, /) -> float:
-        """Return that of a sweep [s]."""
+Times = Floats | dict[int, float]
+"""Times of sweeps by their rows [s]."""
 
 
 class SightLimits:
