@@ -237,24 +237,24 @@ def observe(
     shapes = shapes_of(sweep, boxes, numbers.margin)
     columns = np.ascontiguousarray(sweep.points.T)
     near = crop_kernels.near_points(columns, shapes)
-    own = OwnPoints(*crop_kernels.own_points(near, shapes, numbers))
-    row, owner, most = own.row, own.owner, config.sampling.points
+    row, owner, road, num_inside = crop_kernels.own_points(near, shapes, numbers)
+    kept, most = (row, owner), config.sampling.points
     if config.objective == 'paper':
-        row, owner = _farthest(own, sweep, n, most)
-    rows, points, counts = crop_kernels.thinned(columns, shapes, row, owner, most)
+        kept = _farthest(row, owner, sweep, n, most)
+    rows, points, counts = crop_kernels.thinned(columns, shapes, *kept, most)
     delays = np.zeros(len(rows), np.float32)
     sights = np.zeros(n)
     if config.sampling.deskew and sweep.times is not None:
         delays = sweep.times[rows].astype(np.float32)
         sights = _medians(delays, counts)
     up = shapes.rotations[:, 2, 2]  # of the z axis of each box, in the fixed frame
-    ground = (own.road - boxes[:, 5] / 2) / up.clip(LEAST_UP)  # along z of the fixed frame
+    ground = (road - boxes[:, 5] / 2) / up.clip(LEAST_UP)  # along z of the fixed frame
     origins = _origins(sweep, rows, counts, boxes[:, :3])
     heights = ring_heights(points, counts, origins)
     if view is not None:
         (origin,), _ = _among_points(sweep, sweep.origin[None])
         is_hidden = view.hidden_tops(
-            sweep, origin, shapes.centers, boxes[:, 3:6], own.row, own.owner, heights
+            sweep, origin, shapes.centers, boxes[:, 3:6], row, owner, heights
         )
         heights[is_hidden] = UNKNOWN_TOP
     return Observations(
@@ -266,7 +266,7 @@ def observe(
         origins=origins,
         ground=ground,
         ring_heights=heights,
-        num_points=own.num_inside,
+        num_points=num_inside,
         sights=sights,
         is_pinned=np.zeros(n, bool),
     )
@@ -309,20 +309,6 @@ def _medians(values: NDArray[np.float32], counts: Ints) -> Floats:
     rows = np.arange(len(counts))
     medians = (ordered[rows, (counts - 1) // 2] + ordered[rows, counts // 2]) / 2
     return np.where(counts > 0, medians, 0.0)
-
-
-class OwnPoints(NamedTuple):
-    """The points that belong to each of n boxes, as P pairs, and the road beside them."""
-
-    row: Ints
-    """(P,), of the point in its sweep."""
-    owner: Ints
-    """(P,), row of the box: ascending, then by the x coordinate of the point."""
-    road: Floats
-    """(n,), height of the road above the bottom of each box, along its z axis [m]; NaN if
-    unknown."""
-    num_inside: Ints
-    """(n,), sweep points inside each box."""
 
 
 def crop_numbers(config: Config) -> crop_kernels.CropNumbers:
@@ -391,17 +377,17 @@ def crop(sweep: Sweep, boxes: Floats, margin: float) -> Crop:
     return Crop(row[order], owner[order], offset[order].T, outside[order].T)
 
 
-def _farthest(own: OwnPoints, sweep: Sweep, n: int, most: int) -> tuple[Ints, Ints]:
+def _farthest(row: Ints, owner: Ints, sweep: Sweep, n: int, most: int) -> tuple[Ints, Ints]:
     """Return those of the pairs of n boxes that are kept for the paper: farthest points; (P,)."""
-    counts = np.bincount(own.owner, minlength=n)
+    counts = np.bincount(owner, minlength=n)
     first = np.cumsum(counts) - counts
-    is_kept = np.ones(len(own.row), bool)
+    is_kept = np.ones(len(row), bool)
     for box in np.flatnonzero(counts > most):
         part = slice(first[box], first[box] + counts[box])
-        picks = farthest_point_sample(sweep.points[own.row[part]].astype(np.float64), most)
+        picks = farthest_point_sample(sweep.points[row[part]].astype(np.float64), most)
         is_kept[part] = False
         is_kept[first[box] + picks] = True
-    return own.row[is_kept], own.owner[is_kept]
+    return row[is_kept], owner[is_kept]
 
 
 def _runs(first: Ints, counts: Ints) -> Ints:
