@@ -9,7 +9,6 @@ that use the originals. A package whose files have not changed since its build i
 """
 
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import redirect_stdout
 from functools import cache
 from hashlib import sha256
 from io import StringIO
@@ -43,8 +42,13 @@ def main() -> None:
         sys.exit(f'no C++ compiler {compiler!r} to build message types with: apt install g++')
     if packages:
         print(f'building message types of {", ".join(p.name for p in packages)} ...', flush=True)
-    with ProcessPoolExecutor() as pool:
+    with ProcessPoolExecutor(initializer=silence) as pool:
         list(pool.map(build, packages, [compiler] * len(packages)))
+
+
+def silence() -> None:
+    """Drop what the generators print; empy demands that the process keeps one stdout."""
+    sys.stdout = StringIO()
 
 
 def stamp(package: Path) -> Path:
@@ -108,12 +112,11 @@ def generate(package: Path, folder: Path) -> None:
     shutil.copytree(package, source)
     (source / 'package.xml').write_text(MANIFEST.format(name))
     included = [str(PREFIX / 'share')]
-    with redirect_stdout(StringIO()):
-        files = [f'{source}:msg/{path.name}' for path in sorted(source.glob('msg/*.msg'))]
-        translator = TranslateMsgToIDL('msg2idl')
-        files = list(translator.translate(name, files, included, folder / 'idl'))
-        for generator in generators:
-            generator.generate(name, files, included, folder / generator.name / name)
+    files = [f'{source}:msg/{path.name}' for path in sorted(source.glob('msg/*.msg'))]
+    translator = TranslateMsgToIDL('msg2idl')
+    files = list(translator.translate(name, files, included, folder / 'idl'))
+    for generator in generators:
+        generator.generate(name, files, included, folder / generator.name / name)
 
 
 def compile_package(package: Path, folder: Path, compiler: str, library: Path) -> None:
