@@ -83,7 +83,7 @@ def test_points_of_two_lidars_are_compared_at_their_own_times(known):
 
 def mean_ious(speed, at_sight, seed):
     """Return the mean 3D IoU of each estimate on a highway at some speed [m/s]."""
-    drive = Drive.from_scene(highway(np.random.default_rng(seed), 25, at_sight, speed))
+    drive = Drive.from_scene(highway(np.random.default_rng(seed), 12, at_sight, speed))
     keys = list(zip(drive.truth.stamps_ns, drive.truth.track_ids, strict=True))
     tables = [drive.registered(Config(estimate=estimate)) for estimate in ('final', 'track')]
     means = {}

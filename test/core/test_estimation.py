@@ -432,7 +432,7 @@ def test_minimum_of_the_default_objective_against_torch():
     for part, again in zip(found, unknown, strict=True):
         np.testing.assert_array_equal(part, again)
     assert (found.value < 0.9 * value).all()
-    for row in range(4):
+    for row in (0, 3):  # a full window, and a padded one
         terms = objective.tensors(sums.terms[row])
         common = objective.tensors(sums.common[row])
 
@@ -475,8 +475,8 @@ def test_minimum_of_the_papers_objective_against_torch():
             (gradient,) = torch.autograd.grad(loss.sum(), x)
             return loss.detach(), gradient
 
-        found = minimize(function, found.x, 100, 10, 1e-9)
-    for row in range(4):
+        found = minimize(function, found.x, 50, 10, 1e-9)
+    for row in (0, 3):  # a full window, and a padded one
         index = torch.tensor([row])
 
         def loss(x, index=index):
@@ -491,7 +491,7 @@ def test_multipliers_reduce_constraint_violations():
     # Smoothness and alignment are constraints: after the rounds they are violated less than at
     # the input, and the objective at the multipliers of the first round is lower.
     problem, x, total = paper_problem()
-    found = solve_paper(problem, PAPER)
+    found = solve_paper(problem, PAPER.updated({'paper.iterations': 20}))
     assert not len(found.left.state)
     assert found.posterior.poses.shape == (*problem.valid.shape, 6, 6)
     rows, none = torch.arange(4), torch.zeros(4, 2, dtype=D)

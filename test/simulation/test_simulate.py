@@ -156,8 +156,8 @@ def test_street_has_parked_turning_and_reversing_cars(street):
 
 def test_articulated_trucks_bend_in_curves():
     """A box around both holds the points of both; the axle of a trailer does not slip."""
-    joined, parts = (simulate(name, 2, 30) for name in ('articulated', 'articulated-parts'))
-    times = np.arange(30) * 0.1
+    joined, parts = (simulate(name, 2, 20) for name in ('articulated', 'articulated-parts'))
+    times = np.arange(20) * 0.1
     boxes = {actor.track_id: boxes_of(actor, actor.motion.at(times)) for actor in parts.actors}
     names = [actor.track_id for actor in joined.actors]
     for name in (actor.track_id for actor in joined.actors if actor.class_name == 'truck'):
