@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import chain, takewhile
 from math import ceil, inf
+from typing import TYPE_CHECKING
 
-from boxreg_ros.config import Config
+from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.field_of_view import FieldOfView
 from boxreg_ros.core.following.stream import FollowedObjects
@@ -27,6 +28,9 @@ from boxreg_ros.errors import ConfigError
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, RefinedBoxes, Sweep, X, Z
 import numpy as np
+
+if TYPE_CHECKING:
+    from boxreg_ros.core.point_labels import ObjectTrack, PointLabeller
 
 GetEstimates = Callable[[], list[Estimate | None]]
 """Waits for the estimates of submitted windows, None for windows that are too short."""
@@ -354,6 +358,27 @@ class BoxRegistrar:
         inputs = self._input_model.inputs(self.config, with_noise=False)
         margins: Floats = settings_of_kinds(self.config)['gaps'] + inputs['margin']
         return margins
+
+    def labeller(
+        self, objects: Sequence[ObjectTrack], array_stamps_ns: Iterable[int]
+    ) -> PointLabeller:
+        """
+        Return what labels points by boxes, with the margins and the time of boxes known so far.
+
+        Parameters
+        ----------
+        objects : sequence of ObjectTrack
+            All that have boxes.
+        array_stamps_ns : iterable of int
+            At which the input has boxes, or states that there are none [ns].
+
+        """
+        from boxreg_ros.core.point_labels import PointLabeller  # few need it
+
+        config = self.box_time.resolved(self.config)
+        margins = self.margins()[[KINDS.index(config.kind(one.class_name)) for one in objects]]
+        stamps_ns = np.array([*array_stamps_ns], np.int64)
+        return PointLabeller(objects, stamps_ns, config, margins.reshape(-1, 6))
 
     def statistics(self, name: str = '') -> Drives:
         """Return what the boxes so far have shown of their detector, by a `name`."""

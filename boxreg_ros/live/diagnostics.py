@@ -31,8 +31,10 @@ EARLY_REFINED = 'early_refined'
 EARLY_BUDGET = 'early_budget'
 EARLY_KEPT = 'early_kept'
 """Counters of early boxes, those of the core are of final ones."""
-LATENCY, STATIC_LATENCY = 'latency', 'static_points latency'
-STATIC_CPU, TICK = 'static_points CPU', 'tick'
+LATENCY, TICK = 'latency', 'tick'
+"""Times until early boxes are published, from the arrival of the boxes, and of all they need."""
+STATIC_LATENCY, STATIC_CPU = 'static_points latency', 'static_points CPU'
+"""Of a cloud without moving objects."""
 LATENCY_QUANTILES = (('median', 0.5), ('p99', 0.99), ('most', 1.0))
 
 
@@ -65,22 +67,12 @@ class Health:
         with self._lock:
             self._core_counts = Counter(counts)
 
-    def add_latency(self, seconds: float, took: float | None = None) -> None:
-        """
-        Record times until the early estimate of boxes is published [s].
-
-        Parameters
-        ----------
-        seconds : float
-            From the arrival of the boxes.
-        took : float or None
-            From the arrival of all that they need; None where nothing was solved.
-
-        """
+    def add_times(self, times: Mapping[str, float | None]) -> None:
+        """Record times by what took them [s]; None where it was nothing."""
         with self._lock:
-            self._times[LATENCY].append(seconds)
-            if took is not None:
-                self._times[TICK].append(took)
+            for what, seconds in times.items():
+                if seconds is not None:
+                    self._times[what].append(seconds)
 
     def add_early(self, refined: RefinedBoxes) -> None:
         """Count early boxes: refined, without time to solve them, and kept for other reasons."""
@@ -90,12 +82,6 @@ class Health:
             self._counts[EARLY_REFINED] += number
             self._counts[EARLY_BUDGET] += late
             self._counts[EARLY_KEPT] += len(refined.status) - number - late
-
-    def add_static(self, seconds: float, cpu: float) -> None:
-        """Record latency and CPU time of a cloud without moving objects [s]."""
-        with self._lock:
-            self._times[STATIC_LATENCY].append(seconds)
-            self._times[STATIC_CPU].append(cpu)
 
     def report(self, reason: Reason, text: str, number: int = 1) -> None:
         """Count a reason and log the text, at most once per `LOG_PERIOD` and reason."""

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from time import thread_time
 from typing import Any, NamedTuple
 
-from boxreg_ros.config import Config, KINDS
-from boxreg_ros.core.point_labels import ObjectTrack, PointLabeller
+from boxreg_ros.core.point_labels import ObjectTrack
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.items import Item
 from boxreg_ros.structures import Floats, is_valid_box, REFINED, RefinedBoxes, Sweep
@@ -127,7 +126,7 @@ class StaticPoints:
     def _label(self, cloud: _Waiting) -> None:
         """Make the messages of a cloud ready without the points of moving objects."""
         begin = thread_time()
-        labeller = self._labeller(self._registrar.box_time.resolved(self._registrar.config))
+        labeller = self._registrar.labeller(self._objects(), self._array_stamps)
         if not labeller.knows(cloud.sweep.stamp_ns):
             self._pass(cloud)
             return
@@ -149,17 +148,11 @@ class StaticPoints:
             begin = thread_time()
             self._ready.append(StaticCloud(edited, cloud.received, False, cpu))
 
-    def _labeller(self, config: Config) -> PointLabeller:
-        """Return a labeller by the boxes of the last seconds."""
-        tracks = []
-        kinds = []
+    def _objects(self) -> list[ObjectTrack]:
+        """Return the objects by their boxes of the last seconds."""
+        found = []
         for track_id, history in self._boxes.items():
-            name = history[-1].class_name
-            stamps_ns = np.array([one.stamp_ns for one in history], np.int64)
-            boxes = np.array([one.box for one in history])
-            is_certain = np.array([one.is_certain for one in history])
-            tracks.append(ObjectTrack(track_id, name, stamps_ns, boxes, is_certain))
-            kinds.append(KINDS.index(config.kind(name)))
-        margins = self._registrar.margins()[kinds].reshape(-1, 6)
-        stamps_ns = np.array(self._array_stamps, np.int64)
-        return PointLabeller(tracks, stamps_ns, config, margins)
+            stamps_ns, names, boxes, are_certain = zip(*history, strict=True)
+            columns = np.array(stamps_ns, np.int64), np.array(boxes), np.array(are_certain)
+            found.append(ObjectTrack(track_id, names[-1], *columns))
+        return found

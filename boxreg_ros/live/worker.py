@@ -20,7 +20,7 @@ from boxreg_ros.io.session import is_placeholder
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.bursts import JOIN_TIME, JoiningAdapter, messages_of
 from boxreg_ros.live.debug_times import DebugTimes
-from boxreg_ros.live.diagnostics import Health
+from boxreg_ros.live.diagnostics import Health, LATENCY, STATIC_CPU, STATIC_LATENCY, TICK
 from boxreg_ros.live.inbox import CloudPatience, Inbox, Message
 from boxreg_ros.live.model_file import ModelFile
 from boxreg_ros.live.outgoing import labels_passed_through, Outgoing
@@ -423,7 +423,7 @@ class Worker:
                 continue
             if out.received is not None:
                 took = self._budget.end()
-                self._health.add_latency(time.monotonic() - out.received, took)
+                self._health.add_times({LATENCY: time.monotonic() - out.received, TICK: took})
                 if self.times is not None and took is not None and out.given is not None:
                     self.times.add(out.given.stamp_ns, took)
             if out.given is not None:
@@ -450,7 +450,8 @@ class Worker:
         for cloud in self._live.static_points.take(time.monotonic()):
             self.static.publish(cloud.message)
             self._health.count('static_published')
-            self._health.add_static(time.monotonic() - cloud.received, cloud.cpu)
+            latency = time.monotonic() - cloud.received
+            self._health.add_times({STATIC_LATENCY: latency, STATIC_CPU: cloud.cpu})
             if cloud.is_late:
                 reason = Reason.STATIC_UNCHANGED
                 self._health.report(reason, f'{reason.meaning}; {reason.remedy}')

@@ -168,18 +168,18 @@ class MainProcess:
         summary: Summary,
     ) -> None:
         """Look for objects without a box, and label the points, by the boxes of all tracks."""
-        from boxreg_ros.offline.point_products import labeller_of, PointProducts  # few need it
+        from boxreg_ros.offline.point_products import object_tracks, PointProducts  # few need it
 
         request, clock, frame = self.request, self.clock, summary.fixed_frame
         tracks = sink.changes.tracks()
         with clock('points'):
-            labeller = labeller_of(tracks, sink.array_stamps_ns, registrar, request.config)
+            labeller = registrar.labeller(object_tracks(tracks), sink.array_stamps_ns)
         if request.proposals:
             with clock('proposals'):
                 summary.proposals = write_proposals(folder, sweeps, labeller, frame)
         if request.needs_point_labels:
             if request.boxes == NO_TOPIC and not tracks:  # nothing states what is there
-                labeller = labeller_of(tracks, (), registrar, request.config)
+                labeller = registrar.labeller((), ())
             with clock('points'):
                 summary.points = PointProducts(folder, request, sweeps, labeller, frame).write()
 

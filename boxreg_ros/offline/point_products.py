@@ -12,10 +12,9 @@ from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 from urllib.parse import quote
 
-from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method.labelling import MOVING
 from boxreg_ros.core.method.voxels import add_new, FREE
 from boxreg_ros.core.point_labels import (
@@ -44,9 +43,6 @@ from boxreg_ros.structures import (
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from boxreg_ros.core.registrar import BoxRegistrar
-
 CLOUDS_FOLDER = 'clouds'
 MAX_NAME = 200
 """Longest name of a file of an object [bytes]; derived: file systems take 255."""
@@ -58,20 +54,6 @@ FIRST_ENTRIES = 2**10
 """Entries of the first table of known voxels; at most half of them are used."""
 RECENT_SWEEPS = 4
 """Sweeps whose labels are kept: the clouds of several LiDARs are not in the order of sweeps."""
-
-
-def labeller_of(
-    tracks: Sequence[TrackChanges],
-    array_stamps_ns: Sequence[int],
-    registrar: BoxRegistrar,
-    config: Config,
-) -> PointLabeller:
-    """Return the labeller of a run, with the labelling margins and box times of its registrar."""
-    objects = object_tracks(tracks)
-    kinds = [KINDS.index(config.kind(one.class_name)) for one in objects]
-    margins = registrar.margins()[kinds].reshape(-1, 6)
-    config = registrar.box_time.resolved(config)
-    return PointLabeller(objects, np.array(array_stamps_ns, np.int64), config, margins)
 
 
 def object_tracks(tracks: Sequence[TrackChanges]) -> list[ObjectTrack]:

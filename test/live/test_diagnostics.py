@@ -1,6 +1,6 @@
 """Counters, levels and log entries of the node."""
 
-from boxreg_ros.live.diagnostics import Health
+from boxreg_ros.live.diagnostics import Health, LATENCY, TICK
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
@@ -27,7 +27,7 @@ def test_level_is_ok_while_boxes_are_refined_and_warn_in_silence():
     health = Health(Log())
     health.count('points_received')
     health.count('boxes_received')
-    health.add_latency(0.05)
+    health.add_times({LATENCY: 0.05})
     status = health.status('node', {'fixed_frame': 'odom'})
     assert status.level == DiagnosticStatus.OK
     values = {item.key: item.value for item in status.values}
@@ -111,7 +111,7 @@ def test_early_boxes_without_time_and_late_ones_are_a_warning(late, took, expect
     health.set_core_counts({'refined': 100})
     health.add_early(early(90 - late, late, 10))
     for one in (took, took, 5.0):  # a single interruption
-        health.add_latency(0.2, one)
+        health.add_times({LATENCY: 0.2, TICK: one})
     status = health.status('node', {}, deadline=0.08)
     assert status.level == (DiagnosticStatus.WARN if expected else DiagnosticStatus.OK)
     assert status.message.startswith(expected or 'refining')
