@@ -15,6 +15,7 @@ from boxreg_ros.core.observation import crop
 from boxreg_ros.core.registrar import BoxRegistrar, Submit
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.session import hand_to_registrar
+from boxreg_ros.io.stamp_join import nearest_rows
 from boxreg_ros.io.sweep_store import SweepStore
 from boxreg_ros.offline.reader import ArrayPlace
 from boxreg_ros.rotations import matrix_from_rpy
@@ -68,9 +69,7 @@ class Arrivals:
         arrays = np.sort(np.array([array.stamp_ns for array in self.arrays], np.int64))
         if len(sweeps) < 2 or not len(arrays):
             return []
-        after = np.searchsorted(arrays, sweeps)
-        nearest = np.stack([arrays[(after - 1).clip(0)], arrays[after.clip(0, len(arrays) - 1)]])
-        away = np.abs(nearest - sweeps).min(0)
+        away = np.abs(arrays[nearest_rows(sweeps, arrays)] - sweeps)
         reach_ns = np.median(np.diff(sweeps)) / 2 if self.reach_ns is None else self.reach_ns
         missing: list[int] = sweeps[away > reach_ns].tolist()
         return missing

@@ -14,7 +14,7 @@ from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.checks.axis import AxisCheck
-from boxreg_ros.io.checks.place import MIN_TILTED, MIN_UPRIGHT
+from boxreg_ros.io.checks.place import MIN_TILTED, MIN_UPRIGHT, other_order, uprightness
 from boxreg_ros.io.fixed_frame import FixedFrameItems, StoredCloud
 from boxreg_ros.io.lidars import SINGLE_LIDAR
 from boxreg_ros.labels import (
@@ -33,9 +33,8 @@ from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
 from boxreg_ros.offline.sources import label_frame_of, scene_address, source_of, writer_options
 from boxreg_ros.reasons import Reason
-from boxreg_ros.structures import BoxArray, is_valid_box, REJECTED, ROLL, Sweep, YAW
+from boxreg_ros.structures import BoxArray, is_valid_box, REJECTED, Sweep
 from msg_adapters.convention import Convention
-import numpy as np
 
 FORMAT_OF_NODE = 'recording'
 """Format of labels that are messages of a recording, which also has the clouds and poses."""
@@ -110,8 +109,8 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             named = list(filter(None, boxes.track_ids))
             counts['boxes_without_id'] += len(boxes.track_ids) - len(named)
             counts['boxes_with_repeated_id'] += len(named) - len(set(named))
-            tilts = np.cos(boxes.boxes[is_valid_box(boxes.boxes), ROLL:YAW]).prod(axis=1)
-            counts['tilted_boxes'] += int((tilts < MIN_UPRIGHT).sum())
+            upright = uprightness(boxes.boxes[is_valid_box(boxes.boxes)])
+            counts['tilted_boxes'] += int((upright < MIN_UPRIGHT).sum())
             if not counts['boxes_with_repeated_id']:  # whose way is that of several objects
                 axes.add(boxes)
             counts['rejected_boxes'] += frame.refined.status.count(REJECTED)
@@ -241,7 +240,7 @@ def _doubts(summary: dict[str, Any], convention: Convention) -> Iterator[str]:
         if summary[name]:
             yield f'{summary[name]:,} boxes {text}'
     if summary['tilted_boxes'] >= MIN_TILTED * max(1, summary['boxes']):
-        other = 'xyzw' if convention.orientation == 'wxyz' else 'wxyz'
+        other = other_order(convention)
         yield (
             f'{summary["tilted_boxes"]:,} boxes lie on their sides or backs: if w of their '
             f'quaternions comes {"last" if other == "xyzw" else "first"}, set --orientation '

@@ -13,7 +13,7 @@ from boxreg_ros.core.method.constants import CONSTANTS, Constants
 from boxreg_ros.core.method.follow_numbers import FOLLOW
 from boxreg_ros.core.method.noise import LEAST_RATIO, MAD_TO_DEVIATION
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL
+from boxreg_ros.structures import Floats, Ints, LENGTH, on_lines, ROLL
 import numpy as np
 
 POSITION, ANGLE = 0.03, np.radians(1.0)
@@ -104,7 +104,6 @@ def moved(stamps_ns: Ints, boxes: Floats, at_ns: Ints, steps: Floats) -> Floats:
     found = boxes.copy()
     if not steps.any():
         return found
-    for column, values in enumerate(steps.T):
-        found[:, column] += np.interp(stamps_ns - at_ns[0], at_ns - at_ns[0], values)
+    found += on_lines(at_ns - at_ns[0], steps, stamps_ns - at_ns[0])
     found[:, ROLL:] = wrap_angle(found[:, ROLL:])
     return found

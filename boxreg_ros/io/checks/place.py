@@ -114,6 +114,7 @@ class PlaceCheck(PairedCheck):
         scale = 2 * convention.size_scale
         mirrored = replace(convention, orientation='left_handed')
         doubled = replace(convention, size_scale=scale)
+        self._other_order = other_order(convention)
         self._own = _Place('', '')
         self._others = {
             'mirrored': _Place('orientation', 'left_handed', mirrored),
@@ -170,10 +171,10 @@ class PlaceCheck(PairedCheck):
         kept = BoxArray(0, '', ('',) * count, ('',) * count, np.ones(count), boxes)
         raw = self._convention.from_centers(kept)
         other = replace(self._convention, orientation=self._other_order).to_centers(raw).boxes
-        self._tilts += np.cos([boxes[:, ROLL:YAW], other[:, ROLL:YAW]]).prod(axis=2).T.tolist()
+        self._tilts += np.transpose([uprightness(boxes), uprightness(other)]).tolist()
         T = self._frames.pop('')
         own = moved_boxes(boxes, T)
-        self._stands += np.cos(own[:, ROLL:YAW]).prod(axis=1).tolist()
+        self._stands += uprightness(own).tolist()
         _add_coverages(self._own, points, own)
         self._within += [share for box in own if (share := _share_within(points, box)) is not None]
         self._heights += raw.boxes[:, BOX_CENTER][:, 2].tolist()
@@ -184,11 +185,6 @@ class PlaceCheck(PairedCheck):
         for name, T_fixed_frame in self._frames.items():
             place = self._others.setdefault(f'frame {name}', _Place('boxes_frame', name))
             _add_coverages(place, points, moved_boxes(boxes, T_fixed_frame))
-
-    @property
-    def _other_order(self) -> str:
-        """Return the orientation that takes w of quaternions from the other end."""
-        return 'xyzw' if self._convention.orientation == 'wxyz' else 'wxyz'
 
     def _tilt_text(self) -> str:
         """
@@ -292,6 +288,16 @@ class PlaceCheck(PairedCheck):
         if place.option == 'size_scale' and place.mean < MIN_RATIO_OF_SIZES * own.mean:
             return False
         return place.total >= MIN_RATIO_OF_COVERAGE * own.total
+
+
+def uprightness(boxes: Floats) -> Floats:
+    """Return the cosine of the tilt of boxes (n, 9), (n,)."""
+    return np.asarray(np.cos(boxes[:, ROLL:YAW]).prod(axis=1))
+
+
+def other_order(convention: Convention) -> str:
+    """Return the orientation that takes w of quaternions from the other end."""
+    return 'xyzw' if convention.orientation == 'wxyz' else 'wxyz'
 
 
 def _share_within(points: NDArray[np.floating], box: Floats) -> float | None:
