@@ -138,7 +138,7 @@ class MotionTimeCheck(PairedCheck):
         if len(self._begins) > MAX_BEGINS:
             self._begins.clear()
         rows = []
-        is_known = is_valid_box(boxes.boxes) & np.array([bool(name) for name in boxes.track_ids])
+        is_known = is_valid_box(boxes.boxes) & np.array([*map(bool, boxes.track_ids)], bool)
         for row in np.flatnonzero(is_known).tolist():
             center = boxes.boxes[row, BOX_CENTER]
             now = boxes.stamp_ns, center
