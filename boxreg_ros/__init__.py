@@ -42,23 +42,19 @@ __all__ = [
 
 # The import of torch takes seconds: these names are imported at their first use.
 _MODULES = {
-    'BoxArray': 'boxreg_ros.structures',
-    'BoxRegistrar': 'boxreg_ros.core.registrar',
-    'FollowedTrack': 'boxreg_ros.core.follow',
-    'RefinedBoxes': 'boxreg_ros.structures',
-    'RefinedTrack': 'boxreg_ros.core.refine',
-    'Sweep': 'boxreg_ros.structures',
-    'Track': 'boxreg_ros.core.refine',
-    'follow': 'boxreg_ros.core.follow',
-    'refine': 'boxreg_ros.core.refine',
+    'structures': ('BoxArray', 'RefinedBoxes', 'Sweep'),
+    'core.registrar': ('BoxRegistrar',),
+    'core.follow': ('FollowedTrack', 'follow'),
+    'core.refine': ('RefinedTrack', 'Track', 'refine'),
 }
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name at its first use."""
-    if name not in _MODULES:
+    module = next((module for module, names in _MODULES.items() if name in names), '')
+    if not module:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    value = getattr(import_module(_MODULES[name]), name)
+    value = getattr(import_module(f'boxreg_ros.{module}'), name)
     globals()[name] = value
     return value
 
