@@ -92,7 +92,8 @@ def to_msg(
         if o.shape.type == CYLINDER and np.isfinite(box).all():
             diameter = float(box[LENGTH : WIDTH + 1].mean())
             size = poses.replaced(size, x=diameter, y=diameter)
-        is_flipped = bool(poses.forward_of(given_pose) @ poses.forward_of(pose) < 0)
+        before, after = (poses.forward_of(poses.quaternion_of(p)) for p in (given_pose, pose))
+        is_flipped = bool(before @ after < 0)
         kinematics = _with_pose(o.kinematics, pose, covariance, T_out_in, is_flipped)
         if own_motion is not None:
             kinematics = _with_motion(kinematics, own_motion[i : i + 1])

@@ -65,6 +65,8 @@ PACKETS = {
     'seyond/msg/SeyondScan': 'start.py of seyond with replay_rosbag:=true',
 }
 """Types of the packets of a LiDAR -> what converts them to points."""
+LONG = ('i8', 'u8')
+"""Kinds of numbers that a cloud cannot have."""
 LIVOX_FIELDS = {'x': 'f4', 'y': 'f4', 'z': 'f4', 'reflectivity': 'u1', 'offset_time': 'u4'}
 """Fields of Livox's ``CustomPoint`` that are read; ``offset_time`` is in ns."""
 
@@ -98,13 +100,13 @@ def plain(msg: Any) -> Any:
             return _cloudini_cloud(header, bytes(bytes_of(msg.data)))
         if msg.format != 'draco':
             raise _unknown_format('CompressedPointCloud', msg.format, ('draco', CLOUDINI))
-        return _cloud_of_columns(header, _draco_columns(bytes(bytes_of(msg.data))))
+        return cloud_of_columns(header, _draco_columns(bytes(bytes_of(msg.data))))
     if hasattr(msg, 'point_num'):
         columns = [
             (name, np.array([getattr(point, name) for point in msg.points], kind))
             for name, kind in LIVOX_FIELDS.items()
         ]
-        return _cloud_of_columns(msg.header, columns)
+        return cloud_of_columns(msg.header, columns)
     return msg
 
 
@@ -270,9 +272,7 @@ def _draco_columns(data: bytes) -> list[tuple[str, NDArray[Any]]]:
             own = ['x', 'y', 'z']
         for name, column in zip(own, columns, strict=True):
             _check_exact(name, attribute['is_rounded'])
-            # A cloud has no 64-bit integers; as a double, a time of today is exact to 256 ns.
-            is_long = column.dtype.kind in 'iu' and column.dtype.itemsize > 4
-            found.append((name, column.astype(np.float64) if is_long else column))
+            found.append((name, column))
     return found
 
 
@@ -345,9 +345,17 @@ def _check_exact(name: str, is_rounded: bool) -> None:
         )
 
 
-def _cloud_of_columns(header: Any, columns: Sequence[tuple[str, NDArray[Any]]]) -> Any:
-    """Return columns (M,) by name as a cloud of one row."""
-    kinds = [(name, values.dtype.newbyteorder('<')) for name, values in columns]
+def cloud_of_columns(header: Any, columns: Sequence[tuple[str, NDArray[Any]]]) -> Any:
+    """
+    Return columns (M,) by name as a cloud of one row; its type has no integers of 64 bits.
+
+    They become doubles, to which a time of today is exact to 256 ns.
+
+    """
+    kinds = [
+        (name, np.dtype('<f8' if values.dtype.str[1:] in LONG else values.dtype.newbyteorder('<')))
+        for name, values in columns
+    ]
     table = np.zeros(len(columns[0][1]) if columns else 0, np.dtype(kinds))
     fields = []
     offset = 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from boxreg_ros.errors import UnsupportedMessage
@@ -69,13 +69,9 @@ def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
     if not msg.width * msg.height:
         _check_empty(msg)
         return Sweep(stamp, msg.header.frame_id, np.zeros((0, 3), np.float32))
-    fields = _fields(msg)
-    kinds = _kinds(fields)
+    kinds = _kinds(_fields(msg))
     time_field = point_layout.time_field_of(kinds)
-    names = ['x', 'y', 'z']
-    if time_field:
-        names.append(time_field)
-    table = _table(msg, [fields[name] for name in names])
+    table = _table(msg, [*'xyz', time_field] if time_field else 'xyz')
 
     dtype = np.result_type(np.float32, *(table.dtype[name] for name in 'xyz'))
     columns = np.empty((3, table.size), dtype.newbyteorder('='))  # contiguous per coordinate
@@ -126,7 +122,7 @@ def described(msg: Any, time_unit: str = AUTO) -> str:
     time_field = point_layout.time_field_of(kinds)
     if not time_field:
         return f'{name}: no times of the points'
-    raw = _table(msg, [fields[time_field]])[time_field].ravel()
+    raw = _table(msg, [time_field])[time_field].ravel()
     raw = raw[np.isfinite(raw)]
     reading = (
         point_layout.reading_of(raw, stamp_ns(msg.header), layout, time_unit) if raw.size else None
@@ -167,7 +163,7 @@ def finite_rows(msg: Any) -> Ints | None:
     """
     if not msg.width * msg.height:
         return None
-    is_finite = _is_finite(_table(msg, list(map(_fields(msg).__getitem__, 'xyz'))))
+    is_finite = _is_finite(_table(msg, 'xyz'))
     return None if is_finite.all() else np.flatnonzero(is_finite)
 
 
@@ -191,8 +187,7 @@ def positions(msg: Any) -> Floats:
         If x, y and z cannot be read, as in `from_msg`.
 
     """
-    fields = _fields(msg)
-    table = _table(msg, [fields[key] for key in 'xyz'])
+    table = _table(msg, 'xyz')
     return np.column_stack([table[key].reshape(-1).astype(np.float64) for key in 'xyz'])
 
 
@@ -223,7 +218,7 @@ def intensities(msg: Any) -> Floats | None:
     name = next((name for name in INTENSITY_FIELDS if name in fields), None)
     if name is None:
         return None
-    table = _table(msg, [fields[key] for key in (*'xyz', name)])
+    table = _table(msg, [*'xyz', name])
     values = table[name].reshape(-1)[_is_finite(table)].astype(np.float64)
     return np.nan_to_num(values, posinf=0, neginf=0)
 
@@ -259,8 +254,7 @@ def byte_order(msg: Any) -> Literal['<', '>']:
         As `from_msg`.
 
     """
-    fields = _fields(msg)
-    table = _rows(msg, [fields[key] for key in 'xyz'])
+    table = _rows(msg, 'xyz')
     stated: Literal['<', '>'] = '>' if msg.is_bigendian else '<'
     other: Literal['<', '>'] = '<' if msg.is_bigendian else '>'
     if _likely_share(table.view(table.dtype.newbyteorder(stated))) >= 0.5:
@@ -291,21 +285,23 @@ def _is_finite(table: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(np.logical_and.reduce(columns))
 
 
-def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
+def _table(msg: Any, names: Sequence[str]) -> NDArray[Any]:
     """Return a structured view (height, width) of the raw bytes, with these fields only."""
-    rows = _rows(msg, fields)
+    rows = _rows(msg, names)
     return rows.view(rows.dtype.newbyteorder(byte_order(msg)))
 
 
-def _rows(msg: Any, fields: list[Any]) -> NDArray[Any]:
+def _rows(msg: Any, names: Sequence[str]) -> NDArray[Any]:
     """Return the same as if the byte order were that of this machine."""
+    known = _fields(msg)
+    fields = [known[name] for name in names]
     data = np.frombuffer(bytes_of(msg.data), np.uint8)
     row_step = _checked_row_step(msg, len(data))
     for field in fields:
         _check_field(field, msg.point_step)
     layout = np.dtype(
         {
-            'names': [field.name for field in fields],
+            'names': list(names),
             'formats': [DTYPES[field.datatype] for field in fields],
             'offsets': [field.offset for field in fields],
             'itemsize': msg.point_step,

@@ -242,10 +242,14 @@ def with_frame(header: Any, frame_id: str) -> Any:
     return replaced(header, frame_id=frame_id)
 
 
+def with_xyz(vector: Any, xyz: Iterable[float]) -> Any:
+    """Return a copy of a vector or point with other coordinates."""
+    return replaced(vector, **dict(zip('xyz', map(float, xyz), strict=True)))
+
+
 def with_position(pose: Any, position: Sequence[float]) -> Any:
     """Return a copy of a pose with another position."""
-    x, y, z = map(float, position)
-    return replaced(pose, position=replaced(pose.position, x=x, y=y, z=z))
+    return replaced(pose, position=with_xyz(pose.position, position))
 
 
 def with_orientation(pose: Any, quaternion_xyzw: Sequence[float]) -> Any:
@@ -281,7 +285,7 @@ def with_box(pose: Any, size: Any, box: Floats, quaternion_xyzw: Floats) -> tupl
     if np.isfinite(box[BOX_EXTENT]).all():
         extent = box[BOX_EXTENT].tolist()
         if hasattr(size, 'x'):
-            size = replaced(size, **dict(zip('xyz', extent, strict=True)))
+            size = with_xyz(size, extent)
         else:
             size = copy(size)
             for axis, value in enumerate(extent):
@@ -346,8 +350,7 @@ def rotated(vector: Any, T_out_in: Floats | None) -> Any:
     """Return a ``Vector3`` of the input frame in the output frame."""
     if T_out_in is None:
         return vector
-    x, y, z = T_out_in[:3, :3] @ [vector.x, vector.y, vector.z]
-    return replaced(vector, x=float(x), y=float(y), z=float(z))
+    return with_xyz(vector, T_out_in[:3, :3] @ [vector.x, vector.y, vector.z])
 
 
 def moved_polygon(polygon: Any, T_out_in: Floats | None) -> Any:
@@ -369,12 +372,9 @@ def moved_polygon(polygon: Any, T_out_in: Floats | None) -> Any:
     """
     if T_out_in is None:
         return polygon
-    points = [T_out_in[:3, :3] @ [p.x, p.y, p.z] + T_out_in[:3, 3] for p in polygon.points]
-    moved_points = [
-        replaced(p, **dict(zip('xyz', xyz.tolist(), strict=True)))
-        for p, xyz in zip(polygon.points, points, strict=True)
-    ]
-    return replaced(polygon, points=moved_points)
+    R, t = T_out_in[:3, :3], T_out_in[:3, 3]
+    points = [with_xyz(p, R @ [p.x, p.y, p.z] + t) for p in polygon.points]
+    return replaced(polygon, points=points)
 
 
 def rotated_motion(motion: Any, name: str, T_out_in: Floats | None) -> Any:
@@ -447,11 +447,8 @@ def _with_motion_numbers(motion: Any, name: str, numbers: Floats) -> Any:
     if hasattr(motion, 'covariance'):
         inner = _with_motion_numbers(getattr(motion, name), name, numbers[:6])
         return replaced(motion, **{name: inner, 'covariance': numbers[6:]})
-    parts = {}
-    for part, values in (('linear', numbers[:3]), ('angular', numbers[3:])):
-        xyz = dict(zip('xyz', values.tolist(), strict=True))
-        parts[part] = replaced(getattr(motion, part), **xyz)
-    return replaced(motion, **parts)
+    linear = with_xyz(motion.linear, numbers[:3])
+    return replaced(motion, linear=linear, angular=with_xyz(motion.angular, numbers[3:]))
 
 
 def with_kinematics(own: Floats, kinematics: NDArray[np.void] | None, name: str) -> Floats:
@@ -541,9 +538,9 @@ def moved(pose: Any, T_out_in: Floats | None) -> Any:
     return with_orientation(pose, quaternion_from_matrix(R @ matrix_from_quaternion(q)).tolist())
 
 
-def forward_of(pose: Any) -> Floats:
-    """Return the x axis (3,) of a pose."""
-    x, y, z, w = quaternion_of(pose)
+def forward_of(quaternion_xyzw: Sequence[Any] | Floats) -> Floats:
+    """Return the x axes (3, ...) of orientations (4, ...)."""
+    x, y, z, w = quaternion_xyzw
     return np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)])
 
 

@@ -47,6 +47,12 @@ DETECTED_TYPE = MessageType(
         'footprint, scaled with the box'
     ),
 )
+OBJECT_TYPE = MessageType(
+    'msg_adapters.derived',
+    track_id='`id`',
+    class_and_score='`classification`, `classification_certainty`',
+    also_written='twist and acceleration; objects that are not a BOX only change their frame',
+)
 MESSAGE_TYPES = {
     'vision_msgs/msg/Detection3DArray': MessageType(
         'msg_adapters.vision',
@@ -61,20 +67,9 @@ MESSAGE_TYPES = {
     'autoware_auto_perception_msgs/msg/TrackedObjects': TRACKED_TYPE,
     'autoware_auto_perception_msgs/msg/PredictedObjects': PREDICTED_TYPE,
     'autoware_auto_perception_msgs/msg/DetectedObjects': DETECTED_TYPE,
-    'derived_object_msgs/msg/ObjectArray': MessageType(
-        'msg_adapters.derived',
-        track_id='`id`',
-        class_and_score='`classification`, `classification_certainty`',
-        also_written='twist and acceleration; objects that are not a BOX only change their frame',
-    ),
-    'derived_object_msgs/msg/ObjectWithCovarianceArray': MessageType(
-        'msg_adapters.derived',
-        track_id='`id`',
-        class_and_score='`classification`, `classification_certainty`',
-        also_written=(
-            'covariance, twist and acceleration; objects that are not a BOX only change their '
-            'frame'
-        ),
+    'derived_object_msgs/msg/ObjectArray': OBJECT_TYPE,
+    'derived_object_msgs/msg/ObjectWithCovarianceArray': replace(
+        OBJECT_TYPE, also_written=f'covariance, {OBJECT_TYPE.also_written}'
     ),
     'foxglove_msgs/msg/SceneUpdate': MessageType(
         'msg_adapters.foxglove',

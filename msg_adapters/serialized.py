@@ -379,7 +379,8 @@ def _write_footprints_and_motion(fields: Fields, rewrite: Rewrite, *motions: str
     corners = fields.numbers(FOOTPRINT + '.x', '<f4', 3)
     scaled = corners * np.repeat(scale, fields.counts(FOOTPRINT), axis=0)
     fields.put(FOOTPRINT + '.x', scaled.astype('<f4'))
-    is_flipped = (_forward(rewrite.old_pose) * _forward(rewrite.new_pose)).sum(1) < 0
+    old, new = (poses.forward_of(p[:, 3:].T) for p in (rewrite.old_pose, rewrite.new_pose))
+    is_flipped = (old * new).sum(0) < 0
     signs = np.concatenate([HALF_TURN_SIGNS, np.outer(HALF_TURN_SIGNS, HALF_TURN_SIGNS).ravel()])
     known = poses.kinematics_of_axes(rewrite.boxes)
     for path, name in zip(motions, poses.MOTION_AXES, strict=False):
@@ -400,12 +401,6 @@ def _write_detected(fields: Fields, rewrite: Rewrite) -> None:
     has_velocity = rewrite.boxes.known_kinematics['has_velocity']
     has_twist = fields.numbers(HAS_TWIST, '|u1', 2)
     fields.put(HAS_TWIST, has_twist | has_velocity[:, None].astype('|u1'))
-
-
-def _forward(pose: Floats) -> Floats:
-    """Return the x axes (n, 3) of poses (n, 7)."""
-    x, y, z, w = pose[:, 3:].T
-    return np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
 
 
 # ---------------------------------------------------------------- derived_object_msgs
