@@ -48,18 +48,16 @@ class Camera:
     """Width and height of the image [px]."""
 
     @classmethod
-    def read(cls, path: Path | None, needed_by: str = 'this format') -> Camera:
+    def read(cls, path: Path) -> Camera:
         """
         Read a calibration file of KITTI, or YAML with the keys of ``camera_info`` of ROS.
 
         Parameters
         ----------
-        path : Path or None
+        path : Path
             YAML, if its name ends in ``.yaml`` or ``.yml``, holds ``projection_matrix``,
             ``T_camera_sensor`` (12 or 16 numbers, row by row) and optionally
             ``rectification_matrix``, ``image_width`` and ``image_height``.
-        needed_by : str
-            What needs the camera, for the error without a path.
 
         Returns
         -------
@@ -69,13 +67,9 @@ class Camera:
         Raises
         ------
         ConfigError
-            If `path` is None or cannot be read, or a part is missing or has the wrong size.
+            If `path` cannot be read, or a part is missing or has the wrong size.
 
         """
-        if path is None:
-            raise ConfigError(
-                f'{needed_by} needs the calibration of a camera; give it with --camera FILE'
-            )
         try:
             text = path.read_text(encoding='utf-8')
             is_yaml = path.suffix.lower() in ('.yaml', '.yml')

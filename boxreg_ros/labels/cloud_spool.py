@@ -52,46 +52,34 @@ class Spool:
         own = Sweep(stamp_ns, sweep.frame_id, sweep.points, sweep.times)
         self._file(stamp_ns).write_bytes(pickle.dumps((own, T_fixed_sweep, intensities), 5))
 
-    def take(
-        self, stamp_ns: int, frame_id: str, T_fixed_frame: Floats
-    ) -> tuple[Sweep | None, Floats | None]:
+    def with_cloud(self, frame: LabelFrame) -> LabelFrame:
         """
-        Return the cloud nearest to a stamp, and delete the clouds that are too old for it.
+        Return a frame with the cloud nearest to its stamp, and delete those too old for it.
 
         Parameters
         ----------
-        stamp_ns : int
-            Of a box array [ns]; not smaller than in the call before.
-        frame_id : str
-            Frame that the points are returned in.
-        T_fixed_frame : array, shape (4, 4)
-            Pose of that frame at `stamp_ns`.
+        frame : LabelFrame
+            Of a stamp that is not smaller than in the call before.
 
         Returns
         -------
-        sweep : Sweep or None
-            With its own stamp; None if no sweep lies within the maximum time offset.
-        intensities : array, shape (M,), or None
-            As they were added; None without them or without a sweep.
+        frame : LabelFrame
+            Itself if the pose of its sensor is not known, or no cloud lies within the maximum time
+            offset. The cloud keeps its own stamp, and is in the frame of the sensor at that of
+            the boxes.
 
         """
+        if frame.T_fixed_sensor is None:
+            return frame
+        stamp_ns = frame.refined.boxes.stamp_ns
         self._delete_before(stamp_ns)
         nearest = min(self._stamps, key=lambda stamp: abs(stamp - stamp_ns), default=None)
         if nearest is None or abs(nearest - stamp_ns) > self._max_offset_ns:
-            return None, None
-        sweep, T_fixed_sweep, intensities = pickle.loads(self._file(nearest).read_bytes())
-        if (nearest, sweep.frame_id) != (stamp_ns, frame_id):
-            T_frame_sweep = inverse(T_fixed_frame) @ T_fixed_sweep
-            sweep = sweep_to_frame(sweep, T_frame_sweep, frame_id).in_frame()
-        return sweep, intensities
-
-    def with_cloud(self, frame: LabelFrame) -> LabelFrame:
-        """Return a frame with the cloud nearest to its stamp; as it is where there is none."""
-        T_fixed_sensor = frame.T_fixed_sensor
-        if T_fixed_sensor is None:
             return frame
-        stamp_ns = frame.refined.boxes.stamp_ns
-        sweep, intensities = self.take(stamp_ns, frame.sensor_frame, T_fixed_sensor)
+        sweep, T_fixed_sweep, intensities = pickle.loads(self._file(nearest).read_bytes())
+        if (nearest, sweep.frame_id) != (stamp_ns, frame.sensor_frame):
+            T_frame_sweep = inverse(frame.T_fixed_sensor) @ T_fixed_sweep
+            sweep = sweep_to_frame(sweep, T_frame_sweep, frame.sensor_frame).in_frame()
         return replace(frame, sweep=sweep, intensities=intensities)
 
     def remove(self) -> None:

@@ -85,13 +85,9 @@ def write_cloud(
 def _header(suffix: str, names: list[str], points: int) -> str:
     """Return the header of a cloud of `points` points; BIN files have none."""
     if suffix == '.pcd':
-        n = len(names)
+        sizes, types, counts = (' '.join(word * len(names)) for word in '4F1')
         return PCD_HEADER.format(
-            names=' '.join(names),
-            sizes=' '.join(['4'] * n),
-            types=' '.join(['F'] * n),
-            counts=' '.join(['1'] * n),
-            points=points,
+            names=' '.join(names), sizes=sizes, types=types, counts=counts, points=points
         )
     if suffix == '.ply':
         properties = '\n'.join(f'property float {name}' for name in names)

@@ -20,7 +20,7 @@ from boxreg_ros.io.covariance_table import POSE_TRIANGLE
 from boxreg_ros.labels.files import following, require_single
 from boxreg_ros.labels.folder import FolderWriter, frame_name
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame
-from boxreg_ros.labels.records import evidence_of, ReadBox
+from boxreg_ros.labels.records import evidence_of, FrameBoxes, NO_FRAME_BOXES
 from boxreg_ros.labels.sidecar import read_sidecar, STAMPS_FILE
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, ROLL
@@ -31,16 +31,10 @@ EVIDENCE_KEY = 'boxreg'
 """Key of the evidence that is written beside a box; the tools ignore it."""
 UNKNOWN_CLASS = 'unknown'
 """Class name of boxes without one, for tools that require a name."""
-FrameBoxes = tuple[list[ReadBox], Mapping[str, int]]
-"""Boxes of a frame, and the number of those left out by reason."""
-NO_FRAME_BOXES: FrameBoxes = ([], {})
-
-
 CUBOID_FORMAT = Format(
     name='',
     title='',
     frame='sensor',
-    reference='centre',
     sizes='length width height (x y z)',
     rotation='angles x y z, R = Rx Ry Rz',
     files='',

@@ -27,7 +27,7 @@ from boxreg_ros.labels.cameras import LabelCamera
 from boxreg_ros.labels.cuboids import EVIDENCE_KEY
 from boxreg_ros.labels.files import at, following, from_json, JsonList, require_single, visible
 from boxreg_ros.labels.protocol import absolute, LabelFrame
-from boxreg_ros.labels.records import ReadBox, TrackNumbers
+from boxreg_ros.labels.records import FrameBoxes, ReadBox, TrackNumbers
 from boxreg_ros.labels.sidecar import named_frames
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import INTERPOLATED
@@ -184,7 +184,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         label_category = content.get('categories', {}).get('label', {})
         labels = [str(label['name'] or '') for label in label_category.get('labels', ())]
         is_swapped = bool(content.get('infos', {}).get(SWAPPED_KEY))
-        items: dict[str, cuboids.FrameBoxes] = {}
+        items: dict[str, FrameBoxes] = {}
         numbers: dict[str, int] = {}
         for item in sorted(content['items'], key=_order):
             name = str(item['id'])
@@ -203,7 +203,7 @@ def _order(item: dict[str, Any]) -> tuple[int, str]:
 
 def _cuboids(
     annotations: Sequence[dict[str, Any]], labels: list[str], is_swapped: bool
-) -> cuboids.FrameBoxes:
+) -> FrameBoxes:
     """Return the cuboids among the annotations of an item, and the number without a box."""
     found: list[ReadBox] = []
     outside = 0

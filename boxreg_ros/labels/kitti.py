@@ -25,7 +25,7 @@ from boxreg_ros.labels.protocol import (
     LabelFrame,
     SceneFrames,
 )
-from boxreg_ros.labels.records import ReadBox, require_radians, TrackNumbers
+from boxreg_ros.labels.records import FrameBoxes, ReadBox, require_radians, TrackNumbers
 from boxreg_ros.labels.sidecar import numbered_frames, numbered_scene
 from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import wrap_angle
@@ -211,9 +211,9 @@ def read(path: Path) -> Iterator[LabelFrame]:
         found = visible(path, 'label_02/*.txt')
         path = require_single(found, path, 'sequence, label_02/NAME.txt')
     folder = absolute(path).parent.parent
-    lines, left_out = _read_lines(path)
+    lines = _read_lines(path)
     camera = Camera.read(folder / 'calib' / path.name)
-    yield from numbered_frames(folder, _placed(path, lines, camera), left_out)
+    yield from numbered_frames(folder, _placed(path, lines, camera))
 
 
 def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
@@ -242,13 +242,13 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """
     if path.is_dir():
         path = _file_of_sequence(path, scene.name)
-    lines, left_out = _read_lines(path)
+    lines = _read_lines(path)
     if scene.camera is None:
         raise RecordingError(
             f'{path}: expected the calibration of a camera, which the scene {scene.name!r} '
             f'lacks; read it with a scene of kitti-tracking'
         )
-    yield from numbered_scene(path, _placed(path, lines, scene.camera), left_out, scene)
+    yield from numbered_scene(path, _placed(path, lines, scene.camera), scene)
 
 
 def _file_of_sequence(folder: Path, name: str) -> Path:
@@ -262,14 +262,14 @@ def _file_of_sequence(folder: Path, name: str) -> Path:
     )
 
 
-Lines = dict[int, list[ReadBox]]
-"""Boxes by frame: of a line height, width, length, x, y, z and rotation_y, or placed (9,)."""
+def _read_lines(path: Path) -> dict[int, FrameBoxes]:
+    """
+    Return the lines of each frame of a label file, in their order, and the number of its regions.
 
+    The numbers of a line are height, width, length, x, y, z and rotation_y.
 
-def _read_lines(path: Path) -> tuple[Lines, dict[int, Counter[str]]]:
-    """Return the lines of a label file, in their order, and the regions in each frame."""
-    lines: Lines = {}
-    left_out: dict[int, Counter[str]] = {}
+    """
+    frames: dict[int, tuple[list[ReadBox], Counter[str]]] = {}
     with following(path, '17 or 18 columns of KITTI tracking'):
         for number, text in enumerate(path.read_text(encoding='utf-8').splitlines(), 1):
             words = text.split()
@@ -280,28 +280,27 @@ def _read_lines(path: Path) -> tuple[Lines, dict[int, Counter[str]]]:
                     raise ValueError(
                         f'got {len(words)} columns{OTHER_COLUMNS.get(len(words), "")}'
                     )
-                frame = int(words[0])
+                boxes, left_out = frames.setdefault(int(words[0]), ([], Counter()))
                 numbers = [float(word) for word in words[10:17]]
                 if words[2] == IGNORED_CLASS and numbers[0] <= 0:
-                    left_out.setdefault(frame, Counter())[Reason.NO_BOX] += 1
+                    left_out[Reason.NO_BOX] += 1
                     continue
                 score = float(words[17]) if len(words) > 17 else np.nan
                 evidence = {'score': score, 'attributes': attributes_of(*words[3:5])}
-                box = ReadBox(words[1], words[2], numbers, evidence)
-                lines.setdefault(frame, []).append(box)
-    return lines, left_out
+                boxes.append(ReadBox(words[1], words[2], numbers, evidence))
+    return {**frames}
 
 
-def _placed(path: Path, lines: Lines, camera: Camera) -> Lines:
+def _placed(path: Path, lines: Mapping[int, FrameBoxes], camera: Camera) -> dict[int, FrameBoxes]:
     """Return the boxes of lines in the LiDAR frame; tracks have the names beside the file."""
     about = read_provenance(absolute(path).parent.parent)
     tracks, given = {NO_TRACK: ''} | about.get('tracks', {}), about.get('given_classes', {})
     status = noted_status(about)
-    found: Lines = {}
-    for frame, items in lines.items():
+    found: dict[int, FrameBoxes] = {}
+    for frame, (items, left_out) in lines.items():
         with following(path, 'rotations in radians'):
-            boxes = boxes_of(camera, np.array([item.box for item in items]))
-        found[frame] = [
+            boxes = boxes_of(camera, np.reshape([item.box for item in items], (-1, 7)))
+        placed = [
             item._replace(
                 track_id=tracks.get(item.track_id, item.track_id),
                 class_name=given.get(f'{item.track_id} {item.class_name}', item.class_name),
@@ -310,6 +309,7 @@ def _placed(path: Path, lines: Lines, camera: Camera) -> Lines:
             )
             for item, box in zip(items, boxes, strict=True)
         ]
+        found[frame] = placed, left_out
     return found
 
 

@@ -105,7 +105,7 @@ class KittiCamera:
                 f'{self._needed_by}: expected --camera TOPIC, whose images --with-images writes, '
                 f'got the file {str(path)!r}; leave one of them out'
             )
-        return Camera.read(path, self._needed_by)
+        return Camera.read(path)
 
     def _take(self, found: LabelCamera | None, sensor_frame: str) -> Camera:
         """Use a camera of the recording, and return its calibration."""

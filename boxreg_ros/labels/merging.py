@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.items import Item
@@ -19,6 +19,7 @@ LONGEST_DRIVE_NS = 24 * 3600 * 10**9
 """The same where only a part of the recording is read [ns]; chosen: a day."""
 
 
+@dataclass(eq=False, repr=False)
 class LabelMerger:
     """
     Yield the boxes of a stamp after the sweep of that stamp, or the next one.
@@ -34,29 +35,26 @@ class LabelMerger:
 
     """
 
-    def __init__(
-        self,
-        frames: Iterator[LabelFrame],
-        tree: TransformTree,
-        sensor_frame: str,
-        start_ns: int,
-        is_part: bool,
-        keyframes: bool,
-    ) -> None:
+    frames: Iterator[LabelFrame]
+    tree: TransformTree
+    sensor_frame: str
+    start_ns: int
+    is_part: bool
+    keyframes: bool
+
+    def __post_init__(self) -> None:
+        """Read the first frame."""
         self.outside = 0
         self.left_out: Counter[str] = Counter()
         self.notes: list[str] = []
-        labels = (frame.labels() for frame in frames)
-        self._frames = keyframes_of(labels) if keyframes else labels
+        labels = (frame.labels() for frame in self.frames)
+        self._frames = keyframes_of(labels) if self.keyframes else labels
         self._next = next(self._frames, None)
-        self._tree = tree
-        self._sensor_frame = sensor_frame
-        self._received_ns = start_ns
-        self._is_part = is_part
+        self._received_ns = self.start_ns
         self._first_ns: int | None = None
         self._newest_ns = 0
         self._labelled_ns: tuple[int, int] | None = None  # of the first and the newest label
-        self._longest_ns = LONGEST_DRIVE_NS if is_part else LARGEST_LAG_NS
+        self._longest_ns = LONGEST_DRIVE_NS if self.is_part else LARGEST_LAG_NS
 
     def after(self, received_ns: int, stamp_ns: int) -> Iterator[Item]:
         """
@@ -85,7 +83,7 @@ class LabelMerger:
         if self._first_ns is None:
             self._first_ns = self._newest_ns
         while self._next is not None and _stamp(self._next) <= self._newest_ns:
-            yield from self._take(self._is_part and _stamp(self._next) < self._first_ns)
+            yield from self._take(self.is_part and _stamp(self._next) < self._first_ns)
         if self._next is None and self._labelled_ns is not None:
             self._check(self._first_ns - self._labelled_ns[1])
 
@@ -95,7 +93,7 @@ class LabelMerger:
             self._labelled_ns = _stamp(self._next), _stamp(self._next)
             self._check(self._labelled_ns[0] - self._newest_ns)
         while self._next is not None:
-            yield from self._take(self._is_part)
+            yield from self._take(self.is_part)
 
     def _take(self, is_outside: bool) -> Iterator[Item]:
         """Yield the next boxes, or count them as outside, and go on to those after them."""
@@ -110,7 +108,7 @@ class LabelMerger:
         if is_outside:
             self.outside += len(frame.refined.status)
         else:
-            yield _item(frame, self._received_ns, self._tree, self._sensor_frame)
+            yield _item(frame, self._received_ns, self.tree, self.sensor_frame)
         self._next = next(self._frames, None)
 
     def _check(self, apart_ns: int) -> None:

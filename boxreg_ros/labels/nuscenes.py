@@ -42,7 +42,6 @@ FORMAT = Format(
     name='nuscenes',
     title='nuScenes',
     frame='fixed (global)',
-    reference='centre',
     sizes='width length height',
     rotation='quaternion w x y z',
     files='v1.0-boxreg/, samples/, maps/',
@@ -511,23 +510,31 @@ def _boxes_of(items: list[dict[str, Any]]) -> Floats:
 
 def _poses(tables: Path) -> dict[str, Floats]:
     """Return the global pose (4, 4) of the LiDAR by sample; none where there are several."""
-    sensors = files.from_json(tables / 'sensor.json')
-    lidars = {sensor['token'] for sensor in sensors if sensor['modality'] == 'lidar'}
-    mounts = {
-        item['token']: (item['sensor_token'], pose_matrix(item))
-        for item in files.from_json(tables / 'calibrated_sensor.json')
-        if item['sensor_token'] in lidars
-    }
+    mounts = lidar_mounts(tables)
     ego_poses = {item['token']: item for item in files.from_json(tables / 'ego_pose.json')}
     poses = {}
     used = set()
     for item in files.from_json(tables / 'sample_data.json'):
         if item['is_key_frame'] and item['calibrated_sensor_token'] in mounts:
-            sensor, T_ego_lidar = mounts[item['calibrated_sensor_token']]
-            used.add(sensor)
+            channel, T_ego_lidar = mounts[item['calibrated_sensor_token']]
+            used.add(channel)
             T_global_ego = pose_matrix(_row_of(ego_poses, item['ego_pose_token'], 'ego_pose'))
             poses[item['sample_token']] = T_global_ego @ T_ego_lidar
     return poses if len(used) == 1 else {}
+
+
+def lidar_mounts(tables: Path) -> dict[str, tuple[str, Floats]]:
+    """Return channel and pose (4, 4) in the vehicle of each LiDAR by its calibration's token."""
+    channels = {
+        row['token']: row['channel']
+        for row in files.from_json(tables / 'sensor.json')
+        if row['modality'] == 'lidar'
+    }
+    return {
+        row['token']: (channels[row['sensor_token']], pose_matrix(row))
+        for row in files.from_json(tables / 'calibrated_sensor.json')
+        if row['sensor_token'] in channels
+    }
 
 
 def pose_matrix(item: dict[str, Any]) -> Floats:

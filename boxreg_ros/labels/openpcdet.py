@@ -25,7 +25,6 @@ FORMAT = Format(
     name='openpcdet',
     title='OpenPCDet custom data',
     frame='sensor',
-    reference='centre',
     sizes='length width height (dx dy dz)',
     rotation='heading about z; roll and pitch are lost',
     files='labels/STAMP.txt, points/STAMP.npy, ImageSets/',

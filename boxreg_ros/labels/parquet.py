@@ -21,7 +21,7 @@ from boxreg_ros.io.box_table import COLUMNS
 from boxreg_ros.labels.arrow import read_table, Table
 from boxreg_ros.labels.files import to_json
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.records import finite_or_none, numbers_of, refined_boxes
+from boxreg_ros.labels.records import finite_or_none, numbers_of, ReadBox, refined_of
 from boxreg_ros.rotations import boxes_from_quaternions
 import numpy as np
 
@@ -29,8 +29,6 @@ FORMAT = Format(
     name='parquet',
     title='Parquet',
     frame='fixed, named in each row',
-    reference='centre',
-    sizes='length width height',
     rotation='quaternion x y z w',
     files='boxes.parquet',
     packages=('pyarrow',),
@@ -100,17 +98,14 @@ def read(path: Path) -> Iterator[LabelFrame]:
         items = list(group)
         # score, x y z, qx qy qz qw, length width height
         numbers = np.array([[item[name] for name in COLUMNS[4:15]] for item in items], np.float64)
-        refined = refined_boxes(
-            stamp_ns,
-            frame_id,
-            [item['track_id'] for item in items],
-            [item['class_name'] for item in items],
-            boxes_from_quaternions(numbers[:, 1:4], numbers[:, 8:], numbers[:, 4:8]),
-            items,
-        )
+        boxes = boxes_from_quaternions(numbers[:, 1:4], numbers[:, 8:], numbers[:, 4:8])
+        found = [
+            ReadBox(item['track_id'], item['class_name'], box, item)
+            for item, box in zip(items, boxes, strict=True)
+        ]
         T = items[0].get('T_fixed_sensor')
         yield LabelFrame(
-            refined,
+            refined_of(stamp_ns, frame_id, found),
             items[0].get('fixed_frame') or frame_id,
             items[0].get('sensor_frame') or '',
             None if T is None else np.array(T).reshape(4, 4),

@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from boxreg_ros.labels.cuboids import FrameBoxes, NO_FRAME_BOXES, read_frames
+from boxreg_ros.labels.cuboids import read_frames
 from boxreg_ros.labels.files import at, following, from_json, write_json
 from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import LabelFrame
-from boxreg_ros.labels.records import evidence_of, ReadBox
+from boxreg_ros.labels.records import evidence_of, FrameBoxes, NO_FRAME_BOXES, ReadBox
 from boxreg_ros.labels.sidecar import named_frames
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, Ints

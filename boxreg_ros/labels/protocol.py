@@ -38,7 +38,7 @@ NOT_OF_A_PERSON = (*ADDED, AUTOMATIC_STATUS)
 """Status of boxes that are no keyframes; labelling tools interpolate, as we do."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Format:
     """The conventions of a format, as ``boxreg formats`` prints them."""
 
@@ -48,9 +48,9 @@ class Format:
     """In prose."""
     frame: str
     """Of the boxes."""
-    reference: str
-    """Point of the box at its position, for example its centre."""
-    sizes: str
+    reference: str = 'centre'
+    """Point of the box at its position."""
+    sizes: str = 'length width height'
     """Order of the extents."""
     rotation: str
     """Parameters of the orientation, and the angles that are lost."""

@@ -28,8 +28,6 @@ FORMAT = Format(
     name='recording',
     title='Recording of the live node (refined_labels, else refined_boxes_final)',
     frame='fixed; of the message without refined_labels',
-    reference='centre',
-    sizes='length width height',
     rotation='roll pitch yaw; of the message type without refined_labels',
     files='none: `ros2 bag record` writes it',
 )

@@ -29,6 +29,11 @@ class ReadBox(NamedTuple):
     evidence: Mapping[str, Any] = {}
 
 
+FrameBoxes = tuple[list[ReadBox], Mapping[str, int]]
+"""Boxes of a frame, and the number of those left out by `Reason`."""
+NO_FRAME_BOXES: FrameBoxes = ([], {})
+
+
 def refined_of(stamp_ns: int, frame_id: str, items: Sequence[ReadBox]) -> RefinedBoxes:
     """Return the boxes of one stamp [ns]; see `refined_boxes`."""
     columns = zip(*items, strict=True) if items else [()] * len(ReadBox._fields)

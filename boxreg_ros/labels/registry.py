@@ -106,11 +106,10 @@ def check_options(names: Sequence[str], options: Options) -> None:
     for name in names:
         if 'class_map' in module_of(name).FORMAT.options:
             ClassNames(name, options.class_map)  # raises for other names
-        camera = options.camera
+        camera = options.camera if 'camera' in module_of(name).FORMAT.options else None
         # Without a file it is that of the recording, which is not open yet.
-        is_file = camera is not None and (camera.is_file() or not str(camera).startswith('/'))
-        if is_file and 'camera' in module_of(name).FORMAT.options:
-            Camera.read(camera, f'format {name}')
+        if camera is not None and (camera.is_file() or not str(camera).startswith('/')):
+            Camera.read(camera)  # raises if it cannot be read
 
 
 def _formats_with(option: str) -> list[str]:

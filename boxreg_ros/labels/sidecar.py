@@ -17,7 +17,7 @@ import re
 from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.labels.files import following, frame_names
 from boxreg_ros.labels.protocol import LabelFrame, SceneFrames
-from boxreg_ros.labels.records import ReadBox, refined_of
+from boxreg_ros.labels.records import FrameBoxes, NO_FRAME_BOXES, ReadBox, refined_of
 from boxreg_ros.labels.stamps import stamps_ns, stamps_of_names
 from boxreg_ros.structures import Floats
 import numpy as np
@@ -107,8 +107,7 @@ def read_sidecar(
 
 def numbered_frames(
     folder: Path,
-    boxes_by_frame: Mapping[int, Sequence[ReadBox]],
-    left_out: Mapping[int, Mapping[str, int]],
+    frames: Mapping[int, FrameBoxes],
     stamps: Path | None = None,
     names: Sequence[str] = (),
 ) -> Iterator[LabelFrame]:
@@ -119,10 +118,8 @@ def numbered_frames(
     ----------
     folder : Path
         Of the sidecar files.
-    boxes_by_frame : mapping of int to sequence of ReadBox
-        By the number of the frame, from 0; in the sensor frame [m, rad].
-    left_out : mapping of int to mapping of str to int
-        Number of boxes that are not read, by frame and `Reason`.
+    frames : mapping of int to FrameBoxes
+        By the number of the frame, from 0; boxes in the sensor frame [m, rad].
     stamps : Path, optional
         File of the stamps, instead of that of the folder.
     names : sequence of str
@@ -139,17 +136,13 @@ def numbered_frames(
         If the sidecar files are missing, do not follow their format, or have too few frames.
 
     """
-    count = 1 + max((*boxes_by_frame, *left_out), default=-1)
-    sidecar = read_sidecar(folder, count, stamps, names)
+    sidecar = read_sidecar(folder, 1 + max(frames, default=-1), stamps, names)
     for index in range(len(sidecar.stamps_ns)):
-        yield sidecar.frame(index, boxes_by_frame.get(index, ()), left_out.get(index, {}))
+        yield sidecar.frame(index, *frames.get(index, NO_FRAME_BOXES))
 
 
 def numbered_scene(
-    path: Path,
-    boxes_by_frame: Mapping[int, Sequence[ReadBox]],
-    left_out: Mapping[int, Mapping[str, int]],
-    scene: SceneFrames,
+    path: Path, frames: Mapping[int, FrameBoxes], scene: SceneFrames
 ) -> Iterator[LabelFrame]:
     """
     Yield the frames of a scene of a data set whose labels have the number of their frame.
@@ -158,10 +151,8 @@ def numbered_scene(
     ----------
     path : Path
         The label file, for the error.
-    boxes_by_frame : mapping of int to sequence of ReadBox
-        By the number of the frame; in the sensor frame of the scene [m, rad].
-    left_out : mapping of int to mapping of str to int
-        Number of boxes that are not read, by frame and `Reason`.
+    frames : mapping of int to FrameBoxes
+        By the number of the frame; boxes in the sensor frame of the scene [m, rad].
     scene : SceneFrames
         Its `stamps_ns` are by the number of the frame, as text.
 
@@ -176,17 +167,17 @@ def numbered_scene(
         If there are boxes of a frame that the scene does not have.
 
     """
-    unknown = [number for number in boxes_by_frame if str(number) not in scene.stamps_ns]
+    known = scene.stamps_ns
+    unknown = [number for number in frames if str(number) not in known and frames[number][0]]
     if unknown:
         raise RecordingError(
-            f'{path}: expected frames 0 to {len(scene.stamps_ns) - 1} of {scene.name}, got frame '
+            f'{path}: expected frames 0 to {len(known) - 1} of {scene.name}, got frame '
             f'{max(unknown)}; name the labels of this drive'
         )
-    for number, stamp_ns in scene.stamps_ns.items():
-        boxes = boxes_by_frame.get(int(number), ())
+    for number, stamp_ns in known.items():
+        boxes, left_out = frames.get(int(number), NO_FRAME_BOXES)
         refined = refined_of(stamp_ns, scene.sensor_frame, boxes)
-        counts = dict(left_out.get(int(number), {}))
-        yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame, left_out=counts)
+        yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame, left_out=dict(left_out))
 
 
 def whole_stamps(path: Path, count: int = 0, names: Sequence[str] = ()) -> list[int]:
@@ -353,12 +344,8 @@ def read_poses(path: Path, count: int) -> list[Floats | None]:
     """
     if not path.exists() or not count:
         return [None] * count
-    try:
+    with following(path, 'twelve numbers a line'):
         rows = np.loadtxt(path, ndmin=2).reshape(-1, 3, 4)  # (frame, row, column)
-    except OSError as error:
-        raise RecordingError(unreadable(path, error)) from None
-    except ValueError as error:
-        raise RecordingError(f'{path}: expected twelve numbers a line: {error}') from None
     if len(rows) != count:
         raise RecordingError(f'{path}: expected {count} poses, one per stamp, got {len(rows)}')
     last_row = np.array([[0.0, 0.0, 0.0, 1.0]])

@@ -22,7 +22,7 @@ from boxreg_ros.labels.protocol import (
     INPUT_STATUS,
     LabelFrame,
 )
-from boxreg_ros.labels.records import ReadBox
+from boxreg_ros.labels.records import FrameBoxes, ReadBox
 from boxreg_ros.labels.sidecar import named_frames
 from boxreg_ros.structures import INTERPOLATED
 
@@ -91,7 +91,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
     """
 
-    def boxes_of(name: str) -> cuboids.FrameBoxes:
+    def boxes_of(name: str) -> FrameBoxes:
         file = path / 'label' / f'{name}.json'
         content = from_json(file)
         with following(file, 'boxes of SUSTechPOINTS'):

@@ -250,15 +250,14 @@ def read(path: Path) -> Iterator[LabelFrame]:
     raw_stamps = path.parent / 'velodyne_points' / 'timestamps.txt'
     stamps = raw_stamps if raw_stamps.exists() else None
     names = _frame_names(path.parent / NAMES_FILE)
-    frames = numbered_frames(path.parent, content.boxes, content.left_out, stamps, names)
-    yield from content.noted(frames)
+    yield from content.noted(numbered_frames(path.parent, content.frames, stamps, names))
 
 
 def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
     """Yield the frames of a drive, by the stamps of the data set."""
     path = _file_of(path)
     content = _read_file(path)
-    yield from content.noted(numbered_scene(path, content.boxes, content.left_out, scene))
+    yield from content.noted(numbered_scene(path, content.frames, scene))
 
 
 def _file_of(path: Path) -> Path:
@@ -281,24 +280,19 @@ CVAT = _Convention(('w', 'h', 'l'), True, 'CVAT')
 
 
 class _Content(NamedTuple):
-    """The boxes of a file, and the number of those left out by reason, by index of the frame."""
+    """The boxes of a file by index of the frame, and what was assumed of it."""
 
-    boxes: dict[int, list[ReadBox]]
-    left_out: dict[int, Counter[str]]
+    frames: dict[int, tuple[list[ReadBox], Counter[str]]]
     note: str
 
     def with_status(self, status: Mapping[tuple[str, int], str]) -> _Content:
         """Return it with the status of some boxes, by track and index of the frame."""
-        boxes = {
-            index: [
-                one._replace(evidence={**one.evidence, 'status': status[one.track_id, index]})
-                if (one.track_id, index) in status
-                else one
-                for one in found
-            ]
-            for index, found in self.boxes.items()
-        }
-        return self._replace(boxes=boxes)
+        for index, (found, _) in self.frames.items():
+            for row, one in enumerate(found):
+                known = status.get((one.track_id, index))
+                if known is not None:
+                    found[row] = one._replace(evidence={**one.evidence, 'status': known})
+        return self
 
     def noted(self, frames: Iterator[LabelFrame]) -> Iterator[LabelFrame]:
         """Yield frames, the first with the note."""
@@ -373,7 +367,7 @@ def _content(root: ElementTree.Element, convention: _Convention, is_own: bool = 
             f'along x, y and z, and the position is the centre; as KITTI defines them, most '
             f'objects would be longest upwards or sideways'
         )
-    content = _Content({}, {}, note)
+    content = _Content({}, note)
     status_of = _kitti_status
     if not is_own and convention.is_centre:
         poses = [pose for item in items for pose in item.findall('poses/item')]
@@ -397,17 +391,17 @@ def _add(
     extent = [_number(item, tag) for tag in convention.tags]
     first_frame = int(_number(item, 'first_frame'))
     for index, pose in enumerate(item.findall('poses/item'), first_frame):
+        boxes, left_out = content.frames.setdefault(index, ([], Counter()))
         status = status_of(pose)
         if status is None:
-            content.left_out.setdefault(index, Counter())[Reason.NO_BOX] += 1
+            left_out[Reason.NO_BOX] += 1
             continue
         values = [_number(pose, tag) for tag in POSE_TAGS]
         box = np.array([*values[:3], *extent, *values[3:]])
         if not convention.is_centre:
             box[BOX_CENTER] = _shifted_centres(box[None], extent[2] / 2)[0]
         evidence = {'status': status, 'attributes': _attributes(pose)}
-        read_box = ReadBox(track_id, class_name, box, evidence)
-        content.boxes.setdefault(index, []).append(read_box)
+        boxes.append(ReadBox(track_id, class_name, box, evidence))
 
 
 def _kitti_status(pose: ElementTree.Element) -> str | None:
@@ -435,20 +429,22 @@ def _attributes(pose: ElementTree.Element) -> dict[str, str]:
     """Return the attributes of a pose: its flags, and those that Datumaro adds."""
     flags = [_text(pose, tag) for tag in ('truncation', 'occlusion')]
     numbers = [str(NAMED_FLAGS.get(flag.rpartition('.')[2], flag or '-1')) for flag in flags]
-    found = attributes_of(*numbers)
-    for attribute in pose.findall('attributes/attribute'):
-        name, value = (attribute.findtext(tag) or '' for tag in ('name', 'value'))
-        if name not in ('keyframe', OCCLUDED, 'track_id', 'outside'):
-            found |= attributes_from({name: value})
-    return found
+    others = attributes_from(_own_attributes(pose), ('keyframe', OCCLUDED, 'track_id', 'outside'))
+    return attributes_of(*numbers) | others
 
 
 def _keyframe(pose: ElementTree.Element) -> bool:
     """Return whether a pose of Datumaro is marked as a keyframe."""
-    for attribute in pose.findall('attributes/attribute'):
-        if attribute.findtext('name') == 'keyframe':
-            return _text(attribute, 'value').lower() == 'true'
-    return _text(pose, 'occlusion_kf') == '1'
+    stated = _own_attributes(pose).get('keyframe')
+    return (
+        _text(pose, 'occlusion_kf') == '1' if stated is None else stated.strip().lower() == 'true'
+    )
+
+
+def _own_attributes(pose: ElementTree.Element) -> dict[str, str]:
+    """Return the attributes that Datumaro adds to a pose, by name."""
+    found = pose.findall('attributes/attribute')
+    return {one.findtext('name') or '': one.findtext('value') or '' for one in found}
 
 
 def _track_id(item: ElementTree.Element, default: str) -> str:

@@ -25,7 +25,7 @@ from boxreg_ros.labels.protocol import (
     INPUT_STATUS,
     LabelFrame,
 )
-from boxreg_ros.labels.records import ReadBox
+from boxreg_ros.labels.records import FrameBoxes, ReadBox
 from boxreg_ros.labels.sidecar import named_frames
 from boxreg_ros.reasons import Reason
 
@@ -124,7 +124,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     sources = [one.source for found in results.values() for one in found if one.boxes]
     source = _source(path, Counter(sources), part)
 
-    def boxes_of(name: str) -> cuboids.FrameBoxes:
+    def boxes_of(name: str) -> FrameBoxes:
         boxes: list[ReadBox] = []
         left_out: Counter[str] = Counter()
         for result in results.get(name, ()):
