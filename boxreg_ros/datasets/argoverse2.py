@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from boxreg_ros.datasets.files import finite_cloud, missing_sweep, require, require_lidar
+from boxreg_ros.datasets.files import missing_sweep, require
 from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.labels import frames_of, SceneFrames
@@ -36,7 +36,7 @@ DATASET = Dataset(
     scene='LOG',
     labels='argoverse2',
     remedy='download the whole log',
-    lidar='lidar',
+    lidars=('lidar',),
     packages=('pyarrow',),
     reads='sweeps, poses, annotations',
     leaves_out='cameras, maps',
@@ -56,13 +56,12 @@ def scene_names(root: Path) -> list[str]:
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
     """Return the files and folders of a log."""
     log = _logs(root)[name]
-    paths = [log / part for part in (FEATHER_FILE, EGO_POSES_FILE, SENSOR_POSES_FILE)]
-    return (log / 'sensors' / DATASET.lidar, *(path for path in paths if path.is_file()))
+    files = (FEATHER_FILE, EGO_POSES_FILE, SENSOR_POSES_FILE)
+    return (log / 'sensors' / DATASET.lidar, *(log / name for name in files))
 
 
 def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a log; see `protocol.DatasetModule`."""
-    require_lidar(lidars, [DATASET.lidar], DATASET.lidar)
     log = _logs(root)[name]
     clouds = require(log / 'sensors' / DATASET.lidar, 'the sweeps', DATASET.remedy)
     stamps_ns = sorted(int(path.stem) for path in visible(clouds, '*.feather'))
@@ -112,7 +111,8 @@ def _cloud(path: Path, origins: Floats) -> Cloud:
     sensors = None
     if len(origins) > 1:
         sensors = (lasers >= LASERS_EACH).astype(np.uint8)
-    return finite_cloud(points, columns['intensity'].astype(np.float64), times, origins, sensors)
+    intensities = columns['intensity'].astype(np.float64)
+    return Cloud(points, intensities, times, origins, sensors).finite()
 
 
 def _origins(path: Path) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +14,7 @@ from boxreg_ros.labels.clouds import BIN_COLUMNS, read_pcd, SUFFIXES
 from boxreg_ros.rotations import matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix
 from boxreg_ros.structures import Floats, Ints, on_lines
 from msg_adapters import pointcloud
+from msg_adapters.clouds import cloud_of_columns
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,30 +75,12 @@ def _read_pcd_cloud(path: Path, stamp_ns: int) -> Cloud:
     return Cloud(sweep.points, intensities, sweep.times)
 
 
-def _as_message(table: NDArray[Any], stamp_ns: int) -> SimpleNamespace:
+def _as_message(table: NDArray[Any], stamp_ns: int) -> Any:
     """Return the points of a PCD file (M,) with the attributes of a PointCloud2."""
-    kinds = {}
-    for name in table.dtype.names or ():
-        kind = table.dtype[name]
-        if not kind.shape:
-            # PointCloud2 has no integers of 64 bits; absolute times in them keep 0.3 us.
-            kinds[name] = '<f8' if kind.kind in 'iu' and kind.itemsize == 8 else kind.str
-    packed = np.zeros(len(table), list(kinds.items()))
-    for name in kinds:
-        packed[name] = table[name]
-    offsets: Mapping[str, Any] = packed.dtype.fields or {}
-    fields = [
-        SimpleNamespace(
-            name=name, offset=offsets[name][1], datatype=pointcloud.NUMBERS[kind[1:]], count=1
-        )
-        for name, kind in kinds.items()
-    ]
+    names = [name for name in table.dtype.names or () if not table.dtype[name].shape]
     stamp = SimpleNamespace(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    return SimpleNamespace(
-        header=SimpleNamespace(stamp=stamp, frame_id=''), height=1, width=len(packed),
-        fields=fields, is_bigendian=False, point_step=packed.dtype.itemsize,
-        row_step=packed.nbytes, data=packed.tobytes(),
-    )  # fmt: skip
+    header = SimpleNamespace(stamp=stamp, frame_id='')
+    return cloud_of_columns(header, [(name, table[name]) for name in names])
 
 
 def read_bin(path: Path, columns: int) -> Cloud:
@@ -127,47 +110,7 @@ def read_bin(path: Path, columns: int) -> Cloud:
             f'download it again'
         )
     rows = numbers.reshape(-1, columns)
-    return finite_cloud(rows[:, :3], rows[:, 3].astype(np.float64))
-
-
-def finite_cloud(
-    points: np.ndarray,
-    intensities: Floats | None = None,
-    times: Floats | None = None,
-    origins: Floats | None = None,
-    sensors: NDArray[np.uint8] | None = None,
-) -> Cloud:
-    """
-    Return a cloud without the points that are not finite.
-
-    Parameters
-    ----------
-    points : array, shape (M, 3)
-        In the frame of the clouds of the scene [m].
-    intensities : array, shape (M,), or None
-        In the unit of the data set.
-    times : array, shape (M,), or None
-        Of measurement relative to the stamp [s].
-    origins : array, shape (K, 3), or None
-        Positions of the sensors [m]; None for one at the origin of the frame.
-    sensors : array of uint8, shape (M,), or None
-        Row of `origins` of each point; None for one sensor.
-
-    Returns
-    -------
-    cloud : Cloud
-        The same arrays, not copied, if all points are finite.
-
-    """
-    is_finite = np.isfinite(points).all(axis=1)
-    if not is_finite.all():
-        points = points[is_finite]
-        intensities = None if intensities is None else intensities[is_finite]
-        times = None if times is None else times[is_finite]
-        sensors = None if sensors is None else sensors[is_finite]
-    return Cloud(
-        points, intensities, times, np.zeros((1, 3)) if origins is None else origins, sensors
-    )
+    return Cloud(rows[:, :3], rows[:, 3].astype(np.float64)).finite()
 
 
 def at_stamp(
@@ -222,32 +165,29 @@ def require(path: Path, what: str, remedy: str) -> Path:
     return path
 
 
-def require_lidars(asked: Sequence[str], names: Sequence[str], main: str = '') -> list[str]:
+def require_lidars(asked: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
     """
     Return the LiDARs to read.
 
     Parameters
     ----------
     asked : sequence of str
-        Names that are asked for; none for the default.
+        Names that are asked for; none for the only one.
     names : sequence of str
         Those of the data set or scene.
-    main : str
-        The default; if empty, it is the only one of `names`.
 
     Returns
     -------
-    lidars : list of str
-        One or more of `names`, in the order in which they are asked for.
+    lidars : tuple of str
+        One or more of `names`, each once, in the order in which they are asked for.
 
     Raises
     ------
     RecordingError
-        If a name is none of `names`, or none is asked for and there is no default.
+        If a name is none of `names`, or none is asked for and there are several.
 
     """
-    default = [main] if main else list(names)[: len(names) == 1]
-    found = list(asked) or default
+    found = tuple(dict.fromkeys(asked or names[: len(names) == 1]))
     unknown = [name for name in found if name not in names]
     if found and not unknown:
         return found
@@ -257,21 +197,7 @@ def require_lidars(asked: Sequence[str], names: Sequence[str], main: str = '') -
     )
 
 
-def require_lidar(asked: Sequence[str], names: Sequence[str], main: str = '') -> str:
-    """Return the only LiDAR as `require_lidars`; RecordingError if several are asked for."""
-    found = require_lidars(asked, names, main)
-    if len(found) > 1:
-        raise RecordingError(
-            f'points: expected one of the LiDARs {", ".join(names)}, got {", ".join(found)}; '
-            f'leave out all but one --points'
-        )
-    return found[0]
-
-
-def pose_rows(transforms: Sequence[Floats]) -> Floats:
+def pose_rows(transforms: Sequence[Floats] | Floats) -> Floats:
     """Return poses x y z qx qy qz qw, shape (P, 7), of P matrices (4, 4)."""
-    poses = np.zeros((len(transforms), 7))
-    for pose, T in zip(poses, transforms, strict=True):
-        pose[:3] = T[:3, 3]
-        pose[3:] = quaternion_from_matrix(T[:3, :3])
-    return poses
+    T = np.reshape(transforms, (-1, 4, 4))
+    return np.hstack([T[:, :3, 3], quaternion_from_matrix(T[:, :3, :3])])

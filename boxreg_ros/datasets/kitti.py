@@ -14,9 +14,10 @@ from pathlib import Path
 
 from boxreg_ros.datasets.files import pose_rows, read_bin, require
 from boxreg_ros.datasets.protocol import Cloud, SweepFile
-from boxreg_ros.errors import RecordingError, unreadable, UnsupportedMessage
+from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.transforms import inverse
 from boxreg_ros.labels.clouds import BIN_COLUMNS
+from boxreg_ros.labels.files import following
 from boxreg_ros.labels.sidecar import POSES_FILE, read_poses, STAMPS_FILE, whole_stamps
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, Ints
@@ -47,12 +48,8 @@ def oxts_rows(path: Path) -> Floats:
         If the file cannot be read, or has other lines.
 
     """
-    try:
+    with following(path, f'{OXTS_COLUMNS} numbers a line'):
         rows = np.loadtxt(path, ndmin=2)
-    except OSError as error:
-        raise RecordingError(unreadable(path, error)) from None
-    except ValueError as error:
-        raise RecordingError(f'{path}: expected {OXTS_COLUMNS} numbers a line: {error}') from None
     if rows.shape[1] != OXTS_COLUMNS or not np.isfinite(rows[:, :6]).all():
         raise RecordingError(
             f'{path}: expected {OXTS_COLUMNS} numbers a line, got {rows.shape[1]}, or NaN; '
@@ -85,7 +82,7 @@ def oxts_poses(rows: Floats, T_velo_imu: Floats) -> Floats:
     T_map_imu = np.tile(np.eye(4), (len(rows), 1, 1))  # (n, row, column)
     T_map_imu[:, :3, :3] = matrix_from_rpy(rows[:, 3:6])
     T_map_imu[:, :3, 3] = positions - positions[0]
-    return pose_rows(list(T_map_imu @ inverse(T_velo_imu)))
+    return pose_rows(T_map_imu @ inverse(T_velo_imu))
 
 
 def exported_poses(folder: Path, count: int) -> tuple[Ints, Floats] | None:

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from boxreg_ros.datasets import kitti
-from boxreg_ros.datasets.files import require, require_lidar
+from boxreg_ros.datasets.files import require
 from boxreg_ros.datasets.protocol import Dataset, Scene
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, SceneFrames
@@ -31,7 +31,7 @@ DATASET = Dataset(
     scene='2011_09_26_drive_0001',
     labels='tracklets',
     remedy='unpack its archives into one folder',
-    lidar='velodyne_points',
+    lidars=('velodyne_points',),
     reads='synchronised clouds, OXTS, tracklets',
     leaves_out='cameras, unsynchronised drives',
     read_back='pykitti 0.3.1',
@@ -49,13 +49,12 @@ def scene_names(root: Path) -> list[str]:
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
     """Return the files and folders of a drive."""
     drive = _drives(root)[name]
-    paths = (drive / FILE, drive / 'oxts', drive.parent / IMU_CALIBRATION_FILE)
-    return (drive / DATASET.lidar, *(path for path in paths if path.exists()))
+    parts = (DATASET.lidar, FILE, 'oxts')
+    return (*(drive / part for part in parts), drive.parent / IMU_CALIBRATION_FILE)
 
 
 def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a drive; see `protocol.DatasetModule`."""
-    require_lidar(lidars, [DATASET.lidar], DATASET.lidar)
     drive = _drives(root)[name]
     exported = kitti.exported_poses(drive, 1)
     if exported is None:

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from boxreg_ros.datasets import kitti
-from boxreg_ros.datasets.files import require, require_lidar
+from boxreg_ros.datasets.files import require
 from boxreg_ros.datasets.protocol import Dataset, Scene
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import frames_of, SceneFrames
@@ -29,7 +29,7 @@ DATASET = Dataset(
     scene='0000',
     labels='kitti',
     remedy='unpack its archives into one folder',
-    lidar='velodyne',
+    lidars=('velodyne',),
     reads='clouds, OXTS, labels',
     leaves_out='cameras, regions DontCare',
     read_back='pykitti 0.3.1',
@@ -47,13 +47,12 @@ def scene_names(root: Path) -> list[str]:
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
     """Return the files and folders of a sequence."""
     split = _split(root)
-    paths = [split / folder / f'{name}.txt' for folder in ('label_02', 'oxts', 'calib')]
-    return (split / DATASET.lidar / name, *(path for path in paths if path.is_file()))
+    files = (split / folder / f'{name}.txt' for folder in ('label_02', 'oxts', 'calib'))
+    return (split / DATASET.lidar / name, *files)
 
 
 def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a sequence; see `protocol.DatasetModule`."""
-    require_lidar(lidars, [DATASET.lidar], DATASET.lidar)
     split = _split(root)
     clouds = split / DATASET.lidar / name
     numbers = [int(path.stem) for path in visible(clouds, '*.bin') if path.stem.isdigit()]

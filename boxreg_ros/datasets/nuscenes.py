@@ -21,7 +21,7 @@ from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.labels import frames_of, SceneFrames
 from boxreg_ros.labels.clouds import BIN_COLUMNS
 from boxreg_ros.labels.files import frame_names, from_json, json_items, visible
-from boxreg_ros.labels.nuscenes import own_values, pose_matrix
+from boxreg_ros.labels.nuscenes import lidar_mounts, own_values, pose_matrix
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
 
@@ -56,36 +56,25 @@ def inputs(root: Path, name: str) -> tuple[Path, ...]:
 
 def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a scene; see `protocol.DatasetModule`."""
-    tables, scene = tables_of(root, name)
-    return scene_of(root, tables, scene, lidars)
+    return scene_of(root, name, lidars)
 
 
-def scene_of(
-    root: Path,
-    tables: Path,
-    scene: dict[str, Any],
-    lidars: Sequence[str],
-    *,
-    takes_all: bool = False,
-    has_all_poses: bool = False,
-) -> Scene:
+def scene_of(root: Path, name: str, lidars: Sequence[str], has_all_poses: bool = False) -> Scene:
     """
     Return a scene of tables as those of nuScenes.
 
     Parameters
     ----------
-    root, tables : Path
-        The folder of the data set, and that of its tables.
-    scene : dict
-        Row of the table ``scene``.
+    root : Path
+        The folder of the data set.
+    name : str
+        Of the scene.
     lidars : sequence of str
         Channels of the LiDARs, the first gives the stamps; by default the only one.
-    takes_all : bool
-        Whether the default is all LiDARs.
     has_all_poses : bool
-        Whether ``ego_pose`` has the motion of the vehicle, and not one pose per sweep. Then poses
-        are at their own stamps, and the motion during a sweep is compensated where its points have
-        times.
+        Whether ``ego_pose`` has the motion of the vehicle, and not one pose per sweep. Then the
+        default is all LiDARs, poses are at their own stamps, and the motion during a sweep is
+        compensated where its points have times.
 
     Raises
     ------
@@ -93,8 +82,9 @@ def scene_of(
         If a table or row is missing, or there is no such LiDAR.
 
     """
+    tables, scene = tables_of(root, name)
     try:
-        sensors = _lidars(tables, lidars, takes_all)
+        sensors = _lidars(tables, lidars, has_all_poses)
         return _scene(root, tables, scene, sensors, has_all_poses)
     except (KeyError, TypeError, ValueError) as error:
         raise RecordingError(
@@ -160,7 +150,7 @@ def _scene(
             motion if has_all_poses else None,
         ),
         motion.stamps_ns,
-        pose_rows(list(motion.T_global)),
+        pose_rows(motion.T_global),
         partial(frames_of, 'nuscenes', tables, frames) if has_annotations else None,
         without_boxes=str(annotations),
         lidars=() if is_single else lidars.channels,
@@ -168,20 +158,11 @@ def _scene(
 
 
 def _lidars(tables: Path, asked: Sequence[str], takes_all: bool) -> _Lidars:
-    """Return the LiDARs that are asked for, else the only one, or all where that is the rule."""
-    channels = {
-        row['token']: row['channel']
-        for row in from_json(tables / 'sensor.json')
-        if row['modality'] == 'lidar'
-    }
-    names = sorted(set(channels.values()))
-    chosen = tuple(require_lidars(asked or (names if takes_all else ()), names))
-    mounts = {}
-    for row in from_json(tables / 'calibrated_sensor.json'):
-        channel = channels.get(row['sensor_token'])
-        if channel in chosen:
-            mounts[row['token']] = channel, pose_matrix(row)
-    return _Lidars(chosen, mounts)
+    """Return the LiDARs that are asked for, else the only one, or all if it `takes_all`."""
+    mounts = lidar_mounts(tables)
+    names = sorted({channel for channel, _ in mounts.values()})
+    chosen = require_lidars(asked or (names if takes_all else ()), names)
+    return _Lidars(chosen, {token: one for token, one in mounts.items() if one[0] in chosen})
 
 
 def _sweeps_of_scene(

@@ -13,13 +13,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from boxreg_ros.datasets.files import (
-    finite_cloud,
-    missing_sweep,
-    pose_rows,
-    read_bin,
-    require_lidar,
-)
+from boxreg_ros.datasets.files import missing_sweep, pose_rows, read_bin
 from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.labels import frames_of, SceneFrames
@@ -36,7 +30,7 @@ DATASET = Dataset(
     scene='drive',
     labels='openpcdet',
     remedy='write the clouds again',
-    lidar='points',
+    lidars=('points',),
     reads='clouds of one drive, stamps, labels; poses in `poses.txt`',
     leaves_out='ImageSets',
 )
@@ -52,12 +46,11 @@ def scene_names(root: Path) -> list[str]:
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
     """Return the files and folders of the drive."""
     known = ('points', 'labels', 'boxreg', 'timestamps.txt', POSES_FILE)
-    return tuple(root / part for part in known if (root / part).exists())
+    return tuple(root / part for part in known)
 
 
 def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return the drive; see `protocol.DatasetModule`."""
-    require_lidar(lidars, [DATASET.lidar], DATASET.lidar)
     paths = {path.stem: path for path in _clouds(root)}
     # As of `labels.openpcdet`: frames with labels or clouds have a stamp each.
     labels = {path.stem for path in visible(root, 'labels/*.txt')}
@@ -128,4 +121,4 @@ def _cloud(path: Path) -> Cloud:
             f'write it again'
         )
     has_intensity = rows.shape[1] > 3
-    return finite_cloud(rows[:, :3], rows[:, 3].astype(np.float64) if has_intensity else None)
+    return Cloud(rows[:, :3], rows[:, 3].astype(np.float64) if has_intensity else None).finite()

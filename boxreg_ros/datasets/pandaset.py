@@ -18,7 +18,7 @@ import pickle
 from typing import Any
 import zlib
 
-from boxreg_ros.datasets.files import finite_cloud, missing_sweep, require, require_lidars
+from boxreg_ros.datasets.files import missing_sweep, require
 from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.transforms import inverse, matrix
@@ -36,7 +36,7 @@ DATASET = Dataset(
     scene='001',
     labels='',
     remedy='unpack the archive of this part again',
-    lidar='pandar64',
+    lidars=('pandar64', 'pandarGT'),
     packages=('pandas',),
     reads='clouds of both LiDARs, cuboids',
     leaves_out='cameras, semantic segmentation',
@@ -69,13 +69,11 @@ def scene_names(root: Path) -> list[str]:
 
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
     """Return the folders of a sequence."""
-    paths = (root / name / 'lidar', root / name / 'annotations' / 'cuboids')
-    return tuple(path for path in paths if path.is_dir())
+    return root / name / 'lidar', root / name / 'annotations' / 'cuboids'
 
 
 def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a sequence; see `protocol.DatasetModule`."""
-    lidar_names = require_lidars(lidars, list(SENSOR_IDS), DATASET.lidar)
     folder = root / name / 'lidar'
     path = require(folder / 'timestamps.json', 'the stamps', DATASET.remedy)
     try:
@@ -95,12 +93,12 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     cuboids = root / name / 'annotations' / 'cuboids'
     return Scene(
         frames,
-        ', '.join(lidar_names),
+        ', '.join(lidars),
         stamps_ns,
-        partial(_sweep_files, folder, stamps_ns.tolist(), poses, lidar_names),
+        partial(_sweep_files, folder, stamps_ns.tolist(), poses, lidars),
         stamps_ns,
         poses,
-        partial(_boxes, cuboids, frames, lidar_names) if cuboids.is_dir() else None,
+        partial(_boxes, cuboids, frames, lidars) if cuboids.is_dir() else None,
         without_boxes=str(cuboids),
     )
 
@@ -139,7 +137,7 @@ def _cloud(path: Path, stamp_ns: int, T_world_vehicle: Floats, lidars: Sequence[
     if len(lidars) > 1:
         sensors = (measured_by == numbers[1]).astype(np.uint8)
     origins = np.array([POSITIONS[name] for name in lidars])
-    return finite_cloud(points.astype(np.float32), intensities, times, origins, sensors)
+    return Cloud(points.astype(np.float32), intensities, times, origins, sensors).finite()
 
 
 def _boxes(folder: Path, scene: SceneFrames, lidars: Sequence[str]) -> Iterator[LabelFrame]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -29,8 +29,8 @@ class Dataset:
     """Label format of its results for ``--labels``; empty for none."""
     remedy: str
     """How to complete a folder with missing files."""
-    lidar: str = ''
-    """Name of the main one; empty if the scene states it."""
+    lidars: tuple[str, ...] = ()
+    """Names of the LiDARs, the main one first; empty if the scene states them."""
     packages: tuple[str, ...] = ()
     """Of pip, beyond those of boxreg_ros itself."""
     reads: str = ''
@@ -39,6 +39,11 @@ class Dataset:
     """What the data set has beside it."""
     read_back: str = ''
     """Library and version that has the same clouds or poses, in the tests."""
+
+    @property
+    def lidar(self) -> str:
+        """Return the main one of `lidars`."""
+        return self.lidars[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +60,15 @@ class Cloud:
     """(K, 3) positions of the sensors [m]."""
     sensors: NDArray[np.uint8] | None = None
     """(M,) row of `origins`; None for one sensor."""
+
+    def finite(self) -> Cloud:
+        """Return it without the points that are not finite; itself if all are."""
+        is_finite = np.isfinite(self.points).all(axis=1)
+        if is_finite.all():
+            return self
+        names = ('points', 'intensities', 'times', 'sensors')
+        known = [name for name in names if getattr(self, name) is not None]
+        return replace(self, **{name: getattr(self, name)[is_finite] for name in known})
 
 
 class SweepFile(NamedTuple):
@@ -136,7 +150,7 @@ class DatasetModule(Protocol):
         Returns
         -------
         paths : tuple of Path
-            Folders stand for all files below them.
+            Folders stand for all files below them; those that do not exist are left out later.
 
         """
 
@@ -149,7 +163,7 @@ class DatasetModule(Protocol):
         root, name
             As of `inputs`.
         lidars : sequence of str
-            Names of the LiDARs to read; none for the main one.
+            Some of `Dataset.lidars` to read; where these are empty, those that the user names.
 
         Returns
         -------

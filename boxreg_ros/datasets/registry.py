@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import cast, NamedTuple
 
+from boxreg_ros.datasets.files import require_lidars
 from boxreg_ros.datasets.protocol import DatasetModule, Scene
 from boxreg_ros.errors import RecordingError, require_packages
 
@@ -122,7 +123,8 @@ def resolved(address: Address) -> Address:
 def scene_inputs(address: Address) -> tuple[Path, ...]:
     """Return the files and folders that a scene is read from; raises as `resolved`."""
     address = resolved(address)
-    return module_of(address.dataset).inputs(address.root, address.scene)
+    paths = module_of(address.dataset).inputs(address.root, address.scene)
+    return tuple(path for path in paths if path.exists())
 
 
 def scene_files(address: Address) -> list[Path]:
@@ -166,7 +168,10 @@ def open_scene(address: Address, lidars: Sequence[str] = ()) -> Scene:
 
     """
     address = resolved(address)
-    return module_of(address.dataset).open_scene(address.root, address.scene, lidars)
+    module = module_of(address.dataset)
+    names = module.DATASET.lidars
+    chosen = require_lidars(lidars or names[:1], names) if names else lidars
+    return module.open_scene(address.root, address.scene, chosen)
 
 
 def _listed(names: list[str]) -> str:

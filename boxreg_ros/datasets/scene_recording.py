@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -25,6 +26,7 @@ ANNOTATIONS = 'annotations'
 """Name of the boxes of a data set, where recordings have a topic."""
 
 
+@dataclass(eq=False, repr=False)
 class SceneRecording:
     """
     Clouds, poses and boxes of a scene, as `Recording` has those of a bag: an `ItemSource`.
@@ -38,28 +40,22 @@ class SceneRecording:
     """
 
     has_boxes = True
-    odometry_topic: str | None = None
+    odometry_topic: ClassVar[str | None] = None
     apart: ClassVar[dict[str, float]] = {}  # no topic was recorded apart
     damages: ClassVar[list[Damage]] = []  # sweeps that cannot be read are counted
 
-    def __init__(
-        self,
-        address: Address,
-        lidars: Sequence[str] = (),
-        start: float | None = None,
-        end: float | None = None,
-        labels: tuple[str, Path] | None = None,
-        convention: Convention = STANDARD,
-        keyframes: bool = False,
-    ) -> None:
-        self._address = address
-        self._dataset = module_of(address.dataset).DATASET
-        self._lidars = lidars
-        self._start, self._end = start, end
-        self._labels = labels
-        self._convention = convention
-        self._keyframes = keyframes
-        self.boxes_topic = '' if labels else ANNOTATIONS
+    address: Address
+    lidars: Sequence[str] = ()
+    start: float | None = None
+    end: float | None = None
+    labels: tuple[str, Path] | None = None
+    convention: Convention = STANDARD
+    keyframes: bool = False
+
+    def __post_init__(self) -> None:
+        """Begin with nothing read."""
+        self._dataset = module_of(self.address.dataset).DATASET
+        self.boxes_topic = '' if self.labels else ANNOTATIONS
         self.unreadable: Counter[str] = Counter()
         self.first_errors: dict[str, UnsupportedMessage] = {}
         self.placement = SensorPlacement()
@@ -70,12 +66,12 @@ class SceneRecording:
 
     def __enter__(self) -> Self:
         """Read stamps, poses and boxes of the scene, but no cloud."""
-        self._address = resolved(self._address)
-        self._scene: Scene = open_scene(self._address, self._lidars)
+        self.address = resolved(self.address)
+        self._scene: Scene = open_scene(self.address, self.lidars)
         self.points_topic = self._scene.points_topic
         self.placement = SensorPlacement(Lidars(self._scene.lidars))
         first_ns, last_ns = self._scene.sweep_stamps_ns[[0, -1]].tolist()
-        part_ns = requested_part(str(self), first_ns, last_ns + 1, self._start, self._end)
+        part_ns = requested_part(str(self), first_ns, last_ns + 1, self.start, self.end)
         self.start_ns, self.end_ns = part_ns
         if self.has_boxes:
             self._frames()  # raises if there are no boxes
@@ -86,7 +82,7 @@ class SceneRecording:
 
     def __str__(self) -> str:
         """Return the address."""
-        return str(self._address)
+        return str(self.address)
 
     @property
     def topics(self) -> dict[str, int]:
@@ -94,7 +90,7 @@ class SceneRecording:
         counts = {self.points_topic: len(self._scene.sweep_stamps_ns)}
         if self._scene.lidars:
             counts = dict(Counter(sweep.lidar for sweep in self._scene.sweeps()))
-        if self._labels is None and self._scene.boxes is not None:
+        if self.labels is None and self._scene.boxes is not None:
             counts[ANNOTATIONS] = len(self._scene.frames.stamps_ns)
         return counts
 
@@ -106,7 +102,7 @@ class SceneRecording:
     @property
     def files(self) -> list[Path]:
         """Return the files that the scene is read from."""
-        return scene_files(self._address)
+        return scene_files(self.address)
 
     @property
     def camera(self) -> Camera | None:
@@ -157,9 +153,9 @@ class SceneRecording:
         self._readable = 0
         tree.rewind(0)  # the pose that was read to choose a frame is read again
         frames = self._frames() if self.has_boxes else iter(())
-        is_part = self._start is not None or self._end is not None
+        is_part = self.start is not None or self.end is not None
         sensor_frame = self.sensor_frame()
-        merger = LabelMerger(frames, tree, sensor_frame, self.start_ns, is_part, self._keyframes)
+        merger = LabelMerger(frames, tree, sensor_frame, self.start_ns, is_part, self.keyframes)
         num_poses = 0
         for sweep in self._scene.sweeps():
             stamp_ns = sweep.stamp_ns
@@ -190,8 +186,8 @@ class SceneRecording:
     def _frames(self) -> Iterator[LabelFrame]:
         """Return the boxes to refine, by stamp."""
         scene = self._scene
-        if self._labels is not None:
-            return frames_of(*self._labels, scene.frames, self._convention)
+        if self.labels is not None:
+            return frames_of(*self.labels, scene.frames, self.convention)
         if scene.boxes is not None:
             return scene.boxes()
         remedy = 'give label files with --labels'

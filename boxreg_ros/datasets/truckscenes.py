@@ -32,5 +32,4 @@ DATASET = replace(
 
 def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a scene, by default with all of its LiDARs; see `protocol.DatasetModule`."""
-    tables, row = nuscenes.tables_of(root, name)
-    return nuscenes.scene_of(root, tables, row, lidars, takes_all=True, has_all_poses=True)
+    return nuscenes.scene_of(root, name, lidars, has_all_poses=True)

@@ -20,7 +20,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from boxreg_ros.datasets.files import finite_cloud, pose_rows, require, require_lidars
+from boxreg_ros.datasets.files import pose_rows, require
 from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import one_line, RecordingError, UnsupportedMessage
 from boxreg_ros.io.transforms import inverse
@@ -40,15 +40,15 @@ DATASET = Dataset(
     scene='SEGMENT',
     labels='waymo',
     remedy='download it again',
-    lidar='TOP',
+    lidars=('TOP', 'FRONT', 'SIDE_LEFT', 'SIDE_RIGHT', 'REAR'),
     packages=('pyarrow',),
     reads='range images of the LiDARs asked for, both returns, rows in any order',
     leaves_out='cameras, segmentation, version 1',
     read_back='waymo-open-dataset 1.6.7 (columns)',
 )
-LASERS = {'TOP': 1, 'FRONT': 2, 'SIDE_LEFT': 3, 'SIDE_RIGHT': 4, 'REAR': 5}
+LASERS = {name: number for number, name in enumerate(DATASET.lidars, 1)}
 """LiDAR -> value of the column `LASER`."""
-TOP_LASER = LASERS['TOP']
+TOP_LASER = LASERS[DATASET.lidar]
 LASER = 'key.laser_name'
 RETURNS = [f'[LiDARComponent].range_image_return{i}' for i in (1, 2)]
 PIXEL_POSE = '[LiDARPoseComponent].range_image_return1'
@@ -67,16 +67,14 @@ def scene_names(root: Path) -> list[str]:
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
     """Return the files of a segment."""
     parts = ('lidar', 'lidar_pose', 'lidar_calibration', 'vehicle_pose', 'lidar_box')
-    paths = (_file(root, part, name) for part in parts)
-    return tuple(path for path in paths if path.is_file())
+    return tuple(_file(root, part, name) for part in parts)
 
 
 def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a segment; see `protocol.DatasetModule`."""
-    names = require_lidars(lidars, list(LASERS), DATASET.lidar)
     clouds = _component(root, 'lidar', name)
-    pixel_poses = _component(root, 'lidar_pose', name) if DATASET.lidar in names else None
-    calibrations = _calibrations(_component(root, 'lidar_calibration', name), names)
+    pixel_poses = _component(root, 'lidar_pose', name) if DATASET.lidar in lidars else None
+    calibrations = _calibrations(_component(root, 'lidar_calibration', name), lidars)
     rows = read_rows(_component(root, 'vehicle_pose', name))
     T_world_vehicle = {
         row[MICROSECONDS] * 1000: np.reshape(row[VEHICLE_POSE], (4, 4)) for row in rows
@@ -84,7 +82,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     stamps_ns = [micros * 1000 for micros, _ in _by_time(clouds, [], calibrations)]
     if not stamps_ns:
         raise RecordingError(
-            f'{clouds}: expected sweeps of {", ".join(names)}, got none; {DATASET.remedy}'
+            f'{clouds}: expected sweeps of {", ".join(lidars)}, got none; {DATASET.remedy}'
         )
     missing = set(stamps_ns) - T_world_vehicle.keys()
     if missing:
@@ -101,7 +99,7 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     pose_stamps_ns = sorted(T_world_vehicle)
     return Scene(
         frames,
-        ', '.join(names),
+        ', '.join(lidars),
         np.array(stamps_ns, np.int64),
         partial(_sweeps, clouds, pixel_poses, calibrations, T_world_vehicle),
         np.array(pose_stamps_ns, np.int64),
@@ -258,12 +256,12 @@ def _cloud(
             points.append(found)
             intensities.append(image[at][:, INTENSITY])
             sensors.append(np.full(len(found), number, np.uint8))
-    return finite_cloud(
+    return Cloud(
         np.concatenate(points).astype(np.float32),
         np.concatenate(intensities),
         origins=np.array([one.T_vehicle_lidar[:3, 3] for one in calibrations.values()]),
         sensors=np.concatenate(sensors) if len(calibrations) > 1 else None,
-    )
+    ).finite()
 
 
 def _rays(calibration: _Calibration, shape: tuple[int, ...], rows: Any, columns: Any) -> Floats:
