@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, UTC
 import os
 from pathlib import Path
@@ -12,7 +13,7 @@ import sys
 from tempfile import NamedTemporaryFile
 from threading import Lock, Thread
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Any
 from zipfile import ZipFile
 
 import anyio
@@ -28,7 +29,6 @@ from boxreg_ros.review.requests import box_of, json_of, posted, STAMP, stamp_of,
 from boxreg_ros.review.scene import DriveSource
 from boxreg_ros.review.scene_routes import SceneRoutes
 from boxreg_ros.review.solve import ReportParts
-from boxreg_ros.review.token import review_token
 import orjson
 from starlette import responses
 from starlette.applications import Starlette
@@ -67,36 +67,18 @@ DRIVES_TEMPLATE = 'drives.html.j2'
 DRIVES_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'"
 
 
-class ReviewApplication(NamedTuple):
-    """The application, its token, and the reviews that it serves."""
-
-    application: ASGIApp
-    token: str
-    reviews: list[Review]
-
-
-def review_application(
-    results: Sequence[tuple[Path, DriveSource | None]],
-    port: int,
-    who: str,
-    is_ending: Callable[[], bool],
-    classes: Sequence[str] = (),
-) -> ReviewApplication:
+def review_application(reviews: Sequence[Review], port: int, token: str) -> ASGIApp:
     """
-    Return the application for result folders, and the token that requests need.
+    Return the application for some reviews, which refuses requests without a token.
 
-    Several folders are behind a page of their progress; a recording gives whole clouds and added
-    objects. The port is one on loopback: requests under another name are refused. `who` is the
-    person where the page sends none. Streams of events end when the server `is_ending`. The token
-    is in the address of the first request or in the cookie that this one sets. Raises
-    RecordingError if decisions or summary cannot be read.
+    Several reviews are behind a page of their progress. The port is one on loopback: requests
+    under another name are refused. The token is in the address of the first request or in the
+    cookie that this one sets.
 
     """
-    token = review_token([out for out, _ in results])
-    reviews = [Review(out, who, is_ending, source, token, classes) for out, source in results]
     applications = [review.application() for review in reviews]
     if len(reviews) == 1:
-        return ReviewApplication(_Guard(applications[0], port, token), token, reviews)
+        return _Guard(applications[0], port, token)
 
     async def page(_: Request) -> Response:
         text = await run_in_threadpool(_page_of_drives, reviews)
@@ -104,8 +86,7 @@ def review_application(
         return responses.HTMLResponse(text, headers=headers)
 
     mounts = [Mount(f'/{number}', app=one) for number, one in enumerate(applications)]
-    application = Starlette(routes=[Route('/', page), *mounts])
-    return ReviewApplication(_Guard(application, port, token), token, reviews)
+    return _Guard(Starlette(routes=[Route('/', page), *mounts]), port, token)
 
 
 class _Guard:
@@ -147,30 +128,33 @@ class _Guard:
         await answer(scope, receive, send_with_headers)
 
 
+@dataclass(eq=False, repr=False)
 class Review:
-    """The state of a review, and the answers to its requests. It goes on in what it writes."""
+    """
+    The state of a review, and the answers to its requests. It goes on in what it writes.
 
-    def __init__(
-        self,
-        out: Path,
-        who: str,
-        is_ending: Callable[[], bool],
-        source: DriveSource | None,
-        token: str,
-        classes: Sequence[str] = (),
-    ) -> None:
-        self._classes = list(classes)
+    A recording, the `source`, gives whole clouds and added objects. `who` is the person where the
+    page sends none; `classes` are to choose from, none for those of the result. Streams of events
+    end when the server `is_ending`. Raises RecordingError if decisions or summary cannot be read.
+
+    """
+
+    out: Path
+    source: DriveSource | None
+    who: str
+    classes: Sequence[str]
+    token: str
+    is_ending: Callable[[], bool]
+
+    def __post_init__(self) -> None:
+        """Read the result."""
         self.listeners = 0
         self._open: dict[str, tuple[str, float]] = {}  # tracks by page, and since when
-        self._who = who
-        self._token = token
         self._log_lock = Lock()
         self._save_lock = asyncio.Lock()
-        self._is_ending = is_ending
-        self._source = source
         self._progress = ''  # of the run that writes labels, as JSON
         self._written = 0  # how often labels were written
-        self._load(out)
+        self._load(self.out)
 
     def _load(self, out: Path) -> None:
         """Take over a result."""
@@ -203,8 +187,8 @@ class Review:
             Route('/files', self.files),
             Route('/download', self.download),
         ]
-        if self._source is not None:
-            routes += SceneRoutes(self._source, self._frame_id).routes()
+        if self.source is not None:
+            routes += SceneRoutes(self.source, self._frame_id).routes()
         handlers: Any = {BoxregError: _refused, OSError: _failed}
         return Starlette(routes=routes, exception_handlers=handlers)
 
@@ -219,14 +203,14 @@ class Review:
     async def decisions(self, _: Request) -> Response:
         """Return all decisions."""
         await run_in_threadpool(self._refresh)
-        has_scene = self._source is not None
+        has_scene = self.source is not None
         more = {
-            'who': self._who,
-            'token': self._token,
+            'who': self.who,
+            'token': self.token,
             'has_scene': has_scene,
             'proposals': self._proposals,
             'changes': self._changes,
-            'classes': self._classes,
+            'classes': list(self.classes),
         }
         return JSONResponse({**self._since(0), **more})
 
@@ -273,8 +257,8 @@ class Review:
     async def files(self, _: Request) -> Response:
         """Return the files of the result, and the formats that can be written."""
         listed = self._summary.get('files', {}).items()
-        formats = {} if self._source is None else await run_in_threadpool(self._source.formats)
-        chosen = () if self._source is None else self._source.chosen
+        formats = {} if self.source is None else await run_in_threadpool(self.source.formats)
+        chosen = () if self.source is None else self.source.chosen
         return JSONResponse({
             'folder': str(self.out.resolve()),
             'files': [{'name': name, 'size': about['size']} for name, about in listed],
@@ -300,7 +284,7 @@ class Review:
     def _formats_of(self, sent: Mapping[str, Any]) -> list[str]:
         """Return the formats that a request asks for; none for those of the result."""
         names = sent.get('formats', [])
-        known = {} if self._source is None or not names else self._source.formats()
+        known = {} if self.source is None or not names else self.source.formats()
         if not isinstance(names, list) or not all(name in known for name in names):
             raise RecordingError(
                 f'formats: expected some of {", ".join(known)}, got {names!r:.80}'
@@ -337,7 +321,7 @@ class Review:
         self.listeners += 1
         progress, written = '', self._written
         try:
-            while not self._is_ending():
+            while not self.is_ending():
                 if self._progress != progress:
                     progress = self._progress
                     yield f'event: progress\ndata: {progress or "{}"}\n\n'.encode()
@@ -368,7 +352,7 @@ class Review:
             box=box,
             end_ns=stamp_of(sent, 'end_ns'),
             value=text_of(sent, 'value'),
-            who=text_of(sent, 'who') or self._who,
+            who=text_of(sent, 'who') or self.who,
             when=when,
         )
 

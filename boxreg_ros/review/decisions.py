@@ -311,17 +311,16 @@ class DecisionLog:
     def refresh(self) -> None:
         """Read what others have appended."""
         if self._state != _state_of(self._path):
-            with self._locked():
-                self._read()
+            with self.locked():
+                pass  # it is read
 
     def append(self, new: Sequence[Decision]) -> None:
         """Write decisions at the end of the file: all of them, or none."""
-        with self._locked():
+        with self.locked():
             self.append_locked(new)
 
     def append_locked(self, new: Sequence[Decision]) -> None:
         """Write decisions behind the last whole row of the file that this log has locked."""
-        self._read()
         rows = _encoded(new)
         text = _whole_rows(self._path.read_bytes().decode()) if self._path.exists() else ''
         # Ids of a file that was joined may have been changed.
@@ -336,26 +335,22 @@ class DecisionLog:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the file, as it is now: no other program appends to it inside the block."""
-        with self._locked():
-            self._read()
-            yield
+        """
+        Read the file as it is now, and hold it: no other program appends to it inside the block.
 
-    @contextmanager
-    def _locked(self) -> Iterator[None]:
-        """Lock the folder: the file may be replaced by one of a newer version."""
+        The folder is locked: the file may be replaced by one of a newer version.
+
+        """
         folder = os.open(self._path.parent, os.O_RDONLY)
         try:
             fcntl.flock(folder, fcntl.LOCK_EX)
+            state = _state_of(self._path)
+            if state != self._state:
+                self.decisions = read_decisions(self._path) if state else []
+                self._state = state
             yield
         finally:
             os.close(folder)
-
-    def _read(self) -> None:
-        state = _state_of(self._path)
-        if state != self._state:
-            self.decisions = read_decisions(self._path) if state else []
-            self._state = state
 
 
 def _encoded(decisions: Iterable[Decision]) -> str:

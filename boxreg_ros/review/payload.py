@@ -5,7 +5,7 @@ from __future__ import annotations
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 import zlib
 
@@ -115,6 +115,7 @@ def true_boxes(tracks: Sequence[TrackChanges], truth: BoxTable | None) -> list[T
     return [TrackTruth(*found) for found in zip(*parts, strict=True)]
 
 
+@dataclass(eq=False, repr=False)
 class TrackPart:
     """
     The points and figures of one track, as the report shows them: `before` and `after`.
@@ -123,26 +124,19 @@ class TrackPart:
 
     """
 
-    def __init__(
-        self,
-        row: TrackRow,
-        points: list[Floats],
-        sensor: Floats,
-        truth: TrackTruth,
-        usual: Usual = UNKNOWN_USUAL,
-    ) -> None:
-        track = row.track
-        self._track = track
-        self._risk = row.risk
-        self._why = row.reasons
-        self._truth = truth
-        self._usual = usual
-        self._sensor = sensor
-        self._points = points
+    source: TrackRow
+    points: list[Floats]
+    sensor: Floats
+    truth: TrackTruth
+    usual: Usual = UNKNOWN_USUAL
+
+    def __post_init__(self) -> None:
+        """Measure the boxes before and after."""
+        self._track = track = self.source.track
         of_labels = np.where(track.is_label, 0.0, np.nan)  # NaN for rejected boxes
-        given = track.given + of_labels[:, None]
-        self.before = quality(track, given, self._points, truth.iou_before + of_labels)
-        self.after = quality(track, track.labels, self._points, truth.iou_after + of_labels)
+        given, truth = track.given + of_labels[:, None], self.truth
+        self.before = quality(track, given, self.points, truth.iou_before + of_labels)
+        self.after = quality(track, track.labels, self.points, truth.iou_after + of_labels)
 
     def row(self, stamps_ns: Ints) -> dict[str, Any]:
         """Return the row of the list; `stamps_ns` are those of the drive, sorted."""
@@ -180,9 +174,9 @@ class TrackPart:
             'after': asdict(self.after),
             'path': np.round(track.boxes[picks][:, [X, Y]], 2),
             'rows': picks,
-            'risk': round(self._risk.track, RISK_DECIMALS),
-            'riskiest': str(track.stamps_ns[int(np.argmax(self._risk.boxes))]),
-            'why': self._why,
+            'risk': round(self.source.risk.track, RISK_DECIMALS),
+            'riskiest': str(track.stamps_ns[int(np.argmax(self.source.risk.boxes))]),
+            'why': self.source.reasons,
             'added': _is_added(track),
         }
 
@@ -190,7 +184,7 @@ class TrackPart:
         """Return the median number of points near a box that are above its lower face."""
         known = np.where(np.isfinite(self._track.boxes), self._track.boxes, self._track.given)
         floor = known[:, Z] - known[:, HEIGHT] / 2 + GROUND_CLEARANCE
-        pairs = zip(self._points, floor, strict=True)
+        pairs = zip(self.points, floor, strict=True)
         return median([float((points[:, Z] > lowest).sum()) for points, lowest in pairs])
 
     def part(self, begin_ns: int, max_points: int) -> dict[str, Any]:
@@ -199,7 +193,7 @@ class TrackPart:
         center = np.where(np.isfinite(track.boxes), track.boxes, track.given)[:, : Z + 1]
         origin = np.nan_to_num(np.append(center[np.isfinite(center[:, X])], [[0, 0, 0]], 0)[0])
         shown = []
-        for middle, points in zip(center, self._points, strict=True):
+        for middle, points in zip(center, self.points, strict=True):
             step = max(1, -(-len(points) // max_points))
             shown.append(to_millimetres(points[::step] - middle))
         every = np.concatenate([np.zeros((0, 3), np.int16), *shown])
@@ -209,20 +203,20 @@ class TrackPart:
             'times': np.round((track.stamps_ns - begin_ns) * 1e-9, DECIMALS),
             'given': _moved(track.given, origin),
             'boxes': _moved(track.boxes, origin),
-            'truth': _moved(self._truth.boxes, origin),
-            'iou': np.round([self._truth.iou_before, self._truth.iou_after], 3),
-            'sensor': np.round(self._sensor - origin, 2),
+            'truth': _moved(self.truth.boxes, origin),
+            'iou': np.round([self.truth.iou_before, self.truth.iou_after], 3),
+            'sensor': np.round(self.sensor - origin, 2),
             'status': track.status.tolist(),
             'reasons': track.reasons.tolist(),
             'flipped': track.is_flipped.tolist(),
             'change': np.round(track.change, DECIMALS),
             'deviations': np.round(track.deviations, DECIMALS),
             'extent_deviations': np.round(track.extent_deviations, DECIMALS),
-            'risk': np.round(self._risk.boxes, RISK_DECIMALS),
+            'risk': np.round(self.source.risk.boxes, RISK_DECIMALS),
             'disagreement': np.round(track.disagreement, 3),
             'faces': np.round(track.face_distances, 3),
             'near': track.near_points,
-            'usual': [self._usual.outside, self._usual.sizes.get(track.class_name)],
+            'usual': [self.usual.outside, self.usual.sizes.get(track.class_name)],
             'num_points': track.num_points,
             'attributes': track.attributes,
             'counts': [len(points) for points in shown],

@@ -78,6 +78,9 @@ OUTER_PART = 0.1
 """Part of the points near a face that are its outermost points; chosen."""
 NEAR_FACE = 0.5
 """Points so far inside of a face count as near it [m]; chosen."""
+FLOOR_CLEARANCE = 0.3
+"""Points up to so far above the lower face may be of the road [m]; chosen: `GROUND_CLEARANCE`, and
+0.1 m that a box may be too high."""
 MIN_FACE_POINTS = 5
 """Fewer points do not show where a face is; chosen."""
 
@@ -278,8 +281,8 @@ def evidence(points: Floats, box: Floats) -> tuple[Floats, float]:
     """
     local = (points - box[: Z + 1]) @ matrix_from_rpy(box[None, ROLL:])[0]
     half = box[BOX_EXTENT] / 2
-    is_above_road = local[:, 2] > 0.3 - half[2]
-    is_near = (np.abs(local) < half + 0.6).all(1) & is_above_road
+    is_above_road = local[:, 2] > FLOOR_CLEARANCE - half[2]
+    is_near = (np.abs(local) < half + MARGIN).all(1) & is_above_road
     is_inside = (np.abs(local) < half).all(1)
     distances = np.full(6, np.nan)
     for face in range(6):

@@ -6,6 +6,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
+from functools import cached_property
 from tempfile import gettempdir
 from threading import Condition, Lock, Thread
 from typing import Any
@@ -19,19 +20,13 @@ from boxreg_ros.io.items import Item, ItemSource
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.sweep_store import SweepStore
 from boxreg_ros.io.transforms import inverse
-from boxreg_ros.rotations import (
-    interpolate_rotation,
-    matrix_from_rpy,
-    quaternion_from_rpy,
-    rpy_from_matrix,
-)
+from boxreg_ros.review.track_points import SHOWN_MARGIN
+from boxreg_ros.rotations import interpolate_rotation, matrix_from_rpy, quaternion_from_matrix
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Sweep, Z
 from msg_adapters.convention import Convention
 import numpy as np
 from numpy.typing import NDArray
 
-SHOWN_MARGIN = 0.6
-"""Points up to this far outside a box belong to its part of the scene [m]; chosen."""
 GRAIN = 0.03
 """Of accumulated points one is kept in each cube of this edge [m]; chosen: range noise."""
 
@@ -217,8 +212,8 @@ class DriveScene:
         part = (stamp_ns - begin_ns) / (end_ns - begin_ns)
         pose = np.eye(4)
         pose[:3, 3] = (1 - part) * known[0][:3, 3] + part * known[1][:3, 3]
-        turns = [quaternion_from_rpy(rpy_from_matrix(one[None, :3, :3]))[0] for one in known]
-        pose[:3, :3] = interpolate_rotation(turns[0], turns[1], part)
+        first, second = (quaternion_from_matrix(one[:3, :3]) for one in known)
+        pose[:3, :3] = interpolate_rotation(first, second, part)
         return pose
 
     def _row(self, stamp_ns: int) -> int:
@@ -288,8 +283,6 @@ class DriveImages:
         self._scene = scene
         self._lock = Lock()
         self._opened = ExitStack()
-        self._images: RecordedImages | None = None
-        self._is_open = False
 
     def cameras(self, stamp_ns: int) -> list[dict[str, Any]]:
         """Return the cameras with their poses at a stamp; none for data sets."""
@@ -340,12 +333,12 @@ class DriveImages:
 
     def _known(self) -> list[ImageCamera]:
         with self._lock:
-            if not self._is_open:
-                recording = self._opened.enter_context(self._source.recording())
-                if isinstance(recording, Recording):
-                    self._images = recording.images()
-                self._is_open = True
             return [] if self._images is None else self._images.cameras
+
+    @cached_property
+    def _images(self) -> RecordedImages | None:
+        recording = self._opened.enter_context(self._source.recording())
+        return recording.images() if isinstance(recording, Recording) else None
 
     def _T_image_fixed(self, camera: ImageCamera, stamp_ns: int) -> Floats | None:
         pose = self._scene.pose_of(camera.frame_id, stamp_ns)

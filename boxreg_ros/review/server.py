@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 HOST = '127.0.0.1'
 PORT = 8765
-SUMMARY = 'summary.json'
 SERVER_PACKAGES = ('starlette', 'uvicorn')
 SHUTDOWN_SECONDS = 1
 """Pages that listen for decisions are left after this time; chosen."""
@@ -98,16 +97,18 @@ class ReviewServer:
     def __init__(
         self, results: Results, bound: socket.socket, who: str, classes: Sequence[str]
     ) -> None:
-        from boxreg_ros.review.application import review_application
+        from boxreg_ros.review.application import Review, review_application
+        from boxreg_ros.review.token import review_token
         from uvicorn import Config, Server
 
         self._socket = bound
         self.server_port = int(bound.getsockname()[1])
-        found = review_application(results, self.server_port, who, self._is_ending, classes)
-        self._reviews = found.reviews
-        self.address = f'http://{HOST}:{self.server_port}/?token={found.token}'
+        token = review_token([out for out, _ in results])
+        self._reviews = [Review(*one, who, classes, token, self._is_ending) for one in results]
+        application = review_application(self._reviews, self.server_port, token)
+        self.address = f'http://{HOST}:{self.server_port}/?token={token}'
         config = Config(
-            found.application, http='h11', ws='none', lifespan='off', log_config=None,
+            application, http='h11', ws='none', lifespan='off', log_config=None,
             log_level='critical', server_header=False, date_header=False,
             timeout_graceful_shutdown=SHUTDOWN_SECONDS,
         )  # fmt: skip
@@ -162,6 +163,7 @@ def review_server(
         If the port is in use, or a package is missing.
 
     """
+    from boxreg_ros.review.folders import SUMMARY
     from boxreg_ros.review.report import REPORT
 
     require_packages('boxreg review', SERVER_PACKAGES)
