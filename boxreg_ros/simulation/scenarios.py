@@ -23,8 +23,15 @@ from boxreg_ros.simulation.raycast import (
     SWEEP_PERIOD,
     to_matrix,
 )
-from boxreg_ros.simulation.scene import boxes_of, is_near, make_scene, make_sweep, SimulatedScene
-from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL, Sweep, YAW
+from boxreg_ros.simulation.scene import (
+    boxes_of,
+    is_near,
+    make_scene,
+    make_sweep,
+    Scan,
+    SimulatedScene,
+)
+from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,15 +72,6 @@ class ActorPlan(NamedTuple):
     place: StartPose
     speed: Rate
     yaw_rate: Rate
-
-
-class Scan(NamedTuple):
-    """What a sensor sees of a road users, the first three as in `SimulatedScene`."""
-
-    sweeps: list[Sweep]
-    owners: list[Ints]
-    T_fixed_sensor: Floats
-    true_boxes: Floats  # (a, n, 9) of each road user at each sweep
 
 
 def zero(times: Floats) -> Floats:
@@ -351,10 +349,7 @@ def _with_detections(
     actors: Sequence[Actor], scan: Scan, rng: np.random.Generator
 ) -> SimulatedScene:
     """Return a scene with boxes as a detector reports them."""
-    return make_scene(
-        actors, scan.true_boxes, scan.sweeps, scan.owners, scan.T_fixed_sensor, detector_noise,
-        MISS_PROBABILITY, rng,
-    )  # fmt: skip
+    return make_scene(actors, scan, detector_noise, MISS_PROBABILITY, rng)
 
 
 def _scanned(
@@ -422,7 +417,8 @@ def paper(rng: np.random.Generator, sweeps: int | None, is_flat: bool) -> Simula
     true_boxes = boxes_of(suv, poses)[None]  # (1, sweeps, 9)
     T_fixed_sensor = to_matrix(poses) @ T_box_sensor
     noise = table_one_noise(is_flat)
-    return make_scene([suv], true_boxes, clouds, owners, T_fixed_sensor, noise, 0.0, rng)
+    seen = Scan(clouds, owners, T_fixed_sensor, true_boxes)
+    return make_scene([suv], seen, noise, 0.0, rng)
 
 
 def _paper_poses(count: int, height: float, is_flat: bool) -> Floats:

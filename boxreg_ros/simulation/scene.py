@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
@@ -38,31 +39,31 @@ class SimulatedScene:
         return [boxes_to_frame(boxes, T, FIXED_FRAME) for boxes, T in pairs]
 
 
+class Scan(NamedTuple):
+    """What a sensor sees of a road users in n sweeps, the first three as in `SimulatedScene`."""
+
+    sweeps: Sequence[Sweep]
+    owners: Sequence[Ints]
+    T_fixed_sensor: Floats
+    true_boxes: Floats  # (a, n, 9) of each road user at each sweep, in ``odom``
+
+
 def make_scene(
     actors: Sequence[Actor],
-    true_boxes: Floats,
-    sweeps: Sequence[Sweep],
-    owners: Sequence[Ints],
-    T_fixed_sensor: Floats,
+    scan: Scan,
     noise: Noise,
     miss_probability: float,
     rng: np.random.Generator,
 ) -> SimulatedScene:
     """
-    Return a scene with its truth and its detections; sequences as in `SimulatedScene`.
+    Return a scene with its truth and its detections.
 
     Parameters
     ----------
     actors : sequence of Actor, length a
         The road users.
-    true_boxes : array, shape (a, n, 9)
-        Per actor and sweep, in the fixed frame [m, rad].
-    sweeps : sequence of n Sweep
-        In the sensor frame.
-    owners : sequence of n arrays, shape (M,)
-        Row of the actor of each point, or `raycast.ROAD`.
-    T_fixed_sensor : array, shape (n, 4, 4)
-        Poses of the sensor at the stamps.
+    scan : Scan
+        Of them.
     noise : callable
         Makes the noisy boxes of one track, see `noise.Noise`.
     miss_probability : float
@@ -76,6 +77,7 @@ def make_scene(
         The truth of an actor is from its first to its last return.
 
     """
+    sweeps, owners, T_fixed_sensor, true_boxes = scan
     returns = np.array([[np.sum(owner == a) for owner in owners] for a in range(len(actors))])
     noisy = np.stack([noise(boxes, T_fixed_sensor[:, :3, 3], rng) for boxes in true_boxes])
     is_detected = (returns >= MIN_RETURNS) & (rng.random(returns.shape) >= miss_probability)

@@ -247,30 +247,31 @@ def complete(
     return _Completer(given, fixed_frame, config, decided).completed(results, num_points)
 
 
+@dataclass(eq=False, repr=False)
 class _Completer:
     """The steps, with the input, the decisions and the plan that all of them share."""
 
-    def __init__(
-        self, given: Sequence[BoxArray], fixed_frame: str, config: Config, decided: Decided
-    ) -> None:
-        self._given = given
-        self._fixed_frame = fixed_frame
-        self._config = config
-        self._decided = decided
-        self._plan = unchanged_plan(given)
+    given: Sequence[BoxArray]
+    fixed_frame: str
+    config: Config
+    decided: Decided
+
+    def __post_init__(self) -> None:
+        """Begin with a plan that changes nothing."""
+        self._plan = unchanged_plan(self.given)
         self._of_track: dict[str, DecidedTrack] = {}
-        self._array_of = _array_of_stamp(given, fixed_frame)
+        self._array_of = _array_of_stamp(self.given, self.fixed_frame)
         self._stamps_ns = np.array(sorted(self._array_of), np.int64)
 
     def completed(
         self, results: Sequence[RefinedBoxes], num_points: Sequence[Ints]
     ) -> CompletionPlan:
         """Return the plan, from the results of the input."""
-        config, decided = self._config, self._decided
+        config, decided = self.config, self.decided
         steps = config.complete
         if steps.stitch:
             results = self._exchanged(results)
-        tracks = tracklets_of(results, num_points, self._fixed_frame, config, decided.names)
+        tracks = tracklets_of(results, num_points, self.fixed_frame, config, decided.names)
         if steps.prune:  # first: a duplicate could be stitched to its object
             tracks = self._rejected(tracks, duplicates(tracks, config), Reason.DUPLICATE)
         ambiguous: list[tuple[str, str]] = []
@@ -283,7 +284,7 @@ class _Completer:
         if steps.prune:  # last: a fragment of an object may look like a ghost
             tracks = self._rejected(tracks, ghosts(tracks), Reason.GHOST)
         for track in tracks:
-            self._of_track[track.track_id] = DecidedTrack.of(track, self._given, decided)
+            self._of_track[track.track_id] = DecidedTrack.of(track, self.given, decided)
             self._place(track)
         if steps.fill:
             self._fill(tracks)
@@ -295,7 +296,7 @@ class _Completer:
     def _exchanged(self, results: Sequence[RefinedBoxes]) -> Sequence[RefinedBoxes]:
         """Return results with the ids back that tracks have exchanged, but for named tracks."""
         every = BoxTable.from_arrays(self._arrays())
-        is_free = np.array([name not in self._decided.names for name in every.track_ids], bool)
+        is_free = np.array([name not in self.decided.names for name in every.track_ids], bool)
         table = every.rows(is_valid_box(every.boxes) & is_free)
         found = id_switches(by_id(table.track_ids, table.stamps_ns, table.boxes[:, : Y + 1]))
         exchanged = []
@@ -308,12 +309,12 @@ class _Completer:
 
     def _arrays(self) -> list[BoxArray]:
         """Return the arrays of the input in the fixed frame."""
-        return [array for array in self._given if array.frame_id == self._fixed_frame]
+        return [array for array in self.given if array.frame_id == self.fixed_frame]
 
     def _is_held(self, track: Tracklet) -> bool:
         """Return whether a person has accepted a track, or given it a box in the input."""
-        pinned = (self._given[index].is_pinned[row] for index, row in track.places)
-        return DecidedTrack.of(track, self._given, self._decided).is_accepted() or any(pinned)
+        pinned = (self.given[index].is_pinned[row] for index, row in track.places)
+        return DecidedTrack.of(track, self.given, self.decided).is_accepted() or any(pinned)
 
     def _rejected(
         self, tracks: Sequence[Tracklet], names: set[str], reason: str
@@ -368,13 +369,13 @@ class _Completer:
     def _fill(self, tracks: Sequence[Tracklet]) -> None:
         """Add the missing boxes of tracks; of rarely detected ones those of a person alone."""
         detected = [one.stamp_ns for one in self._arrays() if len(one.boxes)]
-        rare = rarely_detected(tracks, np.unique(np.array(detected, np.int64)), self._config)
+        rare = rarely_detected(tracks, np.unique(np.array(detected, np.int64)), self.config)
         steps = {one.track_id: one for one in self._plan.tracks}
         for track in tracks:
             own = self._of_track[track.track_id]
             gaps = [
                 own.left(gap, is_extension=False)
-                for gap in fill(track, self._stamps_ns, self._config)
+                for gap in fill(track, self._stamps_ns, self.config)
             ]
             missing_ns = [stamp_ns for gap in gaps for stamp_ns in gap.stamps_ns.tolist()]
             is_rare = track.track_id in rare and not self._is_held(track)
@@ -396,7 +397,7 @@ class _Completer:
         extensions = self._plan.extensions
         for track in tracks:
             own = self._of_track[track.track_id]
-            for candidates in extend(track, self._stamps_ns, self._config):
+            for candidates in extend(track, self._stamps_ns, self.config):
                 first = candidates.take(range(num_free(candidates, owned)))
                 free = own.left(first, is_extension=True)
                 if not len(free.boxes):

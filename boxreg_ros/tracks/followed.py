@@ -14,6 +14,7 @@ from boxreg_ros.core.following.person import (
     moved,
     residuals,
 )
+from boxreg_ros.core.tables import rows_by_key
 from boxreg_ros.structures import (
     BoxArray,
     EXTENDED,
@@ -143,9 +144,7 @@ def with_evidence(
         return list(results)
     exact, away = are_exact(*shown), residuals(boxes, fits)
     away[~is_fit] = np.nan
-    rows_of: dict[str, list[int]] = {}
-    for row, name in enumerate(names):
-        rows_of.setdefault(name, []).append(row)
+    rows_of = rows_by_key(names)
     places: dict[str, list[tuple[int, int]]] = {name: [] for name in rows_of}
     for index, result in enumerate(results):
         for row, name in enumerate(result.boxes.track_ids):
@@ -155,12 +154,12 @@ def with_evidence(
     for name, rows in rows_of.items():
         at = np.array([results[index].boxes.stamp_ns for index, _ in places[name]], np.int64)
         own = np.array([found[index][row] for index, row in places[name]])
-        fit_rows = [row for row in rows if is_fit[row]]
-        if fit_rows:
+        fit_rows = rows[is_fit[rows]]
+        if len(fit_rows):
             own = moved(at, own, stamps_ns[fit_rows], steps[fit_rows])
         if exact:
             key_ns, first = np.unique(stamps_ns[rows], return_index=True)  # of two, the first
-            keys = np.array(rows)[first]
+            keys = rows[first]
             own = between_exact(at, own, Keyframes(key_ns, boxes[keys], away[keys]))
         for (index, row), box in zip(places[name], own, strict=True):
             if results[index].status[row] != KEPT:

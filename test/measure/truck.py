@@ -25,6 +25,7 @@ from boxreg_ros.simulation.scene import (
     is_near,
     make_scene,
     make_sweep,
+    Scan,
     START_NS,
 )
 from boxreg_ros.simulation.writer import LidarMessages, write_messages
@@ -104,10 +105,8 @@ def truck_scene(seed: int, sweeps: int | None = None) -> TruckScene:
     roof_rng = np.random.default_rng([seed, ROOF_STREAM])
     roof, _ = _scanned(ROOF_LIDAR, actors, ego, true_boxes, roof_rng)
     whole = [merged(_in_base(parts, ego)) for parts in zip(*clouds.values(), strict=True)]
-    scene = make_scene(
-        actors, true_boxes, whole, owners, raycast.to_matrix(ego.at(stamps)), detector_noise,
-        scenarios.MISS_PROBABILITY, rng,
-    )  # fmt: skip
+    scan = Scan(whole, owners, raycast.to_matrix(ego.at(stamps)), true_boxes)
+    scene = make_scene(actors, scan, detector_noise, scenarios.MISS_PROBABILITY, rng)
     return TruckScene(clouds | roof, scene.detections, scene.truth, ego)
 
 

@@ -29,7 +29,7 @@ from boxreg_ros.simulation.scenarios import (
     STREET_SENSOR,
     zero,
 )
-from boxreg_ros.simulation.scene import boxes_of, make_scene, make_sweep, SimulatedScene
+from boxreg_ros.simulation.scene import boxes_of, make_scene, make_sweep, Scan, SimulatedScene
 import numpy as np
 
 LIDARS = (
@@ -82,9 +82,8 @@ def random_street(
     owners = [owner for _, _, owner in scans]
     boxes = np.stack([boxes_of(actor, actor.motion.at(stamps)) for actor in labelled])
     of_boxes = np.random.default_rng([seed, 1])  # the same clouds with any noise
-    return make_scene(
-        labelled, boxes, clouds, owners, T_fixed_sensor, noise, miss_probability, of_boxes
-    )
+    scan = Scan(clouds, owners, T_fixed_sensor, boxes)
+    return make_scene(labelled, scan, noise, miss_probability, of_boxes)
 
 
 def _road_users(lane: float, speed: float, rng: Rng) -> Iterator[ActorPlan]:
