@@ -31,7 +31,7 @@ SCHEMA = ['check_jsonschema', '--builtin-schema']
         ['ament_flake8.main', '--config', '.flake8', *SOURCES],
         ['ament_pep257.main', *SOURCES],
         ['ament_xmllint.main', 'package.xml'],
-        ['codespell_lib', '--ignore-words-list=nees,mot', *TEXTS],  # of the evaluation
+        ['codespell_lib', '--ignore-words-list=nees,mot,empy,ue', *TEXTS],  # names
         [*SCHEMA, 'vendor.github-workflows', *WORKFLOWS],
         [*SCHEMA, 'vendor.citation-file-format', 'CITATION.cff'],
     ],
