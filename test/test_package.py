@@ -177,7 +177,7 @@ def test_sdist_contains_every_file_of_the_sources(unpacked):
 
 def test_tests_of_the_sdist_run_in_it(unpacked):
     tests = ('test/test_rotations.py', 'test/core/test_metrics.py')
-    command = [sys.executable, '-B', '-m', 'pytest', '-q', '-n0', *tests]
+    command = [sys.executable, '-B', '-m', 'pytest', '-q', *tests]
     assert ' passed' in run(command, cwd=unpacked)
 
 
@@ -287,6 +287,7 @@ def test_command_line_starts_from_the_workspace(prefix):
         assert command in output
 
 
+@pytest.mark.parametrize('prefix', ['plain'], indirect=True)  # `boxreg` starts from both
 def test_node_starts_and_ends_from_the_workspace(prefix):
     rclpy = pytest.importorskip('rclpy')
     process = sourced(prefix, [prefix / 'lib/boxreg_ros/boxreg_node'], start_new_session=True)

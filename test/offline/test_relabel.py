@@ -719,16 +719,18 @@ def test_unreadable_intensities_drop_no_cloud(tmp_path):
     assert 'intensity' in summary.first_unreadable
 
 
-@pytest.mark.parametrize('name', ['boxes.csv', 'mine/notes.txt'])
-def test_result_changed_by_hand_is_not_replaced(tmp_path, name):
+def test_result_changed_by_hand_is_not_replaced(tmp_path):
     drive = Drive(sweeps=3).write(tmp_path / 'drive')
-    file = tmp_path / 'out' / name
     run(drive, tmp_path / 'out')
-    file.parent.mkdir(exist_ok=True)
-    file.write_text('by hand')
-    with pytest.raises(RecordingError, match=rf"'{name}' changed or added since.*choose another"):
-        run(drive, tmp_path / 'out')
-    assert file.read_text() == 'by hand'
+    for name in ('mine/notes.txt', 'boxes.csv'):
+        file = tmp_path / 'out' / name
+        before = file.read_bytes() if file.exists() else None
+        file.parent.mkdir(exist_ok=True)
+        file.write_text('by hand')
+        with pytest.raises(RecordingError, match=rf"'{name}' changed or added since.*another"):
+            run(drive, tmp_path / 'out')
+        assert file.read_text() == 'by hand'
+        file.unlink() if before is None else file.write_bytes(before)
 
 
 @pytest.mark.parametrize('content', ['notes.txt', 'summary.json'])
@@ -744,8 +746,7 @@ def test_folder_with_other_files_is_not_replaced(tmp_path, content):
         run(tmp_path / 'drive' / 'drive.mcap', tmp_path / 'file')
 
 
-@pytest.mark.parametrize('given', ['{out}/drive.mcap', '{out}', '{link}', '{bag}'])
-def test_output_that_contains_an_input_is_refused(tmp_path, capsys, given):
+def test_output_that_contains_an_input_is_refused(tmp_path, capsys):
     out = tmp_path / 'out'
     link = tmp_path / 'link.mcap'
     bag = Drive(sweeps=3).write(tmp_path / 'drive')
@@ -755,10 +756,9 @@ def test_output_that_contains_an_input_is_refused(tmp_path, capsys, given):
     margins = out / 'margins.yaml'
     margins.write_text('')
     before = sorted(out.rglob('*'))
-    words = ['relabel', given.format(out=out, link=link, bag=bag), '-o', str(out)]
-    words += ['--config', str(margins)] if given == '{bag}' else []
-    assert main(words) == 2
-    assert 'choose another with -o' in capsys.readouterr().err
+    for words in ([out / 'drive.mcap'], [out], [link], [bag, '--config', margins]):
+        assert main(['relabel', *map(str, words), '-o', str(out)]) == 2, words
+        assert 'choose another with -o' in capsys.readouterr().err, words
     labels = 'csv', out / 'boxes.csv'
     with pytest.raises(ConfigError, match=r"contains no input, got one with .*boxes\.csv'"):
         run(bag, out, labels=labels)
