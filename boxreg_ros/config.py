@@ -520,6 +520,11 @@ class Config:
             return cls.from_dict(_without_node_options(values))
         except OSError as error:
             raise ConfigError(f'config file {unreadable(path, error)}') from None
+        except UnicodeDecodeError as error:
+            raise ConfigError(
+                f'config file {str(path)!r}: expected YAML in UTF-8, got other bytes '
+                f'({error.reason}); save it as UTF-8, or correct the path'
+            ) from None
         except (ConfigError, *YAML_ERRORS) as error:
             raise ConfigError(f'config file {str(path)!r}: {one_line(error)}') from None
 

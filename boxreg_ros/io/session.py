@@ -260,9 +260,11 @@ class Session:
             )
         found = self.tree.fixed_frame(sensor_frame)
         if found is None:
+            is_alone = sensor_frame not in self.tree.frames() and bool(self.tree.edges())
+            connect = 'publish its place in one of these on /tf_static; ' if is_alone else ''
             raise TransformUnavailable(
                 f'neither /tf nor odometry has the motion of the frame of the clouds '
-                f'{sensor_frame!r}; known: {self.tree}; if it does not move, set '
+                f'{sensor_frame!r}; known: {self.tree}; {connect}if it does not move, set '
                 f'fixed_frame:={self.tree.root(sensor_frame)}'
             )
         self.fixed_frame = found

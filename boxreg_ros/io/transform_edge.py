@@ -25,6 +25,8 @@ SAME_POSITION = 0.01
 """Positions of one frame at one stamp differ by less [m]; chosen: one centimetre of rounding."""
 SAME_ANGLE = 0.01
 """And its orientations by less [rad]; chosen: a centimetre at a metre."""
+IF_LATE = 'where it comes late or rarely, raise transform_timeout of the node'
+"""Remedy for transforms that arrive after the messages that need them."""
 END_NS = 10**9
 """Time without transforms that is not the fault of a clock [ns]; chosen: detectors are as late."""
 MAX_LINEAR_GAP = 0.25
@@ -302,18 +304,18 @@ class Edge:
     def _remedy(self, outside_ns: int) -> str:
         """Return what to do about a stamp so far from all samples [ns]."""
         if len(self.stamps) < 2:
-            return 'check that its stamps use the clock of the point cloud'
+            return f'check that its stamps use the clock of the point cloud; {IF_LATE}'
         period_ns = float(np.median(np.diff(self.stamps)))
         if period_ns > MAX_LINEAR_GAP * 1e9 and outside_ns < 2 * period_ns:
             return (
                 f'it comes every {period_ns * 1e-9:.2g} s, too rarely to carry the motion on for '
                 f'{outside_ns * 1e-9:.2g} s; use a faster source of motion, if there is one: '
-                f'--odometry TOPIC comes before TF'
+                f'--odometry TOPIC comes before TF; {IF_LATE}'
             )
         if outside_ns < END_NS:
             return (
-                'nothing to do where the recording begins or ends; elsewhere transforms are '
-                'missing, or the stamp is late'
+                f'nothing to do where the recording begins or ends; elsewhere transforms are '
+                f'missing, or the stamp is late; {IF_LATE}'
             )
         return (
             'check that its stamps use the clock of the point cloud; of a recording, a part '

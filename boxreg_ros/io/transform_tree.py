@@ -519,7 +519,7 @@ class TransformTree:
             if route is None:
                 raise TransformUnavailable(
                     f'no transform from {source!r} to {target!r}; known: {self}; publish the '
-                    f'missing one on /tf or as odometry, or choose another fixed frame'
+                    f'missing one on /tf or as odometry, or choose another frame'
                 )
             self._routes[key] = route
         return self._routes[key]

@@ -115,6 +115,8 @@ class BoxregNode(PolledClockNode):
         wait = TransformWait(session, options.transform_timeout, options.output_frame)
         patience = options.static_points_wait if options.static_points else None
         self._model = ModelFile(options.input_model)
+        if self._model.text:
+            self.get_logger().info(self._model.text)
         self._live = MessagePipeline(
             config, session, wait, report, self._budget, patience, self._model.drives
         )
@@ -322,6 +324,7 @@ class BoxregNode(PolledClockNode):
         few = QoSProfile(depth=FOLLOW_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._topics.subscribe(boxed(FOLLOW_TOPIC, few, self._follow))
         self.get_logger().info(f'boxes are {type_name}; {self._topics.description()}')
+        self._topics.warn_of_unused_overrides()
 
     def _follow(self, msg: Any) -> None:
         if self._can_follow.is_set():

@@ -167,6 +167,11 @@ def declare(node: Node) -> tuple[Config, NodeOptions]:
             f'{names}: ignored, since the node does not wait for whole tracks; for missed '
             f'detections set coast'
         )
+    if options.config_file != NodeOptions().config_file:
+        node.get_logger().info(
+            f'config_file: ~/save_config writes {options.config_file!r}, which is not read: to '
+            f'read a saved file, start with --params-file'
+        )
     config = replace(config, estimate='final', complete=Config().complete)
     values = [*config.items(), *options.items()]
     for item, value in values:

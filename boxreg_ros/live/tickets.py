@@ -81,7 +81,8 @@ class Tickets:
         try:
             ticket.boxes, ticket.frame = self._in_output_frame(item, given)
         except TransformUnavailable as error:
-            return item._replace(moved=None, reason=Reason.NO_TRANSFORM, detail=str(error))
+            detail = f'output_frame: {error}'
+            return item._replace(moved=None, reason=Reason.NO_TRANSFORM, detail=detail)
         ticket.has_new_ids = moved.track_ids != given.track_ids
         if ticket.has_new_ids:
             ticket.boxes = replace(ticket.boxes, track_ids=moved.track_ids)

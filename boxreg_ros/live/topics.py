@@ -43,6 +43,8 @@ QOS_OVERRIDES = QoSOverridingOptions(
     [QoSPolicyKind[policy.upper()] for policy in (*QOS_POLICIES, 'depth')]
 )
 """Policies that parameters ``qos_overrides.TOPIC.ENTITY.POLICY`` may set."""
+RCLPY_TOPICS = ('/clock', '/parameter_events', '/rosout')
+"""Topics of every node, whose QoS overrides rclpy takes."""
 TF_TOPIC = '/tf'
 """Of moving transforms, as of tf2; a robot in a namespace has it there."""
 FOLLOW_TOPIC = '~/follow'
@@ -179,6 +181,22 @@ class NodeTopics:
         published = [_described(item) for item in self._endpoints if not item.is_input]
         return f'subscribed to {"; ".join(subscribed)}. Publishing {"; ".join(published)}'
 
+    def warn_of_unused_overrides(self) -> None:
+        """Log the QoS overrides that no topic takes; for when all topics are there."""
+        used = {
+            f'{item.name}.{"subscription" if item.is_input else "publisher"}.{policy}'
+            for item in self._endpoints
+            for policy in (*QOS_POLICIES, 'depth')
+        }
+        given: dict[str, Any] = self._node.get_parameters_by_prefix('qos_overrides')
+        unused = sorted(n for n in given if n not in used and not n.startswith(RCLPY_TOPICS))
+        if unused:
+            self._node.get_logger().warning(
+                f'qos_overrides.{", qos_overrides.".join(unused)}: ignored; expected '
+                f'TOPIC.subscription.POLICY or TOPIC.publisher.POLICY, a topic as named above and '
+                f'{", ".join(QOS_POLICIES)} or depth: correct the name'
+            )
+
     def box_publishers(self) -> dict[bool | None, list[TopicEndpointInfo]]:
         """
         Return the publishers of boxes by whether these are refined by a node of this kind.
@@ -201,7 +219,7 @@ class NodeTopics:
                 peers = self._node.get_subscriptions_info_by_topic(endpoint.topic)
             same_type = [peer for peer in peers if peer.topic_type == endpoint.type_name]
             other_type = [peer for peer in peers if peer.topic_type != endpoint.type_name]
-            found += _qos_problems(endpoint, same_type)
+            found += qos_problems(endpoint, same_type)
             if other_type and not (endpoint.is_input and same_type):
                 found.append(_type_problem(endpoint, other_type))
             if endpoint.is_input:
@@ -404,7 +422,7 @@ def _seconds(duration_ns: int) -> str:
     return 'infinite' if duration_ns >= INFINITE_NS else f'{1e-9 * duration_ns:g} s'
 
 
-def _qos_problems(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Iterator[TopicProblem]:
+def qos_problems(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Iterator[TopicProblem]:
     """Yield a problem for each policy for which an endpoint and a peer do not match."""
     for peer in peers:
         publisher, subscription = peer.qos_profile, endpoint.qos
@@ -415,11 +433,13 @@ def _qos_problems(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Iterato
             ours = 'subscription', 'requests', requested
             if not endpoint.is_input:
                 theirs, ours = ours, theirs
+            override = ''
+            if policy in QOS_POLICIES:
+                name = f'qos_overrides.{endpoint.name}.{ours[0]}.{policy}'
+                override = f'set the parameter {name} to {theirs[2]}, or '
             text = (
                 f'the {theirs[0]} of {nodes_of([peer])} {theirs[1]} {policy} {theirs[2]}, the '
-                f'{ours[0]} of this node {ours[1]} {ours[2]}; set the parameter '
-                f'qos_overrides.{endpoint.name}.{ours[0]}.{policy} to {theirs[2]}, or change the '
-                f'{theirs[0]}'
+                f'{ours[0]} of this node {ours[1]} {ours[2]}; {override}change the {theirs[0]}'
             )
             yield TopicProblem(f'{endpoint.name}: {text}', DiagnosticStatus.ERROR, is_qos=True)
 

@@ -62,6 +62,7 @@ def test_parameters_and_services_at_run_time(graph, tmp_path):
     assert '/points: the publisher of /neighbour offers reliability best_effort' in output
     assert 'requests durability transient_local, the publisher of this node' in output
     assert 'qos_overrides' in output
+    assert f'{str(file)!r}, which is not read: to read' in output
 
     def set_to(**values):
         changes = [Parameter(n.replace('__', '.'), value=v) for n, v in values.items()]

@@ -16,6 +16,8 @@ def test_a_drive_is_added_to_the_file_of_the_drives_before(tmp_path):
             node = graph.run(part, *QUICK, *options)
             node.play(part)
             ended_cleanly(node)
+        known = f'drives read from {model}: 1' if number == 2 else f'no file {model} yet'
+        assert known in node.output()
         drives = from_text(model.read_text(), str(model))
         assert len(drives) == number
         assert all(len(kinds[0].tracks) for kinds in drives.values())

@@ -8,7 +8,13 @@ from types import SimpleNamespace
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.polling import PolledClockNode
-from boxreg_ros.live.topics import Endpoint, import_message, mismatches, NodeTopics
+from boxreg_ros.live.topics import (
+    Endpoint,
+    import_message,
+    mismatches,
+    NodeTopics,
+    qos_problems,
+)
 from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters.convention import Convention
 from preloaded import CODE, IMPATIENT_NODE
@@ -141,8 +147,10 @@ def test_qos_overrides_apply_to_markers_and_durability(graph):
         'refined_markers.publisher.durability': 'transient_local',
         'refined_markers.publisher.depth': 3,
         'points.subscription.durability': 'transient_local',
+        'points.subscription.reliabilty': 'reliable',
     }
     options = [f'qos_overrides./{name}:={value}' for name, value in overrides.items()]
+    options += [f'boxes_type:={DETECTIONS}', 'qos_overrides.points.subscription.depth:=1']
     node = graph.start(*[part for text in options for part in ('-p', text)])
     graph.wait(lambda: topics_status(diagnostics).values, 'diagnostics')
     values = {item.key: item.value for item in topics_status(diagnostics).values}
@@ -153,6 +161,9 @@ def test_qos_overrides_apply_to_markers_and_durability(graph):
     (info,) = graph.node.get_subscriptions_info_by_topic('/points')
     assert info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     assert ended_cleanly(node)
+    (warning,) = [line for line in node.output().splitlines() if 'ignored' in line]
+    assert 'qos_overrides./points.subscription.reliabilty, qos_overrides.points.' in warning
+    assert 'markers' not in warning
     assert 'ERROR' not in node.output()
 
 
@@ -367,6 +378,9 @@ def test_a_policy_mismatches_in_one_direction_only(policy, offered, requested):
     assert [name for name, *_ in mismatches(weak, strong)] == [policy]
     assert not mismatches(strong, weak)
     assert not mismatches(weak, weak)
+    peer = SimpleNamespace(qos_profile=weak, node_name='lidar', node_namespace='/')
+    (problem,) = qos_problems(Endpoint(POINTS, 'points', strong, print), [peer])
+    assert ('qos_overrides' in problem.text) == (policy in ('reliability', 'durability'))
 
 
 def test_transforms_of_a_robot_in_a_namespace_are_named(graph):

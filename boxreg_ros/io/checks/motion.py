@@ -36,7 +36,10 @@ MAX_BOXES_DELAY = 1.0
 """Delay of boxes after their clouds that is reported [s]; a live detector takes 0.1 to 0.5 s."""
 MIN_COPIED = 0.5
 """Part of the stamps that are those of clouds by which one clock has set both; chosen."""
-LATE_ODOMETRY = ', unless it is computed from these clouds, whose stamps it has, and comes late'
+LATE_ODOMETRY = (
+    ', unless it is computed from these clouds, whose stamps it has, and comes late: then raise '
+    'transform_timeout of the node'
+)
 LOOK_PERIOD = 10
 """Clouds between two looks at what changes slowly; chosen: 1 s at 10 Hz."""
 SETTLED_CLOUDS = 15
