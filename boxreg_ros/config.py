@@ -550,12 +550,7 @@ def words_of(class_name: str) -> set[str]:
 
 
 @lru_cache(maxsize=4096)
-def _kind_by_names(
-    class_name: str,
-    cyclist: tuple[str, ...],
-    pedestrian: tuple[str, ...],
-    vehicle: tuple[str, ...],
-) -> str:
+def _kind_by_names(class_name: str, *names_of_kinds: tuple[str, ...]) -> str:
     """
     Return the kind with the name of most words, all of them in `class_name`; empty for none.
 
@@ -564,7 +559,7 @@ def _kind_by_names(
     """
     words = words_of(class_name)
     found, most = '', 0
-    for kind, names in (('cyclist', cyclist), ('pedestrian', pedestrian), ('vehicle', vehicle)):
+    for kind, names in zip(('cyclist', 'pedestrian', 'vehicle'), names_of_kinds, strict=True):
         for name in map(words_of, names):
             if name <= words and len(name) > most:
                 found, most = kind, len(name)
