@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.images import Image
@@ -116,23 +116,23 @@ def read(path: Path) -> Iterator[LabelFrame]:
     path, part = _parts(path)
     scene, folder = cuboids.single_part(path, 'scene', [RESULT_FOLDER, LIDAR_FOLDER])
     names = {file.stem for file in visible(scene, f'{LIDAR_FOLDER}/*.pcd')}
-    results: dict[str, list[_Result]] = {}
+    results: dict[str, list[tuple[str, FrameBoxes]]] = {}  # of each source
     for file in visible(scene, f'{RESULT_FOLDER}/*.json'):
         content = from_json(file)
         with following(file, 'objects of Xtreme1'):
             results[file.stem] = _results(content)
-    sources = [one.source for found in results.values() for one in found if one.boxes]
+    sources = [one for found in results.values() for one, (boxes, _) in found if boxes]
     source = _source(path, Counter(sources), part)
 
     def boxes_of(name: str) -> FrameBoxes:
         boxes: list[ReadBox] = []
         left_out: Counter[str] = Counter()
-        for result in results.get(name, ()):
-            left_out[Reason.NO_BOX] += result.without_box
-            if result.source == source:
-                boxes += result.boxes
+        for one, (found, absent) in results.get(name, ()):
+            left_out.update(absent)
+            if one == source:
+                boxes += found
             else:
-                left_out[Reason.OTHER_SOURCE] += len(result.boxes)
+                left_out[Reason.OTHER_SOURCE] += len(found)
         return boxes, +left_out
 
     frames = named_frames(folder, names | results.keys())
@@ -169,18 +169,10 @@ def _parts(path: Path) -> tuple[Path, str]:
     return (path, '') if path.exists() or not mark else (Path(before), part)
 
 
-class _Result(NamedTuple):
-    """The boxes of one source in a frame, and the number of its objects without a box."""
-
-    source: str
-    boxes: list[ReadBox]
-    without_box: int
-
-
-def _results(content: Any) -> list[_Result]:
-    """Return the results in a file: one, or a list with one for each source."""
+def _results(content: Any) -> list[tuple[str, FrameBoxes]]:
+    """Return source and boxes of each result in a file: one, or a list for several sources."""
     parts = content if isinstance(content, list) else [content]
-    found = []
+    found: list[tuple[str, FrameBoxes]] = []
     for part in parts:
         result = part.get('result') or part  # versions up to 0.5 have another level
         source = str(part.get('sourceName') or '')
@@ -195,7 +187,7 @@ def _results(content: Any) -> list[_Result]:
                     without_box += 1
                     continue
                 boxes.append(_cuboid(item, source))
-        found.append(_Result(source, boxes, without_box))
+        found.append((source, (boxes, {Reason.NO_BOX: without_box})))
     return found
 
 
