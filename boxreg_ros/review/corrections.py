@@ -61,14 +61,10 @@ class Corrections:
         earlier: Iterable[Decision] = (),
     ) -> None:
         self._rejected = rejected
-        self._of_track: dict[str, list[Decision]] = {}
-        self._earlier_classes: dict[str, list[Decision]] = {}
         decisions, earlier = [*decisions], held(earlier)
-        for one in held([*(one for one in earlier if one.kind != 'reclass'), *decisions]):
-            self._of_track.setdefault(one.track_id, []).append(one)
-        for one in earlier:
-            if one.kind == 'reclass':
-                self._earlier_classes.setdefault(one.track_id, []).append(one)
+        others = (one for one in earlier if one.kind != 'reclass')
+        self._of_track = _by_track(held([*others, *decisions]))
+        self._earlier_classes = _by_track(one for one in earlier if one.kind == 'reclass')
         self._unused = {
             one.scope
             for one in held(decisions)
@@ -534,6 +530,14 @@ class Corrections:
             new_id = renames[-1].value if renames else one.track_id
             by_track.setdefault(new_id, []).append(one.box[BOX_EXTENT])
         return {track_id: np.mean(extents, axis=0) for track_id, extents in by_track.items()}
+
+
+def _by_track(decisions: Iterable[Decision]) -> dict[str, list[Decision]]:
+    """Return decisions by the track that they are about, in their order."""
+    found: dict[str, list[Decision]] = {}
+    for one in decisions:
+        found.setdefault(one.track_id, []).append(one)
+    return found
 
 
 def _array_of(one: Decision, track_id: str, class_name: str) -> BoxArray:

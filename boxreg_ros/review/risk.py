@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.observation import MARGIN
+from boxreg_ros.core.tables import rows_by_key
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
@@ -117,14 +118,12 @@ class Usual(NamedTuple):
         counts = counts[counts.sum(axis=1) > 0]
         outside = counts[:, 1] / counts.sum(axis=1)
         usual = float(np.median(outside)) if len(outside) >= MIN_COMPARED else USUAL_OUTSIDE
-        by_class: dict[str, list[Floats]] = {}
-        for track in tracks:
-            size = np.log(_extents(track)).mean(axis=0)
-            by_class.setdefault(track.class_name, []).append(size)
+        logs = np.array([np.log(_extents(track)).mean(axis=0) for track in tracks]).reshape(-1, 3)
+        by_class = rows_by_key([track.class_name for track in tracks])
         sizes = {
-            name: _median_and_deviation(np.array(of_class))
-            for name, of_class in by_class.items()
-            if len(of_class) >= MIN_COMPARED
+            name: _median_and_deviation(logs[rows])
+            for name, rows in by_class.items()
+            if len(rows) >= MIN_COMPARED
         }
         return cls(usual, sizes)
 
