@@ -12,10 +12,11 @@ from boxreg_ros.labels import import_format
 from boxreg_ros.labels.registry import BUILT_IN
 from boxreg_ros.offline import formats
 from boxreg_ros.reasons import Reason
-from msg_adapters import registry
+from msg_adapters import MESSAGE_TYPES
 
 DOCS = Path(__file__).resolve().parent
 COMMAND = 'python docs/generate.py'
+MESSAGE_COLUMNS = ('type', 'track id', 'class and score', 'also written')
 READING_COLUMNS = ('name', 'what is read', 'what is left out', 'read back by')
 
 
@@ -51,6 +52,14 @@ def parameters() -> str:
     )
 
 
+def message_rows() -> list[tuple[str, ...]]:
+    """Return what is read and written of each type of messages, in `MESSAGE_COLUMNS`."""
+    return [
+        (name, item.track_id or 'none', item.class_and_score or 'none', item.also_written)
+        for name, item in MESSAGE_TYPES.items()
+    ]
+
+
 def reading_rows() -> list[tuple[str, ...]]:
     """Return what is read of each format and data set that states it, in `READING_COLUMNS`."""
     found: list[tuple[str, ...]] = []
@@ -65,7 +74,7 @@ def reading_rows() -> list[tuple[str, ...]]:
 TABLES = {
     'parameters.md': {'': parameters},
     'formats.md': {
-        'messages': lambda: table(registry.MESSAGE_COLUMNS, registry.rows()),
+        'messages': lambda: table(MESSAGE_COLUMNS, message_rows()),
         'labels': lambda: table(formats.FORMAT_COLUMNS, formats.rows()),
         'reading': lambda: table(READING_COLUMNS, reading_rows()),
         'datasets': lambda: table(formats.DATASET_COLUMNS, formats.dataset_rows()),

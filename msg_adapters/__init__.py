@@ -13,9 +13,7 @@ from msg_adapters.registry import (
     adapter_for,
     ADAPTERS,
     canonical,
-    MESSAGE_COLUMNS,
     MESSAGE_TYPES,
-    rows,
     WITHOUT_IDS,
 )
 
@@ -25,9 +23,7 @@ __all__ = [
     'ADAPTERS',
     'canonical',
     'CLOUD_TYPES',
-    'MESSAGE_COLUMNS',
     'MESSAGE_TYPES',
     'POINTS_TYPE',
-    'rows',
     'WITHOUT_IDS',
 ]

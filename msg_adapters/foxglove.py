@@ -75,15 +75,13 @@ def to_msg(
     msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
     """Return a copy with the cubes replaced; covariances are not written."""
-    quaternions_xyzw = poses.quaternions_of(boxes.boxes)
+    own = poses.placed(boxes)
     entities = []
-    i = 0  # index of the next box
     for entity in _items(msg, 'entities'):
         cubes = []
         for cube in _items(entity, 'cubes'):
-            pose, size = poses.with_box(cube.pose, cube.size, boxes.boxes[i], quaternions_xyzw[i])
+            pose, size = poses.with_box(cube.pose, cube.size, *next(own))
             cubes.append(poses.replaced(cube, pose=pose, size=size))
-            i += 1
         if cubes:
             entity = _with_cubes(entity, cubes, boxes.frame_id, T_out_in)
         entities.append(entity)

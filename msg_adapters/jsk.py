@@ -36,10 +36,9 @@ def to_msg(
     msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
     """Return a copy with the boxes replaced; covariances are not written."""
-    quaternions_xyzw = poses.quaternions_of(boxes.boxes)
     replaced = []
-    for i, own in enumerate(msg.boxes):
-        pose, size = poses.with_box(own.pose, own.dimensions, boxes.boxes[i], quaternions_xyzw[i])
+    for own, box in zip(msg.boxes, poses.placed(boxes), strict=True):
+        pose, size = poses.with_box(own.pose, own.dimensions, *box)
         header = poses.with_frame(own.header, boxes.frame_id)
         replaced.append(poses.replaced(own, header=header, pose=pose, dimensions=size))
     header = poses.with_frame(msg.header, boxes.frame_id)

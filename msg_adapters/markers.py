@@ -48,17 +48,13 @@ def to_msg(
     msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
     """Return a copy with the boxes replaced; covariances are not written."""
-    quaternions_xyzw = poses.quaternions_of(boxes.boxes)
+    own = poses.placed(boxes)
     markers = []
-    i = 0  # index of the next box
     for marker in msg.markers:
         if _is_box(marker):
-            pose, scale = poses.with_box(
-                marker.pose, marker.scale, boxes.boxes[i], quaternions_xyzw[i]
-            )
+            pose, scale = poses.with_box(marker.pose, marker.scale, *next(own))
             header = poses.with_frame(marker.header, boxes.frame_id)
             marker = poses.replaced(marker, header=header, pose=pose, scale=scale)
-            i += 1
         markers.append(marker)
     return poses.replaced(msg, markers=markers)
 

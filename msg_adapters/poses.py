@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from operator import attrgetter
 from types import SimpleNamespace
@@ -207,6 +207,11 @@ def quaternion_of(pose: Any) -> tuple[float, float, float, float]:
 def quaternions_of(boxes: Floats) -> Floats:
     """Return quaternions (n, 4), x y z w with w >= 0, of boxes (n, 9); NaN stays NaN."""
     return quaternion_from_rpy(boxes[:, ROLL:])
+
+
+def placed(boxes: BoxArray) -> Iterator[tuple[Floats, Floats]]:
+    """Yield each box (9,) with its quaternion (4,), as `with_box` takes them."""
+    return zip(boxes.boxes, quaternions_of(boxes.boxes), strict=True)
 
 
 def replaced(msg: Any, **fields: Any) -> Any:

@@ -89,16 +89,6 @@ ADAPTERS = {name: item.module for name, item in MESSAGE_TYPES.items()}
 WITHOUT_IDS = tuple(name for name, item in MESSAGE_TYPES.items() if not item.track_id)
 """Types without track ids; their boxes need data association."""
 
-MESSAGE_COLUMNS = ('type', 'track id', 'class and score', 'also written')
-
-
-def rows() -> list[tuple[str, ...]]:
-    """Return the table of message types for the documentation, see `MESSAGE_COLUMNS`."""
-    return [
-        (name, item.track_id or 'none', item.class_and_score or 'none', item.also_written)
-        for name, item in MESSAGE_TYPES.items()
-    ]
-
 
 @dataclass(frozen=True, slots=True)
 class ConvertingAdapter:

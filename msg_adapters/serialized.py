@@ -10,7 +10,7 @@ boxes) after they have been deserialised.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -261,6 +261,12 @@ def serialized_adapter_for(
     return adapter if convention.is_standard else ConvertingAdapter(adapter, convention)
 
 
+def _parts(counts: NDArray[np.int64]) -> Iterator[slice]:
+    """Yield the rows of the elements of each item, of their numbers (n,)."""
+    ends = np.append(0, np.cumsum(counts)).tolist()
+    return map(slice, ends, ends[1:])
+
+
 def _finite_or(new: Floats, old: Floats) -> Floats:
     """Return the rows of `new`, and those of `old` where they are not finite."""
     return np.where(np.isfinite(new).all(1, keepdims=True), new, old)
@@ -286,10 +292,8 @@ def _detection_labels(fields: Fields) -> BoxLabels:
     if (counts == 1).all():
         return fields.texts('detections.id'), classes, scores
     best = []
-    end = 0
-    for count in counts.tolist():
-        begin, end = end, end + count
-        hypotheses = zip(classes[begin:end], scores[begin:end].tolist(), strict=True)
+    for part in _parts(counts):
+        hypotheses = zip(classes[part], scores[part].tolist(), strict=True)
         best.append(max(hypotheses, key=lambda item: item[1], default=('', 1.0)))
     found_scores = np.array([score for _, score in best])
     return fields.texts('detections.id'), [name for name, _ in best], found_scores
@@ -341,10 +345,8 @@ def _autoware_labels(fields: Fields) -> BoxLabels:
     labels = fields.numbers('objects.classification.label', '|u1')[:, 0].tolist()
     probabilities = fields.numbers('objects.classification.probability', '<f4')[:, 0].tolist()
     classes = []
-    end = 0
-    for count in fields.counts('objects.classification').tolist():
-        begin, end = end, end + count
-        best = max(range(begin, end), key=probabilities.__getitem__, default=None)
+    for part in _parts(fields.counts('objects.classification')):
+        best = max(range(part.start, part.stop), key=probabilities.__getitem__, default=None)
         classes.append('' if best is None else autoware.class_name_of(labels[best]))
     scores = fields.numbers('objects.existence_probability', '<f4')[:, 0].astype(np.float64)
     return [''] * len(scores), classes, scores
@@ -463,10 +465,8 @@ def _entity_labels(fields: Fields) -> BoxLabels:
     values = fields.texts('entities.metadata.value')
     classes = []
     scores = []
-    end = 0
-    for count in fields.counts('entities.metadata').tolist():
-        begin, end = end, end + count
-        metadata = dict(zip(keys[begin:end], values[begin:end], strict=True))
+    for part in _parts(fields.counts('entities.metadata')):
+        metadata = dict(zip(keys[part], values[part], strict=True))
         class_name, score = foxglove.class_and_score(metadata)
         classes.append(class_name)
         scores.append(score)

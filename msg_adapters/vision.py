@@ -50,13 +50,13 @@ def to_msg(
 
     """
     header = poses.with_frame(msg.header, boxes.frame_id)
-    quaternions_xyzw = poses.quaternions_of(boxes.boxes)
+    own = poses.placed(boxes)
     if not hasattr(msg, 'detections'):
-        pairs = zip(msg.boxes, boxes.boxes, quaternions_xyzw, strict=True)
-        return poses.replaced(msg, header=header, boxes=[_with_box(*pair) for pair in pairs])
+        new = [_with_box(bbox, *box) for bbox, box in zip(msg.boxes, own, strict=True)]
+        return poses.replaced(msg, header=header, boxes=new)
     detections = []
-    for i, detection in enumerate(msg.detections):
-        bbox = _with_box(detection.bbox, boxes.boxes[i], quaternions_xyzw[i])
+    for i, (detection, box) in enumerate(zip(msg.detections, own, strict=True)):
+        bbox = _with_box(detection.bbox, *box)
         covariance = None if covariances is None else covariances[i]
         results = []
         for result in detection.results:
