@@ -35,7 +35,6 @@ from boxreg_ros.review.track_points import PointCollector, SHOWN_MARGIN
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, RefinedBoxes, ROLL, Sweep, X, Y, Z
 from browser import BROWSER_OPTIONS, BROWSERS, end_shared_browser, opened_page, serving
-import matplotlib
 from measure import MEASURE
 import numpy as np
 from numpy.typing import NDArray
@@ -210,7 +209,9 @@ def car_picture(recording: Path, result: Path) -> bytes:
             collector.gather(pair.boxes, pair.sweep)
     for pair in matcher.flush():
         collector.gather(pair.boxes, pair.sweep)
-    with matplotlib.rc_context(STYLE):
+    from matplotlib import rc_context  # late: most that import this module draw nothing
+
+    with rc_context(STYLE):
         return points_picture(track, collector.points_of(track))
 
 

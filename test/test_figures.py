@@ -2,6 +2,7 @@
 
 import base64
 from dataclasses import replace
+from importlib.util import find_spec
 import io
 import json
 import re
@@ -18,8 +19,9 @@ from paths import BAGS, ROOT
 import pytest
 
 Image = pytest.importorskip('PIL.Image')
-pytest.importorskip('matplotlib')
 figures = pytest.importorskip('figures')
+# Not imported: each process that shares the tests would, also where others run these.
+pytestmark = pytest.mark.skipif(find_spec('matplotlib') is None, reason='no matplotlib')
 PAGES = [ROOT / 'README.md', BAGS / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 MAX_BYTES = 300_000
 """Largest size of a picture, so that pages load fast."""

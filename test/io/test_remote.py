@@ -2,6 +2,7 @@
 
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.util import find_spec
 from io import SEEK_END
 import json
 from pathlib import Path
@@ -24,10 +25,11 @@ import numpy as np
 import pytest
 from ros_messages import Drive, SECOND, START
 
-pytest.importorskip('aiohttp', reason='the extra "remote" is not installed')
 fsspec = pytest.importorskip('fsspec')
 remote_file = pytest.importorskip('boxreg_ros.io.storage.remote_file')
 
+# Not imported: each process that shares the tests would, also where others run these.
+pytestmark = pytest.mark.skipif(find_spec('aiohttp') is None, reason='no extra "remote"')
 QUICK = ['--set=min_observations=3', '--formats=csv']
 
 

@@ -1,6 +1,7 @@
 """`boxreg batch`: each drive once, failures apart, a second run skips drives that are done."""
 
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 import json
 import os
 from threading import Event, Thread
@@ -13,10 +14,10 @@ import pytest
 from relabel_results import rows_in
 from ros_messages import Drive
 
-dask = pytest.importorskip('dask')
-distributed = pytest.importorskip('distributed')
-psutil = pytest.importorskip('psutil')  # comes with it
+psutil = pytest.importorskip('psutil')  # comes with Dask
 
+# Not imported: each process that shares the tests would, also where others run these.
+pytestmark = pytest.mark.skipif(find_spec('distributed') is None, reason='no Dask')
 QUICK = ['--set=min_observations=3', '--set=window=5', '--set=lag=2']
 DECISIONS = 'track_id,stamp_ns,decision,comment,frame_id,x,y,z,qx,qy,qz,qw,length,width,height\n'
 """Header of decisions."""
@@ -151,6 +152,8 @@ def test_a_drive_whose_worker_is_killed_is_done_by_another(tmp_path, capsys):
 
 
 def test_the_workers_of_a_cluster_have_one_thread_each(tmp_path, capsys):
+    import distributed
+
     path = Drive(sweeps=6).write(tmp_path / 'one')
     command = ['batch', str(path), '-o', str(tmp_path / 'out'), *QUICK]
     for threads, status in ((1, 0), (2, 1)):
@@ -166,6 +169,9 @@ def test_the_workers_of_a_cluster_have_one_thread_each(tmp_path, capsys):
 
 
 def test_a_drive_whose_workers_are_all_killed_has_failed(tmp_path, capsys):
+    import dask
+    import distributed
+
     path = Drive(sweeps=6).write(tmp_path / 'one')
     out = tmp_path / 'out'
     options = {'n_workers': 1, 'threads_per_worker': 1, 'dashboard_address': None}
