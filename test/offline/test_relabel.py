@@ -18,8 +18,9 @@ from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transform_tree import TransformTree
-from boxreg_ros.labels import Options
+from boxreg_ros.labels import LabelFrame, Options
 from boxreg_ros.labels.cloud_spool import Spool
+from boxreg_ros.labels.records import refined_of
 from boxreg_ros.offline import reader as reading
 from boxreg_ros.offline.convert import convert
 from boxreg_ros.offline.notes import closing_line, notes
@@ -689,8 +690,10 @@ def test_earlier_result_is_replaced_only_by_success(tmp_path):
 def test_spool_returns_clouds_within_the_maximum_time_offset(tmp_path):
     spool = Spool(tmp_path, Config(reach=0.06))
     spool.add(Sweep(START, 'lidar', np.ones((1, 3))), np.eye(4))
-    assert spool.take(START - SECOND * 50 // 1000, 'lidar', np.eye(4))[0] is not None
-    assert spool.take(START - SECOND * 70 // 1000, 'lidar', np.eye(4))[0] is None
+    for milliseconds, has_cloud in ((70, False), (50, True)):
+        refined = refined_of(START - SECOND * milliseconds // 1000, 'lidar', ())
+        frame = spool.with_cloud(LabelFrame(refined, 'map', 'lidar', np.eye(4)))
+        assert (frame.sweep is not None) == has_cloud
 
 
 def test_label_frames_without_cloud_are_a_note(tmp_path):
