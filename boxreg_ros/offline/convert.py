@@ -131,7 +131,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             'left_out_of_source': dict(+not_read),
             'assumed': assumed,
             **unused,
-            'warning': '; '.join(filter(None, (axes.finding, request.unbound_text()))),
+            'warning': '; '.join(filter(None, (axes.finding, request.unbound_text(False)))),
             'left_out_of_labels': left_out,
             'label_notes': output.notes(),
             'versions': {'boxreg_ros': __version__},

@@ -16,7 +16,7 @@ from boxreg_ros.io.storage.urls import entries_of, url_of
 from boxreg_ros.labels import check_options, files_of, labels_points, module_of, Options
 from boxreg_ros.offline.result_folder import has_changed
 from boxreg_ros.options import option
-from boxreg_ros.review.decisions import APPLIED, DECISIONS
+from boxreg_ros.review.decisions import APPLIED, DECISIONS, read_decisions
 from msg_adapters.convention import Convention, STANDARD
 
 NO_TOPIC = 'none'
@@ -287,8 +287,16 @@ class Request:
         path = (path if path.is_dir() else path.parent) / APPLIED
         return path if path.is_file() else None
 
-    def unbound_text(self) -> str:
-        """Return that decisions of a person beside the labels do not bind; '' for none."""
+    def unbound_text(self, refines: bool = True) -> str:
+        """
+        Return that decisions of a person beside the labels do not bind; '' for none.
+
+        Parameters
+        ----------
+        refines : bool
+            Whether the run refines boxes.
+
+        """
         if self.labels is None or self.decisions is not None:
             return ''
         name, path = self.labels
@@ -305,12 +313,15 @@ class Request:
                 )
         files = [folder / each for folder in folders for each in (APPLIED, DECISIONS)]
         found = next((file for file in files if file.is_file()), None)
-        if found is None or name == 'csv' or not self.completes:
+        if found is None or name == 'csv':
+            return ''
+        if not self.completes and not (refines and _has_rejected(found)):
             return ''
         return (
-            f'labels {str(path)!r}: {found.name} beside them is about boxes.csv alone: classes '
-            f'and ids that a person gave may change, and deleted boxes be added again; use '
-            f'--labels csv:{found.parent}, or relabel the recording with --decisions'
+            f'labels {str(path)!r}: {found.name} beside them is about boxes.csv alone: boxes '
+            f'that a person rejected are refined again, classes and ids that a person gave may '
+            f'change, and deleted boxes be added again; use --labels csv:{found.parent}, or '
+            f'relabel the recording with --decisions'
         )
 
     def drive_name(self) -> str:
@@ -329,6 +340,13 @@ class Request:
                 place = one.path if url_of(path) is not None else one.path.resolve()
                 files.append((str(place), one.size, one.version))
         return hashlib.sha256(repr((__version__, self, files)).encode()).hexdigest()
+
+
+def _has_rejected(decisions: Path) -> bool:
+    """Return whether decisions about a result reject refined boxes, which its labels have not."""
+    if decisions.name != APPLIED:
+        return False
+    return any(one.kind == 'reject' for one in read_decisions(decisions))
 
 
 def _parts_of(path: Path) -> tuple[Path, ...]:

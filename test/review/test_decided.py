@@ -528,6 +528,9 @@ def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, op
     capsys.readouterr()
     Run(recording, '--labels', f'openlabel:{other}', '--complete')(tmp_path / '4')
     assert f'--labels csv:{tmp_path / "3"}, or' in capsys.readouterr().err
+    request = Request((recording,), labels=('openlabel', other))
+    assert 'a person rejected are refined again' in request.unbound_text()
+    assert not request.unbound_text(refines=False)
     decided = tmp_path / '0'
     (decided / APPLIED).unlink()  # as of a run that has deleted boxes alone
     requests = [
