@@ -1,6 +1,7 @@
 """Environment of all tests: ROS on this machine only, in its own domain, with type checks."""
 
 import fcntl
+import gc
 import os
 from pathlib import Path
 import signal
@@ -49,9 +50,11 @@ def pytest_collection():
         fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         fcntl.flock(folder, fcntl.LOCK_SH)
+    gc.disable()  # what is imported and collected stays
     try:
         return (yield)
     finally:
+        gc.enable()
         os.close(folder)
 
 
