@@ -41,6 +41,8 @@ class DebugTimes:
         now = self._now()
         times = (1e3 * seconds, 1e-6 * (now.nanoseconds - stamp_ns))  # [ms]
         for publisher, milliseconds in zip(publishers, times, strict=True):
+            if publisher is self._latency and not now.nanoseconds:
+                continue  # /clock has not come
             message = self._kind(data=milliseconds)
             if hasattr(message, 'stamp'):
                 message.stamp = now.to_msg()

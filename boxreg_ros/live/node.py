@@ -34,7 +34,13 @@ from boxreg_ros.live.model_file import ModelFile
 from boxreg_ros.live.params import changed, declare, numbers_as_declared, parameters_yaml
 from boxreg_ros.live.pipeline import MessagePipeline
 from boxreg_ros.live.polling import PolledClockNode
-from boxreg_ros.live.topics import Endpoint, FOLLOW_TOPIC, import_message, NodeTopics
+from boxreg_ros.live.topics import (
+    Endpoint,
+    FOLLOW_TOPIC,
+    import_message,
+    NodeTopics,
+    TopicProblem,
+)
 from boxreg_ros.live.transform_wait import TransformWait
 from boxreg_ros.live.worker import Worker
 from boxreg_ros.reasons import Reason
@@ -62,6 +68,11 @@ MOTION_DEPTH = 1000
 """Queue size of `odom` and /tf: a second of five publishers of 200 Hz."""
 FOLLOW_DEPTH = 10
 """Queue size of `~/follow`, where a person publishes."""
+WITHOUT_CLOCK = TopicProblem(
+    '/clock: use_sim_time is set, and nothing has been received from it: /diagnostics has stamps '
+    'of 0 and no ages; play the recording with --clock, or set use_sim_time to false'
+)
+"""Clouds without a time; boxes are refined as always, by their stamps."""
 FINALS_MARGIN = 10
 """Queue size of the boxes beyond what may be published at once at the end."""
 
@@ -396,13 +407,15 @@ class BoxregNode(PolledClockNode):
     def _publish_status(self) -> None:
         name = self.get_fully_qualified_name()
         further = [] if self._search is None else self._search.problems()
+        now = self.get_clock().now()
+        if not now.nanoseconds and self.worker.cloud_received:
+            further.append(WITHOUT_CLOCK)
         topics = self._topics.report(f'{name}: topics', further)
         self._health.log_counts()
         self._health.log_waiting(self.worker.fixed_frame or '')
-        now = self.get_clock().now()
         newest_ns = self.worker.newest_transform_ns
         age = 'none'
-        if newest_ns is not None:
+        if newest_ns is not None and now.nanoseconds:
             age = f'{1e-9 * (now.nanoseconds - newest_ns):.3f}'
         facts = {
             'fixed_frame': self.worker.fixed_frame or 'not known yet',

@@ -129,7 +129,15 @@ def test_time_jump_with_sim_time_and_silence_after_it(graph, tmp_path):
     )
     clock = graph.publisher('rosgraph_msgs/msg/Clock', '/clock')
     node = graph.run(first, *QUICK, '-p', 'use_sim_time:=true', '-p', 'backlog:=60.0')
-    for records, sec in ((first, START // SECOND + 31), (second, START // SECOND + 1)):
+    begun = next(i for i, record in enumerate(first) if record.topic == '/points') + 1
+    for record in first[:begun]:
+        graph.publishers[record.topic].publish(record.data)
+    text = '/clock: use_sim_time is set'
+    graph.wait(lambda: node.diagnostics and text in node.diagnostics[-1].status[1].message, text)
+    assert node.values()['newest transform, age [s]'] == 'none'
+    assert text in node.output()
+    rest = first[begun:]
+    for records, sec in ((rest, START // SECOND + 31), (second, START // SECOND + 1)):
         message = import_message('rosgraph_msgs/msg/Clock')()
         message.clock.sec = sec
         clock.publish(message)
