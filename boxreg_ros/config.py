@@ -8,6 +8,7 @@ these dataclasses. Deviations are standard deviations: each residual is divided 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
@@ -516,7 +517,7 @@ class Config:
 
         """
         try:
-            values = yaml.safe_load(Path(path).read_text(encoding='utf-8')) or {}
+            values = yaml.load(Path(path).read_text(encoding='utf-8'), _SettingsLoader) or {}
             return cls.from_dict(_without_node_options(values))
         except OSError as error:
             raise ConfigError(f'config file {unreadable(path, error)}') from None
@@ -527,6 +528,19 @@ class Config:
             ) from None
         except (ConfigError, *YAML_ERRORS) as error:
             raise ConfigError(f'config file {str(path)!r}: {one_line(error)}') from None
+
+
+class _SettingsLoader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
+    """Reads YAML, but refuses a setting that is given twice: PyYAML would take the last one."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        is_mapping = isinstance(node, yaml.MappingNode)  # not so with a wrong tag
+        names = Counter(str(key.value) for key, _ in node.value) if is_mapping else Counter()
+        twice = [name for name, number in names.items() if number > 1]
+        if twice:
+            raise ConfigError(f'{twice[0]}: expected one value, got it twice; leave one out')
+        values: dict[Any, Any] = super().construct_mapping(node, deep)
+        return values
 
 
 def _without_node_options(values: Any) -> Any:

@@ -156,7 +156,15 @@ def test_wrong_types_are_refused_by_name(name, value):
 
 
 @pytest.mark.parametrize(
-    'text', ['- 1\n- 2\n', 'word\n', 'a: [\n', '/**:\n  ros__parameters: 3\n', 'window: 2\n']
+    'text',
+    [
+        '- 1\n- 2\n',
+        'word\n',
+        'a: [\n',
+        '/**:\n  ros__parameters: 3\n',
+        'window: 2\n',
+        'lag: 4\nlag: 5\n',
+    ],
 )
 def test_errors_of_invalid_files_name_the_file(tmp_path, text):
     path = tmp_path / 'invalid.yaml'
