@@ -19,9 +19,6 @@ INSTALL = $(BIN)/python test/uv_install.py --python
 unexport PYTHONPATH AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # Containers often set it: every process would compile all its modules, torch alone for 1.2 s.
 unexport PYTHONDONTWRITEBYTECODE
-# Colorama comes with the packages of the documentation: numba would format each of the 12,000 errors
-# that it makes and catches itself for a terminal, a twentieth of the time to compile.
-export NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING := 1
 
 # Recordings with known truth, and which stored measurements are made again.
 DATA ?= ../recordings
