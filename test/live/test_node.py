@@ -230,10 +230,10 @@ def test_best_effort_publisher_of_boxes_may_start_after_the_node(graph, tmp_path
 
 
 def test_wait_for_transforms_does_not_count_as_backlog(graph, tmp_path):
-    # All clouds get their transforms at once, after many times `backlog`. Boxes arrive before the
+    # All clouds get their transforms at once, after more than `backlog`. Boxes arrive before the
     # first cloud, which determines the fixed frame.
     drive, records = thirty_stamps(tmp_path)
-    options = ['transform_timeout:=60.0', 'queue:=100', 'backlog:=0.5', 'window:=4', 'lag:=2']
+    options = ['transform_timeout:=60.0', 'queue:=100', 'backlog:=4.0', 'window:=4', 'lag:=2']
     options += ['solver.rounds:=1']  # on a busy machine, too, less than the wait for transforms
     node = graph.run(records, *[part for text in options for part in ('-p', text)])
     moving = [record for record in records if record.topic == '/tf']
