@@ -11,6 +11,14 @@ import numpy as np
 
 Centers = tuple[Ints, Floats]
 """Stamps (n,) [ns] and centres (n, 2) [m] of the boxes of one id."""
+SWITCH_SPEED = 10.0
+"""
+Least deviation from constant velocity that is an id switch [m/s].
+
+Derived: within the 0.2 s of two observations no road user changes its velocity by 10 m/s, which
+is 50 m/s^2.
+
+"""
 MOST_APART = 8.0
 """Objects that change places are so near each other [m]; chosen: two lanes."""
 NUM_BOXES = 4

@@ -14,6 +14,7 @@ from itertools import chain
 from math import hypot, inf
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.id_switches import SWITCH_SPEED
 from boxreg_ros.core.method.margins import MIN_HITS
 from boxreg_ros.core.motion import motion_at
 from boxreg_ros.core.observation import Observation
@@ -39,14 +40,6 @@ ID_SWITCH_OBSERVATIONS = 6
 Observations that an id switch is detected from, at least one less; chosen.
 
 The last two are tested against the velocity of those before.
-
-"""
-ID_SWITCH_SPEED = 10.0
-"""
-Least deviation from constant velocity that is an id switch [m/s].
-
-Derived: within the 0.2 s of two observations no road user changes its velocity by 10 m/s, which
-is 50 m/s^2.
 
 """
 
@@ -314,7 +307,7 @@ class ObservedTrack:
         Move the last two observations to a new track if they are of another object.
 
         They are if both are farther from the constant velocity prediction than half the length
-        of the object and `ID_SWITCH_SPEED`. A single one may be an outlier.
+        of the object and `SWITCH_SPEED`. A single one may be an outlier.
 
         """
         recent = self.entries[-ID_SWITCH_OBSERVATIONS:]
@@ -329,7 +322,7 @@ class ObservedTrack:
             part = elapsed_ns / duration_ns
             off_x = entry.place[0] - latest_x - part * (latest_x - first_x)
             off_y = entry.place[1] - latest_y - part * (latest_y - first_y)
-            if hypot(off_x, off_y) < length / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9:
+            if hypot(off_x, off_y) < length / 2 + SWITCH_SPEED * elapsed_ns * 1e-9:
                 return None
         moved, seen = [copy(entry) for entry in self.entries[-2:]], self.seen[-2:]
         for entry in moved:

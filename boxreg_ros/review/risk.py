@@ -15,6 +15,7 @@ from math import erf
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.id_switches import SWITCH_SPEED
 from boxreg_ros.core.observation import MARGIN
 from boxreg_ros.core.tables import rows_by_key
 from boxreg_ros.review.changes import TrackChanges
@@ -50,8 +51,6 @@ USUAL_OUTSIDE = 0.1
 to measure it. Chosen."""
 USUAL_FILL = 0.34
 """Part of its volume with that margin that a car fills; smaller objects fill less. Derived."""
-SWITCH_SPEED = 10.0
-"""Deviation from constant velocity that is an id switch [m/s], as in `core.registrar`."""
 SWITCH_LOSS = 0.5
 """Loss to expect where the id of a track has switched: half its boxes are of another object."""
 MIN_COMPARED = 8

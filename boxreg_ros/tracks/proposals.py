@@ -68,6 +68,10 @@ PERSON_SIZES = (0.2, 1.1), 0.9, (1.2, 2.1)
 CYCLIST_SIZES = (1.1, 2.2), 0.9, (1.2, 2.1)
 """Least and most of the longer side, most of the shorter, and least and most height above the
 road, of what is seen of an object [m]."""
+LONGEST_CAR, HIGHEST_CAR = 6.0, 2.4
+"""Longer or higher vehicles are trucks [m]; chosen: vans are 6 m long and 2.4 m high at most."""
+LEAST_HEIGHT = 0.7
+"""Least height of a box, as part of the usual one; chosen."""
 USUAL = {
     'car': (4.5, 1.9, 1.6),
     'truck': (8.0, 2.5, 3.0),
@@ -319,7 +323,7 @@ def _class_of(clusters: Sequence[_Cluster], moves: bool) -> str:
         return 'pedestrian'
     if moves and _fits(sides, height, CYCLIST_SIZES):
         return 'bicycle'
-    return 'truck' if sides[0] > 6.0 or height > 2.4 else 'car'
+    return 'truck' if sides[0] > LONGEST_CAR or height > HIGHEST_CAR else 'car'
 
 
 def _box(cluster: _Cluster, class_name: str, heading: float | None) -> Floats:
@@ -331,5 +335,5 @@ def _box(cluster: _Cluster, class_name: str, heading: float | None) -> Floats:
         yaw += np.pi / 2
     *usual, tall = USUAL[class_name]
     centre, sides = completed(cluster.points[:, :2], yaw, cluster.origin[:2], np.array(usual))
-    height = max(float(cluster.points[:, 2].max()) - cluster.road, 0.7 * tall)
+    height = max(float(cluster.points[:, 2].max()) - cluster.road, LEAST_HEIGHT * tall)
     return np.array([*centre, cluster.road + height / 2, *sides, height, 0, 0, yaw])

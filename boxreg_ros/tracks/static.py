@@ -18,6 +18,8 @@ import numpy as np
 
 SAME_PLACE = 0.5
 """Least IoU of the median boxes; chosen: another car in the same space rarely reaches it."""
+OCCUPIED = 0.2
+"""3D IoU beyond which another object stands at the place; chosen: cars in a row have none."""
 
 
 def join_static(
@@ -69,6 +71,6 @@ def _is_occupied(place: Floats, after_ns: int, before_ns: int, tracklets: list[T
     for tracklet in tracklets:
         is_between = (tracklet.stamps_ns > after_ns) & (tracklet.stamps_ns < before_ns)
         boxes = tracklet.boxes[is_between]
-        if len(boxes) and (iou_3d(boxes, np.tile(place, (len(boxes), 1))) > 0.2).any():
+        if len(boxes) and (iou_3d(boxes, np.tile(place, (len(boxes), 1))) > OCCUPIED).any():
             return True
     return False

@@ -10,6 +10,7 @@ from math import inf
 from typing import ClassVar, NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
+from boxreg_ros.core.id_switches import SWITCH_SPEED
 from boxreg_ros.core.motion import EndMotion, motion_at, UNKNOWN_SPEED_DEVIATION
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.rotations import wrap_angle
@@ -31,9 +32,6 @@ from boxreg_ros.structures import (
 )
 import numpy as np
 
-SWITCH_SPEED = 10.0
-"""Deviation from constant velocity beyond half a length that is another object [m/s]. Derived: as
-in the registrar, no road user changes its velocity by 10 m/s within two boxes."""
 UNKNOWN_SPEED = 40.0
 """Greatest speed of an object of which only one box is known [m/s]; chosen: a motorway."""
 
