@@ -23,9 +23,9 @@ def true_pose(seconds):
     return T
 
 
-def parked(rng):
+def parked(rng, first):
     """Return boxes (K, 9) of cars beside the arc, and points (M, 3) on their sides."""
-    poses = [true_pose(seconds) for seconds in np.linspace(0, 8, 12)]
+    poses = [true_pose(seconds) for seconds in np.linspace(first, first + 8, 12)]
     boxes = np.tile([0, 0, 0.8, 4.5, 1.9, 1.6, 0, 0, 0.0], (len(poses), 1))
     points = []
     for k, (box, T) in enumerate(zip(boxes, poses, strict=True)):
@@ -38,11 +38,10 @@ def parked(rng):
     return boxes, np.concatenate(points)
 
 
-@pytest.mark.parametrize('frame', ['odom', 'lidar'])
-@pytest.mark.parametrize('late', [0.0, 0.1, 0.3, -0.2])
-def test_motion_that_is_late_is_named_by_boxes_of_the_fixed_frame(late, frame):
+def found(late, frame, size=1.0, too_far=0.0):
+    """Return the findings of boxes of another size, or known ahead only and too far [m]."""
     rng = np.random.default_rng(0)
-    boxes, points = parked(rng)
+    boxes, points = parked(rng, 4 if too_far else 0)
     session = Session(STANDARD, Config(), 'odom')
     session.sensor_frame = 'lidar'
     names = tuple(map(str, range(len(boxes))))
@@ -54,15 +53,28 @@ def test_motion_that_is_late_is_named_by_boxes_of_the_fixed_frame(late, frame):
         T_lidar_odom = inverse(true_pose(k / 10 + 2))
         sweep = sweep_to_frame(Sweep(stamp_ns, 'odom', points), T_lidar_odom, 'lidar')
         noisy = boxes + rng.normal(0, 1, boxes.shape) * [0.1, 0.1, 0.03, 0, 0, 0, 0, 0, 0.02]
+        noisy[:, 3:6] *= size
         array = BoxArray(stamp_ns, 'odom', names, ('car',) * len(names), np.ones(12), noisy)
+        if too_far:
+            seen = boxes_to_frame(array, T_lidar_odom, 'lidar').boxes[:, 0] > 0
+            noisy[:, :2] += too_far * true_pose(k / 10 + 2)[:2, 0]
+            array = array.take(np.flatnonzero(seen))
         if frame == 'lidar':
             array = boxes_to_frame(array, T_lidar_odom, 'lidar')
         session.admit(Item(0, sweep))
         session.admit(Item(0, array))
-    found = [one for one in session.findings if one.reason == 'clock_offset']
-    if not late or frame == 'lidar':
-        assert not found
-        return
+    return [one.text for one in session.findings if one.reason == 'clock_offset']
+
+
+@pytest.mark.parametrize('late', [0.1, 0.3, -0.2])
+def test_motion_that_is_late_is_named_by_boxes_of_the_fixed_frame(late):
+    assert not found(late, 'lidar')
+    (text,) = found(late, 'odom')
     where = f'lie {abs(late) * SPEED:.1f} m {"ahead of" if late > 0 else "behind"} their points'
-    assert f"boxes of 12 objects that stand still in 'odom' {where}" in found[0].text
-    assert f'--clock-offset={-late:g} (node: clock_offset:={-late:g})' in found[0].text
+    assert f"boxes of 12 objects that stand still in 'odom' {where}" in text
+    assert f'--clock-offset={-late:g} (node: clock_offset:={-late:g})' in text
+
+
+@pytest.mark.parametrize('fault', [{'size': 1.0}, {'size': 0.7}, {'size': 2.0}, {'too_far': 0.8}])
+def test_motion_in_time_is_not_named_by_boxes_that_are_off(fault):
+    assert not found(0.0, 'odom', **fault)

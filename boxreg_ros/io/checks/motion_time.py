@@ -44,7 +44,9 @@ MIN_STANDING = 8
 MIN_COMPARED_BOXES = 150
 """Boxes that a finding needs: fewer may all be on one side, where boxes are all too short."""
 FEWEST_BOXES = 3
-"""Boxes of an object that is counted."""
+"""Boxes of an object that is counted, ahead or behind."""
+MIN_OF_SIDE = 3
+"""Objects ahead, and behind, that a finding needs: of one side all may be too long or too far."""
 MIN_MOTION_OFFSET = 0.075
 """Offset that is named [s]; derived: clouds whose points have no times look half a sweep off."""
 MIN_GAIN_DEVIATIONS = 2.5
@@ -94,7 +96,8 @@ class MotionTimeCheck(PairedCheck):
     def __init__(self) -> None:
         super().__init__()
         self._begins: dict[str, tuple[int, Floats]] = {}  # first stamp and centre of each track
-        self._shares = defaultdict[str, list[Floats]](list)  # by track, (C,) of each box
+        # By whether the object is ahead of the sensor, and track: (C,) of each box.
+        self._shares = defaultdict[tuple[bool, str], list[Floats]](list)
         self._speeds: list[float] = []
         self._seen = 0
         self.finding = ''
@@ -164,26 +167,36 @@ class MotionTimeCheck(PairedCheck):
             is_inside = (np.abs(local) <= limit + POINT_MARGIN).all(axis=2)
             counts = (is_inside & (local[..., 2] > ROAD_CLEARANCE - limit[2])).sum(axis=1)
             if counts.max() >= MIN_POINTS_OF_BOX:
-                self._shares[track_id].append(counts / counts.max())
+                is_ahead = bool((box[BOX_CENTER] - motion.position) @ motion.velocity > 0)
+                self._shares[is_ahead, track_id].append(counts / counts.max())
                 self._speeds.append(motion.speed)
 
     def _text(self, fixed_frame: str, frame: str, clock_offset: float) -> str:
         """Return by which time of the motion boxes fit better; empty where it is in time."""
-        known = [np.mean(one, axis=0) for one in self._shares.values() if len(one) >= FEWEST_BOXES]
-        if len(known) < MIN_STANDING or len(self._speeds) < MIN_COMPARED_BOXES:
+        known = {key: one for key, one in self._shares.items() if len(one) >= FEWEST_BOXES}
+        is_ahead = np.array([key[0] for key in known], bool)
+        objects = len({track_id for _, track_id in known})
+        is_of_side = ~is_ahead, is_ahead
+        is_one_sided = min(map(np.count_nonzero, is_of_side)) < MIN_OF_SIDE
+        if is_one_sided or objects < MIN_STANDING or len(self._speeds) < MIN_COMPARED_BOXES:
             return ''
-        shares = np.array(known)
-        best = int(shares.mean(axis=0).argmax())
-        gains = shares[:, best] - shares[:, IN_TIME]
-        deviation = float(gains.std(ddof=1)) / np.sqrt(len(gains))
+        shares = np.array([np.mean(one, axis=0) for one in known.values()])
+        # Boxes that are too long, short or far lie off to one side ahead, to the other behind.
+        best = int(sum(shares[side].mean(axis=0) for side in is_of_side).argmax())
         seconds = float(MOTION_TIMES[best])
-        if abs(seconds) < MIN_MOTION_OFFSET or gains.mean() < MIN_GAIN_DEVIATIONS * deviation:
+        if abs(seconds) < MIN_MOTION_OFFSET:
             return ''
+        for other in IN_TIME, len(MOTION_TIMES) - 1 - best:  # short boxes fit by both times
+            gains = shares[:, best] - shares[:, other]
+            deviation = float(gains.std(ddof=1)) / np.sqrt(len(gains))
+            is_clear = gains.mean() >= MIN_GAIN_DEVIATIONS * deviation
+            if not (is_clear and all(gains[side].mean() > 0 for side in is_of_side)):
+                return ''
         way = abs(seconds) * float(np.median(self._speeds))
         where, when = ('ahead of', 'late') if seconds > 0 else ('behind', 'early')
         total = seconds_text(clock_offset - seconds)
         return (
-            f'boxes of {len(gains)} objects that stand still in {fixed_frame!r} lie {way:.1f} m '
+            f'boxes of {objects} objects that stand still in {fixed_frame!r} lie {way:.1f} m '
             f'{where} their points, on the way of {frame!r}: clouds are placed by a motion that '
             f'is about {abs(seconds):.2g} s {when}, and refined boxes are off as much; correct it '
             f'with --clock-offset={total} (node: clock_offset:={total}); otherwise a static '
