@@ -371,11 +371,12 @@ class SweepMerger:
     Merge the clouds of several LiDARs into one sweep per period.
 
     A sweep has at most one cloud of each topic, and their stamps are within `span` [s]. It is
-    complete with a cloud of every LiDAR that was heard in the last second; without one of them it
-    is returned once a later sweep is complete, or two later ones have begun. After a complete
-    sweep the LiDARs keep their order within a period, so that a lost cloud shifts no pairs. The
-    rule reads stamps and the order of arrival only, no clock. A sweep has the stamp of the first
-    topic in it, in the order of `topics`; the times of its points are relative to that.
+    complete with a cloud of every LiDAR that was heard in the last second, also where that cloud
+    was late by less than `span`, as the first of a LiDAR that begins after the others; without
+    one of them it is returned once a later sweep is complete, or two later ones have begun. After
+    a complete sweep the LiDARs keep their order within a period, so that a lost cloud shifts no
+    pairs. The rule reads stamps and the order of arrival only, no clock. A sweep has the stamp of
+    the first topic in it, in the order of `topics`; the times of its points are relative to that.
 
     `report` is called for each cloud that is late, and each that a sweep lacks; `counts` has them
     by topic and reason, beside those ``merged``.
@@ -421,6 +422,9 @@ class SweepMerger:
                 CLOUD_LATE,
                 f'a cloud of {sweep.stamp_ns} ns arrived after the others of its time were merged',
             )
+            heard_ns = self._heard_ns[sweep.topic]
+            if sweep.stamp_ns >= (self._returned_ns or 0) - self._span_ns:
+                self._heard_ns[sweep.topic] = max(heard_ns, sweep.stamp_ns)  # awaited from now on
             return []
         group[sweep.topic] = sweep, extra
         if not self._heard_ns:  # those that have not been heard are waited for at the start

@@ -72,9 +72,17 @@ def test_a_silent_lidar_is_waited_for_one_second_only():
 
 
 def test_a_lidar_that_was_never_heard_does_not_hold_back_the_others():
-    complete, _ = groups(periods(15, {'a': 0, 'b': 10}))
+    order = periods(15, {'a': 0, 'b': 10})
+    complete, _ = groups(order)
     assert complete[0] == [1000, 1010]
     assert len(complete) == 15
+    # It begins, behind the others of its time: the first cloud is late, the next are waited for.
+    for k in range(15, 30):
+        order += [
+            (name, 1000 + 100 * k + offset) for name, offset in (('a', 0), ('b', 10), ('c', 5))
+        ]
+    complete, _ = groups(order)
+    assert [len(stamps) for stamps in complete] == [2] * 16 + [3] * 14
 
 
 def test_a_lidar_that_is_a_second_late_is_counted_and_left_out():
