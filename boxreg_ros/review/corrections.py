@@ -413,26 +413,31 @@ class Corrections:
 
     def _deletions(self) -> list[Decision]:
         """Return where the tracks of the results have no boxes by a decision: none is added."""
-        places: list[tuple[str, int, int]] = []
+        places: list[tuple[str, int, int, bool]] = []  # with whether boxes are deleted there
         parts: dict[str, list[int]] = {}  # first and last stamps of new tracks
         for one in (*self._of_kind('delete'), *self._of_kind('rename')):
             if one.stamp_ns is None or one.value == one.track_id:
                 continue
-            span = one.stamp_ns, one.stamp_ns if one.end_ns is None else one.end_ns
-            places.append((one.track_id, *span))
+            span = _span_of(one)
+            places.append((one.track_id, *span, one.kind == 'delete'))
             if one.kind == 'delete':
                 renames = (each for each in self._of_track[one.track_id] if each.kind == 'rename')
-                places += [(each.value, *span) for each in renames]
+                for each in renames:
+                    first_ns, last_ns = _span_of(each)
+                    part = max(first_ns, span[0]), min(last_ns, span[1])
+                    places.append((each.value, *part, True))
             elif one.value in self.apart:
                 parts.setdefault(one.value, []).extend(span)
         for name, ends in parts.items():
-            places.append((name, -MAX_STAMP_NS, min(ends) - 1))
-            places.append((name, max(ends) + 1, MAX_STAMP_NS))
+            places.append((name, -MAX_STAMP_NS, min(ends) - 1, True))
+            places.append((name, max(ends) + 1, MAX_STAMP_NS, True))
         found = []
-        for name, first_ns, last_ns in dict.fromkeys(places):
+        for name, first_ns, last_ns, is_deleted in dict.fromkeys(places):
             left = sorted(one.stamp_ns for one in self._of_result.get(name, ()))
             within = [stamp_ns for stamp_ns in left if first_ns <= stamp_ns <= last_ns]
-            for before_ns, after_ns in pairwise([first_ns - 1, *within, last_ns + 1]):
+            gaps = [*pairwise([first_ns - 1, *within, last_ns + 1])]
+            # From the first box that was joined to the track there, it is not the part given away.
+            for before_ns, after_ns in gaps if is_deleted else gaps[:1]:
                 if left and after_ns - before_ns > 1:
                     span = before_ns + 1, after_ns - 1
                     found.append(Decision(name, span[0], 'delete', end_ns=span[1]))
@@ -560,6 +565,14 @@ def _ranges(
             text = value if isinstance(value, str) else ''
             found.append(Decision(track_id, span[0], kind, end_ns=span[1], value=text))
     return found
+
+
+def _span_of(decision: Decision) -> tuple[int, int]:
+    """Return the first and the last stamp that a decision is about."""
+    first_ns, last_ns = decision.stamp_ns, decision.end_ns
+    if first_ns is None:
+        return -MAX_STAMP_NS, MAX_STAMP_NS
+    return first_ns, first_ns if last_ns is None else last_ns
 
 
 def _closeness(decision: Decision) -> int:

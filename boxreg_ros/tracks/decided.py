@@ -123,7 +123,8 @@ class DecidedTrack:
         """Return whether the box at a stamp was given to another track, or left with it."""
         input_id = self.input_id(stamp_ns)
         name = self.decided.track_id(input_id, stamp_ns)
-        if not name and self.track_id in self.decided.apart:
+        is_before = stamp_ns < self.stamps_ns[0]  # where a track begins with a part of another
+        if not name and (is_before or self.track_id in self.decided.apart):
             name = input_id
         return name not in ('', self.track_id)
 

@@ -547,6 +547,27 @@ def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, op
     assert all(newer in request.unbound_text() for request in requests)
 
 
+@pytest.mark.parametrize('first', [2, 8])
+def test_tracks_that_swap_their_ends_are_completed_alike_by_later_runs(completed, tmp_path, first):
+    """A part joined to another track is not followed back into where it was cut off."""
+    _, stamps, _, out = completed
+    swap = [
+        Decision('1', stamps[0], 'delete', end_ns=stamps[first - 1]),
+        Decision('1', stamps[first], 'rename', end_ns=stamps[-1], value='2'),
+        Decision('2', stamps[first], 'rename', end_ns=stamps[-1], value='1'),
+    ]
+    recording = out.with_name('drive')
+    rows = Run(recording, '--keyframes')(tmp_path / '0', swap)
+    Run(recording)(tmp_path / '1', swap)
+    later = Run(recording, '--keyframes', '--labels', f'csv:{tmp_path / "1"}')(tmp_path / '2')
+    before, after = words_of(rows, '1', stamps), words_of(rows, '2', stamps)
+    assert before[:first] == ['rejected'] * first
+    cut = (before if first < GAP[0] else after)[GAP[0] : GAP[-1] + 1]
+    assert cut == ['interpolated'] * len(GAP)
+    is_there = [[bool(word) for word in words_of(later, name, stamps)] for name in '12']
+    assert is_there == [[False] * first + [True] * (SWEEPS - first), [bool(one) for one in after]]
+
+
 def test_a_box_of_a_person_keeps_its_class(completed, tmp_path):
     _, stamps, _, out = completed
     table = BoxTable.read(out / 'boxes.csv').without_rejected()
