@@ -42,7 +42,7 @@ ROAD_CLEARANCE = 0.3
 MIN_STANDING = 8
 """Objects that a finding needs."""
 MIN_COMPARED_BOXES = 150
-"""Boxes that a finding needs: fewer may all be on one side, where boxes are all too short."""
+"""Boxes that a finding needs: fewer are of one moment, and their errors of one kind."""
 FEWEST_BOXES = 3
 """Boxes of an object that is counted, ahead or behind."""
 MIN_OF_SIDE = 3
@@ -60,7 +60,7 @@ MAX_BEGINS = 1000
 class _Motion(NamedTuple):
     """Where the sensor is, and how it moves, in the fixed frame."""
 
-    position: Floats
+    position: Floats  # (3,) [m]
     velocity: Floats  # (3,) [m/s]
     yaw_rate: float  # [rad/s]
 
@@ -88,8 +88,9 @@ class MotionTimeCheck(PairedCheck):
     Where boxes are given in a frame that does not move with the sensor, clouds that are placed by
     poses of another moment lie off them, by the way of the sensor in between: the check finds the
     time by which they lie on them. Boxes in the frame of the sensor show nothing: they are moved
-    with the clouds. `finding` says so; it is empty before. Sweeps and boxes arrive in any order,
-    in one frame, at most `AT_ONCE` [s] apart. The check ends after `MAX_STANDING_BOXES`.
+    with the clouds, and objects that are all ahead neither: boxes that are too far off would seem
+    late, too. `finding` says so; it is empty before. Sweeps and boxes arrive in any order, in one
+    frame, at most `AT_ONCE` [s] apart. The check ends after `MAX_STANDING_BOXES`.
 
     """
 
