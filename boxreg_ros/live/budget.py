@@ -169,9 +169,10 @@ class TickBudget:
     @property
     def _period(self) -> float:
         """Return the measured period of the boxes [s]."""
-        if len(self._arrivals) < 2:
+        arrivals = tuple(self._arrivals)  # reports ask for it in another thread
+        if len(arrivals) < 2:
             return FIRST_PERIOD
-        return (self._arrivals[-1] - self._arrivals[0]) / (len(self._arrivals) - 1)
+        return (arrivals[-1] - arrivals[0]) / (len(arrivals) - 1)
 
     def _timed(
         self, windows: list[Window], config: Config, model: InputModel

@@ -87,6 +87,9 @@ class MessagePipeline:
         self._report = report
         submit, windows = (None, None) if budget is None else (budget.submit, budget.windows)
         self.registrar = BoxRegistrar(config, submit, windows, drives, prepare=self._note_latency)
+        # That of the newest boxes, for reports of another thread: the registrar estimates it anew
+        # when it is read.
+        self._latency = self.registrar.latency
         self.following = Following(self.registrar, session, wait, report)
         self.static_points: StaticPoints | None = None
         if static_patience is not None:
@@ -99,7 +102,7 @@ class MessagePipeline:
     @property
     def facts(self) -> dict[str, object]:
         """Return origin of the ids, latency of the boxes and followed objects, for reports."""
-        facts = {**self.session.facts, 'box latency': self.registrar.latency.text}
+        facts = {**self.session.facts, 'box latency': self._latency.text}
         return facts | self.following.facts
 
     @property
@@ -339,7 +342,7 @@ class MessagePipeline:
 
     def _note_latency(self, pair: Pair) -> BoxArray:
         """Report boxes that were late, and return them."""
-        latency = self.registrar.latency
+        latency = self._latency = self.registrar.latency
         ticket_of(pair.boxes).is_late = latency.seconds != 0
         if latency.warning:
             self._report(Reason.LATENCY, latency.warning, 1)

@@ -179,7 +179,7 @@ class Worker:
         if message.topic == 'boxes':
             passed = [Outgoing(message.content, False)]
             self._publish_boxes(passed)
-            self._show(passed)
+            self._inbox.put_event(self._show, passed)  # labels take the transforms of the worker
             self._inbox.put_passing(message)  # the final copy, in the order of all
         else:
             lost_ns = stamp_ns(header_of(message.content))
