@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from math import inf
 from typing import NamedTuple, Self
 
@@ -29,7 +30,7 @@ from boxreg_ros.structures import (
     ROLL,
     Sweep,
 )
-from boxreg_ros.tracks.complete import complete, CompletionPlan
+from boxreg_ros.tracks.complete import complete, CompletionPlan, PlannedArray
 from boxreg_ros.tracks.decided import Decided, NOTHING
 from boxreg_ros.tracks.followed import with_evidence
 import numpy as np
@@ -74,42 +75,32 @@ class Arrivals:
         missing: list[int] = sweeps[away > reach_ns].tolist()
         return missing
 
-    def completed(self, frame_id: str) -> list[BoxArray]:
-        """Return the arrays in the order of `with_empty_arrays`, empty ones included."""
-        inserter = Inserter([self])
-        found: list[BoxArray] = []
+    def insertions(self) -> list[list[int]]:
+        """Return for each item the stamps of the empty arrays that are inserted after it."""
+        missing = set(self.missing_ns())
+        oldest_to_come = _oldest_to_come(self.arrays)
+        arrived = 0
+        waiting: list[int] = []
+        found = []
         for item in self.items:
             if isinstance(item, BoxArray):
-                found.append(item)
-            stamp_ns = None if isinstance(item, BoxArray) else item
-            found += [BoxArray.empty(one, frame_id) for one in inserter.after(stamp_ns, False)]
+                arrived += 1
+            elif item in missing:
+                missing.discard(item)
+                waiting.append(item)
+            # After their sweep, and after all older arrays.
+            found.append(sorted(one for one in waiting if one < oldest_to_come[arrived]))
+            waiting = [one for one in waiting if one >= oldest_to_come[arrived]]
         return found
 
-
-class Inserter:
-    """Decide where empty arrays are inserted: after their sweep, and after all older arrays."""
-
-    def __init__(self, parts: Sequence[Arrivals]) -> None:
-        self._missing = [set(part.missing_ns()) for part in parts]
-        self._oldest_to_come = [_oldest_to_come(part.arrays) for part in parts]
-        self._part = 0
-        self._arrived = 0
-        self._waiting: list[int] = []
-
-    def after(self, sweep_ns: int | None, restarts: bool) -> list[int]:
-        """Return the stamps of empty arrays after the next item: a sweep, or None for boxes."""
-        if restarts:
-            self._part += 1
-            self._arrived = 0
-        if sweep_ns is None:
-            self._arrived += 1
-        elif sweep_ns in self._missing[self._part]:
-            self._missing[self._part].discard(sweep_ns)
-            self._waiting.append(sweep_ns)
-        oldest = self._oldest_to_come[self._part][self._arrived]
-        ready = [stamp_ns for stamp_ns in self._waiting if stamp_ns < oldest]
-        self._waiting = [stamp_ns for stamp_ns in self._waiting if stamp_ns >= oldest]
-        return sorted(ready)
+    def completed(self, frame_id: str) -> list[BoxArray]:
+        """Return the arrays in the order of `with_empty_arrays`, empty ones included."""
+        found: list[BoxArray] = []
+        for item, stamps_ns in zip(self.items, self.insertions(), strict=True):
+            if isinstance(item, BoxArray):
+                found.append(item)
+            found += [BoxArray.empty(stamp_ns, frame_id) for stamp_ns in stamps_ns]
+        return found
 
 
 def _oldest_to_come(arrays: Sequence[BoxArray]) -> list[float]:
@@ -135,17 +126,15 @@ def with_empty_arrays(
     items: Iterable[Item], parts: Sequence[Arrivals], frame_id: str
 ) -> Iterator[Item]:
     """Yield the items of a recording, and an empty array for each sweep without one."""
-    inserter = Inserter(parts)
+    insertions = chain.from_iterable(part.insertions() for part in parts)
     poses: dict[int, Floats | None] = {}
     for item in items:
         yield item
-        moved = item.moved
-        if moved is None:
+        if item.moved is None:
             continue
-        is_sweep = isinstance(moved, Sweep)
-        if is_sweep:
-            poses[moved.stamp_ns] = item.T_fixed_sensor
-        for stamp_ns in inserter.after(moved.stamp_ns if is_sweep else None, item.restarts):
+        if isinstance(item.moved, Sweep):
+            poses[item.moved.stamp_ns] = item.T_fixed_sensor
+        for stamp_ns in next(insertions):
             empty = BoxArray.empty(stamp_ns, frame_id)
             moved = replace(empty, ticket=ArrayPlace())
             pose = poses.pop(stamp_ns)
@@ -194,6 +183,20 @@ def points_above_road(sweep: Sweep | None, boxes: Floats) -> Ints:
     is_inside = (near.outside.max(0) <= SIDE_MARGIN) & (height > ROAD_CLEARANCE)
     counts[valid] = np.bincount(near.owner[is_inside], minlength=len(valid))
     return counts
+
+
+class _Registered(NamedTuple):
+    """A box array as it was given, in time, and as it was registered."""
+
+    given: BoxArray
+    boxes: BoxArray
+    num_points: Ints
+    """Above the road, in `boxes`."""
+
+    @classmethod
+    def of(cls, given: BoxArray, boxes: BoxArray, sweep: Sweep | None) -> Self:
+        """Return it with the points of its sweep."""
+        return cls(given, boxes, points_above_road(sweep, boxes.boxes))
 
 
 class FirstPass(NamedTuple):
@@ -247,19 +250,15 @@ def first_pass(
 
     """
     parts = [Arrivals.empty(with_sweeps)]
-    arrived: list[int] = []
+    arrived = 0
     results: dict[object, RefinedBoxes] = {}
-    in_time: dict[object, BoxArray] = {}
-    given: dict[object, BoxArray] = {}
-    num_points: dict[object, Ints] = {}
+    registered: dict[object, _Registered] = {}
     is_early = config.estimate == 'early'
 
     def prepared(pair: Pair) -> BoxArray:
-        ticket = pair.boxes.ticket
-        in_time[ticket] = pair.boxes
-        given[ticket] = boxes = corrected(pair.boxes)
-        num_points[ticket] = points_above_road(pair.sweep, boxes.boxes)
-        return boxes
+        own = _Registered.of(pair.boxes, corrected(pair.boxes), pair.sweep)
+        registered[pair.boxes.ticket] = own
+        return own.boxes
 
     def keep(ready: Iterable[RefinedBoxes]) -> None:
         for result in ready:
@@ -271,14 +270,16 @@ def first_pass(
         if restarts:
             parts.append(Arrivals.empty(with_sweeps))
         if isinstance(moved, BoxArray):
-            moved = replace(moved, ticket=len(arrived))
-            arrived.append(len(arrived))
+            moved = replace(moved, ticket=arrived)
+            arrived += 1
         if moved is not None:
             parts[-1].add(moved)
         keep(hand_to_registrar(registrar, moved, restarts))
     keep(registrar.flush())
     for part in parts:
-        part.items = [one if isinstance(one, int) else given[one.ticket] for one in part.items]
+        part.items = [
+            one if isinstance(one, int) else registered[one.ticket].boxes for one in part.items
+        ]
     arrays = [
         part.arrays if fixed_frame is None else part.completed(fixed_frame) for part in parts
     ]
@@ -288,9 +289,12 @@ def first_pass(
             [results[a.ticket] if a.ticket is not None else kept(a, '') for a in part]
             for part in arrays
         ],
-        [[num_points.get(a.ticket, NO_COUNTS) for a in part] for part in arrays],
+        [
+            [NO_COUNTS if a.ticket is None else registered[a.ticket].num_points for a in part]
+            for part in arrays
+        ],
         parts,
-        [in_time[ticket] for ticket in arrived],
+        [registered[ticket].given for ticket in range(arrived)],
         registrar.latency,
     )
 
@@ -309,40 +313,35 @@ class Completion:
         self._plan = plan
         self._deviations = deviations
         self._is_early = config.estimate == 'early'
-        self._index_of: dict[object, int] = {}
-        self._given: dict[int, BoxArray] = {}
-        self._registered: dict[int, BoxArray] = {}
-        self._num_points: dict[int, Ints] = {}
-        self._results: dict[int, RefinedBoxes] = {}
+        # By ticket: the first in the order of the plan.
+        self._planned: dict[object, PlannedArray] = {}
+        self._registered: dict[object, _Registered] = {}
+        self._results: dict[object, RefinedBoxes] = {}
         self._kept: list[RefinedBoxes] = []
 
     def expect(self, ticket: object) -> None:
         """Note the ticket of the next box array, in the order of the plan."""
-        self._index_of[ticket] = len(self._index_of)
+        self._planned[ticket] = self._plan.arrays[len(self._planned)]
 
     def to_register(self, boxes: BoxArray, sweep: Sweep | None) -> BoxArray:
         """Return boxes as they are to be registered: with those that the plan adds."""
-        index = self._index_of[boxes.ticket]
-        self._given[index] = boxes
-        registered = self._plan.arrays[index].to_register(boxes)
-        self._registered[index] = registered
-        self._num_points[index] = points_above_road(sweep, registered.boxes)
-        return registered
+        own = _Registered.of(boxes, self._planned[boxes.ticket].to_register(boxes), sweep)
+        self._registered[boxes.ticket] = own
+        return own.boxes
 
     def added_boxes(self, given: BoxArray) -> BoxArray:
         """Return the boxes that the plan adds to an array."""
-        return self._plan.arrays[self._index_of[given.ticket]].added_boxes(given)
+        return self._planned[given.ticket].added_boxes(given)
 
     def add(self, ready: Iterable[RefinedBoxes]) -> None:
         """Hold results of the registrar."""
         for result in ready:
-            index = self._index_of.get(result.boxes.ticket)
             if not (result.is_final or self._is_early):
                 continue
-            if index is None:  # one of `add_kept`: the plan has no place for it
+            if result.boxes.ticket in self._planned:
+                self._results.setdefault(result.boxes.ticket, result)
+            else:  # one of `add_kept`: the plan has no place for it
                 self._kept.append(result)
-            else:
-                self._results.setdefault(index, result)
 
     def finished(self) -> list[RefinedBoxes]:
         """Return the results of all arrays, in the order of their stamps."""
@@ -351,15 +350,15 @@ class Completion:
 
     def _completed(self) -> list[RefinedBoxes]:
         """Return the results of the arrays of the plan, in their order."""
-        indices = range(len(self._index_of))
-        given = [self._given[index] for index in indices]
-        registered = [self._results[index] for index in indices]
-        points = [self._num_points[index] for index in indices]
-        results = self._plan.finished(given, registered, points)
+        arrays = [self._registered[ticket] for ticket in self._planned]
+        results = self._plan.finished(
+            [one.given for one in arrays],
+            [self._results[ticket] for ticket in self._planned],
+            [one.num_points for one in arrays],
+        )
         if self._deviations is None:
             return results
-        pairs = zip(given, (self._registered[index] for index in indices), strict=True)
         keyframes = [
-            replace(array, boxes=boxes.boxes[: len(array.track_ids)]) for array, boxes in pairs
+            replace(one.given, boxes=one.boxes.boxes[: len(one.given.track_ids)]) for one in arrays
         ]  # none of them is rejected
         return with_evidence(keyframes, results, self._deviations)
