@@ -191,6 +191,12 @@ class Reason(StrEnum):
         'has the figures',
         'set `associate`, or run a tracker before this node',
     )
+    OBJECTS_TWICE = _reason(
+        'message',
+        'most of its objects have two boxes with an id each, as of two detectors or trackers on '
+        'one topic; each is refined by itself',
+        'publish the boxes of one of them on this topic, or join them before this node',
+    )
     CLOCK_OFFSET = _reason(
         'message',
         'the clock of its stamps is off from that of the motion, or of the clouds; the log has '

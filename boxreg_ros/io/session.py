@@ -24,6 +24,7 @@ from boxreg_ros.io.checks.motion import MotionCheck
 from boxreg_ros.io.checks.motion_time import MotionTimeCheck
 from boxreg_ros.io.checks.place import PlaceCheck
 from boxreg_ros.io.checks.pose import PoseCheck
+from boxreg_ros.io.checks.twice import TwiceCheck
 from boxreg_ros.io.checks.unit import UnitCheck
 from boxreg_ros.io.id_assignment import IdCheck, Tracker
 from boxreg_ros.io.items import Item
@@ -92,6 +93,7 @@ class Session:
         self._tracker = self._id_check.tracker if self._id_check else Tracker(config.max_gap)
         self._axis_check = AxisCheck(convention, config.drives)
         self._common_motion = CommonMotionCheck()
+        self._twice_check = TwiceCheck(config)
         self._boxes_without_frame = ''
         self._odometry_lacks_child = False
         self._has_clouds_without_frame = False
@@ -155,6 +157,7 @@ class Session:
                 moved = self._tracker.identify(moved)
             else:
                 self._id_check.add(moved)
+            self._twice_check.add(moved)
             if self.sensor_frame:
                 route = self.tree.route(self.fixed_frame, self.sensor_frame)
                 self._common_motion.add(moved.stamp_ns, self._tracker, route, self._pose_of_sensor)
@@ -294,6 +297,7 @@ class Session:
             (Reason.TRANSFORM_FAULT, self._boxes_without_frame),
             (Reason.TRANSFORM_FAULT, odometry),
             (Reason.POSE_REFERENCE, poses),
+            (Reason.OBJECTS_TWICE, self._twice_check.finding),
             (Reason.TRACK_IDS_JUMP, self.jumping_ids and f'{self.jumping_ids}; {ASSOCIATE}'),
         ]
         found = [Finding(reason, text) for reason, text in texts if text]

@@ -357,3 +357,40 @@ def test_register_flushes_and_resets_at_a_time_jump():
     ready = hand_to_registrar(registrar, replace(sweep, stamp_ns=earlier), restarts=False)
     assert [r.reasons for r in ready] != [('late',)]
     assert hand_to_registrar(registrar, None, restarts=True)[-1].boxes.stamp_ns == earlier
+
+
+def objects_of(kind, count, apart, second=None, seed=0):
+    """Return boxes of objects in a row, and of a second detector with ids of its own."""
+    size = {'car': (4.5, 1.9, 1.6), 'pedestrian': (0.7, 0.6, 1.7), 'bicycle': (1.8, 0.6, 1.6)}
+    rng = np.random.default_rng(seed)
+    found = []
+    for name, prefix in ((kind, 'a'), *([(second, 'b')] if second else ())):
+        boxes = np.zeros((count, 9))
+        boxes[:, 0] = apart * np.arange(count)
+        boxes[:, 3:6] = size[name]
+        boxes[:, :2] += rng.normal(0, 0.06, (count, 2))
+        found += [(f'{prefix}{k}', name, box) for k, box in enumerate(boxes)]
+    return found
+
+
+@pytest.mark.parametrize(
+    ('kind', 'apart', 'second', 'is_named'),
+    [
+        ('car', 6.0, 'car', True),
+        ('pedestrian', 2.0, 'pedestrian', True),
+        ('car', 4.7, None, False),  # parked bumper to bumper
+        ('pedestrian', 0.6, None, False),  # a group
+        ('bicycle', 3.0, 'pedestrian', False),  # riders
+    ],
+)
+@pytest.mark.parametrize('messages', [1, 2])
+def test_objects_with_two_boxes_are_named(kind, apart, second, is_named, messages):
+    session = Session(STANDARD, Config(), 'map')
+    for k in range(12):
+        rows = objects_of(kind, 6, apart, second, seed=k)
+        for part in range(messages):
+            ids, names, boxes = zip(*rows[part::messages], strict=True)
+            array = BoxArray(START + k * SECOND // 10, 'map', ids, names, np.ones(len(ids)), boxes)
+            session.admit(Item(0, array))
+    assert ('boxes: expected one for each object' in session.finding) == is_named
+    assert [one.reason for one in session.findings] == ['objects_twice'] * is_named
