@@ -37,7 +37,8 @@ class _Applied(NamedTuple):
     stamp_ns: int
     class_name: str
     track_id: str
-    judgement: str  # `accept` or `reject`
+    judgement: str
+    of_track: str  # judgement of its whole track
 
 
 class Corrections:
@@ -402,6 +403,12 @@ class Corrections:
             rows.sort()
             if track_id in apart:  # also boxes that a step has added
                 rows = [one._replace(track_id=track_id) for one in rows]
+            if {one.of_track for one in rows} == {'reject'}:  # where it has no boxes, too
+                found.append(Decision(track_id, None, 'reject'))
+                rows = [
+                    one._replace(judgement='' if one.judgement == 'reject' else 'accept')
+                    for one in rows
+                ]
             for kind, values in (
                 ('reclass', [one.class_name for one in rows]),
                 ('rename', [one.track_id for one in rows]),
@@ -446,12 +453,14 @@ class Corrections:
     def _note(self, track_id: str, input_id: str, stamp_ns: int) -> None:
         """Note what was decided about a box of a result."""
         judgement = self._judgement(input_id, stamp_ns)
+        of_track = self._judgement(input_id, MAX_STAMP_NS + 1)  # of no box
         self._of_result.setdefault(track_id, []).append(
             _Applied(
                 stamp_ns,
                 self.class_name(input_id, stamp_ns),
                 self.track_id(input_id, stamp_ns),
                 '' if judgement is None else judgement.kind,
+                '' if of_track is None else of_track.kind,
             )
         )
 

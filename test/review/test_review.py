@@ -262,7 +262,13 @@ def test_last_decision_holds_and_box_goes_before_track():
     assert found.status == ('human', 'kept', 'refined')
     assert found.reasons == ('', 'rejected', '')
     np.testing.assert_array_equal(found.boxes.boxes, [pin, BOX, moved[2]])
+    for stamp_ns in (5, 9):
+        at = replace(given, stamp_ns=stamp_ns)
+        corrections.with_attributes(at, corrections.apply(at, replace(refined, boxes=at)))
     assert corrections.unused() == ["'2' at 6", "'4'"]
+    later = Corrections(earlier=corrections.applied())  # on the result: gaps are rejected as well
+    assert [later.is_left_out(name, 7) for name in '123'] == [True, True, False]
+    assert not later.is_left_out('1', 5)
 
 
 def test_deleted_renamed_and_reclassed_boxes_of_a_range():
