@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from boxreg_ros.io.stamp_join import nearest_rows
 import numpy as np
 
@@ -31,10 +33,16 @@ Derived: other programs cut stamps to milliseconds at most; of stamps of another
 is as near to one of clouds at 10 Hz.
 
 """
-KNOWN_OFFSETS = {37.0: 'TAI and UTC', 18.0: 'GPS time and UTC', 19.0: 'TAI and GPS time'}
+HALF_HOUR = 1800.0
+"""Time zones differ by multiples of it [s]."""
+KNOWN_OFFSETS = {37.0: 'TAI and UTC', 18.0: 'GPS time and UTC', 19.0: 'TAI and GPS time'} | {
+    HALF_HOUR * count: 'two time zones' for count in range(1, 53)
+}
 """Offsets of clocks that are known exactly [s], and between which they are."""
 NEAR_KNOWN = 0.3
 """Largest difference from an offset that is known [s]: the delay of a message."""
+MAX_DELAY = 0.6
+"""Longest delay of a message after the one that it copies the stamp of [s]; chosen."""
 
 
 class ReceiveTimes:
@@ -50,6 +58,12 @@ class ReceiveTimes:
         self.received_ns: list[int] = []
         self.delays_ns: list[int] = []
         """Receive times less stamps."""
+
+    @property
+    def stamps_ns(self) -> list[int]:
+        """Return the stamps."""
+        pairs = zip(self.received_ns, self.delays_ns, strict=True)
+        return [received_ns - delay_ns for received_ns, delay_ns in pairs]
 
     def add(self, received_ns: int, stamp_ns: int) -> None:
         """Add a message, unless it follows the one before it at once, or there are enough."""
@@ -103,6 +117,34 @@ def likely_offset(offset: float) -> tuple[float, str]:
     return round(offset, 2), ''
 
 
+def copied_offset(offset: float, stamps_ns: Sequence[int], of_ns: Sequence[int]) -> float:
+    """
+    Return the offset of two clocks by which stamps of the one are copies of those of the other.
+
+    Parameters
+    ----------
+    offset : float
+        By when messages were received [s]: the delay of the copying ones is part of it.
+    stamps_ns, of_ns : sequence of int
+        Stamps of the copying messages by their clock, and of the copied ones by the other [ns].
+
+    Returns
+    -------
+    offset : float
+        That of most copies, of equal ones the nearest to `offset`, which is returned, rounded,
+        where most are no copies [s].
+
+    """
+    apart = np.subtract.outer(of_ns, stamps_ns).ravel() / COPY_NS
+    late = offset * 1e9 / COPY_NS - apart
+    is_near = (late <= MAX_DELAY * 1e9 / COPY_NS) & (-late <= SPACING_NS / COPY_NS)
+    found, counts = np.unique(np.round(apart[is_near]), return_counts=True)
+    if counts.max(initial=0) < len(stamps_ns) / 2:
+        return round(offset, 2)
+    best = found[counts > 0.9 * counts.max()] * COPY_NS * 1e-9
+    return float(best[np.abs(best - offset).argmin()])
+
+
 def seconds_text(seconds: float) -> str:
-    """Return seconds with up to two decimals and all digits before them, as options take them."""
-    return f'{seconds:.2f}'.rstrip('0').rstrip('.')
+    """Return seconds with up to three decimals and all digits before, as options take them."""
+    return f'{seconds:.3f}'.rstrip('0').rstrip('.')

@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 
 UNUSED_PREFIXES = ('sweep_', 'boxes_')
 """Counters of the registrar with these prefixes count unused messages and not kept boxes."""
-NO_BOXES = (
-    'no boxes in the input, or in its part by --start and --end: nothing was refined (of a '
-    'MarkerArray, markers of the type CUBE are boxes)'
-)
+NO_BOXES = 'no boxes in {}, or in its part by --start and --end: nothing was refined'
 
 
 @dataclass(slots=True)
@@ -133,7 +130,7 @@ class Summary:
             without_stamp=_without_stamp(findings),
             lidars={topic: dict(counts) for topic, counts in findings.lidars.items()},
             warning='; '.join(filter(None, (findings.warning, latency.warning)))
-            or ('' if sink.boxes_in or request.boxes == NO_TOPIC else NO_BOXES),
+            or ('' if sink.boxes_in or request.boxes == NO_TOPIC else _no_boxes(request)),
             **findings.facts,
             left_out_of_labels=sink.output.left_out(),
             label_notes=sink.output.notes(),
@@ -178,6 +175,14 @@ class Summary:
     def part_refined(self) -> float:
         """Return the part of the input boxes that were refined; 1 without boxes."""
         return self.num_refined / self.boxes_in if self.boxes_in else 1.0
+
+
+def _no_boxes(request: Request) -> str:
+    """Return that the input has no boxes."""
+    if request.labels is not None:
+        return NO_BOXES.format(request.labels[1])
+    no_boxes = NO_BOXES.format('the input')
+    return f'{no_boxes} (of a MarkerArray, markers of the type CUBE are boxes)'
 
 
 def _labels(request: Request, findings: Findings) -> dict[str, Any] | None:

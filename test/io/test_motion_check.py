@@ -265,10 +265,13 @@ def test_boxes_from_the_future_have_another_clock(tmp_path, seconds):
         assert not items.session.finding
 
 
-@pytest.mark.parametrize('seconds', [1.53, 18.04, 36.98])
+@pytest.mark.parametrize('seconds', [1.53, 18.04, 36.98, 3600, 12.345])
 def test_boxes_whose_stamps_are_of_no_cloud_have_a_clock_that_is_behind(tmp_path, seconds):
     drive = Drive(sweeps=30)
     stamps_moved(drive, ('/boxes',), -seconds)
+    late = 30_000_000  # of the detector
+    drive.items = [(name, at + late * (name == '/boxes'), one) for name, at, one in drive.items]
+    drive.items.sort(key=lambda item: item[1])
     found = read(drive, tmp_path)[2]
     offset = {18.04: 18, 36.98: 37}.get(seconds, seconds)
     assert f'stamps of the boxes {offset} s behind those of the clouds' in found

@@ -17,6 +17,7 @@ from boxreg_ros.io.checks.pose_jitter import PoseJitter
 from boxreg_ros.io.clocks import (
     CAPACITY,
     clock_offset,
+    copied_offset,
     COPY_NS,
     likely_offset,
     MIN_CLOCK_OFFSET,
@@ -294,12 +295,17 @@ class MotionCheck:
 
     def _boxes_clock_text(self) -> str:
         """Return how far the clock of the boxes is off from that of the clouds."""
+        known = self.findings.get('boxes_clock')
+        if known and self._count > CAPACITY:
+            return known.text  # of the first messages, which are compared; later stamps are known
         measured = min(self._offsets_from(self._boxes).values(), key=abs, default=None)
         if measured is None or -MIN_CLOCK_OFFSET < measured < MAX_BOXES_DELAY:
             return ''
         if measured > 0 and sum(self._copied) >= MIN_COPIED * max(1, len(self._copied)):
             return ''  # a slow detector copies the stamps of its clouds
         offset, names = likely_offset(measured)
+        if not names:
+            offset = copied_offset(measured, self._boxes.stamps_ns, self._cloud_stamps)
         of_whom = f', as {names} are' if names else ''
         if offset > 0:
             of_whom += ', and of no other cloud'
