@@ -10,10 +10,13 @@ pose is the centre, `dimensions` are length, width and height.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, WIDTH, YAW
 from msg_adapters import poses
+from msg_adapters.box_fields import BoxFields, BoxLabels, parts, Rewrite
+from msg_adapters.cdr import Fields
 import numpy as np
 from numpy.typing import NDArray
 
@@ -111,7 +114,7 @@ def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
     return poses.replaced(msg, objects=[*msg.objects, *added])
 
 
-def class_name_of(label: int) -> str:
+def _name_of(label: int) -> str:
     """Return the class of a label."""
     return LABELS[label] if label < len(LABELS) else f'label_{label}'
 
@@ -184,7 +187,7 @@ def _track_id(o: Any) -> str:
 def _class_name(o: Any) -> str:
     if not o.classification:
         return ''
-    return class_name_of(max(o.classification, key=lambda item: item.probability).label)
+    return _name_of(max(o.classification, key=lambda item: item.probability).label)
 
 
 def _scaled_footprint(shape: Any, box: Floats) -> Any:
@@ -195,3 +198,105 @@ def _scaled_footprint(shape: Any, box: Floats) -> Any:
     scale_x, scale_y = (box[LENGTH : WIDTH + 1] / old).tolist()
     points = [poses.replaced(p, x=p.x * scale_x, y=p.y * scale_y) for p in shape.footprint.points]
     return poses.replaced(shape.footprint, points=points)
+
+
+HALF_TURN_SIGNS = np.tile([-1.0, -1.0, 1.0], 2)
+"""Signs of the numbers of a twist or acceleration that is rotated by 180 degrees about z."""
+OF_OBJECTS = 'objects.kinematics.'
+FOOTPRINT = 'objects.shape.footprint.points'
+TWIST_FIELD = OF_OBJECTS + 'twist_with_covariance.twist.linear.x'
+ACCELERATION_FIELD = OF_OBJECTS + 'acceleration_with_covariance.accel.linear.x'
+HAS_COVARIANCE = OF_OBJECTS + 'has_position_covariance'
+HAS_TWIST = OF_OBJECTS + 'has_twist'
+AUTOWARE_FIELDS = (
+    'objects.existence_probability', 'objects.classification', 'objects.classification.label',
+    'objects.classification.probability', OF_OBJECTS + 'orientation_availability', TWIST_FIELD,
+    'objects.shape.type', FOOTPRINT, FOOTPRINT + '.x',
+)  # fmt: skip
+
+
+def _detected_labels(fields: Fields) -> BoxLabels:
+    """Return the most probable classes and the probabilities of existence; no ids."""
+    labels = fields.numbers('objects.classification.label', '|u1')[:, 0].tolist()
+    probabilities = fields.numbers('objects.classification.probability', '<f4')[:, 0].tolist()
+    classes = []
+    for part in parts(fields.counts('objects.classification')):
+        best = max(range(part.start, part.stop), key=probabilities.__getitem__, default=None)
+        classes.append('' if best is None else _name_of(labels[best]))
+    scores = fields.numbers('objects.existence_probability', '<f4')[:, 0].astype(np.float64)
+    return [''] * len(scores), classes, scores
+
+
+def _tracked_labels(fields: Fields) -> BoxLabels:
+    """Return the same with the UUIDs in hexadecimal."""
+    _, classes, scores = _detected_labels(fields)
+    uuids = fields.numbers('objects.object_id.uuid', '|u1', 16)
+    ids = [row.tobytes().hex() if row.any() else '' for row in uuids]
+    return ids, classes, scores
+
+
+def _has_no_cylinder(fields: Fields) -> bool:
+    return not (fields.numbers('objects.shape.type', '|u1') == CYLINDER).any()
+
+
+def _is_oriented(fields: Fields) -> NDArray[np.bool_]:
+    """Return which objects have an orientation."""
+    availability = fields.numbers(OF_OBJECTS + 'orientation_availability', '|u1')[:, 0]
+    is_oriented: NDArray[np.bool_] = availability != ORIENTATION_UNAVAILABLE
+    return is_oriented
+
+
+def _write_footprints_and_motion(fields: Fields, rewrite: Rewrite, *motions: str) -> None:
+    """Scale footprints with their boxes; write the motion, or rotate it with the heading."""
+    new_size = rewrite.boxes.boxes[:, LENGTH : WIDTH + 1]
+    old_size = rewrite.old_size[:, :2]
+    is_scaled = (old_size > 0).all(1) & np.isfinite(new_size).all(1)
+    scale = np.ones((len(new_size), 3))
+    scale[is_scaled, :2] = new_size[is_scaled] / old_size[is_scaled]
+    corners = fields.numbers(FOOTPRINT + '.x', '<f4', 3)
+    scaled = corners * np.repeat(scale, fields.counts(FOOTPRINT), axis=0)
+    fields.put(FOOTPRINT + '.x', scaled.astype('<f4'))
+    old, new = (poses.forward_of(p[:, 3:].T) for p in (rewrite.old_pose, rewrite.new_pose))
+    is_flipped = (old * new).sum(0) < 0
+    signs = np.concatenate([HALF_TURN_SIGNS, np.outer(HALF_TURN_SIGNS, HALF_TURN_SIGNS).ravel()])
+    known = poses.kinematics_of_axes(rewrite.boxes)
+    for path, name in zip(motions, poses.MOTION_AXES, strict=False):
+        motion = fields.numbers(path, '<f8', len(signs))
+        motion[is_flipped] *= signs
+        fields.put(path, poses.with_kinematics(motion, known, name))
+
+
+def _write_tracked(fields: Fields, rewrite: Rewrite) -> None:
+    _write_footprints_and_motion(fields, rewrite, TWIST_FIELD, ACCELERATION_FIELD)
+
+
+def _write_detected(fields: Fields, rewrite: Rewrite) -> None:
+    _write_footprints_and_motion(fields, rewrite, TWIST_FIELD)
+    own = fields.numbers(HAS_COVARIANCE, '|u1')
+    is_estimated = np.isfinite(rewrite.covariance).all(1, keepdims=True)
+    fields.put(HAS_COVARIANCE, own | is_estimated.astype('|u1'))
+    has_velocity = rewrite.boxes.known_kinematics['has_velocity']
+    has_twist = fields.numbers(HAS_TWIST, '|u1', 2)
+    fields.put(HAS_TWIST, has_twist | has_velocity[:, None].astype('|u1'))
+
+
+DETECTED_OBJECTS = BoxFields(
+    ('header.frame_id',),
+    OF_OBJECTS + 'pose_with_covariance.pose.position.x',
+    'objects.shape.dimensions.x',
+    _detected_labels,
+    others=(*AUTOWARE_FIELDS, HAS_COVARIANCE, HAS_TWIST),
+    covariance=OF_OBJECTS + 'pose_with_covariance.covariance',
+    is_ordinary=_has_no_cylinder,
+    has_angles=_is_oriented,
+    write=_write_detected,
+)
+BOX_FIELDS = {
+    'autoware_perception_msgs/msg/TrackedObjects': replace(
+        DETECTED_OBJECTS,
+        labels=_tracked_labels,
+        others=(*AUTOWARE_FIELDS, ACCELERATION_FIELD, 'objects.object_id.uuid'),
+        write=_write_tracked,
+    ),
+    'autoware_perception_msgs/msg/DetectedObjects': DETECTED_OBJECTS,
+}

@@ -9,11 +9,14 @@ dimensions are skipped when reading; when writing, they only change their frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from boxreg_ros.structures import BoxArray, Floats
 from msg_adapters import poses
+from msg_adapters.box_fields import BoxFields, BoxLabels, Rewrite, SIZE_WIDTH
+from msg_adapters.cdr import Fields
 import numpy as np
 
 BOX = 1
@@ -111,19 +114,19 @@ def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
     return poses.replaced(msg, objects=[*msg.objects, *added])
 
 
-def class_name_of(number: int) -> str:
+def _name_of(number: int) -> str:
     """Return the class of a classification."""
     return CLASS_NAMES[number] if number < len(CLASS_NAMES) else f'class_{number}'
 
 
 def _is_box(o: Any) -> bool:
-    return o.shape.type == BOX and len(o.shape.dimensions) == 3
+    return o.shape.type == BOX and len(o.shape.dimensions) == SIZE_WIDTH
 
 
 def _class_name(o: Any) -> str:
     if not o.object_classified:
         return ''
-    return class_name_of(o.classification)
+    return _name_of(o.classification)
 
 
 def _score(o: Any) -> float:
@@ -132,3 +135,67 @@ def _score(o: Any) -> float:
 
 def _pose(o: Any) -> Any:
     return o.pose.pose if hasattr(o.pose, 'covariance') else o.pose
+
+
+DIMENSIONS = 'objects.shape.dimensions'
+OBJECT_FIELDS = (
+    'objects.id', 'objects.object_classified', 'objects.shape.type', 'objects.classification',
+)  # fmt: skip
+
+
+def _motion_fields(of_twist: str = '', of_accel: str = '') -> tuple[str, str]:
+    """Return the first numbers of twist and acceleration, with the names of those within."""
+    return f'objects.twist{of_twist}.linear.x', f'objects.accel{of_accel}.linear.x'
+
+
+PLAIN_MOTION = _motion_fields()
+MOTION_WITH_COVARIANCE = _motion_fields('.twist', '.accel')
+
+
+def _writes_motion(fields_of_motion: tuple[str, str], width: int) -> Callable[..., None]:
+    """Return a function that writes twist and acceleration, of `width` numbers each."""
+
+    def write(fields: Fields, rewrite: Rewrite) -> None:
+        for path, name in zip(fields_of_motion, poses.MOTION_AXES, strict=True):
+            own = fields.numbers(path, '<f8', width)
+            fields.put(path, poses.with_kinematics(own, rewrite.boxes.kinematics, name))
+
+    return write
+
+
+def _has_boxes_only(fields: Fields) -> bool:
+    is_box = fields.numbers('objects.shape.type', '|u1') == BOX
+    return bool(is_box.all() and (fields.counts(DIMENSIONS) == SIZE_WIDTH).all())
+
+
+def _labels(fields: Fields) -> BoxLabels:
+    """Return ids, and classes and certainties where an object is classified."""
+    ids = [str(number) for number in fields.numbers('objects.id', '<u4')[:, 0].tolist()]
+    is_known = fields.numbers('objects.object_classified', '|u1')[:, 0] != 0
+    numbers, certainties = fields.numbers('objects.classification', '|u1', 2).T
+    classes = [
+        _name_of(number) if known else ''
+        for number, known in zip(numbers.tolist(), is_known.tolist(), strict=True)
+    ]
+    return ids, classes, np.where(is_known, certainties / CERTAIN, 1.0)
+
+
+OBJECT_ARRAY = BoxFields(
+    ('header.frame_id', 'objects.header.frame_id'),
+    'objects.pose.position.x',
+    DIMENSIONS,
+    _labels,
+    others=(*OBJECT_FIELDS, *PLAIN_MOTION),
+    is_ordinary=_has_boxes_only,
+    write=_writes_motion(PLAIN_MOTION, 6),
+)
+BOX_FIELDS = {
+    'derived_object_msgs/msg/ObjectArray': OBJECT_ARRAY,
+    'derived_object_msgs/msg/ObjectWithCovarianceArray': replace(
+        OBJECT_ARRAY,
+        pose='objects.pose.pose.position.x',
+        covariance='objects.pose.covariance',
+        others=(*OBJECT_FIELDS, *MOTION_WITH_COVARIANCE),
+        write=_writes_motion(MOTION_WITH_COVARIANCE, 42),
+    ),
+}

@@ -14,6 +14,8 @@ from typing import Any
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.structures import BoxArray, Floats
 from msg_adapters import poses
+from msg_adapters.box_fields import BoxFields, BoxLabels, parts
+from msg_adapters.cdr import Fields
 import numpy as np
 
 CLASS_KEYS = ('class', 'class_name', 'category', 'label', 'type', 'classification')
@@ -57,7 +59,7 @@ def from_msg(msg: Any) -> BoxArray:
         metadata = _metadata(entity)
         for k, cube in enumerate(own_cubes):
             track_ids.append(str(entity.id) if len(own_cubes) == 1 else f'{entity.id}/{k}')
-            class_name, score = class_and_score(metadata)
+            class_name, score = _class_and_score(metadata)
             class_names.append(class_name)
             scores.append(score)
             cubes.append(cube)
@@ -120,7 +122,7 @@ def _without_score(metadata: Sequence[Any]) -> list[Any]:
     return [*others, *scores]
 
 
-def class_and_score(metadata: dict[str, str]) -> tuple[str, float]:
+def _class_and_score(metadata: dict[str, str]) -> tuple[str, float]:
     """Return class and score of an entity by its metadata, with keys in lower case."""
     class_name = _first_value(metadata, CLASS_KEYS, '')
     return class_name, _score(_first_value(metadata, SCORE_KEYS, '1'))
@@ -181,3 +183,37 @@ def _score(text: str) -> float:
         return float(text)
     except ValueError:
         return 1.0
+
+
+def _has_one_cube_each(fields: Fields) -> bool:
+    return bool((fields.counts('entities.cubes') == 1).all())
+
+
+def _labels(fields: Fields) -> BoxLabels:
+    """Return ids, and classes and scores by the metadata."""
+    keys = fields.texts('entities.metadata.key')
+    lower = {key: key.lower() for key in set(keys)}
+    items = [
+        (lower[key], value)
+        for key, value in zip(keys, fields.texts('entities.metadata.value'), strict=True)
+    ]
+    counts = fields.counts('entities.metadata')
+    found = [_class_and_score(dict(items[part])) for part in parts(counts)]
+    ids = fields.texts('entities.id')
+    return ids, [name for name, _ in found], np.array([score for _, score in found])
+
+
+BOX_FIELDS = {
+    'foxglove_msgs/msg/SceneUpdate': BoxFields(
+        ('entities.frame_id',),
+        'entities.cubes.pose.position.x',
+        'entities.cubes.size.x',
+        _labels,
+        others=(
+            'entities.id', 'entities.cubes', 'entities.metadata', 'entities.metadata.key',
+            'entities.metadata.value',
+        ),
+        stamp='entities.timestamp.sec',
+        is_ordinary=_has_one_cube_each,
+    )
+}  # fmt: skip

@@ -13,6 +13,8 @@ from typing import Any
 
 from boxreg_ros.structures import BoxArray, Floats
 from msg_adapters import poses
+from msg_adapters.box_fields import BoxFields, BoxLabels
+from msg_adapters.cdr import Fields
 import numpy as np
 
 REQUIRED_FIELDS = ('header', 'pose', 'dimensions', 'value', 'label')
@@ -50,3 +52,21 @@ def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
     header = poses.common_header('BoundingBoxArray', msg.header, msg.boxes)
     added = [poses.replaced(m.boxes[row], header=header, value=0.0) for m, row in sources]
     return poses.replaced(msg, boxes=[*msg.boxes, *added])
+
+
+def _labels(fields: Fields) -> BoxLabels:
+    """Return labels as classes, and values as scores; no ids."""
+    classes = [str(label) for label in fields.numbers('boxes.label', '<u4')[:, 0].tolist()]
+    scores = fields.numbers('boxes.value', '<f4')[:, 0].astype(np.float64)
+    return [''] * len(classes), classes, scores
+
+
+BOX_FIELDS = {
+    'jsk_recognition_msgs/msg/BoundingBoxArray': BoxFields(
+        ('header.frame_id', 'boxes.header.frame_id'),
+        'boxes.pose.position.x',
+        'boxes.dimensions.x',
+        _labels,
+        others=('boxes.value', 'boxes.label'),
+    )
+}

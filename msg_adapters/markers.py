@@ -12,7 +12,10 @@ from typing import Any
 
 from boxreg_ros.structures import BoxArray, Floats
 from msg_adapters import poses
+from msg_adapters.box_fields import BoxFields, BoxLabels
+from msg_adapters.cdr import Fields
 import numpy as np
+from numpy.typing import NDArray
 
 CUBE = 1
 ADD = 0
@@ -76,3 +79,31 @@ def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
 
 def _is_box(marker: Any) -> bool:
     return bool(marker.type == CUBE and marker.action == ADD)
+
+
+def _cubes(fields: Fields) -> NDArray[np.bool_]:
+    """Return which markers are boxes."""
+    _, kinds, actions = fields.numbers('markers.id', '<i4', 3).T
+    is_box: NDArray[np.bool_] = (kinds == CUBE) & (actions == ADD)
+    return is_box
+
+
+def _labels(fields: Fields) -> BoxLabels:
+    """Return ids and namespaces of the boxes."""
+    rows = _cubes(fields)
+    ids = [str(number) for number in fields.numbers('markers.id', '<i4')[rows, 0].tolist()]
+    names = np.array(fields.texts('markers.ns'), object)[rows].tolist()
+    return ids, names, np.ones(len(ids))
+
+
+BOX_FIELDS = {
+    'visualization_msgs/msg/MarkerArray': BoxFields(
+        ('markers.header.frame_id',),
+        'markers.pose.position.x',
+        'markers.scale.x',
+        _labels,
+        others=('markers.id', 'markers.ns'),
+        stamp='markers.header.stamp.sec',
+        rows=_cubes,
+    )
+}

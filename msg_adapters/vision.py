@@ -10,13 +10,25 @@ The definition of vision_msgs 2 (ROS 2 Foxy) is read as well: its track id is `t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.structures import BoxArray, Floats
 from msg_adapters import poses
+from msg_adapters.box_fields import (
+    BoxFields,
+    BoxLabels,
+    COVARIANCE_WIDTH,
+    finite_or,
+    parts,
+    Rewrite,
+)
+from msg_adapters.cdr import Fields
 import numpy as np
+
+RESULT_POSE = 'detections.results.pose.pose.position.x'
+RESULT_COVARIANCE = 'detections.results.pose.covariance'
 
 
 def from_msg(msg: Any) -> BoxArray:
@@ -153,4 +165,56 @@ def _best_hypothesis(detection: Any) -> tuple[str, float]:
         hypothesis = _hypothesis_of(result)
         name = hypothesis.class_id if hasattr(hypothesis, 'class_id') else hypothesis.id
         found.append((str(name), float(hypothesis.score)))
-    return max(found, key=lambda item: item[1], default=('', 1.0))
+    return _best(found)
+
+
+def _best(hypotheses: Iterable[tuple[str, float]]) -> tuple[str, float]:
+    """Return that of several classes and scores which has the highest score."""
+    return max(hypotheses, key=lambda item: item[1], default=('', 1.0))
+
+
+def _detection_labels(fields: Fields) -> BoxLabels:
+    """Return ids, and classes and scores of the hypotheses with the highest score."""
+    classes = fields.texts('detections.results.hypothesis.class_id')
+    scores = fields.numbers('detections.results.hypothesis.score', '<f8')[:, 0]
+    counts = fields.counts('detections.results')
+    if (counts == 1).all():
+        return fields.texts('detections.id'), classes, scores
+    hypotheses = [*zip(classes, scores.tolist(), strict=True)]
+    best = [_best(hypotheses[part]) for part in parts(counts)]
+    found_scores = np.array([score for _, score in best])
+    return fields.texts('detections.id'), [name for name, _ in best], found_scores
+
+
+def _write_hypotheses(fields: Fields, rewrite: Rewrite) -> None:
+    """Write pose and covariance of each box into its hypotheses."""
+    counts = fields.counts('detections.results')
+    fields.put(RESULT_POSE, np.repeat(rewrite.new_pose, counts, axis=0))
+    own = fields.numbers(RESULT_COVARIANCE, '<f8', COVARIANCE_WIDTH)
+    fields.put(RESULT_COVARIANCE, finite_or(np.repeat(rewrite.covariance, counts, axis=0), own))
+
+
+def _without_labels(fields: Fields) -> BoxLabels:
+    """Return empty ids and classes, and the score 1."""
+    n = len(fields.counts('boxes.center.position.x'))
+    return [''] * n, [''] * n, np.ones(n)
+
+
+BOX_FIELDS = {
+    'vision_msgs/msg/Detection3DArray': BoxFields(
+        ('header.frame_id', 'detections.header.frame_id'),
+        'detections.bbox.center.position.x',
+        'detections.bbox.size.x',
+        _detection_labels,
+        others=(
+            'detections.id', 'detections.results', 'detections.results.hypothesis.class_id',
+            'detections.results.hypothesis.score', RESULT_POSE, RESULT_COVARIANCE,
+        ),
+        is_ordinary=lambda fields: bool((fields.counts('detections.id') > 1).all()),
+        write=_write_hypotheses,
+    ),
+    'vision_msgs/msg/BoundingBox3DArray': BoxFields(
+        ('header.frame_id',), 'boxes.center.position.x', 'boxes.size.x', _without_labels
+    ),
+}  # fmt: skip
+"""Of the definition of vision_msgs 4."""
