@@ -42,6 +42,12 @@ WHOLE_REVOLUTION = 0.9
 """Part of its length that times over a whole revolution have; chosen: ends are not measured."""
 LONG_SWEEP = 0.25
 """Longer sweeps are not read as such before the period is known [s]; slow LiDARs have 5 Hz."""
+SHORTEST_REVOLUTION = 0.02
+"""Shorter revolutions no LiDAR has [s]; derived: 50 Hz, the fastest of those with 3D have 30."""
+TURNING = 0.95
+"""Correlation of azimuth and time of points in their order; chosen: rows are degrees apart."""
+TURN_POINTS = 1000
+"""Points that it is taken of; chosen."""
 MAX_REVOLUTIONS = 1.5
 """Length of times, in periods of clouds, that no sweep has; chosen: clouds overlap a little."""
 MAX_PERIOD = 0.5
@@ -152,8 +158,9 @@ class SensorPlacement:
 
         Some drivers number the points over a revolution, from 0 to 1, in degrees or in ticks. No
         sweep is longer than the period of the clouds: times from about 0 on that are longer are
-        such parts, and are scaled to it. As long as the period is not known, points with times
-        beyond `LONG_SWEEP` have none.
+        such parts, and are scaled to it. So are times in the order of the azimuth over a whole
+        revolution that is too long, or shorter than any. As long as the period is not known,
+        points with such times have none.
 
         """
         stamps_ns = self._stamps_ns.setdefault(topic, deque(maxlen=PERIOD_STAMPS))
@@ -161,21 +168,24 @@ class SensorPlacement:
         times = sweep.times
         if times is None or not len(times):
             return sweep
-        high = float(times.max())
-        if high <= LONG_SWEEP:
+        low, high = float(times.min()), float(times.max())
+        is_short = high - low < SHORTEST_REVOLUTION
+        if not is_short and high - low <= LONG_SWEEP:
             return sweep
-        low = float(times.min())
-        if not 0 <= low < (1 - WHOLE_REVOLUTION) * high:
+        is_from_stamp = not is_short and 0 <= low < (1 - WHOLE_REVOLUTION) * high
+        if not is_from_stamp and not _is_one_turn(sweep.points, times):
             return sweep
         if len(stamps_ns) < 2:
             return replace(sweep, times=None)
         periods = np.diff(sorted(stamps_ns)) * 1e-9
         period = float(np.median(periods))
-        if not 0 < period < MAX_PERIOD or high < MAX_REVOLUTIONS * periods.max():
+        extent = high if is_from_stamp else high - low
+        is_sweep = not is_short and extent < MAX_REVOLUTIONS * periods.max()
+        if is_sweep or not 0 < period < MAX_PERIOD:
             return sweep
-        whole = 1.0 if WHOLE_REVOLUTION < high <= 1 else high
+        whole = 1.0 if is_from_stamp and WHOLE_REVOLUTION < high <= 1 else extent
         self.normalised[topic] = (
-            f'times of the points{f" of {topic}" if topic else ""} run over {high - low:.2f} s, '
+            f'times of the points{f" of {topic}" if topic else ""} run over {high - low:.2g} s, '
             f'while clouds come every {period:.3f} s: they are parts of a revolution, and are '
             f'read as such'
         )
@@ -317,6 +327,17 @@ def _nearest(points: NDArray[np.floating], origins: Floats) -> NDArray[np.uint8]
 
 def _with_sensors(sweep: Sweep, origins: Floats, sensors: NDArray[np.uint8]) -> Sweep:
     return replace(sweep, origin=origins.mean(axis=0), origins=origins, sensors=sensors)
+
+
+def _is_one_turn(points: NDArray[np.floating], times: Floats) -> bool:
+    """Return whether points (M, 3) by their times (M,) go around the LiDAR once."""
+    rows = np.argsort(times)[:: max(1, len(times) // TURN_POINTS)]
+    x, y, _ = points[rows].T
+    is_away = np.hypot(x, y) > 0  # of no return there are zeros
+    azimuth = np.unwrap(np.arctan2(y, x)[is_away])
+    if len(azimuth) < 2 or not 0.9 <= abs(azimuth[-1] - azimuth[0]) / (2 * np.pi) <= 1.1:
+        return False
+    return abs(float(np.corrcoef(azimuth, times[rows][is_away])[0, 1])) >= TURNING
 
 
 def _divided(

@@ -17,7 +17,9 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.io.box_table import number_cells
+from boxreg_ros.io.checks.twice import SAME_OBJECT_IOU
 from boxreg_ros.io.transforms import inverse, moved_boxes
 from boxreg_ros.labels.attributes import attributes_from, plain
 from boxreg_ros.labels.files import at, following, from_json, to_json
@@ -239,7 +241,8 @@ def read(path: Path) -> Iterator[LabelFrame]:
     Yield the cuboids of each frame, in one coordinate system where transforms connect theirs.
 
     The track id is the uid of the object, in files written by `Writer` its name; more cuboids of
-    an object in a frame are tracks of their own, ``uid/name``. Cuboids of an object itself are in
+    an object in a frame are tracks of their own, ``uid/name``, but for those that lie on another
+    one, as with and without an open door, which are left out. Cuboids of an object itself are in
     all frames of its intervals, or in every frame. Rotations of three values are roll, pitch and
     yaw, as defined in `structures`. Poses are those of the frame, else ``pose_wrt_parent``.
 
@@ -275,7 +278,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         stamps = _stamps(path, frames)
         objects.require_frames(len(frames))
         in_time = sorted(zip(stamps.stamps_ns, frames, strict=True), key=lambda item: item[0])
-        note = stamps.note
+        note = '; '.join(filter(None, (stamps.note, objects.note(frames))))
         for stamp_ns, (number, frame) in in_time:
             with at(f'frame {number}'):
                 found = list(_read_frame(number, frame, stamp_ns, objects, systems))
@@ -347,6 +350,23 @@ class _Objects:
                     if (uid, cuboid.get('name')) not in own:
                         yield uid, cuboid
 
+    def note(self, frames: list[tuple[int, dict[str, Any]]]) -> str:
+        """Return how many objects have several cuboids in a frame; empty for none."""
+        several = 0
+        for number, frame in frames:
+            of_objects = Counter(
+                (uid, self.system_of(uid, cuboid))
+                for uid, cuboid in self.cuboids_in(number, frame)
+                if cuboid['val'] is not None
+            )
+            several += sum(one > 1 for one in of_objects.values())
+        if not several:
+            return ''
+        return (
+            f'objects: expected one cuboid in each frame, got several, {several} times: those '
+            f'after the first are tracks of their own, ID/NAME'
+        )
+
     def system_of(self, uid: str, cuboid: dict[str, Any]) -> str:
         """Return the coordinate system of a cuboid, by default that of its object."""
         return str(cuboid.get('coordinate_system') or self._systems.get(uid, ''))
@@ -377,14 +397,23 @@ def _read_frame(
 ) -> Iterator[LabelFrame]:
     """Yield the content of one frame, one `LabelFrame` per unconnected coordinate system."""
     boxes: dict[str, list[ReadBox]] = {}
+    of_object: dict[tuple[str, str], list[Floats]] = {}
     left_out: Counter[str] = Counter()
     for uid, cuboid in objects.cuboids_in(number, frame):
         with at(f'object {uid}'):
             if cuboid['val'] is None:
                 left_out[Reason.NO_BOX] += 1
                 continue
-            found = boxes.setdefault(objects.system_of(uid, cuboid), [])
-            found.append(objects.read_box(uid, cuboid, {box.track_id for box in found}))
+            system = objects.system_of(uid, cuboid)
+            found = boxes.setdefault(system, [])
+            box = objects.read_box(uid, cuboid, {box.track_id for box in found})
+            others = of_object.setdefault((uid, system), [])
+            values = np.asarray(box.box)[None]
+            if any(iou_3d(values, other)[0] >= SAME_OBJECT_IOU for other in others):
+                left_out[Reason.DUPLICATE_TRACK_ID] += 1
+                continue
+            others.append(values)
+            found.append(box)
     poses = _Poses(frame.get('frame_properties') or {}, systems)
     if not boxes:
         boxes[poses.first()] = []

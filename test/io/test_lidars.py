@@ -283,6 +283,28 @@ def test_times_that_are_parts_of_a_revolution_become_seconds(whole):
     assert 'clouds come every 0.100 s: they are parts of a revolution' in placement.normalised['']
 
 
+@pytest.mark.parametrize('kind', ['u4', 'i4'], ids=['begin', 'end'])
+@pytest.mark.parametrize(
+    ('tick', 'degrees', 'is_named'), [(1e-5, 360, True), (1e-7, 360, True), (1e-5, 120, False)]
+)
+def test_ticks_that_are_no_unit_are_parts_of_a_revolution(kind, tick, degrees, is_named):
+    """A LiDAR that does not turn may take its points in 10 ms."""
+    m = Messages()
+    placement = SensorPlacement()
+    times = np.linspace(0, 0.099, 5000) - (0.099 if kind == 'i4' else 0)
+    azimuth = np.radians(np.linspace(0, degrees, 5000) + np.tile([-4, 0, 3, 1], 1250))
+    x, y = 20 * np.cos(azimuth), 20 * np.sin(azimuth)
+    x[::7] = y[::7] = 0
+    columns = [('x', 'f4', x), ('y', 'f4', y), ('z', 'f4', 0 * x)]
+    for k in range(4):
+        stamp = START + k * SECOND // 10
+        ticks = np.round(times / tick).astype(kind)
+        sweep = placement.sweep_of(m.cloud(stamp, 'lidar', [*columns, ('t', kind, ticks)]), '')
+    assert ('they are parts of a revolution' in placement.normalised.get('', '')) == is_named
+    expected = times if is_named else times / 10
+    np.testing.assert_allclose(sweep.times, expected, atol=2e-3)
+
+
 def test_a_revolution_in_a_second_is_read_as_it_is():
     m = Messages()
     parts = np.linspace(0, 1, 500)

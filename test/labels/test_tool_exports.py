@@ -448,11 +448,13 @@ def test_openlabel_cuboids_of_an_object_are_in_the_frames_of_its_intervals(tmp_p
 
 
 def test_openlabel_several_cuboids_of_an_object_and_null(tmp_path):
-    cuboids = [val(1), val(5) | {'name': 'trailer'}, {'name': 'gone', 'val': None}]
+    others = [val(5) | {'name': 'trailer'}, val(1.5) | {'name': 'open doors'}]
+    cuboids = [val(1), *others, {'name': 'gone', 'val': None}]
     frames = {'0': {'frame_properties': {'timestamp': 1}, 'objects': objects_of(*cuboids)}}
     (found,) = read('openlabel', openlabel(tmp_path / 'a.json', frames, CLASSES))
     assert ids([found]) == [('0', '0/trailer')]
-    assert found.left_out == {'no_box': 1}
+    assert found.left_out == {'no_box': 1, 'duplicate_track_id': 1}
+    assert 'got several, 1 times: those after the first are tracks of their own' in found.note
 
 
 def test_openlabel_interpolated_by_its_tool(tmp_path):
@@ -461,7 +463,7 @@ def test_openlabel_interpolated_by_its_tool(tmp_path):
         {'boolean': [{'name': 'keyframe', 'val': False}]},
         {'text': [{'name': 'interpolated', 'val': 'false'}, {'name': 'keyframe', 'val': 'True'}]},
     ]
-    cuboids = [val(i, attributes=flag) | {'name': f'{i}'} for i, flag in enumerate(flags)]
+    cuboids = [val(9 * i, attributes=flag) | {'name': f'{i}'} for i, flag in enumerate(flags)]
     frames = {'0': {'frame_properties': {'timestamp': 1}, 'objects': objects_of(*cuboids)}}
     (found,) = read('openlabel', openlabel(tmp_path / 'a.json', frames, CLASSES))
     assert found.refined.status == ('interpolated', 'interpolated', 'input')
