@@ -11,6 +11,7 @@ FILE_REMEDIES = {
     errno.EISDIR: 'name a file in this folder',
     errno.EACCES: 'change its permissions, or run as another user',
     errno.EPERM: 'change its permissions, or run as another user',
+    errno.EROFS: 'choose a folder that can be written',
     errno.ENOSPC: 'free some space on its disk',
     errno.EMFILE: 'raise the limit of open files (ulimit -n)',
 }

@@ -246,14 +246,14 @@ def test_recordings_without_overlap_in_time_name_both_ranges(tmp_path, capsys):
 
 def test_unknown_class_names_are_named_with_their_kind(tmp_path, capsys):
     drive = Drive(sweeps=5)
-    for index in range(5):
-        drive.replace('/boxes', index, lambda boxes: _name_first(boxes, 'hovercraft'))
+    for index, name in enumerate(('', *['hovercraft'] * 4)):
+        drive.replace('/boxes', index, lambda boxes, name=name: _name_first(boxes, name))
     recording = drive.write(tmp_path / 'drive')
     status, _, err = boxreg(capsys, 'relabel', recording, '-o', tmp_path / 'out', *QUICK)
     assert status == 0
     (line,) = err.splitlines()
-    assert "unknown class names are treated as vehicles: 'hovercraft' (5 boxes)" in line
-    assert 'vehicle.names' in line
+    assert "unknown class names are treated as vehicles: 'hovercraft', '' (5 boxes)" in line
+    assert 'vehicle.names' in line and line.endswith('; give those without a name one')
 
 
 def _name_first(boxes, name):
@@ -274,7 +274,8 @@ def test_a_file_without_permission_names_the_remedy(tmp_path, capsys):
 
 
 def test_the_remedy_of_a_file_is_that_of_the_cause():
-    for number, words in ((errno.EACCES, 'permissions'), (errno.EIO, 'disk')):
+    causes = (errno.EACCES, 'permissions'), (errno.EIO, 'disk'), (errno.EROFS, 'be written')
+    for number, words in causes:
         text = unreadable('a.mcap', OSError(number, os.strerror(number)))
         assert text.startswith(f'a.mcap: cannot be read: {os.strerror(number)}; ')
         assert words in text

@@ -161,6 +161,7 @@ class BoxTable(Columns):
                 except (ValueError, OverflowError) as error:
                     what = 'a whole number' if kind is int else 'a number'
                     what += ' of 64 bits' * isinstance(error, OverflowError)
+                    what += ' (ns, which spreadsheets round)' * (name == 'stamp_ns')
                     raise RecordingError(
                         f'{path}: line {line}, column {name}: expected {what}, got '
                         f'{row[name] or "nothing"}; correct the line'

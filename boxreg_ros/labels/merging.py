@@ -115,11 +115,14 @@ class LabelMerger:
         """Refuse labels that lie further apart from the clouds [ns] than those of one drive."""
         if apart_ns <= self._longest_ns or self._labelled_ns is None or self._first_ns is None:
             return
+        cause = 'another drive? give the labels of this recording'
+        for unit, in_ns in (('s', 10**9), ('ms', 10**6), ('us', 10**3)):
+            if abs(self._labelled_ns[0] * in_ns - self._first_ns) < LONGEST_DRIVE_NS:
+                cause = f'stamps in {unit}? write them in ns'
         raise RecordingError(
             f'labels: expected those of the time of the clouds, got labels of '
             f'{time_range(*self._labelled_ns)}, clouds of '
-            f'{time_range(self._first_ns, self._newest_ns)}: another drive? give the labels of '
-            f'this recording'
+            f'{time_range(self._first_ns, self._newest_ns)}: {cause}'
         )
 
 

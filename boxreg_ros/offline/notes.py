@@ -102,6 +102,8 @@ def notes(summary: Summary) -> Iterator[str]:
         yield (
             f'unknown class names are treated as vehicles: {names} ({boxes:,} boxes); name '
             f'them in vehicle.names, cyclist.names or pedestrian.names'
+            + '; give those without a name one'
+            * ('' in summary.unknown_classes)
         )
     if summary.part_refined < FEW_REFINED:
         yield _why_few_were_refined(summary)

@@ -156,6 +156,10 @@ def test_labels_of_another_drive_are_refused(tmp_path, drive, apart):
     with pytest.raises(RecordingError, match=r'clouds of .* \(2023-11-14\): another drive\?'):
         relabel(request, tmp_path / 'out')
     assert not (tmp_path / 'out').exists()
+    replace(labels, stamps_ns=labels.stamps_ns // 10**6).write(table)
+    with pytest.raises(RecordingError, match=r'stamps in ms\? write them in ns'):
+        relabel(request, tmp_path / 'out')
+    replace(labels, stamps_ns=labels.stamps_ns + apart).write(table)
     part = Request((recording,), config=QUICK, labels=('csv', table), end=0.3)
     if abs(apart) < 10**12:
         assert relabel(part, tmp_path / 'out').labels['boxes_outside_part'] == 14

@@ -200,7 +200,9 @@ def test_table_survives_the_round_trip(tmp_path):
         (','.join(COLUMNS) + '\n' + '1,' * 16 + '1\n' + '1,' * 16 + '\n',
          'line 3, column num_points: expected a whole number, got nothing'),
         (','.join(COLUMNS) + '\n' + '9' * 25 + ',1' * 16,
-         'line 2, column stamp_ns: expected a whole number of 64 bits, got 99999'),
+         'line 2, column stamp_ns: expected a whole number of 64 bits .*, got 99999'),
+        (','.join(COLUMNS) + '\n1.7E+18' + ',1' * 16,
+         'expected a whole number .ns, which spreadsheets round., got 1.7E.18; correct the line'),
     ],
 )  # fmt: skip
 def test_malformed_table_is_refused(tmp_path, text, message):
