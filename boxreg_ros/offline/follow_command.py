@@ -51,7 +51,9 @@ def _require_accepted(seeds: Path) -> None:
     """Say how many boxes are proposals that no one has accepted; raise if there is no other."""
     words = [word for table in BoxTable.read_frames(seeds).values() for word in table.status]
     if not words:
-        raise ConfigError(f'{seeds}: expected boxes to follow, got a table of none')
+        raise ConfigError(
+            f'{seeds}: expected boxes to follow, got a table of none; add a box of each object'
+        )
     proposed = words.count(PROPOSED)
     if not proposed:
         return

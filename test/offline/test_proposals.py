@@ -61,7 +61,8 @@ def test_what_is_left_out_is_proposed_and_followed_once_accepted(tmp_path, capsy
     none = tmp_path / 'none.csv'
     none.write_text((out / 'proposals.csv').read_text().splitlines()[0] + '\n')
     assert main(['follow', str(drive), str(none)]) == 2
-    assert f'{none}: expected boxes to follow, got a table of none' in capsys.readouterr().err
+    text = f'{none}: expected boxes to follow, got a table of none; add a box'
+    assert text in capsys.readouterr().err
     words = ['follow', str(drive), str(out / 'proposals.csv'), '-o', str(tmp_path / 'followed')]
     assert main([*words, '--formats', 'csv']) == 2
     assert 'write accepted in place of proposed' in capsys.readouterr().err
