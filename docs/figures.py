@@ -149,7 +149,7 @@ def proposals_frames(out: Path) -> Iterator[tuple[bytes, int]]:
             yield page.screenshot(), 700
             page.keyboard.press('Enter')
             page.wait_for_function(
-                f"TRACKS.length === {count} && !$('tracks').hidden && view.part", timeout=120_000
+                f"TRACKS.length === {count} && !$('tracks').hidden && view.part"
             )
             page.wait_for_timeout(SETTLE)
             yield page.screenshot(), 700

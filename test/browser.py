@@ -17,6 +17,8 @@ Root needs ``--no-sandbox``; the next two draw WebGL without a GPU. The popups o
 are pages of their own, which a window loads though nobody sees them: 1.5 s of processor time.
 """
 EXECUTABLE = next(filter(None, map(shutil.which, BROWSERS)), None)
+READY = 'html[data-ready]'
+PATIENCE = 120.0  # [s]; pages are slow on a busy machine
 NEEDS_BROWSER = pytest.mark.skipif(
     EXECUTABLE is None, reason='no Chromium on PATH: apt install chromium'
 )
@@ -63,7 +65,7 @@ def serving(server):
 
 
 @contextmanager
-def opened_page(url, expected='', ready='html[data-ready]', **context):
+def opened_page(url, expected='', ready=READY, **context):
     """
     Yield a page in a context of its own, ready.
 
@@ -74,14 +76,24 @@ def opened_page(url, expected='', ready='html[data-ready]', **context):
     # Tests evaluate text on the page, which its policy forbids.
     usual = {'viewport': {'width': 1366, 'height': 800}, 'bypass_csp': True}
     with shared_browser().new_context(**{**usual, **context}) as opened:
+        opened.set_default_timeout(1e3 * PATIENCE)
         page = opened.new_page()
         page.on('console', lambda line: errors.append(line.text) if line.type == 'error' else None)
         page.on('pageerror', lambda error: errors.append(str(error)))
         page.goto(url)
-        page.wait_for_selector(ready, timeout=60_000)
+        page.wait_for_selector(ready)
         yield page
     unexpected = [line for line in errors if not expected or expected not in line]
     assert not unexpected, unexpected
+
+
+def other_page(page, url, ready=READY):
+    """Return the page of another person, in a context of its own, ready."""
+    page = page.context.browser.new_page(bypass_csp=True)
+    page.set_default_timeout(1e3 * PATIENCE)
+    page.goto(url)
+    page.wait_for_selector(ready)
+    return page
 
 
 def show_charts(page):

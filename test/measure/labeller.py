@@ -529,7 +529,7 @@ class Labeller:
                 self._page.wait_for_timeout(500)
                 continue
             self.key('o')
-            self._page.wait_for_function('view.solved', timeout=120_000)
+            self._page.wait_for_function('view.solved')
 
     def _drag_to(self, target):
         """Drag the stroke at the front of the box, and the box in two views, to a true box."""
@@ -612,7 +612,7 @@ class Labeller:
             self.click('#tab-drive')
             stamps = self._page.evaluate('DATA.stamps')
             at, last = stamps.index(stamp), len(stamps) - 1
-            self._page.wait_for_function('scene.sweep', timeout=120_000)
+            self._page.wait_for_function('scene.sweep')
             self.click_slider('#scene-time', at, last)
             self._page.wait_for_timeout(500)
             self.key('i')
@@ -634,7 +634,7 @@ class Labeller:
             )
             self.actions['click'] += 1
             self._page.mouse.click(*place)
-            self._page.wait_for_function('scene.fit', timeout=60_000)
+            self._page.wait_for_function('scene.fit')
             wanted = self._truth.class_names[row]
             if self._page.evaluate('scene.fit.class') != wanted:
                 self.actions['click'] += 2
@@ -646,7 +646,6 @@ class Labeller:
             self._page.wait_for_function(
                 f"TRACKS.length > {count} && !$('tracks').hidden && view.part && "
                 'view.open === TRACKS.at(-1)',
-                timeout=120_000,
             )
             self._correct()
 

@@ -253,7 +253,7 @@ def corrected_by_page(followed, folder):
         page.keyboard.press('Shift+ArrowRight')
         pin = page.evaluate('moved(view.edit, view.part.origin, 1)')
         press(page, 'Enter', 'pinOf(view.row) !== null')
-        press(page, 'Control+s', "$('notice').textContent.includes('boxes in')", timeout=120_000)
+        press(page, 'Control+s', "$('notice').textContent.includes('boxes in')")
         assert page.locator('#failure').is_hidden()
     rows = rows_in(folder / 'out.corrected' / 'boxes.csv')
     return {(row['track_id'], int(row['stamp_ns'])): row for row in rows}, pin
@@ -352,7 +352,7 @@ def test_decisions_of_the_page_are_all_in_the_labels_that_it_writes(
         show_charts(page)
         DecisionLog(out / DECISIONS).append([Decision('nobody', None, 'delete')])
         page.keyboard.press('Control+s')
-        page.wait_for_selector('#failure:not([hidden])', timeout=120_000)
+        page.wait_for_selector('#failure:not([hidden])')
         assert "could not be used: 'nobody'" in page.inner_text('#failure')
         assert 'boxes in' in page.inner_text('#notice')
     rows = rows_in(tmp_path / 'out.corrected' / 'boxes.csv')

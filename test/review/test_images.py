@@ -92,11 +92,12 @@ def test_boxes_are_shown_in_the_nearest_image_of_the_best_camera(tmp_path):
           return [...c.getContext('2d').getImageData(x, y, 1, 1).data]; })()""")
         assert np.abs(np.subtract(shown, [0, 0, 200, 255])).max() < 6  # bgr8
         # The points of the sweep in the image, by their distance: grey pixels get colours.
-        coloured = """(async () => {
+        page.evaluate("""(async () => {
+          const stamp = sceneStamp(), { pose } = await imageAt(0, stamp);
+          window.shown = { camera: (await camerasAt(stamp))[0], pose }; })()""")
+        coloured = """(() => {
           const c = document.querySelector('#drive-cameras canvas'), context = c.getContext('2d');
-          const stamp = sceneStamp(), camera = (await camerasAt(stamp))[0];
-          const { pose } = await imageAt(0, stamp);
-          const { points, origin } = scene.sweep, found = [];
+          const { points, origin } = scene.sweep, { camera, pose } = window.shown, found = [];
           for (let i = 0; i < points.length; i += 3) {
             const at = inCamera(pose, [0, 1, 2].map(k => points[i + k] + origin[k]));
             const pixel = pixelOf(camera, at);
@@ -109,11 +110,9 @@ def test_boxes_are_shown_in_the_nearest_image_of_the_best_camera(tmp_path):
         assert count > 50
         assert before < count / 2  # the outlines of boxes
         page.check('#scene-in-image')
-        page.wait_for_timeout(300)
-        assert page.evaluate(coloured)[1] > 0.9 * count
+        page.wait_for_function(f'{coloured}[1] > 0.9 * {count}')
         page.uncheck('#scene-in-image')
-        page.wait_for_timeout(300)
-        assert page.evaluate(coloured) == [count, before]
+        page.wait_for_function(f"{coloured}.join() === '{count},{before}'")
 
 
 @NEEDS_BROWSER

@@ -81,7 +81,7 @@ def test_undo_and_redo_outlast_a_reload_and_leave_what_others_decided(out, serve
 
         def reload():
             page.reload()
-            page.wait_for_selector('html[data-ready]', timeout=60_000)
+            page.wait_for_selector('html[data-ready]')
 
         press(page, 'a', f"{judged} === 'accept'")
         page.evaluate('step(3)')
@@ -358,7 +358,7 @@ def test_the_track_follows_a_box_while_it_is_dragged(serve):
         before = page.evaluate('moved(view.edit, view.part.origin, 1)')
         for _ in range(4):
             page.keyboard.press('Shift+ArrowUp')  # 0.4 m to the left
-        page.wait_for_function('view.followed && !view.isAsking', timeout=120_000)
+        page.wait_for_function('view.followed && !view.isAsking')
         stamps = page.evaluate('view.part.stamps')
         followed = dict(page.evaluate('[...view.followed]'))
         dragged = page.evaluate('moved(view.edit, view.part.origin, 1)')

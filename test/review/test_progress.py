@@ -9,7 +9,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
 from boxreg_ros.review.progress import agreement, progress_of
 from boxreg_ros.review.server import review_server
-from browser import NEEDS_BROWSER, opened_page, press, serving
+from browser import NEEDS_BROWSER, opened_page, other_page, press, serving
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -124,8 +124,7 @@ def test_several_drives_are_reviewed_under_one_address(outs):
         page.wait_for_function('view.part')
         # Another page gets another track by "Accept, next": the queue is shared out.
         taken = page.evaluate('current().id')
-        other = page.context.browser.new_page(bypass_csp=True)
-        other.goto(server.address)
+        other = other_page(page, server.address, '#drives a')
         other.click('#drives a')
         other.wait_for_selector('html[data-ready]')
         assert other.evaluate("notePage('')") == [taken]

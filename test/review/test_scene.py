@@ -64,7 +64,7 @@ def serve():
 def open_scene(page, at):
     page.click('#tab-drive')
     page.evaluate(f'showScene({at})')
-    page.wait_for_function(f'scene.sweep?.stamp === DATA.stamps[{at}]', timeout=60_000)
+    page.wait_for_function(f'scene.sweep?.stamp === DATA.stamps[{at}]')
 
 
 def click_at(page, x, y):
@@ -80,11 +80,11 @@ def add_car(page, drive):
     (x, y, *_), length = drive.truth[drive.stamps[7]][1], drive.truth[drive.stamps[7]][1][3]
     page.keyboard.press('i')
     click_at(page, x - length / 2, y)
-    page.wait_for_function('scene.fit', timeout=60_000)
+    page.wait_for_function('scene.fit')
     page.select_option('#scene-class', 'car')
     page.wait_for_function("scene.fit.class === 'car'")
     page.locator('#scene-view').focus()
-    press(page, 'Enter', "!$('tracks').hidden && current()?.id === '2'", timeout=60_000)
+    press(page, 'Enter', "!$('tracks').hidden && current()?.id === '2'")
 
 
 def stamps_of(table, track_id):
@@ -120,7 +120,7 @@ def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serv
         page.keyboard.press('e')
         page.keyboard.press('Shift+ArrowRight')
         # The object follows the box before it is kept.
-        page.wait_for_function('view.followed && !view.isAsking', timeout=60_000)
+        page.wait_for_function('view.followed && !view.isAsking')
         moved = page.evaluate("""[0, 1].map(row =>
           moved(view.part.usable[row], view.part.origin, 1).map((v, k) =>
             view.followed.get(view.part.stamps[row])[k] - v).slice(0, 2))""")
@@ -138,12 +138,12 @@ def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serv
         assert 'no input to keep' in page.inner_text('#failure')
         # The page opened again follows it again.
         page.reload()
-        page.wait_for_selector('html[data-ready]', timeout=60_000)
+        page.wait_for_selector('html[data-ready]')
         assert page.evaluate('TRACKS.map(track => [track.id, track.class])') == [
             ['1', 'car'],
             ['2', 'van'],
         ]
-        press(page, 'Control+s', "$('notice').textContent.includes('boxes in')", timeout=120_000)
+        press(page, 'Control+s', "$('notice').textContent.includes('boxes in')")
     again = out.with_name('out.corrected')
     table = BoxTable.read(again / 'boxes.csv')
     rows = [row for row, name in enumerate(table.track_ids) if name == '2']
@@ -188,7 +188,7 @@ def click_on_points(page, box):
         box.tolist(),
     )
     page.mouse.click(x, y)
-    page.wait_for_function('scene.fit', timeout=60_000)
+    page.wait_for_function('scene.fit')
 
 
 @NEEDS_BROWSER
@@ -242,7 +242,7 @@ def test_a_drive_without_boxes_is_labelled_from_its_recording_alone(tmp_path, pr
             page.wait_for_function("!$('tracks').hidden && current()?.id === '2'")
             assert 'end of the recording' in page.inner_text('#title')
             page.keyboard.press('Control+s')
-            page.wait_for_function("$('notice').textContent.includes('boxes in')", timeout=120_000)
+            page.wait_for_function("$('notice').textContent.includes('boxes in')")
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)
     assert process.returncode == 0
@@ -280,7 +280,7 @@ def test_whole_clouds_are_shown_in_the_scene_and_in_a_track(drive, made, out, se
         assert page.inner_text('#scene-proposals option') == '1 proposed'
         page.locator('#scene-view').focus()
         press(page, 'p', 'scene.fit')
-        press(page, 'Enter', "!$('tracks').hidden && current()?.class === 'van'", timeout=60_000)
+        press(page, 'Enter', "!$('tracks').hidden && current()?.class === 'van'")
         assert page.evaluate('[view.row, openProposals().length]') == [6, 0]
     (out / DECISIONS).unlink()
     narrow = {'viewport': {'width': 390, 'height': 844}, 'color_scheme': 'dark'}

@@ -14,7 +14,7 @@ from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
-from browser import NEEDS_BROWSER, opened_page, press, serving
+from browser import NEEDS_BROWSER, opened_page, other_page, press, serving
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -138,7 +138,7 @@ def test_labels_are_written_with_all_decisions_without_a_terminal(server):
         open_track(page, '2', 0)
         press(page, 'd', 'isGone(current())')
         assert page.locator('#rows tr.gone').count() == 1
-        press(page, 'Control+s', "$('notice').textContent.includes('boxes in')", timeout=120_000)
+        press(page, 'Control+s', "$('notice').textContent.includes('boxes in')")
         assert page.locator('#failure').is_hidden()
     again = out.with_name('out.corrected')
     table = BoxTable.read(again / 'boxes.csv')
@@ -174,7 +174,7 @@ def test_labels_that_cannot_be_written_leave_all_as_it_was(server, made):
         with opened_page(server.address + '#track=1', expected='400') as page:
             press(page, 'd', 'isGone(current())')
             page.click('#save-button')
-            page.wait_for_selector('#failure:not([hidden])', timeout=120_000)
+            page.wait_for_selector('#failure:not([hidden])')
             text = page.inner_text('#failure')
     finally:
         hidden.rename(made / 'drive')
@@ -209,7 +209,7 @@ def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path, preloaded_
     ):
         press(page, 'd', 'isGone(current())')
         page.keyboard.press('Control+s')  # the report is larger
-        page.wait_for_selector('#failure:not([hidden])', timeout=120_000)
+        page.wait_for_selector('#failure:not([hidden])')
         text = page.inner_text('#failure')
         assert 'the earlier ones are as they were' in text and 'too large' in text
         assert sorted(path.name for path in tmp_path.iterdir()) == ['out']
@@ -236,8 +236,8 @@ def test_a_full_disk_and_a_killed_server_lose_nothing(made, tmp_path, preloaded_
         running(out, preloaded_python) as (process, address),
         opened_page(address, expected='40') as page,
     ):
-        for _ in range(30):
-            press(page, 'Control+s', '!view.isSaving', timeout=120_000)
+        for _ in range(120):
+            press(page, 'Control+s', '!view.isSaving')
             if 'boxes in' in page.inner_text('#notice'):
                 break
             page.wait_for_timeout(1000)  # the command that was left is still at work
@@ -342,7 +342,7 @@ def test_a_correction_shows_its_figures_is_typed_and_undone_in_steps(server):
 def test_a_track_is_solved_again_with_its_pin_within_the_page(server):
     out = server.log_paths[0].parent
     with opened_page(server.address + '#track=1') as page:
-        press(page, 'o', "$('notice').textContent.includes('pinned boxes')", timeout=120_000)
+        press(page, 'o', "$('notice').textContent.includes('pinned boxes')")
         page.evaluate('step(6)')
         page.keyboard.press('e')
         page.fill('#n-length', str(page.evaluate('view.edit[3] + 0.4')))
@@ -350,7 +350,7 @@ def test_a_track_is_solved_again_with_its_pin_within_the_page(server):
         page.locator('#top').focus()
         page.keyboard.press('Enter')
         page.wait_for_selector(DO.format('unpin'))
-        press(page, 'o', "$('notice').textContent.includes('1 pinned box')", timeout=60_000)
+        press(page, 'o', "$('notice').textContent.includes('1 pinned box')")
         assert 'solved again' in page.inner_text('#legend')
         solved = page.evaluate('[...view.solved]')
         part = page.evaluate('({ ...view.part, points: [...view.part.points] })')
@@ -378,9 +378,7 @@ def test_a_track_is_solved_again_with_its_pin_within_the_page(server):
 
 def test_people_see_the_decisions_of_each_other(server):
     with opened_page(server.address + '#track=1', expected='409') as first:
-        second = first.context.browser.new_page(bypass_csp=True)
-        second.goto(server.address + '#track=1')
-        second.wait_for_selector('html[data-ready]', timeout=60_000)
+        second = other_page(first, server.address + '#track=1')
         second.fill('#who', 'ben')
         second.keyboard.press('Tab')
         first.keyboard.press('r')

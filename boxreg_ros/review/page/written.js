@@ -33,8 +33,15 @@ async function followWritten(count) {
   say('The labels were written, with all decisions: this is the new result.');
 }
 
-// Take the result that the server has now into this page, and show what changed.
-async function openResult() {
+// Take the result that the server has now into this page, and show what changed; decisions of others
+// that arrive meanwhile are about it, and wait.
+function openResult() {
+  const opened = takeResult();
+  log.answered = opened.catch(() => {});
+  return opened;
+}
+
+async function takeResult() {
   const response = await fetch(location.pathname);
   if (!response.ok) throw new Error(await response.text());
   const fresh = new DOMParser().parseFromString(await response.text(), 'text/html');
