@@ -139,17 +139,25 @@ class RecordedMotion:
                     found.add(message.transforms)
         return found
 
-    def add(self, tree: TransformTree, record: Record) -> None:
-        """Add a message of `topics` to `tree`, or count it as unreadable."""
+    def add(self, tree: TransformTree, record: Record, *, may_jump: bool = True) -> bool:
+        """
+        Add a message of `topics` to `tree`, or count it as unreadable.
+
+        Return False where it was not added: by it time goes back, and it may not.
+
+        """
         topic = record.connection.topic
         with self._decoder.counted(topic):
             message = self._decoder.message(record)
             with malformed(f'topic {topic!r}'):
+                if not may_jump and tree.jumps_back(message):
+                    return False
                 if record.connection.msgtype == ODOMETRY_TYPE:
                     tree.add_odometry(message, record.received_ns)
                 else:
                     is_static = topic in self._topics.static_transforms
                     tree.add_transforms(message.transforms, is_static, record.received_ns)
+        return True
 
     def first(self, topic: str) -> Any:
         """Return the first readable message on a topic; UnsupportedMessage if none of them is."""

@@ -366,7 +366,10 @@ class Recording:
             while waiting and waiting[0].received_ns <= record.received_ns - LOOKAHEAD_NS:
                 yield waiting.popleft()
             if record.connection.topic in ahead_topics:
-                self._follow(tree, record)
+                if not self._follow(tree, record, may_jump=not waiting):
+                    while waiting:  # before their transforms are forgotten
+                        yield waiting.popleft()
+                    self._follow(tree, record)
             elif (begin or 0) <= record.received_ns and (not end or record.received_ns < end):
                 waiting.append(record)
         while waiting:
@@ -395,13 +398,18 @@ class Recording:
         except UnsupportedMessage:
             return None
 
-    def _follow(self, tree: TransformTree, record: Record) -> None:
-        """Add a message that is read ahead to `tree`, or to the placement of the sensors."""
+    def _follow(self, tree: TransformTree, record: Record, *, may_jump: bool = True) -> bool:
+        """
+        Add a message that is read ahead to `tree`, or to the placement of the sensors.
+
+        Return False where it was not added, see `RecordedMotion.add`.
+
+        """
         topic = record.connection.topic
         if topic != self.placement.lidars.info:
-            self._motion.add(tree, record)
-            return
+            return self._motion.add(tree, record, may_jump=may_jump)
         with self.decoder.counted(topic):
             message = self.decoder.message(record)
             with malformed(f'topic {topic!r}'):
                 self.placement.add_info(message)
+        return True

@@ -195,8 +195,8 @@ class Edge:
             return  # no pose; the error of a lookup has the stamps that are known
         self._last_added = stamp_ns, values
         self._last_found = None
-        is_old = bool(self.stamps) and stamp_ns < self.stamps[-1] - round(TIME_JUMP * 1e9)
-        has_jumped = is_old and self._was_old  # a single old one is an outlier
+        is_old = self._is_old(stamp_ns)
+        has_jumped = self.jumps_to(stamp_ns)
         if has_jumped:
             self._forget()
             self._was_forgotten = True
@@ -211,6 +211,13 @@ class Edge:
         # Two samples stay at any age: extrapolation needs a velocity.
         old = max(min(old, len(self.stamps) - 2), 0)
         del self.stamps[:old], self.poses[:old]
+
+    def _is_old(self, stamp_ns: int) -> bool:
+        return bool(self.stamps) and stamp_ns < self.stamps[-1] - round(TIME_JUMP * 1e9)
+
+    def jumps_to(self, stamp_ns: int) -> bool:
+        """Return whether a sample of a stamp is a time jump back: a single old one is none."""
+        return self._was_old and self._is_old(stamp_ns)
 
     def rewind(self, stamp_ns: int) -> None:
         """Forget later samples; at 0 the recording is read again."""
@@ -229,6 +236,7 @@ class Edge:
         self.stamps.clear()
         self.poses.clear()
         self._clock = StreamClock()
+        self.arrivals = ReceiveTimes()
         self._was_old = False
         self._last_found = None
 

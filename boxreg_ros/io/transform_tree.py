@@ -177,9 +177,21 @@ class TransformTree:
             self._forget_routes()
             self.odometry_child = above.used.parent
 
+    def jumps_back(self, message: Any) -> bool:
+        """Return whether by a TFMessage or odometry time goes back: samples are forgotten then."""
+        frames, items = self._odometry, [message]
+        if hasattr(message, 'transforms'):
+            frames, items = self._tf, message.transforms
+        for item in items:
+            frame = frames.get(_name(item.child_frame_id) or self.odometry_child)
+            edge = frame and frame.edge_to(_name(item.header.frame_id))
+            if edge and edge.jumps_to(self._stamp_of(item)):
+                return True
+        return False
+
     def rewind(self, stamp_ns: int) -> None:
         """Forget samples of moving frames that are later than a stamp that time went back to."""
-        for edge in self.edges():
+        for edge in _edges_of((*self._tf.values(), *self._odometry.values())):
             edge.rewind(stamp_ns)
 
     def newest_ns(self) -> int | None:
@@ -421,11 +433,15 @@ class TransformTree:
     def _sample(
         self, item: Any, pose: Pose, received_ns: int | None, is_static: bool = False
     ) -> Sample:
-        stamp_ns = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
-        if not is_static:
-            stamp_ns += round(self.clock_offset * 1e9)
+        stamp_ns = self._stamp_of(item, is_static)
         names = _name(item.header.frame_id), _name(item.child_frame_id)
         return Sample(*names, stamp_ns, pose, is_static, received_ns)
+
+    def _stamp_of(self, item: Any, is_static: bool = False) -> int:
+        """Return the stamp of a transform or odometry in the clock of `lookup` [ns]."""
+        stamp = item.header.stamp
+        offset_ns = 0 if is_static else round(self.clock_offset * 1e9)
+        return int(stamp.sec * 10**9 + stamp.nanosec + offset_ns)
 
     def _add(self, frames: dict[str, Attachment], sample: Sample) -> None:
         """Add a sample to the frames of TF, or to those of odometry."""

@@ -260,15 +260,20 @@ def test_an_array_without_boxes_stamp_and_frame_is_a_placeholder():
     assert not is_placeholder(replace(placeholder, stamp_ns=START, frame_id='map'))
 
 
-def test_the_pose_check_is_renewed_after_a_time_jump(tmp_path):
-    """A finding about the boxes before the jump does not apply to those after it."""
+@pytest.mark.parametrize('later', [86_400.0, 101.3])
+def test_the_pose_check_is_renewed_after_a_time_jump(tmp_path, later):
+    """
+    A finding about the boxes before the jump does not apply to those after it.
+
+    Also where the transforms after it are read ahead, and those before it are forgotten.
+    """
     wrong, right = Drive(sweeps=12, start=START + 100 * SECOND), Drive(sweeps=12)
     for _, _, message in wrong.items:
         for detection in getattr(message, 'detections', []):
             detection.bbox.center.position.z -= detection.bbox.size.z / 2
-    day = 86_400 * SECOND
-    later = [(topic, at + day, message) for topic, at, message in right.items]
-    path = write_recording(tmp_path / 'drive', [*wrong.items, *later])
+    later_ns = round(later * SECOND)
+    again = [(topic, at + later_ns, message) for topic, at, message in right.items]
+    path = write_recording(tmp_path / 'drive', [*wrong.items, *again])
     findings = list(findings_of(path))
     jumps = [k for k, (restarts, _) in enumerate(findings) if restarts]
     assert len(jumps) == 1

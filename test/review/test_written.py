@@ -55,6 +55,10 @@ def test_the_new_result_opens_with_what_changed_and_its_files(made, tmp_path, he
         opened_page(server.address + '#track=1') as page,
     ):
         colleague = other_page(page, server.address + '#track=2')
+        colleague.evaluate(
+            '{ const shown = say; window.said = []; '
+            'say = text => { window.said.push(text); shown(text); }; }'
+        )
         press(page, 'd', 'isGone(current())')
         page.click('#files-button')
         page.wait_for_selector('#files[open]')
@@ -83,7 +87,7 @@ def test_the_new_result_opens_with_what_changed_and_its_files(made, tmp_path, he
         first = page.inner_text('#written-rows tr:first-child').split()
         assert first == ['1', '10', 'removed']
         assert '1' in page.evaluate('[...view.changed]')
-        colleague.wait_for_function("$('notice').textContent.includes('the new result')")
+        colleague.wait_for_function("window.said.some(text => text?.includes('the new result'))")
         assert colleague.evaluate("view.changed.has('1')")
         colleague.context.close()
         page.wait_for_function('log.count === 3')  # none is lost that was made meanwhile
