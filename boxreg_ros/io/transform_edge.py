@@ -193,6 +193,7 @@ class Edge:
         values = np.array(pose, dtype=np.float64)
         if not np.isfinite(values).all() or not np.any(values[3:]):
             return  # no pose; the error of a lookup has the stamps that are known
+        before = self._last_added
         self._last_added = stamp_ns, values
         self._last_found = None
         is_old = self._is_old(stamp_ns)
@@ -200,6 +201,8 @@ class Edge:
         if has_jumped:
             self._forget()
             self._was_forgotten = True
+            if before is not None and abs(before[0] - stamp_ns) <= round(TIME_JUMP * 1e9):
+                self.stamps, self.poses = [before[0]], [before[1]]  # the first one behind it
         self._was_old = is_old and not has_jumped
         first, end = bisect_left(self.stamps, stamp_ns), bisect_right(self.stamps, stamp_ns)
         if self.is_static:
