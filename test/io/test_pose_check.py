@@ -393,13 +393,12 @@ def placed(meant=STANDARD, frame='lidar', taken=STANDARD):
 
 @pytest.mark.parametrize(
     ('option', 'value'),
-    [('orientation', 'wxyz'), ('orientation', 'left_handed'), ('size_scale', 2.0)],
+    [('orientation', 'wxyz'), ('orientation', 'left_handed')],
 )
-def test_boxes_that_are_tilted_mirrored_or_of_half_the_size_are_named(option, value):
+def test_boxes_that_are_tilted_or_mirrored_are_named(option, value):
     meant = Convention(**{option: value})
     text = placed(meant)
-    shown = '2' if option == 'size_scale' else value
-    assert f'set {option}:={shown}' in text
+    assert f'set {option}:={value}' in text
     assert f'--{option.replace("_", "-")}' in text
     assert ('it is the clouds whose y' in text) == (value == 'left_handed')
     assert placed(meant, taken=meant) == ''
@@ -423,10 +422,35 @@ def test_w_that_is_taken_to_come_first_by_mistake_is_named(turn, how):
         assert (how in found and 'set orientation:=xyzw' in found) == (meant == 'xyzw'), found
 
 
-def test_boxes_twice_as_large_as_their_objects_are_named():
-    meant = Convention(size_scale=0.5)
-    assert 'set size_scale:=0.5 (boxreg relabel: --size-scale 0.5)' in placed(meant)
-    assert placed(meant, taken=meant) == ''
+@pytest.mark.parametrize(('scale', 'how'), [(0.5, 'twice'), (2.0, 'half')])
+def test_boxes_half_or_twice_as_large_as_their_objects_are_named(scale, how):
+    boxes, points = scene()
+    meant = Convention(size_scale=scale)
+    text = checked(boxes, points, STANDARD, meant)
+    assert f'are about {how} as large as their objects' in text
+    assert f'set size_scale:={scale:g} (boxreg relabel: --size-scale {scale:g})' in text
+    assert placed(meant) == placed(meant, taken=meant) == ''
+    assert checked(boxes, points, meant, meant) == ''
+
+
+@pytest.mark.parametrize(
+    ('factor', 'how'),
+    [(0.5, 'half'), (2.0, 'twice'), (0.7, ''), (0.8, ''), (1.0, ''), (1.2, ''), (1.4, '')],
+)
+@pytest.mark.parametrize('classes', ['truck', 'car truck'])
+def test_one_class_of_another_size_is_named_and_the_others_are_not(factor, how, classes):
+    boxes, points = scene()
+    names = ('car', 'truck') * 8
+    boxes[[name in classes for name in names], 3:6] *= factor
+    check = PoseCheck(STANDARD)
+    for k in range(6):
+        check.add(Sweep(STAMP + k * 10**8, 'map', points))
+        check.add(replace(array_of(*boxes, stamp_ns=STAMP + k * 10**8), class_names=names))
+    text = check.class_finding or check.finding
+    assert (f'are about {how} as large as their objects' in text) if how else not text
+    if how:
+        is_alone = "boxes of 'truck' are" in text and "those of 'car' fit theirs" in text
+        assert is_alone == (classes == 'truck')
 
 
 def test_boxes_without_heights_are_named():

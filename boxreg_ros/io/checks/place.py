@@ -52,15 +52,6 @@ Factor by which larger boxes must be better, in the mean: more of them have poin
 Chosen: half extents contain a tenth of what the whole ones do.
 
 """
-MAX_FILLED = 0.7
-"""Part of the extents up to which the points of twice too large boxes reach; derived: 0.5."""
-MIN_SHARE_WITHIN = 0.7
-"""
-Share of the points in the upper half of a box within this part of it: that of a small object.
-
-Chosen: in the median of the sample 0.13, with extents twice as large 0.88; by chance 0.34.
-
-"""
 MAX_FLAT = 1e-5
 """Difference of heights that count as one [m]; derived: rounding of float32 and transforms."""
 MIN_UPRIGHT = 0.5
@@ -122,7 +113,6 @@ class PlaceCheck(PairedCheck):
         }
         # As read, and with w at the other end of the quaternion: cosine of the tilt.
         self._tilts: list[tuple[float, float]] = []
-        self._within: list[float] = []
         self._heights: list[float] = []  # in the frame of the messages
         self._stands: list[float] = []  # cosine of z of each box with that of the fixed frame
         self._fixed_frame = ''
@@ -162,7 +152,7 @@ class PlaceCheck(PairedCheck):
         pair = self._paired(item)
         if pair is not None:
             self._compare(*pair)
-            self.finding = self._tilt_text() or self._place_text() or self._size_text()
+            self.finding = self._tilt_text() or self._place_text()
 
     def _compare(self, points: NDArray[np.floating], array: BoxArray) -> None:
         """Add what boxes in the frame of their message contain of the points, in each place."""
@@ -176,7 +166,6 @@ class PlaceCheck(PairedCheck):
         own = moved_boxes(boxes, T)
         self._stands += uprightness(own).tolist()
         _add_coverages(self._own, points, own)
-        self._within += [share for box in own if (share := _share_within(points, box)) is not None]
         self._heights += raw.boxes[:, BOX_CENTER][:, 2].tolist()
         for place in self._others.values():
             if place.convention is not None:
@@ -242,28 +231,16 @@ class PlaceCheck(PairedCheck):
             f'that of the box, as in --pose-reference=0,0,0.5'
         )
 
-    def _size_text(self) -> str:
-        """Return that boxes are twice as large as what they contain; empty if they are not."""
-        enough = len(self._within) >= ENOUGH_BOXES
-        if not enough or np.median(self._within) < MIN_SHARE_WITHIN:
-            return ''
-        scale = f'{self._convention.size_scale / 2:g}'
-        return (
-            f'boxes are about twice as large as the objects in them: in half of '
-            f'{len(self._within)}, {np.median(self._within):.0%} of the points or more lie within '
-            f'{MAX_FILLED:g} of the extents: expected size_scale {scale}, got '
-            f'{self._convention.size_scale:g}; {advice("size_scale", scale)}'
-        )
-
     def _place_text(self) -> str:
         """Return the place that the boxes should have; empty if it is not known, or theirs."""
         fitting = [place for place in self._others.values() if self._is_better(place)]
         if not fitting:
             return ''
         best = max(fitting, key=lambda place: place.total)
+        if best.option == 'size_scale':
+            return ''  # `PoseCheck` names it, and the classes that have it
         got = {
             'orientation': repr(self._convention.orientation),
-            'size_scale': f'{self._convention.size_scale:g}',
             'boxes_frame': 'that of the messages',
         }
         instead = ''
@@ -298,18 +275,6 @@ def uprightness(boxes: Floats) -> Floats:
 def other_order(convention: Convention) -> str:
     """Return the orientation that takes w of quaternions from the other end."""
     return 'xyzw' if convention.orientation == 'wxyz' else 'wxyz'
-
-
-def _share_within(points: NDArray[np.floating], box: Floats) -> float | None:
-    """Return the share of the points in the upper half of a box that its inner part contains."""
-    if not np.isfinite(box).all():
-        return None
-    limit = box[BOX_EXTENT] / 2
-    away = points_around(points, box[BOX_CENTER], float(np.linalg.norm(limit)))
-    local = away @ matrix_from_rpy(box[ROLL:])
-    parts = np.abs(local / limit).max(axis=1)[local[:, 2] > 0]
-    parts = parts[parts <= 1]
-    return float(np.mean(parts <= MAX_FILLED)) if len(parts) >= MIN_POINTS_AROUND else None
 
 
 def _add_coverages(place: _Place, points: NDArray[np.floating], boxes: Floats) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from boxreg_ros.core.matching import AT_ONCE
 from boxreg_ros.io.checks.finding import advice
+from boxreg_ros.io.checks.size import counts_of, ENLARGED, SizeCounts, SizeEvidence
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
     BOX_CENTER,
@@ -83,6 +84,7 @@ class _Evidence:
     counts: list[Ints] = field(default_factory=list)  # of each box; the present convention first
     objects: list[str] = field(default_factory=list)  # of each of them
     seen: int = 0
+    sizes: SizeEvidence = field(default_factory=SizeEvidence)
 
     @property
     def is_enough(self) -> bool:
@@ -92,14 +94,17 @@ class _Evidence:
     @property
     def is_over(self) -> bool:
         """Return whether no more boxes are needed, or looked at."""
-        return self.is_enough or self.seen >= MAX_BOXES
+        return (self.is_enough and self.sizes.is_enough) or self.seen >= MAX_BOXES
 
-    def add(self, counts: Ints, track_id: str) -> None:
-        """Add the points in a box under each convention."""
+    def add(self, counts: Ints, sizes: SizeCounts | None, track_id: str) -> None:
+        """Add the points in a box under each convention, and by its size."""
         self.seen += 1
-        if counts.max() >= MIN_POINTS_OF_POSE:
+        name = track_id or f'box {self.seen}'  # without ids of one each
+        if counts.max() >= MIN_POINTS_OF_POSE and not self.is_enough:
             self.counts.append(counts)
-            self.objects.append(track_id or f'box {self.seen}')  # without ids of one each
+            self.objects.append(name)
+        if sizes is not None:
+            self.sizes.add(sizes, name)
 
     @property
     def is_shown(self) -> NDArray[np.bool_]:
@@ -120,13 +125,22 @@ class _Evidence:
 
     def best(self) -> int:
         """Return the index of the convention that fits better than the present one; 0 for none."""
-        if not self.is_enough:
-            return 0
+        if not self.is_enough or self.sizes.differ:
+            return 0  # boxes of another size contain more elsewhere, too
         totals = (self.weights @ self.shares)[1:]
         fits = self.is_shown[1:] & (totals >= EQUIVALENT_SHARE * totals.max())
         # Of equal conventions the first: they are ordered by how common they are.
         best = 1 + int(fits.argmax())
         return best if fits.any() and self.prefers(best, 0) else 0
+
+    @property
+    def scale(self) -> float:
+        """Return the factor that mends the extents: 2 or 0.5, 1 if they fit; 0 if unknown."""
+        if self.sizes.is_half:
+            return 2.0
+        if self.sizes.is_twice:
+            return 0.5
+        return float(self.is_enough and self.sizes.fits and not self.best())
 
     def prefers(self, one: int, other: int) -> bool:
         """Return whether boxes have clearly more points under one convention than another."""
@@ -143,7 +157,8 @@ class PoseCheck(PairedCheck):
     Compare the first boxes, of all classes and of each, with their points under every convention.
 
     All conventions give boxes of the same volume about the same pose, so the right one contains
-    most points. Sweeps and boxes arrive in any order, in one frame, at most `AT_ONCE` [s] apart.
+    most points. Extents that are half or twice those of the objects are found apart. Sweeps and
+    boxes arrive in any order, in one frame, at most `AT_ONCE` [s] apart.
     `finding` says which setting of the `convention` they were read with is wrong and its right
     value; `class_finding` which classes are wrong where others are right. They are empty if none
     is known to be wrong.
@@ -158,6 +173,8 @@ class PoseCheck(PairedCheck):
             *(replace(convention, pose_reference=name) for name in REFERENCES),
             *(replace(convention, size_order=order) for order in SIZE_ORDERS),
         ]
+        scales = [convention.size_scale * factor for factor in (ENLARGED, 2.0)]
+        self._larger = [replace(convention, size_scale=scale) for scale in scales]
         own = convention.reference[:2]
         self._is_above = np.array([(c.reference[:2] == own).all() for c in self._conventions])
         self._all = _Evidence(self._is_above)
@@ -178,7 +195,10 @@ class PoseCheck(PairedCheck):
         pair = self._paired(item)
         if pair is not None:
             self._count(*pair)
-            decided = sum(one.is_enough for one in (self._all, *self._classes.values()))
+            evidence = self._all, *self._classes.values()
+            decided = sum(
+                one.is_enough + one.sizes.is_half + one.sizes.is_enough for one in evidence
+            )
             if decided > self._decided:
                 self._decided = decided
                 self._judge()
@@ -198,20 +218,24 @@ class PoseCheck(PairedCheck):
             if self._is_over(class_name):
                 continue
             center, extent = kept.boxes[row, BOX_CENTER], kept.boxes[row, BOX_EXTENT]
-            away = points_around(points, center, 1.5 * float(np.linalg.norm(extent)))
-            counts = np.zeros(len(self._conventions), dtype=int)
+            away = points_around(points, center, 2.2 * float(np.linalg.norm(extent)))
+            counts, sizes = np.zeros(len(self._conventions), dtype=int), None
             if len(away) >= MIN_POINTS_OF_POSE:
                 candidates = self._candidates(kept) if candidates is None else candidates
-                counts = _inside(away + center, candidates[row])
+                is_inside = _is_inside(away + center, candidates[row])
+                counts = is_inside[: len(counts)].sum(axis=1)
+                local = away @ matrix_from_rpy(kept.boxes[row, ROLL:])
+                sizes = counts_of(is_inside, local, extent)
             own = self._classes.setdefault(class_name, _Evidence(self._is_above))
             for evidence in (self._all, own):
                 if not evidence.is_over:
-                    evidence.add(counts, kept.track_ids[row])
+                    evidence.add(counts, sizes, kept.track_ids[row])
 
     def _candidates(self, boxes: BoxArray) -> Floats:
-        """Return boxes read by each convention (boxes, conventions, 9)."""
+        """Return boxes read by each convention, and larger ones, (boxes, conventions + 2, 9)."""
         raw = self._convention.from_centers(boxes)
-        return np.stack([c.to_centers(raw).boxes for c in self._conventions], axis=1)
+        candidates = *self._conventions, *self._larger
+        return np.stack([c.to_centers(raw).boxes for c in candidates], axis=1)
 
     def _judge(self) -> None:
         """Update the findings."""
@@ -228,6 +252,11 @@ class PoseCheck(PairedCheck):
             right = self._right(index) if names else []
             texts = of_some if right else of_all
             texts.append(self._text(index, names, right))
+        for scale in (2.0, 0.5):
+            names = [name for name, one in self._classes.items() if one.scale == scale]
+            right = [name for name, one in self._classes.items() if one.scale == 1]
+            if names and not best:
+                (of_some if right else of_all).append(self._size_text(scale, names, right))
         self.finding = ''.join(of_all[:1])
         self.class_finding = '; '.join(of_some)
 
@@ -270,13 +299,35 @@ class PoseCheck(PairedCheck):
         if right:
             return (
                 f'{seen}, those of {_listed(right)} fit theirs: expected {name} {got!r} of all '
-                f'classes, got {expected!r} of these; an option is for all classes: {correction} '
-                f'where they are made, or in the boxes.csv that boxreg convert RECORDING#TOPIC '
-                f'--from recording --to csv writes and boxreg relabel --labels csv:FOLDER reads'
+                f'classes, got {expected!r} of these; {_for_some(correction)}'
             )
         return (
             f'{seen}: expected {name} {expected!r}, got {got!r}; {advice(name, expected)}{instead}'
         )
+
+    def _size_text(self, scale: float, names: list[str], right: list[str]) -> str:
+        """Return that boxes of classes are too small, or too large, beside `right` ones."""
+        own = self._convention.size_scale
+        expected = f'{own * scale:g}'
+        how = 'half' if scale > 1 else 'twice'
+        seen = f'boxes of {_listed(names)} are about {how} as large as their objects'
+        if right:
+            return (
+                f'{seen}, those of {_listed(right)} fit theirs: expected size_scale {own:g} of '
+                f'all classes, got {expected} of these; '
+                f'{_for_some(f"multiply their extents by {scale:g}")}'
+            )
+        advised = advice('size_scale', expected)
+        return f'{seen}: expected size_scale {expected}, got {own:g}; {advised}'
+
+
+def _for_some(correction: str) -> str:
+    """Return how boxes of some classes are corrected."""
+    return (
+        f'an option is for all classes: {correction} where they are made, or in the boxes.csv '
+        f'that boxreg convert RECORDING#TOPIC --from recording --to csv writes and boxreg relabel '
+        f'--labels csv:FOLDER reads'
+    )
 
 
 def _listed(names: list[str]) -> str:
@@ -294,10 +345,9 @@ def points_around(points: NDArray[np.floating], center: Floats, reach: float) ->
     return found
 
 
-def _inside(points: NDArray[np.floating], boxes: Floats) -> Ints:
-    """Count the points in each of n boxes, a margin around it included, (n,)."""
+def _is_inside(points: NDArray[np.floating], boxes: Floats) -> NDArray[np.bool_]:
+    """Return which points are in each of n boxes, a margin around it included, (n, points)."""
     R = matrix_from_rpy(boxes[:, ROLL:])
     local = (points - boxes[:, None, BOX_CENTER]) @ R  # (n, points, 3)
     limit = boxes[:, None, BOX_EXTENT] / 2 + POINT_MARGIN
-    counts: Ints = (np.abs(local) <= limit).all(axis=2).sum(axis=1)
-    return counts
+    return np.asarray((np.abs(local) <= limit).all(axis=2))
