@@ -5,7 +5,7 @@ from collections import defaultdict
 
 from paths import ROOT
 
-PROTOCOL = {'DATASET', 'FORMAT', 'REQUIRED_FIELDS', '__all__'}
+PROTOCOL = {'BOX_FIELDS', 'DATASET', 'FORMAT', 'REQUIRED_FIELDS', '__all__'}
 """Names that each label format, data set or message adapter defines for itself."""
 KERNELS = [ROOT / 'boxreg_ros' / 'core' / name for name in ('method',)]
 """Kernels number what others have under the same names: variables as slices, reasons."""
