@@ -147,8 +147,8 @@ class InputModel:
     ) -> None:
         """Add face observations, of records `TERMS` (B, N), that were made with `inputs`."""
         kinds = problem.kind
-        sums, logarithms = np.empty((len(kinds), 3, 3, 6)), np.empty((len(kinds), 3))
-        sum_faces(problem, terms, inputs, self.constants.record(), sums, logarithms)
+        sums, logarithms = np.zeros((len(kinds), 3, 3, 6)), np.log(problem.mean_extents())
+        sum_faces(kinds, problem.lengths, terms, inputs, self.constants.record(), sums)
         for k in set(kinds.tolist()):
             rows, kept = _kept(self._tracks[k], track_ids, kinds == k)
             known = self._tracks[k].arrays

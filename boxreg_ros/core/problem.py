@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, GAP, PIVOT, POSE, PRIOR, SHARED
 from boxreg_ros.core.method.constants import CONSTANTS
-from boxreg_ros.core.method.expectation import fill_all_mean_extents
 from boxreg_ros.core.method.headings import align, correct_flips
 from boxreg_ros.core.observation import Observations
 from boxreg_ros.core.tables import rows_of
@@ -176,8 +175,11 @@ class Problem(NamedTuple):
         Of windows with pinned boxes the mean extents of these.
 
         """
-        means = np.empty((len(self.boxes), 3))
-        fill_all_mean_extents(self, means)
+        has_pin = self.pinned.any(1, keepdims=True)
+        counts = np.where(has_pin, self.pinned, self.valid)
+        before = self.marginalised_extents * ~has_pin
+        sums = (self.boxes[..., 3:6] * counts[..., None]).sum(1) + before[:, :3]
+        means: Floats = sums / (counts.sum(1) + before[:, 3])[:, None]
         return means
 
     def expected_shared(self, inputs: NDArray[np.void], number: int = SHARED) -> Floats:

@@ -88,6 +88,8 @@ class Batch(NamedTuple):
     problem: Problem
     free: Floats
     """(B, 6 N + S), 1 for variables that are estimated."""
+    mean_extents: Floats
+    """(B, 3), of the input [m]."""
     solution: Solution
     """Where the round begins; the round writes its end."""
 
@@ -161,8 +163,9 @@ def start(problem: Problem, config: Config, plan: SolverPlan, inputs: Inputs) ->
     number = SHARED if plan.uses_rigid_shape else ANCHOR
     free = problem.free_variables(config, number)
     shared = problem.expected_shared(inputs, number)
+    mean_extents = shared[:, EXTENT:BIAS].copy()
     evidence = np.zeros((B, 3, 3))
-    evidence[:, 0] = np.log(shared[:, EXTENT:BIAS])
+    evidence[:, 0] = np.log(mean_extents)
     if plan.starts_from_fit:
         is_free = free[:, -number:][:, EXTENT:BIAS]
         shared[:, EXTENT:BIAS] += is_free * (problem.start[:, 0, 3:6] - shared[:, EXTENT:BIAS])
@@ -175,7 +178,7 @@ def start(problem: Problem, config: Config, plan: SolverPlan, inputs: Inputs) ->
         ),
         no_priors(leaving),
     )  # fmt: skip
-    return Batch(problem, free, solution)
+    return Batch(problem, free, mean_extents, solution)
 
 
 def run_round(
@@ -208,8 +211,8 @@ def run_round(
 
 def observe(batch: Batch, inputs: Inputs, rows: Ints, constants: Constants) -> method.Sums:
     """Return what the points show of the windows `rows` (b,) where the round begins."""
-    problem, free, solution = batch
-    sums = method.empty_sums(rows, problem.length, free.shape[1])
+    problem, solution = batch.problem, batch.solution
+    sums = method.empty_sums(rows, problem.length, batch.free.shape[1])
     record, at = constants.record(), (solution.poses, solution.shared)
     run(observe_faces, 40, len(rows), rows, problem, *at, inputs, record, sums.terms)
     if constants.uses_shape:

@@ -43,10 +43,9 @@ def matrix(N, S=SHARED):
     return Arrowhead(np.zeros(N + 2, BLOCK), np.zeros((S, S)))
 
 
-def empty_factor(N):
-    """Return room for the factor of a window of N observations."""
-    width = padded(SHARED + NEXT)
-    shapes = (N, POSE, POSE), (N, POSE, width), (SHARED, SHARED)
+def empty_factor(N, S=SHARED):
+    """Return room for the factor of a window of N observations and S shared variables."""
+    shapes = (N, POSE, POSE), (N, POSE, padded(S + NEXT)), (S, S)
     return Factor(*(np.empty(shape) for shape in shapes))
 
 
@@ -199,7 +198,7 @@ def test_the_prior_is_the_schur_complement_of_the_oldest_residuals():
     _, pull, H = objective.linearise(x, first, only, prior)
     np.testing.assert_allclose(dense(A, N), H, atol=1e-9 * np.abs(H).max())
     mean, step, information = np.empty(PRIOR), np.empty(PRIOR), np.empty((PRIOR, PRIOR))
-    marginalise(x, gradient, A, mean, step, information)
+    marginalise(x, gradient, A, empty_factor(N, ANCHOR), mean, step, information)
     left = [*range(6, 18), *range(6 * N, 6 * N + ANCHOR)]
     across = np.linalg.solve(H[:6, :6], H[:6])
     schur = (H - H[:, :6] @ across)[np.ix_(left, left)]
@@ -227,7 +226,8 @@ def test_the_prior_is_exact_for_linear_residuals():
         A = matrix(n + 1, ANCHOR)
         _, gradient = summed(away, terms, common, prior, last=1, A=A)
         mean, step, information = np.empty(PRIOR), np.empty(PRIOR), np.empty((PRIOR, PRIOR))
-        marginalise(away, gradient, A, mean, step, information)
+        factor = empty_factor(n + 1, ANCHOR)
+        marginalise(away, gradient, A, factor, mean, step, information)
         terms = terms[1:]
         found = minimum(terms, common, prior := (mean + step, information))
         np.testing.assert_allclose(found, known[-6 * n - ANCHOR :], atol=1e-7)

@@ -19,7 +19,8 @@ def expected_of(problem, inputs=None, b=0):
     """Return the record `COMMON` of window `b` before its points are used."""
     common = np.zeros(len(problem.boxes), COMMON)
     inputs = no_inputs() if inputs is None else inputs
-    expect(b, problem, inputs[problem.kind[b]], RECORD, np.empty(3), common[b])
+    mean = problem.mean_extents()[b]
+    expect(b, problem, inputs[problem.kind[b]], RECORD, mean, common[b])
     return common[b]
 
 

@@ -2,9 +2,9 @@
 
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.method.arrays import BOX_POSE, most_points, POSE
+from boxreg_ros.core.method.arrays import most_points, POSE
 from boxreg_ros.core.method.articulation import changes_shape, extent_ranges
-from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.compile import kernel, loop, small_array
 from boxreg_ros.core.method.expectation import SIZE
 from boxreg_ros.core.method.faces import fill_moved, fill_velocity, to_box_axes
 from boxreg_ros.core.method.noise import are_finite
@@ -72,16 +72,6 @@ def count_held(b, n, problem, velocity, pose, extent, margin, room):
     return count
 
 
-@kernel
-def input_poses(boxes):
-    """Return the poses (N, 6) of boxes (N, 9)."""
-    poses = np.empty((len(boxes), POSE))
-    for n in range(len(boxes)):
-        for k in range(POSE):
-            poses[n, k] = boxes[n, BOX_POSE[k]]
-    return poses
-
-
 @loop
 def fill_box(pose, extent, base, box):
     """Write a box (9,) by its pose relative to `base` (3,), its angles within [-pi, pi)."""
@@ -126,9 +116,19 @@ def accept(
     """
     M = most_points(problem.counts[first:last])
     room = _Room(np.empty((3, M)), np.empty((3, M)), np.empty((3, 3)))
-    velocity = np.empty(3)
-    velocity[:] = 0.0
-    constants = constants[0]
+    accept_in_turn(
+        first, last, problem, base, poses, extents, covariances, margin, span, constants[0], found,
+        room, np.empty((poses.shape[1], POSE)),
+    )  # fmt: skip
+
+
+@loop
+def accept_in_turn(first, last, problem, base, poses, extents, covariances, margin, span,
+                   constants, found, room, given):  # fmt: skip
+    """Do what `accept` does; `room`, and `given` (N, 6) for input poses, are to work in."""
+    velocity = small_array(3)
+    for k in range(3):
+        velocity[k] = 0.0
     kept_part = 1 - constants.max_lost_part
     for b in range(first, last):
         length, boxes, times = problem.lengths[b], problem.boxes[b], problem.times[b]
@@ -136,32 +136,35 @@ def accept(
         is_bent = changes_shape(found.ranges[b], problem.of_class[b].extent, constants.gate)
         has_points = sum_of(problem.counts[b]) > 0
         found.is_finite[b] = True
-        given = np.empty((0, POSE))
         for n in range(len(boxes)):
-            pose, extent = poses[b, n], extents[b, n]
-            is_finite = are_finite(pose) and are_finite(extent)
+            for k in range(POSE):
+                given[n, k] = boxes[n, k if k < 3 else k + 3]
+        for n in range(len(boxes)):
+            of_poses, extent = poses[b], extents[b, n]
+            is_finite = are_finite(of_poses[n]) and are_finite(extent)
             is_finite &= min(extent[0], extent[1], extent[2]) > 0.0
             for k in range(POSE):
                 is_finite &= are_finite(covariances[b, n, k])
             found.is_finite[b] &= is_finite
-            fill_box(pose, extent, base[b], found.boxes[b, n])
+            fill_box(of_poses[n], extent, base[b], found.boxes[b, n])
             found.results[b, n] = ACCEPTED
             if n >= length:
                 continue
-            if problem.is_moving:
-                fill_velocity(poses[b], times, n, length, velocity)
-            held = count_held(b, n, problem, velocity, pose, extent, margin, room)
-            found.near_points[b, n, 0] = held
-            found.near_points[b, n, 1] = problem.counts[b, n] - held
-            least = kept_part * problem.counts[b, n] - constants.min_face_points
-            if held < least:  # at most: counting those of the input boxes takes time
-                if not len(given):
-                    given = input_poses(boxes)
+            held, count = -1, problem.counts[b, n]
+            least = kept_part * count - constants.min_face_points
+            for is_input in range(2):
                 if problem.is_moving:
-                    fill_velocity(given, times, n, length, velocity)
-                extent = boxes[n, 3 : 3 + SIZE]
-                before = count_held(b, n, problem, velocity, given[n], extent, margin, room)
-                least = kept_part * before - constants.min_face_points
+                    fill_velocity(of_poses, times, n, length, velocity)
+                inside = count_held(b, n, problem, velocity, of_poses[n], extent, margin, room)
+                if is_input:
+                    least = kept_part * inside - constants.min_face_points
+                else:
+                    held = inside
+                if held >= least:  # at most: counting those of the input boxes takes time
+                    break
+                of_poses, extent = given, boxes[n, 3 : 3 + SIZE]
+            found.near_points[b, n, 0] = held
+            found.near_points[b, n, 1] = count - held
             if not has_points:
                 found.results[b, n] = NO_POINTS
             elif not is_finite:

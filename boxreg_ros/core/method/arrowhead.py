@@ -10,23 +10,36 @@ SciPy's BLAS would take 0.2 s and 10 to 15 MB to import.
 
 from math import sqrt
 
-from boxreg_ros.core.method.arrays import ANCHOR, copy, padded, PIVOT, POSE, SHARED, WIDTH
+from boxreg_ros.core.method.arrays import (
+    ANCHOR,
+    BLOCK,
+    copy,
+    padded,
+    PIVOT,
+    POSE,
+    SHARED,
+    SPAN,
+    WIDTH,
+)
 from boxreg_ros.core.method.compile import loop, small_array
+import numpy as np
 
 NEXT = 2 * POSE
 """Variables of the two poses after one."""
 RIDGE = 1e-9
 """Added to the diagonal: an unobserved variable does not break the factorisation. Derived: the
 information of a deviation of 30 km."""
+NO_BLOCK = np.zeros(1, BLOCK)
 
 
 @loop
 def clear(A):
     """Set a matrix to zero."""
     for n in range(len(A.poses)):
-        A.poses[n].links[:] = 0.0
-        A.poses[n].border[:] = 0.0
-    A.corner[:] = 0.0
+        A.poses[n] = NO_BLOCK[0]
+    for s in range(len(A.corner)):
+        for t in range(len(A.corner)):
+            A.corner[s, t] = 0.0
 
 
 @loop
@@ -36,19 +49,23 @@ def fix_variables(A, free):
     n = len(free) - S
     for i in range(n):
         pose, a = i // POSE, i % POSE
+        block = A.poses[pose]
         if free[i] == 0.0:
             for before in range(max(pose - 2, 0), pose + 1):
+                links = A.poses[before].links
                 for b in range(POSE):
-                    A.poses[before].links[b, POSE * (pose - before) + a] = 0.0
-            A.poses[pose].links[a] = 0.0
-            A.poses[pose].border[a] = 0.0
-        A.poses[pose].links[a, a] += 1.0 - free[i] + RIDGE
+                    links[b, POSE * (pose - before) + a] = 0.0
+            for c in range(SPAN):
+                block.links[a, c] = 0.0
+            for s in range(S):
+                block.border[a, s] = 0.0
+        block.links[a, a] += 1.0 - free[i] + RIDGE
     for s in range(S):
         if free[n + s] == 0.0:
-            for pose in range(len(A.poses)):
-                A.poses[pose].border[:, s] = 0.0
-            A.corner[s] = 0.0
-            A.corner[:, s] = 0.0
+            for i in range(n):
+                A.poses[i // POSE].border[i % POSE, s] = 0.0
+            for t in range(S):
+                A.corner[s, t] = A.corner[t, s] = 0.0
         A.corner[s, s] += 1.0 - free[n + s] + RIDGE
 
 
@@ -230,7 +247,9 @@ def eliminate_poses(A, factor):
     triangle, change, of_corner = (
         small_array(POSE, POSE), small_array(NEXT, WIDTH), small_array(SHARED, WIDTH)
     )  # fmt: skip
-    of_corner[:S] = 0.0
+    for s in range(S):
+        for t in range(WIDTH):
+            of_corner[s, t] = 0.0
     for pose in range(N):
         block, own, coupling = A.poses[pose], factor.own[pose], factor.coupling[pose]
         if not factorise_block(block.links, triangle):
@@ -270,9 +289,8 @@ def substitute_forward(factor, x, rest):
     """
     S = len(factor.corner)
     end = len(x) - S
-    rest[:] = 0.0
-    for s in range(S):
-        rest[s] = x[end + s]
+    for r in range(len(rest)):
+        rest[r] = x[end + r] if r < S else 0.0
     for pose in range(len(factor.own)):
         coupling, own, after = factor.coupling[pose], x[POSE * pose :], POSE * (pose + 1)
         for c in range(NEXT):
@@ -299,7 +317,7 @@ def substitute_backward(factor, x, rest, found):
         rest[S + c] = 0.0
     for pose in range(len(factor.own) - 1, -1, -1):
         own, coupling, right = factor.own[pose], factor.coupling[pose], x[POSE * pose :]
-        for a in range(POSE):
+        for a in range(len(own)):
             total = 0.0
             for b in range(POSE):
                 total += own[a, b] * right[b]
@@ -360,14 +378,16 @@ def invert_poses(factor, blocks, links, response):
     S = len(factor.corner)
     known = small_array(NEXT, WIDTH)  # Z_rr, T_r
     after, product = small_array(POSE, NEXT), small_array(POSE, WIDTH)
-    known[:] = 0.0
+    for c in range(NEXT):
+        for r in range(WIDTH):
+            known[c, r] = 0.0
     for pose in range(len(blocks) - 1, -1, -1):
         coupling, own = factor.coupling[pose], factor.own[pose]
         for a in range(POSE):
             for c in range(NEXT):
                 after[a, c] = coupling[a, S + c]
         multiply(after, known, NEXT + S, product)
-        for a in range(POSE):
+        for a in range(len(own)):
             for c in range(NEXT):
                 links[pose, a, c] = product[a, c]
             for s in range(S):
@@ -395,14 +415,14 @@ def multiply(after, known, width, product):
 def multiply_shared(response, shared, product):
     """Write the product of a `response` (6, S) and the first S columns of a matrix."""
     # Both forms of S have these variables; a sum of constant length takes a quarter of the time.
-    for a in range(POSE):
+    for a in range(len(response)):
         for r in range(padded(response.shape[1])):
             total = 0.0
             for s in range(ANCHOR):
                 total += response[a, s] * shared[s, r]
             product[a, r] = total
     if response.shape[1] > ANCHOR:
-        for a in range(POSE):
+        for a in range(len(response)):
             for r in range(padded(response.shape[1])):
                 total = product[a, r]
                 for s in range(ANCHOR, SHARED):

@@ -6,17 +6,16 @@ Every residual adds r' W r / 2 to the value, J' W r to the gradient and J' W J t
 """
 
 from boxreg_ros.core.method.arrays import (
-    ANCHOR,
     Arrowhead,
     BLOCK,
-    BOX_POSE,
     copy,
     EXTENT,
     Factor,
     GAP,
-    padded,
     POSE,
     PRIOR,
+    SPAN,
+    WIDTH,
 )
 from boxreg_ros.core.method.arrowhead import (
     clear,
@@ -29,13 +28,17 @@ from boxreg_ros.core.method.arrowhead import (
     solve_corner,
     substitute_forward,
 )
-from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.compile import kernel, loop, small_array
 from boxreg_ros.core.method.residuals import (
     AXES,
     fill_axes,
     fill_plane,
+    fill_residual,
+    fill_weight,
+    IS_COMBINATION,
+    IS_ROBUST,
     level_of,
-    RESIDUALS,
+    POSES_OF,
 )
 from boxreg_ros.core.method.weights import (
     fill_parked,
@@ -45,7 +48,6 @@ from boxreg_ros.core.method.weights import (
     weigh_shared,
     Weighing,
 )
-from numba import literal_unroll
 import numpy as np
 
 UNKNOWN_RIDGE = 1e-6
@@ -91,29 +93,29 @@ def add(n, poses, rows, columns, W, out, first, gradient, A):
         if not is_wanted(A):
             continue
         for i in range(poses):
-            own = A.poses[n + i]
-            for a in range(POSE):
-                weighted = W[row] * J[POSE * i + a]
-                for k in range(i, poses):
-                    for b in range(POSE):
-                        own.links[a, POSE * (k - i) + b] += weighted * J[POSE * k + b]
-                for s in range(columns):
-                    own.border[a, out.columns[s]] += weighted * S[s]
+            links, border, before = A.poses[n + i].links, A.poses[n + i].border, POSE * i
+            for c in range(before, width):
+                weighted = W[row] * J[c]
+                for a in range(POSE):
+                    links[a, c - before] += J[before + a] * weighted
+            for s in range(columns):
+                weighted = W[row] * S[s]
+                for a in range(POSE):
+                    border[a, out.columns[s]] += J[before + a] * weighted
         for s in range(columns):
             weighted = W[row] * S[s]
-            if weighted == 0.0:
-                continue
             for t in range(s, columns):
                 A.corner[out.columns[s], out.columns[t]] += weighted * S[t]
     return value
 
 
 @loop
-def add_combination(n, poses, columns, W, out, first, gradient, A):
+def add_combination(n, poses, rows, columns, W, out, first, gradient, A):
     """
     Add one residual `out` of a combination of some poses from n on, as `add` does.
 
-    With J the derivatives by the combination, J' W J is computed once for all of the poses.
+    With J the derivatives by the combination, J' W J is computed once for all of the poses. Its
+    rows are six: few residuals have shared variables, whose loop is not written out.
 
     """
     J, share, pull, curvature = out.J, out.share, out.pull, out.curvature
@@ -146,7 +148,7 @@ def add_combination(n, poses, columns, W, out, first, gradient, A):
                 for b in range(POSE):
                     links[a, after + b] += share[i] * share[k] * curvature[a, b]
     for s in range(columns):
-        for row in range(POSE):
+        for row in range(rows):
             weighted = W[row] * out.S[row, s]
             if weighted == 0.0:
                 continue
@@ -241,6 +243,7 @@ def add_marginal_prior(x, mean, W, r, first, gradient, A):
     Its minimum is `mean` (29,), its information `W` (29, 29); `r` (29,) is to work in.
 
     """
+    S = len(W) - NEXT
     for k in range(PRIOR):
         r[k] = x[k if k < NEXT else first + k - NEXT] - mean[k]
     value = 0.0
@@ -257,10 +260,10 @@ def add_marginal_prior(x, mean, W, r, first, gradient, A):
             links, border = own.links[k - POSE * pose], own.border[k - POSE * pose]
             for m in range(k, NEXT):
                 links[m - POSE * pose] += W[k, m]
-            for s in range(ANCHOR):
+            for s in range(S):
                 border[s] += W[k, NEXT + s]
-        for s in range(ANCHOR):
-            for t in range(s, ANCHOR):
+        for s in range(S):
+            for t in range(s, S):
                 A.corner[s, t] += W[NEXT + s, NEXT + t]
     return value
 
@@ -283,28 +286,30 @@ def has_weight(W):
 @loop
 def clear_derivatives(out):
     """Set the derivatives of a residual to zero."""
-    out.J[:] = 0.0
-    out.S[:] = 0.0
+    for a in range(POSE):
+        for c in range(SPAN):
+            out.J[a, c] = 0.0
+        for s in range(POSE):
+            out.S[a, s] = 0.0
 
 
 @loop
 def add_all(poses, shared, last, terms, at, room, first, gradient, A):
     """Add all `RESIDUALS` that begin at the first `last` observations."""
     value = 0.0
-    i = 0
     out = room[0]
-    for row in literal_unroll(RESIDUALS):
-        for n in range(min(last, number_of(len(poses), row.poses, True))):
+    for i in range(len(POSES_OF)):
+        for n in range(min(last, number_of(len(poses), POSES_OF[i], True))):
             W = terms[n].W[i]
             if has_weight(W):
                 clear_derivatives(out)
-                rows, known = row.function(n, poses, shared, terms, at, out)
-                columns = np.int64(known)  # each literal number would be compiled by itself
-                if row.is_combination:
-                    value += add_combination(n, row.poses, columns, W, out, first, gradient, A)
+                rows, columns = fill_residual(i, n, poses, shared, terms, at, out)
+                if IS_COMBINATION[i]:
+                    value += add_combination(
+                        n, POSES_OF[i], rows, columns, W, out, first, gradient, A
+                    )
                 else:
-                    value += add(n, row.poses, rows, columns, W, out, first, gradient, A)
-        i += 1
+                    value += add(n, POSES_OF[i], rows, columns, W, out, first, gradient, A)
     return value
 
 
@@ -336,7 +341,8 @@ def accumulate(x, last, terms, common, prior_mean, W_prior, at, out, gradient, A
     first = POSE * N
     poses, shared = x[:first].reshape(N, POSE), x[first:]
     room = out[0]
-    gradient[:] = 0.0
+    for k in range(len(x)):
+        gradient[k] = 0.0
     clear(A)
     fill_axes(poses, 0, min(last + 1, N), at)
     value = 0.0
@@ -389,8 +395,9 @@ def weigh(b, problem, poses, shared, constants, at, out, terms, common):
                 terms[n].axes[i, j] = at[n].R[i, j]
         for k in range(POSE):
             terms[n].start[k] = poses[n, k]
-            terms[n].given[k] = boxes[n, BOX_POSE[k]]
-        terms[n].W[:] = 0.0
+            terms[n].given[k] = boxes[n, k if k < 3 else k + 3]
+            for i in range(len(POSES_OF)):
+                terms[n].W[i, k] = 0.0
     weigh_faces(length, of_class.roughness, constants, terms, face_weight)
     weigh_shared(length, shared, terms, common, face_weight, constants)
     window = Weighing(
@@ -403,17 +410,16 @@ def weigh(b, problem, poses, shared, constants, at, out, terms, common):
 @loop
 def weigh_each(poses, shared, terms, window, constants, at, room):
     """Write the weights of each of `RESIDUALS` where they are not zero."""
-    i, out, squared = 0, room[0], at['squared']
-    for row in literal_unroll(RESIDUALS):
-        count = number_of(window.length, row.poses, constants.residuals[i])
+    out, squared = room[0], at['squared']
+    for i in range(len(POSES_OF)):
+        count = number_of(window.length, POSES_OF[i], constants.residuals[i])
         for n in range(count):
             W = terms[n].W[i]
-            rows, _ = row.function(n, poses, shared, terms, at, out)
-            row.weight(n, out.r, window, constants, W)
+            rows, _ = fill_residual(i, n, poses, shared, terms, at, out)
+            fill_weight(i, n, out.r, window, constants, W)
             squared[n] = squared_norm(rows, W, out.r)
-        if row.is_robust and constants.is_robust:
+        if IS_ROBUST[i] and constants.is_robust:
             robustify(i, count, squared, constants.outlier, terms)
-        i += 1
 
 
 @loop
@@ -436,14 +442,15 @@ def factorise_free(A, free, factor):
     """
     Write the factor of a matrix in the `free` variables (6 N + S,).
 
-    That of one that is not positive definite is NaN.
+    The corner of one that is not positive definite is NaN, and with it all that follows.
 
     """
     fix_variables(A, free)
     if not factorise(A, factor):
-        factor.own[:] = np.nan
-        factor.coupling[:] = np.nan
-        factor.corner[:] = np.nan
+        S = len(factor.corner)
+        for s in range(S):
+            for t in range(S):
+                factor.corner[s, t] = np.nan
 
 
 @loop
@@ -465,34 +472,33 @@ def fill_dense(A, dense):
             dense[i, j] = dense[j, i]
 
 
-@kernel
-def marginalise(x, gradient, A, mean, step, information):
+@loop
+def marginalise(x, gradient, A, factor, mean, step, information):
     """
     Write the quadratic form that replaces the oldest observation of one window (M13).
 
     In the next two poses and the shared variables: where they are (29,), the step from there to
     the minimum (29,), and the curvature (29, 29). The sums of the residuals of the oldest
-    observation, from `accumulate`, are the input; they are changed.
+    observation, from `accumulate`, are the input; they are changed, as is the `factor` of the
+    window.
 
     """
-    S = len(A.corner)
-    n = len(x) - S
+    n = len(x) - len(A.corner)
     copy(x[POSE:], mean[:NEXT])
     copy(x[n:], mean[NEXT:])
     for a in range(POSE):
         A.poses[0].links[a, a] += RIDGE
-    width = padded(S + NEXT)
-    oldest = Factor(np.empty((1, POSE, POSE)), np.empty((1, POSE, width)), np.empty((S, S)))
+    oldest = Factor(factor.own[:1], factor.coupling[:1], factor.corner)
     is_definite = eliminate_poses(A, oldest)
     fill_dense(A, information)
-    substitute_forward(oldest, gradient, np.empty(width))
+    substitute_forward(oldest, gradient, small_array(WIDTH)[: factor.coupling.shape[2]])
+    triangle = small_array(PRIOR, PRIOR)
     for k in range(PRIOR):
         step[k] = -gradient[POSE + k if k < NEXT else n + k - NEXT]
-    triangle = information.copy()
-    for k in range(PRIOR):
+        copy(information[k], triangle[k])
         triangle[k, k] += UNKNOWN_RIDGE
     if not (is_definite and factorise_corner(triangle)):
-        step[:] = np.nan
-        information[:] = np.nan
+        for k in range(PRIOR):
+            step[k] = np.nan
         return
     solve_corner(triangle, step)  # an inverse would lose directions of almost no information

@@ -79,9 +79,11 @@ def fill_unclaimed(length, marginalised, terms, common, shape, constants, G):
 
     """
     c, W = constants.residual_correlation, common.W_shared
-    G[:] = 0.0
-    for k in range(GAP):
-        G[k, k] = W[k] ** 2 * common.unclaimed[k]
+    for k in range(PIVOT):
+        for m in range(PIVOT):
+            G[k, m] = 0.0
+        if k < GAP:
+            G[k, k] = W[k] ** 2 * common.unclaimed[k]
     for face in range(FACES):
         total = 0.0
         for n in range(length):
@@ -104,9 +106,9 @@ def fill_shared_covariance(corner, G, inverse):
         copy(corner[s], inverse.shared[s])
     add_sandwich(corner, G, small_array(PIVOT), inverse.shared)
     shared, product = small_array(SHARED, WIDTH), small_array(POSE, WIDTH)
-    shared[:] = 0.0
     for s in range(S):
-        copy(inverse.shared[s], shared[s, :S])
+        for r in range(WIDTH):
+            shared[s, r] = inverse.shared[s, r] if r < S else 0.0
     for n in range(len(inverse.response)):
         multiply_shared(inverse.response[n], shared, product)
         for a in range(POSE):

@@ -62,7 +62,7 @@ class CropNumbers(NamedTuple):
 @loop
 def metre(value):
     """Return a coordinate as whole metres, truncated: the order of coordinates is kept."""
-    return np.int32(min(max(value, -LARGEST), LARGEST))
+    return np.int32(min(max(np.float32(value), -LARGEST), LARGEST))
 
 
 @loop
@@ -182,13 +182,16 @@ def near_points(points, shapes):
     """
     side = side_of(points.shape[1])
     spans, start = cells_of_boxes(shapes, side)
-    is_touched = np.zeros(side * side, np.bool_)  # small enough for the processor's cache
+    is_touched = np.empty(side * side, np.bool_)  # small enough for the processor's cache
+    is_any = np.empty(side * side // 8, np.bool_)  # of eight cells
+    for cell in range(len(is_touched)):
+        is_touched[cell] = is_any[cell // 8] = False
     for k in range(spans.shape[1]):
         for cell in range(spans[0, k], spans[1, k]):
-            is_touched[cell] = True
+            is_touched[cell] = is_any[cell // 8] = True
     number, T = np.empty(side * side, np.int32), 0  # of each touched cell, in their order
-    for eight, word in enumerate(is_touched.view(np.uint64)):
-        if word:
+    for eight in range(len(is_any)):
+        if is_any[eight]:
             for cell in range(8 * eight, 8 * eight + 8):
                 number[cell] = T
                 T += is_touched[cell]
@@ -323,12 +326,13 @@ def grouped(values, owner, n):
 
     """
     first = np.empty(n + 2, np.int64)
-    first[:] = 0
+    for b in range(n + 2):
+        first[b] = 0
     for k in range(len(owner)):
         first[owner[k] + 2] += 1
     for b in range(n):
         first[b + 2] += first[b + 1]
-    ordered = np.empty_like(values)
+    ordered = np.empty(len(values), np.int32)
     for k in range(len(owner)):  # the places after the next ones end as the first of the next
         ordered[first[owner[k] + 1]] = values[k]
         first[owner[k] + 1] += 1
@@ -401,7 +405,8 @@ def sorted_by_x(owner, x, rows, n):
         n //= 2
     order, other = np.empty(P, np.int64), np.empty(P, np.int64)
     count = np.empty((3, 2048), np.int64)
-    count[:] = 0
+    for value in range(2048):
+        count[0, value] = count[1, value] = count[2, value] = 0
     for k in range(P):
         place = np.int64((owner[k] + 0.5 + x[k] / scale / 4) * unit)
         order[k] = place << ROW_BITS | rows[k]
@@ -455,7 +460,8 @@ def own_points(near, shapes, numbers):
     x, depth, chosen = np.empty(near.pairs), np.empty(near.pairs), np.empty(near.most, np.int32)
     road, num_inside = np.empty(n), np.empty(n, np.int64)
     deepest = np.empty(len(near.rows))  # of each point in any box
-    deepest[:] = np.inf
+    for i in range(len(deepest)):
+        deepest[i] = np.inf
     P = 0
     for box in range(n):
         m = measure(box, near, shapes, numbers, room)
@@ -513,7 +519,8 @@ def thinned(points, shapes, row, owner, most):
 
     """
     given, counts = np.empty(len(shapes.half), np.int64), np.empty(len(shapes.half), np.int64)
-    given[:] = 0
+    for box in range(len(given)):
+        given[box] = 0
     for k in range(len(owner)):
         given[owner[k]] += 1
     Q = 0

@@ -7,7 +7,7 @@ And evidence of the points about its extents, after a round (M18).
 
 from math import exp, isfinite, log, sqrt
 
-from boxreg_ros.core.method.arrays import ANCHOR, BIAS, BOTTOM, EXTENT, GAP, PIVOT, POSE, SIDESLIP
+from boxreg_ros.core.method.arrays import BIAS, BOTTOM, EXTENT, GAP, PIVOT, POSE, SHARED, SIDESLIP
 from boxreg_ros.core.method.compile import loop
 from boxreg_ros.core.method.selection import sum_of
 
@@ -22,28 +22,6 @@ EXTENT_TAILS = (1.28, 1.05, 1.18)
 KITTI."""
 PINNED_DEVIATION = 0.01
 """Deviation of the bias of a pinned box [m, rad]: practically held. Chosen."""
-
-
-@loop
-def fill_mean_extents(b, problem, mean):
-    """Write the mean input extents, marginalised ones included; of pinned boxes if there are."""
-    has_pin = sum_of(problem.pinned[b]) > 0
-    for k in range(SIZE):
-        total, count = 0.0, 0.0
-        if not has_pin:
-            total, count = problem.marginalised_extents[b, k], problem.marginalised_extents[b, 3]
-        for n in range(problem.lengths[b]):
-            if problem.pinned[b, n] or not has_pin:
-                total += problem.boxes[b, n, 3 + k]
-                count += 1.0
-        mean[k] = total / count
-
-
-@loop
-def fill_all_mean_extents(problem, means):
-    """Write the mean input extents of each window, (B, 3) [m]."""
-    for b in range(len(means)):
-        fill_mean_extents(b, problem, means[b])
 
 
 @loop
@@ -111,7 +89,8 @@ def fill_shared(b, problem, inputs, constants, mean, common):
     pins = sum_of(problem.pinned[b])
     count = problem.lengths[b] + problem.marginalised_extents[b, 3]
     shared, deviation = common.shared, common.deviation
-    shared[:] = 0.0
+    for s in range(SHARED):  # deviations of the bias come later
+        shared[s], deviation[s] = 0.0, 1.0
     for k in range(SIZE):
         correlation = inputs.correlation[POSE + k]
         error = of_class.extent * inputs.extent_error[k]
@@ -141,7 +120,6 @@ def fill_shared(b, problem, inputs, constants, mean, common):
         common.margin_variance[face] = inputs.margin_variance[face]
     shared[PIVOT] = deviation[PIVOT] = mean[0] * constants.pivot
     deviation[SIDESLIP] = constants.sideslip
-    deviation[ANCHOR:] = 1.0
 
 
 @loop
@@ -160,14 +138,13 @@ def expect(b, problem, inputs, constants, mean, common):
     constants : record of `Constants`
         Of the method, with the settings.
     mean : array, shape (3,)
-        To work in: mean input extents [m].
+        Mean input extents of the window [m].
     common : record `COMMON`
         Of the window: written.
 
     """
-    fill_mean_extents(b, problem, mean)
-    fill_poses(b, problem, inputs, constants, common)
     fill_shared(b, problem, inputs, constants, mean, common)
+    fill_poses(b, problem, inputs, constants, common)
 
 
 @loop

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP, most_points, padded, TOP
 from boxreg_ros.core.method.compile import kernel, loop, small_array
+from boxreg_ros.core.method.residuals import TERMS
 from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
 
@@ -29,6 +30,7 @@ FAR_SENSOR = 1e6
 """Distance of an unknown sensor, over that of the centre of the points."""
 MIN_ALONG = 0.5
 """Least distance along a face in the tangent of its visibility [m]. Chosen."""
+NO_TERMS = np.zeros(1, TERMS)
 
 
 @loop
@@ -74,7 +76,7 @@ def fill_depths(m, half, level, constants, work):
         constants.outside_margin, constants.edge_margin, constants.deepest
     )  # fmt: skip
     strips = constants.strips
-    for k in range(3):
+    for k in range(len(excess)):
         for i in range(m):
             excess[k, i] = abs(local[k, i]) - half[k]
     near = 0
@@ -84,12 +86,12 @@ def fill_depths(m, half, level, constants, work):
             & (excess[1, i] < outside_margin)
             & (excess[2, i] < outside_margin)
         )
-    for k in range(2):
+    for k in range(len(strip)):
         scale = strips / 2 / half[k]
         for i in range(m):
             place = (local[k, i] + half[k]) * scale
             strip[k, i] = np.int32(min(max(0.0, place), strips - 1.0))  # 0 for NaN
-    for face in range(FACES):
+    for face in range(len(depth)):
         axis = face // 2
         one = 1 if axis == 0 else 0
         other = 1 if axis == 2 else 2
@@ -183,7 +185,8 @@ def to_middle(R, shift, lever, moment):
 @loop
 def centre_of(points, centre):
     """Write the mean of points (M, 3); zero without points."""
-    centre[:] = 0.0
+    for k in range(3):
+        centre[k] = 0.0
     for i in range(len(points)):
         for k in range(3):
             centre[k] += points[i, k]
@@ -195,7 +198,8 @@ def centre_of(points, centre):
 def fill_visibility(box, origins, points, R, toward, tangent):
     """Write the visibility of each face of one input box from its best sensor, (6,)."""
     fill_rotation(box[6], box[7], box[8], R)
-    tangent[:4] = -inf
+    for face in range(4):
+        tangent[face] = -inf
     for sensor in range(len(origins)):
         raise_visibility(box, origins[sensor], points, R, toward, tangent)
     tangent[4] = ALWAYS_VISIBLE
@@ -354,7 +358,8 @@ class FaceWork(NamedTuple):
 def empty_face_work(problem, constants):
     """Return arrays for the observations of a batch."""
     M = most_points(problem.counts)
-    size = ceil(max(constants.min_face_points, constants.outermost / constants.strips * M)) + 1
+    share = constants.outermost / constants.strips
+    size = ceil(max(float(constants.min_face_points), share * M)) + 1
     index = np.empty(M)
     for i in range(M):
         index[i] = i
@@ -367,14 +372,9 @@ def empty_face_work(problem, constants):
 
 @loop
 def clear_padding(length, terms):
-    """Set the face observations of padding to zero."""
+    """Set the terms of padding to zero."""
     for n in range(length, len(terms)):
-        terms[n].W_faces[:] = 0.0
-        terms[n].distance[:] = 0.0
-        terms[n].visibility[:] = 0.0
-        terms[n].inset[:] = 0.0
-        terms[n].inset_shares[:] = 0.0
-        terms[n].num_points = 0.0
+        terms[n] = NO_TERMS[0]
 
 
 @loop
@@ -419,10 +419,10 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
     lever = small_array(3)
     tangent = small_array(6)
     velocity = small_array(3)
-    velocity[:] = 0.0
     length = problem.lengths[b]
     clear_padding(length, terms)
     for k in range(3):
+        velocity[k] = 0.0
         half[k] = shared[EXTENT + k] / 2
     for n in range(length):
         box, pose, origins = problem.boxes[b, n], poses[n], problem.origins[b, n]
@@ -447,7 +447,7 @@ def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
         to_box_axes(m, work.moved, shift, R, work.local)
         near = fill_depths(m, half, level, constants, work)
         share = constants.outermost / constants.strips
-        wanted = ceil(max(constants.min_face_points, share * near))
+        wanted = ceil(max(float(constants.min_face_points), share * near))
         outermost_points(m, wanted, constants, work, term.W_faces)
         to_middle(R, shift, lever, term.W_faces[TOP])
         for face in range(FACES):

@@ -1,10 +1,10 @@
 """Labelling margins and insets of one kind of objects, by what its tracks show (M15)."""
 
-from math import exp, log
+from math import exp
 
 from boxreg_ros.core.method.arrays import POSE
-from boxreg_ros.core.method.compile import kernel, loop, small_array
-from boxreg_ros.core.method.expectation import constant_part, FACES, fill_mean_extents, SIZE
+from boxreg_ros.core.method.compile import kernel, loop
+from boxreg_ros.core.method.expectation import constant_part, FACES
 from boxreg_ros.core.method.selection import nth, sum_of
 import numpy as np
 
@@ -31,33 +31,28 @@ def add_value(quantity, face, value, share, sums):
 
 
 @loop
-def sum_faces(problem, terms, inputs, constants, sums, logarithms):
+def sum_faces(kind, lengths, terms, inputs, constants, sums):
     """
     Sum what the faces of each window show of its track.
 
     Parameters
     ----------
-    problem : Problem
-        The windows; all their observations count.
+    kind, lengths : array, shape (B,)
+        Of the windows, see `Problem`; all their observations count.
     terms : array of `TERMS`, shape (B, N)
         Their face observations.
     inputs : array of `INPUTS`, shape (K,)
         What these were made with, by kind.
     constants : array of one record of `Constants`, shape (1,)
         Of the method.
-    sums, logarithms : array, shapes (B, 3, 3, 6) and (B, 3)
-        Written: see `TRACK`, and of the mean input extents.
+    sums : array, shape (B, 3, 3, 6)
+        Zeros, to which these are added: see `TRACK`.
 
     """
     constants = constants[0]
-    mean = small_array(SIZE)
-    sums[:] = 0.0
     for b in range(len(terms)):
-        known = inputs[problem.kind[b]]
-        fill_mean_extents(b, problem, mean)
-        for k in range(SIZE):
-            logarithms[b, k] = log(mean[k])
-        for n in range(problem.lengths[b]):
+        known = inputs[kind[b]]
+        for n in range(lengths[b]):
             term = terms[b, n]
             has_points = term.num_points >= constants.min_box_points
             for face in range(FACES):

@@ -48,7 +48,8 @@ def fill_residuals(problem, poses, extents, residuals):
             for k in range(len(box)):
                 change = max(change, abs(box[k] - before[k]))
             if problem.counts[b, n] == 0 or change < REPEATED_BOX_TOLERANCE:
-                own[:] = np.nan
+                for k in range(len(own)):
+                    own[k] = np.nan
                 continue
             fill_rotation(pose[3], pose[4], pose[5], R)
             for k in range(SIZE):

@@ -39,7 +39,8 @@ def fill_costs(points, times, velocity, boxes, fewest, costs):
     inside, depth = np.empty(len(boxes)), np.empty(len(boxes))
     for way in range(2):
         is_near = np.empty(len(times), np.bool_)
-        is_near[:] = False
+        for i in range(len(times)):
+            is_near[i] = False
         for c in range(len(boxes)):
             box = boxes[c]
             along, across = cos(box[8]), sin(box[8])

@@ -1,7 +1,7 @@
 """The population of tracks: how the input errs in extents unlike the usual ones (M18)."""
 
 from boxreg_ros.core.method.arrowhead import factorise_corner, solve_corner
-from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.compile import kernel, loop, small_array
 from boxreg_ros.core.method.expectation import SIZE
 from boxreg_ros.core.method.selection import lower_median
 import numpy as np
@@ -37,14 +37,25 @@ def population_slopes(evidence, constants, median, slopes):
 
     """
     constants = constants[0]
+    values = np.empty(len(evidence))
     for m in range(len(median)):
-        median[m] = lower_median(evidence[:, 0, m].copy())
+        for track in range(len(evidence)):
+            values[track] = evidence[track, 0, m]
+        median[m] = lower_median(values)
+    fill_slopes(evidence, constants, median, np.empty((SIZE, SIZE, SIZE)), slopes)
+
+
+@loop
+def fill_slopes(evidence, constants, median, curvature, slopes):
+    """Write the slopes of `population_slopes`; `curvature` (3, 3, 3) is to work in."""
     information = 1 / constants.slope_deviation**2
-    curvature, off = np.zeros((SIZE, SIZE, SIZE)), np.empty(SIZE)
-    slopes[:] = 0.0
+    off = small_array(SIZE)
     for k in range(SIZE):
         for m in range(SIZE):
-            curvature[k, m, m] = information * (1.0 if m == k else CROSS_SLOPE_INFORMATION)
+            slopes[k, m] = 0.0
+            for j in range(SIZE):
+                own = 1.0 if m == k else CROSS_SLOPE_INFORMATION
+                curvature[k, m, j] = information * own if m == j else 0.0
     for track in range(len(evidence)):
         log, correction, weight = evidence[track, 0], evidence[track, 1], evidence[track, 2]
         away = 0.0

@@ -29,6 +29,7 @@ from boxreg_ros.core.method.weights import (
     slip_weight,
     zero_motion_weight,
 )
+from numba import literal_unroll
 import numpy as np
 
 
@@ -75,7 +76,6 @@ LINEARISED = np.dtype(
         ('by_angles', float, (4, 3)),
         ('weighted', float, (4, 3)),
         ('off', float, PRIOR),
-        ('extents', float, 3),
         ('pin_factor', float, POSE),
     ],
     align=True,
@@ -91,10 +91,12 @@ columns
 share
     Factors of the poses in a combination of them, (3,): the first six columns of J are derivatives
     by this.
-R, dR, step, pull, curvature, plane, by_angles, weighted, off, extents, pin_factor
+R, dR, step, pull, curvature, plane, by_angles, weighted, off, pin_factor
     To work in.
 """
 
+
+NO_LINEARISED = np.zeros(1, LINEARISED)
 
 AXES = np.dtype(
     [
@@ -119,7 +121,9 @@ squared, face_weight, parked
 @kernel
 def empty_linearised():
     """Return room for one residual."""
-    return np.zeros(1, LINEARISED)
+    room = np.empty(1, LINEARISED)
+    room[0] = NO_LINEARISED[0]  # numpy's zeros take numba a tenth of a second
+    return room
 
 
 @loop
@@ -275,6 +279,10 @@ RESIDUALS = (
     Residual(slip, slip_weight, 2, True, 'slip'),
 )
 """All residuals of observations but those of the faces, which `assemble.add_faces` sums."""
+POSES_OF = np.array([row.poses for row in RESIDUALS])
+IS_ROBUST = np.array([row.is_robust for row in RESIDUALS])
+IS_COMBINATION = np.array([row.is_combination for row in RESIDUALS])
+"""Columns of the table, of which a kernel looks up those of a row."""
 
 
 TERMS = np.dtype(
@@ -322,6 +330,27 @@ wanted, root
 W
     Weights of the `RESIDUALS` that begin here, 0 where they are left out, (n, 6).
 """
+
+
+@loop
+def fill_residual(i, n, poses, shared, terms, at, out):
+    """Write residual `i` of observation n; return its numbers of rows and columns."""
+    k, found = 0, (0, 0)
+    for row in literal_unroll(RESIDUALS):
+        if k == i:
+            found = row.function(n, poses, shared, terms, at, out)
+        k += 1
+    return found
+
+
+@loop
+def fill_weight(i, n, r, window, constants, W):
+    """Write the weights of residual `i` of observation n."""
+    k = 0
+    for row in literal_unroll(RESIDUALS):
+        if k == i:
+            row.weight(n, r, window, constants, W)
+        k += 1
 
 
 @loop

@@ -135,10 +135,12 @@ def evaluate_in_turn(first, last, rows, wanted, batch, sums, inputs, constants, 
         terms, common = sums.terms[s], sums.common[s]
         if wanted == START:
             poses, shared = solution.poses[b], solution.shared[b]
-            shared[ANCHOR:] = 0.0
-            copy(poses.reshape(POSE * N), x[0, row, : POSE * N])
+            for k in range(ANCHOR, len(shared)):
+                shared[k] = 0.0
+            for k in range(POSE * N):
+                x[0, row, k] = poses[k // POSE, k % POSE]
             copy(shared, x[0, row, POSE * N :])
-            expect(b, problem, inputs[problem.kind[b]], constants, out[0].extents, common)
+            expect(b, problem, inputs[problem.kind[b]], constants, batch.mean_extents[b], common)
             weigh(b, problem, poses, shared, constants, at, out, terms, common)
         observations = 1 if wanted == OLDEST else N
         for point in range(len(x)):
@@ -153,7 +155,9 @@ def evaluate_in_turn(first, last, rows, wanted, batch, sums, inputs, constants, 
             )  # fmt: skip
             if wanted == OLDEST:
                 left = solution.left
-                marginalise(at_x, pull, A, left.state[b], left.step[b], left.information[b])
+                marginalise(
+                    at_x, pull, A, factor, left.state[b], left.step[b], left.information[b]
+                )
                 continue
             for k in range(D):
                 pull[k] *= free[b, k]
@@ -164,12 +168,12 @@ def evaluate_in_turn(first, last, rows, wanted, batch, sums, inputs, constants, 
 
 
 @loop
-def has_settled(poses, start, errors, settled_step):
+def has_settled(x, start, errors, settled_step):
     """Return whether no box of a window moves by more than `settled_step` errors of its input."""
-    for n in range(len(poses)):
+    for n in range(len(start)):
         moved = 0.0
         for k in range(POSE):
-            moved += ((poses[n, k] - start[n, k]) / errors[k]) ** 2 / POSE
+            moved += ((x[POSE * n + k] - start[n, k]) / errors[k]) ** 2 / POSE
         if not moved <= settled_step**2:
             return False
     return True
@@ -202,16 +206,15 @@ def end(first, last, x, batch, sums, constants, is_last, may_settle, is_done):
 def end_in_turn(first, last, x, batch, sums, constants, is_last, may_settle, is_done, inverse):
     """Do what `end` does; `inverse` is to work in."""
     problem, free, solution = batch.problem, batch.free, batch.solution
-    N = solution.poses.shape[1]
-    n = POSE * N
+    n = POSE * solution.poses.shape[1]
     for row in range(first, last):
         b, factor = sums.windows[row], factor_of_window(row, sums.factor)
         terms, common = sums.terms[row], sums.common[row]
-        found = x[row][:n].reshape(N, POSE)
-        errors = problem.of_class[b].pose
-        is_settled = has_settled(found, solution.poses[b], errors, constants.settled_step)
+        poses, errors = solution.poses[b], problem.of_class[b].pose
+        is_settled = has_settled(x[row], poses, errors, constants.settled_step)
         is_done[row] = is_last or (may_settle and is_settled)
-        copy(x[row], solution.poses[b].reshape(n))
+        for k in range(n):
+            poses[k // POSE, k % POSE] = x[row, k]
         copy(x[row, n:], solution.shared[b])
         fill_evidence(
             common, solution.shared[b], factor.corner, constants.min_extent_gain,
@@ -221,6 +224,6 @@ def end_in_turn(first, last, x, batch, sums, constants, is_last, may_settle, is_
             continue
         invert_poses(factor, inverse.poses, inverse.links, inverse.response)
         fill_posterior(
-            b, problem, found, solution.shared[b], terms, common, free[b], inverse, factor.corner,
+            b, problem, poses, solution.shared[b], terms, common, free[b], inverse, factor.corner,
             constants, solution.posterior,
         )  # fmt: skip

@@ -91,7 +91,7 @@ def find(points, expected, target):
     own = around(points, prior, target.half, FOLLOW.around)
     height = road_below(own, prior, target) - expected.road
     if np.isfinite(height):
-        weight = FOLLOW.road_deviation**-2
+        weight = 1 / FOLLOW.road_deviation**2
         prior[2] += height * weight / (information[2, 2] + weight)
         information[2, 2] += weight
     best = registered(own, prior, prior, information, target, FOLLOW.max_steps)

@@ -58,29 +58,30 @@ def input_weight(n, r, window, constants, w):
 @loop
 def rigid_shape_weight(n, r, window, constants, w):
     """Write ones: the residual is whitened by the root of its information (M4)."""
-    w[:] = 1.0
+    for k in range(POSE):
+        w[k] = 1.0
 
 
 @loop
 def acceleration_weight(n, r, window, constants, w):
     """Write the weight of an acceleration along the axes of the body (M23)."""
     forward, sideways, turning = window.of_class.motion
-    w[0], w[1], w[2] = forward**-2, sideways**-2, constants.vertical**-2
-    w[3] = w[4] = constants.tilting**-2
-    w[5] = turning**-2
+    w[0], w[1], w[2] = 1 / forward**2, 1 / sideways**2, 1 / constants.vertical**2
+    w[3] = w[4] = 1 / constants.tilting**2
+    w[5] = 1 / turning**2
 
 
 @loop
 def zero_motion_weight(n, r, window, constants, w):
     """Write the weight of the step of a parked object; zero where it drives (M25)."""
     for k in range(POSE):
-        w[k] = constants.drift[k] ** -2 if window.parked[n] else 0.0
+        w[k] = 1 / constants.drift[k] ** 2 if window.parked[n] else 0.0
 
 
 @loop
 def slip_weight(n, r, window, constants, w):
     """Write the weight of the velocity of the pivot across the path and upward (M7)."""
-    w[0], w[1] = window.of_class.slip**-2, constants.climb**-2
+    w[0], w[1] = 1 / window.of_class.slip**2, 1 / constants.climb**2
 
 
 @loop
@@ -107,8 +108,7 @@ def fill_rates(boxes, times, length, rate):
     for n in range(length):
         mean += times[n] / length
     x_y_yaw = (0, 1, 8)
-    rate[:] = 0.0
-    power = 0.0
+    rate[0] = rate[1] = rate[2] = power = 0.0
     for n in range(length):
         for k in range(3):
             rate[k] += (times[n] - mean) * boxes[n, x_y_yaw[k]]
@@ -138,27 +138,29 @@ def is_parked(boxes, times, length, yaw_deviation, constants):
 @kernel
 def median_place(boxes, times, first, last):
     """Return the medians of x, y and time of the boxes `first` to `last`."""
-    values, found = np.empty((3, last - first)), np.empty(3)
-    for n in range(last - first):
-        box = boxes[first + n]
-        values[0, n], values[1, n], values[2, n] = box[0], box[1], times[first + n]
-    for k in range(len(values)):
-        found[k] = lower_median(values[k])
-    return found[0], found[1], found[2]
+    values, found = np.empty(last - first), np.empty(2)
+    for k in range(len(found)):
+        for n in range(last - first):
+            values[n] = boxes[first + n, k]
+        found[k] = lower_median(values)
+    return found[0], found[1], times[(first + last - 1) // 2]  # which increase
 
 
 @kernel
 def fill_parked(boxes, times, length, yaw_deviation, constants, parked):
     """Write whether the object is parked from each box to the next (M25), (N,)."""
-    parked[:] = is_parked(boxes, times, length, yaw_deviation, constants)
-    if not parked[0]:
+    known = is_parked(boxes, times, length, yaw_deviation, constants)
+    for n in range(len(parked)):
+        parked[n] = known
+    if not known:
         return
     span = constants.driving_span
     for step in range(span - 1, length - span):
         x0, y0, t0 = median_place(boxes, times, step + 1 - span, step + 1)
         x1, y1, t1 = median_place(boxes, times, step + 1, step + 1 + span)
         if hypot(x1 - x0, y1 - y0) > constants.driving_speed * (t1 - t0):
-            parked[step + 1 - span : step + span] = False
+            for n in range(step + 1 - span, step + span):
+                parked[n] = False
 
 
 @loop
