@@ -1,10 +1,10 @@
 """
 Preparation of sweeps and boxes for the registrar, the same for the live node and for recordings.
 
-A `Session` brings each item into the fixed frame, merges
-the clouds of several LiDARs, assigns ids where they are asked for, and checks the poses of the
-boxes. `hand_to_registrar` adds the result to the registrar. The live node adds waiting for
-transforms and publishing; `boxreg relabel` adds reading and writing.
+A `Session` brings each item into the fixed frame, merges the clouds of several LiDARs, assigns ids
+where they are asked for, and checks the input. `hand_to_registrar` adds the result to the
+registrar. The live node adds waiting for transforms and publishing; `boxreg relabel` adds reading
+and writing.
 
 """
 
@@ -16,16 +16,8 @@ from typing import TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.checks.axis import AxisCheck
-from boxreg_ros.io.checks.cloud import CloudCheck
-from boxreg_ros.io.checks.common_motion import CommonMotionCheck
 from boxreg_ros.io.checks.finding import Finding
-from boxreg_ros.io.checks.motion import MotionCheck
-from boxreg_ros.io.checks.motion_time import MotionTimeCheck
-from boxreg_ros.io.checks.place import PlaceCheck
-from boxreg_ros.io.checks.pose import PoseCheck
-from boxreg_ros.io.checks.twice import TwiceCheck
-from boxreg_ros.io.checks.unit import UnitCheck
+from boxreg_ros.io.checks.input_checks import InputChecks
 from boxreg_ros.io.id_assignment import IdCheck, Tracker
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.lidars import ignore, MergedSweep, Report, SensorPlacement, SweepMerger
@@ -62,9 +54,9 @@ class Session:
     Prepare sweeps and boxes for the registrar.
 
     State: the transforms, the clouds that wait for those of other LiDARs, the tracks of id
-    assignment, and the pose check. Not thread-safe.
+    assignment, and the checks of the input. Not thread-safe.
 
-    Adapters have applied the `convention` already; the pose check compares it with the others. Of
+    Adapters have applied the `convention` already; the checks compare it with others. Of
     `config`, `max_gap` and `merge_span` are used; `report` is called for clouds that are not
     merged. The caller feeds `tree` and `placement`, and sets `sensor_frame`, that of the point
     clouds, by which `fixed_frame` is chosen where it is empty.
@@ -88,26 +80,17 @@ class Session:
         self._merger: SweepMerger | None = None
         if len(lidars.topics) > 1:
             self._merger = SweepMerger(lidars.topics, config.merge_span, self.report)
-        self._motion_check = MotionCheck(self.tree, bool(lidars.frames or lidars.info))
+        self._checks = InputChecks(convention, config, self.tree, lidars)
         self._id_check = None if convention.associate else IdCheck(config.max_gap)
         self._tracker = self._id_check.tracker if self._id_check else Tracker(config.max_gap)
-        self._axis_check = AxisCheck(convention, config.drives)
-        self._common_motion = CommonMotionCheck()
-        self._twice_check = TwiceCheck(config)
         self._boxes_without_frame = ''
         self._odometry_lacks_child = False
         self._has_clouds_without_frame = False
-        self._cloud_check = CloudCheck(is_merged=self._merger is not None)
-        self.restart()
 
     def restart(self) -> None:
         """Forget all but the transforms; ids that were assigned are not used again."""
-        self._pose_check = PoseCheck(self.convention)
-        self._place_check = PlaceCheck(self.convention)
-        self._unit_check = UnitCheck()
-        self._motion_time = MotionTimeCheck()
-        parts = (self._motion_check, self._axis_check, self._common_motion, self._merger)
-        for part in (*parts, self._id_check or self._tracker):
+        self._checks.restart()
+        for part in (self._merger, self._id_check or self._tracker):
             if part is not None:
                 part.forget()
 
@@ -131,7 +114,7 @@ class Session:
             self._boxes_without_frame = BOXES_WITHOUT_FRAME.format(self.sensor_frame)
         try:
             fixed_frame = self.require_fixed_frame(given)
-            self._motion_check.add(given, fixed_frame, item.received_ns)
+            self._checks.add_received(given, fixed_frame, item.received_ns)
             T_fixed_item = self.tree.lookup(fixed_frame, given.frame_id, given.stamp_ns)
         except TransformUnavailable as error:
             is_sweep = isinstance(given, Sweep)
@@ -141,40 +124,18 @@ class Session:
         reason, detail = None, ''
         moved: Sweep | BoxArray
         if isinstance(given, Sweep):
-            self._cloud_check.add(given)
-            self._motion_check.add_pose(given, fixed_frame, T_fixed_item)
             moved = sweep_to_frame(given, T_fixed_item, self.fixed_frame)
             moved, reason, detail = self.placement.placed(moved, self.tree)
         else:
             motion = self.tree.motion(self.fixed_frame, given.frame_id, given.stamp_ns)
             moved = boxes_to_frame(given, T_fixed_item, self.fixed_frame, motion, ticket)
-        self._unit_check.add(moved, T_fixed_item)
-        self._pose_check.add(moved)
-        self._place_check.add(moved, T_fixed_item, self._other_frames(given))
-        if isinstance(moved, BoxArray):
             self._tracker.max_gap = self.config.max_gap  # which may change
             if self._id_check is None:
                 moved = self._tracker.identify(moved)
             else:
                 self._id_check.add(moved)
-            self._twice_check.add(moved)
-            if self.sensor_frame:
-                route = self.tree.route(self.fixed_frame, self.sensor_frame)
-                self._common_motion.add(moved.stamp_ns, self._tracker, route, self._pose_of_sensor)
-            frame_yaw = float(np.arctan2(T_fixed_item[1, 0], T_fixed_item[0, 0]))
-            self._axis_check.add(moved, frame_yaw)
-        if isinstance(given, Sweep) or not self._is_carried(given.frame_id):
-            offset = self.tree.clock_offset
-            self._motion_time.add(moved, self._pose_of_sensor, self.sensor_frame, offset)
+        self._checks.add(given, moved, T_fixed_item, self.sensor_frame, self._tracker)
         return item._replace(moved=moved, T_fixed_item=T_fixed_item, reason=reason, detail=detail)
-
-    def _is_carried(self, frame: str) -> bool:
-        """Return whether a frame is fixed to that of the clouds, which may not move either."""
-        return all(map(self.tree.is_constant, self.tree.route(frame, self.sensor_frame)))
-
-    def _pose_of_sensor(self, stamp_ns: int) -> Floats | None:
-        """Return the pose (4, 4) of the frame of the clouds at a stamp; None if it is unknown."""
-        return self.tree.find(self.fixed_frame, self.sensor_frame, stamp_ns)
 
     def _name_odometry_child(self) -> None:
         """Take odometry without a child frame for that of the vehicle, if no motion is known."""
@@ -182,19 +143,6 @@ class Session:
         if tree.lacks_odometry_child and frame and tree.fixed_frame(frame) is None:
             tree.name_odometry_child(frame)
             self._odometry_lacks_child = True
-
-    def _other_frames(self, item: Sweep | BoxArray) -> dict[str, Floats]:
-        """Return the poses of the frames that boxes may be in, beside that of their message."""
-        found: dict[str, Floats] = {}
-        if isinstance(item, Sweep) or not self._place_check.is_open:
-            return found
-        route = self.tree.route(self.fixed_frame, self.sensor_frame or item.frame_id)
-        names = {name for edge in route for name in (edge.parent, edge.child)}
-        for name in sorted(names - {item.frame_id}):
-            pose = self.tree.find(self.fixed_frame, name, item.stamp_ns)
-            if pose is not None:
-                found[name] = pose
-        return found
 
     def merged(self, sweep: Sweep, extra: object = None) -> list[MergedSweep]:
         """
@@ -277,31 +225,16 @@ class Session:
     def findings(self) -> list[Finding]:
         """Return the faults of the input, and guesses about it, that were found so far."""
         same = ', '.join(f'{a!r} and {b!r}' for a, b in sorted(self.tree.same_frames.items()))
-        # Points show which horizontal extent is which, motion also which axis points forward, but
-        # of all classes together; boxes in another place show neither.
-        place, pose = self._place_check, self._pose_check
-        of_ways = '' if self.jumping_ids else self._axis_check.finding  # by ids
-        of_classes = '' if self._axis_check.is_turned else pose.class_finding
-        of_axes = of_classes or of_ways or pose.finding
-        poses = self._unit_check.finding or place.finding or of_axes or place.flat
-        known = self._motion_check.findings
-        of_time = '' if 'clock' in known else self._motion_time.finding
         odometry = f'odometry: {self.tree.odometry_note}' if self._odometry_lacks_child else ''
         texts = [
             *((Reason.POINT_TIMES, text) for text in self.placement.normalised.values()),
             (Reason.TRANSFORM_FAULT, same and SAME_FRAMES.format(same)),
-            *((Reason.CLOUD_FAULT, text) for text in self._cloud_check.findings),
-            (Reason.TRANSFORM_FAULT, self._common_motion.finding),
-            (Reason.CLOCK_OFFSET, of_time),
-            (Reason.TRANSFORM_FAULT, place.fallen),
             (Reason.TRANSFORM_FAULT, self._boxes_without_frame),
             (Reason.TRANSFORM_FAULT, odometry),
-            (Reason.POSE_REFERENCE, poses),
-            (Reason.OBJECTS_TWICE, self._twice_check.finding),
             (Reason.TRACK_IDS_JUMP, self.jumping_ids and f'{self.jumping_ids}; {ASSOCIATE}'),
         ]
         found = [Finding(reason, text) for reason, text in texts if text]
-        return [*known.values(), *found]
+        return [*self._checks.findings(not self.jumping_ids), *found]
 
     @property
     def jumping_ids(self) -> str:
