@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import groupby, pairwise
+from itertools import chain, groupby, pairwise
 from typing import NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError
@@ -416,38 +416,41 @@ class Corrections:
                 ('reject', [one.judgement == 'reject' for one in rows]),
             ):
                 found += _ranges(track_id, kind, [one.stamp_ns for one in rows], values)
-        return found + self._deletions()
+        return held(found + self._left_empty())
 
-    def _deletions(self) -> list[Decision]:
+    def _left_empty(self) -> list[Decision]:
         """Return where the tracks of the results have no boxes by a decision: none is added."""
-        places: list[tuple[str, int, int, bool]] = []  # with whether boxes are deleted there
+        places: list[tuple[str, int, int, str]] = []  # with the kind of the decision
         parts: dict[str, list[int]] = {}  # first and last stamps of new tracks
-        for one in (*self._of_kind('delete'), *self._of_kind('rename')):
+        for one in chain.from_iterable(map(self._of_kind, ('delete', 'reject', 'rename'))):
             if one.stamp_ns is None or one.value == one.track_id:
                 continue
             span = _span_of(one)
-            places.append((one.track_id, *span, one.kind == 'delete'))
-            if one.kind == 'delete':
+            places.append((one.track_id, *span, one.kind))
+            if one.kind != 'rename':
                 renames = (each for each in self._of_track[one.track_id] if each.kind == 'rename')
                 for each in renames:
                     first_ns, last_ns = _span_of(each)
                     part = max(first_ns, span[0]), min(last_ns, span[1])
-                    places.append((each.value, *part, True))
+                    places.append((each.value, *part, one.kind))
             elif one.value in self.apart:
                 parts.setdefault(one.value, []).extend(span)
         for name, ends in parts.items():
-            places.append((name, -MAX_STAMP_NS, min(ends) - 1, True))
-            places.append((name, max(ends) + 1, MAX_STAMP_NS, True))
+            places.append((name, -MAX_STAMP_NS, min(ends) - 1, 'delete'))
+            places.append((name, max(ends) + 1, MAX_STAMP_NS, 'delete'))
         found = []
-        for name, first_ns, last_ns, is_deleted in dict.fromkeys(places):
-            left = sorted(one.stamp_ns for one in self._of_result.get(name, ()))
-            within = [stamp_ns for stamp_ns in left if first_ns <= stamp_ns <= last_ns]
+        for name, first_ns, last_ns, why in dict.fromkeys(places):
+            kind = 'reject' if why == 'reject' else 'delete'
+            rows = self._of_result.get(name, [])
+            # Between rejected boxes there is none, either.
+            left = (one.stamp_ns for one in rows if one.judgement != why)
+            within = sorted(stamp_ns for stamp_ns in left if first_ns <= stamp_ns <= last_ns)
             gaps = [*pairwise([first_ns - 1, *within, last_ns + 1])]
             # From the first box that was joined to the track there, it is not the part given away.
-            for before_ns, after_ns in gaps if is_deleted else gaps[:1]:
-                if left and after_ns - before_ns > 1:
+            for before_ns, after_ns in gaps[:1] if why == 'rename' else gaps:
+                if rows and after_ns - before_ns > 1:
                     span = before_ns + 1, after_ns - 1
-                    found.append(Decision(name, span[0], 'delete', end_ns=span[1]))
+                    found.append(Decision(name, span[0], kind, end_ns=span[1]))
         return found
 
     def _note(self, track_id: str, input_id: str, stamp_ns: int) -> None:

@@ -480,7 +480,8 @@ def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, op
     """
     A split stays one, classes are not outvoted, accepted tracks not rejected, however often.
 
-    Boxes that were deleted, also those that a run has added, are not added again.
+    Boxes that were deleted, also those that a run has added, are not added again; nor are those
+    that a run has added and a person has rejected.
 
     """
     _, stamps, _, out = completed
@@ -491,6 +492,7 @@ def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, op
         Decision('9', None, 'accept'),
         Decision('1', stamps[3], 'reject'),
         Decision('2', stamps[GAP[1]], 'delete'),
+        Decision('2', stamps[GAP[2]], 'reject'),
         Decision('2', stamps[12], 'delete'),
         Decision('1', stamps[SWEEPS - 3], 'delete'),
     ]
@@ -506,7 +508,7 @@ def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, op
         keys = [('2_2' if k >= 10 else '2', stamps[k]) for k in range(SWEEPS)]
         found = {key: row['class_name'] for key, row in rows.items() if key[0] in ('2', '2_2')}
         classes = dict(zip(keys, ['car', 'truck', 'truck'] + ['car'] * 13, strict=True))
-        gone = {keys[12], *(keys[j] for j in (GAP if k == 1 and not options else GAP[1:2]))}
+        gone = {keys[12], *(keys[j] for j in (GAP if k == 1 and not options else GAP[1:]))}
         assert found == {key: classes[key] for key in keys if key not in gone}
         assert words_of(rows, '1', stamps)[-3] == ''
         words = [str(cell)[:9] for cell in rows['1', stamps[3]].values()]
