@@ -264,10 +264,11 @@ class Recording:
         """Yield that the boxes are taken for those of a slow detector."""
         late = self.timeline.as_slow.get(self.boxes_topic)
         if late is not None:
+            total = late + self.convention.boxes_offset
             yield (
                 f'{self.boxes_topic}: boxes have stamps of clouds that were received {late:.2f} s '
                 f'before them: they are taken for those of a slow detector and used at their '
-                f'stamps; if its clock is behind, correct them with --boxes-offset={late:.2f}'
+                f'stamps; if its clock is behind, correct them with --boxes-offset={total:.2f}'
             )
 
     def _pauses(self) -> Iterator[str]:

@@ -263,6 +263,12 @@ def test_boxes_from_the_future_have_another_clock(tmp_path, seconds):
         stamps = [item.content.stamp_ns for item in items.read()]
         assert sorted(stamps) == sorted(2 * list(true_origins(30)))
         assert not items.session.finding
+    convention = Convention(boxes_offset=0.5)  # what is advised takes its place
+    with Recording([path], convention=convention) as recording:
+        items = FixedFrameItems(recording, Config(), convention)
+        assert len([*items.read()]) > 0
+        assert f'stamps of the boxes {seconds + 0.5:g} s ahead' in items.session.finding
+        assert f'--boxes-offset={-seconds:g}' in items.session.finding
 
 
 @pytest.mark.parametrize('seconds', [1.53, 18.04, 36.98, 3600, 12.345])

@@ -38,7 +38,8 @@ class InputChecks:
         self._convention = convention
         self._tree = tree
         self._cloud = CloudCheck(is_merged=len(lidars.topics) > 1)
-        self._motion = MotionCheck(tree, bool(lidars.frames or lidars.info))
+        named_sensors = bool(lidars.frames or lidars.info)
+        self._motion = MotionCheck(tree, named_sensors, convention.boxes_offset)
         self._axis = AxisCheck(convention, config.drives)
         self._common_motion = CommonMotionCheck()
         self._twice = TwiceCheck(config)

@@ -75,13 +75,17 @@ class MotionCheck:
     """
     Watch the transforms of a stream of clouds and boxes for what makes their motion wrong.
 
-    `findings` has what was found so far, in words, by its kind.
+    `findings` has what was found so far, in words, by its kind. The stamps of boxes have
+    `boxes_offset` [s] in them.
 
     """
 
-    def __init__(self, tree: TransformTree, named_sensors: bool) -> None:
+    def __init__(
+        self, tree: TransformTree, named_sensors: bool, boxes_offset: float = 0.0
+    ) -> None:
         self._tree = tree
         self._named_sensors = named_sensors
+        self._boxes_offset = boxes_offset
         self._jumps = JumpSearch()
         self.findings: dict[str, Finding] = {}
         self._clouds_ns = inf, -inf  # first and last stamp
@@ -309,12 +313,12 @@ class MotionCheck:
         of_whom = f', as {names} are' if names else ''
         if offset > 0:
             of_whom += ', and of no other cloud'
-        shown = seconds_text(offset)
+        total = seconds_text(offset + self._boxes_offset)
         return (
             f'clocks: expected one for clouds and boxes, got stamps of the boxes '
-            f'{shown.lstrip("-")} s {"behind" if offset > 0 else "ahead of"} those of the clouds '
-            f'received at the same time{of_whom}; correct them with --boxes-offset={shown} '
-            f'(node: boxes_offset:={shown})'
+            f'{seconds_text(abs(offset))} s {"behind" if offset > 0 else "ahead of"} those of the '
+            f'clouds received at the same time{of_whom}; correct them with --boxes-offset={total} '
+            f'(node: boxes_offset:={total})'
         )
 
 
