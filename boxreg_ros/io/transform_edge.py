@@ -293,6 +293,8 @@ class Edge:
         stamps = self.stamps
         if not stamps:
             cause = 'all poses are NaN or have no orientation; check its publisher'
+            if self._last_added is not None:  # it was read before, and is read again
+                cause = 'its poses begin later; a part without them is left out by --start'
             if self._was_forgotten:
                 cause = 'no pose has arrived since time went back; check that its publisher runs'
             raise TransformUnavailable(f'transform {self.parent} -> {self.child}: {cause}')

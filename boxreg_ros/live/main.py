@@ -55,6 +55,8 @@ def main(args: Sequence[str] | None = None, is_managed: bool = False) -> int:
         is_usage = isinstance(error, ConfigError) or not isinstance(error, BoxregError)
         return _fail(error, 2 if is_usage else 1)
     failures = run(node)
+    if second is not None:
+        second.end(is_finished=False)  # `os._exit` would leave it compiling
     status = _fail(failures[0], 1) if failures else 0
     # Torch cannot be interrupted, and destroying millions of waiting objects would take seconds.
     sys.stdout.flush()

@@ -396,6 +396,10 @@ def test_samples_after_a_time_jump_replace_the_old_ones():
         tree.add_transforms(M.tf(M.transform(stamp, 'odom', 'base', (0, 0, 0))).transforms)
         tree.rewind(90 * S)
         assert tree.covers('odom', 'lidar', stamp) == is_new
+    tree = tree_of(*moves, static=static)
+    tree.rewind(0)  # the recording is read again
+    with pytest.raises(TransformUnavailable, match='its poses begin later'):
+        tree.lookup('odom', 'lidar', 90 * S)
 
 
 @pytest.mark.parametrize('is_odometry', [False, True])

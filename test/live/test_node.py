@@ -361,6 +361,24 @@ def test_boxes_pass_unchanged_while_the_solver_is_compiled(graph, tmp_path):
     assert ended_cleanly(node)
 
 
+BUSY_SECOND = """
+from boxreg_ros.io import warm_up as second
+second.warm_up_others = lambda *_: time.sleep(60)
+"""
+
+
+def test_a_signal_ends_both_processes_that_compile(graph, tmp_path):
+    code = 'import time' + BUSY_SECOND + FIRST_START.format(compiled=str(tmp_path / 'never'))
+    node = graph.start(command=(CODE, code))
+    graph.wait_until_discovered_by('/boxreg_node')
+    assert 'once after an installation' in node.output()
+    pid = node.popen.pid
+    children = Path(f'/proc/{pid}/task/{pid}/children').read_text().split()
+    assert children
+    assert ended_cleanly(node)
+    assert not [child for child in children if Path('/proc', child).exists()]
+
+
 def test_boxes_that_wait_too_long_are_published_unchanged(graph, tmp_path):
     # Boxes wait ten times the backlog, 0.3 s. Each stamp takes a tenth of a second to solve,
     # while the boxes after it wait.
