@@ -23,6 +23,9 @@ FEW_BOXES = 3
 every second cloud is none."""
 FEW_REFINED = 0.5
 """Refined part of the boxes below which a run prints its most frequent reason. Chosen."""
+MAX_UNPAIRED = 0.05
+"""Part of the clouds or boxes up to which those without use by their stamps are only counted;
+chosen, as the part of the early boxes by which the node warns."""
 
 
 def closing_line(summary: Summary, out: Path) -> str:
@@ -107,6 +110,8 @@ def notes(summary: Summary) -> Iterator[str]:
         )
     if summary.part_refined < FEW_REFINED:
         yield _why_few_were_refined(summary)
+    else:
+        yield from _stamp_notes(summary)
 
 
 def _lidar_notes(summary: Summary) -> Iterator[str]:
@@ -206,6 +211,23 @@ def _damage_line(damages: list[dict[str, Any]]) -> str:
         f'{parts} of the recording cannot be read; the rest was used; first: '
         f'{Damage(**damages[0])}; {SUMMARY} lists {"all" if count > 1 else "it"} under "damage"'
     )
+
+
+def _stamp_notes(summary: Summary) -> Iterator[str]:
+    """Yield the first cause for which many clouds or boxes are of no use by their stamps."""
+    for what, name, counts, total in (
+        ('clouds', Reason.SWEEP_LATE, summary.dropped, summary.sweeps),
+        ('boxes', Reason.DUPLICATE_STAMP, summary.reasons, summary.boxes_in),
+        ('boxes', Reason.NO_SWEEP, summary.reasons, summary.boxes_in),
+    ):
+        count = counts.get(name, 0)
+        if count > MAX_UNPAIRED * total:
+            reason = REASONS[name]
+            yield (
+                f'{count:,} of {total:,} {what} were not used ({name}): {reason.meaning}; '
+                f'remedy: {reason.remedy}'
+            )
+            return
 
 
 def _why_few_were_refined(summary: Summary) -> str:

@@ -27,6 +27,7 @@ from boxreg_ros.offline.notes import closing_line, notes
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.sources import source_of
 from boxreg_ros.offline.summary import Summary
+from boxreg_ros.reasons import Reason
 from boxreg_ros.review import tables
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import Convention
@@ -704,8 +705,31 @@ def test_label_frames_without_cloud_are_a_note(tmp_path):
     options = {'formats': ('sustechpoints',), 'options': Options(with_points=True)}
     summary, _ = run(path, tmp_path / 'out', **options)
     assert summary.frames_without_cloud == 2
-    assert list(notes(summary)) == ['2 of 6 box arrays have no cloud to write beside them']
-    assert list(notes(run(path, tmp_path / 'plain')[0])) == []
+    lacking, unpaired = notes(summary)
+    assert lacking == '2 of 6 box arrays have no cloud to write beside them'
+    assert unpaired.startswith('4 of 12 boxes were not used (no_sweep): no cloud within `reach`')
+    assert list(notes(run(path, tmp_path / 'plain')[0])) == [unpaired]
+
+
+def test_many_late_clouds_and_boxes_that_come_twice_are_notes(tmp_path):
+    late = Drive(sweeps=12)
+    for stamp in late.stamps[2:11:3]:  # the cloud is recorded after the next one and its boxes
+        cloud = next(item for item in late.items if item[:2] == ('/points', stamp))
+        late.items.remove(cloud)
+        late.items.append(('/points', stamp + 110_000_000, cloud[2]))
+    late.items.sort(key=lambda item: item[1])
+    summary, _ = run(late.write(tmp_path / 'late'), tmp_path / 'out_late')
+    (note,) = notes(summary)
+    assert note == (
+        f'3 of 12 clouds were not used (sweep_late): {Reason.SWEEP_LATE.meaning}; '
+        f'remedy: {Reason.SWEEP_LATE.remedy}'
+    )
+    twice = Drive(sweeps=12)
+    again = [(topic, ns + 40_000_000, m) for topic, ns, m in twice.items if topic == '/boxes'][:3]
+    twice.items = sorted([*twice.items, *again], key=lambda item: item[1])
+    summary, _ = run(twice.write(tmp_path / 'twice'), tmp_path / 'out_twice')
+    (note,) = notes(summary)
+    assert note.startswith('6 of 30 boxes were not used (duplicate_stamp): ')
 
 
 def test_unreadable_intensities_drop_no_cloud(tmp_path):
