@@ -516,7 +516,8 @@ def test_relabel_lists_damages_and_strict_fails(tmp_path, drive, whole, capsys):
     out = tmp_path / 'out'
     command = ['relabel', str(whole), '-o', str(out), '--formats=csv,mcap']
     assert main(command) == 0
-    (line,) = capsys.readouterr().err.splitlines()
+    line, unpaired = capsys.readouterr().err.splitlines()
+    assert '(no_sweep)' in unpaired  # the damaged chunk had clouds
     assert f'{whole}: damaged chunk' in line
     assert f'bytes {first} to {first + length}' in line
     (damage,) = json.loads((out / 'summary.json').read_text())['damage']
