@@ -119,7 +119,7 @@ class _Fit:
 
     def deviations(self) -> Tensor:
         """Return the expected error of every variable, 0 for those held fixed; (1, D)."""
-        problem, free, _ = self.batch
+        problem, free = self.batch.problem, self.batch.free
         sums = self.objective.sums
         poses = np.tile(problem.of_class['pose'], problem.length)
         number = free.shape[1] - poses.shape[1]
