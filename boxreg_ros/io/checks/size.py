@@ -25,19 +25,30 @@ MIN_SIZED_OBJECTS = 2
 MIN_SIZE_POINTS = 10
 """Points of a box, or around it, that it is counted from; chosen."""
 ROAD_HEIGHT = 0.2
-"""Points up to this height above the bottom of a box, or of its upper half, may be of the road."""
+"""Points up to this far above the bottom or centre of a box may be of the road [m]; chosen."""
 SIZE_MARGIN = 0.1
-"""Points up to this distance outside of a box are of its object [m]: range noise and labels."""
+"""Points up to this far outside of a box are of its object [m]; chosen, for noise and labels."""
 ENLARGED = 1.4
-"""Factor of extents by which boxes that are too small contain more than at any other place."""
+"""Factor of the extents of a larger box; chosen, between those of fitting and of half boxes."""
 MIN_OF_ENLARGED = 1.15
-"""Ratio to the best other place by which they do: of 0.7 times 1.25, at that place 1.13."""
+"""
+Least ratio of the points in such a box to those at the best place of the given box.
+
+Chosen: 1.25 where extents are 0.7 of the right ones, 1.13 where boxes are at another place.
+
+"""
 MIN_OF_DOUBLED = 1.5
-"""Ratios of the points in doubled boxes of half ones: to `ENLARGED` 1.6, of 0.7 times 1.3."""
+"""
+Least ratio of the points in a box of twice the extents to the most in an `ENLARGED`
+one or at another place.
+
+Chosen: 1.6 where extents are half of the right ones, 1.3 where they are 0.7 of them.
+
+"""
 MIN_DOUBLED_COVERAGE = 0.5
-"""Part of the points around them that doubled boxes of half ones have: 0.6 or more."""
+"""Least part of the points around it in a box of twice the extents; chosen: 0.6 of half ones."""
 MIN_RATIO_OF_COVERAGES = 3.0
-"""Ratio of this part to that of the boxes: of half ones 3.2, of whole ones 1.5 at most."""
+"""Least ratio of it to that of the given box; chosen: 3.2 of half boxes, 1.5 of right ones."""
 MAX_FILLED = 0.6
 """Part of the extents up to which the points of twice too large boxes reach; derived: 0.5."""
 MIN_SHARE_WITHIN = 0.8
