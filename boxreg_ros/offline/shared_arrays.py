@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from contextlib import suppress
+from itertools import accumulate
 from mmap import mmap
 import pickle
 from typing import Any
@@ -55,13 +56,13 @@ class Sender:
         pickled = pickle.dumps(item, pickle.HIGHEST_PROTOCOL, buffer_callback=arrays.append)
         contents = [array.raw() for array in arrays]
         lines = [-(-content.nbytes // ARRAY_ALIGNMENT) for content in contents]
-        ends = np.cumsum(lines) * ARRAY_ALIGNMENT
-        if not contents or not SHARED_BYTES <= ends[-1] <= SLOT_BYTES:
+        ends = [line * ARRAY_ALIGNMENT for line in accumulate(lines, initial=0)]
+        if not SHARED_BYTES <= ends[-1] <= SLOT_BYTES:
             self._send((pickled, arrays, None))
             return
         slot = self._free.pop() if self._free else self._receive()
         places = []
-        for begin, content in zip([0, *ends.tolist()], contents, strict=False):
+        for begin, content in zip(ends, contents, strict=False):
             places.append(slice(begin, begin + content.nbytes))
             self._memory[slot][places[-1]] = content
         self._send((pickled, places, slot))

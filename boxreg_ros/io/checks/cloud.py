@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 MAX_ROUNDING = 0.02
 """Step between coordinates from which they are named as coarse [m]; chosen: the range noise."""
+LOOK_PERIOD = 10
+"""Clouds of which the coordinates of one are looked at; chosen: one a second at 10 Hz."""
 UNIT_POINTS = 100
 """Points of a cloud that its unit is looked up by; chosen."""
 MAX_MEDIAN_DISTANCE = 200.0
@@ -55,6 +57,7 @@ class CloudCheck:
     def __init__(self, is_merged: bool) -> None:
         self._is_merged = is_merged
         self._coordinates = ''
+        self._count = 0
         self._sectors: list[NDArray[np.bool_]] = []
         self._stamps_ns: list[int] = []
         self._frames: Counter[str] = Counter()
@@ -68,7 +71,9 @@ class CloudCheck:
             if not (is_again and np.array_equal(sectors, self._sectors[-1])):
                 self._sectors.append(sectors)
                 self._stamps_ns.append(sweep.stamp_ns)
-        self._coordinates = self._coordinates or _unit_text(sweep) or _coarse_text(sweep)
+        if self._count % LOOK_PERIOD == 0:
+            self._coordinates = self._coordinates or _unit_text(sweep) or _coarse_text(sweep)
+        self._count += 1
 
     @property
     def findings(self) -> list[str]:

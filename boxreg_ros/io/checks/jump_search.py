@@ -149,14 +149,20 @@ class JumpSearch:
         at most a times half of their time. A single wrong sample is a step there and one back.
 
         """
-        if row < 5 or not _is_step(*edge.poses[row - 3 : row - 1]):
+        if row < 5:
+            return
+        middle = edge.poses[row - 3 : row - 1]
+        is_displaced, is_turned = _is_displaced(*middle), _is_turned(*middle)
+        if not (is_displaced or is_turned):
             return
         stamps_ns = edge.stamps[row - 5 : row + 1]
         poses = np.array(edge.poses[row - 5 : row + 1])
         seconds = np.asarray(np.diff(stamps_ns) * 1e-9, float)
-        jump = _jump_of(np.diff(poses[:, :3], axis=0), seconds, MIN_STEP, MAX_EGO_ACCELERATION)
-        unit = 'm'
-        if not jump:
+        jump, unit = 0.0, 'm'
+        if is_displaced:
+            steps = np.diff(poses[:, :3], axis=0)
+            jump = _jump_of(steps, seconds, MIN_STEP, MAX_EGO_ACCELERATION)
+        if is_turned and not jump:
             turns = _turns_between(poses[:, 3:])
             jump = np.degrees(_jump_of(turns, seconds, MIN_STEP_ANGLE, MAX_EGO_YAW_ACCELERATION))
             unit = 'degrees'
@@ -165,10 +171,13 @@ class JumpSearch:
             self.jumps.append((key, stamps_ns[2], stamps_ns[3], float(jump)))
 
 
-def _is_step(one: Floats, other: Floats) -> bool:
+def _is_displaced(one: Floats, other: Floats) -> bool:
     """Return whether two poses (7,) are as far apart as the smallest jump."""
-    if np.linalg.norm(other[:3] - one[:3]) > MIN_STEP:
-        return True
+    return bool(np.linalg.norm(other[:3] - one[:3]) > MIN_STEP)
+
+
+def _is_turned(one: Floats, other: Floats) -> bool:
+    """Return whether two poses (7,) are turned to each other by as much as the smallest jump."""
     first, second = one[3:], other[3:]
     cosine_squared = (first @ second) ** 2 / ((first @ first) * (second @ second))
     return bool(cosine_squared < np.cos(MIN_STEP_ANGLE / 2) ** 2)
@@ -176,9 +185,7 @@ def _is_step(one: Floats, other: Floats) -> bool:
 
 def _jump_of(steps: Floats, seconds: Floats, least: float, acceleration: float) -> float:
     """Return how far the third of steps (5, 3) exceeds the motion around it; 0 if it may."""
-    if np.linalg.norm(steps[2]) <= least:
-        return 0.0
-    rate = np.median(steps / seconds[:, None], axis=0)
+    rate = np.sort(steps / seconds[:, None], axis=0)[2]  # their median
     steps = steps - rate * seconds[:, None]
     jump = steps[2]
     limit = max(least, acceleration * seconds[2] * seconds.sum() / 2)
