@@ -67,7 +67,6 @@ class FolderWriter:
         self.number = 0
         self.name = ''
         self.about: dict[str, Any] = asdict(provenance)
-        self._status: dict[str, dict[str, list[int]]] = {}  # frames by status and track
         self._used_stamps: Counter[int] = Counter()
         self.files = ExitStack()
         if self.has_kitti_camera:
@@ -170,9 +169,14 @@ class FolderWriter:
         write_cloud(path, points, frame.intensities)
 
     def note_status(self, track: str, status: str) -> None:
-        """Note a status of `NOTED_STATUS` of a track in this frame, see `noted_status`."""
+        """Note a status of `NOTED_STATUS` of a track in this frame, see `noted`."""
         if status in NOTED_STATUS:
-            self._status.setdefault(status, {}).setdefault(track, []).append(self.number)
+            self.note('status', status, track)
+
+    def note(self, what: str, value: str, track: str) -> None:
+        """Note a value of a track in this frame under a key of ``boxreg.json``, see `noted`."""
+        of_value = self.about.setdefault(what, {}).setdefault(value, {})
+        of_value.setdefault(track, []).append(self.number)
 
     def finish(self) -> None:
         """Complete the labels, before their files are closed."""
@@ -185,16 +189,14 @@ class FolderWriter:
             self.about['class_names'] = self.class_names.translated
         if self.class_names.uncounted:
             self.about['uncounted'] = dict(self.class_names.uncounted)
-        if self._status:
-            self.about['status'] = self._status
         write_provenance(self.folder, self.about)
 
 
-def noted_status(about: Mapping[str, Any]) -> dict[tuple[str, int], str]:
-    """Return the status by track and frame that `FolderWriter.note_status` has noted."""
+def noted(about: Mapping[str, Any], what: str) -> dict[tuple[str, int], str]:
+    """Return the values by track and frame that `FolderWriter.note` has noted."""
     return {
-        (track, number): status
-        for status, frames in about.get('status', {}).items()
+        (track, number): value
+        for value, frames in about.get(what, {}).items()
         for track, numbers in frames.items()
         for number in numbers
     }

@@ -3,8 +3,9 @@ KITTI tracking: one line per box, in the rectified frame of a camera.
 
 The folder is one sequence of the benchmark: ``label_02/0000.txt``, ``calib/0000.txt`` and
 ``velodyne/0000``. Boxes outside of the image are written too, with truncation 2 and a rectangle
-of -1. Occlusion is 3, unknown, where boxes have no attribute ``occluded``. Stamps and poses are in
-the files of `sidecar`.
+of -1. Occlusion is 3, unknown, where boxes have no attribute ``occluded``. Truncation is that of
+the rectangle where they have no attribute ``truncated``: those that have are in ``boxreg.json``.
+Stamps and poses are in the files of `sidecar`.
 
 """
 
@@ -18,7 +19,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.attributes import FALSE, is_set, OCCLUDED, PARTLY, TRUE, TRUNCATED
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.files import at, following, read_provenance, require_single, visible
-from boxreg_ros.labels.folder import FolderWriter, noted_status
+from boxreg_ros.labels.folder import FolderWriter, noted
 from boxreg_ros.labels.protocol import (
     absolute,
     Format,
@@ -80,6 +81,7 @@ class Writer(FolderWriter):
         self._file = self.text_file(f'label_02/{SEQUENCE}.txt')
         self._tracks = TrackNumbers()
         self._given_classes: dict[str, str] = {}  # by number of the track and class as written
+        self.about[TRUNCATED] = {}
 
     def add(self, frame: LabelFrame) -> None:
         """Add the lines of a frame."""
@@ -96,6 +98,8 @@ class Writer(FolderWriter):
             attributes = array.attributes_of(row)
             cut = truncation_of(attributes, int(truncation[i]))
             self.note_status(str(track), frame.refined.status[row])
+            if TRUNCATED in attributes:
+                self.note(TRUNCATED, attributes[TRUNCATED], str(track))
             self._file.write(f'{self.number} {track} {name} {cut} {occlusion_of(attributes)} ')
             self._file.write(decimals(columns[i], array.scores[row]) + '\n')
 
@@ -295,11 +299,16 @@ def _placed(path: Path, lines: Mapping[int, FrameBoxes], camera: Camera) -> dict
     """Return the boxes of lines in the LiDAR frame; tracks have the names beside the file."""
     about = read_provenance(absolute(path).parent.parent)
     tracks, given = {NO_TRACK: ''} | about.get('tracks', {}), about.get('given_classes', {})
-    status = noted_status(about)
+    status, truncated = noted(about, 'status'), noted(about, TRUNCATED)
     found: dict[int, FrameBoxes] = {}
     for frame, (items, left_out) in lines.items():
         with following(path, 'rotations in radians'):
             boxes = boxes_of(camera, np.reshape([item.box for item in items], (-1, 7)))
+        if TRUNCATED in about:  # else they are labels of others, which state what they have
+            for item in items:
+                item.evidence['attributes'].pop(TRUNCATED, None)
+                if value := truncated.get((item.track_id, frame)):
+                    item.evidence['attributes'][TRUNCATED] = value
         placed = [
             item._replace(
                 track_id=tracks.get(item.track_id, item.track_id),

@@ -24,7 +24,7 @@ from xml.sax.saxutils import escape, unescape
 from boxreg_ros.config import Config
 from boxreg_ros.labels.attributes import attributes_from, OCCLUDED
 from boxreg_ros.labels.files import at, following, read_provenance, to_json
-from boxreg_ros.labels.folder import FolderWriter, noted_status
+from boxreg_ros.labels.folder import FolderWriter, noted
 from boxreg_ros.labels.kitti import attributes_of, occlusion_of, truncation_of
 from boxreg_ros.labels.protocol import (
     Format,
@@ -315,7 +315,7 @@ def _read_file(path: Path) -> _Content:
         if not is_swapped and OWN_COMMENT not in origin:
             return _content(root, _convention_of(root))
         content = _content(root, DATUMARO if is_swapped else KITTI_CONVENTION, is_own=True)
-    return content.with_status(noted_status(read_provenance(path.parent)))
+    return content.with_status(noted(read_provenance(path.parent), 'status'))
 
 
 def _frame_names(path: Path) -> list[str]:

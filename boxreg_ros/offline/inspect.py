@@ -362,9 +362,11 @@ def _command(args: argparse.Namespace, facts: dict[str, Any], scene: Address | N
     first = args.recordings[0]
     out = f'out/{first.stem if scene is None else scene.scene or scene.root.name}'
     words = ['boxreg', 'relabel', *map(str, args.recordings), '-o', out]
-    words += words_of(args, Request, *TOPICS)
-    advised = ADVISED.findall('; '.join(facts['warnings']))
-    words += shlex.split(' '.join(dict.fromkeys(advised)))
+    found = ADVISED.findall('; '.join(facts['warnings']))
+    advised = shlex.split(' '.join(dict.fromkeys(found)))
+    given = words_of(args, Request, *TOPICS)
+    words += [word for word in given if word.partition('=')[0] not in advised]
+    words += advised
     if facts['sample']['boxes_without_id'] and '--associate' not in words:
         words.append('--associate')
     words.append('--complete')

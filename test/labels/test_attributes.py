@@ -34,9 +34,7 @@ AS_READ = {
     'nuscenes': GIVEN,
     't4': GIVEN,
     'datumaro': (GIVEN[0], {'truncated': 'true'}, {}),  # CVAT: every box is occluded, or not
-    'kitti': (
-        {'occluded': 'true', 'truncated': 'false'}, GIVEN[1], {'truncated': 'false'},
-    ),
+    'kitti': ({'occluded': 'true'}, GIVEN[1], {}),
     'kitti_object': GIVEN,
     'openpcdet': GIVEN,
     'tracklets': ({'occluded': 'true'}, GIVEN[1], {}),

@@ -56,6 +56,10 @@ def test_the_command_has_the_options_that_warnings_advise(tmp_path, capsys):
     _, facts = facts_of(capsys, drive.write(tmp_path / 'drive'))
     assert '(boxreg relabel: --set reach=0.11)' in ' '.join(facts['warnings'])
     assert ' -o out/drive --size-scale 2 --set reach=0.11 --complete' in facts['command']
+    given = ['--points', '/points', '--size-scale', '4']  # what is advised takes its place
+    _, facts = facts_of(capsys, tmp_path / 'drive', *given)
+    expected = ' -o out/drive --points=/points --size-scale 2 --set reach=0.11 --complete'
+    assert expected in facts['command']
 
 
 def test_why_no_command_can_be_run(tmp_path, capsys):
