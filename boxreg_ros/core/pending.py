@@ -11,10 +11,10 @@ from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from math import hypot, inf
+from math import hypot, inf, prod
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.id_switches import SWITCH_SPEED
+from boxreg_ros.core.id_switches import is_other_size, switch_distance
 from boxreg_ros.core.method.margins import MIN_HITS
 from boxreg_ros.core.motion import motion_at
 from boxreg_ros.core.observation import Observation
@@ -26,10 +26,10 @@ from boxreg_ros.structures import (
     BoxArray,
     COASTED,
     Floats,
+    HEIGHT,
     is_valid_box,
     KEPT,
     KINEMATICS,
-    LENGTH,
     REFINED,
     RefinedBoxes,
 )
@@ -112,7 +112,7 @@ class PendingArray:
             return
         table = seen[0].table
         self.num_points[[one.row for one in boxes]] = table.num_points
-        places = table.boxes[:, : LENGTH + 1].tolist()
+        places = table.boxes[:, : HEIGHT + 1].tolist()
         for one, place in zip(boxes, places, strict=True):
             self.reasons[one.row] = Reason.SHORT_TRACK  # until there is an estimate
             self.observed[one.row] = one
@@ -216,7 +216,7 @@ class PendingBox:
     is_followed: bool = False
     array: PendingArray = field(init=False)
     place: list[float] = field(init=False)
-    """x y z length of the box as plain numbers, of which motion is computed [m]."""
+    """x y z length width height of the box as plain numbers, for id switches [m]."""
     estimate: tuple[Estimates, int] | None = None
     """Estimates of the windows that it was last in, and its row there."""
     is_settled: bool = False
@@ -307,7 +307,8 @@ class ObservedTrack:
         Move the last two observations to a new track if they are of another object.
 
         They are if both are farther from the constant velocity prediction than half the length
-        of the object and `SWITCH_SPEED`. A single one may be an outlier.
+        of the object and `switch_distance`, or of another size after a pause. A single one may be
+        an outlier.
 
         """
         recent = self.entries[-ID_SWITCH_OBSERVATIONS:]
@@ -315,23 +316,24 @@ class ObservedTrack:
             return None
         first, latest = recent[0], recent[-3]
         duration_ns = latest.stamp_ns - first.stamp_ns
-        first_x, first_y, _, _ = first.place
-        latest_x, latest_y, _, length = latest.place
+        first_x, first_y, *_ = first.place
+        latest_x, latest_y, _, *extents = latest.place
         for entry in (recent[-1], recent[-2]):
             elapsed_ns = entry.stamp_ns - latest.stamp_ns
-            part = elapsed_ns / duration_ns
+            seconds, part = elapsed_ns * 1e-9, elapsed_ns / duration_ns
             off_x = entry.place[0] - latest_x - part * (latest_x - first_x)
             off_y = entry.place[1] - latest_y - part * (latest_y - first_y)
-            if hypot(off_x, off_y) < length / 2 + SWITCH_SPEED * elapsed_ns * 1e-9:
+            is_near = hypot(off_x, off_y) < extents[0] / 2 + switch_distance(seconds)
+            if is_near and not is_other_size(prod(extents), prod(entry.place[3:]), seconds):
                 return None
         moved, seen = [copy(entry) for entry in self.entries[-2:]], self.seen[-2:]
         for entry in moved:
             entry.array.observed[entry.row] = entry
         del self.entries[-2:], self.seen[-2:]
         self.starts = self.starts[: len(self.entries)]
-        return ObservedTrack(
-            self.track_id, self.class_name, moved, seen, detected_ns=self.detected_ns
-        )
+        newest = moved[-1]
+        class_name = newest.array.input.class_names[newest.row]
+        return ObservedTrack(self.track_id, class_name, moved, seen, detected_ns=self.detected_ns)
 
     def write(self, estimate: Estimate, entries: list[PendingBox], length: int) -> None:
         """

@@ -10,12 +10,13 @@ from math import inf
 from typing import ClassVar, NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
-from boxreg_ros.core.id_switches import SWITCH_SPEED
+from boxreg_ros.core.id_switches import is_other_size, switch_distance
 from boxreg_ros.core.motion import EndMotion, motion_at, UNKNOWN_SPEED_DEVIATION
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import (
     BOX_CENTER,
+    BOX_EXTENT,
     Columns,
     concatenated,
     Floats,
@@ -197,10 +198,14 @@ class _Part:
             return np.inf
         if max_gap == inf:
             return 0.0
-        speed = UNKNOWN_SPEED if self._velocity is None else SWITCH_SPEED
-        velocity = np.zeros(3) if self._velocity is None else self._velocity
+        volumes = self._box[BOX_EXTENT].prod(), box[BOX_EXTENT].prod()
+        if is_other_size(*volumes, seconds):
+            return np.inf
+        velocity, reach = self._velocity, switch_distance(seconds)
+        if velocity is None:
+            velocity, reach = np.zeros(3), UNKNOWN_SPEED * seconds
         predicted = self._box[BOX_CENTER] + seconds * velocity
-        gate = self._box[LENGTH] / 2 + speed * seconds
+        gate = self._box[LENGTH] / 2 + reach
         return float(np.linalg.norm((box[BOX_CENTER] - predicted)[:2]) / gate)
 
     def add(self, row: int, stamp_ns: int, box: Floats) -> None:
