@@ -1,4 +1,4 @@
-"""Check of where boxes are: in another frame, mirrored, half as large, on their backs."""
+"""Check of where boxes are: in another frame, mirrored, on their backs."""
 
 from __future__ import annotations
 
@@ -42,14 +42,7 @@ MIN_RATIO_OF_COVERAGE = 1.5
 """
 Factor by which another place must be better, in the sum over the boxes.
 
-Chosen: on the sample the right place has 4 times that of the second, and twice its size 0.75.
-
-"""
-MIN_RATIO_OF_SIZES = 3.0
-"""
-Factor by which larger boxes must be better, in the mean: more of them have points around them.
-
-Chosen: half extents contain a tenth of what the whole ones do.
+Chosen: on the sample the right place has 4 times that of the second.
 
 """
 MAX_FLAT = 1e-5
@@ -69,7 +62,7 @@ NO_FRAMES: Mapping[str, Floats] = {}
 
 @dataclass(slots=True)
 class _Place:
-    """A place and size that the boxes may have, and the option that gives it."""
+    """A place that the boxes may have, and the option that gives it."""
 
     option: str
     value: str
@@ -102,15 +95,10 @@ class PlaceCheck(PairedCheck):
     def __init__(self, convention: Convention) -> None:
         super().__init__()
         self._convention = convention
-        scale = 2 * convention.size_scale
         mirrored = replace(convention, orientation='left_handed')
-        doubled = replace(convention, size_scale=scale)
         self._other_order = other_order(convention)
         self._own = _Place('', '')
-        self._others = {
-            'mirrored': _Place('orientation', 'left_handed', mirrored),
-            'doubled': _Place('size_scale', f'{scale:g}', doubled),
-        }
+        self._others = {'mirrored': _Place('orientation', 'left_handed', mirrored)}
         # As read, and with w at the other end of the quaternion: cosine of the tilt.
         self._tilts: list[tuple[float, float]] = []
         self._heights: list[float] = []  # in the frame of the messages
@@ -237,8 +225,6 @@ class PlaceCheck(PairedCheck):
         if not fitting:
             return ''
         best = max(fitting, key=lambda place: place.total)
-        if best.option == 'size_scale':
-            return ''  # `PoseCheck` names it, and the classes that have it
         got = {
             'orientation': repr(self._convention.orientation),
             'boxes_frame': 'that of the messages',
@@ -259,12 +245,9 @@ class PlaceCheck(PairedCheck):
 
     def _is_better(self, place: _Place) -> bool:
         """Return whether the boxes belong to another place, and not where they are."""
-        own = self._own
         if len(place.coverages) < ENOUGH_BOXES or place.mean < MIN_COVERAGE:
             return False
-        if place.option == 'size_scale' and place.mean < MIN_RATIO_OF_SIZES * own.mean:
-            return False
-        return place.total >= MIN_RATIO_OF_COVERAGE * own.total
+        return place.total >= MIN_RATIO_OF_COVERAGE * self._own.total
 
 
 def uprightness(boxes: Floats) -> Floats:
