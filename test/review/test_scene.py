@@ -333,15 +333,20 @@ def test_a_run_follows_added_objects_beside_its_other_steps(drive, tmp_path, cap
     assert "expected frame 'odom', got 'map'" in capsys.readouterr().err
 
 
-def test_a_box_is_fitted_to_the_points_at_a_place():
-    rng = np.random.default_rng(3)
+def road_and_vehicle(rng, yaw, center, size):
+    """Return points of a road, and of the side and the rear of a vehicle on it."""
     road = np.column_stack([rng.uniform(-15, 25, (4000, 2)), rng.normal(0, 0.02, 4000)])
-    yaw, center, size = math.radians(20), np.array([12.0, 4.0]), np.array([4.4, 1.8, 1.5])
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     local = rng.uniform(-0.5, 0.5, (600, 2)) * size[:2]
-    local[:400, 1] = -size[1] / 2  # the side and the rear are seen from the origin
+    local[:400, 1] = -size[1] / 2
     local[400:, 0] = -size[0] / 2
-    car = np.column_stack([local @ turn.T + center, rng.uniform(0.2, 1.5, 600)])
+    return road, np.column_stack([local @ turn.T + center, rng.uniform(0.2, size[2], 600)])
+
+
+def test_a_box_is_fitted_to_the_points_at_a_place():
+    rng = np.random.default_rng(3)
+    yaw, center, size = math.radians(20), np.array([12.0, 4.0]), np.array([4.4, 1.8, 1.5])
+    road, car = road_and_vehicle(rng, yaw, center, size)
     post = np.column_stack([rng.normal([12, 8], 0.05, (50, 2)), rng.uniform(0.3, 2, 50)])
     points = np.concatenate([road, car, post])
     sizes = {'car': size, 'bus': np.array([12.0, 2.6, 3.2])}
@@ -364,16 +369,10 @@ def test_a_box_is_fitted_to_the_points_at_a_place():
 
 def test_a_box_is_drawn_with_the_class_the_width_and_the_height_of_its_points():
     """A van half as high again as a car, whose roof is not seen, and an object of no points."""
-    rng = np.random.default_rng(5)
-    road = np.column_stack([rng.uniform(-15, 25, (4000, 2)), rng.normal(0, 0.02, 4000)])
     yaw, center, size = math.radians(30), np.array([12.0, 4.0]), np.array([5.2, 2.0, 2.4])
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    local = rng.uniform(-0.5, 0.5, (600, 2)) * size[:2]
-    local[:400, 1] = -size[1] / 2
-    local[400:, 0] = -size[0] / 2
-    van = np.column_stack([local @ turn.T + center, rng.uniform(0.2, size[2], 600)])
+    road, van = road_and_vehicle(np.random.default_rng(5), yaw, center, size)
     points = np.concatenate([road, van])
-    half = size[0] / 2 * turn[:, 0]
+    half = size[0] / 2 * np.array([np.cos(yaw), np.sin(yaw)])
     found = drawn(points, center - half, center + half, USUAL_EXTENTS)
     truth = np.array([*center, size[2] / 2, *size, 0, 0, yaw])
     assert iou_3d(found.box[None], truth[None])[0] > 0.9
