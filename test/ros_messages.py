@@ -374,6 +374,18 @@ class Drive:
         at = [i for i, item in enumerate(self.items) if item[0] == topic][index]
         change(self.items[at][2])
 
+    def add_ghost(self, index):
+        """Add a box of track 9, far from all points, to message number `index` of boxes."""
+
+        def add(message):
+            (ghost,) = self.messages.boxes(
+                DETECTIONS, 0, 'lidar', [(9, ((30, 30, 0), (0, 0, 0, 1)), (4, 2, 1.5))]
+            ).detections
+            ghost.header = message.detections[0].header
+            message.detections.append(ghost)
+
+        self.replace('/boxes', index, add)
+
     def write(self, path, storage='mcap'):
         """Write the recording and return its path."""
         return write_recording(path, self.items, storage, self.messages)

@@ -37,17 +37,8 @@ def spoiled():
         drive.replace('/boxes', k, lambda message: message.detections.pop(1))
     for k in range(SWEEPS - 3, SWEEPS):
         drive.replace('/boxes', k, lambda message: message.detections.pop(0))
-
-    def add_ghost(message):
-        ghost = drive.messages.boxes(
-            'vision_msgs/msg/Detection3DArray', 0, 'lidar',
-            [(9, ((30, 30, 0), (0, 0, 0, 1)), (4, 2, 1.5))],
-        ).detections[0]  # fmt: skip
-        ghost.header = message.detections[0].header
-        message.detections.append(ghost)
-
     for k in (8, 9):
-        drive.replace('/boxes', k, add_ghost)
+        drive.add_ghost(k)
     return drive
 
 

@@ -210,16 +210,7 @@ def test_every_format_has_added_boxes_and_no_rejected_ones(tmp_path):
     recorded = Recorded(sweeps=14)
     for k in (4, 5, 6):  # the moving car is missing
         recorded.replace('/boxes', k, lambda message: message.detections.pop(1))
-
-    def add_ghost(message):
-        ghost = recorded.messages.boxes(
-            'vision_msgs/msg/Detection3DArray', 0, 'lidar',
-            [(9, ((30, 30, 0), (0, 0, 0, 1)), (4, 2, 1.5))],
-        ).detections[0]  # fmt: skip
-        ghost.header = message.detections[0].header
-        message.detections.append(ghost)
-
-    recorded.replace('/boxes', 8, add_ghost)
+    recorded.add_ghost(8)
     path_ = recorded.write(tmp_path / 'drive')
     request = Request((path_,), formats=(*FORMATS, 'mcap'), config=ALL_STEPS)
     summary = relabel(request, tmp_path / 'out')
