@@ -460,13 +460,13 @@ class _Poses:
         """Return boxes with those of connected systems in the first of these."""
         joined: dict[str, list[ReadBox]] = {}
         for system, items in boxes.items():
-            targets = ((target, self._between(target, system)) for target in joined)
-            target, T = next(((name, T) for name, T in targets if T is not None), (system, None))
-            if T is None:
+            reached = self._reached(system)
+            target = next((name for name in joined if name in reached), None)
+            if target is None:
                 joined[system] = items
                 continue
             known = {box.track_id for box in joined[target]}
-            moved = moved_boxes(np.reshape([box.box for box in items], (-1, 9)), T)
+            moved = moved_boxes(np.reshape([box.box for box in items], (-1, 9)), reached[target])
             joined[target] += [
                 box._replace(box=row)
                 for box, row in zip(items, moved, strict=True)
@@ -492,10 +492,6 @@ class _Poses:
         if not fixed:
             return system, '', None
         return fixed[-1], system, connected[fixed[-1]]
-
-    def _between(self, target: str, source: str) -> Floats | None:
-        """Return T_target_source (4, 4); None if it is not known."""
-        return self._reached(source).get(target)
 
     def _reached(self, source: str) -> dict[str, Floats]:
         """Return T_name_source (4, 4) of all connected systems, the nearest first."""

@@ -147,7 +147,7 @@ def writer_for(
 
     """
     module = module_of(name)
-    folder = _folder_of(name, out)
+    folder = out if name in IN_RESULT_FOLDER else out / name
     folder.mkdir(exist_ok=True)
     return module.Writer(folder, provenance, options or Options())
 
@@ -234,7 +234,3 @@ def import_format(name: str) -> FormatModule:
             f'format {name!r} of another package: expected a module {FORMATS[name]}, got '
             f'{type(error).__name__}: {error}; update or uninstall that package'
         ) from None
-
-
-def _folder_of(name: str, out: Path) -> Path:
-    return out if name in IN_RESULT_FOLDER else out / name

@@ -197,7 +197,8 @@ class McapFile:
         """Yield the attachments and the metadata; damaged ones are noted and left out."""
         for first_byte in self._extras:
             try:
-                record: Any = self._record_at(first_byte)
+                self._file.seek(first_byte)
+                record: Any = next(self._records())
             except TransferError:
                 raise
             except Exception as error:  # of the library, for any malformed content
@@ -373,10 +374,6 @@ class McapFile:
             stream, skip_magic=skip_magic, emit_chunks=True, validate_crcs=not skip_magic
         )
         return reader.records
-
-    def _record_at(self, first_byte: int) -> records.McapRecord:
-        self._file.seek(first_byte)
-        return next(self._records())
 
     def _messages_of(self, place: Chunk) -> list[records.Message]:
         """Return the messages of a part; none, and a damage is noted, if it is damaged."""
