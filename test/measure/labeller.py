@@ -371,9 +371,7 @@ class Labeller:
             self._look()
         self._join()
         self._add()
-        self.key('Control+s')
-        self._page.wait_for_function("$('notice').textContent.includes('boxes in')",
-                                     timeout=600_000)  # fmt: skip
+        self._save()
 
     def label(self):
         """Label a drive without boxes: what is proposed, then the objects with the most points."""
@@ -389,6 +387,10 @@ class Labeller:
             rows = np.flatnonzero(ids == name)
             self._draw(self._truth.boxes[self._row_to_draw(rows)])
             self._keep('drawn')
+        self._save()
+
+    def _save(self):
+        """Save the decisions, and wait for the run with them."""
         self.key('Control+s')
         self._page.wait_for_function("$('notice').textContent.includes('boxes in')",
                                      timeout=600_000)  # fmt: skip
