@@ -229,12 +229,15 @@ class LatencyEvidence:
             drifts = self._latency.drifts
             half = len(self._samples) // 2
             older, newer = known.part(0, half), known.part(half, MAX_SAMPLES)
-            if not drifts and _differ(older, newer):
-                drifts = True
+            is_new = not drifts and _differ(older, newer)
+            if is_new:
                 known = newer
                 for _ in range(half):
                     self._samples.popleft()
-            found = _estimated(known)._replace(drifts=drifts)
+            found = _estimated(known)
+            # Where nothing was or is corrected, a few objects erred for a while.
+            drifts |= is_new and bool(self._latency.seconds or found.seconds)
+            found = found._replace(drifts=drifts)
             if abs(found.seconds - self._latency.seconds) < STEP:
                 found = found._replace(seconds=self._latency.seconds)
             self._latency = found

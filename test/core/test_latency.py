@@ -174,6 +174,12 @@ def test_a_latency_that_drifts_is_followed_and_said(sample_drive):
     assert 'drifts' in found.warning
 
 
+def test_a_change_of_errors_that_corrects_nothing_is_no_drift(sample_drive, monkeypatch):
+    monkeypatch.setattr('boxreg_ros.core.latency._differ', lambda older, newer: True)
+    found = estimated(sample_drive.sweeps, sample_drive.boxes)
+    assert (found.seconds, found.drifts, found.warning) == (0.0, False, '')
+
+
 def boxes_of(truth, stamps_ns, **more):
     """Return an array per box of an object."""
     return [
