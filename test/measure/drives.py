@@ -84,12 +84,16 @@ class Drive(drive.Drive):
             for name, results in self.refined(config).items()
         }
 
+    def items(self) -> list[Sweep | BoxArray]:
+        """Return sweeps and boxes in the order of their stamps, each sweep before its boxes."""
+        items: list[Sweep | BoxArray] = [*self.sweeps, *self.boxes]
+        return sorted(items, key=lambda item: item.stamp_ns)
+
     def refined(self, config: Config) -> dict[str, list[RefinedBoxes]]:
         """Return the same with covariances and status, one result for each box array."""
         registrar = BoxRegistrar(config)
         results: list[RefinedBoxes] = []
-        items: list[Sweep | BoxArray] = [*self.sweeps, *self.boxes]
-        for item in sorted(items, key=lambda item: item.stamp_ns):
+        for item in self.items():
             results += hand_to_registrar(registrar, item, restarts=False)
         results += registrar.flush()
         found: dict[str, list[RefinedBoxes]] = {}

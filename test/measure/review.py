@@ -12,8 +12,6 @@ import math
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import iou_3d, pose_errors
-from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.offline.consistency import CONSISTENCY_VARIABLES
 from boxreg_ros.review.changes import Changes, median
 from boxreg_ros.review.corrections import Corrections
@@ -86,17 +84,10 @@ def measure(drive):
 
 def refined_tracks(drive):
     """Return the tracks of a drive before and after registration of whole tracks."""
-    given = {}
     changes = Changes(drive.truth.frame_id)
-    registrar = BoxRegistrar(Config())
-    items = [*drive.sweeps, *drive.boxes]
-    results = []
-    for item in sorted(items, key=lambda item: item.stamp_ns):
-        if isinstance(item, BoxArray):
-            item = replace(item, ticket=len(given))
-            given[item.ticket] = item
-        results += hand_to_registrar(registrar, item, restarts=False)
-    for refined in [*results, *registrar.flush()]:
+    given = [replace(array, ticket=row) for row, array in enumerate(drive.boxes)]
+    (results,) = replace(drive, boxes=tuple(given)).refined(Config()).values()
+    for refined in results:
         changes.add(given[refined.boxes.ticket], refined)
     return changes.tracks()
 

@@ -120,13 +120,13 @@ class FarMisses:
 def _rows(whole, drive, coast):
     """Yield the scores of the registered tracks of the `whole` drive, then of the broken one."""
     config = Config(estimate='final' if coast else 'track')
-    yield UNBROKEN, _row(_registered(_items(whole), config), whole)
+    yield UNBROKEN, _row(whole.refined(config)[config.estimate], whole)
     yield from with_coast(drive, coast) if coast else after_each_step(drive)
 
 
 def after_each_step(drive):
     """Yield the scores of the input, of registration alone, and with one more step each."""
-    items = _items(drive)
+    items = drive.items()
     yield 'input', _input_row(drive)
     config = Config()
     first = first_pass(((item, False) for item in items), config)
@@ -139,27 +139,10 @@ def after_each_step(drive):
 
 def with_coast(drive, seconds):
     """Yield the scores of the input, and of final boxes without and with `coast` [s]."""
-    items = _items(drive)
     yield 'input', _input_row(drive)
     for name, coast in (('final', 0.0), (f'coast {seconds:g} s', seconds)):
         config = Config(estimate='final', coast=coast)
-        yield name, _row(_registered(items, config), drive)
-
-
-def _items(drive):
-    """Return sweeps and boxes in the order of their stamps, each sweep before its boxes."""
-    items = [*drive.sweeps, *drive.boxes]
-    return sorted(items, key=lambda item: item.stamp_ns)
-
-
-def _registered(items, config):
-    """Return the last estimates of all box arrays."""
-    registrar = BoxRegistrar(config)
-    results = []
-    for item in items:
-        results += hand_to_registrar(registrar, item, restarts=False)
-    results += registrar.flush()
-    return [result for result in results if result.is_final]
+        yield name, _row(drive.refined(config)[config.estimate], drive)
 
 
 def _input_row(drive):
