@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, groupby, pairwise
+from operator import itemgetter
 from typing import NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.reasons import Reason
-from boxreg_ros.review.decisions import Decision, held, MAX_STAMP_NS, Scope
+from boxreg_ros.review.decisions import Decision, held, MAX_STAMP_NS, Scope, TOPIC_OF
 from boxreg_ros.structures import (
     BOX_EXTENT,
     BoxArray,
@@ -29,16 +30,19 @@ if TYPE_CHECKING:
 SAME_SWEEP_NS = 50_000_000
 """Boxes are of a sweep if its stamp is nearer than this [ns]; chosen: half a revolution."""
 WITHOUT_EFFECT = ('accept', 'unsure', 'none')
+STATED = ('reclass', 'attribute')
+"""Kinds whose values the boxes of a result state, but not whose values they are."""
 
 
 class _Applied(NamedTuple):
     """What was decided about one box of the result; empty for nothing."""
 
     stamp_ns: int
-    class_name: str
+    input_id: str
     track_id: str
     judgement: str
     of_track: str  # judgement of its whole track
+    stated: Mapping[str, Decision]  # by topic: those of `STATED`, with the value of the box
 
 
 class Corrections:
@@ -51,7 +55,7 @@ class Corrections:
     have one that is `rejected`, named by id and stamp. The steps that complete tracks ask for the
     decisions as `tracks.decided.Decided`, after the boxes of the input have passed `to_register`.
     `earlier` decisions are those that the boxes of the input have already, see `applied`; whatever
-    class such a box has, it is that of a person.
+    class or attribute such a box has, it is that of a person.
 
     """
 
@@ -63,9 +67,9 @@ class Corrections:
     ) -> None:
         self._rejected = rejected
         decisions, earlier = [*decisions], held(earlier)
-        others = (one for one in earlier if one.kind != 'reclass')
+        others = (one for one in earlier if one.kind not in STATED)
         self._of_track = _by_track(held([*others, *decisions]))
-        self._earlier_classes = _by_track(one for one in earlier if one.kind == 'reclass')
+        self._earlier = _by_track(one for one in earlier if one.kind in STATED)
         self._unused = {
             one.scope
             for one in held(decisions)
@@ -176,13 +180,14 @@ class Corrections:
     def class_name(self, input_id: str, stamp_ns: int) -> str:
         """Return the class that was given to a box, or one of a person has; empty for none."""
         known = self._human_classes.get((input_id, stamp_ns), '')
+        earlier = self._stated_earlier(input_id, stamp_ns).get('class')
         decided = self._value('class', input_id, stamp_ns)
-        return decided or known or self._earlier_class(input_id, stamp_ns)
+        return decided or known or (earlier.value if earlier else '')
 
-    def _earlier_class(self, track_id: str, stamp_ns: int) -> str:
-        """Return the class that a box was given in an earlier run; empty for none."""
-        rows = reversed(self._earlier_classes.get(track_id, ()))
-        return next((one.value for one in rows if one.covers(stamp_ns)), '')
+    def _stated_earlier(self, track_id: str, stamp_ns: int) -> dict[str, Decision]:
+        """Return what an earlier run has given to a box, or would have, by topic."""
+        rows = self._earlier.get(track_id, ())
+        return {one.topic: one for one in rows if one.covers(stamp_ns)}
 
     def is_left_out(self, input_id: str, stamp_ns: int) -> bool:
         """
@@ -274,7 +279,7 @@ class Corrections:
         given = given.plain()  # `with_attributes` gives the result its own
         for row, is_pinned in enumerate(given.is_pinned.tolist()):
             track_id = given.track_ids[row]
-            if is_pinned or self._earlier_class(track_id, given.stamp_ns):
+            if is_pinned or 'class' in self._stated_earlier(track_id, given.stamp_ns):
                 self._human_classes[track_id, given.stamp_ns] = given.class_names[row]
         if not self._of_track:
             return given
@@ -369,23 +374,30 @@ class Corrections:
         """
         Return a result of `apply` with the attributes of its boxes, as decided or as in the input.
 
-        A box that the input does not have has those of the box before it in its track. Results
-        are given in the order of stamps.
+        A box that the input does not have has those of the box before it in its track, without
+        those that a person gave to that one. Results are given in the order of stamps.
 
         """
-        if not (self._of_track or self._before or given.attributes):
+        if not (self._of_track or self._earlier or self._before or given.attributes):
             return refined  # no box has had any so far
         found: list[Mapping[str, str]] = []
         for row, track_id in enumerate(refined.boxes.track_ids):
             if row < len(given.track_ids):
                 own, input_id = given.attributes_of(row), given.track_ids[row]
-                self._before[track_id] = input_id, own
+                earlier = self._stated_earlier(input_id, given.stamp_ns).values()
+                names = {one.attribute[0] for one in earlier if one.kind == 'attribute'}
+                left = {name: value for name, value in own.items() if name not in names}
+                self._before[track_id] = input_id, left
             else:
                 input_id, own = self._before.get(track_id) or (self._first_id(track_id), {})
                 input_id = self.origin_of(given.stamp_ns, track_id) or input_id
+                earlier = self._stated_earlier(input_id, given.stamp_ns).values()
+                own = {**own, **dict(one.attribute for one in earlier if one.kind == 'attribute')}
+            decided = self._last_attributes(input_id, given.stamp_ns)
+            values = {**own, **dict(one.attribute for one in decided)}
+            found.append({name: value for name, value in values.items() if value})
             if refined.status[row] != REJECTED:
-                self._note(track_id, input_id, given.stamp_ns)
-            found.append({**own, **self._decided_attributes(input_id, given.stamp_ns)})
+                self._note(track_id, input_id, given.stamp_ns, found[-1])
         attributes = tuple(found) if any(found) else ()
         return replace(refined, boxes=replace(refined.boxes, attributes=attributes))
 
@@ -394,7 +406,7 @@ class Corrections:
         Return the decisions that the boxes of all results have, about the ids of the results.
 
         A later run on these boxes, as labels, is bound by them: tables of labels do not state
-        which classes and ids are those of a person.
+        which classes, ids and attributes are those of a person.
 
         """
         found: list[Decision] = []
@@ -409,8 +421,8 @@ class Corrections:
                     one._replace(judgement='' if one.judgement == 'reject' else 'accept')
                     for one in rows
                 ]
+            found += _stated(track_id, rows)
             for kind, values in (
-                ('reclass', [one.class_name for one in rows]),
                 ('rename', [one.track_id for one in rows]),
                 ('accept', [one.judgement == 'accept' for one in rows]),
                 ('reject', [one.judgement == 'reject' for one in rows]),
@@ -453,17 +465,31 @@ class Corrections:
                     found.append(Decision(name, span[0], kind, end_ns=span[1]))
         return found
 
-    def _note(self, track_id: str, input_id: str, stamp_ns: int) -> None:
-        """Note what was decided about a box of a result."""
+    def _note(
+        self, track_id: str, input_id: str, stamp_ns: int, attributes: Mapping[str, str]
+    ) -> None:
+        """Note what was decided about a box of a result, which has these attributes."""
         judgement = self._judgement(input_id, stamp_ns)
         of_track = self._judgement(input_id, MAX_STAMP_NS + 1)  # of no box
+        own = self._last('class', input_id, stamp_ns), *self._last_attributes(input_id, stamp_ns)
+        known = self._stated_earlier(input_id, stamp_ns)
+        known |= {one.topic: one for one in own if one is not None}
+        stated = {}
+        for topic, one in known.items():
+            name, _ = one.attribute
+            value = self.class_name(input_id, stamp_ns)
+            if topic != 'class':
+                value = f'{name}={attributes[name]}' if name in attributes else ''
+            if value:
+                stated[topic] = replace(one, track_id=input_id, value=value)
         self._of_result.setdefault(track_id, []).append(
             _Applied(
                 stamp_ns,
-                self.class_name(input_id, stamp_ns),
+                input_id,
                 self.track_id(input_id, stamp_ns),
                 '' if judgement is None else judgement.kind,
                 '' if of_track is None else of_track.kind,
+                stated,
             )
         )
 
@@ -472,12 +498,12 @@ class Corrections:
         renames = (one for one in self._of_kind('rename') if one.value == track_id)
         return next((one.track_id for one in renames), track_id)
 
-    def _decided_attributes(self, input_id: str, stamp_ns: int) -> dict[str, str]:
-        topics = dict.fromkeys(
-            one.topic for one in self._of_track.get(input_id, ()) if one.kind == 'attribute'
-        )
+    def _last_attributes(self, input_id: str, stamp_ns: int) -> list[Decision]:
+        """Return the last decision about each attribute of a box."""
+        rows = self._of_track.get(input_id, ())
+        topics = dict.fromkeys(one.topic for one in rows if TOPIC_OF[one.kind] == 'attribute')
         found = (self._last(topic, input_id, stamp_ns) for topic in topics)
-        return dict(one.attribute for one in found if one is not None)
+        return [one for one in found if one is not None]
 
     def _left(self, given: BoxArray) -> list[int]:
         """Return the rows of the boxes that are not deleted."""
@@ -576,6 +602,37 @@ def _ranges(
             span = (None, None) if is_whole else (within[0], within[-1])
             text = value if isinstance(value, str) else ''
             found.append(Decision(track_id, span[0], kind, end_ns=span[1], value=text))
+    return found
+
+
+def _stated(track_id: str, rows: Sequence[_Applied]) -> list[Decision]:
+    """
+    Return the classes and attributes that the boxes of a track were given, as ranges.
+
+    They go as far as what was decided, also where there are no boxes yet: a box between two others
+    is one of the track in the input that the first is of.
+
+    """
+    found = []
+    for topic in dict.fromkeys(topic for row in rows for topic in row.stated):
+        values = [row.stated.get(topic) for row in rows]
+        free_ns, before = -MAX_STAMP_NS, rows[0].input_id  # first stamp of the gap, box before it
+        groups = groupby(zip(values, rows, strict=True), itemgetter(0))
+        parts = [(one, [row for _, row in group]) for one, group in groups]
+        ends_ns = [part[0].stamp_ns - 1 for _, part in parts[1:]]
+        for (one, part), end_ns in zip(parts, [*ends_ns, MAX_STAMP_NS], strict=True):
+            last_ns = part[-1].stamp_ns
+            if one is not None:
+                first_ns, last_ns = _span_of(one)
+                is_alike = before == one.track_id
+                first_ns = max(first_ns, free_ns if is_alike else part[0].stamp_ns)
+                last_ns = min(last_ns, end_ns)
+                is_whole = (first_ns, last_ns) == (-MAX_STAMP_NS, MAX_STAMP_NS)
+                span = (None, None) if is_whole else (first_ns, last_ns)
+                found.append(
+                    Decision(track_id, span[0], one.kind, end_ns=span[1], value=one.value)
+                )
+            free_ns, before = last_ns + 1, part[-1].input_id
     return found
 
 

@@ -39,7 +39,7 @@ KINDS_OF_TOPIC: Mapping[str, tuple[str, ...]] = {
     'id': ('rename',),
     'class': ('reclass',),
     'addition': ('add', 'withdraw'),
-    'attribute': ('attribute',),
+    'attribute': ('attribute', 'remove'),
 }
 """Kinds of decisions by topic: a decision replaces those of its topic about the same boxes."""
 WITH_BOX = ('pin', 'add')
@@ -80,7 +80,8 @@ class Decision:
     end_ns: int | None = None
     """Last stamp of a range [ns]; None for one box, or the whole track."""
     value: str = ''
-    """New id or class, or an attribute: NAME=VALUE, without a value to take it back."""
+    """New id or class, or an attribute: NAME=VALUE, without a value to take it back; NAME of one
+    to remove."""
     who: str = ''
     when: str = ''
     """In UTC (ISO 8601)."""
@@ -95,9 +96,10 @@ class Decision:
         self._check_stamps()
         if self.kind in WITH_BOX:
             self._check_box()
-        if self.kind == 'attribute' and not (self.attribute[0] and '=' in self.value):
+        expected = {'attribute': 'NAME=VALUE', 'remove': 'NAME'}.get(self.kind)
+        if expected and not (self.attribute[0] and ('=' in self.value) == ('=' in expected)):
             raise RecordingError(
-                f'attribute of track {self.track_id!r:.80}: expected NAME=VALUE, got '
+                f'{self.kind} of track {self.track_id!r:.80}: expected {expected}, got '
                 f'{self.value!r:.80}; decide again, or remove the row'
             )
 
@@ -131,11 +133,11 @@ class Decision:
     def topic(self) -> str:
         """Return the topic of the decision: of `KINDS_OF_TOPIC`, an attribute with its name."""
         topic = TOPIC_OF[self.kind]
-        return f'{topic} {self.attribute[0]}' if self.kind == 'attribute' else topic
+        return f'{topic} {self.attribute[0]}' if topic == 'attribute' else topic
 
     @property
     def attribute(self) -> tuple[str, str]:
-        """Return name and value of an attribute."""
+        """Return name and value of an attribute; the value is empty for one to remove."""
         name, _, value = self.value.partition('=')
         return name, value
 

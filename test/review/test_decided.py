@@ -423,13 +423,15 @@ def test_attributes_of_label_files_pass_a_run(completed, tmp_path):
     lines = [f'{row["stamp_ns"]},2,colour,red' for row in keyframes[:4]]
     (labels / 'attributes.csv').write_text('\n'.join(['stamp_ns,track_id,name,value', *lines]))
     recording = out.parent / 'drive'
-    deleted = Decision('2', stamps[1], 'delete')
-    again = Run(recording, '--complete', f'--labels=csv:{labels}')(tmp_path / 'out', [deleted])
+    decisions = [
+        Decision('2', stamps[1], 'delete'), Decision('2', stamps[2], 'remove', value='colour'),
+    ]  # fmt: skip
+    again = Run(recording, '--complete', f'--labels=csv:{labels}')(tmp_path / 'out', decisions)
     assert words_of(again, '2', stamps)[1] == 'rejected'
     found = attributes_in(tmp_path / 'out')
     assert [words_of(again, '2', stamps)[k] for k in GAP] == ['interpolated'] * 3
     assert [found.get(('2', stamp), {}).get('colour', '') for stamp in stamps] == [
-        'red' if k < 7 else '' for k in range(SWEEPS)
+        'red' if k < 7 and k != 2 else '' for k in range(SWEEPS)
     ]
 
 
@@ -460,6 +462,11 @@ def test_attributes_are_set_in_the_page(completed, tmp_path):
         page.keyboard.press('Escape')
         press(page, 'z', 'attributesAt(3).weather === undefined')
         press(page, 'y', "attributesAt(3).weather === 'rain'")
+        page.keyboard.press('x')
+        page.wait_for_selector('#ask[open]')
+        page.fill('#ask-text', 'parked=')
+        press(page, 'Enter', 'attributesAt(3).parked === undefined')
+        press(page, 'z', "attributesAt(3).parked === 'true'")
     found = [(one.stamp_ns, one.end_ns, one.value) for one in read_decisions(out / DECISIONS)]
     assert found[:2] == [(None, None, 'parked=true'), (stamps[2], stamps[4], 'weather=rain')]
 
@@ -538,6 +545,24 @@ def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, op
     DecisionLog(decided / DECISIONS).append([Decision('2', stamps[4], 'delete')])
     newer = f'do not have all decisions of {decided / DECISIONS}'
     assert all(newer in request.unbound_text() for request in requests)
+
+
+def test_ranges_end_in_later_runs_where_a_person_ended_them(completed, tmp_path):
+    """A class reaches the box that is added within its range, an attribute none beyond."""
+    _, stamps, _, out = completed
+    recording = out.with_name('drive')
+    decisions = [
+        Decision('2', stamps[1], 'reclass', end_ns=stamps[GAP[0]], value='truck'),
+        Decision('2', stamps[1], 'attribute', end_ns=stamps[GAP[0] - 1], value='occluded=partly'),
+    ]
+    Run(recording)(tmp_path / '0', decisions)
+    for k in (1, 2):
+        labels = f'--labels=csv:{tmp_path / str(k - 1)}'
+        rows = Run(recording, '--complete', labels)(tmp_path / str(k))
+        is_truck = [rows['2', stamp]['class_name'] == 'truck' for stamp in stamps]
+        assert is_truck == [1 <= j <= GAP[0] for j in range(SWEEPS)]
+        found = attributes_in(tmp_path / str(k))
+        assert found == {('2', stamp): {'occluded': 'partly'} for stamp in stamps[1 : GAP[0]]}
 
 
 @pytest.mark.parametrize('first', [2, 8])

@@ -175,8 +175,10 @@ async function classify(name) {
 const USUAL_ATTRIBUTES = ['occluded=true', 'occluded=partly', 'truncated=true', 'parked=true'];
 function attributesAt(row) {
   const [s, k] = boxAt(row), found = { ...view.part.attributes?.[row] };
-  const decided = (log.ofInput.get(inputOf(s, k)) ?? []).filter(one => one.decision === 'attribute' && covers(one, stampOf(s, k)));
-  for (const { value } of decided) found[value.split('=')[0]] = value.slice(value.indexOf('=') + 1);
+  for (const { decision, value } of covering('attribute', inputOf(s, k), stampOf(s, k))) {
+    if (decision === 'remove') delete found[value];
+    else found[value.split('=')[0]] = value.slice(value.indexOf('=') + 1);
+  }
   return found;
 }
 
@@ -192,11 +194,12 @@ async function describe(isBox) {
     const [name, value] = one.split('=');
     return held[name] === value ? `${name}=false` : one;
   });
-  const text = await ask(`Attribute of ${view.mark !== null ? 'the marked boxes' : isBox ? 'this box' : 'the track'}`, 'NAME=VALUE, or a name alone for true',
+  const text = await ask(`Attribute of ${view.mark !== null ? 'the marked boxes' : isBox ? 'this box' : 'the track'}`, 'NAME=VALUE, a name alone for true, or NAME= to remove it',
     offered.map((one, k) => [one, `${k + 1} ${attributeText(...one.split('='))}`]), offered);
   const [name, value = 'true'] = (text ?? '').split(/=(.*)/s).map(part => part.trim());
   if (!name) return;
-  return decideAbout(chosenScopes(isBox || view.mark !== null).map(scope => rowOf(scope, 'attribute', { value: `${name}=${value}` })));
+  const decision = value ? ['attribute', { value: `${name}=${value}` }] : ['remove', { value: name }];
+  return decideAbout(chosenScopes(isBox || view.mark !== null).map(scope => rowOf(scope, ...decision)));
 }
 
 // Turn the whole track by 180°: an added object is followed again from its turned boxes; else each box is

@@ -5,7 +5,7 @@
 const ROUNDING = 1e-6;             // of boxes in the file [m, rad]
 const RETRY = 1000;                // of a server that refuses to stream [ms]
 const TOPIC_OF = { accept: 'judgement', reject: 'judgement', unsure: 'judgement', pin: 'judgement', none: 'judgement',
-                   delete: 'deletion', restore: 'deletion', rename: 'id', reclass: 'class', add: 'addition', withdraw: 'addition', attribute: 'attribute' };
+                   delete: 'deletion', restore: 'deletion', rename: 'id', reclass: 'class', add: 'addition', withdraw: 'addition', attribute: 'attribute', remove: 'attribute' };
 const TAKEN_BACK = { judgement: 'none', deletion: 'restore', id: 'rename', class: 'reclass', addition: 'withdraw', attribute: 'attribute' };
 // What was decided at once, and what held before; those of `log.who` are undone and redone one by one.
 /** @typedef {{ before: Row[], after: Row[] }} Made */
@@ -13,12 +13,12 @@ const TAKEN_BACK = { judgement: 'none', deletion: 'restore', id: 'rename', class
 const log = { count: 0, rows: [], held: new Map(), ofInput: new Map(), made: [], undone: [], who: '', stepping: Promise.resolve() };
 
 const scopeKey = (topic, row) => JSON.stringify([topic, row.track_id, row.stamp_ns, row.end_ns]);
-// An attribute is a topic of its own: NAME=VALUE, without a value to take it back.
-const topicOf = row => (row.decision === 'attribute' ? `attribute ${row.value.split('=')[0]}` : TOPIC_OF[row.decision]);
+// An attribute is a topic of its own: NAME=VALUE, without a value to take it back; `remove` states NAME.
+const topicOf = row => (TOPIC_OF[row.decision] === 'attribute' ? `attribute ${row.value.split('=')[0]}` : TOPIC_OF[row.decision]);
 const keyOf = row => scopeKey(topicOf(row), row);
 const isTakenBack = row => ['none', 'restore', 'withdraw'].includes(row.decision) || (['rename', 'reclass'].includes(row.decision) && !row.value) || (row.decision === 'attribute' && row.value.endsWith('='));
 const rowOf = (scope, decision, more = {}) => ({ ...scope, decision, comment: '', value: '', box: null, ...more });
-const takenBack = row => rowOf({ track_id: row.track_id, stamp_ns: row.stamp_ns, end_ns: row.end_ns }, TAKEN_BACK[TOPIC_OF[row.decision]], row.decision === 'attribute' ? { value: `${row.value.split('=')[0]}=` } : {});
+const takenBack = row => rowOf({ track_id: row.track_id, stamp_ns: row.stamp_ns, end_ns: row.end_ns }, TAKEN_BACK[TOPIC_OF[row.decision]], TOPIC_OF[row.decision] === 'attribute' ? { value: `${row.value.split('=')[0]}=` } : {});
 
 function covers(row, stamp) {
   if (!row.stamp_ns) return true;
