@@ -208,6 +208,22 @@ def test_unresolved_headings_are_no_finding(is_of_track):
     assert axes_of(frames(), STANDARD).finding == ''
 
 
+@pytest.mark.parametrize('exchanged', [True, False])
+def test_a_class_that_moves_sideways_beside_another_is_named(exchanged):
+    check = AxisCheck(STANDARD, Config().drives)
+    for stamp, ids, boxes in street(moving=4):
+        names = ['car'] * len(boxes)
+        names[-2:] = ['truck'] * 2
+        boxes[-2:, 8] += np.pi / 2
+        if exchanged:
+            boxes[-2:, [3, 4]] = boxes[-2:, [4, 3]]
+        check.add(BoxArray(stamp, 'odom', tuple(ids), tuple(names), np.ones(len(ids)), boxes))
+    found = check.class_finding
+    assert found.startswith("boxes of 'truck' move along their y axis, sideways")
+    assert "those of 'car' along their x axis" in found
+    assert ('exchange their length and width' in found) == exchanged
+
+
 def street_of(yaw_of, frame_yaw=0.0):
     """Return the check of a street with other yaws, in a frame of the boxes that is turned."""
     check = AxisCheck(STANDARD, Config().drives)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import atan2, hypot, pi
+from typing import NamedTuple
 
+from boxreg_ros.io.checks.finding import advice_for_some, listed
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, LENGTH, WIDTH, YAW
 from msg_adapters.convention import Convention, FORWARD
@@ -25,6 +27,8 @@ MIN_MOVING_TRACKS = 2
 """Tracks that a finding needs."""
 MIN_DIRECTIONS = 4
 """Directions of a single track that are enough: 8 m."""
+MIN_DIRECTIONS_OF_CLASS = 8
+"""Directions of a class that are enough; chosen: 16 m, as a single vehicle drives straight."""
 MIN_TRACKS_BACKWARD = 3
 """Tracks that must drive backward; chosen: one or two may."""
 MAX_DIRECTIONS = 500
@@ -67,6 +71,15 @@ AXES = tuple(FORWARD)
 """Axes of a pose, each a quarter turn after the one before it."""
 
 
+class _Direction(NamedTuple):
+    """A direction that a box moved in, of one class."""
+
+    axis: str
+    """Of the box, along which it moved; '' for none."""
+    ratio: float
+    """Of its length and width."""
+
+
 @dataclass(slots=True)
 class _Way:
     """Where a track was when its last direction was taken, and the axes that it moved along."""
@@ -83,8 +96,9 @@ class AxisCheck:
 
     Points cannot show which axis points forward; the way of moving vehicles and cyclists does.
     Once that is known, the larger horizontal extent is the length. `finding` says which options
-    would fit; it is empty where nothing moves. `is_turned` says that all boxes are turned from
-    their way by one angle that is no quarter turn. The check ends after `MAX_DIRECTIONS`.
+    would fit; it is empty where nothing moves. `class_finding` says which classes move sideways
+    where others move along their length. `is_turned` says that all boxes are turned from their
+    way by one angle that is no quarter turn. The check ends after `MAX_DIRECTIONS`.
 
     """
 
@@ -97,7 +111,9 @@ class AxisCheck:
         self._mirrored: Counter[bool] = Counter()  # where one sense of yaw fits alone: the other?
         self._angles: list[tuple[float, float, float]] = []  # from x of a box to its way
         self._yaws: list[float] = []  # in the frame of the message
+        self._classes = defaultdict[str, list[_Direction]](list)
         self.finding = ''
+        self.class_finding = ''
         self.is_turned = False
         self.forget()
 
@@ -124,13 +140,15 @@ class AxisCheck:
         self._ways = {k: way for k, way in self._ways.items() if way.stamp_ns >= oldest_ns}
         is_valid = is_valid_box(boxes.boxes).tolist()
         for row, track_id in enumerate(boxes.track_ids):
-            if track_id and is_valid[row] and self._is_checked(boxes.class_names[row]):
-                self._add(track_id, boxes.stamp_ns, boxes.boxes[row], frame_yaw)
+            name = boxes.class_names[row]
+            if track_id and is_valid[row] and self._is_checked(name):
+                self._add(track_id, name, boxes.stamp_ns, boxes.boxes[row], frame_yaw)
         if len(self._ratios) > known:
             self.finding = self._text()
+            self.class_finding = self._class_text()
             self.is_turned = self._is_enough and self._is_turned(AS_READ)
 
-    def _add(self, track_id: str, stamp_ns: int, box: Floats, frame_yaw: float) -> None:
+    def _add(self, track_id: str, name: str, stamp_ns: int, box: Floats, frame_yaw: float) -> None:
         way = self._ways.setdefault(track_id, _Way(stamp_ns, box, frame_yaw))
         step = (box[:2] - way.box[:2]).tolist()
         moved = hypot(*step)
@@ -152,7 +170,9 @@ class AxisCheck:
                 self._mirrored[fits_mirrored] += 1
             self._tracks[axis] += not way.axes[axis]
             self._axes[axis] += 1
-            self._ratios.append(float(box[LENGTH] / box[WIDTH]))
+            ratio = float(box[LENGTH] / box[WIDTH])
+            self._ratios.append(ratio)
+            self._classes[name].append(_Direction(axis, ratio))
             way.axes[axis] += 1
         self._ways[track_id] = _Way(stamp_ns, box, frame_yaw, way.axes)
 
@@ -193,6 +213,30 @@ class AxisCheck:
             f'boxes of vehicles {how} (by {ways} directions of moving ones): expected {expected}, '
             f'got {got}; set {node} (boxreg relabel and convert: {flags})'
         )
+
+    def _class_text(self) -> str:
+        """Return that some classes move sideways, others along their length; '' if not so."""
+        right, sideways = self._moving_along('x+'), self._moving_along('y+', 'y-')
+        if not right or not sideways:
+            return ''
+        of_sideways = [one for name in sideways for one in self._classes[name]]
+        correction = 'turn them by 90 degrees'
+        if np.median([one.ratio for one in of_sideways]) < 1 / MIN_RATIO:
+            correction += ' and exchange their length and width'
+        return (
+            f'boxes of {listed(sideways)} move along their y axis, sideways (by '
+            f'{len(of_sideways)} directions of moving ones), those of {listed(right)} along their '
+            f'x axis: expected one forward_axis of all classes; {advice_for_some(correction)}'
+        )
+
+    def _moving_along(self, *axes: str) -> list[str]:
+        """Return the classes that move along one of some axes of their boxes."""
+        return [
+            name
+            for name, known in self._classes.items()
+            if len(known) >= MIN_DIRECTIONS_OF_CLASS
+            and sum(one.axis in axes for one in known) >= MIN_SHARE * len(known)
+        ]
 
     @property
     def _is_mirrored(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import re
 from typing import NamedTuple
 
@@ -26,3 +27,17 @@ ADVISED = re.compile(
 def advice(name: str, value: object) -> str:
     """Return how an option is set, for the node and for commands."""
     return f'set {name}:={value} (boxreg relabel: --{name.replace("_", "-")} {value})'
+
+
+def advice_for_some(correction: str) -> str:
+    """Return how boxes of some classes are corrected."""
+    return (
+        f'an option is for all classes: {correction} where they are made, or in the boxes.csv '
+        f'that boxreg convert RECORDING#TOPIC --from recording --to csv writes and boxreg relabel '
+        f'--labels csv:FOLDER reads'
+    )
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return class names as part of a sentence."""
+    return ', '.join(map(repr, names))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from boxreg_ros.core.matching import AT_ONCE
-from boxreg_ros.io.checks.finding import advice
+from boxreg_ros.io.checks.finding import advice, advice_for_some, listed
 from boxreg_ros.io.checks.size import counts_of, ENLARGED, SizeCounts, SizeEvidence
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
@@ -293,13 +293,13 @@ class PoseCheck(PairedCheck):
                 correction += ' (or turn them by 90 degrees, if yaw is wrong)'
         evidence = [self._classes[one] for one in names] or [self._all]
         share = float(np.concatenate([one.shares[:, 0] for one in evidence]).mean())
-        whose = f'boxes of {_listed(names)}' if names else 'boxes'
+        whose = f'boxes of {listed(names)}' if names else 'boxes'
         seen = f'{whose} {how} their points, of which they contain {share:.0%}'
         expected, got = getattr(other, name), getattr(own, name)
         if right:
             return (
-                f'{seen}, those of {_listed(right)} fit theirs: expected {name} {got!r} of all '
-                f'classes, got {expected!r} of these; {_for_some(correction)}'
+                f'{seen}, those of {listed(right)} fit theirs: expected {name} {got!r} of all '
+                f'classes, got {expected!r} of these; {advice_for_some(correction)}'
             )
         return (
             f'{seen}: expected {name} {expected!r}, got {got!r}; {advice(name, expected)}{instead}'
@@ -310,29 +310,15 @@ class PoseCheck(PairedCheck):
         own = self._convention.size_scale
         expected = f'{own * scale:g}'
         how = 'half' if scale > 1 else 'twice'
-        seen = f'boxes of {_listed(names)} are about {how} as large as their objects'
+        seen = f'boxes of {listed(names)} are about {how} as large as their objects'
         if right:
             return (
-                f'{seen}, those of {_listed(right)} fit theirs: expected size_scale {own:g} of '
+                f'{seen}, those of {listed(right)} fit theirs: expected size_scale {own:g} of '
                 f'all classes, got {expected} of these; '
-                f'{_for_some(f"multiply their extents by {scale:g}")}'
+                f'{advice_for_some(f"multiply their extents by {scale:g}")}'
             )
         advised = advice('size_scale', expected)
         return f'{seen}: expected size_scale {expected}, got {own:g}; {advised}'
-
-
-def _for_some(correction: str) -> str:
-    """Return how boxes of some classes are corrected."""
-    return (
-        f'an option is for all classes: {correction} where they are made, or in the boxes.csv '
-        f'that boxreg convert RECORDING#TOPIC --from recording --to csv writes and boxreg relabel '
-        f'--labels csv:FOLDER reads'
-    )
-
-
-def _listed(names: list[str]) -> str:
-    """Return class names as part of a sentence."""
-    return ', '.join(map(repr, names))
 
 
 def points_around(points: NDArray[np.floating], center: Floats, reach: float) -> Floats:
