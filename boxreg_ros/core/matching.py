@@ -43,7 +43,9 @@ class StampMatcher:
     A box array takes the nearest sweep within `AT_ONCE` at once. A sweep within `reach` is taken
     as soon as no later one can be nearer, whichever kind arrives first: when a younger sweep than
     the boxes is known, or when the boxes are in the first half of the shortest step between the
-    last sweeps. Where the sweeps are further behind than boxes are held, as by another clock,
+    last sweeps. Once a sweep has come behind a younger one, boxes wait for such a sweep, too; one
+    that was further behind than the longest of the last steps is an exception, and not waited for.
+    Where the sweeps are further behind than boxes are held, as by another clock,
     boxes wait for none. A sweep may be paired with several box arrays. A box array whose sweep was
     dropped is returned without one. At most `queue` sweeps and `queue` box arrays are held.
     Dropped sweeps are counted in `counts` by reason.
@@ -60,6 +62,9 @@ class StampMatcher:
         self._newest_boxes_ns = 0
         self._used_ns: set[int] = set()  # stamps of held sweeps that were paired
         self._newest_ns = -inf  # of all sweeps added, and boxes released
+        self._newest_sweep_ns = -inf  # of all sweeps that were not dropped: they come in order
+        self._behind_ns = -1.0  # boxes are decided by a sweep that is younger by more than this
+        self._released_ns = -inf
         self._steps_ns = deque[float](maxlen=STEPS)
         self._oldest_ns = -inf  # sweeps before this one are late
 
@@ -76,6 +81,11 @@ class StampMatcher:
             self._counts[Reason.SWEEP_DUPLICATE] += 1
         else:
             insort(self._sweeps, sweep, key=lambda item: item.stamp_ns)
+        if not sweep.is_dropped:
+            behind_ns = self._newest_sweep_ns - sweep.stamp_ns
+            if 0 < behind_ns <= max(self._steps_ns, default=0):
+                self._behind_ns = max(self._behind_ns, behind_ns)
+            self._newest_sweep_ns = max(self._newest_sweep_ns, sweep.stamp_ns)
         if -inf < self._newest_ns < sweep.stamp_ns:
             self._steps_ns.append(sweep.stamp_ns - self._newest_ns)
         self._newest_ns = max(self._newest_ns, sweep.stamp_ns)
@@ -116,6 +126,7 @@ class StampMatcher:
     def release(self, stamp_ns: int) -> Iterator[Pair]:
         """Return the pairs of the box arrays up to a stamp, which wait for no sweep any more."""
         self._newest_ns = max(self._newest_ns, stamp_ns)
+        self._released_ns = max(self._released_ns, stamp_ns)
         return self._pop_pairs()
 
     def flush(self) -> Iterator[Pair]:
@@ -160,8 +171,10 @@ class StampMatcher:
 
     def _is_decided(self, stamp_ns: int) -> bool:
         """Return whether no later sweep can be nearer to a stamp, or is waited for."""
-        if self._newest_ns >= stamp_ns:
+        if self._released_ns >= stamp_ns:
             return True
+        if self._newest_ns >= stamp_ns:
+            return self._newest_ns > stamp_ns + self._behind_ns
         if len(self._steps_ns) < FEWEST_STEPS:
             return False
         behind_ns = stamp_ns - self._newest_ns

@@ -187,6 +187,26 @@ def test_boxes_wait_for_no_sweep_of_another_clock():
     assert feed.add('s600', 's1000') == [(1000, 1000)]
 
 
+def test_boxes_wait_for_sweeps_that_come_behind_younger_ones():
+    feed = Feed()
+    first = feed.add('s0', 'b0', 's200', 'b100', 's100', 'b200')  # shows that they do
+    assert first == [(0, 0), (100, None), (200, 200)]
+    assert feed.add('s400', 'b300', 'b400') == []
+    assert feed.add('s300') == [(300, 300), (400, 400)]
+    assert feed.add('s500', 'b500') == [(500, 500)]  # at once, as before
+    assert feed.add('b600', 's700', 'b700') == []
+    assert feed.add('s800') == [(600, None), (700, 700)]
+    assert feed.add('s900', 'b900', 'b1000', 's1100') == [(900, 900)]
+    assert stamps_of(feed.matcher.release(1000 * MS)) == [(1000, None)]
+
+
+def test_one_sweep_far_behind_or_a_dropped_one_changes_nothing():
+    for late in ('s100', 'd600'):
+        feed = Feed()
+        feed.add('s100', 's200', 's300', 's400', 's500', late)
+        assert feed.add('s550', 'b600', 's700') == [(600, None)]
+
+
 def test_no_box_array_is_lost_in_any_order():
     # In every order each box array is returned once, with its own sweep or none, and sweeps
     # without boxes are counted. If each kind arrives in order, all are paired.
