@@ -43,11 +43,11 @@ class StampMatcher:
     A box array takes the nearest sweep within `AT_ONCE` at once. A sweep within `reach` is taken
     as soon as no later one can be nearer, whichever kind arrives first: when a younger sweep than
     the boxes is known, or when the boxes are in the first half of the shortest step between the
-    last sweeps. Once a sweep has come behind a younger one, boxes wait for such a sweep, too; one
-    that was further behind than the longest of the last steps is an exception, and not waited for.
-    Where the sweeps are further behind than boxes are held, as by another clock,
-    boxes wait for none. A sweep may be paired with several box arrays. A box array whose sweep was
-    dropped is returned without one. At most `queue` sweeps and `queue` box arrays are held.
+    last sweeps. Once a sweep has come behind a younger one, boxes wait for such a sweep, too, but
+    for none that was further behind than the longest of the last steps. Where the sweeps are
+    further behind than boxes are held, as by another clock, boxes wait for none. A sweep may be
+    paired with several box arrays. A box array whose sweep was dropped is returned without one. At
+    most `queue` sweeps and `queue` box arrays are held.
     Dropped sweeps are counted in `counts` by reason.
 
     """
@@ -64,7 +64,7 @@ class StampMatcher:
         self._newest_ns = -inf  # of all sweeps added, and boxes released
         self._newest_sweep_ns = -inf  # of all sweeps that were not dropped: they come in order
         self._behind_ns = -1.0  # boxes are decided by a sweep that is younger by more than this
-        self._released_ns = -inf
+        self._released_ns = -inf  # boxes up to here wait for no sweep
         self._steps_ns = deque[float](maxlen=STEPS)
         self._oldest_ns = -inf  # sweeps before this one are late
 
