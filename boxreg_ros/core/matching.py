@@ -47,8 +47,8 @@ class StampMatcher:
     for none that was further behind than the longest of the last steps. Where the sweeps are
     further behind than boxes are held, as by another clock, boxes wait for none. A sweep may be
     paired with several box arrays. A box array whose sweep was dropped is returned without one. At
-    most `queue` sweeps and `queue` box arrays are held.
-    Dropped sweeps are counted in `counts` by reason.
+    most `queue` sweeps and `queue` box arrays are held. Dropped sweeps are counted in `counts` by
+    reason.
 
     """
 
@@ -62,7 +62,7 @@ class StampMatcher:
         self._newest_boxes_ns = 0
         self._used_ns: set[int] = set()  # stamps of held sweeps that were paired
         self._newest_ns = -inf  # of all sweeps added, and boxes released
-        self._newest_sweep_ns = -inf  # of all sweeps that were not dropped: they come in order
+        self._newest_sweep_ns = -inf  # of all sweeps added that were not dropped
         self._behind_ns = -1.0  # boxes are decided by a sweep that is younger by more than this
         self._released_ns = -inf  # boxes up to here wait for no sweep
         self._steps_ns = deque[float](maxlen=STEPS)
