@@ -21,6 +21,8 @@ STEPS = 10
 10 Hz."""
 FEWEST_STEPS = 3
 """Fewer steps are no period; chosen: one may follow a lost sweep."""
+LAGS = 100
+"""Sweeps in order after which none is waited for behind a younger one; chosen: 10 s at 10 Hz."""
 
 
 class Pair(NamedTuple):
@@ -43,12 +45,12 @@ class StampMatcher:
     A box array takes the nearest sweep within `AT_ONCE` at once. A sweep within `reach` is taken
     as soon as no later one can be nearer, whichever kind arrives first: when a younger sweep than
     the boxes is known, or when the boxes are in the first half of the shortest step between the
-    last sweeps. Once a sweep has come behind a younger one, boxes wait for such a sweep, too, but
-    for none that was further behind than the longest of the last steps. Where the sweeps are
-    further behind than boxes are held, as by another clock, boxes wait for none. A sweep may be
-    paired with several box arrays. A box array whose sweep was dropped is returned without one. At
-    most `queue` sweeps and `queue` box arrays are held. Dropped sweeps are counted in `counts` by
-    reason.
+    last sweeps. Once a sweep has come behind a younger one, by no more than the longest of the
+    last steps, boxes wait for such a sweep, too, until `LAGS` have come in order. Where the sweeps
+    are further behind than boxes are held, as by another clock, boxes wait for none. A sweep may
+    be paired with several box arrays. A box array whose sweep was dropped is returned without one.
+    At most `queue` sweeps and `queue` box arrays are held. Dropped sweeps are counted in `counts`
+    by reason.
 
     """
 
@@ -63,7 +65,7 @@ class StampMatcher:
         self._used_ns: set[int] = set()  # stamps of held sweeps that were paired
         self._newest_ns = -inf  # of all sweeps added, and boxes released
         self._newest_sweep_ns = -inf  # of all sweeps added that were not dropped
-        self._behind_ns = -1.0  # boxes are decided by a sweep that is younger by more than this
+        self._lags_ns = deque[float](maxlen=LAGS)  # of sweeps behind a younger one; -1 in order
         self._released_ns = -inf  # boxes up to here wait for no sweep
         self._steps_ns = deque[float](maxlen=STEPS)
         self._oldest_ns = -inf  # sweeps before this one are late
@@ -82,9 +84,9 @@ class StampMatcher:
         else:
             insort(self._sweeps, sweep, key=lambda item: item.stamp_ns)
         if not sweep.is_dropped:
-            behind_ns = self._newest_sweep_ns - sweep.stamp_ns
-            if 0 < behind_ns <= max(self._steps_ns, default=0):
-                self._behind_ns = max(self._behind_ns, behind_ns)
+            lag_ns = self._newest_sweep_ns - sweep.stamp_ns
+            is_lag = 0 < lag_ns <= max(self._steps_ns, default=0)
+            self._lags_ns.append(lag_ns if is_lag else -1)
             self._newest_sweep_ns = max(self._newest_sweep_ns, sweep.stamp_ns)
         if -inf < self._newest_ns < sweep.stamp_ns:
             self._steps_ns.append(sweep.stamp_ns - self._newest_ns)
@@ -174,7 +176,7 @@ class StampMatcher:
         if self._released_ns >= stamp_ns:
             return True
         if self._newest_ns >= stamp_ns:
-            return self._newest_ns > stamp_ns + self._behind_ns
+            return self._newest_ns > stamp_ns + max(self._lags_ns, default=-1)
         if len(self._steps_ns) < FEWEST_STEPS:
             return False
         behind_ns = stamp_ns - self._newest_ns

@@ -364,8 +364,9 @@ def _command(args: argparse.Namespace, facts: dict[str, Any], scene: Address | N
     words = ['boxreg', 'relabel', *map(str, args.recordings), '-o', out]
     found = ADVISED.findall('; '.join(facts['warnings']))
     advised = shlex.split(' '.join(dict.fromkeys(found)))
+    replaced = {word.partition('=')[0] for word in advised}
     given = words_of(args, Request, *TOPICS)
-    words += [word for word in given if word.partition('=')[0] not in advised]
+    words += [word for word in given if word.partition('=')[0] not in replaced]
     words += advised
     if facts['sample']['boxes_without_id'] and '--associate' not in words:
         words.append('--associate')

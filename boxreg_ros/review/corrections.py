@@ -31,7 +31,7 @@ SAME_SWEEP_NS = 50_000_000
 """Boxes are of a sweep if its stamp is nearer than this [ns]; chosen: half a revolution."""
 WITHOUT_EFFECT = ('accept', 'unsure', 'none')
 STATED = ('reclass', 'attribute')
-"""Kinds whose values the boxes of a result state, but not whose values they are."""
+"""Kinds whose values the boxes of a result state, but not whether a person gave them."""
 
 
 class _Applied(NamedTuple):
@@ -609,8 +609,8 @@ def _stated(track_id: str, rows: Sequence[_Applied]) -> list[Decision]:
     """
     Return the classes and attributes that the boxes of a track were given, as ranges.
 
-    They go as far as what was decided, also where there are no boxes yet: a box between two others
-    is one of the track in the input that the first is of.
+    They go as far as what was decided, also where there are no boxes yet. A box that a later run
+    adds between two others has the input track of the first.
 
     """
     found = []

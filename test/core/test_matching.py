@@ -4,7 +4,7 @@ from collections import Counter
 from itertools import permutations
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.matching import StampMatcher
+from boxreg_ros.core.matching import LAGS, StampMatcher
 from boxreg_ros.core.pending import PendingArray
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.structures import BoxArray, Sweep
@@ -198,6 +198,8 @@ def test_boxes_wait_for_sweeps_that_come_behind_younger_ones():
     assert feed.add('s800') == [(600, None), (700, 700)]
     assert feed.add('s900', 'b900', 'b1000', 's1100') == [(900, 900)]
     assert stamps_of(feed.matcher.release(1000 * MS)) == [(1000, None)]
+    feed.add(*(f's{stamp}' for stamp in range(1200, 1200 + 100 * LAGS, 100)))  # in order again
+    assert feed.add('b12000', 's12100') == [(12000, None)]
 
 
 def test_one_sweep_far_behind_or_a_dropped_one_changes_nothing():

@@ -62,6 +62,15 @@ def test_the_command_has_the_options_that_warnings_advise(tmp_path, capsys):
     assert expected in facts['command']
 
 
+def test_the_command_has_the_offset_that_is_advised_once(tmp_path, capsys):
+    drive = Drive(sweeps=30)
+    for index in range(30):
+        drive.replace('/boxes', index, two_seconds_ahead)
+    path = drive.write(tmp_path / 'drive')
+    _, facts = facts_of(capsys, path, '--boxes-offset', '0.5')
+    assert shlex.split(facts['command'])[5:-2] == ['--boxes-offset=-2']
+
+
 def test_why_no_command_can_be_run(tmp_path, capsys):
     drive = Drive(motion='none')
     status, facts = facts_of(capsys, drive.write(tmp_path / 'drive'))
@@ -148,6 +157,11 @@ def half_extents(message):
     for detection in message.detections:
         size = detection.bbox.size
         size.x, size.y, size.z = size.x / 2, size.y / 2, size.z / 2
+
+
+def two_seconds_ahead(message):
+    for one in (message, *message.detections):
+        one.header.stamp.sec += 2
 
 
 def clear_ids(message):

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import atan2, hypot, pi
-from typing import NamedTuple
 
 from boxreg_ros.io.checks.finding import advice_for_some, listed
 from boxreg_ros.rotations import wrap_angle
@@ -28,7 +27,7 @@ MIN_MOVING_TRACKS = 2
 MIN_DIRECTIONS = 4
 """Directions of a single track that are enough: 8 m."""
 MIN_DIRECTIONS_OF_CLASS = 8
-"""Directions of a class that are enough; chosen: 16 m, as a single vehicle drives straight."""
+"""Directions of a class that are enough, also of a single track: 16 m."""
 MIN_TRACKS_BACKWARD = 3
 """Tracks that must drive backward; chosen: one or two may."""
 MAX_DIRECTIONS = 500
@@ -71,15 +70,6 @@ AXES = tuple(FORWARD)
 """Axes of a pose, each a quarter turn after the one before it."""
 
 
-class _Direction(NamedTuple):
-    """A direction that a box moved in, of one class."""
-
-    axis: str
-    """Of the box, along which it moved; '' for none."""
-    ratio: float
-    """Of its length and width."""
-
-
 @dataclass(slots=True)
 class _Way:
     """Where a track was when its last direction was taken, and the axes that it moved along."""
@@ -105,13 +95,13 @@ class AxisCheck:
     def __init__(self, convention: Convention, is_checked: Callable[[str], bool]) -> None:
         self._convention = convention
         self._is_checked = lru_cache(maxsize=100)(is_checked)
-        self._ratios: list[float] = []
+        self._ratios = defaultdict[str, list[float]](list)  # length to width, by class
         self._axes: Counter[str] = Counter()
+        self._axes_of = defaultdict[str, Counter[str]](Counter)  # the same by class
         self._tracks: Counter[str] = Counter()  # by the axis along which they moved first
         self._mirrored: Counter[bool] = Counter()  # where one sense of yaw fits alone: the other?
         self._angles: list[tuple[float, float, float]] = []  # from x of a box to its way
         self._yaws: list[float] = []  # in the frame of the message
-        self._classes = defaultdict[str, list[_Direction]](list)
         self.finding = ''
         self.class_finding = ''
         self.is_turned = False
@@ -133,7 +123,7 @@ class AxisCheck:
             Yaw of the frame of their message in the fixed frame [rad]: a yaw is mirrored in it.
 
         """
-        known = len(self._ratios)
+        known = self._axes.total()
         if known >= MAX_DIRECTIONS:
             return
         oldest_ns = boxes.stamp_ns - round(MAX_SECONDS * 1e9)
@@ -143,7 +133,7 @@ class AxisCheck:
             name = boxes.class_names[row]
             if track_id and is_valid[row] and self._is_checked(name):
                 self._add(track_id, name, boxes.stamp_ns, boxes.boxes[row], frame_yaw)
-        if len(self._ratios) > known:
+        if self._axes.total() > known:
             self.finding = self._text()
             self.class_finding = self._class_text()
             self.is_turned = self._is_enough and self._is_turned(AS_READ)
@@ -170,9 +160,8 @@ class AxisCheck:
                 self._mirrored[fits_mirrored] += 1
             self._tracks[axis] += not way.axes[axis]
             self._axes[axis] += 1
-            ratio = float(box[LENGTH] / box[WIDTH])
-            self._ratios.append(ratio)
-            self._classes[name].append(_Direction(axis, ratio))
+            self._axes_of[name][axis] += 1
+            self._ratios[name].append(float(box[LENGTH] / box[WIDTH]))
             way.axes[axis] += 1
         self._ways[track_id] = _Way(stamp_ns, box, frame_yaw, way.axes)
 
@@ -186,7 +175,7 @@ class AxisCheck:
             return self._convention
         turned = AXES[(AXES.index(self._convention.forward_axis) + AXES.index(axis)) % 4]
         wanted = replace(self._convention, forward_axis=turned)
-        ratio = float(np.median(self._ratios))
+        ratio = self._ratio(self._ratios)
         is_long = ratio > (1 / MIN_RATIO if axis[0] == 'x' else MIN_RATIO)
         # A vehicle is longer than wide: along the axis that points forward.
         if is_long:
@@ -199,7 +188,7 @@ class AxisCheck:
         names = [name for name in OPTIONS if getattr(wanted, name) != getattr(own, name)]
         if not names:
             return self._yaw_text()
-        ways = len(self._ratios)
+        ways = self._axes.total()
         expected = ' and '.join(f'{name} {getattr(wanted, name)!r}' for name in names)
         got = ' and '.join(repr(getattr(own, name)) for name in names)
         node = ' '.join(f'{name}:={getattr(wanted, name)}' for name in names)
@@ -219,24 +208,28 @@ class AxisCheck:
         right, sideways = self._moving_along('x+'), self._moving_along('y+', 'y-')
         if not right or not sideways:
             return ''
-        of_sideways = [one for name in sideways for one in self._classes[name]]
+        ways = sum(self._axes_of[name].total() for name in sideways)
         correction = 'turn them by 90 degrees'
-        if np.median([one.ratio for one in of_sideways]) < 1 / MIN_RATIO:
+        if self._ratio(sideways) < 1 / MIN_RATIO:
             correction += ' and exchange their length and width'
         return (
-            f'boxes of {listed(sideways)} move along their y axis, sideways (by '
-            f'{len(of_sideways)} directions of moving ones), those of {listed(right)} along their '
-            f'x axis: expected one forward_axis of all classes; {advice_for_some(correction)}'
+            f'boxes of {listed(sideways)} move along their y axis, sideways (by {ways} '
+            f'directions of moving ones), those of {listed(right)} along their x axis: expected '
+            f'one forward_axis of all classes; {advice_for_some(correction)}'
         )
 
     def _moving_along(self, *axes: str) -> list[str]:
         """Return the classes that move along one of some axes of their boxes."""
         return [
             name
-            for name, known in self._classes.items()
-            if len(known) >= MIN_DIRECTIONS_OF_CLASS
-            and sum(one.axis in axes for one in known) >= MIN_SHARE * len(known)
+            for name, known in self._axes_of.items()
+            if known.total() >= MIN_DIRECTIONS_OF_CLASS
+            and sum(known[axis] for axis in axes) >= MIN_SHARE * known.total()
         ]
+
+    def _ratio(self, names: Iterable[str]) -> float:
+        """Return the median ratio of length and width of boxes that moved, of some classes."""
+        return float(np.median([ratio for name in names for ratio in self._ratios[name]]))
 
     @property
     def _is_mirrored(self) -> bool:

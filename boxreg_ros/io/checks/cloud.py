@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
+from boxreg_ros.io.checks.motion import LOOK_PERIOD
 from boxreg_ros.structures import Sweep
 import numpy as np
 from numpy.typing import NDArray
 
 MAX_ROUNDING = 0.02
 """Step between coordinates from which they are named as coarse [m]; chosen: the range noise."""
-LOOK_PERIOD = 10
-"""Clouds of which the coordinates of one are looked at; chosen: one a second at 10 Hz."""
 UNIT_POINTS = 100
 """Points of a cloud that its unit is looked up by; chosen."""
 MAX_MEDIAN_DISTANCE = 200.0

@@ -123,8 +123,8 @@ class InputChecks:
 
     def findings(self, ids_identify: bool) -> list[Finding]:
         """Return what was found so far; ways of objects count where ids identify these."""
-        # Points show which horizontal extent is which, motion also which axis points forward, but
-        # of all classes together; boxes in another place show neither.
+        # Points show which horizontal extent is which, motion also which axis points forward;
+        # boxes in another place show neither.
         of_ways = (self._axis.class_finding or self._axis.finding) if ids_identify else ''
         of_classes = '' if self._axis.is_turned else self._pose.class_finding
         of_axes = of_classes or of_ways or self._pose.finding
