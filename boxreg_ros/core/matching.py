@@ -23,6 +23,8 @@ FEWEST_STEPS = 3
 """Fewer steps are no period; chosen: one may follow a lost sweep."""
 LAGS = 100
 """Sweeps in order after which none is waited for behind a younger one; chosen: 10 s at 10 Hz."""
+LAG_MARGIN = 1.5
+"""Factor of the largest known lag by which a sweep is waited for; chosen: periods vary by less."""
 
 
 class Pair(NamedTuple):
@@ -87,6 +89,8 @@ class StampMatcher:
             lag_ns = self._newest_sweep_ns - sweep.stamp_ns
             is_lag = 0 < lag_ns <= max(self._steps_ns, default=0)
             self._lags_ns.append(lag_ns if is_lag else -1)
+            if is_lag:  # a step that the younger sweep hid
+                self._steps_ns.append(lag_ns)
             self._newest_sweep_ns = max(self._newest_sweep_ns, sweep.stamp_ns)
         if -inf < self._newest_ns < sweep.stamp_ns:
             self._steps_ns.append(sweep.stamp_ns - self._newest_ns)
@@ -176,7 +180,7 @@ class StampMatcher:
         if self._released_ns >= stamp_ns:
             return True
         if self._newest_ns >= stamp_ns:
-            return self._newest_ns > stamp_ns + max(self._lags_ns, default=-1)
+            return self._newest_ns > stamp_ns + LAG_MARGIN * max(self._lags_ns, default=-1)
         if len(self._steps_ns) < FEWEST_STEPS:
             return False
         behind_ns = stamp_ns - self._newest_ns

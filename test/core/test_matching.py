@@ -202,6 +202,15 @@ def test_boxes_wait_for_sweeps_that_come_behind_younger_ones():
     assert feed.add('b12000', 's12100') == [(12000, None)]
 
 
+def test_boxes_wait_for_such_sweeps_before_a_younger_one_is_known():
+    feed = Feed()
+    for stamp in range(0, 1000, 200):
+        feed.add(f's{stamp + 100}', f's{stamp}')
+    assert feed.add('b999') == []
+    assert feed.add('s1101') == []  # a period that is longer than all before
+    assert feed.add('s1000') == [(999, 1000)]
+
+
 def test_one_sweep_far_behind_or_a_dropped_one_changes_nothing():
     for late in ('s100', 'd600'):
         feed = Feed()
