@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, WIDTH, YAW
+from boxreg_ros.structures import BoxArray, Floats, LENGTH, WIDTH
 from msg_adapters import poses
 from msg_adapters.box_fields import BoxFields, BoxLabels, parts, Rewrite
 from msg_adapters.cdr import Fields
@@ -25,7 +25,6 @@ LABELS = (
     'hazard', 'over_drivable', 'under_drivable',
 )  # fmt: skip
 """Names of ``ObjectClassification.label``, by value."""
-ORIENTATION_UNAVAILABLE = 0
 CYLINDER = 1
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 """Rotation by 180 degrees about z."""
@@ -36,7 +35,7 @@ REQUIRED_FIELDS = (
     'classification',
     'existence_probability',
 )
-KINEMATICS_FIELDS = ('pose_with_covariance.pose', 'orientation_availability')
+KINEMATICS_FIELDS = ('pose_with_covariance.pose',)
 PREDICTED_FIELDS = ('initial_pose_with_covariance.pose', 'predicted_paths')
 """Fields of the kinematics that are read, and those of a PredictedObject."""
 INITIAL = 'initial_'
@@ -49,8 +48,8 @@ def from_msg(msg: Any) -> BoxArray:
     """
     Return the boxes of objects of any of the types; UnsupportedMessage without a field.
 
-    An object without orientation gets NaN angles, so that its box is returned unchanged, unless it
-    is a cylinder. The sign of the heading is resolved per track later.
+    `orientation_availability` is not read: the sign of each heading is resolved per track later,
+    and detectors that call it unavailable, as CenterPoint of pedestrians and bicycles, give one.
 
     """
     poses.require_fields('TrackedObjects', msg.objects[:1], REQUIRED_FIELDS)
@@ -61,9 +60,6 @@ def from_msg(msg: Any) -> BoxArray:
         [_posed(o.kinematics).pose for o in msg.objects],
         [o.shape.dimensions for o in msg.objects],
     )
-    for box, o in zip(boxes, msg.objects, strict=True):
-        if not _has_orientation(o.kinematics) and o.shape.type != CYLINDER:
-            box[ROLL : YAW + 1] = np.nan
     return BoxArray(
         poses.stamp_ns(msg.header),
         msg.header.frame_id,
@@ -171,13 +167,6 @@ def _posed(kinematics: Any) -> Any:
     return getattr(kinematics, f'{_prefix_of(kinematics)}pose_with_covariance')
 
 
-def _has_orientation(kinematics: Any) -> bool:
-    """Return whether the orientation is known; predictions do not say, and have one."""
-    if _prefix_of(kinematics):
-        return True
-    return bool(kinematics.orientation_availability != ORIENTATION_UNAVAILABLE)
-
-
 def _track_id(o: Any) -> str:
     """Return the UUID in hexadecimal; '' if there is none or it is zero."""
     uuid = bytes(o.object_id.uuid) if hasattr(o, 'object_id') else b''
@@ -210,8 +199,8 @@ HAS_COVARIANCE = OF_OBJECTS + 'has_position_covariance'
 HAS_TWIST = OF_OBJECTS + 'has_twist'
 AUTOWARE_FIELDS = (
     'objects.existence_probability', 'objects.classification', 'objects.classification.label',
-    'objects.classification.probability', OF_OBJECTS + 'orientation_availability', TWIST_FIELD,
-    'objects.shape.type', FOOTPRINT, FOOTPRINT + '.x',
+    'objects.classification.probability', TWIST_FIELD, 'objects.shape.type', FOOTPRINT,
+    FOOTPRINT + '.x',
 )  # fmt: skip
 
 
@@ -237,13 +226,6 @@ def _tracked_labels(fields: Fields) -> BoxLabels:
 
 def _has_no_cylinder(fields: Fields) -> bool:
     return not (fields.numbers('objects.shape.type', '|u1') == CYLINDER).any()
-
-
-def _is_oriented(fields: Fields) -> NDArray[np.bool_]:
-    """Return which objects have an orientation."""
-    availability = fields.numbers(OF_OBJECTS + 'orientation_availability', '|u1')[:, 0]
-    is_oriented: NDArray[np.bool_] = availability != ORIENTATION_UNAVAILABLE
-    return is_oriented
 
 
 def _write_footprints_and_motion(fields: Fields, rewrite: Rewrite, *motions: str) -> None:
@@ -288,7 +270,6 @@ DETECTED_OBJECTS = BoxFields(
     others=(*AUTOWARE_FIELDS, HAS_COVARIANCE, HAS_TWIST),
     covariance=OF_OBJECTS + 'pose_with_covariance.covariance',
     is_ordinary=_has_no_cylinder,
-    has_angles=_is_oriented,
     write=_write_detected,
 )
 BOX_FIELDS = {

@@ -53,8 +53,6 @@ class BoxFields:
     """Whether all its objects are boxes that arrays can represent."""
     rows: Callable[[Fields], NDArray[np.bool_]] | None = None
     """Which of the poses are those of boxes; by default all."""
-    has_angles: Callable[[Fields], NDArray[np.bool_]] | None = None
-    """Which boxes have an orientation; by default all."""
     write: Callable[[Fields, Rewrite], None] = lambda fields, rewrite: None
     """Writes what depends on the box beside pose, size and covariance."""
 

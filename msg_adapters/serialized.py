@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
-from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, YAW
+from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL
 from msg_adapters import poses
 from msg_adapters.box_fields import (
     BoxFields,
@@ -82,8 +82,6 @@ class BoxReader:
             fields.numbers(at.pose, '<f8', POSE_WIDTH)[rows],
             fields.numbers(at.size, '<f8', SIZE_WIDTH)[rows],
         )
-        if at.has_angles is not None:
-            boxes[~at.has_angles(fields), ROLL : YAW + 1] = np.nan
         ids, classes, scores = at.labels(fields)
         sec, nanosec = fields.numbers(at.stamp, '<i4', 2)[0].tolist()
         frame_id = fields.texts(at.frames[0])[0]

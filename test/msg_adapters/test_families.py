@@ -299,17 +299,14 @@ def test_predicted_paths_are_moved_to_the_output_frame():
     np.testing.assert_allclose([step.position.x, step.position.y], [102.0, 210.0], atol=1e-9)
 
 
-def test_unavailable_orientation_makes_the_box_invalid_except_for_cylinders():
+@pytest.mark.parametrize('availability', [0, 1, 2])
+def test_the_orientation_is_read_whatever_its_availability(availability):
     message = message_of(TRACKED)
-    message.objects[0].kinematics.orientation_availability = 0
-    boxes = adapter_for(TRACKED).from_msg(message).boxes
-    assert np.isnan(boxes[0, 6:]).all() and np.isfinite(boxes[0, :6]).all()
-    np.testing.assert_allclose(boxes[1], INPUT_BOXES[1], atol=1e-12)
-    message.objects[0].shape.type = 1
-    assert np.isfinite(adapter_for(TRACKED).from_msg(message).boxes).all()
-    message.objects[0].kinematics.orientation_availability = 1  # SIGN_UNKNOWN
-    out = adapter_for(TRACKED).to_msg(message, adapter_for(TRACKED).from_msg(message))
-    assert out.objects[0].kinematics.orientation_availability == 1
+    message.objects[0].kinematics.orientation_availability = availability
+    boxes = adapter_for(TRACKED).from_msg(message)
+    np.testing.assert_allclose(boxes.boxes, INPUT_BOXES, atol=1e-12)
+    out = adapter_for(TRACKED).to_msg(message, boxes)
+    assert out.objects[0].kinematics.orientation_availability == availability
 
 
 def test_cylinder_gets_the_mean_of_length_and_width():

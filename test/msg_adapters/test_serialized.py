@@ -207,9 +207,8 @@ def test_what_is_out_of_the_ordinary_is_left_to_the_objects(type_name, change):
     assert not Adapters(type_name).check(message)
 
 
-def test_objects_without_orientation_or_class_are_ordinary():
+def test_objects_without_class_are_ordinary():
     message = message_of(TRACKED)
-    message.objects[0].kinematics.orientation_availability = 0
     message.objects[1].classification = []
     message.objects[2].classification[0].label = 99
     message.objects[2].classification[0].probability = 1.0
